@@ -13,6 +13,7 @@ from su3d_bench.cli.common import (
     answer,
     answer_estimate,
     answer_json,
+    answer_nothing_to_pay,
     chat_client,
     file_name_of,
     remark,
@@ -84,12 +85,8 @@ def call(arguments: argparse.Namespace) -> int:
         return _estimate(scene, run, arguments)
     reply = _solve(scene, run, arguments)
     picture = _draw(instances, scene, reply, job, arguments)
-    if arguments.json:
-        answer_json(
-            {"scene": arguments.scene, "question": arguments.question}
-            | reply.to_json()
-            | {"names": note, "picture": None if picture is None else str(picture)}
-        )
+    value = {"scene": arguments.scene, "question": arguments.question} | reply.to_json()
+    if answer_json(arguments, value | {"names": note, "picture": None if picture is None else str(picture)}):
         return EXIT_DONE
     answer(reply.text)
     for line in (*reply.notes, f"names: {note}"):
@@ -117,8 +114,7 @@ def _estimate(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) ->
     from su3d_bench.questions.reasoning.language_solver import LanguageSolver
 
     if arguments.solver != "llm":
-        answer("the built-in solver asks no model: nothing to pay")
-        return EXIT_DONE
+        return answer_nothing_to_pay(arguments, "the built-in solver")
     client, config = chat_client(arguments, run)
     return answer_estimate(arguments, client, [LanguageSolver(scene, client, config).request(arguments.question)])
 

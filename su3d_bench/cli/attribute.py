@@ -17,7 +17,7 @@ def add_parser(verbs: Any) -> None:
         "Show where a run loses its points: the gain when each kind of error alone is mended.",
         (
             "su3d-bench attribute runs/my-run --out errors.png",
-            "su3d-bench attribute runs/my-run --protocol rooms-instance --oracle runs/my-oracle-run --json",
+            "su3d-bench attribute runs/my-run --protocols rooms-instance --oracle runs/my-oracle-run --json",
         ),
         call,
     )
@@ -39,7 +39,7 @@ def call(arguments: argparse.Namespace) -> int:
     attribution = attribute(
         arguments.run,
         method=arguments.method,
-        protocols=arguments.protocol,
+        protocols=arguments.protocols,
         oracle=arguments.oracle,
     ).to_json()
     if arguments.out is not None:

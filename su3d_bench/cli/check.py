@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, answer, answer_commands, answer_json, remark, written
+from su3d_bench.cli.common import add_verb, answer, answer_commands, answer_either, answer_json, remark, written
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def call(arguments: argparse.Namespace) -> int:
 def _learn(arguments: argparse.Namespace) -> int:
     from su3d_bench.analysis.gate.costs import why_no_cost
     from su3d_bench.analysis.gate.reference import ACROSS_MACHINES, COST_LIMIT, MOST_COST_LIMIT, learn
-    from su3d_bench.core.errors import printable
+    from su3d_bench.core.errors import counted, printable
     from su3d_bench.runs.finished import read_run
     from su3d_bench.store.atomic import json_text
 
@@ -76,7 +76,11 @@ def _learn(arguments: argparse.Namespace) -> int:
     written(arguments.out, json_text(reference.model_dump(mode="json", exclude_defaults=True)))
     n_exact = sum(metric.tolerance == 0 for each in reference.results for metric in each.metrics.values())
     n_values = sum(len(each.metrics) for each in reference.results)
-    answer(f"{arguments.out}: {n_values} headline values from {reference.n_runs} runs, {n_exact} of them exact")
+    about = {"reference": str(arguments.out), "n_runs": reference.n_runs, "n_values": n_values, "n_exact": n_exact}
+    line = (
+        f"{arguments.out}: {n_values} headline values from {counted(reference.n_runs, 'run')}, {n_exact} of them exact"
+    )
+    answer_either(arguments, about, line)
     if reference.n_runs == 1:
         remark("one run shows no spread: every value must be met exactly; learn from several where runs vary")
     for method in runs[0].methods:
@@ -95,9 +99,7 @@ def _check(arguments: argparse.Namespace) -> int:
 
     verdict = check(read_run(arguments.runs[0]), read_reference(arguments.against))
     _write(verdict, arguments)
-    if arguments.json:
-        answer_json({"passed": verdict.is_passed, **asdict(verdict)})
-    else:
+    if not answer_json(arguments, {"passed": verdict.is_passed, **asdict(verdict)}):
         answer(*plain_lines(verdict))
         in_workflow = os.environ.get("GITHUB_ACTIONS") == "true"
         if in_workflow if arguments.github is None else arguments.github:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import json
+import math
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -11,7 +13,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
-from su3d_bench.core.errors import EXIT_DONE
+from su3d_bench.cli.parser import JSON, JsonFlag
+from su3d_bench.core.errors import EXIT_DONE, StoreError, shown
+from su3d_bench.core.files import file_text
 from su3d_bench.core.printing import Door, escaped_json, one_line, stream_behind
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
 
@@ -25,6 +29,7 @@ if TYPE_CHECKING:
     from su3d_bench.store.run_folder import RunFolder
 
 MOST_OF_A_BAR = 80  # characters of its words
+MOST_OF_AN_ANSWER = 1 << 28  # bytes of a file that is looked at before it is replaced
 TABLE_FORMATS = ("text", "markdown", "latex", "csv", "html")
 
 
@@ -35,20 +40,15 @@ def add_verb(
     examples: tuple[str, str],
     call: Callable[[argparse.Namespace], int],
     *,
-    json_to_file: bool = False,
     uses_all_cores: bool = False,
 ) -> argparse.ArgumentParser:
     """A verb's parser: help that ends with two examples, ``--json``, ``--quiet`` and ``--debug``.
 
-    ``json_to_file``: ``--json`` takes a file to write the answer to, instead of answering in JSON. Numerical libraries
-    are held to one thread unless the verb ``uses_all_cores``.
+    Numerical libraries are held to one thread unless the verb ``uses_all_cores``.
     """
     parser = _parser(verbs, name, summary, examples)
-    parser.set_defaults(call=call, uses_all_cores=uses_all_cores)
-    if json_to_file:
-        parser.add_argument("--json", type=Path, metavar="FILE", help="write the answer to a JSON file too")
-    else:
-        parser.add_argument("--json", action="store_true", help="answer in JSON")
+    parser.set_defaults(call=call, uses_all_cores=uses_all_cores, json_file=None)
+    parser.add_argument(JSON, action=JsonFlag, help="answer in JSON; with a file, write that there")
     parser.add_argument("--quiet", action="store_true", help="no progress and no remarks on stderr")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     return parser
@@ -86,8 +86,8 @@ def add_settings(parser: argparse.ArgumentParser, description: str) -> None:
 
 
 def add_protocols(parser: argparse.ArgumentParser, description: str, metavar: str = "P") -> None:
-    """``--protocol NAME...``, which may be given several times; ``description`` says what is done under them."""
-    parser.add_argument("--protocol", nargs="+", action="extend", default=[], metavar=metavar, help=description)
+    """``--protocols NAME...``, which may be given several times; ``description`` says what is done under them."""
+    parser.add_argument("--protocols", nargs="+", action="extend", default=[], metavar=metavar, help=description)
 
 
 def add_whose_map(parser: argparse.ArgumentParser) -> None:
@@ -125,24 +125,67 @@ def answer_document(text: str) -> None:
     answer(*text.rstrip("\n").split("\n"))
 
 
-def answer_json(value: Any) -> None:
-    """Print ``value`` as JSON to stdout."""
-    print(escaped_json(value, indent=2))
+def answer_json(arguments: argparse.Namespace, value: Any) -> bool:
+    """Give ``value`` as ``--json`` asks for it: on stdout, or in its file; whether it stands in place of the words.
+
+    A file that the flag may not have meant, and that holds something else than such an answer, stays as it is.
+    """
+    text = escaped_json(_defined(value), indent=2, allow_nan=False)
+    file: Path | None = arguments.json_file
+    if file is not None and arguments.json_is_guess and not _is_earlier_answer(file, value):
+        print(text)
+        raise StoreError(
+            f"{shown(file)}: is there and no earlier answer of this command, so it stays as it is and the answer went "
+            f"to stdout; to replace it, write --json={shown(file)}"
+        )
+    if file is not None:
+        path = written(file, f"{text}\n")
+        remark(f"written: {path}", quiet=arguments.quiet)
+    if arguments.json:
+        print(text)
+    return bool(arguments.json)
+
+
+def _defined(value: Any) -> Any:
+    """``value`` with null for a number that is none, which JSON does not know."""
+    if isinstance(value, dict):
+        return {name: _defined(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_defined(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _is_earlier_answer(file: Path, value: Any) -> bool:
+    """Whether nothing is lost where ``value`` takes the place of ``file``: there is none, or one of the same keys."""
+    try:
+        if file.stat().st_size > MOST_OF_AN_ANSWER:
+            return False
+        held = json.loads(file_text(file))
+    except FileNotFoundError:
+        return True
+    except (OSError, ValueError, RecursionError):
+        return False
+    return not held or _have_one_form(held, value)
+
+
+def _have_one_form(held: Any, value: Any) -> bool:
+    """Whether both are tables of which one has all keys of the other, or lists of such."""
+    if isinstance(held, list) and isinstance(value, list):
+        return not held or not value or _have_one_form(held[0], value[0])
+    if isinstance(held, dict) and isinstance(value, dict):
+        return held.keys() <= value.keys() or value.keys() <= held.keys()
+    return type(held) is type(value)
 
 
 def answer_either(arguments: argparse.Namespace, value: Any, *lines: str) -> None:
-    """Print ``value`` where ``--json`` asks for it, else ``lines``."""
-    if arguments.json:
-        answer_json(value)
-    else:
+    """Give ``value`` as ``--json`` asks for it, and ``lines`` unless it is printed."""
+    if not answer_json(arguments, value):
         answer(*lines)
 
 
 def answer_tables(arguments: argparse.Namespace, value: Any, parts: Sequence[Table | Prose]) -> None:
-    """Print ``value`` where ``--json`` asks for it, else the tables."""
-    if arguments.json:
-        answer_json(value)
-    else:
+    """Give ``value`` as ``--json`` asks for it, and the tables unless it is printed."""
+    if not answer_json(arguments, value):
         answer_document(formatted(parts, arguments))
 
 
@@ -159,21 +202,34 @@ def answer_estimate(arguments: argparse.Namespace, client: ChatClient, requests:
     return EXIT_DONE
 
 
+def answer_nothing_to_pay(arguments: argparse.Namespace, who: str) -> int:
+    """Say that ``who`` asks no language model; the exit code."""
+    from su3d_bench.perception.language.spending import Estimate
+
+    nothing = Estimate(n_requests=0, n_stored=0, input_tokens=0, output_tokens=0, usd=0.0, models=())
+    answer_either(arguments, nothing.to_json(), f"{who} asks no model: nothing to pay")
+    return EXIT_DONE
+
+
 def written(path: Path, text: str) -> Path:
     """Write ``text`` to a file that a flag named, with its folder; its path."""
     from su3d_bench.store.atomic import make_folder, write_text
+    from su3d_bench.store.run_folder import refuse_records
 
+    refuse_records(path)
     make_folder(path.parent)
     write_text(path, text)
     return path
 
 
-def answer_or_write(arguments: argparse.Namespace, text: str) -> None:
-    """Print the document ``text``, or write it to the file that ``--out`` names."""
+def answer_or_write(arguments: argparse.Namespace, value: Any, parts: Sequence[Table | Prose]) -> None:
+    """Write the tables to the file of ``--out``, or give them as ``answer_tables`` does."""
     if arguments.out is None:
-        answer_document(text)
+        answer_tables(arguments, value, parts)
     else:
-        remark(f"written: {written(arguments.out, text)}", quiet=arguments.quiet)
+        path = written(arguments.out, formatted(parts, arguments, is_file=True))
+        remark(f"written: {path}", quiet=arguments.quiet)
+        answer_json(arguments, value)
 
 
 def file_name_of(text: str, kind: Literal["text", "question"]) -> str:

@@ -16,7 +16,7 @@ def add_parser(verbs: Any) -> None:
         "Compare two runs over their common scenes: exact test, and differences with interval.",
         (
             "su3d-bench compare runs/before runs/after --per-class",
-            "su3d-bench compare runs/old-0,runs/old-1 runs/new-0,runs/new-1 --protocol rooms-instance --json",
+            "su3d-bench compare runs/old-0,runs/old-1 runs/new-0,runs/new-1 --protocols rooms-instance --json",
         ),
         call,
     )
@@ -36,7 +36,7 @@ def call(arguments: argparse.Namespace) -> int:
         arguments.left,
         arguments.right,
         method=arguments.method,
-        protocols=arguments.protocol,
+        protocols=arguments.protocols,
         per_class=arguments.per_class,
     ).to_json()
     answer_tables(arguments, comparison, comparison_tables(comparison))

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_protocols, add_table_format, add_verb, answer_document, formatted, remark, written
+from su3d_bench.cli.common import add_protocols, add_table_format, add_verb, answer_tables, remark
 from su3d_bench.core.errors import EXIT_DONE
 
 
@@ -17,10 +17,9 @@ def add_parser(verbs: Any) -> None:
         "Score predictions made elsewhere, under every protocol that fits; the format is recognised.",
         (
             "su3d-bench evaluate predictions/ --dataset replica --json numbers.json",
-            "su3d-bench evaluate pred/ --ground-truth gt/ --protocol scannet-instance --per-class",
+            "su3d-bench evaluate pred/ --ground-truth gt/ --protocols scannet-instance --per-class",
         ),
         call,
-        json_to_file=True,
     )
     parser.add_argument(
         "predictions",
@@ -72,7 +71,6 @@ def add_parser(verbs: Any) -> None:
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.evaluation.evaluate import NOT_MEANT, Request, evaluate
     from su3d_bench.reports.tables.evaluation import evaluation_tables
-    from su3d_bench.store.atomic import json_text
 
     result = evaluate(
         Request(
@@ -80,7 +78,7 @@ def call(arguments: argparse.Namespace) -> int:
             dataset=arguments.dataset,
             ground_truth=arguments.ground_truth,
             truth_values=arguments.truth_values,
-            protocols=tuple(arguments.protocol),
+            protocols=tuple(arguments.protocols),
             scenes=tuple(arguments.scenes),
             format=arguments.format,
             text_features=arguments.text_features,
@@ -89,9 +87,7 @@ def call(arguments: argparse.Namespace) -> int:
         )
     )
     document = result.to_json()
-    if arguments.json is not None:
-        written(arguments.json, json_text(document))
-    answer_document(formatted(evaluation_tables(document, per_class=arguments.per_class), arguments))
+    answer_tables(arguments, document, evaluation_tables(document, per_class=arguments.per_class))
     remark(f"format: {', '.join(result.formats)}; ground truth: {result.ground_truth}", quiet=arguments.quiet)
     for line in result.remarks:
         remark(line, quiet=arguments.quiet)
@@ -101,6 +97,4 @@ def call(arguments: argparse.Namespace) -> int:
     for reason, names in reasons.items():
         if not reason.startswith(NOT_MEANT):
             remark(f"not scored under {', '.join(names)}: {reason}", quiet=arguments.quiet)
-    if arguments.json is not None:
-        remark(f"written: {arguments.json}", quiet=arguments.quiet)
     return EXIT_DONE

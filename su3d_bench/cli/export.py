@@ -91,8 +91,7 @@ def call(arguments: argparse.Namespace) -> int:
                     remarks = write_scannet(masks, name, folder)
             remarks = (*_partial_remark(source.run), *prediction.remarks, *remarks)
             rows.append({"scene": source.address, "remarks": list(remarks)})
-    if arguments.json:
-        answer_json({"to": arguments.to, "folder": str(arguments.out), "scenes": rows})
+    if answer_json(arguments, {"to": arguments.to, "folder": str(arguments.out), "scenes": rows}):
         return EXIT_DONE
     for row in rows:
         for line in row["remarks"]:

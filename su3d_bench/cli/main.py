@@ -7,19 +7,17 @@ import sys
 import traceback
 from collections.abc import Sequence
 from importlib import import_module
-from typing import Any
 
 from su3d_bench import __version__
 from su3d_bench.cli.common import remark
+from su3d_bench.cli.parser import Parser
 from su3d_bench.core.endings import Ended, ending_in_order
 from su3d_bench.core.errors import (
     EXIT_DONE,
     EXIT_INTERNAL,
     EXIT_WRONG_INPUT,
-    ConfigError,
     Su3dError,
     printable,
-    suggest,
 )
 from su3d_bench.core.printing import doors
 from su3d_bench.runs.executors.local import limit_threads
@@ -52,32 +50,6 @@ EPILOG = """examples:
   su3d-bench run --scenes rooms/living0 --methods opensu3d oracle
   su3d-bench query rooms/living0 "plant on shelf"
 """
-
-
-class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are ``ConfigError``, with a suggestion for a misspelt verb or flag."""
-
-    def error(self, message: str) -> None:  # type: ignore[override]
-        verb = self.prog.partition(" ")[2]
-        raise ConfigError(f"{verb}{': ' if verb else ''}{self._with_suggestion(message)}; see {self.prog} --help")
-
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
-        """As the base class, but a verb itself refuses what it does not know, for it knows what comes near."""
-        parsed, unknown = super().parse_known_args(args, namespace)
-        if unknown:
-            self.error(f"unrecognized arguments: {' '.join(unknown)}")
-        return parsed, unknown
-
-    def _with_suggestion(self, message: str) -> str:
-        if message.startswith("unrecognized arguments: "):
-            word = [*message.removeprefix("unrecognized arguments: ").split(), ""][0]
-            return f"unknown argument '{word}'{suggest(word, self._option_string_actions)}"
-        if "invalid choice: " in message:
-            argument, _, rest = message.partition(": invalid choice: ")
-            word = rest.partition(" (choose from")[0][1:-1]  # a repr, with either kind of quotes
-            known = [choice for action in self._actions for choice in (action.choices or ())]
-            return f"unknown {argument.removeprefix('argument ')} '{word}'{suggest(word, map(str, known))}"
-        return message
 
 
 def build_parser() -> Parser:

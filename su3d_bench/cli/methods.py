@@ -92,9 +92,8 @@ def _show(arguments: argparse.Namespace) -> int:
     row = _about(method.name, method)
     figures = figures_of(method=method.name)
     presets = {name: dict(settings) for name, settings in _presets_of(method).items()}
-    if arguments.json:
-        published = [figure.model_dump(mode="json", exclude_none=True) for figure in figures]
-        answer_json({**row, "settings": defaults, "presets": presets, "published": published})
+    published = [figure.model_dump(mode="json", exclude_none=True) for figure in figures]
+    if answer_json(arguments, {**row, "settings": defaults, "presets": presets, "published": published}):
         return EXIT_DONE
     leaves = [(("method", method.name, *path), value, _remark(method, path)) for path, value in flatten(defaults)]
     answer(*(f"# {line}" for line in _lines(row)))

@@ -95,8 +95,7 @@ def _perception_config(arguments: argparse.Namespace) -> PerceptionConfig:
 
 def call_list(arguments: argparse.Namespace) -> int:
     states = _states(arguments, ())
-    if arguments.json:
-        answer_json([_state_row(state) for state in states])
+    if answer_json(arguments, [_state_row(state) for state in states]):
         return EXIT_DONE
     width = max(len(state.entry.name) for state in states)
     for state in states:

@@ -17,7 +17,7 @@ def add_parser(verbs: Any) -> None:
         "Tell how many scenes and seeds show a difference of so many points between two methods.",
         (
             "su3d-bench plan runs/my-run --methods opensu3d conceptgraphs --points 1 2 5",
-            "su3d-bench plan runs/seed-0 runs/seed-1 runs/seed-2 --protocol rooms-instance --json",
+            "su3d-bench plan runs/seed-0 runs/seed-1 runs/seed-2 --protocols rooms-instance --json",
         ),
         call,
     )
@@ -41,7 +41,7 @@ def call(arguments: argparse.Namespace) -> int:
         arguments.runs,
         arguments.methods,
         points=arguments.points,
-        protocols=arguments.protocol,
+        protocols=arguments.protocols,
         power=arguments.power,
     ).to_json()
     answer_tables(arguments, made, plan_tables(made))

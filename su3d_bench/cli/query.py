@@ -50,8 +50,8 @@ def call(arguments: argparse.Namespace) -> int:
     picture = arguments.out or job.picture(f"query-{file_name_of(arguments.text, 'text')}.png")
     lines = [f"{row['rank']}. {row['name']}  {row['similarity']:.3f}" for row in rows]
     draw_heat_map(prediction, ranking.similarity, picture, f'{arguments.scene}: "{arguments.text}"', lines)
-    if arguments.json:
-        answer_json({"scene": arguments.scene, "text": arguments.text, "picture": str(picture), "ranking": rows})
+    value = {"scene": arguments.scene, "text": arguments.text, "picture": str(picture), "ranking": rows}
+    if answer_json(arguments, value):
         return 0
     answer(f"{'rank':>4}  {'id':>4}  {'similarity':>10}  {'centroid (m)':<22}  name")
     for row in rows:

@@ -81,7 +81,7 @@ def _make(arguments: argparse.Namespace) -> int:
     made = _made(arguments)
     write_questions(arguments.out, made)
     remark(f"{counted(len(made), 'question')}: {arguments.out}", quiet=arguments.quiet)
-    _answer_counts(made, arguments)
+    answer_either(arguments, *_counts(made))
     return EXIT_DONE
 
 
@@ -110,10 +110,9 @@ def _show(arguments: argparse.Namespace) -> int:
         raise ConfigError("questions show: name a file, or 'paper' for the queries that the paper's page shows")
     questions: Sequence[Question]
     questions = paper_queries() if arguments.file == PAPER else read_questions(Path(arguments.file), "")
-    if arguments.json:
-        answer_json([_row(question) for question in questions])
+    if answer_json(arguments, [_row(question) for question in questions]):
         return EXIT_DONE
-    _answer_counts(questions, arguments)
+    answer(_counts(questions)[1])
     for question in questions[:N_SHOWN]:
         answer("  ".join(str(value) for value in _printable_row(question)))
     if len(questions) > N_SHOWN:
@@ -142,7 +141,8 @@ def _printable_row(question: Question) -> tuple[str, ...]:
     return printable(question.scene, 60), question.kind, printable(question.text, MOST_CHARACTERS), f"-> {known}"
 
 
-def _answer_counts(questions: Sequence[Question], arguments: argparse.Namespace) -> None:
+def _counts(questions: Sequence[Question]) -> tuple[dict[str, Any], str]:
+    """How many of each kind, as JSON has it and in words."""
     counts = Counter(question.kind for question in questions)
     n_known = sum(question.is_known for question in questions)
     kinds = ", ".join(f"{n} {kind}" for kind, n in counts.items())
@@ -152,7 +152,7 @@ def _answer_counts(questions: Sequence[Question], arguments: argparse.Namespace)
     if n_replies := sum(bool(question.reply) for question in questions):
         text += f", {n_replies} with one in words"
     content = {"n": len(questions), "n_known": n_known, "n_replies": n_replies, "kinds": dict(counts)}
-    answer_either(arguments, content, text)
+    return content, text
 
 
 def _audit(arguments: argparse.Namespace) -> int:

@@ -14,6 +14,7 @@ from su3d_bench.cli.common import (
     answer,
     answer_estimate,
     answer_json,
+    answer_nothing_to_pay,
     chat_client,
     remark,
 )
@@ -150,8 +151,7 @@ def _estimate(tops: dict[str, list[TopNames]], arguments: argparse.Namespace) ->
     from su3d_bench.store.run_folder import RunFolder
 
     if arguments.refiner != "model":
-        answer("the vote asks no model: nothing to pay")
-        return EXIT_DONE
+        return answer_nothing_to_pay(arguments, "the vote")
     client, config = chat_client(arguments, RunFolder(arguments.run))
     refiner = ModelRefiner(client, config)
     requests = [request for of_scene in tops.values() for request in refiner.requests(of_scene)]
@@ -173,8 +173,7 @@ def _refine(
 
 
 def _answer(made: dict[str, NameRecords], arguments: argparse.Namespace) -> None:
-    if arguments.json:
-        answer_json({scene: records.model_dump(mode="json") for scene, records in made.items()})
+    if answer_json(arguments, {scene: records.model_dump(mode="json") for scene, records in made.items()}):
         return
     for scene, records in made.items():
         changed = [name for name in records.names if name.refined != name.label]

@@ -161,9 +161,8 @@ def carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
 def _answer_result(result: RunResult, arguments: argparse.Namespace) -> None:
     from su3d_bench.reports.tables.run import run_tables
 
-    if arguments.json:
-        answer_json(result.metrics | ({"found": [asdict(found) for found in result.found]} if result.found else {}))
-    else:
+    found = {"found": [asdict(found) for found in result.found]} if result.found else {}
+    if not answer_json(arguments, result.metrics | found):
         answer_document(formatted(run_tables(result.metrics, result.found), arguments))
     for line in result.remarks:
         remark(line, quiet=arguments.quiet)
@@ -176,9 +175,8 @@ def show_plan(plan: Plan, arguments: argparse.Namespace) -> int:
     from su3d_bench.runs.planning.estimate import estimate
 
     rows = estimate(plan)
-    if arguments.json:
-        jobs = [asdict(row) for row in rows]
-        answer_json({"folder": str(plan.folder.path), "n_workers": plan.n_workers, "jobs": jobs})
+    jobs = [asdict(row) for row in rows]
+    if answer_json(arguments, {"folder": str(plan.folder.path), "n_workers": plan.n_workers, "jobs": jobs}):
         return EXIT_DONE
     for row in rows:
         state = "done already" if row.is_done else f"{row.n_updates} updates, about {row.seconds:.0f} s"

@@ -217,7 +217,8 @@ def nest(leaves: Sequence[tuple[KeyPath, Any]]) -> dict[str, Any]:
 
 
 def read_assignments(texts: Sequence[str], methods: Sequence[str], datasets: Sequence[str]) -> Settings:
-    """The settings of ``--set KEY=VALUE``: KEY is ``<method>.x``, ``<dataset>.x`` or ``perception.x``.
+    """The settings of ``--set KEY=VALUE``: KEY is ``<method>.x``, ``<dataset>.x`` or ``perception.x``,
+    or as a file has it, ``method.<method>.x`` or ``dataset.<dataset>.x``.
 
     ``methods`` and ``datasets`` are the names that the run uses; VALUE is TOML, and plain text where it is not.
     """
@@ -233,13 +234,15 @@ def read_assignments(texts: Sequence[str], methods: Sequence[str], datasets: Seq
 
 def _full_path(text: str, path: KeyPath, methods: Sequence[str], datasets: Sequence[str]) -> KeyPath:
     if len(path) == 1 and path[0] in RunConfig.model_fields:
-        raise ConfigError(f"--set {text}: '{path[0]}' has a flag of its own: --{path[0]}")
+        raise ConfigError(f"--set {text}: '{path[0]}' has a flag of its own: --{path[0].replace('_', '-')}")
     for section, names in (("method", methods), ("dataset", datasets)):
+        if path[0] == section and len(path) > 2 and path[1] in names:
+            return path  # as a file has it: [method.opensu3d]
         if path[0] in names and len(path) > 1:
             return (section, *path)
     if path[0] == "perception" and len(path) > 1:
         return path
-    known = [*methods, *datasets, "perception"]
+    known = dict.fromkeys([*methods, *datasets, "perception"])
     hint = suggest(path[0], known) or "; known: " + ", ".join(known)
     raise ConfigError(f"--set {text}: '{path[0]}' is no method or dataset of this run{hint}")
 
@@ -270,7 +273,7 @@ def check_names(section: str, settings: Settings, known: Sequence[str]) -> None:
     """Refuse ``[section.name]`` where ``name`` is not ``known``."""
     for entry in settings.under((section,)):
         if entry.path[0] not in known:
-            hint = suggest(entry.path[0], known) or "; known: " + ", ".join(known)
+            hint = suggest(entry.path[0], known) or "; known: " + ", ".join(dict.fromkeys(known))
             raise ConfigError(f"{entry.source}: unknown {section} '{entry.path[0]}'{hint}")
 
 

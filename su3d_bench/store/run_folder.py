@@ -27,6 +27,7 @@ from su3d_bench.store.unfinished import LOCK_FILE, clear_unfinished, hold_folder
 JOBS = "scenes"
 WRITTEN_BY_ALL = ("language", "language/images")  # where all jobs of a run write; a job clears its own folders
 MARKS = ("run.toml", "run.json")  # by which a folder is known for a run's; the first is the first that a run writes
+RECORDS = ("run.toml", "run.json", "metrics.json", "ablation.json")  # the files of a run beside its jobs
 BEFORE_MARKS = (JOBS, "language", LOCK_FILE)  # what a run may hold of which a power cut took them
 # What a folder's name says otherwise, so that each scene has a folder of its own; "." ends the dataset's name.
 _ESCAPES = {"%": "%25", "/": "%2F", ".": "%2E"}
@@ -64,6 +65,20 @@ def refuse_links(top: Path, place: Path) -> None:
             return
         if folder.is_symlink():
             raise StoreError(f"{shown(folder)}: is a link, and a run writes into folders of its own alone; remove it")
+
+
+def refuse_records(place: Path) -> None:
+    """A ``StoreError`` where a verb would write into the place of what a run itself has written."""
+    above = place.absolute().parents
+    is_record = place.name in RECORDS and is_run(above[0])
+    is_of_job = len(above) > 3 and above[2].name == JOBS and is_run(above[3])
+    if (is_record or is_of_job) and place.exists():
+        raise StoreError(f"{shown(place)}: is a file of the run itself, and stays as it is; choose another name")
+
+
+def is_run(folder: Path) -> bool:
+    """Whether the folder is known for a run's."""
+    return any((folder / name).is_file() for name in MARKS)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -24,7 +25,7 @@ CASES: dict[str, tuple[list[str], int, str]] = {
         "sweep/metrics.json",
     ),
     "evaluate": (
-        ["out/scenes/rooms.living0/opensu3d", "--dataset", "rooms", "--protocol", "rooms-instance", "--json", "e.json"],
+        ["out/scenes/rooms.living0/opensu3d", "--dataset", "rooms", "--protocol", "rooms-instance"],
         0,
         "rooms-instance",
     ),
@@ -67,7 +68,7 @@ CASES: dict[str, tuple[list[str], int, str]] = {
 PLACES = {
     "run": ("out", "out/scenes/rooms.living0/opensu3d"),
     "ablate": ("sweep",),
-    "evaluate": (".",),
+    "evaluate": ("answers",),
     "check": (".",),
     "attribute": (".",),
     "report tables": (".",),
@@ -110,7 +111,10 @@ def test_the_verb_does_its_work(verb: str, capsys: pytest.CaptureFixture[str]) -
     for path in half:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("half")
-    assert main([*verb.split(), *words]) == code, capsys.readouterr().err
+    json_file = Path("answers", f"{verb}.json")
+    assert main([*verb.split(), *words, "--json", str(json_file)]) == code, capsys.readouterr().err
     answer = capsys.readouterr()
     assert left in answer.out + answer.err or Path(left).exists(), answer.out + answer.err
+    assert not answer.out.startswith(("{", "[")), "the answer in words stands beside the file"
+    assert code == 2 or json.loads(json_file.read_text()) is not None
     assert not [path for path in half if path.exists()], "what a killed process left goes"

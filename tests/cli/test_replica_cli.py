@@ -16,7 +16,7 @@ from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.runs.planning.scenes import data_root
 
 SMALL = ["--set", "n_frames=3", "--set", "rooms.width=64", "--set", "height=48", "--set", "mesh_spacing_m=0.15"]
-MAKE = ["datasets", "make", "rooms", "--scenes", "bathroom0", *SMALL, "--workers", "1"]
+MAKE = ["datasets", "make", "rooms", "--scenes", "bathroom0", *SMALL, "--jobs", "1"]
 
 
 @pytest.fixture(autouse=True)
@@ -105,7 +105,7 @@ def test_one_worker_and_two_make_the_same_bytes(tmp_path: Path) -> None:
         (["datasets", "make", "rooms", "--scenes", "replica/*"], "'replica/*' is no scene of it; expected 'rooms/...'"),
         (["datasets", "make", "rooms", "--set", "widht=3"], "unknown key 'widht'; did you mean 'width'?"),
         (["datasets", "make", "rooms", "--set", "width=3"], "--set rooms.width: rooms.width = 3: input"),
-        (["datasets", "make", "rooms", "--workers", "0"], "--workers 0: expected 1 or more"),
+        (["datasets", "make", "rooms", "--jobs", "0"], "--jobs 0: expected 1 or more"),
         (["datasets", "make", "rooms", "--layout", "replcia"], "unknown --layout 'replcia'; did you mean 'replica'?"),
         (["datasets", "lsit"], "'lsit'; did you mean 'list'?"),
         ([*MAKE, "--layout", "replica", "--out", "file/below"], "a file stands where a folder should be"),

@@ -93,13 +93,24 @@ def test_a_wrong_value_is_named_with_its_line(tmp_path: Path, text: str, message
         ("opensu3d.top_m", "--set opensu3d.top_m: expected KEY=VALUE, such as opensu3d.top_m=10"),
         ("opensu3.top_m=1", "--set opensu3.top_m=1: 'opensu3' is no method or dataset of this run; "),
         ("seed=3", "--set seed=3: 'seed' has a flag of its own: --seed"),
+        ("gpus_per_job=1", "--set gpus_per_job=1: 'gpus_per_job' has a flag of its own: --gpus-per-job"),
         ("rooms=3", "--set rooms=3: 'rooms' is no method or dataset of this run"),
+        ("x.y=3", "--set x.y=3: 'x' is no method or dataset of this run; known: opensu3d, rooms, perception"),
     ],
 )
 def test_a_wrong_assignment_is_explained(text: str, message: str) -> None:
     with pytest.raises(ConfigError) as error:
-        read_assignments([text], ["opensu3d"], ["rooms"])
+        read_assignments([text], ["opensu3d", "opensu3d"], ["rooms"])
     assert str(error.value).startswith(message)
+
+
+def test_a_key_is_taken_as_a_file_has_it_too() -> None:
+    texts = ["method.opensu3d.top_m=1", "dataset.rooms.noise=2", "opensu3d.k=3"]
+    settings = read_assignments(texts, ["opensu3d"], ["rooms"])
+    paths = [("method", "opensu3d", "top_m"), ("dataset", "rooms", "noise"), ("method", "opensu3d", "k")]
+    assert [entry.path for entry in settings.entries] == paths
+    with pytest.raises(ConfigError, match=r"'method' is no method or dataset of this run"):
+        read_assignments(["method.opensu3=1"], ["opensu3d"], ["rooms"])
 
 
 def test_a_misspelt_assignment_key_names_the_flag() -> None:

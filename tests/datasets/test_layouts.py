@@ -308,7 +308,7 @@ def test_the_verb_makes_each_layout_and_the_same_command_again_does_nothing(
 ) -> None:
     monkeypatch.setenv("SU3D_DATA", str(tmp_path / "cache"))
     small = ["n_frames=2", "width=32", "height=24", "mesh_spacing_m=0.15"]
-    words = ["datasets", "make", "rooms", "--scenes", ROOM, "--set", *small, "--layout", name, "--workers", "1"]
+    words = ["datasets", "make", "rooms", "--scenes", ROOM, "--set", *small, "--layout", name, "--jobs", "1"]
     words += ["--out", str(tmp_path / "made")]
     assert main(words) == 0
     said = capsys.readouterr()

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from itertools import groupby
 from typing import Any
 
-from su3d_bench.cli.common import answer, answer_json, progress, remark
+from su3d_bench.cli.common import answer, answer_either, progress, remark
 from su3d_bench.core import registry
 from su3d_bench.core.config import read_assignments
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable, printable_json
@@ -35,17 +35,13 @@ def check(arguments: argparse.Namespace) -> int:
         if not arguments.json:
             answer(*([""] if len(inspections) > 1 else []), *lines_of(inspections[-1]))
     n_with_errors = sum(inspection.count("error") > 0 for inspection in inspections)
-    if arguments.json:
-        answer_json(
-            {
-                "data_root": printable(str(data_root())),
-                "n_scenes": len(inspections),
-                "n_with_errors": n_with_errors,
-                "scenes": [as_json(inspection) for inspection in inspections],
-            }
-        )
-    else:
-        answer("", f"{counted(len(inspections), 'scene')}, {n_with_errors} with errors")
+    value = {
+        "data_root": printable(str(data_root())),
+        "n_scenes": len(inspections),
+        "n_with_errors": n_with_errors,
+        "scenes": [as_json(inspection) for inspection in inspections],
+    }
+    answer_either(arguments, value, "", f"{counted(len(inspections), 'scene')}, {n_with_errors} with errors")
     return EXIT_CHECK_FAILED if n_with_errors else EXIT_DONE
 
 

@@ -117,7 +117,7 @@ def _add_make(actions: Any) -> None:
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="the data root to make (native: default $SU3D_DATA)")
     add_settings(parser, "an option of the dataset, such as n_frames=200")
-    parser.add_argument("--workers", type=int, metavar="N", help="processes side by side (default: the CPU cores)")
+    parser.add_argument("--jobs", type=int, metavar="N", help="processes side by side (default: the CPU cores)")
 
 
 def call_list(arguments: argparse.Namespace) -> int:

@@ -49,8 +49,8 @@ class Unit:
 
 def make(arguments: argparse.Namespace) -> int:
     """Make what was asked for and print, scene by scene, whether it was made or was there already."""
-    if arguments.workers is not None and arguments.workers < 1:
-        raise ConfigError(f"--workers {arguments.workers}: expected 1 or more")
+    if arguments.jobs is not None and arguments.jobs < 1:
+        raise ConfigError(f"--jobs {arguments.jobs}: expected 1 or more")
     part = _dataset_part(arguments.dataset, arguments.set)
     scenes = _scenes(part, arguments.scenes)
     is_native = arguments.layout == "native"
@@ -123,7 +123,7 @@ def _make_files(part: Part, scenes: Sequence[str], out: Path, arguments: argpars
 
 
 def _run(units: Sequence[Unit], arguments: argparse.Namespace, done: Callable[[Unit], None]) -> None:
-    n_workers = min(arguments.workers or os.cpu_count() or 1, len(units))
+    n_workers = min(arguments.jobs or os.cpu_count() or 1, len(units))
     with _progress(units, is_quiet=arguments.quiet) as report:
         if n_workers > 1:
             outcomes = run_processes(_work, units, report, jobs=n_workers, lost=_lost)
@@ -158,7 +158,7 @@ def _dataset(part: Part, root: Path) -> Any:
 
 
 def _lost(unit: Unit, cause: str) -> NoReturn:
-    raise DataError(f"{unit.dataset.name}/{unit.scene}: {cause.replace('--jobs', '--workers')}")
+    raise DataError(f"{unit.dataset.name}/{unit.scene}: {cause}")
 
 
 def _label(unit: Unit) -> str:

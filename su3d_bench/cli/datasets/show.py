@@ -30,18 +30,17 @@ def show(arguments: argparse.Namespace) -> int:
     with progress(1, is_quiet=arguments.quiet, last_step="drawing") as report:
         look = look_at(dataset, scene, arguments.stride, lambda n_done, n: report(Event(name, "frames", n_done, n)))
         draw_scene_picture(look, path)
-    if arguments.json:
-        table = {
-            "scene": name,
-            "picture": str(path),
-            "n_frames": look.n_frames,
-            "size": list(look.shown[0].rgb.shape[1::-1]) if look.shown else None,
-            "depth_m": list(look.depth_m),
-            "up": None if look.up is None else asdict(look.up),
-            "ground_truth": None if look.truth is None else {"variant": look.truth.variant, **look.counts},
-            "no_ground_truth": look.no_truth or None,
-        }
-        answer_json(printable_json(table))
+    table = {
+        "scene": name,
+        "picture": str(path),
+        "n_frames": look.n_frames,
+        "size": list(look.shown[0].rgb.shape[1::-1]) if look.shown else None,
+        "depth_m": list(look.depth_m),
+        "up": None if look.up is None else asdict(look.up),
+        "ground_truth": None if look.truth is None else {"variant": look.truth.variant, **look.counts},
+        "no_ground_truth": look.no_truth or None,
+    }
+    if answer_json(arguments, printable_json(table)):
         return EXIT_DONE
     answer(f"{printable(name)}: {facts_line(look)}")
     if look.up is not None:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_table_format, add_verb, answer_json, answer_or_write, formatted, remark
+from su3d_bench.cli.common import add_table_format, add_verb, answer_or_write, remark
 from su3d_bench.core.errors import EXIT_DONE, counted
 
 NAME = "leaderboard"
@@ -36,11 +36,8 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.analysis.leaderboard import leaderboard, tables
 
     board = leaderboard(arguments.folder, arguments.protocols, with_ranks=arguments.intervals)
-    if arguments.json:
-        answer_json(asdict(board))
-        return EXIT_DONE
     parts = tables(board, intervals=arguments.intervals)
-    answer_or_write(arguments, formatted(parts, arguments, is_file=arguments.out is not None))
+    answer_or_write(arguments, asdict(board), parts)
     entries = f"{counted(sum(map(len, board.boards)), 'entry')} in {counted(len(board.boards), 'ranking')}"
     remark(f"{entries}, {len(board.refused)} left out", quiet=arguments.quiet)
     return EXIT_DONE

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_table_format, add_verb, answer_or_write, formatted
+from su3d_bench.cli.common import add_table_format, add_verb, answer_or_write
 from su3d_bench.core.errors import EXIT_DONE
 
 if TYPE_CHECKING:
@@ -63,12 +63,8 @@ def add_parser(actions: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.store.atomic import json_text
-
     tables = _tables(arguments)
-    is_file = arguments.out is not None
-    text = json_text(list(map(asdict, tables))) if arguments.json else formatted(tables, arguments, is_file=is_file)
-    answer_or_write(arguments, text)
+    answer_or_write(arguments, list(map(asdict, tables)), tables)
     return EXIT_DONE
 
 

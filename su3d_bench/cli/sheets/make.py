@@ -131,8 +131,7 @@ def call(arguments: argparse.Namespace) -> int:
         drafts |= of_truth
         drawn |= _drawn(truth, truth.run or QUESTIONS, of_truth, arguments)
     written_sets = _write({kind: origins[kind] for kind in kinds}, drafts, drawn, arguments)
-    if arguments.json:
-        answer_json({"sets": written_sets})
+    if answer_json(arguments, {"sets": written_sets}):
         return EXIT_DONE
     for sheet in written_sets:
         answer(f"{sheet['sheet_id']}: {counted(sheet['n_items'], 'item')}, {counted(sheet['n_questions'], 'question')}")

@@ -120,7 +120,7 @@ def _sheet_file(arguments: argparse.Namespace, key_file: Path, sheet_id: str) ->
 def _refuse(faults: Sequence[str], arguments: argparse.Namespace) -> None:
     """Tell all faults, then raise."""
     if arguments.json:
-        answer_json({"faults": list(faults)})
+        answer_json(arguments, {"faults": list(faults)})
     else:
         for fault in faults[:SHOWN_FAULTS]:
             remark(fault)

@@ -19,14 +19,13 @@ from su3d_bench.runs.job import MethodOutcome, SceneJob
 from su3d_bench.runs.remote.folder import RemoteFolder
 from su3d_bench.runs.scene import failed_outcomes, run_scene
 from su3d_bench.store.atomic import make_folder, write_bytes
-from su3d_bench.store.run_folder import RunFolder
+from su3d_bench.store.run_folder import RECORDS, RunFolder
 from su3d_bench.store.scratch import TemporaryFolder
 from su3d_bench.store.unfinished import is_unfinished
 
 CACHE_ROOT = "~/.cache/su3d-bench/cache"
 SEAL = "done.json"
 REPLIES = "language"  # of language models, which the scenes of a run share
-OF_THE_RUN = ("run.toml", "run.json", "metrics.json", "ablation.json")
 LARGE = ("prediction.npz", ".features.npy", ".png")  # ends of names that no table or comparison reads
 
 
@@ -137,5 +136,5 @@ def _write(mirror: Path, store: RemoteFolder, names: Sequence[str]) -> None:
 def send_records(url: str, mirror: Path) -> None:
     """Bring the run's own records in the store up to those of ``mirror``."""
     store = RemoteFolder(url)
-    store.remove(name for name in OF_THE_RUN if not (mirror / name).is_file())
-    store.send(mirror, [name for name in OF_THE_RUN if (mirror / name).is_file()])
+    store.remove(name for name in RECORDS if not (mirror / name).is_file())
+    store.send(mirror, [name for name in RECORDS if (mirror / name).is_file()])

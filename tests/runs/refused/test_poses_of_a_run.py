@@ -20,7 +20,7 @@ from su3d_bench.runs.planning import poses
 from su3d_bench.runs.planning.plan import make_plan
 from su3d_bench.runs.scene import run_scene
 
-MAKE = "datasets make rooms --layout replica --scenes bathroom0 office0 --workers 1 --quiet"
+MAKE = "datasets make rooms --layout replica --scenes bathroom0 office0 --jobs 1 --quiet"
 SMALL = ["--set", "n_frames=40", "--set", "width=96", "--set", "height=72", "--set", "mesh_spacing_m=0.1"]
 RUN = "run --scenes replica/bathroom0 --stride 20 --jobs 1 --protocols rooms-semantic --no-pictures --quiet --out out"
 CONTRADICTED = "replica/bathroom0: poses and depth contradict each other: "

@@ -14,7 +14,7 @@ import pytest
 
 from su3d_bench.cli.main import main
 
-MAKE = "datasets make rooms --layout replica --scenes bathroom0 office0 --workers 1 --quiet"
+MAKE = "datasets make rooms --layout replica --scenes bathroom0 office0 --jobs 1 --quiet"
 SMALL = ["--set", "n_frames=4", "--set", "width=160", "--set", "height=120", "--set", "mesh_spacing_m=0.08"]
 RUN = "run --scenes replica/* --stride 2 --jobs 1 --protocols rooms-semantic --no-pictures"
 Spoil = Callable[[Path], Any]
