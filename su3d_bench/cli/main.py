@@ -43,6 +43,7 @@ VERBS = (
     "models",
     "protocols",
     "export",
+    "cache",
 )
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 DESCRIPTION = "Evaluate and benchmark open-vocabulary, instance-level 3D scene understanding from RGB-D."

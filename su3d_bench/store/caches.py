@@ -1,14 +1,27 @@
-"""Whether what is compiled can be kept: where it cannot, every process compiles it again."""
+"""What is kept to be quick: what the cache folder holds, by kind, and whether compiled code can be kept at all."""
 
 from __future__ import annotations
 
+import errno
+import math
 import os
+import re
+import stat
 import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from su3d_bench.core.digests import PACKAGE_ROOT
 from su3d_bench.core.errors import shown
+from su3d_bench.store.atomic import write_error
+from su3d_bench.store.unfinished import hold_folder
 
+MEGABYTE, GIGABYTE = 10**6, 10**9
+LARGE_BYTES = 20 * GIGABYTE  # of kept perception: a thousand scenes of 150 frames, and a tenth of a common disk
+MOST_ENTRIES = 10_000_000  # that are looked at
+_HEX = "[0-9a-f]"
 SMALL_BYTES = 1 << 16  # a kept kernel has about as many: a full disk takes none
 
 
@@ -43,3 +56,142 @@ def _takes_files(folder: Path) -> bool:
     except (OSError, RuntimeError):  # of a home that nobody knows
         return False
     return True
+
+
+@dataclass(frozen=True)
+class CacheKind:
+    """One kind of what the cache folder keeps: the folder's name, the form of a file's path in it, and what it is.
+
+    ``is_paid``: it is not computed again but asked for anew, which may cost money.
+    """
+
+    name: str
+    form: re.Pattern[str]
+    what: str
+    is_paid: bool = False
+
+
+KINDS = {
+    kind.name: kind
+    for kind in (
+        CacheKind(
+            "perception",
+            re.compile(f"{_HEX}{{2}}/{_HEX}{{64}}\\.npz"),
+            "what was found in frames: runs over the same frames are many times as fast",
+        ),
+        CacheKind(
+            "model-digests", re.compile(f"{_HEX}{{32}}\\.json"), "digests of weights, which take seconds a gigabyte"
+        ),
+        CacheKind(
+            "runs",
+            re.compile(f"[^/]*-{_HEX}{{8}}/(run\\.toml|[a-z]+\\.json|(scenes|language)/.+|\\.lock)"),
+            "the small files of runs that are kept in a store such as s3://",
+        ),
+        CacheKind(
+            "replies",
+            re.compile(f"(images/)?{_HEX}+\\.(json|png)"),
+            "replies of language models outside a run, which may have cost money",
+            is_paid=True,
+        ),
+    )
+}
+
+
+@dataclass(frozen=True)
+class CacheEntry:
+    """A file of a kind: its path below the kind's folder, its size, and when it was written (seconds since 1970)."""
+
+    name: str
+    n_bytes: int
+    written: float
+
+
+def cache_entries(root: Path, kind: CacheKind) -> Iterator[CacheEntry]:
+    """The files of ``kind`` below ``root``; what has another form, and what is behind a link, is passed over."""
+    for entry, _, _ in _walked(root, kind):
+        yield entry
+
+
+def clear_cache(root: Path, kind: CacheKind, *, before: float = math.inf) -> tuple[int, int]:
+    """Remove the files of ``kind`` that were written before a time; how many, and their bytes.
+
+    Folders stay, for a run may be about to write there; so does what a living process holds.
+    """
+    held: dict[str, int | None] = {}
+    n_files = n_bytes = 0
+    try:
+        for entry, folder, name in _walked(root, kind):
+            if entry.written >= before or (kind.name == "runs" and _hold(root, entry.name, held) is None):
+                continue
+            try:
+                os.unlink(name, dir_fd=folder)  # by the open folder, in whose place no link can come meanwhile
+            except OSError as error:
+                if error.errno == errno.ENOENT:
+                    continue
+                raise write_error(root / kind.name / entry.name, error) from error
+            n_files, n_bytes = n_files + 1, n_bytes + entry.n_bytes
+    finally:
+        for handle in held.values():
+            if handle is not None:
+                os.close(handle)
+    return n_files, n_bytes
+
+
+def _hold(root: Path, name: str, held: dict[str, int | None]) -> int | None:
+    """The lock of the run folder in which ``name`` lies; None where a run has it."""
+    run = name.partition("/")[0]
+    if run not in held:
+        try:
+            held[run] = hold_folder(root / "runs" / run)
+        except OSError:
+            held[run] = None
+    return held[run]
+
+
+def _walked(root: Path, kind: CacheKind) -> Iterator[tuple[CacheEntry, int, str]]:
+    """Each file of ``kind`` with its open folder and its name in that."""
+    top = root / kind.name
+    if top.is_symlink() or not top.is_dir():
+        return
+    n_seen = 0
+    for place, folders, names, handle in os.fwalk(top, follow_symlinks=False):
+        folders.sort()
+        below = Path(place).relative_to(top).as_posix()
+        for name in sorted(names):
+            n_seen += 1
+            if n_seen > MOST_ENTRIES:
+                return
+            path = name if below == "." else f"{below}/{name}"
+            try:
+                status = os.stat(name, dir_fd=handle, follow_symlinks=False)
+            except OSError:  # gone meanwhile
+                continue
+            if stat.S_ISREG(status.st_mode) and kind.form.fullmatch(path):
+                yield CacheEntry(path, status.st_size, status.st_mtime), handle, name
+
+
+def why_large(root: Path) -> str | None:
+    """A line that says that much perception is kept, and what to do; None where it is not much.
+
+    Told from an eighth of its folders, over which keys spread evenly, for a run should not wait for it.
+    """
+    kept = KINDS["perception"]
+    n_bytes = 0
+    for name in (f"{first:x}{second:x}" for first in range(16) for second in (0, 8)):
+        with suppress(OSError), os.scandir(root / kept.name / name) as entries:
+            n_bytes += 8 * sum(entry.stat(follow_symlinks=False).st_size for entry in entries)
+    if n_bytes < LARGE_BYTES:
+        return None
+    return (
+        f"{shown(root)}: keeps about {size_text(n_bytes)} of perception; to keep what is young alone: "
+        "su3d-bench cache clear perception --older-than 30"
+    )
+
+
+def size_text(n_bytes: int) -> str:
+    """A size as people say it.
+
+    >>> size_text(1_234_567_890), size_text(56_700_000), size_text(1200)
+    ('1.2 GB', '56.7 MB', '0.0 MB')
+    """
+    return f"{n_bytes / GIGABYTE:.1f} GB" if n_bytes >= GIGABYTE else f"{n_bytes / MEGABYTE:.1f} MB"
