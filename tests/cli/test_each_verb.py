@@ -114,6 +114,7 @@ def test_the_verb_does_its_work(verb: str, capsys: pytest.CaptureFixture[str]) -
     json_file = Path("answers", f"{verb}.json")
     assert main([*verb.split(), *words, "--json", str(json_file)]) == code, capsys.readouterr().err
     answer = capsys.readouterr()
+    assert r"\n" not in answer.out + answer.err, "an escaped end of a line"
     assert left in answer.out + answer.err or Path(left).exists(), answer.out + answer.err
     assert not answer.out.startswith(("{", "[")), "the answer in words stands beside the file"
     assert code == 2 or json.loads(json_file.read_text()) is not None

@@ -49,5 +49,6 @@ def call(arguments: argparse.Namespace) -> int:
     written(file, text)
     at = str(file) if what == "protocol" else f"{file}:{class_name}"
     commands = [f"su3d-bench {command.format(at=at)}" for command in NEXT[what]]
-    answer_either(arguments, {"file": str(file), "next": commands}, "\n  ".join([f"{file}; then:", *commands]))
+    lines = (f"{file}; then:", *(f"  {command}" for command in commands))
+    answer_either(arguments, {"file": str(file), "next": commands}, *lines)
     return EXIT_DONE
