@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import mmap
 import os
 import re
@@ -20,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import StoreError
+from su3d_bench.store.unfinished import held_folder, remove_unheld
 
 MOST_IN_MEMORY_BYTES = 1 << 26  # a hundredth of a small machine's memory; most scenes never reach it
 
@@ -112,8 +112,8 @@ def release_pages(table: NDArray[Any]) -> None:
         base.madvise(mmap.MADV_DONTNEED)
 
 
-HELD = ".held"  # a file in each folder that its process keeps locked; the lock ends with the process
-OWN_NAME = re.compile(r"su3d-[a-z]+-[a-z0-9_]{8}")  # what ``tempfile.mkdtemp`` makes of a prefix of ours
+SUFFIX = ".held"
+OWN_NAME = re.compile(r"su3d-[a-z]+-[a-z0-9_]{8}\.held")  # what ``tempfile.mkdtemp`` makes of a prefix of ours
 
 
 class TemporaryFolder:
@@ -125,12 +125,8 @@ class TemporaryFolder:
     def __init__(self, prefix: str) -> None:
         remove_abandoned()
         try:
-            held = None
-            while held is None:
-                self.path = Path(tempfile.mkdtemp(prefix=prefix))
-                assert OWN_NAME.fullmatch(self.path.name)
-                held = _hold(self.path)
-            self._lock = held
+            self.path, self._lock = held_folder(lambda: Path(tempfile.mkdtemp(SUFFIX, prefix)))
+            assert OWN_NAME.fullmatch(self.path.name)
         except OSError as error:
             where = f" below {tempfile.tempdir}" if tempfile.tempdir else ""
             reason = error.strerror or str(error)
@@ -140,9 +136,9 @@ class TemporaryFolder:
 
     def close(self) -> None:
         """Remove the folder; once is enough, twice is no fault."""
-        if self._lock >= 0:
-            shutil.rmtree(self.path, ignore_errors=True)
-            lock, self._lock = self._lock, -1  # first, so that an interrupt here closes nothing twice
+        shutil.rmtree(self.path, ignore_errors=True)
+        lock, self._lock = self._lock, None  # first, so that an interrupt here closes nothing twice
+        if lock is not None:
             os.close(lock)
 
     def __enter__(self) -> Path:
@@ -154,45 +150,12 @@ class TemporaryFolder:
         self.close()
 
 
-def _hold(folder: Path) -> int | None:
-    """The lock of a folder that was made just now; None where somebody took it for abandoned before it was held."""
-    try:
-        lock = os.open(folder / HELD, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
-    except FileNotFoundError:
-        return None
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if os.path.samestat(os.fstat(lock), (folder / HELD).stat()):
-            return lock
-    except FileNotFoundError:
-        pass
-    except BaseException:
-        os.close(lock)
-        raise
-    os.close(lock)
-    return None
-
-
 def remove_abandoned() -> None:
     """Remove the temporary folders of processes that were killed."""
     with suppress(OSError):  # no such place, or a closed one: whoever makes a folder there says so
         for folder in Path(tempfile.gettempdir()).iterdir():
             if OWN_NAME.fullmatch(folder.name):
                 with suppress(OSError):  # in use, gone meanwhile, or somebody else's
-                    _remove_unheld(folder)
-
-
-def _remove_unheld(folder: Path) -> None:
-    about = folder.lstat()
-    if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid():
-        return
-    try:
-        lock = os.open(folder / HELD, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
-    except FileNotFoundError:
-        folder.rmdir()  # made and never held; one that holds anything is somebody else's
-        return
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        shutil.rmtree(folder, ignore_errors=True)
-    finally:
-        os.close(lock)
+                    about = folder.lstat()
+                    if stat.S_ISDIR(about.st_mode) and about.st_uid == os.getuid():
+                        remove_unheld(folder)

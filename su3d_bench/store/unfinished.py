@@ -14,8 +14,9 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
 FORM = re.compile(r"\..*\.[0-9a-f]{12}\.unfinished", re.DOTALL)
@@ -109,7 +110,7 @@ def hold_folder(folder: Path, *, waits: bool = False) -> int:
 @contextmanager
 def unfinished_folder(path: Path) -> Iterator[Path]:
     """A folder in which ``path`` is written, gone at the end of the block unless it was renamed by then."""
-    place, handle = _new_folder(path)
+    place, handle = held_folder(partial(_made_beside, path))
     try:
         yield place
     finally:
@@ -118,10 +119,16 @@ def unfinished_folder(path: Path) -> Iterator[Path]:
             os.close(handle)
 
 
-def _new_folder(path: Path) -> tuple[Path, int | None]:
+def _made_beside(path: Path) -> Path:
+    place = beside(path)
+    place.mkdir()
+    return place
+
+
+def held_folder(make: Callable[[], Path]) -> tuple[Path, int | None]:
+    """A folder that ``make`` made, and an open file that holds its lock; None on a disk without locks."""
     while True:  # as in ``new_file``
-        place = beside(path)
-        place.mkdir()
+        place = make()
         try:
             handle = hold_folder(place)
         except (BlockingIOError, FileNotFoundError):
@@ -164,14 +171,19 @@ def clear_unfinished(folder: Path) -> None:
             _remove_abandoned(entry)
 
 
+def remove_unheld(folder: Path) -> None:
+    """Remove a folder; raises ``OSError`` where a living process holds it, or where nobody can tell."""
+    handle = hold_folder(folder)
+    try:
+        shutil.rmtree(folder, ignore_errors=True)
+    finally:
+        os.close(handle)
+
+
 def _remove_abandoned(entry: os.DirEntry[str]) -> None:
     with suppress(OSError):  # held, gone meanwhile, somebody else's, or on a disk without locks
         if entry.is_dir(follow_symlinks=False):
-            handle = hold_folder(Path(entry))
-            try:
-                shutil.rmtree(entry, ignore_errors=True)
-            finally:
-                os.close(handle)
+            remove_unheld(Path(entry))
         elif entry.is_file(follow_symlinks=False):
             held = own_file(Path(entry), os.O_RDWR, is_sure=True)
             if held is not None:

@@ -302,7 +302,7 @@ def test_the_temporary_folder_of_a_killed_process_goes_when_the_next_is_made(
     (tmp_path / "su3d-test-of-another-kind").mkdir()
     (tmp_path / "su3d-scene-kitchen1").mkdir()
     (tmp_path / "su3d-scene-kitchen1" / "drawing").touch()
-    (tmp_path / "su3d-scene-unheld_0").mkdir()
+    (tmp_path / "su3d-scene-unheld_0.held").mkdir()
     others = {"su3d-test-of-another-kind", "su3d-scene-kitchen1"}
     left = abandoned(tmp_path)
     with TemporaryFolder("su3d-test-") as first, TemporaryFolder("su3d-other-") as second:
