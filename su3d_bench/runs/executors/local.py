@@ -16,6 +16,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
@@ -139,7 +140,9 @@ def _start(work: Work[Unit, Outcome], unit: Unit) -> tuple[Connection, BaseProce
     ours, theirs = context.Pipe(duplex=False)
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     limit_threads()
-    # A worker that still imports would answer an interrupt with a traceback; it inherits that none reaches it yet.
+    # A worker that still imports would answer an interrupt with a traceback; it inherits that none reaches it yet. The
+    # tracker, whose start would let them through again, has started by then.
+    resource_tracker.ensure_running()
     blocked = signal.pthread_sigmask(signal.SIG_BLOCK, FOR_THE_PARENT)
     try:
         process = context.Process(target=_worker, args=(work, unit, theirs), daemon=True)
