@@ -44,6 +44,7 @@ VERBS = (
     "protocols",
     "export",
     "cache",
+    "completion",
 )
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 DESCRIPTION = "Evaluate and benchmark open-vocabulary, instance-level 3D scene understanding from RGB-D."
