@@ -45,6 +45,7 @@ VERBS = (
     "export",
     "cache",
     "completion",
+    "doctor",
 )
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 DESCRIPTION = "Evaluate and benchmark open-vocabulary, instance-level 3D scene understanding from RGB-D."

@@ -60,6 +60,11 @@ CASES: dict[str, tuple[list[str], int, str]] = {
     "models warm": (["--profile", "embedded"], 0, ""),
     "protocols": (["show", "rooms-semantic"], 0, "rooms-semantic"),
     "new": (["method", "my_method.py"], 0, "my_method.py"),
+    "cache list": ([], 0, "perception"),
+    "cache size": ([], 0, "MB in "),
+    "cache clear": (["all", "--dry-run"], 0, "would be removed"),
+    "completion": (["bash"], 0, "complete -o"),
+    "doctor": ([], 0, "the main job can run"),
     "export": (["out", "--to", "openlex3d", "--method", "opensu3d", "--out", "exported"], 0, "exported"),
 }
 

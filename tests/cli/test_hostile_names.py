@@ -68,6 +68,11 @@ CASES: dict[str, list[list[str]]] = {
     "models export": [[HOSTILE, "--out", "out/model"]],
     "models warm": [["--profile", HOSTILE]],
     "protocols": [["show", "rules.toml"], ["show", "rules.toml", "--json"]],
+    "cache list": [[], ["--json"]],
+    "cache size": [[]],
+    "cache clear": [["all"], [HOSTILE]],
+    "completion": [["bash"], ["zsh"], [HOSTILE]],
+    "doctor": [[]],
     "export": [["RUN", "--to", "openlex3d", "--method", "METHOD", "--out", "out/exported"],
                ["RUN", "--to", "openlex3d", "--method", HOSTILE, "--out", "out/other"]],
 }  # fmt: skip
