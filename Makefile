@@ -54,9 +54,10 @@ bench-methods: $(VENV)/test
 reference: demo
 	$(BIN)/su3d-bench check --learn runs/demo --out .ci/reference.json --across-machines 5 --cost-limit 3
 
-# Draws what docs/architecture.md says of the code from the code.
+# Draws what docs/architecture.md says of the code from the code, and makes docs/verbs.md from the parser.
 architecture: $(VENV)/test
 	$(BIN)/python tests/support/house.py
+	$(BIN)/python tests/support/verbs_page.py
 
 lint: $(VENV)/dev
 	$(BIN)/ruff check .

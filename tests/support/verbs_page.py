@@ -1,0 +1,136 @@
+"""docs/verbs.md, made from the parser: every verb with what it does, its examples and its flags.
+
+``python tests/support/verbs_page.py`` writes the page; ``--check`` says whether it still holds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+
+from places import ROOT
+
+from su3d_bench.cli.main import build_parser
+
+PAGE = ROOT / "docs" / "verbs.md"
+HEAD = """# The verbs
+
+Made from the parser by `make architecture`; a test fails where it does not hold any more. `su3d-bench VERB --help` says
+the same. Exit codes: 0 done, 1 a check failed, 2 wrong input, 3 some scenes failed, 4 an error of ours.
+
+One rule for flags, in every verb:
+
+- `--json` alone gives the answer as JSON on stdout; `--json FILE.json` writes it there, beside the answer in words. A
+  file that is no earlier answer of the verb stays as it is; `--json=FILE` replaces it whatever it is. What a run
+  itself has written is never replaced.
+- `--out` is the place of what is written, `--jobs N` how many processes work side by side.
+- `--methods`, `--protocols` and `--scenes` take several, `--method` and `--protocol` one; either spelling is
+  understood.
+- `--set KEY=VALUE` takes a key as `opensu3d.top_m`, or as a file for `--config` has it, `method.opensu3d.top_m`.
+- `--quiet` leaves out progress and remarks, `--debug` shows the traceback of an error.
+"""
+IN_EVERY = {"--help", "--json", "--quiet", "--debug"}
+# What a verb's help has no room for, and the page that says more.
+MORE = {
+    "run": "Frames of each scene go to each method, maps are scored under every protocol that fits the "
+    "dataset and drawn. Killed, it goes on where it was. `--methods all` is OpenSU3D and the seven "
+    "baselines; `opensu3d@scheme4` or `opensu3d@top_m=1` is a variant beside its base; `--anytime "
+    "0.25 0.5` scores the maps midway too. Many scenes on many machines: "
+    "[running/clusters.md](running/clusters.md); what a run leaves behind: "
+    "[running/run-folder.md](running/run-folder.md); GPUs: [running/gpu.md](running/gpu.md).",
+    "ablate": "A sweep as variants in one run; `--beside all opensu3d@scheme4` puts other methods into the same "
+    "run: the five tables of the paper from one ([results.md](results.md)).",
+    "report tables": "The paper's tables, with the figures as reported beside, in Markdown, LaTeX, CSV or HTML; "
+    "`report verify` recomputes every cell.",
+    "report html": "One page that works offline: tables that sort, confusion, errors, timing, every map in 3D.",
+    "check": "The gate for CI: [running/ci-gate.md](running/ci-gate.md), `action.yml`.",
+    "ask": "By the built-in solver or a language model: [reasoning.md](reasoning.md).",
+    "questions": "From the ground truth of any dataset; `--protocols rooms-retrieval` scores maps by such. "
+    "`questions audit` draws a sample as contact sheets: [human-evaluation.md](human-evaluation.md).",
+    "sheets make": "Blind sheets with pictures, as an offline page, a workbook and a CSV: "
+    "[human-evaluation.md](human-evaluation.md).",
+    "sheets score": "The paper's Tables IV and V with agreement: [human-evaluation.md](human-evaluation.md).",
+    "compare": "Exact sign-flip test with the smallest p that so many scenes allow, corrected where much is "
+    "compared, and the paired difference with its interval; other data, rules or encoders are "
+    "refused: [statistics.md](statistics.md).",
+    "plan": "At 80 % power, from the variance of finished runs: [statistics.md](statistics.md).",
+    "attribute": "Merged, split, duplicate, mislabelled, background, missed; geometry, association, label.",
+    "datasets check": "Names what is missing, damaged or contradictory, and whether frames and ground truth meet: "
+    "[datasets.md](datasets.md).",
+    "datasets make": "In the exact layout of Replica, ScanNet (`.sens` or exported) or TUM: "
+    "[datasets.md](datasets.md).",
+    "models list": "Where files are looked for, sizes, licences: [methods/models.md](methods/models.md).",
+    "cache list": "What is kept, and the variable that says where: [running/environment.md](running/environment.md).",
+    "doctor": "What each line means: [running/environment.md](running/environment.md).",
+    "completion": "For bash, zsh and fish: [running/environment.md](running/environment.md).",
+}
+
+
+def page() -> str:
+    verbs = list(_verbs(build_parser()))
+    rows = [
+        f"| [`{name}`](#su3d-bench-{name.replace(' ', '-')}) | {_cell(_summary(parser))} |" for name, parser in verbs
+    ]
+    parts = [HEAD, "\n".join(["| verb | what it does |", "|---|---|", *rows]) + "\n"]
+    return "\n".join([*parts, *(_section(name, parser) for name, parser in verbs)])
+
+
+def _verbs(parser: argparse.ArgumentParser, path: str = "") -> Iterator[tuple[str, argparse.ArgumentParser]]:
+    deeper = [one for one in parser._actions if isinstance(one, argparse._SubParsersAction)]
+    for action in deeper:
+        for name, below in action.choices.items():
+            yield from _verbs(below, f"{path} {name}".strip())
+    if not deeper:
+        yield path, parser
+
+
+def _summary(parser: argparse.ArgumentParser) -> str:
+    return parser.description or ""
+
+
+def _section(name: str, parser: argparse.ArgumentParser) -> str:
+    examples = [line.strip() for line in (parser.epilog or "").splitlines()[1:] if line.strip()]
+    rows = [
+        f"| `{_cell(_usage(action))}` | {_cell((action.help or '').replace('%%', '%'))} |"
+        for action in parser._actions
+        if action.help != argparse.SUPPRESS and not IN_EVERY & set(action.option_strings)
+    ]
+    table = ["| word or flag | what |", "|---|---|", *rows, ""] if rows else []
+    text = " ".join(part for part in (_summary(parser), MORE.get(name, "")) if part)
+    return "\n".join([f"## su3d-bench {name}", "", text, "", "```sh", *examples, "```", "", *table])
+
+
+def _usage(action: argparse.Action) -> str:
+    """A word or flag with its values, as the usage line has it."""
+    metavar = action.metavar
+    if isinstance(metavar, tuple):
+        values = " ".join(metavar)
+    else:
+        choices = None if action.choices is None else "|".join(map(str, action.choices))
+        values = metavar or choices or action.dest.upper()
+    several = f"{values}..." if action.nargs in ("+", "*") else values
+    if not action.option_strings:
+        return f"[{several}]" if action.nargs in ("?", "*") else several
+    names = ", ".join(action.option_strings)
+    return names if action.nargs == 0 else f"{names} {several}"
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;")
+
+
+def main(arguments: list[str]) -> int:
+    written = page()
+    if "--check" not in arguments:
+        PAGE.write_text(written)
+        return 0
+    holds = PAGE.is_file() and PAGE.read_text() == written
+    print(
+        "docs/verbs.md is what the parser says" if holds else "docs/verbs.md does not hold any more: make architecture"
+    )
+    return int(not holds)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
