@@ -132,13 +132,12 @@ def answer_json(arguments: argparse.Namespace, value: Any) -> bool:
     """
     text = escaped_json(_defined(value), indent=2, allow_nan=False)
     file: Path | None = arguments.json_file
-    if file is not None and arguments.json_is_guess and not _is_earlier_answer(file, value):
-        print(text)
-        raise StoreError(
-            f"{shown(file)}: is there and no earlier answer of this command, so it stays as it is and the answer went "
-            f"to stdout; to replace it, write --json={shown(file)}"
-        )
     if file is not None:
+        try:
+            _refuse_to_replace(file, value, is_guess=arguments.json_is_guess)
+        except StoreError:
+            print(text)  # what was computed is not lost
+            raise
         path = written(file, f"{text}\n")
         remark(f"written: {path}", quiet=arguments.quiet)
     if arguments.json:
@@ -153,6 +152,17 @@ def _defined(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_defined(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _refuse_to_replace(file: Path, value: Any, *, is_guess: bool) -> None:
+    from su3d_bench.store.run_folder import refuse_records
+
+    refuse_records(file)
+    if is_guess and not _is_earlier_answer(file, value):
+        raise StoreError(
+            f"{shown(file)}: is there and no earlier answer of this command, so it stays as it is and the answer went "
+            f"to stdout; to replace it, write --json={shown(file)}"
+        )
 
 
 def _is_earlier_answer(file: Path, value: Any) -> bool:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import traceback
 from collections.abc import Sequence
 from importlib import import_module
+from pathlib import Path
 
 from su3d_bench import __version__
 from su3d_bench.cli.common import remark
@@ -88,10 +90,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     return code
 
 
+def _refuse_records(arguments: argparse.Namespace) -> None:
+    """Refuse an ``--out`` that is a file of a finished run, whatever the verb would put there."""
+    out = getattr(arguments, "out", None)
+    if isinstance(out, Path) and os.path.isfile(out):
+        from su3d_bench.store.run_folder import refuse_records
+
+        refuse_records(out)
+
+
 def _exit_code(words: Sequence[str]) -> int:
     """What ``words`` ask for, done; whatever goes wrong is one line on stderr, with ``--debug`` below its traceback."""
     try:
         arguments = build_parser().parse_args(words)
+        _refuse_records(arguments)
         if not arguments.uses_all_cores:
             limit_threads()  # before numerical libraries are loaded
         with ending_in_order():

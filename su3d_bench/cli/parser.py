@@ -59,6 +59,8 @@ class Parser(argparse.ArgumentParser):
     def _parsed(self, words: list[str], namespace: Any) -> tuple[Any, list[str]]:
         parsed, unknown = super().parse_known_args(words, namespace)
         if unknown:
+            if f"{JSON}= {unknown[0]}" in f"{' '.join(words)} ":
+                self.error(f"'{unknown[0]}' is no word of it; a file for {JSON} is written {JSON}={unknown[0]}")
             self.error(f"unrecognized arguments: {' '.join(unknown)}")
         return parsed, unknown
 

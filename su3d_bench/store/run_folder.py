@@ -72,13 +72,13 @@ def refuse_records(place: Path) -> None:
     above = place.absolute().parents
     is_record = place.name in RECORDS and is_run(above[0])
     is_of_job = len(above) > 3 and above[2].name == JOBS and is_run(above[3])
-    if (is_record or is_of_job) and place.exists():
+    if (is_record or is_of_job) and os.path.exists(place):
         raise StoreError(f"{shown(place)}: is a file of the run itself, and stays as it is; choose another name")
 
 
 def is_run(folder: Path) -> bool:
     """Whether the folder is known for a run's."""
-    return any((folder / name).is_file() for name in MARKS)
+    return any(os.path.isfile(folder / name) for name in MARKS)
 
 
 @dataclass(frozen=True)

@@ -113,6 +113,10 @@ def test_a_word_that_is_missing_is_still_what_is_said(tmp_path: Path, monkeypatc
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match="the following arguments are required: B"):
         build_parser().parse_args(["compare", "A", "--json", "new.json"])
+    with pytest.raises(
+        ConfigError, match="compare: 'numbers' is no word of it; a file for --json is written --json=numb"
+    ):
+        build_parser().parse_args(["compare", "A", "B", "--json", "numbers"])
     Path("old.json").write_text("{}")
     with pytest.raises(ConfigError, match="unknown argument '--per-klass'"):
         build_parser().parse_args(["compare", "A", "B", "--json", "old.json", "--per-klass"])
@@ -149,10 +153,23 @@ def test_what_a_run_has_written_is_never_the_place_of_an_answer(
     file = Path("runs/demo", name)
     file.parent.mkdir(parents=True)
     Path("runs/demo/run.toml").write_text("seed = 0\n")
-    file.write_text("{}")
-    assert main(["protocols", f"--json={file}"]) == 2
-    assert f"{file}: is a file of the run itself" in capsys.readouterr().err
-    assert file.read_text() == "{}"
+    content = "seed = 0\n" if name == "run.toml" else "{}"
+    file.write_text(content)
+    for words in (
+        ["protocols", f"--json={file}"],
+        ["protocols", "--json", str(file)],
+        ["query", "rooms/living0", "plant", "--out", str(file)],
+        ["ask", "rooms/living0", "Which?", "--out", str(file)],
+        ["questions", "make", "--scenes", "rooms/living0", "--out", str(file)],
+        ["report", "tables", "runs/demo", "--out", str(file)],
+        ["report", "html", "runs/demo", "--out", str(file)],
+        ["attribute", "runs/demo", "--out", str(file)],
+        ["check", "--learn", "runs/demo", "--out", str(file)],
+    ):
+        assert main(words) == 2
+        err = capsys.readouterr().err
+        assert "is a file of the run itself" in err or words[-2] == "--json"
+        assert file.read_text() == content
 
 
 def test_a_verb_has_nothing_to_do_for_its_json(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
