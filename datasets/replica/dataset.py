@@ -179,7 +179,7 @@ class Replica:
                 return self._label_file_truth(scene, variant)
             case "boxes":
                 return box_truth(object_boxes_of(self._info(scene), self._where(scene)))
-        hint = suggest(variant, self.variants) or f"; known: {', '.join(self.variants)}"
+        hint = suggest(variant, self.variants)
         raise GroundTruthMissing(f"{self._where(scene)}: no ground truth '{variant}'{hint}")
 
     def object_boxes(self, scene: str) -> Mapping[int, OrientedBox]:
@@ -217,7 +217,7 @@ class Replica:
         """Where the scene's render is or would be; a ``DataError`` where nothing of the scene is here."""
         if not self._is_rendered(scene) and not self._is_annotated(scene):
             known = self.scenes()
-            hint = suggest(scene, known) or f"; {self.tree.folder} has {', '.join(known[:8])}"
+            hint = suggest(scene, known, f"{self.tree.folder} has")
             raise DataError(f"replica: no scene '{scene}'{hint}")
         return self.tree.folder / scene
 

@@ -175,7 +175,7 @@ class Rgbd:
         descriptions = self._descriptions()
         if scene not in descriptions:
             known = self.scenes()
-            raise DataError(f"rgbd: no scene '{scene}'{suggest(scene, known) or '; known: ' + ', '.join(known[:8])}")
+            raise DataError(f"rgbd: no scene '{scene}'{suggest(scene, known)}")
         return descriptions[scene]
 
     def _recording(self, scene: str) -> Recording:

@@ -122,7 +122,7 @@ def _check_keys(table: dict[str, Any], lines: dict[str, int], where: str) -> Non
     fields = RgbdDescription.model_fields
     for key in table:
         if key not in fields:
-            hint = suggest(key[:40], fields) or "; known: " + ", ".join(fields)
+            hint = suggest(key[:40], fields)
             raise DataError(_one_line(f"{where}:{lines.get(key, 1)}: unknown key '{key[:40]}'{hint}"))
     for key, field in fields.items():
         if field.is_required() and key not in table:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
+from su3d_bench.core.errors import DataError, GroundTruthMissing, nearest
 from su3d_bench.core.types import (
     Float64Array,
     Frame,
@@ -71,7 +71,7 @@ def scene_name_parts(scene: str) -> tuple[str, int]:
     """Kind and number of a scene name; raises ``DataError`` for what is no scene."""
     match = re.fullmatch(r"([a-z]+)(0|[1-9]\d{0,5})", scene)
     if match is None or match[1] not in KIND_NAMES:
-        hint = suggest(scene, DEFAULT_SCENES) or f"; kinds: {', '.join(KIND_NAMES)}"
+        hint = nearest(scene, DEFAULT_SCENES) or f"; kinds: {', '.join(KIND_NAMES)}"
         raise DataError(f"rooms: no scene '{scene}'; a scene is a kind and a number such as office3{hint}")
     return match[1], int(match[2])
 

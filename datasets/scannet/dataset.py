@@ -139,7 +139,7 @@ class ScanNet:
 
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:
         if variant not in self.variants:
-            hint = suggest(variant, self.variants) or f"; known: {', '.join(self.variants)}"
+            hint = suggest(variant, self.variants)
             raise GroundTruthMissing(f"{self._where(scene)}: no ground truth '{variant}'{hint}")
         scan = self._annotated_scan(scene)
         if variant == "nyu40-vertices":
@@ -183,7 +183,7 @@ class ScanNet:
         """The folder of the scan with its recording."""
         if scene not in self.tree.folders:
             known = self.tree.scenes
-            hint = suggest(scene, known) or f"; {self.tree.places[0]} has {', '.join(known[:8])}"
+            hint = suggest(scene, known, f"{self.tree.places[0]} has")
             raise DataError(f"scannet: no scene '{scene}'{hint}")
         return folder_of_recording(self.tree.folders[scene], scene, self.options.source)
 

@@ -129,7 +129,7 @@ class Tum:
             if "/" not in scene and _is_sequence(place / scene):
                 return place / scene
         known = self.scenes()
-        raise DataError(f"tum: no sequence '{scene}'{suggest(scene, known) or '; known: ' + ', '.join(known[:8])}")
+        raise DataError(f"tum: no sequence '{scene}'{suggest(scene, known)}")
 
     def _recording(self, scene: str) -> Recording:
         if self._last is None or self._last[0] != scene:

@@ -55,11 +55,6 @@ def with_interval(value: float | None, interval: Sequence[float] | None) -> str:
     return f"{percent(value)} {bracketed(interval)}".rstrip()
 
 
-def some(names: Sequence[str], most: int) -> str:
-    """The first ``most`` of ``names``, and how many more there are."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
-
-
 def is_count(metric: str) -> bool:
     """Whether a metric is a number of something and no share, by its name as in ``metrics.json``."""
     return metric.startswith("n_")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from su3d_bench.core.errors import some
 from su3d_bench.reports.tables.formats import markdown
 from su3d_bench.reports.tables.found import Found, found_table
 from su3d_bench.reports.tables.model import (
@@ -14,7 +15,6 @@ from su3d_bench.reports.tables.model import (
     confidence_notes,
     few_scenes,
     percent,
-    some,
     text_table,
     with_interval,
 )

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.analysis.recomputed import rules_of_run, why_not_counted
-from su3d_bench.core.errors import ConfigError, Su3dError, counted, printable
+from su3d_bench.core.errors import ConfigError, Su3dError, counted, printable, some
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.protocols.files import protocol_names
 from su3d_bench.metrics.scoring import combine
@@ -30,7 +30,6 @@ from su3d_bench.reports.tables.model import (
     confidence_notes,
     few_scenes,
     percent,
-    some,
 )
 from su3d_bench.runs.finished import FinishedRun, read_run
 

@@ -211,7 +211,7 @@ def choose(
     ):
         for name in wanted:
             if name not in known:
-                hint = suggest(name, known) or f"; they have {', '.join(sorted(known))}"
+                hint = suggest(name, sorted(known), "they have")
                 raise ConfigError(f"these runs hold no scores of the {what} '{printable(name, 80)}'{hint}")
     kept = [row for row in measured if not datasets or _is_of(row, datasets)]
     kept = [row for row in kept if not protocols or row.protocol in protocols]

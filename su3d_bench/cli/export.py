@@ -129,9 +129,7 @@ def sources_of(path: Path, format: str | None, method: str | None) -> list[Sourc
         if method is None:
             raise ConfigError(f"{path}: holds the maps of {', '.join(maps)}; choose one with --method")
         if method not in maps:
-            raise ConfigError(
-                f"{path}: holds no map of the method '{method}'{suggest(method, maps)}; it has {', '.join(maps)}"
-            )
+            raise ConfigError(f"{path}: holds no map of the method '{method}'{suggest(method, maps, 'it has')}")
         reader = READERS["su3d-bench"]
         run = _run_of(maps[method][0])
         return [Source(reader, file, name, name, run) for file in maps[method] for name in reader.scenes(file)]
@@ -184,7 +182,7 @@ def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> li
                 matching.append(replace(source, address=f"{dataset}/{source.scene}") if lacks_dataset else source)
         if not matching:
             known = [source.scene for source in sources]
-            hint = suggest(pattern, known) or f"; it has {', '.join(known[:5])}{', ...' if len(known) > 5 else ''}"
+            hint = suggest(pattern, known, "it has")
             raise ConfigError(printable(f"no scene of {path} matches '{pattern}'{hint}"))
         matches.update({source.address: source for source in matching})
     return list(matches.values())

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.core.errors import ConfigError, suggest
+from su3d_bench.core.errors import ConfigError, nearest, suggest
 
 # A flag is plural where it takes several and ``--jobs`` wherever work is shared out; the other spelling is taken too.
 SPELLINGS = {"--methods": "--method", "--protocols": "--protocol", "--scenes": "--scene", "--jobs": "--workers"}
@@ -90,10 +90,12 @@ class Parser(argparse.ArgumentParser):
     def _with_suggestion(self, message: str) -> str:
         if message.startswith("unrecognized arguments: "):
             word = [*message.removeprefix("unrecognized arguments: ").split(), ""][0]
-            return f"unknown argument '{word}'{suggest(word, self._option_string_actions)}"
-        if "invalid choice: " in message:
-            argument, _, rest = message.partition(": invalid choice: ")
-            word = rest.partition(" (choose from")[0][1:-1]  # a repr, with either kind of quotes
-            known = [choice for action in self._actions for choice in (action.choices or ())]
-            return f"unknown {argument.removeprefix('argument ')} '{word}'{suggest(word, map(str, known))}"
+            return f"unknown argument '{word}'{nearest(word, self._option_string_actions)}"
         return message
+
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        """As the base class, but a choice that is refused is told what there is."""
+        if action.choices is not None and value not in action.choices:
+            is_verb = isinstance(action, argparse._SubParsersAction)
+            name = action.dest if is_verb else (action.option_strings or [action.metavar or action.dest])[0]
+            self.error(f"unknown {name} '{value}'{suggest(str(value), map(str, action.choices))}")

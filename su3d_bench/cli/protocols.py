@@ -33,8 +33,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.metrics.protocols.loading import load_protocol
 
     if arguments.action not in ACTIONS:
-        hint = suggest(arguments.action, ACTIONS) or "; known: list, show NAME"
-        raise ConfigError(f"protocols: unknown action '{arguments.action}'{hint}")
+        raise ConfigError(f"protocols: unknown action '{arguments.action}'{suggest(arguments.action, ACTIONS)}")
     if arguments.action == "show":
         if arguments.name is None:
             raise ConfigError(f"protocols show: name one of {', '.join(protocol_names())}")

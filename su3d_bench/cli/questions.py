@@ -60,8 +60,7 @@ def add_parser(verbs: Any) -> None:
 
 def call(arguments: argparse.Namespace) -> int:
     if arguments.action not in ACTIONS:
-        hint = suggest(arguments.action, ACTIONS) or f"; known: {', '.join(ACTIONS)}"
-        raise ConfigError(f"questions: unknown action '{arguments.action}'{hint}")
+        raise ConfigError(f"questions: unknown action '{arguments.action}'{suggest(arguments.action, ACTIONS)}")
     return {"make": _make, "show": _show, "audit": _audit}[arguments.action](arguments)
 
 
@@ -75,7 +74,7 @@ def _make(arguments: argparse.Namespace) -> int:
     if arguments.per_kind is not None and arguments.per_kind < 1:
         raise ConfigError(f"questions make: --per-kind is {arguments.per_kind}; expected 1 or more")
     if arguments.source not in SOURCES:
-        hint = suggest(arguments.source, SOURCES) or f"; known: {', '.join(SOURCES)}"
+        hint = suggest(arguments.source, SOURCES)
         raise ConfigError(f"questions make: unknown source '{arguments.source}'{hint}")
     check_form(arguments.out)
     made = _made(arguments)

@@ -110,7 +110,7 @@ def _jobs(arguments: argparse.Namespace) -> dict[str, JobFolder]:
     known = _scenes(run)
     for scene in arguments.scenes or ():
         if scene not in known:
-            hint = suggest(scene, known) or f"; it has {', '.join(known[:8])}"
+            hint = suggest(scene, known, "it has")
             raise ConfigError(f"{run.path}: holds no scene '{scene}'{hint}")
     jobs = {scene: run.job(scene, arguments.method) for scene in arguments.scenes or known}
     mapped = {scene: job for scene, job in jobs.items() if job.prediction.is_file()}

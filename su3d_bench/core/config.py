@@ -242,9 +242,8 @@ def _full_path(text: str, path: KeyPath, methods: Sequence[str], datasets: Seque
             return (section, *path)
     if path[0] == "perception" and len(path) > 1:
         return path
-    known = dict.fromkeys([*methods, *datasets, "perception"])
-    hint = suggest(path[0], known) or "; known: " + ", ".join(known)
-    raise ConfigError(f"--set {text}: '{path[0]}' is no method or dataset of this run{hint}")
+    known = [*methods, *datasets, "perception"]
+    raise ConfigError(f"--set {text}: '{path[0]}' is no method or dataset of this run{suggest(path[0], known)}")
 
 
 def parse_value(text: str) -> Any:
@@ -273,8 +272,7 @@ def check_names(section: str, settings: Settings, known: Sequence[str]) -> None:
     """Refuse ``[section.name]`` where ``name`` is not ``known``."""
     for entry in settings.under((section,)):
         if entry.path[0] not in known:
-            hint = suggest(entry.path[0], known) or "; known: " + ", ".join(dict.fromkeys(known))
-            raise ConfigError(f"{entry.source}: unknown {section} '{entry.path[0]}'{hint}")
+            raise ConfigError(f"{entry.source}: unknown {section} '{entry.path[0]}'{suggest(entry.path[0], known)}")
 
 
 def resolve(settings: Settings, prefix: KeyPath, model: type[Model]) -> Model:

@@ -11,7 +11,7 @@ import struct
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -61,6 +61,7 @@ def printable_json(value: Any) -> Any:
     return printable(str(value)) if isinstance(value, str | Path) else value
 
 
+MOST_CHOICES = 30  # that a line lists; every verb is among so many
 MOST_CHARACTERS = 1000  # of a message, which may quote a hostile file and name a deep folder
 EXIT_DONE = 0
 EXIT_CHECK_FAILED = 1
@@ -121,10 +122,30 @@ class CheckFailed(Su3dError):
     exit_code = EXIT_CHECK_FAILED
 
 
-def suggest(word: str, known: Iterable[str]) -> str:
+def some(names: Sequence[str], most: int) -> str:
+    """The first ``most`` of ``names``, and how many more there are.
+
+    >>> some(("a", "b", "c"), 2), some(("a", "b"), 2)
+    ('a, b and 1 more', 'a, b')
+    """
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
     """A clause ``; did you mean 'x'?`` for the known word nearest to ``word``, or nothing when none is near."""
     near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
     return f"; did you mean '{near[0]}'?" if near else ""
+
+
+def suggest(word: str, known: Iterable[str], are: str = "known:") -> str:
+    """What follows a choice that is refused: the known word nearest to it, and what is known; nothing where nothing is.
+
+    >>> suggest("tabel", ["table", "list"]), suggest("x", ["table", "list"], "it has")
+    ("; did you mean 'table'? known: table, list", '; it has table, list')
+    """
+    choices = list(dict.fromkeys(known))
+    near = nearest(word, choices)
+    return f"{near or ';'} {are} {some(choices, MOST_CHOICES)}" if choices else ""
 
 
 @contextmanager

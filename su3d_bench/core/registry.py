@@ -66,7 +66,7 @@ def _found(kind: str, name: str) -> Any:
     if ".py:" in name:
         return _from_file(kind, name)
     known = names(kind)
-    raise ConfigError(f"unknown {kind} '{name}'{suggest(name, known) or '; known: ' + ', '.join(known)}")
+    raise ConfigError(f"unknown {kind} '{name}'{suggest(name, known)}")
 
 
 def _from_module(target: str) -> Any:

@@ -193,7 +193,7 @@ def choose_scenes(words: Sequence[str], known: Sequence[str], where: str) -> lis
         pattern = word.rpartition("/")[2]
         matching = [scene for scene in known if fnmatch.fnmatchcase(scene, pattern)]
         if not matching:
-            hint = suggest(pattern, known) or "; known: " + ", ".join(known[:8])
+            hint = suggest(pattern, known)
             raise DataError(f"no scene of {where} matches '{word}'{hint}")
         chosen.update(dict.fromkeys(matching))
     return list(chosen)

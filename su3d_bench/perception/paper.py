@@ -104,7 +104,7 @@ class PaperPerception:
         kind = needs.grounding if needs.masks == "grounded" else needs.automatic
         known = self._segmenters[needs.masks]
         if kind not in known:
-            hint = suggest(kind, list(known)) or "; known: " + ", ".join(known)
+            hint = suggest(kind, known)
             raise ConfigError(
                 f"profile 'paper': the method asks for {needs.masks} masks '{kind}', there are none{hint}"
             )

@@ -66,9 +66,7 @@ def resolve_profile(profile: str, image_domain: ImageDomain, config: PerceptionC
     Elsewhere ``auto`` is ``embedded``: on rendered rooms, which its encoder was made for, and without ``config``.
     """
     if profile not in PROFILES:
-        raise ConfigError(
-            f"unknown profile '{profile}'{suggest(profile, PROFILES) or '; known: ' + ', '.join(PROFILES)}"
-        )
+        raise ConfigError(f"unknown profile '{profile}'{suggest(profile, PROFILES)}")
     if profile != "auto":
         return profile
     if config is None or image_domain != "camera":

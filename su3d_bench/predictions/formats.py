@@ -43,8 +43,7 @@ def recognise(path: Path, format: str | None = None) -> Reader:
     """
     if format is not None:
         if format not in READERS:
-            known = ", ".join(READERS)
-            raise ConfigError(f"unknown format '{format}'; known: {known}{suggest(format, READERS)}")
+            raise ConfigError(f"unknown format '{format}'{suggest(format, READERS)}")
         return READERS[format]
     if not path.exists():
         raise PredictionError(f"{path}: no such file or folder; give the folder of the predictions")

@@ -93,7 +93,7 @@ def _scene_of(name: str, plain: str, known: Sequence[str], where: str) -> str:
     longer = [scene for scene in known if _goes_on(name, scene)]
     if longer:
         return max(longer, key=len)
-    hint = suggest(name, known) or f"; known: {', '.join(known[:4])}{', ...' if len(known) > 4 else ''}"
+    hint = suggest(name, known)
     raise PredictionError(f"{where}: no ground truth for the predicted scene '{printable(name, 80)}'{hint}")
 
 

@@ -84,7 +84,7 @@ def of_kinds(questions: Sequence[AuditedQuestion], kinds: Sequence[str]) -> list
         is_query = {RETRIEVAL: True, REASONING: False}.get(kind)
         named = {one for one in known if one == kind or (one in MADE_KINDS) is is_query}
         if not named:
-            hint = suggest(kind, (*known, RETRIEVAL, REASONING)) or f"; there are: {', '.join(known) or 'none'}"
+            hint = suggest(kind, (*known, RETRIEVAL, REASONING), "there are:")
             raise ConfigError(f"questions audit: these scenes have no questions of kind '{printable(kind, 40)}'{hint}")
         wanted |= named
     return [question for question in questions if not kinds or question.kind in wanted]

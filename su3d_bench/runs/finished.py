@@ -129,13 +129,13 @@ class FinishedRun:
         if method not in self.methods and not self.has_scores(method):
             has_truth = CEILING_METHOD not in self.methods and self.has_scores(CEILING_METHOD)
             known = [*self.methods, *([CEILING_METHOD] if has_truth else [])]
-            hint = suggest(method, known) or f"; it has {', '.join(known)}"
+            hint = suggest(method, known, "it has")
             raise ConfigError(f"{self.name}: holds no scores of the method '{printable(method, 80)}'{hint}")
 
     def check_protocol(self, protocol: str) -> None:
         """A ``ConfigError`` where the run was not scored under ``protocol``."""
         if protocol not in self.protocols:
-            hint = suggest(protocol, self.protocols) or f"; it has {', '.join(self.protocols)}"
+            hint = suggest(protocol, self.protocols, "it has")
             raise ConfigError(f"{self.name}: was not scored under '{printable(protocol, 80)}'{hint}")
 
     def has_scores(self, method: str) -> bool:
@@ -244,9 +244,9 @@ def _no_map(run: RunFolder, scene: str, method: str) -> StoreError:
     with suppress(StoreError):
         record = read_record(RequestRecord, run.path / "run.json", str(run.path))
     scenes, methods = record.scenes, record.methods
-    hint = suggest(scene, scenes) if scene not in scenes else ""
+    hint = suggest(scene, scenes, "it has") if scene not in scenes else ""
     if scene in scenes and method not in methods:
-        hint = suggest(method, methods) or f"; it has {', '.join(methods)}"
+        hint = suggest(method, methods, "it has")
     hint = hint or f"; run: su3d-bench run --scenes {scene} --methods {method} --out {run.path}"
     return StoreError(f"{run.path}: holds no map of {scene} by {method}{hint}")
 

@@ -140,7 +140,7 @@ def test_a_protocol_shows_every_rule(capsys: pytest.CaptureFixture[str]) -> None
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["rum"], "unknown VERB 'rum'; did you mean 'run'?; see su3d-bench --help"),
+        (["rum"], "unknown verb 'rum'; did you mean 'run'? known: run, ablate, "),
         ([], "the following arguments are required: VERB; see su3d-bench --help"),
         (
             ["run", "--scene-s", "x"],
@@ -170,6 +170,19 @@ def test_a_protocol_shows_every_rule(capsys: pytest.CaptureFixture[str]) -> None
             ["protocols", "show", "rooms-semantics"],
             "unknown protocol 'rooms-semantics'; did you mean 'rooms-semantic'?",
         ),
+        (
+            ["report", "runs/demo"],
+            "report: unknown action 'runs/demo'; known: tables, timing, html, leaderboard, verify; ",
+        ),
+        (
+            ["report", "tables", "r", "--table", "VI"],
+            "report tables: unknown --table 'VI'; did you mean 'V'? known: I, ",
+        ),
+        (
+            ["report", "tables", "r", "--format", "docx"],
+            "report tables: unknown --format 'docx'; known: text, markdown, latex, csv, html; see ",
+        ),
+        ([*RUN, "--solver", "me"], "run: unknown --solver 'me'; known: built-in, llm; see "),
         (["methods", "orcle"], "unknown method 'orcle'; did you mean 'oracle'?"),
         (
             ["query", f"{PAINTED}/a", "x"],
@@ -195,7 +208,8 @@ def test_wrong_input_is_one_line_and_exit_code_2(
 def test_a_misspelt_key_in_a_file_is_named_with_its_line(capsys: pytest.CaptureFixture[str]) -> None:
     Path("run.toml").write_text('scenes = ["rooms/living0"]\nmetod = ["opensu3d"]\n')
     assert main(["run", "--config", "run.toml"]) == 2
-    assert capsys.readouterr().err == "su3d-bench: run.toml:2: unknown key 'metod'; did you mean 'method'?\n"
+    error = capsys.readouterr().err
+    assert error.startswith("su3d-bench: run.toml:2: unknown key 'metod'; did you mean 'method'? known: scenes, ")
 
 
 def test_debug_shows_the_traceback_above_the_line(capsys: pytest.CaptureFixture[str]) -> None:

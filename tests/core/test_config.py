@@ -69,7 +69,7 @@ def test_a_later_source_wins_and_each_value_knows_its_own(tmp_path: Path) -> Non
 def test_a_wrong_file_is_named_with_its_line(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(ConfigError) as error:
         check_keys(file_settings(tmp_path, text))
-    assert str(error.value) == f"{tmp_path}/{message}"
+    assert str(error.value).startswith(f"{tmp_path}/{message}")
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_a_wrong_file_is_named_with_its_line(tmp_path: Path, text: str, message:
 def test_a_wrong_value_is_named_with_its_line(tmp_path: Path, text: str, message: str) -> None:
     with pytest.raises(ConfigError) as error:
         resolve(file_settings(tmp_path, text), ("method", "x"), Model)
-    assert str(error.value) == f"{tmp_path}/{message}"
+    assert str(error.value).startswith(f"{tmp_path}/{message}")
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_a_key_is_taken_as_a_file_has_it_too() -> None:
 
 def test_a_misspelt_assignment_key_names_the_flag() -> None:
     settings = read_assignments(["opensu3d.topm=1"], ["opensu3d"], [])
-    with pytest.raises(ConfigError, match=r"^--set opensu3d.topm: unknown key 'topm'; did you mean 'top_m'\?$"):
+    with pytest.raises(ConfigError, match=r"^--set opensu3d.topm: unknown key 'topm'; did you mean 'top_m'\? known: "):
         resolve(settings, ("method", "opensu3d"), Model)
 
 
@@ -134,7 +134,9 @@ def test_assignments_take_toml_values_and_plain_text() -> None:
 
 def test_a_section_of_an_unknown_name_is_refused() -> None:
     settings = Settings((Setting(("method", "opensu3", "top_m"), 3, "run.toml:2"),))
-    with pytest.raises(ConfigError, match=r"^run.toml:2: unknown method 'opensu3'; did you mean 'opensu3d'\?$"):
+    with pytest.raises(
+        ConfigError, match=r"^run.toml:2: unknown method 'opensu3'; did you mean 'opensu3d'\? known: opensu3d, oracle$"
+    ):
         check_names("method", settings, ["opensu3d", "oracle"])
 
 

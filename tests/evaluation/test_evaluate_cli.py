@@ -117,7 +117,7 @@ def test_protocols_that_do_not_fit_are_told_with_the_reason(capsys: pytest.Captu
         ),
         (["evaluate", "pred", "--ground-truth", "."], ".: has no .txt file; expected <scene>.txt, one value a point"),
         ([*WORDS[:-1], "scannet-instances"], "unknown protocol 'scannet-instances'; did you mean 'scannet-instance'?"),
-        ([*WORDS, "--format", "scanet-text"], "unknown format 'scanet-text'; known: "),
+        ([*WORDS, "--format", "scanet-text"], "unknown format 'scanet-text'; did you mean 'scannet-text'? known: "),
         ([*WORDS, "--dataset", "scanet"], "unknown dataset 'scanet'; did you mean 'scannet'?"),
         ([*WORDS, "--scenes", "scene0009_00"], "no scene of gt matches 'scene0009_00'; did you mean 'scene0001_00'?"),
         ([*WORDS, "--text-features", "none.npz"], "none.npz: cannot be read: No such file or directory"),

@@ -280,7 +280,10 @@ def test_a_table_that_a_spreadsheet_saved_with_semicolons_is_read(folder: Path, 
     ("text", "line"),
     [
         (f"{','.join(COLUMNS)}\n1,a,count,x,0,rigth,\n", "row 2: unknown verdict 'rigth'; did you mean 'right'?"),
-        (f"{','.join(COLUMNS)}\n1,a,count,x,0,5,\n", "unknown verdict '5'; write right, arguable, wrong, or nothing"),
+        (
+            f"{','.join(COLUMNS)}\n1,a,count,x,0,5,\n",
+            "unknown verdict '5'; write nothing, or one of right, arguable, wrong",
+        ),
         ("number,scene,kind,text,answer,remark\n1,a,count,x,0,\n", "lacks the column verdict"),
         (f"{','.join(COLUMNS)}\n", "holds no question"),
         ("", "lacks the column number"),

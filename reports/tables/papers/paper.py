@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from su3d_bench.core.errors import ConfigError, counted, printable, suggest
+from su3d_bench.core.errors import ConfigError, counted, printable, some, suggest
 from su3d_bench.metrics.protocols.files import protocol_names
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.score import RELATIVE, said_by
@@ -26,7 +26,6 @@ from su3d_bench.reports.tables.model import (
     few_scenes,
     is_count,
     percent,
-    some,
 )
 from su3d_bench.reports.tables.papers.published import Figure, PaperTable, figures_of
 
@@ -168,7 +167,7 @@ def protocol_table(measured: Sequence[Measured], shown: Shown, figures: Sequence
     metrics = shown.metrics or rows[0].headline
     for name in metrics:
         if name not in rows[0].metrics:
-            known = suggest(name, rows[0].metrics) or f"; it has {', '.join(rows[0].metrics)}"
+            known = suggest(name, rows[0].metrics, "it has")
             raise ConfigError(f"{rows[0].protocol}: has no metric '{printable(name, 60)}'{known}")
     shown = replace(shown, metrics=metrics, scenes_count=shown.scenes_count or not _are_alike(rows))
     best, why = best_rows(rows, shown)

@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 from su3d_bench.cli.common import answer_either, drawn_bars, remark
 from su3d_bench.core import registry
 from su3d_bench.core.config import read_assignments
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, suggest
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, nearest
 from su3d_bench.datasets.layouts import LAYOUTS
 from su3d_bench.datasets.writing import SceneTarget, finish_scene, plan_scenes, write_frames
 from su3d_bench.runs.executors.local import Event, Report, run_inline, run_processes
@@ -90,7 +90,7 @@ def _scenes(part: Part, wanted: Sequence[str] | None) -> list[str]:
     addresses = [scene if "/" in scene else prefix + scene for scene in wanted or ("*",)]
     for address in addresses:
         if not address.startswith(prefix):
-            hint = suggest(address, [prefix + "*"]) or f"; expected '{prefix}...'"
+            hint = nearest(address, [prefix + "*"]) or f"; expected '{prefix}...'"
             raise ConfigError(f"datasets make {part.target}: '{address}' is no scene of it{hint}")
     chosen, _ = expand_scenes(addresses, {part.target: part})
     return [scene for _, scene in chosen]

@@ -62,8 +62,8 @@ def read_content(path: Path) -> Content:
     if isinstance(table, str):
         tables = {p.stem.removeprefix(_TABLE_PREFIX): p for p in RULES.glob(f"{_TABLE_PREFIX}*.toml")}
         if table not in tables:
-            known = suggest(table, tables) or "; known: " + ", ".join(sorted(tables))
-            raise ConfigError(f"{line_of(files, 'classes')}: unknown class table '{table}'{known}")
+            hint = suggest(table, sorted(tables))
+            raise ConfigError(f"{line_of(files, 'classes')}: unknown class table '{table}'{hint}")
         values["classes"] = _read_toml(tables[table])["classes"]
     if "classes" in values:
         values["classes"] = _entries(files, values.get("classes"))
@@ -83,8 +83,7 @@ def _chain(path: Path) -> list[tuple[Path, dict[str, Any]]]:
             raise ConfigError(f"{where}: extends must be a protocol's name or the path of a .toml file, not {name!r}")
         known = protocol_names()
         if name not in known and not name.endswith(".toml"):
-            hint = suggest(name, known) or "; known: " + ", ".join(known)
-            raise ConfigError(f"{where}: extends the unknown protocol '{name}'{hint}")
+            raise ConfigError(f"{where}: extends the unknown protocol '{name}'{suggest(name, known)}")
         path = rules_file(name) if name in known else path.parent / name
         if path.resolve() in [file.resolve() for file, _ in chain]:
             raise ConfigError(f"{where}: extends itself: {' -> '.join(file.name for file, _ in chain)} -> {path.name}")

@@ -41,7 +41,7 @@ def load_protocol(name: str) -> ProtocolRules:
         if rules.name in known:
             raise ConfigError(f"{name}: the protocol name '{rules.name}' is built in; choose another name")
         return rules
-    raise ConfigError(f"unknown protocol '{name}'{suggest(name, known) or '; known: ' + ', '.join(known)}")
+    raise ConfigError(f"unknown protocol '{name}'{suggest(name, known)}")
 
 
 def read_protocol(path: Path) -> ProtocolRules:

@@ -268,7 +268,7 @@ def model_entry(name: str, kind: Kind | None = None) -> ModelEntry:
     known = [entry.name for entry in _ENTRIES if kind is None or entry.kind == kind]
     if name not in known:
         what = kind or "model"
-        raise ConfigError(f"unknown {what} '{name}'{suggest(name, known) or '; known: ' + ', '.join(known)}")
+        raise ConfigError(f"unknown {what} '{name}'{suggest(name, known)}")
     return MODELS[name]
 
 

@@ -91,7 +91,7 @@ def named_method(text: str) -> NamedMethod:
 def _preset(text: str, base: str, method: Any, variant: str) -> Mapping[str, Any]:
     presets = method.presets if isinstance(method, HasPresets) else {}
     if variant not in presets:
-        hint = suggest(variant, presets) or (f"; it has {', '.join(presets)}" if presets else "; it has none")
+        hint = suggest(variant, presets, "it has") or "; it has none"
         raise ConfigError(f"--methods {text}: {base} has no preset '{variant}'{hint}; or write {base}@KEY=VALUE")
     return presets[variant]
 
@@ -143,8 +143,7 @@ def make_plan(settings: Settings, assignments: Sequence[str] = (), out: Path | s
     config = resolve(settings, (), RunConfig)
     check_execution(config)
     if config.profile not in PROFILES:
-        hint = suggest(config.profile, PROFILES) or "; known: " + ", ".join(PROFILES)
-        raise ConfigError(f"unknown profile '{config.profile}'{hint}")
+        raise ConfigError(f"unknown profile '{config.profile}'{suggest(config.profile, PROFILES)}")
     named_methods = [named_method(text) for text in _method_targets(config.methods)]
     _check_one_a_name("--methods", [(method.name, method.essence) for method in named_methods])
     methods = {method.name: method for method in named_methods}

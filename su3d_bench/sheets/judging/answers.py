@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from su3d_bench.core.errors import DataError, printable, reading, suggest
+from su3d_bench.core.errors import DataError, nearest, printable, reading, suggest
 from su3d_bench.core.files import file_bytes
 from su3d_bench.formats.tables.separated import separated_rows
 from su3d_bench.formats.tables.workbooks import read_workbook
@@ -241,7 +241,7 @@ def _identity_fault(row: AnswerRow, items: dict[str, SheetItem], shares: dict[st
     """What is wrong with whom and what the row speaks of."""
     item = items.get(row.item_id)
     if item is None:
-        near = suggest(row.item_id, items)
+        near = nearest(row.item_id, items)
         return f"item '{printable(row.item_id, 40)}' is not in this set{near or '; put its id back'}"
     if row.check != item.check:
         return f"cells of item '{item.id}' were changed ('check' does not fit); put back what stood there"
@@ -250,7 +250,7 @@ def _identity_fault(row: AnswerRow, items: dict[str, SheetItem], shares: dict[st
         return f"question '{printable(row.question, 40)}' is not asked of item '{item.id}', but {known}; put it back"
     if row.annotator not in shares:
         who = f"annotator '{printable(row.annotator, 40)}' is not of this set" if row.annotator else "has no annotator"
-        return f"{who}{suggest(row.annotator, shares) or '; it has ' + printable(', '.join(sorted(shares)), 120)}"
+        return f"{who}{suggest(row.annotator, sorted(shares), 'it has')}"
     if row.item_id not in shares[row.annotator]:
         return f"item '{item.id}' is not in the share of '{printable(row.annotator, 40)}'; put the name back"
     return None
@@ -262,7 +262,7 @@ def _choice(sheet: Sheet, row: AnswerRow) -> tuple[str, str | None]:
     for choice in choices:
         if " ".join(row.answer.split()).casefold() == choice.casefold():
             return choice, None
-    near = suggest(row.answer, choices) or f"; choose {' | '.join(choices)}"
+    near = suggest(row.answer, choices, "choose one of")
     return "", f"unknown answer '{printable(row.answer, 40)}' to '{row.question}'{near}"
 
 

@@ -60,7 +60,7 @@ def read_verdicts(path: Path) -> list[Verdict]:
             continue
         one = Verdict(**dict.fromkeys(COLUMNS, "") | cells | {"verdict": cells.get("verdict", "").lower()})
         if one.verdict and one.verdict not in VERDICTS:
-            hint = suggest(one.verdict, VERDICTS) or f"; write {', '.join(VERDICTS)}, or nothing"
+            hint = suggest(one.verdict, VERDICTS, "write nothing, or one of")
             raise DataError(f"{at}: unknown verdict '{printable(one.verdict, 40)}'{hint}")
         verdicts.append(one)
     if not verdicts:

@@ -37,7 +37,7 @@ def chosen_of(run: FinishedRun, what: str, wanted: Sequence[str], known: tuple[s
     """Those that are ``wanted``, which the run must have; all without any."""
     for name in wanted:
         if name not in known:
-            hint = suggest(name, known) or f"; it has {', '.join(known)}"
+            hint = suggest(name, known, "it has")
             raise ConfigError(f"{run.name}: has no {what} '{printable(name, 80)}'{hint}")
     return tuple(dict.fromkeys(wanted)) or known
 
