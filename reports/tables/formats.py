@@ -10,8 +10,10 @@ import csv
 import html
 import io
 import re
+import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
+from itertools import zip_longest
 from typing import Any
 
 from su3d_bench.core.errors import printable
@@ -65,25 +67,29 @@ def markdown(parts: Sequence[Table | Prose]) -> str:
     return _laid_out(parts, markup_free)
 
 
-def plain(parts: Sequence[Table | Prose]) -> str:
-    """As ``markdown``, for a terminal: texts stand there as they are."""
-    return _laid_out(parts, printable)
+def plain(parts: Sequence[Table | Prose], width: int | None = None) -> str:
+    """As ``markdown``, for a terminal: texts stand there as they are.
+
+    ``width``: characters that a line may have. What is longer is folded between words and between columns.
+    """
+    return _laid_out(parts, printable, width)
 
 
-def _laid_out(parts: Sequence[Table | Prose], shown: Callable[[str, int], str]) -> str:
-    return "\n\n".join(_block(part, shown) for part in parts) + "\n"
+def _laid_out(parts: Sequence[Table | Prose], shown: Callable[[str, int], str], width: int | None = None) -> str:
+    return "\n\n".join(_block(part, shown, width) for part in parts) + "\n"
 
 
-def _block(part: Table | Prose, shown: Callable[[str, int], str]) -> str:
+def _block(part: Table | Prose, shown: Callable[[str, int], str], width: int | None) -> str:
     if isinstance(part, Prose):
-        return "\n".join(f"{'- ' if part.is_list else ''}{shown(line, MOST_OF_A_NOTE)}" for line in part.lines)
+        begin = "- " if part.is_list else ""
+        return "\n".join(_folded(shown(line, MOST_OF_A_NOTE), width, begin) for line in part.lines)
     head = [shown(text, MOST_OF_A_CELL) for text in (part.head, *part.columns)]
     rows = [[shown(row.title, MOST_OF_A_CELL), *(_marked(cell, shown) for cell in row.cells)] for row in part.rows]
-    lines = aligned([head, *rows]) if rows else []
+    lines = _fitted([head, *rows], width) if rows else []
     heading = f"**{shown(part.heading, MOST_OF_A_CELL)}**" if part.heading else ""
     gap = " " if heading and part.caption.startswith(" ") else ""
-    caption = f"{heading}{gap}{shown(part.caption, MOST_OF_A_CELL)}"
-    notes = [f"- {shown(note, MOST_OF_A_NOTE)}" for note in part.notes]
+    caption = _folded(f"{heading}{gap}{shown(part.caption, MOST_OF_A_CELL)}", width)
+    notes = [_folded(shown(note, MOST_OF_A_NOTE), width, "- ") for note in part.notes]
     return "\n\n".join(block for block in (caption, "\n".join(lines), "\n".join(notes)) if block)
 
 
@@ -95,6 +101,59 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     ]
     rule = "|" + "|".join("-" * (width + 2) for width in widths) + "|"
     return [lines[0], rule, *lines[1:]]
+
+
+def _folded(text: str, width: int | None, begin: str = "") -> str:
+    """``text`` behind ``begin``, folded between words where it is longer than ``width``."""
+    return f"{begin}{text}" if width is None else "\n".join(_wrapped(text, width, begin))
+
+
+def _wrapped(text: str, width: int, begin: str = "") -> list[str]:
+    return textwrap.wrap(
+        text,
+        max(width, 1),
+        initial_indent=begin,
+        subsequent_indent=" " * len(begin),
+        break_long_words=False,  # names, paths and numbers stay whole
+        break_on_hyphens=False,
+    ) or [begin]
+
+
+def _fitted(rows: Sequence[Sequence[str]], width: int | None) -> list[str]:
+    """``aligned``; a table that is wider than ``width`` in several blocks, each with the columns that tell its rows
+    apart, and one for whose columns even that is too narrow with its rows as lists."""
+    sizes = [max(len(row[column]) for row in rows) + 3 for column in range(len(rows[0]))]
+    if width is None or sum(sizes) + 1 <= width:
+        return aligned(rows)
+    n = _n_telling_apart(rows)
+    if n == len(sizes) or sum(sizes[:n]) + max(sizes[n:]) + 1 > width:
+        return _on_its_side(rows, width)
+    blocks: list[list[int]] = []
+    for column in range(n, len(sizes)):
+        if not blocks or sum(sizes[one] for one in (*blocks[-1], column)) + 1 > width:
+            blocks.append([*range(n)])
+        blocks[-1].append(column)
+    folded = [aligned([[row[column] for column in block] for row in rows]) for block in blocks]
+    return [line for lines in folded for line in ("", *lines)][1:]
+
+
+def _n_telling_apart(rows: Sequence[Sequence[str]]) -> int:
+    """How many columns from the left, such as run and method, no two rows have in common; 1 where none do."""
+    numbers = range(1, len(rows[0]))
+    return next((n for n in numbers if len({tuple(row[:n]) for row in rows}) == len(rows)), 1)
+
+
+def _on_its_side(rows: Sequence[Sequence[str]], width: int) -> list[str]:
+    """The lines of a list a row: its first cell, below it the others behind the names of their columns."""
+    (head, *names), *body = rows
+    size = min(max(map(len, names), default=0), max(width // 2 - 4, 1))
+    lines = []
+    for label, *cells in body:
+        lines += ["", *_wrapped(f"{head}: {label}" if head else label, width)]
+        for name, cell in zip(names, cells, strict=True):
+            pairs = zip_longest(_wrapped(name, size), _wrapped(cell, width - size - 4), fillvalue="")
+            lines += [f"  {left:<{size}}  {right}".rstrip() for left, right in pairs]
+    return lines[1:]
 
 
 def _marked(cell: Cell, shown: Callable[[str, int], str]) -> str:

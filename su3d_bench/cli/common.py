@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from su3d_bench.cli.parser import JSON, JsonFlag
 from su3d_bench.core.errors import EXIT_DONE, StoreError, shown
 from su3d_bench.core.files import file_text
-from su3d_bench.core.printing import Door, escaped_json, one_line, stream_behind
+from su3d_bench.core.printing import Door, escaped_json, one_line, stream_behind, terminal_width
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
 
 if TYPE_CHECKING:
@@ -110,9 +110,10 @@ def add_table_format(parser: argparse.ArgumentParser, flag: str = "--format") ->
 
 def formatted(parts: Sequence[Table | Prose], arguments: argparse.Namespace, *, is_file: bool = False) -> str:
     """The tables in the form of ``add_table_format``; ``is_file`` where they are not printed."""
-    from su3d_bench.reports.tables.formats import FORMATS
+    from su3d_bench.reports.tables.formats import FORMATS, plain
 
-    return FORMATS[arguments.table_format or ("markdown" if is_file else "text")](parts)
+    form = arguments.table_format or ("markdown" if is_file else "text")
+    return plain(parts, terminal_width()) if form == "text" and not is_file else FORMATS[form](parts)
 
 
 def answer(*lines: str) -> None:

@@ -11,6 +11,7 @@ import io
 import json
 import os
 import re
+import shutil
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
@@ -21,6 +22,8 @@ from typing import Any, TextIO
 # The parsers of GitHub's runner (ActionCommand.cs), Azure Pipelines (Command.cs) and TeamCity's service messages.
 _COMMAND_FIRST = re.compile(r"^( *):(?=:)")
 _COMMAND_ANYWHERE = re.compile(r"##(?=\w*\[)")
+
+LEAST_WIDTH = 40  # below which nothing is folded any more
 
 
 def one_line(text: str) -> str:
@@ -160,6 +163,15 @@ class Door(io.TextIOBase):
         self._is_open = False
         with suppress(OSError, ValueError), Path(os.devnull).open("wb") as nowhere:
             os.dup2(nowhere.fileno(), self.fileno())
+
+
+def terminal_width() -> int | None:
+    """How many characters a line of stdout may have: what ``COLUMNS`` says, else as wide as its terminal is; None where
+    it is none."""
+    said = os.environ.get("COLUMNS", "")[:6]
+    if not sys.stdout.isatty() and not (said.isdecimal() and int(said)):
+        return None
+    return max(shutil.get_terminal_size().columns, LEAST_WIDTH)
 
 
 @contextmanager

@@ -259,3 +259,48 @@ def test_prose_stands_in_every_format_as_text(name: str) -> None:
     text = FORMATS[name](PARTS)
     assert text.index("run") < text.index("mind this") < text.index("second")
     assert "<b>" not in text or name in ("text", "csv")
+
+
+WIDE = text_table(
+    "wide",
+    [
+        ["run", "method", "first long heading", "second long heading", "third long heading", "fourth"],
+        ["runs/a", "opensu3d", "12.5 [10.1, 14.9]", "1,234,567", "0.1", "x"],
+        ["runs/a", "oracle", "100.0", "7", "0.2", "y"],
+    ],
+    heading="Wide",
+    notes=("a note of several words that goes on beyond the sixty characters that a line of this terminal has",),
+)
+
+
+def test_a_table_that_is_too_wide_is_folded_between_columns_and_each_block_says_whose_rows_they_are() -> None:
+    lines = plain([WIDE], 60).splitlines()
+    assert max(map(len, lines)) <= 60
+    rows = [line for line in lines if line.startswith("| runs/a | opensu3d")]
+    assert len(rows) == 3 and sum("12.5 [10.1, 14.9]" in row for row in rows) == 1
+    assert lines[-2:] == [
+        "- a note of several words that goes on beyond the sixty",
+        "  characters that a line of this terminal has",
+    ]
+
+
+def test_a_table_whose_cells_are_texts_stands_as_lists() -> None:
+    table = text_table("t", [["scene", "names"], ["rooms/living0", "chair, " * 20 + "sofa"]])
+    lines = plain([table], 40).splitlines()
+    assert lines[0] == "scene: rooms/living0" and lines[1] == "  names  chair, chair, chair, chair,"
+    assert max(map(len, lines)) <= 40
+
+
+def test_a_table_that_fits_and_one_in_a_file_keep_their_form() -> None:
+    assert plain([WIDE], 200) == plain([WIDE])
+    assert max(map(len, plain([WIDE]).splitlines())) > 90
+
+
+@given(
+    st.lists(st.lists(st.text("ab ,1|", min_size=1, max_size=30), min_size=5, max_size=5), min_size=2, max_size=4),
+    st.integers(10, 120),
+)
+def test_no_word_is_lost_however_narrow_a_terminal_is(rows: list[list[str]], width: int) -> None:
+    words = sorted(word for row in rows[1:] for cell in row for word in printable(cell).split())
+    shown = plain([text_table("t", rows)], width).replace("|", " ").split()
+    assert all(shown.count(word) >= words.count(word) for word in set(words) if "|" not in word)
