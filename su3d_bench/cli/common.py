@@ -14,7 +14,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
 from su3d_bench.cli.parser import JSON, JsonFlag
-from su3d_bench.core.errors import EXIT_DONE, StoreError, shown
+from su3d_bench.core.errors import EXIT_DONE, StoreError, counted, shown
 from su3d_bench.core.files import file_text
 from su3d_bench.core.printing import Door, escaped_json, one_line, stream_behind, terminal_width
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
@@ -322,10 +322,10 @@ def chat_client(arguments: argparse.Namespace, run: RunFolder) -> tuple[ChatClie
 
 
 @contextmanager
-def progress(n_scenes: int, *, is_quiet: bool, last_step: str = "scoring") -> Iterator[Report]:
+def progress(n_scenes: int, *, is_quiet: bool, last_step: str = "") -> Iterator[Report]:
     """A ``Report`` that draws bars while the block runs; it draws nothing where stderr is no terminal.
 
-    ``last_step`` is what a scene does after its last frame.
+    ``last_step`` is what a scene does after its last frame, where no event says it.
     """
     with drawn_bars(is_quiet=is_quiet) as bars:
         yield _Board(bars, n_scenes, last_step).report if bars is not None else lambda event: None
@@ -348,18 +348,22 @@ def drawn_bars(*, is_quiet: bool, tells_time_left: bool = False) -> Iterator[Pro
         TimeElapsedColumn,
         TimeRemainingColumn,
     )
+    from rich.table import Column
     from rich.text import Text
 
     class Description(ProgressColumn):
         """The words of a bar, which hold names of scenes and methods: no markup, nothing that acts on a terminal."""
 
         def render(self, task: Task) -> Text:
-            return Text(one_line(task.description)[:MOST_OF_A_BAR])
+            return Text(one_line(task.description)[:MOST_OF_A_BAR], no_wrap=True, overflow="ellipsis")
 
     console = Console(file=stream_behind(sys.stderr))
     remarks = TextColumn("{task.fields[remark]}", markup=False)
-    time = TimeRemainingColumn() if tells_time_left else TimeElapsedColumn()
-    columns = (Description(), BarColumn(), MofNCompleteColumn(), remarks, time)
+    # Where the terminal is narrow, names give way alone: only their column may be folded.
+    time = (TimeRemainingColumn if tells_time_left else TimeElapsedColumn)(table_column=Column(no_wrap=True))
+    width = BAR if console.width >= WIDE else NARROW_BAR
+    bar = BarColumn(bar_width=width, table_column=Column(width=width))
+    columns = (Description(), bar, MofNCompleteColumn(table_column=Column(no_wrap=True)), remarks, time)
     bars = Progress(*columns, console=console, transient=True, redirect_stdout=False, redirect_stderr=False)
     with bars, _above(bars):
         yield bars
@@ -381,26 +385,35 @@ class _Board:
     def __init__(self, bars: Progress, n_scenes: int, last_step: str) -> None:
         self._bars = bars
         self._last_step = last_step
-        self._scenes = bars.add_task("scenes", total=n_scenes, remark="")
+        self._scenes = bars.add_task("scenes", total=n_scenes, remark="starting")
         self._tasks: dict[tuple[str, str], TaskID] = {}
 
     def report(self, event: Event) -> None:
+        self._bars.update(self._scenes, remark=event.doing if event.label == SCENE_DONE else "")
         if event.label == SCENE_DONE:
-            self._bars.update(self._scenes, advance=1)
-            for key in [key for key in self._tasks if key[0] == event.unit]:
-                self._bars.remove_task(self._tasks.pop(key))
+            if not event.doing:
+                self._bars.update(self._scenes, advance=1)
+                self._remove(event.unit)
             return
         key = (event.unit, event.label)
         if key not in self._tasks:
+            self._remove(event.unit)
             name = f"  {event.unit} {event.label}"
-            self._tasks[key] = self._bars.add_task(name, total=event.total, remark="")
+            self._tasks[key] = self._bars.add_task(name, total=event.total or None, remark="")
         task = self._tasks[key]
-        self._bars.update(task, completed=event.done, remark=self._remark(event))
-        if event.done == event.total:
-            self._bars.update(task, description=f"  {event.unit} {event.label}: {self._last_step}")
+        if event.total:
+            self._bars.update(task, total=event.total, completed=event.done)
+        if event.doing or event.done:
+            is_last = event.done == event.total > 0
+            self._bars.update(task, remark=event.doing or (is_last and self._last_step) or self._remark(event))
+
+    def _remove(self, unit: str) -> None:
+        """The bars of a scene that is done, or whose next method begins."""
+        for key in [key for key in self._tasks if key[0] == unit]:
+            self._bars.remove_task(self._tasks.pop(key))
 
     def _remark(self, event: Event) -> str:
         own = self._tasks[event.unit, event.label]
         speed = next(task.speed for task in self._bars.tasks if task.id == own)
-        rate = f"{speed:.1f} frames/s" if speed else ""
-        return rate if event.n_instances is None else f"{rate} {event.n_instances} instances"
+        words = [f"{speed:.1f}/s"] if speed else []
+        return ", ".join(words if event.n_instances is None else [*words, counted(event.n_instances, "instance")])

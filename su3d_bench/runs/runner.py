@@ -98,6 +98,7 @@ def run_plan(plan: Plan, report: Report) -> RunResult:
             raise
         if plan.store is not None:
             fetch_results(plan.store, plan.folder.path)
+        report(Event("", SCENE_DONE, doing="adding up"))
         failed = [(outcome.scene, outcome.method, outcome.error) for outcome in outcomes if outcome.error is not None]
         failures = tuple(each for each in failed if each[1] in plan.methods)
         metrics = plain(summarise(plan, outcomes))

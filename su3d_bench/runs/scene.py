@@ -16,7 +16,7 @@ from functools import cache, cached_property, partial
 from typing import Any
 
 from su3d_bench.core.devices import device_for
-from su3d_bench.core.errors import GroundTruthMissing, StoreError
+from su3d_bench.core.errors import GroundTruthMissing, StoreError, counted
 from su3d_bench.core.interfaces import (
     Closes,
     Method,
@@ -42,7 +42,7 @@ from su3d_bench.questions.refined_names import refined_names
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.reports.pictures.maps import draw_scene
 from su3d_bench.reports.tables.found import Unscored, not_scored_lines
-from su3d_bench.runs.executors.local import Report
+from su3d_bench.runs.executors.local import Event, Report
 from su3d_bench.runs.feeding import (
     N_AHEAD,
     Feeding,
@@ -173,6 +173,19 @@ class _Scene:
             return boxes
         return mesh
 
+    def says(self, part: Part, doing: str) -> None:
+        """What is done now, where no frame is fed."""
+        self.report(Event(self.job.scene, part.name, doing=doing))
+
+    @cached_property
+    def is_rendered(self) -> bool:
+        return isinstance(self.dataset, RendersFrames) and self.dataset.renders_frames
+
+    @property
+    def opening(self) -> str:
+        """What the first look at the scene is."""
+        return "making the scene" if self.is_rendered else "reading the scene"
+
     def truth(self, variant: str) -> GroundTruth:
         if variant not in self._truths:
             self._truths[variant] = self.dataset.ground_truth(self.job.scene_name, variant)
@@ -220,6 +233,7 @@ class _Scene:
 
     def run(self, part: Part, folder: JobFolder, log: SceneLog) -> MethodOutcome:
         """Predict and score one method, each step only where its seal is missing or broken."""
+        self.says(part, self.opening)
         method = build_method(part)
         info = self.dataset.info(self.job.scene_name, stride_of(self.job.stride, part.options))
         info = replace(info, seed=self.job.seed)
@@ -274,19 +288,23 @@ class _Scene:
             truth = self.first_truth
             with clock.running("start"):
                 method.receive_truth(truth)
+        self.says(part, "compiling the method")
         _warm_up(part, device)
+        self.says(part, self.opening)
         start_memory_watch()
-        feeding = Feeding(self.job.scene, method, perception, self.report, clock)
+        feeding = Feeding(
+            self.job.scene, method, perception, lambda event: self.report(replace(event, label=part.name)), clock
+        )
         shares = self.job.anytime if method.needs.frames else ()
-        is_rendered = isinstance(self.dataset, RendersFrames) and self.dataset.renders_frames
         with _closed_at_the_end(method, clock):
             with clock.running("start"):
                 method.start(info)
-            with ReadAhead(frames, n, n_ahead=0 if is_rendered else N_AHEAD) as ahead:
+            with ReadAhead(frames, n, n_ahead=0 if self.is_rendered else N_AHEAD) as ahead:
                 for share in shares:
                     feeding.up_to(math.ceil(share * n), ahead, n)
                     feeding.write_map(folder.anytime(share))
                 feeding.up_to(n, ahead, n)
+            self.says(part, "finishing the map")
             feeding.write_map(folder.prediction)
         write_text(folder.updates, feeding.updates_text())
         files = [folder.prediction, folder.updates, *map(folder.anytime, shares)]
@@ -331,6 +349,7 @@ class _Scene:
             write_bytes(folder.anytime_counts(share), pack_scores(early))
             files.append(folder.anytime_counts(share))
         if self.job.pictures:
+            self.says(part, "drawing the map")
             truth_to_draw = next(iter(self._truths.values()), None)
             files += draw_scene(prediction, truth_to_draw, folder.pictures, f"{self.job.scene}, {part.name}")
         reasons = [Unscored(self.job.scene, part.name, *pair) for pair in unscored.items()]
@@ -345,7 +364,9 @@ class _Scene:
         """The scores under every protocol that can score the map, and why the others cannot."""
         scores: dict[str, SceneScore] = {}
         unscored: dict[str, str] = {}
-        for rules in map(load_protocol, self.job.protocols):
+        for n, rules in enumerate(map(load_protocol, self.job.protocols), 1):
+            if rules.ground_truth not in self._truths:
+                self.says(part, "making the truth" if self.is_rendered else "reading the truth")
             try:
                 truth = self.truth(rules.ground_truth)
             except GroundTruthMissing as error:
@@ -354,6 +375,7 @@ class _Scene:
             if (reason := why_not_scorable(rules, prediction)) is not None:
                 unscored[rules.name] = reason
                 continue
+            self.says(part, f"scoring {n} of {counted(len(self.job.protocols), 'protocol')}")
             renamed = self._prediction_in_words_of(truth, part, prediction)
             known = self._truth_of(rules, truth, refined_in)
             scores[rules.name] = score_scene(rules, known, renamed, perception.encoder)

@@ -25,7 +25,10 @@ from su3d_bench.core.endings import Ended, ending_in_order
 from su3d_bench.core.errors import Su3dError
 from su3d_bench.core.printing import doors
 
-ENDING_S = 20.0  # for a worker to let go of what it holds; Slurm waits 30 s before it ends what it asked to end
+ENDING_S = 20.0  # for a worker without a parent to let go of what it holds; Slurm ends what it asked to end after 30 s
+# For a worker whose parent was asked to end. One that loads a library or searches a tree hears of nothing meanwhile; it
+# is ended then, as by a loss of power, after which all that is on disk is whole and the scene is taken up again.
+PATIENCE_S = 1.0
 FOR_THE_PARENT = frozenset({signal.SIGINT, signal.SIGHUP})  # a terminal sends them to both; the parent decides
 SCENE_DONE = "scene"  # label of the event that says that a unit is finished
 Unit = TypeVar("Unit")
@@ -45,13 +48,18 @@ ONE_THREAD = dict.fromkeys(
 
 @dataclass(frozen=True)
 class Event:
-    """Progress of one unit: ``done`` of ``total`` steps under ``label``; ``n_instances`` of the map so far."""
+    """Progress of one unit: ``done`` of ``total`` steps under ``label``, 0 where nobody knows their number yet;
+    ``n_instances`` of the map so far.
+
+    ``doing``: what is done from now on that is none of these steps.
+    """
 
     unit: str
     label: str
-    done: int
-    total: int
+    done: int = 0
+    total: int = 0
     n_instances: int | None = None
+    doing: str = ""
 
 
 Report = Callable[[Event], None]
@@ -124,10 +132,10 @@ def run_processes(
 
 
 def _end(processes: Sequence[BaseProcess]) -> None:
-    """Have workers let go of what they hold, and end those that do not come to it."""
+    """Have workers let go of what they hold, and end those that do not come to it at once."""
     for process in processes:
         process.terminate()
-    until = time.monotonic() + ENDING_S
+    until = time.monotonic() + PATIENCE_S
     for process in processes:
         process.join(max(until - time.monotonic(), 0.0))
         if process.is_alive():

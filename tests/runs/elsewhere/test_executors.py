@@ -8,11 +8,12 @@ import threading
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 from su3d_bench.core.errors import StoreError
 from su3d_bench.runs.executors import ray
-from su3d_bench.runs.executors.local import ONE_THREAD, Event, Report, run_inline, run_processes
+from su3d_bench.runs.executors.local import ENDING_S, ONE_THREAD, Event, Report, run_inline, run_processes
 
 
 def work(unit: str, report: Report) -> str:
@@ -27,6 +28,10 @@ def work(unit: str, report: Report) -> str:
     if unit == "bug":
         raise KeyError("a mistake")
     if unit == "wait":
+        threading.Event().wait(60)
+    if unit == "deaf":  # as in a library's own code, which comes back to Python much later
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+        report(Event(unit, "work", 0, 1))
         threading.Event().wait(60)
     if unit == "threads":
         return " ".join(os.environ[name] for name in sorted(ONE_THREAD))
@@ -96,6 +101,19 @@ def test_an_error_of_the_user_stops_all_at_once() -> None:
     with pytest.raises(StoreError, match="the disk is full"):
         in_processes(["disk", "wait"])
     assert time.monotonic() - start < 30
+
+
+def test_an_interrupt_ends_workers_that_do_not_hear_of_it_too() -> None:
+    def interrupt(event: Event) -> None:
+        pids.extend(child.pid for child in psutil.Process().children() if "spawn_main" in " ".join(child.cmdline()))
+        interrupted.append(time.monotonic())
+        raise KeyboardInterrupt
+
+    pids, interrupted = list[int](), list[float]()
+    with pytest.raises(KeyboardInterrupt):
+        list(run_processes(work, ["deaf"], interrupt, jobs=1, lost=lost))
+    assert time.monotonic() - interrupted[0] < ENDING_S
+    assert len(pids) == 1 and not psutil.pid_exists(pids[0])
 
 
 def test_a_bug_in_a_worker_shows_its_traceback() -> None:

@@ -1,0 +1,70 @@
+"""The bars of a run: what is done is said, also where no frame is fed, and a narrow terminal keeps a bar."""
+
+from __future__ import annotations
+
+import io
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from su3d_bench.cli.common import NARROW_BAR, _Board, drawn_bars
+from su3d_bench.runs.executors.local import SCENE_DONE, Event
+
+LONG = "rooms/a-scene-with-a-long-name-that-no-terminal-has-room-for"
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@contextmanager
+def bars_on(width: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    monkeypatch.setenv("COLUMNS", str(width))
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    with drawn_bars(is_quiet=False) as bars:
+        assert bars is not None
+        yield bars
+
+
+def plain_lines(bars: Any) -> list[str]:
+    from rich.console import Console
+
+    paper = Console(file=io.StringIO(), width=bars.console.width, color_system=None, legacy_windows=False)
+    paper.print(bars.make_tasks_table(bars.tasks), no_wrap=True)
+    assert isinstance(paper.file, io.StringIO)
+    return [line.rstrip() for line in paper.file.getvalue().splitlines()]
+
+
+@pytest.mark.parametrize("scene", ["rooms/living0", LONG])
+def test_on_80_columns_a_bar_is_seen_and_what_is_done_is_read(scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with bars_on(80, monkeypatch) as bars:
+        board = _Board(bars, 4, "")
+        assert "starting" in plain_lines(bars)[0]
+        board.report(Event(scene, "opensu3d", doing="making the scene"))
+        assert "making the scene" in plain_lines(bars)[1] and "0/?" in plain_lines(bars)[1]
+        board.report(Event(scene, "opensu3d", 0, 160))
+        assert "making the scene" in plain_lines(bars)[1] and "0/160" in plain_lines(bars)[1]
+        board.report(Event(scene, "opensu3d", 160, 160, 12))
+        first, second = plain_lines(bars)
+        assert "12 instances" in second and "making" not in second and "starting" not in first
+        assert max(map(len, (first, second))) <= 80 and second.count("━") == NARROW_BAR
+        board.report(Event(scene, "opensu3d", doing="scoring 2 of 4 protocols"))
+        assert "scoring 2 of 4 protocols" in plain_lines(bars)[1] and "160/160" in plain_lines(bars)[1]
+
+
+def test_a_scene_has_one_bar_which_is_its_current_method_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    with bars_on(120, monkeypatch) as bars:
+        board = _Board(bars, 2, "drawing")
+        board.report(Event("rooms/a", "one", 3, 3, 1))
+        assert "drawing" in plain_lines(bars)[1]
+        board.report(Event("rooms/a", "two", 1, 3, 1))
+        assert len(bars.tasks) == 2 and "rooms/a two" in plain_lines(bars)[1] and "1 instance " in plain_lines(bars)[1]
+        board.report(Event("rooms/a", SCENE_DONE, 1, 2))
+        board.report(Event("", SCENE_DONE, doing="adding up"))
+        (line,) = plain_lines(bars)
+        assert "1/2" in line and "adding up" in line
