@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 from xml.etree import ElementTree
 
-from su3d_bench.core.errors import printable
+from su3d_bench.core.errors import counted, printable, some
 from su3d_bench.core.printing import one_line
+from su3d_bench.reports.tables import formats as tables
 from su3d_bench.reports.tables.formats import markup_free
-from su3d_bench.reports.tables.model import NOT_MEASURED
+from su3d_bench.reports.tables.model import NOT_MEASURED, Prose, Table, text_table
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A difference; every kind but ``better`` fails. ``reference`` and ``measured`` are fractions, or costs."""
+    """A difference; every kind but ``better`` fails. ``reference`` and ``measured`` are fractions, or costs.
+
+    ``group``: what many of a kind are told as. ``is_explained``: it follows from scenes of which others speak.
+    """
 
     kind: Literal["regression", "missing", "changed", "cost", "better"]
     where: str
@@ -23,6 +28,8 @@ class Finding:
     reference: float | None = None
     measured: float | None = None
     tolerance: float | None = None
+    group: str = ""
+    is_explained: bool = False
 
     @property
     def is_failure(self) -> bool:
@@ -30,13 +37,33 @@ class Finding:
 
 
 @dataclass(frozen=True)
+class Compared:
+    """A number beside the reference's: a fraction that may differ by ``tolerance``, or a cost that may be so many
+    ``times`` as large; ``where`` as in a finding."""
+
+    where: str
+    name: str
+    reference: float | None
+    measured: float | None
+    tolerance: float = 0.0
+    times: float | None = None
+
+    @property
+    def limit(self) -> str:
+        if self.times is not None:
+            return f"{self.times:g} times"
+        return f"{100 * self.tolerance:.4g} points" if self.tolerance else "equal"
+
+
+@dataclass(frozen=True)
 class Verdict:
-    """All findings of one run; ``n_compared`` headline values were looked at."""
+    """All findings of one run; ``n_compared`` headline values were looked at, and stand with costs in ``numbers``."""
 
     run: str
     findings: tuple[Finding, ...]
     n_compared: int
     remarks: tuple[str, ...]
+    numbers: tuple[Compared, ...] = ()
 
     @property
     def failures(self) -> tuple[Finding, ...]:
@@ -47,6 +74,9 @@ class Verdict:
         return not self.failures
 
 
+SCENES = "scenes"  # the group of those that the run lacks
+MOST_ALIKE = 4  # findings of a group that are told one by one
+MOST_NAMES = 8  # of a group that are named
 MAX_ROWS = 60  # a comment on a pull request may hold 65,536 characters
 
 
@@ -55,20 +85,44 @@ def headline(verdict: Verdict) -> str:
     n_better = len(verdict.findings) - len(verdict.failures)
     better = f", {n_better} better" if n_better else ""
     if verdict.is_passed:
-        return f"passed: {verdict.n_compared} headline values are as the reference has them{better}"
-    n_failed = len(verdict.failures)
-    return f"failed: {n_failed} difference{'s' if n_failed != 1 else ''} from the reference{better}"
+        values = counted(verdict.n_compared, "headline value")
+        are, them = ("is", "it") if verdict.n_compared == 1 else ("are", "them")
+        return f"passed: {values} {are} as the reference has {them}{better}"
+    n_explained = sum(finding.is_explained for finding in verdict.failures)
+    explained = f", {n_explained} of them because of other scenes" if n_explained else ""
+    return f"failed: {counted(len(verdict.failures), 'difference')} from the reference{explained}{better}"
+
+
+def plain_parts(verdict: Verdict) -> list[Table | Prose]:
+    """The headline, each number beside the reference's, then a line a finding or group of them, failures first."""
+    lines = plain_lines(verdict)
+    return [Prose((lines[0],)), *_numbers(verdict), *([Prose(tuple(lines[1:]))] if lines[1:] else [])]
+
+
+def _numbers(verdict: Verdict) -> list[Table | Prose]:
+    if not verdict.numbers:
+        return []
+    marks = {row.where: _mark(row) for row in verdict.findings}
+    rows = []
+    for one in verdict.numbers:
+        is_cost = one.times is not None
+        mark = marks.get(f"{one.where} of {one.name}" if is_cost else f"{one.where} / {one.name}", "")
+        pair = (one.reference, one.measured)
+        values = [_shown(value, pair, is_cost=is_cost) for value in pair]
+        rows.append([one.where, one.name, *values, one.limit, mark])
+    rows.insert(0, ["method", "number", "reference", "now", "limit", "verdict"])
+    return [text_table("check", rows if any(row[-1] for row in rows[1:]) else [row[:-1] for row in rows])]
 
 
 def plain_lines(verdict: Verdict) -> list[str]:
-    """The headline, then one line a finding, failures first."""
-    return [headline(verdict), *(f"{_mark(row)} {row.where}: {_sentence(row)}" for row in _ordered(verdict))]
+    """The headline, then one line a finding or group of them, failures first."""
+    return [headline(verdict), *(f"{_mark(row)} {row.where}: {_sentence(row)}" for row in _told(verdict))]
 
 
 def markdown(verdict: Verdict) -> str:
-    """A comment for a pull request: the headline, a table of findings, remarks."""
+    """A comment for a pull request: the headline, a table of findings, each number, remarks."""
     lines = [f"**su3d-bench {headline(verdict)}**", ""]
-    rows = _ordered(verdict)
+    rows = _told(verdict)
     if rows:
         lines += ["| | where | reference | now | |", "|---|---|---|---|---|"]
         for row in rows[:MAX_ROWS]:
@@ -77,6 +131,7 @@ def markdown(verdict: Verdict) -> str:
         if len(rows) > MAX_ROWS:
             lines.append(f"| | and {len(rows) - MAX_ROWS} more | | | |")
         lines.append("")
+    lines += [tables.markdown([part]) for part in _numbers(verdict)]
     return "\n".join([*lines, *(f"- {markup_free(remark)}" for remark in verdict.remarks)]).rstrip("\n") + "\n"
 
 
@@ -104,12 +159,46 @@ def github_lines(verdict: Verdict) -> list[str]:
     """Workflow commands: an error a failure, a notice an improvement; GitHub shows ten of a kind."""
     return [
         f"::{'error' if row.is_failure else 'notice'} title=su3d-bench::{_workflow(f'{row.where}: {_sentence(row)}')}"
-        for row in _ordered(verdict)
+        for row in _told(verdict)
     ] + [f"::notice title=su3d-bench::{_workflow(headline(verdict))}"]
 
 
 def _ordered(verdict: Verdict) -> Sequence[Finding]:
-    return sorted(verdict.findings, key=lambda finding: not finding.is_failure)
+    """Failures first, and of these first the scenes that are missing; what follows from other scenes last."""
+    return sorted(verdict.findings, key=lambda one: (one.is_explained, not one.is_failure, one.group != SCENES))
+
+
+def _told(verdict: Verdict) -> list[Finding]:
+    """``_ordered``, many of a group as one, and all that follows from other scenes as one."""
+    alike: dict[tuple[str, ...], list[Finding]] = {}
+    for n, one in enumerate(_ordered(verdict)):
+        key = ("explained",) if one.is_explained else (one.kind, one.group, one.text) if one.group else (str(n),)
+        alike.setdefault(key, []).append(one)
+    told: list[Finding] = []
+    for key, ones in alike.items():
+        if key == ("explained",):
+            kind = "missing" if any(one.is_failure for one in ones) else "better"
+            text = f"{counted(len(ones), 'difference')} follow from scenes that the run or the reference alone has"
+            told.append(Finding(kind, "over other scenes", text))
+        else:
+            told += ones if len(ones) <= MOST_ALIKE else [_as_one(ones)]
+    return told
+
+
+def _as_one(alike: Sequence[Finding]) -> Finding:
+    """One finding for several of a group and text: their names, or which of them differs most."""
+    first = alike[0]
+    if first.reference is None and first.measured is None:
+        names = some([one.where.rpartition(" / ")[2] for one in alike], MOST_NAMES)
+        return Finding(first.kind, first.group, f"{first.text} ({len(alike)}: {names})")
+
+    def distance(one: Finding) -> float:
+        return math.inf if one.reference is None or one.measured is None else abs(one.measured - one.reference)
+
+    far = max(alike, key=distance)
+    which = far.where.removeprefix(f"{first.group.rpartition(' / ')[0]} / ")
+    text = f"{len(alike)} values, each of which {first.text}; the farthest is {which}"
+    return replace(far, where=first.group, text=text)
 
 
 def _mark(finding: Finding) -> str:
@@ -125,13 +214,20 @@ def _sentence(finding: Finding) -> str:
 
 
 def _number(finding: Finding, value: float | None) -> str:
-    """Fractions in per cent, as many digits as tell two values apart; costs as ratios."""
+    pair = (finding.reference, finding.measured)
+    return _shown(value, pair, is_cost=finding.kind in ("cost", "missing"))
+
+
+def _shown(value: float | None, pair: tuple[float | None, float | None], *, is_cost: bool) -> str:
+    """Fractions in per cent, as many digits as tell the two of ``pair`` apart; costs as ratios."""
     if value is None:
         return NOT_MEASURED
-    if finding.kind in ("cost", "missing"):
+    if is_cost:
         return f"{value:.3g}"
-    other = finding.measured if value == finding.reference else finding.reference
-    digits = next((n for n in (1, 2, 4, 8) if other is None or f"{100 * value:.{n}f}" != f"{100 * other:.{n}f}"), 12)
+    one, other = pair
+    if one is None or other is None or one == other:
+        return f"{100 * value:.1f}"
+    digits = next((n for n in (1, 2, 4, 8) if f"{100 * one:.{n}f}" != f"{100 * other:.{n}f}"), 12)
     return f"{100 * value:.{digits}f}"
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from su3d_bench.core.errors import DataError
+from su3d_bench.core.errors import ScenesMissing
 from su3d_bench.core.files import file_text
 from su3d_bench.core.types import LabelSet
 
@@ -150,9 +150,9 @@ def find_label_file(root: Path, scene: str, folders: tuple[str, ...], prefix: st
     return None
 
 
-def no_render_tree(root: Path) -> DataError:
+def no_render_tree(root: Path) -> ScenesMissing:
     """What to say where no scene was found: where it was looked for and how to get data."""
-    return DataError(
+    return ScenesMissing(
         f"replica: no scene in {root} or in its folder Replica (a scene is a folder such as room0 with traj.txt and "
         f"results/); unpack {RENDER_URL} there, set SU3D_DATA to where it is, or make rooms in this layout: "
         f"su3d-bench datasets make rooms --layout replica --out {root}"

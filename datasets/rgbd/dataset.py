@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, field_validator
 
-from su3d_bench.core.errors import DataError, GroundTruthMissing, printable, suggest
+from su3d_bench.core.errors import DataError, GroundTruthMissing, ScenesMissing, printable, suggest
 from su3d_bench.core.types import (
     Float32Array,
     Float64Array,
@@ -87,7 +87,7 @@ class Rgbd:
         """The scenes of the option ``files`` in its order, then those below the data root."""
         scenes = tuple(self._descriptions())
         if not scenes:
-            raise DataError(
+            raise ScenesMissing(
                 f"rgbd: no scene in {self.root / 'rgbd'} (a scene is a folder with {FILE_NAME}); describe a folder of "
                 "images in such a file there, or name the file: --set rgbd.files=path/to/rgbd.toml"
             )

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from su3d_bench.core.errors import DataError
+from su3d_bench.core.errors import ScenesMissing
 from su3d_bench.core.files import file_text
 from su3d_bench.datasets.recordings.made_rooms import read_marker
 from su3d_bench.datasets.scannet.labels import FIRST_TABLE_NAME, TABLE_NAME
@@ -111,9 +111,9 @@ def split_scenes(split: str) -> tuple[str, ...]:
     return tuple(file_text(Path(__file__).parent / "splits" / f"scannetv2_{split}.txt").split())
 
 
-def no_scans(root: Path) -> DataError:
+def no_scans(root: Path) -> ScenesMissing:
     """What to say where no scan was found."""
-    return DataError(
+    return ScenesMissing(
         f"scannet: no scan in {root} or in its folders scans, scannet, scannet/scans (a scan is a folder such as "
         f"scene0000_00 with scene0000_00.sens or exported frames); ask for the data at {SCANNET_URL}, set SU3D_DATA to "
         f"where it is, or make rooms in this layout: su3d-bench datasets make rooms --layout scannet --out {root}"

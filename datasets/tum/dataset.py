@@ -23,7 +23,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
+from su3d_bench.core.errors import DataError, GroundTruthMissing, ScenesMissing, suggest
 from su3d_bench.core.types import Float64Array, Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo
 from su3d_bench.datasets.recordings.made_rooms import MARKER
 from su3d_bench.datasets.recordings.recorded_frames import (
@@ -89,7 +89,7 @@ class Tum:
         folders = [folder for place in self.places() if place.is_dir() for folder in sorted(place.iterdir())]
         sequences = [folder.name for folder in folders if _is_sequence(folder)]
         if not sequences:
-            raise DataError(
+            raise ScenesMissing(
                 f"tum: no sequence in {self.root} or in its folder tum (a sequence is a folder with rgb.txt and "
                 "depth.txt); unpack one there or set SU3D_DATA to where they are"
             )

@@ -7,7 +7,15 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, answer, answer_commands, answer_either, answer_json, remark, written
+from su3d_bench.cli.common import (
+    add_verb,
+    answer_commands,
+    answer_document,
+    answer_either,
+    answer_json,
+    remark,
+    written,
+)
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
@@ -94,13 +102,15 @@ def _check(arguments: argparse.Namespace) -> int:
 
     from su3d_bench.analysis.gate.check import check
     from su3d_bench.analysis.gate.reference import read_reference
-    from su3d_bench.reports.gate import github_lines, plain_lines
+    from su3d_bench.core.printing import terminal_width
+    from su3d_bench.reports.gate import github_lines, plain_parts
+    from su3d_bench.reports.tables.formats import plain
     from su3d_bench.runs.finished import read_run
 
     verdict = check(read_run(arguments.runs[0]), read_reference(arguments.against))
     _write(verdict, arguments)
     if not answer_json(arguments, {"passed": verdict.is_passed, **asdict(verdict)}):
-        answer(*plain_lines(verdict))
+        answer_document(plain(plain_parts(verdict), terminal_width()))
         in_workflow = os.environ.get("GITHUB_ACTIONS") == "true"
         if in_workflow if arguments.github is None else arguments.github:
             answer_commands(github_lines(verdict))

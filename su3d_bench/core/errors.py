@@ -94,6 +94,10 @@ class GroundTruthMissing(DataError):
     """The scene has no ground truth in the form that a protocol needs: it runs, unscored."""
 
 
+class ScenesMissing(DataError):
+    """Nothing of a dataset is where it is looked for."""
+
+
 class FramesMissing(DataError):
     """The scene has no frames here: its ground truth can be looked at, and nothing can be run on it."""
 

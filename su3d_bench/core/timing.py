@@ -168,24 +168,35 @@ def hardware_line() -> str:
     import psutil
 
     memory_gib = psutil.virtual_memory().total / 2**30
-    return f"{_processor()}, {os.cpu_count()} cores, {memory_gib:.0f} GiB, {platform.system()} {platform.machine()}"
+    name = processor_name()
+    return f"{name}, {os.cpu_count()} cores, {memory_gib:.0f} GiB, {platform.system()} {platform.machine()}"
+
+
+def processor_name() -> str:
+    """What the processor is called, with the numbers that tell those of one name apart: virtual ones have no other."""
+    numbers = {key: value for key, value in _first_processor() if key in ("cpu family", "model", "stepping")}
+    return f"{_processor()} ({', '.join(f'{key} {numbers[key]}' for key in numbers)})" if numbers else _processor()
 
 
 def processor_digest() -> str:
     """A digest of the processor's kind, its instruction sets included: numerical kernels are chosen by them."""
-    cpu_info = Path("/proc/cpuinfo")
+    fields = ("cpu family", "model", "stepping", "flags", "Features")
     kind = [platform.machine(), _processor()]
-    if cpu_info.is_file():
-        fields = ("cpu family", "model", "stepping", "flags", "Features")
-        first = cpu_info.read_text(errors="replace").split("\n\n")[0].splitlines()
-        kind += [line for line in first if line.partition(":")[0].strip() in fields]
+    kind += [line for line in _cpu_info() if line.partition(":")[0].strip() in fields]
     return hashlib.sha256("\n".join(kind).encode()).hexdigest()[:16]
 
 
 def _processor() -> str:
+    names = [value for key, value in _first_processor() if key == "model name"]
+    return names[0] if names else platform.processor() or "unknown processor"
+
+
+def _first_processor() -> list[tuple[str, str]]:
+    """What Linux says of the first processor, by key."""
+    pairs = [line.partition(":") for line in _cpu_info()]
+    return [(key.strip(), value.strip()) for key, _, value in pairs]
+
+
+def _cpu_info() -> list[str]:
     cpu_info = Path("/proc/cpuinfo")
-    if cpu_info.is_file():
-        for line in cpu_info.read_text(errors="replace").splitlines():
-            if line.startswith("model name"):
-                return line.partition(":")[2].strip()
-    return platform.processor() or "unknown processor"
+    return cpu_info.read_text(errors="replace").split("\n\n")[0].splitlines() if cpu_info.is_file() else []

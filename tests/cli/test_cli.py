@@ -205,6 +205,23 @@ def test_wrong_input_is_one_line_and_exit_code_2(
     assert answer.err.count("\n") == 1
 
 
+def test_datasets_that_are_not_here_have_a_line_each_and_more_when_they_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "none"))
+    assert main(["datasets", "list"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "  rooms/living0    1600 frames" in lines and max(map(len, lines[1:])) <= 80
+    start = lines.index("not here (su3d-bench datasets list NAME says how to get one):")
+    assert [line.split()[0] for line in lines[start + 1 :]] == ["replica", "scannet", "tum", "rgbd"]
+    assert lines[start + 1] == "  replica  looked for in Replica, replica, ."
+    assert main(["datasets", "list", "tum"]) == 0
+    named = capsys.readouterr().out
+    assert "tum: no sequence in " in named and "scannet" not in named
+    assert main(["datasets", "list", "tumm"]) == 2
+    assert "did you mean 'tum'? known: rooms, " in capsys.readouterr().err
+
+
 def test_a_misspelt_key_in_a_file_is_named_with_its_line(capsys: pytest.CaptureFixture[str]) -> None:
     Path("run.toml").write_text('scenes = ["rooms/living0"]\nmetod = ["opensu3d"]\n')
     assert main(["run", "--config", "run.toml"]) == 2

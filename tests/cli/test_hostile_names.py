@@ -57,7 +57,7 @@ CASES: dict[str, list[list[str]]] = {
     "ask": [["SCENE", f"Which {HOSTILE[:40]} is largest?", "--run", "RUN", "--method", "METHOD", "--names", "label"],
             ["SCENE", "What is the largest object?", "--run", "RUN", "--method", "METHOD"]],
     "refine": [["RUN", "--method", "METHOD"], ["RUN", "--method", "METHOD", "--json"]],
-    "datasets list": [[], ["--json"]],
+    "datasets list": [[], ["--json"], [HOSTILE]],
     "datasets check": [["tum/*", "--quick"], ["tum/*", "--quick", "--json"]],
     "datasets show": [["tum/*", "--out", "out/room.png"]],
     "datasets make": [["rooms", "--layout", "tum", "--scenes", HOSTILE, "--out", "out/made"]],

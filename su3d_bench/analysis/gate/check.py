@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import replace
 from typing import Literal
 
-from su3d_bench.analysis.gate.costs import busy_remark, cost_findings, why_no_cost
+from su3d_bench.analysis.gate.costs import busy_remark, cost_findings, cost_numbers, why_no_cost
 from su3d_bench.analysis.gate.reference import (
     SCHEMA,
     MethodResult,
     Reference,
+    Value,
     Values,
     differing_keys,
     settings_of,
     wrong_files,
 )
+from su3d_bench.core.english import plural
 from su3d_bench.core.errors import printable
-from su3d_bench.reports.gate import Finding, Verdict
+from su3d_bench.reports.gate import SCENES, Compared, Finding, Verdict
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.records import NumbersRecord
 
@@ -36,7 +39,9 @@ def check(run: FinishedRun, reference: Reference) -> Verdict:
     findings = [*_identity(run, reference)]
     findings += [Finding("changed", where, fault) for where, fault in wrong_files(run)]
     table = run.results
-    n_compared = 0
+    others = frozenset(reference.data_digests) ^ frozenset(run.scenes)
+    across = None if is_same_machine else reference.across_machines
+    numbers: list[Compared] = []
     for expected in reference.results:
         where = f"{printable(expected.method, 80)} / {printable(expected.protocol, 80)}"
         measured = table.get((expected.method, expected.protocol))
@@ -48,12 +53,18 @@ def check(run: FinishedRun, reference: Reference) -> Verdict:
         if measured.encoder_digest != expected.encoder_digest:
             findings.append(_changed(where, "encoder digest", expected.encoder_digest, measured.encoder_digest))
         findings += _unknown(where, "value", expected.metrics, measured.headline)
-        findings += compared(where, expected, measured.result, None if is_same_machine else reference.across_machines)
-        n_compared += len(expected.metrics)
+        findings += compared(where, expected, measured.result, across, others)
+        numbers += [
+            Compared(where, name, value.value, measured.result.metrics.get(name), tolerance=_tolerance(value, across))
+            for name, value in expected.metrics.items()
+        ]
     costs, limit = reference.costs, reference.cost_limit
     findings += cost_findings(run, costs, reference.calibration_ms, limit, is_judged=is_same_machine)
     findings += _costs_not_learnt(run, reference)
-    return Verdict(run.name, tuple(findings), n_compared, tuple(_remarks(run, reference)))
+    n_values = len(numbers)
+    if is_same_machine:
+        numbers += cost_numbers(run, costs, reference.calibration_ms, limit)
+    return Verdict(run.name, tuple(findings), n_values, tuple(_remarks(run, reference)), tuple(numbers))
 
 
 def _remarks(run: FinishedRun, reference: Reference) -> Iterator[str]:
@@ -86,18 +97,28 @@ def _costs_not_learnt(run: FinishedRun, reference: Reference) -> Iterator[Findin
             yield Finding("missing", f"{printable(method, 80)} / cost", text)
 
 
-def _unknown(where: str, kind: str, known: Collection[str], measured: Collection[str]) -> Iterator[Finding]:
+def _unknown(
+    where: str, kind: str, known: Collection[str], measured: Collection[str], explained: Collection[str] = ()
+) -> Iterator[Finding]:
     """A finding for whatever the run has and the reference has not."""
     for name in measured:
         if name not in known:
             text = f"the reference does not have this {kind}; learn a new one"
-            yield Finding("changed", f"{where} / {kind} {printable(name, 80)}", text)
+            here = f"{where} / {kind} {printable(name, 80)}"
+            yield Finding("changed", here, text, group=_several(where, kind), is_explained=name in explained)
+
+
+def _several(where: str, kind: str) -> str:
+    return f"{where} / {plural(kind)}"
 
 
 def _other_machine(run: FinishedRun, reference: Reference) -> str:
     here, there = (printable(hardware, 120) for hardware in (run.record.hardware, reference.hardware))
+    which = f"another processor ({here}) than the reference's ({there})"
+    if here == there:
+        which = f"another processor of the same name as the reference's ({here}), with other instruction sets"
     return (
-        f"another processor ({here}) than the reference's ({there}): headline values are compared within "
+        f"{which}: headline values are compared within "
         f"{100 * reference.across_machines:g} points, scenes and classes by presence, costs are not judged"
     )
 
@@ -111,7 +132,7 @@ def _identity(run: FinishedRun, reference: Reference) -> Iterator[Finding]:
         yield _changed("settings", key, before, now)
     for scene, digest in reference.data_digests.items():
         if scene not in run.scenes:
-            yield Finding("missing", printable(scene, 80), "the run does not have this scene")
+            yield Finding("missing", printable(scene, 80), "the run does not have this scene", group=SCENES)
         elif run.record.data_digests.get(scene) != digest:
             yield _changed(scene, "data digest", digest, run.record.data_digests.get(scene))
     yield from _unknown("run", "scene", reference.data_digests, run.scenes)
@@ -136,32 +157,50 @@ def _short(value: object) -> str:
     return f"{text[:12]}..." if len(text) > 40 and " " not in text else text
 
 
-def compared(where: str, expected: MethodResult, measured: NumbersRecord, across: float | None) -> Iterator[Finding]:
+def compared(
+    where: str,
+    expected: MethodResult,
+    measured: NumbersRecord,
+    across: float | None,
+    others: Collection[str] = (),
+) -> Iterator[Finding]:
     """Every number that differs, or that one of the two lacks.
 
-    ``across``: the tolerance of headline values of another machine; None on the same one.
+    ``across``: the tolerance of headline values of another machine; None on the same one. ``others``: scenes that the
+    run alone has, or the reference alone; what follows from them is marked as explained, for they are named themselves.
     """
-    yield from _compare(where, expected.metrics, measured.metrics, across)
-    yield from _unknown(where, "scene", expected.scenes, measured.per_scene)
+    are_others = expected.scenes.keys() != measured.per_scene.keys()
+
+    def over_scenes(findings: Iterable[Finding]) -> Iterator[Finding]:
+        return (replace(finding, is_explained=are_others) for finding in findings)
+
+    yield from over_scenes(_compare(where, expected.metrics, measured.metrics, across))
+    yield from _unknown(where, "scene", expected.scenes, measured.per_scene, others)
     if across is None:
-        yield from _unknown(where, "class", expected.classes, measured.per_class)
+        yield from over_scenes(_unknown(where, "class", expected.classes, measured.per_class))
     for kind, tables, rows in (
         ("scene", expected.scenes, measured.per_scene),
         ("class", expected.classes, measured.per_class),
     ):
+        group = _several(where, kind)
         for name, values in tables.items():
-            row = rows.get(name)
+            row, here = rows.get(name), f"{where} / {kind} {printable(name, 80)}"
+            is_explained = name in others if kind == "scene" else are_others
+            found: Iterable[Finding] = ()
             if row is None:
-                yield Finding(
-                    "missing", f"{where} / {kind} {printable(name, 80)}", f"the run does not have this {kind}"
-                )
+                found = [Finding("missing", here, f"the run does not have this {kind}")]
             elif across is None:
-                yield from _compare(f"{where} / {kind} {printable(name, 80)}", values, row, None)
+                found = _compare(here, values, row, None)
+            yield from (replace(finding, group=group, is_explained=is_explained) for finding in found)
+
+
+def _tolerance(value: Value, across: float | None) -> float:
+    return value.tolerance if across is None else max(across, value.tolerance)
 
 
 def _compare(where: str, expected: Values, row: Mapping[str, float | None], across: float | None) -> Iterator[Finding]:
     for name, value in expected.items():
-        tolerance = value.tolerance if across is None else max(across, value.tolerance)
+        tolerance = _tolerance(value, across)
         measured = row.get(name)
         if measured == value.value:
             continue

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.core.errors import counted, printable
 from su3d_bench.metrics.costs import MAP, WARM_UP, UpdateTimes
-from su3d_bench.reports.gate import Finding
+from su3d_bench.reports.gate import Compared, Finding
 from su3d_bench.runs.finished import FinishedRun, read_update_times
 
 # Where the calibrating work itself takes so many times the reference's on the same kind of processor, others used it,
@@ -119,6 +119,19 @@ def cost_findings(
         now = method_cost(run, method, np.inf if calibration_ms is None else MOST_EXCUSED * calibration_ms)
         if is_judged and now is not None:
             yield from _dearer(where, before, now, limit)
+
+
+def cost_numbers(
+    run: FinishedRun, costs: Mapping[str, Cost], calibration_ms: float | None, limit: float
+) -> Iterator[Compared]:
+    """Each part of the cost of every method that the run measured, beside the reference's."""
+    most = np.inf if calibration_ms is None else MOST_EXCUSED * calibration_ms
+    for method, before in costs.items():
+        now = method_cost(run, method, most) if method in run.methods else None
+        if now is not None:
+            where = f"{printable(method, 80)} / cost"
+            for part, shown in SHOWN.items():
+                yield Compared(where, shown, getattr(before, part), getattr(now, part), times=limit)
 
 
 def _dearer(where: str, before: Cost, now: Cost, limit: float) -> Iterator[Finding]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from su3d_bench.cli.common import add_group, add_settings, add_verb, answer_either
-from su3d_bench.core.errors import EXIT_DONE, DataError, Su3dError
+from su3d_bench.core.errors import EXIT_DONE, DataError, ScenesMissing, Su3dError
 
 LAYOUTS = ("native", "replica", "scannet", "scannet-python", "scannet-cpp", "tum")
 MAX_LISTED = 40
@@ -27,13 +27,14 @@ def add_parser(verbs: Any) -> None:
             "su3d-bench datasets make rooms --scenes rooms/living0 --layout replica --out data",
         ),
     )
-    add_verb(
+    parser = add_verb(
         actions,
         "list",
-        "List every dataset, where it is looked for, and the scenes that are there.",
-        ("su3d-bench datasets list", "su3d-bench datasets list --json"),
+        "List every dataset and the scenes that are there; of those named also how to get what is not.",
+        ("su3d-bench datasets list", "su3d-bench datasets list scannet --json"),
         call_list,
     )
+    parser.add_argument("names", nargs="*", metavar="DATASET", help="such as scannet (default: all)")
     _add_check(actions)
     _add_show(actions)
     _add_make(actions)
@@ -124,8 +125,11 @@ def call_list(arguments: argparse.Namespace) -> int:
     from su3d_bench.core import registry
 
     root = data_root()
-    rows = [_row(name, registry.load("dataset", name), root) for name in registry.names("dataset")]
-    lines = [f"data root: {root}", *(line for row in rows for line in _lines(row))]
+    named = list(dict.fromkeys(arguments.names))
+    rows = [_row(name, registry.load("dataset", name), root) for name in named or registry.names("dataset")]
+    absent = [] if named else [row for row in rows if row["is_missing"]]
+    lines = [f"data root: {root}", *(line for row in rows if row not in absent for line in _lines(row))]
+    lines += _absent_lines(absent, root)
     answer_either(arguments, {"data_root": str(root), "datasets": rows}, *lines)
     return EXIT_DONE
 
@@ -147,11 +151,12 @@ def _row(name: str, dataset_class: Any, root: Path) -> dict[str, Any]:
         "ground_truth": list(dataset_class.variants),
         "scenes": [],
         "error": None,
+        "is_missing": False,
     }
     try:
         row["scenes"] = [{"scene": f"{name}/{scene}", "status": _status(dataset, scene)} for scene in dataset.scenes()]
     except DataError as error:
-        row["error"] = str(error)
+        row |= {"error": str(error), "is_missing": isinstance(error, ScenesMissing)}
     return row
 
 
@@ -164,6 +169,19 @@ def _status(dataset: Any, scene: str) -> str:
         return f"{dataset.info(scene, 1).n_frames} frames"
     except Su3dError as error:
         return str(error)
+
+
+def _absent_lines(rows: Sequence[dict[str, Any]], root: Path) -> list[str]:
+    """A line each for datasets of which nothing is here, places below ``root`` as they are called there."""
+    if not rows:
+        return []
+    width = max(len(row["name"]) for row in rows)
+    lines = []
+    for row in rows:
+        places = [Path(place) for place in row["places"]]
+        shown = [str(place.relative_to(root) if place.is_relative_to(root) else place) for place in places]
+        lines.append(f"  {row['name']:<{width}}  looked for in {', '.join(shown) or '.'}")
+    return ["", "not here (su3d-bench datasets list NAME says how to get one):", *lines]
 
 
 def _lines(row: dict[str, Any]) -> list[str]:
