@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from su3d_bench.store.run_folder import RunFolder
 
 MOST_OF_A_BAR = 80  # characters of its words
+WIDE, BAR, NARROW_BAR = 100, 24, 12  # characters: a terminal with room for a long bar, and both bars
 MOST_OF_AN_ANSWER = 1 << 28  # bytes of a file that is looked at before it is replaced
 TABLE_FORMATS = ("text", "markdown", "latex", "csv", "html")
 
