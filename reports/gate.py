@@ -172,14 +172,15 @@ def _told(verdict: Verdict) -> list[Finding]:
     """``_ordered``, many of a group as one, and all that follows from other scenes as one."""
     alike: dict[tuple[str, ...], list[Finding]] = {}
     for n, one in enumerate(_ordered(verdict)):
-        key = ("explained",) if one.is_explained else (one.kind, one.group, one.text) if one.group else (str(n),)
+        alone = (one.kind, one.group, one.text) if one.group else (str(n),)
+        key: tuple[str, ...] = ("explained",) if one.is_explained else alone
         alike.setdefault(key, []).append(one)
     told: list[Finding] = []
     for key, ones in alike.items():
         if key == ("explained",):
-            kind = "missing" if any(one.is_failure for one in ones) else "better"
             text = f"{counted(len(ones), 'difference')} follow from scenes that the run or the reference alone has"
-            told.append(Finding(kind, "over other scenes", text))
+            is_failure = any(one.is_failure for one in ones)
+            told.append(Finding("missing" if is_failure else "better", "over other scenes", text))
         else:
             told += ones if len(ones) <= MOST_ALIKE else [_as_one(ones)]
     return told

@@ -97,5 +97,6 @@ class Parser(argparse.ArgumentParser):
         """As the base class, but a choice that is refused is told what there is."""
         if action.choices is not None and value not in action.choices:
             is_verb = isinstance(action, argparse._SubParsersAction)
-            name = action.dest if is_verb else (action.option_strings or [action.metavar or action.dest])[0]
+            names = [*action.option_strings, action.dest] if is_verb or action.option_strings else [action.metavar]
+            name = names[0] or action.dest
             self.error(f"unknown {name} '{value}'{suggest(str(value), map(str, action.choices))}")

@@ -170,6 +170,20 @@ def _answer_result(result: RunResult, arguments: argparse.Namespace) -> None:
     plan = result.plan
     place = plan.folder.path if plan.store is None else f"{plan.store} (its small files: {plan.folder.path})"
     remark(f"run folder: {place}", quiet=arguments.quiet)
+    if not arguments.quiet:
+        _say_what_is_next(result)
+
+
+def _say_what_is_next(result: RunResult) -> None:
+    from su3d_bench.runs.next_steps import next_commands, pictures_of
+
+    pictures = pictures_of(result)
+    if pictures:
+        others = result.plan.folder.path / "scenes" / "*" / "*" / pictures[0].parent.name
+        more = f" and {len(pictures) - 1} more in {others}" if len(pictures) > 1 else ""
+        remark(f"pictures: {pictures[0]}{more}")
+    for n, command in enumerate(next_commands(result)):
+        remark(f"{'     ' if n else 'next:'} {command}")
 
 
 def show_plan(plan: Plan, arguments: argparse.Namespace) -> int:
