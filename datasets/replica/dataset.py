@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing, suggest
+from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing, counted, suggest
 from su3d_bench.core.files import file_bytes
 from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh, OrientedBox, SceneInfo, Surface
 from su3d_bench.datasets.recordings.made_rooms import read_marker
@@ -108,7 +108,7 @@ class Replica:
                 n_poses = file_bytes(self._folder(scene) / "traj.txt").rstrip().count(b"\n") + 1
             except OSError:
                 return "traj.txt is missing"
-            frames = f"{n_poses} frames"
+            frames = counted(n_poses, "frame")
         try:
             truth = f"ground truth in {self._original(scene)}"
         except GroundTruthMissing as error:

@@ -19,7 +19,7 @@ from typing import Literal
 import numpy as np
 
 from su3d_bench.core.digests import digest_bytes, digest_file
-from su3d_bench.core.errors import DataError
+from su3d_bench.core.errors import DataError, counted
 from su3d_bench.core.files import opened
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.recordings.exported_frames import (
@@ -268,7 +268,7 @@ def describe_recording(folder: Path, scene: str, where: str, kind: SourceKind) -
         if form == "sens":
             with opened(path) as stream:
                 _, n_frames, _ = parse_header(stream.read(MAX_HEADER_BYTES), f"{where}: {path.name}")
-            return f"{n_frames} frames"
+            return counted(n_frames, "frame")
         if form == "cpp":
             return f"{read_info(path / INFO, where)[1]} exported frames"
         return f"{sum(name.endswith(TEXT) for name in os.listdir(path))} exported frames"

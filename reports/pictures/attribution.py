@@ -1,4 +1,4 @@
-"""The plot of an attribution: from the value as it is, a bar for what the mending of each kind of error adds."""
+"""The plot of an attribution: from the value as it is, a bar for what correcting each kind of error adds."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.reports.pictures.canvas import Canvas
-from su3d_bench.reports.tables.attribution import n_text
+from su3d_bench.reports.tables.attribution import LEFT, n_text
 from su3d_bench.reports.tables.model import signed
 
 PANEL_WIDTH, ROW_HEIGHT, PANEL_EXTRA = 4.6, 0.34, 1.25  # inches
@@ -47,7 +47,7 @@ def _bars(protocol: Mapping[str, Any], metric: str) -> list[Bar]:
         gain = cause["gains"][metric]
         bars.append((kind, gain or 0.0, "gain", f"{signed(gain)}  ({n_text(cause['n'], protocol['n_scored'])})"))
     bars += [
-        (name, protocol[name][metric] or 0.0, "left", signed(protocol[name][metric])) for name in ("overlap", "rest")
+        (shown, protocol[name][metric] or 0.0, "left", signed(protocol[name][metric])) for name, shown in LEFT.items()
     ]
     for stage, values in protocol["stages"].items():
         change = None if values[metric] is None else values[metric] - value
@@ -72,7 +72,7 @@ def _draw_panel(axes: Any, protocol: Mapping[str, Any], metric: str, *, has_name
     axes.set_ylim(len(bars) - 0.4, -0.6)
     axes.set_yticks(list(places), [name for name, *_ in bars] if has_names else [""] * len(bars), fontsize=9.5)
     axes.set_title(f"{protocol['protocol']}: {metric} {value:.1f}", fontsize=10.5, loc="left")
-    axes.set_xlabel("value with this alone mended", fontsize=8.5, color="#444444")
+    axes.set_xlabel("value with this alone corrected", fontsize=8.5, color="#444444")
     axes.tick_params(axis="y", length=0)
     axes.tick_params(axis="x", labelsize=8.5)
     for side in ("top", "right", "left"):

@@ -26,10 +26,14 @@ MEANINGS: dict[str, dict[str, str]] = {
 }
 REST: dict[str, str] = {
     "instance": "masks that fit badly; mask and label wrong at once",
-    "semantic": "classes that no mending of points reaches",
+    "semantic": "classes that no correction of points reaches",
 }
-SUM = "gains are in percentage points, each with one kind alone mended; the value, all gains, overlap and rest give 100"
-OVERLAP = "what all mendings give together beyond their sum"
+LEFT = {"overlap": "several together", "rest": "none of these"}  # what the two remainders are called
+SUM = (
+    "a gain is in percentage points, with this kind of error alone corrected; the value, all gains, 'several together' "
+    "and 'none of these' add up to 100"
+)
+OVERLAP = "correcting all of them, beyond the sum of the gains"
 STAGES: dict[str, str] = {
     "labels": "every mask named by the truth",
     "2D masks": "masks and names of each image from the truth",
@@ -37,7 +41,7 @@ STAGES: dict[str, str] = {
 
 
 def attribution_tables(attribution: Mapping[str, Any]) -> list[Table | Prose]:
-    """One table a protocol; gains are in percentage points, each for one kind of error mended alone."""
+    """One table a protocol; gains are in percentage points, each for one kind of error corrected alone."""
     return [
         Prose((f"{attribution['run']}: {attribution['method']}",)),
         *map(_protocol_table, attribution["protocols"]),
@@ -53,8 +57,8 @@ def _protocol_table(protocol: Mapping[str, Any]) -> Table:
     for kind, cause in protocol["causes"].items():
         gains = [signed(cause["gains"][name]) for name in names]
         rows.append([kind, n_text(cause["n"], n_scored), *gains, MEANINGS[protocol["kind"]][kind]])
-    rows.append(["overlap", "", *(signed(protocol["overlap"][name]) for name in names), OVERLAP])
-    rows.append(["rest", "", *(signed(protocol["rest"][name]) for name in names), REST[protocol["kind"]]])
+    rows.append([LEFT["overlap"], "", *(signed(protocol["overlap"][name]) for name in names), OVERLAP])
+    rows.append([LEFT["rest"], "", *(signed(protocol["rest"][name]) for name in names), REST[protocol["kind"]]])
     for stage, values in protocol["stages"].items():
         rows.append([f"with true {stage}", "", *(percent(values[name]) for name in names), STAGES[stage]])
     return text_table(protocol["protocol"], [header, *rows], heading=title)

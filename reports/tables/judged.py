@@ -270,7 +270,7 @@ def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
             f"set {scores['sheet_id']}{origin}; {judged}",
             *(printable(remark, 300) for remark in scores["remarks"]),
             *([f"{WHO_DID[scores['kind']]}{printable(scores['answered_by'], 200)}"] if scores["answered_by"] else []),
-            *([f"'cannot tell' is left out: at most {unclear} judgements of a number"] if unclear else []),
+            *([f"'cannot tell' is left out: at most {counted(unclear, 'judgement')} of a number"] if unclear else []),
             *([f"no answers from {', '.join(scores['silent'])}"] if scores["silent"] else []),
         ),
     )

@@ -55,6 +55,14 @@ def with_interval(value: float | None, interval: Sequence[float] | None) -> str:
     return f"{percent(value)} {bracketed(interval)}".rstrip()
 
 
+REFINED_LABELS = "label n: the name given while mapping; n': the name chosen afterwards from the instance's best views"
+
+
+def label_notes(names: Iterable[str]) -> list[str]:
+    """What the paper's marks in the names of metrics mean, where one has them."""
+    return [REFINED_LABELS] if any(name.endswith((" n", " n'")) for name in names) else []
+
+
 def is_count(metric: str) -> bool:
     """Whether a metric is a number of something and no share, by its name as in ``metrics.json``."""
     return metric.startswith("n_")

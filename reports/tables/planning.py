@@ -28,7 +28,8 @@ def plan_tables(plan: Mapping[str, Any]) -> list[Table | Prose]:
         "two-sided paired test at 5 %; at least 6, of which a sign-flip test can have a p below 0.05",
         f"[..] behind it: at the ends of the 95 % interval of the variance, which {len(plan['scenes'])} scenes leave "
         f"wide; {NOT_MEASURED}: no number of scenes up to 100,000, under so many seeds",
-        "SD: standard deviation of the difference B - A over scenes, over seeds, and of what is left, in points",
+        "SD: standard deviation of the difference B - A over scenes, over seeds, and of what is left; in percentage "
+        "points",
     ]
     if any(one["variance"] is None for metrics in plan["protocols"].values() for one in metrics.values()):
         notes.append("no SD: the difference is the same in every scene and run, or rests on a single scene")
@@ -42,7 +43,7 @@ def plan_tables(plan: Mapping[str, Any]) -> list[Table | Prose]:
 
 def _protocol_table(protocol: str, metrics: Mapping[str, Any], title: str) -> Table:
     asked = list(dict.fromkeys(need["points"] for plan in metrics.values() for need in plan["needs"]))
-    header = ["metric", "B - A", "SD of scenes", "of seeds", "of rest", "seeds"]
+    header = ["metric", "B - A", "SD of scenes", "of seeds", "of what is left", "seeds"]
     rows = [[*header, *(f"{points:g} {'point' if points == 1 else 'points'}" for points in asked)]]
     for name, plan in metrics.items():
         variance = plan["variance"]

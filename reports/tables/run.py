@@ -14,6 +14,7 @@ from su3d_bench.reports.tables.model import (
     Table,
     confidence_notes,
     few_scenes,
+    label_notes,
     percent,
     text_table,
     with_interval,
@@ -67,6 +68,7 @@ def _protocol_table(rows: Sequence[Mapping[str, Any]], metrics: Mapping[str, Any
     notes = [line for row in rows for line in _notes(row)]
     notes += confidence_notes({str(row["method"]): row.get("confidences") for row in rows})
     n_scenes = [row["result"]["n_scenes"] for row in rows if row["result"] and any(row["result"]["intervals"].values())]
+    notes += label_notes(names)
     notes += [line for line in (few_scenes(min(n_scenes, default=0)),) if line]
     return text_table(str(first["protocol"]), [header, *body], heading=title, notes=notes)
 

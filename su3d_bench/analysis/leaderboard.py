@@ -167,7 +167,7 @@ def _why_not(run: FinishedRun, protocol: str, failed: Sequence[str]) -> str | No
     if run.record.is_partial:
         return f"is partial: the first {run.limit} frames of each scene"
     if failed:
-        return f"is incomplete: {len(failed)} scenes failed"
+        return f"is incomplete: {counted(len(failed), 'scene')} failed"
     # A file of rules that somebody else's run names is not looked for.
     return None if protocol in protocol_names() else "its protocol is none of those installed here"
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from su3d_bench.analysis.sides import Side, refuse_unlike, rules_of
-from su3d_bench.core.errors import ConfigError, Su3dError, printable, reading, suggest
+from su3d_bench.core.errors import ConfigError, Su3dError, counted, printable, reading, suggest
 from su3d_bench.core.files import file_bytes
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.costs import UpdateTimes
@@ -134,7 +134,7 @@ def _who_judged(scores: Scores, cells: Sequence[ScoreCell]) -> str:
     n_people = len(scores.annotators)
     n_items = max(cell.n_items for cell in cells)
     of = "" if scores.n_judged == scores.n_items else f", {scores.n_judged} of the set's {scores.n_items} judged"
-    return f"judged by {n_people} {'person' if n_people == 1 else 'people'}, {n_items} items{of}"
+    return f"judged by {counted(n_people, 'person')}, {counted(n_items, 'item')}{of}"
 
 
 def _results_of(name: str, run: FinishedRun) -> list[Measured]:

@@ -14,7 +14,7 @@ def add_parser(verbs: Any) -> None:
     parser = add_verb(
         verbs,
         "attribute",
-        "Show where a run loses its points: the gain when each kind of error alone is mended.",
+        "Show where a run loses its points: the gain when each kind of error alone is corrected.",
         (
             "su3d-bench attribute runs/my-run --out errors.png",
             "su3d-bench attribute runs/my-run --protocols rooms-instance --oracle runs/my-oracle-run --json",

@@ -26,7 +26,12 @@ def add_parser(verbs: Any) -> None:
     )
     parser.add_argument("--methods", nargs=2, default=(), metavar=("A", "B"), help="whose (default: the only two)")
     parser.add_argument(
-        "--points", nargs="+", type=float, default=[1.0, 2.0, 5.0], metavar="N", help="per cent (default: 1 2 5)"
+        "--points",
+        nargs="+",
+        type=float,
+        default=[1.0, 2.0, 5.0],
+        metavar="N",
+        help="differences to be found, in percentage points (default: 1 2 5)",
     )
     parser.add_argument("--power", type=float, default=0.8, metavar="P", help="to find it (default: 0.8)")
     add_protocols(parser, "under these protocols alone (default: all that scored both)")

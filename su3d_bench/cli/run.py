@@ -17,7 +17,7 @@ from su3d_bench.cli.common import (
     formatted,
     remark,
 )
-from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE
+from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE, counted
 
 if TYPE_CHECKING:
     from su3d_bench.core.config import KeyPath, Settings
@@ -155,7 +155,7 @@ def carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
         return EXIT_DONE
     n_failed = len({scene for scene, _, _ in result.failures})
     log = plan.folder.job(*result.failures[0][:2]).log
-    remark(f"su3d-bench: incomplete: {n_failed} of {len(plan.jobs)} scenes failed; see {log}")
+    remark(f"su3d-bench: incomplete: {n_failed} of {counted(len(plan.jobs), 'scene')} failed; see {log}")
     return EXIT_INCOMPLETE
 
 
@@ -194,12 +194,14 @@ def show_plan(plan: Plan, arguments: argparse.Namespace) -> int:
     if answer_json(arguments, {"folder": str(plan.folder.path), "n_workers": plan.n_workers, "jobs": jobs}):
         return EXIT_DONE
     for row in rows:
-        state = "done already" if row.is_done else f"{row.n_updates} updates, about {row.seconds:.0f} s"
+        state = "done already" if row.is_done else f"{counted(row.n_updates, 'update')}, about {row.seconds:.0f} s"
         state = row.remark or state
         answer(f"{row.scene:<24} {row.method:<12} {state}")
     total = sum(row.seconds for row in rows if not row.is_done) / plan.n_workers
     source = "measured in earlier runs" if all(row.is_measured for row in rows) else "a rough guess"
-    answer(f"about {total / 60:.1f} minutes with {plan.n_workers} jobs ({source}); folder {plan.folder.path}")
+    answer(
+        f"about {total / 60:.1f} minutes with {counted(plan.n_workers, 'job')} ({source}); folder {plan.folder.path}"
+    )
     for job in plan.jobs[:1]:
         answer(f"protocols: {', '.join(job.protocols) or 'none'}; profile {job.profile}")
     return EXIT_DONE

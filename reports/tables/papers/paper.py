@@ -25,6 +25,7 @@ from su3d_bench.reports.tables.model import (
     confidence_notes,
     few_scenes,
     is_count,
+    label_notes,
     percent,
 )
 from su3d_bench.reports.tables.papers.published import Figure, PaperTable, figures_of
@@ -185,6 +186,7 @@ def protocol_table(measured: Sequence[Measured], shown: Shown, figures: Sequence
         rows=(*body, *reported),
         notes=(
             units(first, shown),
+            *label_notes(metrics),
             *run_notes(rows, labels),
             *([f"not scored under this protocol: {', '.join(left_out)}"] if left_out else []),
             *([why] if why else []),

@@ -114,7 +114,7 @@ def _frames_text(inspection: Inspection) -> str:
         return "cannot be counted"
     read = "all read" if inspection.n_read == inspection.n_frames else f"{inspection.n_read} read"
     size = "" if inspection.size is None else f", {inspection.size[0]}x{inspection.size[1]}"
-    files = f", {inspection.n_files} files" if inspection.n_files else ", made on demand"
+    files = f", {counted(inspection.n_files, 'file')}" if inspection.n_files else ", made on demand"
     return f"{inspection.n_frames} ({read}){size}{files}"
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.cli.common import add_group, add_settings, add_verb, answer_either
-from su3d_bench.core.errors import EXIT_DONE, DataError, ScenesMissing, Su3dError
+from su3d_bench.core.errors import EXIT_DONE, DataError, ScenesMissing, Su3dError, counted
 
 LAYOUTS = ("native", "replica", "scannet", "scannet-python", "scannet-cpp", "tum")
 MAX_LISTED = 40
@@ -166,7 +166,7 @@ def _status(dataset: Any, scene: str) -> str:
     try:
         if isinstance(dataset, HasStatus):
             return str(dataset.status(scene))
-        return f"{dataset.info(scene, 1).n_frames} frames"
+        return counted(dataset.info(scene, 1).n_frames, "frame")
     except Su3dError as error:
         return str(error)
 
