@@ -13,7 +13,8 @@ import numpy as np
 from su3d_bench.core.errors import printable
 from su3d_bench.core.types import Float64Array, Instances, UInt8Array
 from su3d_bench.reports.pictures.canvas import DARK, GREY, Canvas, drawable, hex_of, paper
-from su3d_bench.reports.pictures.maps import NO_INSTANCE, SQUARE_M, Cloud, Colour, instance_colours, map_cloud, thinned
+from su3d_bench.reports.pictures.colours import NO_INSTANCE, Colour, instance_colours
+from su3d_bench.reports.pictures.maps import SQUARE_M, Cloud, map_cloud, thinned
 from su3d_bench.reports.pictures.render import Camera, View, colour, project, render, room_bounds, view_cameras
 
 PANEL_WIDTH, PANEL_HEIGHT, MARGIN = 760, 640, 14

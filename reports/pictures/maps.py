@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import colorsys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import numpy as np
 
+from su3d_bench.core.errors import printable
 from su3d_bench.core.types import (
     DenseFeatures,
     Float32Array,
@@ -22,28 +22,37 @@ from su3d_bench.core.types import (
     UInt8Array,
 )
 from su3d_bench.numerics.geometry import voxel_coordinates
-from su3d_bench.reports.pictures.canvas import Canvas, hex_of
-from su3d_bench.reports.pictures.render import Camera, View, colour, render, room_bounds, view_cameras
+from su3d_bench.reports.pictures.canvas import DARK, GREY, Canvas, hex_of, paper
+from su3d_bench.reports.pictures.colours import (
+    NO_INSTANCE,
+    Colour,
+    class_colours,
+    heat_colours,
+    instance_colours,
+    scale_stops,
+)
+from su3d_bench.reports.pictures.items import OUTLINE, draw_outline
+from su3d_bench.reports.pictures.render import (
+    OVERSAMPLING,
+    Camera,
+    View,
+    colour,
+    render,
+    room_bounds,
+    view_cameras,
+)
 from su3d_bench.store.atomic import make_folder
 
 VIEW_WIDTH, VIEW_HEIGHT = 640, 560
 DRAWN_SPACING_M = 0.015  # one point a cell of this size is drawn
 SQUARE_M = 2.6 * DRAWN_SPACING_M  # no gaps in a surface whose points lie up to two cells apart
+LEGEND_STEP, COLUMN_WIDTH, MOST_COLUMNS = 22, 250, 10  # pixels; of names and their colours
+MOST_NAME = 26  # characters of a legend's name
+HEAT_WIDTH, BAR_HEIGHT = 290, 16  # of what stands beside a heat map
+MOST_RANKS = 20  # written at instances; more would hide what they name
+RANK_RADIUS, SMALL_PIXELS = 12, 2500  # a rank hides an instance of fewer pixels
 PALE = "#555555"
-NO_INSTANCE = (214, 214, 210)
-# Surfaces of the room stay pale, so that the things in it stand out.
-ROOM_SURFACES = {"wall": (226, 222, 214), "floor": (208, 203, 196), "ceiling": (236, 236, 232)}
-LEGEND_ROWS = 26
 VIEW_TITLES = ("from above", "from one corner", "from the other corner")
-# The most similar instance dark red, the least similar dark blue, as in the paper's heat maps.
-HEAT_STOPS = np.array(
-    [[0, 0, 128], [0, 80, 255], [90, 215, 190], [250, 190, 40], [230, 50, 10], [128, 0, 0]], np.float64
-)
-
-Colour = tuple[int, int, int]
-Scale = Literal["paper", "cividis"]
-SCALES: tuple[Scale, ...] = ("paper", "cividis")
-STEPS = 256
 
 
 @dataclass(frozen=True)
@@ -82,80 +91,99 @@ def draw_scene(prediction: Prediction, truth: GroundTruth | None, folder: Path, 
     classes = folder / "classes.png"
     truth_cloud = None if truth is None else thinned(Cloud(truth.points, truth_owner(truth)))
     truth_names = () if truth is None else truth.labels.names
-    used = _by_size(cloud, names) if truth_cloud is None else _by_size(truth_cloud, truth_names)
-    palette = class_colours([*used, *(name for name in _by_size(cloud, names) if name not in used)])
+    used = [] if truth_cloud is None else _by_size(truth_cloud, truth_names)
+    used += [name for name in _by_size(cloud, names) if name not in used]
+    palette = class_colours([*used, *names])
     rows = [Row("map", _paint(views, cloud, [palette[name] for name in names]))]
     if truth_cloud is not None:
         colours = [palette.get(name, NO_INSTANCE) for name in truth_names]
         rows.append(Row("ground truth", _paint(_views(truth_cloud, cameras), truth_cloud, colours)))
-    _write_picture(classes, f"{title}: classes", rows, palette)
+    _write_picture(classes, f"{title}: classes", rows, {name or "without a name": palette[name] for name in used})
     return [instances, classes]
 
 
 def draw_heat_map(instances: Instances, similarity: Float64Array, path: Path, title: str, top: Sequence[str]) -> None:
-    """Write the picture of a query: each instance in the colour of its similarity; ``top`` are lines of the legend."""
-    make_folder(path.parent)
-    cloud = thinned(map_cloud(instances))
-    colours = heat_colours(similarity)
-    pictures = _paint(_views(cloud, _cameras(cloud.points)), cloud, colours)
-    order = np.argsort(-similarity, kind="stable")[: len(top)]
-    _write_picture(path, title, [Row("", pictures)], {line: colours[k] for line, k in zip(top, order, strict=True)})
+    """Write the picture of a query: each instance in the colour of its similarity, the best one outlined.
 
-
-def heat_colours(similarity: Float64Array) -> list[Colour]:
-    """Dark blue for the least, dark red for the greatest of ``similarity``; all alike: the middle."""
-    if len(similarity) == 0:
-        return []
-    place = _places(similarity)
-    stops = np.linspace(0.0, 1.0, len(HEAT_STOPS))
-    channels = [np.rint(np.interp(place, stops, HEAT_STOPS[:, c])).astype(int) for c in range(3)]
-    return [(int(r), int(g), int(b)) for r, g, b in zip(*channels, strict=True)]
-
-
-def _places(similarity: Float64Array) -> Float64Array:
-    """Where each value lies between the least and the greatest of them; all alike: in the middle."""
-    low, high = float(similarity.min()), float(similarity.max())
-    return np.full(len(similarity), 0.5) if high == low else (similarity - low) / (high - low)
-
-
-def scale_stops(scale: Scale) -> UInt8Array:
-    """The colours (256, 3) of a scale, the least similar first."""
-    if scale == "cividis":  # Nunez, Anderton, Renslow 2018
-        from matplotlib import colormaps
-
-        colours: UInt8Array = (colormaps["cividis"](np.arange(STEPS), bytes=True))[:, :3].astype(np.uint8)
-        return colours
-    return np.array(heat_colours(np.linspace(0.0, 1.0, STEPS)), np.uint8)
-
-
-def similarity_colours(similarity: Float64Array, scale: Scale = "paper") -> UInt8Array:
-    """A colour (K, 3) a value, from the least to the greatest of them; all alike: the middle.
-
-    >>> similarity_colours(np.array([0.2, 0.1, 0.3]))[1:].tolist()
-    [[0, 0, 128], [128, 0, 0]]
+    ``top``: what is said of the most similar instances, the best first; their ranks stand at them.
     """
-    if len(similarity) == 0:
-        return np.zeros((0, 3), np.uint8)
-    colours: UInt8Array = scale_stops(scale)[np.rint(_places(similarity) * (STEPS - 1)).astype(np.int64)]
-    return colours
+    cloud = thinned(map_cloud(instances))
+    views = _views(cloud, _cameras(cloud.points))
+    order = np.argsort(-similarity, kind="stable")[: len(top)]
+    pictures = _paint(views, cloud, heat_colours(similarity))
+    seen = [_owners_seen(view, cloud) for view in views]
+    for picture, owners in zip(pictures, seen, strict=True):
+        for best in order[:1]:
+            draw_outline(picture, owners == best, 3)
+    header = 46
+    page = Canvas(3 * VIEW_WIDTH + HEAT_WIDTH, header + VIEW_HEIGHT)
+    page.text(14, 16, printable(title, 110), 14, fontweight="bold")
+    for axes, owners in zip(_place_views(page, header, Row("", pictures)), seen, strict=True):
+        _write_ranks(axes, owners, order[:MOST_RANKS])
+    _write_ranking(page, 3 * VIEW_WIDTH + 14, header, similarity, top)
+    page.write(path)
 
 
-def instance_colours(names: Sequence[str]) -> list[Colour]:
-    """One colour an instance, neighbours in the list far apart in hue; surfaces of the room pale."""
-    return [ROOM_SURFACES.get(name) or _distinct(k) for k, name in enumerate(names)]
+def _owners_seen(view: View, cloud: Cloud) -> Int32Array:
+    """Whose point each pixel (h, w) of the picture shows, -1 for nobody's."""
+    owners: Int32Array = np.append(cloud.owner, np.int32(-1))[view.point[::OVERSAMPLING, ::OVERSAMPLING]]
+    return owners
 
 
-def class_colours(names: Sequence[str]) -> dict[str, Colour]:
-    """Name -> colour in the order given, the first ones most distinct; surfaces of the room pale."""
-    things = [name for name in names if name not in ROOM_SURFACES]
-    return {name: ROOM_SURFACES[name] if name in ROOM_SURFACES else _distinct(things.index(name)) for name in names}
+def _write_ranks(axes: Any, owners: Int32Array, order: Int64Array) -> None:
+    """The rank of each instance that is seen, at its middle or beside it, where ranks before leave room."""
+    taken: list[Float64Array] = []
+    for rank, row in enumerate(order, start=1):
+        places = np.argwhere(owners == row)[:, ::-1]
+        if not len(places):
+            continue
+        middle = np.median(places, axis=0)
+        middle = places[np.argmin(((places - middle) ** 2).sum(axis=1))].astype(np.float64)  # of a ring no hole
+        at = _free_place(middle, taken, is_beside=len(places) < SMALL_PIXELS)
+        taken.append(at)
+        if not np.array_equal(at, middle):
+            axes.plot(*np.stack([middle, at]).T, color=DARK, linewidth=0.8)
+        shade = hex_of(OUTLINE) if rank == 1 else DARK
+        axes.text(*at, str(rank), fontsize=8.5, color=DARK, ha="center", va="center", fontweight="bold",
+                  bbox=paper(shade, 0.25, 0.92, linewidth=1.6 if rank == 1 else 0.6))  # fmt: skip
 
 
-def _distinct(k: int) -> Colour:
-    """The k-th of an endless list of colours: hues by the golden ratio, saturation and value in turns."""
-    saturation, value = ((0.72, 0.86), (0.55, 0.95), (0.85, 0.62))[(k // 8) % 3]
-    red, green, blue = colorsys.hsv_to_rgb((0.58 + k * 0.61803398875) % 1.0, saturation, value)
-    return round(255 * red), round(255 * green), round(255 * blue)
+def _free_place(wanted: Float64Array, taken: Sequence[Float64Array], *, is_beside: bool) -> Float64Array:
+    """The place nearest to the one ``wanted``, on rings around it, that is clear of those that are ``taken``.
+
+    ``is_beside``: not that place itself, which the rank would hide.
+    """
+    low, high = np.full(2, RANK_RADIUS), np.array([VIEW_WIDTH, VIEW_HEIGHT]) - RANK_RADIUS
+    for ring in range(2 if is_beside else 0, 14):
+        for turn in np.arange(0.0, 2 * np.pi, np.pi / (4 * max(1, ring))):
+            away = 1.5 * RANK_RADIUS * ring * np.array([np.cos(turn), -np.sin(turn)])
+            at = np.clip(wanted + away, low, high)
+            if all(np.abs(at - other).max() >= 2 * RANK_RADIUS for other in taken):
+                return at if ring else wanted
+    return wanted
+
+
+def _write_ranking(page: Canvas, left: float, top: float, similarity: Float64Array, lines: Sequence[str]) -> None:
+    """The scale of similarity with its least and greatest value, and the most similar instances below it."""
+    wide = HEAT_WIDTH - 40
+    page.text(left, top, "similarity to the text (cosine)", 10, colour=GREY)
+    if len(similarity):
+        low, high = float(similarity.min()), float(similarity.max())
+        is_one = high == low
+        colours = np.array(heat_colours(similarity[:1]), np.uint8) if is_one else scale_stops("paper")
+        page.axes(left, top + 22, wide, BAR_HEIGHT).imshow(colours[None], aspect="auto")
+        below = top + 26 + BAR_HEIGHT
+        page.text(left, below, f"{low:.3f}", 10)
+        if not is_one:
+            page.text(left + wide / 2, below, f"{(low + high) / 2:.3f}", 10, ha="center")
+            page.text(left + wide, below, f"{high:.3f}", 10, ha="right")
+    first = top + 80
+    room = int((VIEW_HEIGHT - 110) / LEGEND_STEP)
+    for k, line in enumerate(lines[:room]):
+        weight = "bold" if k == 0 else "normal"
+        page.text(left, first + LEGEND_STEP * k, printable(line, 36), 10, fontweight=weight)
+    note = f"and {len(lines) - room} more; " if len(lines) > room else ""
+    page.text(left, first + LEGEND_STEP * min(len(lines), room) + 8, f"{note}the best is outlined", 10, colour=GREY)
 
 
 def _names_of(prediction: Prediction) -> tuple[str, ...]:
@@ -225,20 +253,33 @@ def _by_size(cloud: Cloud, names: Sequence[str]) -> list[str]:
 
 
 def _write_picture(path: Path, title: str, rows: Sequence[Row], legend: Mapping[str, Colour]) -> None:
-    """Compose views and legend into a PNG; a legend that is too long ends with how many it leaves out."""
-    header, side = 46, 250 if legend else 0
-    page = Canvas(3 * VIEW_WIDTH + side, len(rows) * VIEW_HEIGHT + header)
-    page.text(14, 16, title, 14, fontweight="bold")
+    """Compose views and legend into a PNG; the legend has as many columns as it needs."""
+    header = 46
+    height = len(rows) * VIEW_HEIGHT + header
+    a_column = (height - header) // LEGEND_STEP
+    n_columns = min(MOST_COLUMNS, -(-len(legend) // a_column))
+    page = Canvas(3 * VIEW_WIDTH + n_columns * COLUMN_WIDTH, height)
+    page.text(14, 16, printable(title, 150), 14, fontweight="bold")
     for r, row in enumerate(rows):
-        for c, picture in enumerate(row.pictures):
-            axes = page.picture(c * VIEW_WIDTH, header + r * VIEW_HEIGHT, VIEW_WIDTH, VIEW_HEIGHT, picture)
-            label = f"{row.title} {VIEW_TITLES[c]}".strip()
-            axes.text(14, VIEW_HEIGHT - 14, label, fontsize=10, color=PALE, va="bottom")
-    left = 3 * VIEW_WIDTH
-    for k, (name, rgb) in enumerate(list(legend.items())[:LEGEND_ROWS]):
-        page.text(left + 8, header + 22 * k + 12, "\u25a0", 15, colour=hex_of(rgb), va="center")
-        page.text(left + 30, header + 22 * k + 12, name, 10, va="center")
-    if len(legend) > LEGEND_ROWS:
-        rest = f"and {len(legend) - LEGEND_ROWS} more"
-        page.text(left + 30, header + 22 * LEGEND_ROWS + 12, rest, 10, colour=PALE, va="center")
+        _place_views(page, header + r * VIEW_HEIGHT, row)
+    shown = list(legend.items())
+    most = n_columns * a_column
+    if len(shown) > most:
+        shown = [*shown[: most - 1], (f"and {len(shown) - most + 1} more", NO_INSTANCE)]
+    for k, (name, rgb) in enumerate(shown):
+        column, row_of = divmod(k, a_column)
+        left, middle = 3 * VIEW_WIDTH + column * COLUMN_WIDTH, header + LEGEND_STEP * row_of + 12
+        page.text(left + 8, middle, "\u25a0", 15, colour=hex_of(rgb), va="center")
+        page.text(left + 30, middle, printable(name, MOST_NAME), 10, va="center")
     page.write(path)
+
+
+def _place_views(page: Canvas, top: float, row: Row) -> list[Any]:
+    """The axes of the three views of a row, with their words."""
+    placed = []
+    for c, picture in enumerate(row.pictures):
+        axes = page.picture(c * VIEW_WIDTH, top, VIEW_WIDTH, VIEW_HEIGHT, picture)
+        label = f"{row.title} {VIEW_TITLES[c]}".strip()
+        axes.text(14, VIEW_HEIGHT - 14, label, fontsize=10, color=PALE, va="bottom")
+        placed.append(axes)
+    return placed

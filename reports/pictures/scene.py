@@ -11,22 +11,18 @@ import numpy as np
 from su3d_bench.core.errors import printable
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, UInt8Array
 from su3d_bench.reports.pictures.canvas import DARK, GREY, Canvas, hex_of, paper
-from su3d_bench.reports.pictures.maps import (
-    NO_INSTANCE,
-    Colour,
-    class_colours,
-    instance_colours,
-    thinned_rows,
-    truth_owner,
-)
+from su3d_bench.reports.pictures.colours import NO_INSTANCE, Colour, class_colours, instance_colours
+from su3d_bench.reports.pictures.maps import thinned_rows, truth_owner
 from su3d_bench.reports.pictures.render import OVERSAMPLING, Camera, colour, project, render, room_bounds, view_cameras
 from su3d_bench.reports.pictures.scene_look import SceneLook
 
 WIDTH = 1920
 MARGIN, HEADER, CAPTION = 16, 76, 26
-PANEL_WIDTH, PANEL_HEIGHT = 536, 500
-LEGEND_WIDTH = WIDTH - 3 * PANEL_WIDTH - 5 * MARGIN
-LEGEND_ROWS, LEGEND_STEP = 21, 22
+PANEL_WIDTH, PANEL_HEIGHT = (WIDTH - 4 * MARGIN) // 3, 520
+LEGEND_COLUMNS, LEGEND_STEP = 6, 21  # of classes, below the panels
+LEGEND_WIDTH = (WIDTH - 2 * MARGIN) // LEGEND_COLUMNS
+MOST_CLASSES = 600  # in the legend, thrice those of the largest label space
+REASON_LINES = 6
 FRAME_COLUMNS, SCALE_WIDTH = 6, 74
 FRAME_WIDTH = (WIDTH - 2 * MARGIN - SCALE_WIDTH) // FRAME_COLUMNS
 SEEN_WITHIN_M = 0.12  # a point of the truth has the colour of what a camera saw this near to it
@@ -51,7 +47,9 @@ class Panel:
 def draw_scene_picture(look: SceneLook, path: Path) -> None:
     """Write the picture of ``look`` as a PNG of ``WIDTH`` pixels."""
     frame_height = _frame_height(look)
-    height = HEADER + CAPTION + PANEL_HEIGHT + MARGIN + (2 * (CAPTION + frame_height) if look.shown else 0)
+    legend_top = HEADER + CAPTION + PANEL_HEIGHT + MARGIN
+    below = legend_top + _legend_height(look) + MARGIN
+    height = below + (2 * (CAPTION + frame_height) + MARGIN if look.shown else 0)
     page = Canvas(WIDTH, height)
     page.text(MARGIN, 14, _shortened(look.scene, 90), size=17, weight="bold")
     page.text(MARGIN, 46, facts_line(look), size=11, colour=GREY)
@@ -64,11 +62,11 @@ def draw_scene_picture(look: SceneLook, path: Path) -> None:
             if column == 0 and look.shown:
                 _draw_walk(axes, panel.camera, look.poses)
     if look.truth is not None:
-        _draw_legend(page, look.truth)
+        _draw_legend(page, look.truth, legend_top)
     else:
-        _draw_reason(page, look.no_truth)
+        _draw_reason(page, look.no_truth, legend_top)
     if look.shown:
-        _draw_frames(page, look, HEADER + CAPTION + PANEL_HEIGHT, frame_height)
+        _draw_frames(page, look, below, frame_height)
     page.write(path)
 
 
@@ -180,33 +178,41 @@ def _classes(truth: GroundTruth) -> list[tuple[str, int, int]]:
     return [(truth.labels.names[row], int(n_objects[row]), int(n_points[row])) for row in order]
 
 
-def _draw_legend(page: Canvas, truth: GroundTruth) -> None:
-    """The largest classes with their numbers of objects and points; the rest as a count."""
-    left, top = 3 * PANEL_WIDTH + 4 * MARGIN, HEADER + CAPTION
-    objects, points = left + LEGEND_WIDTH - 62, left + LEGEND_WIDTH
-    page.text(left, HEADER, "class", size=10, colour=GREY)
-    page.text(objects, HEADER, "objects", size=10, colour=GREY, ha="right")
-    page.text(points, HEADER, "points", size=10, colour=GREY, ha="right")
+def _legend_rows(n_classes: int) -> int:
+    return -(-min(n_classes, MOST_CLASSES) // LEGEND_COLUMNS)
+
+
+def _legend_height(look: SceneLook) -> int:
+    rows = REASON_LINES if look.truth is None else 1 + _legend_rows(len(_classes(look.truth)))
+    return LEGEND_STEP * rows
+
+
+def _draw_legend(page: Canvas, truth: GroundTruth, top: float) -> None:
+    """Every class with its numbers of objects and points, column after column, the largest first."""
     classes = _classes(truth)
+    n_rows = _legend_rows(len(classes))
     palette: dict[str, Colour] = class_colours([name for name, _, _ in classes])
-    for k, (name, n_objects, n_points) in enumerate(classes[:LEGEND_ROWS]):
-        y = top + LEGEND_STEP * k + LEGEND_STEP / 2
+    for k, (name, n_objects, n_points) in enumerate(classes[:MOST_CLASSES]):
+        column, row = divmod(k, n_rows)
+        left = MARGIN + column * LEGEND_WIDTH
+        objects, points = left + LEGEND_WIDTH - 84, left + LEGEND_WIDTH - 24
+        if row == 0:
+            page.text(left, top, "class", size=10, colour=GREY)
+            page.text(objects, top, "objects", size=10, colour=GREY, ha="right")
+            page.text(points, top, "points", size=10, colour=GREY, ha="right")
+        y = top + LEGEND_STEP * (row + 1.5)
         page.text(left, y, "\u25a0", size=15, colour=hex_of(palette[name]), va="center")
-        page.text(left + 23, y, _shortened(name, 15), size=10, va="center")
+        page.text(left + 23, y, _shortened(name, 21), size=10, va="center")
         page.text(objects, y, f"{n_objects}", size=10, va="center", ha="right")
         page.text(points, y, _thousands(n_points), size=10, va="center", ha="right")
-    if len(classes) > LEGEND_ROWS:
-        y = top + LEGEND_STEP * LEGEND_ROWS + LEGEND_STEP / 2
-        page.text(left + 23, y, f"and {len(classes) - LEGEND_ROWS} more classes", size=10, colour=GREY, va="center")
 
 
-def _draw_reason(page: Canvas, reason: str) -> None:
+def _draw_reason(page: Canvas, reason: str, top: float) -> None:
     import textwrap
 
-    left = 3 * PANEL_WIDTH + 4 * MARGIN
-    page.text(left, HEADER, "no ground truth", size=11)
-    for k, line in enumerate(textwrap.wrap(printable(reason), 29)[:LEGEND_ROWS]):
-        page.text(left, HEADER + CAPTION + 18 * k, line, size=9, colour=GREY)
+    page.text(MARGIN, top, "no ground truth", size=11)
+    for k, line in enumerate(textwrap.wrap(printable(reason), 190)[: REASON_LINES - 1]):
+        page.text(MARGIN, top + CAPTION + 18 * k, line, size=10, colour=GREY)
 
 
 def _draw_walk(axes: Any, camera: Camera, poses: Float64Array) -> None:

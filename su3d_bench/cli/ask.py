@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from su3d_bench.cli.common import (
     chat_client,
     file_name_of,
     remark,
+    remark_unseen,
 )
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, StoreError
 
@@ -84,14 +86,15 @@ def call(arguments: argparse.Namespace) -> int:
     if arguments.dry_run:
         return _estimate(scene, run, arguments)
     reply = _solve(scene, run, arguments)
+    if not arguments.json:
+        answer(reply.text)
+        for line in (*reply.notes, f"names: {note}"):
+            remark(line, quiet=arguments.quiet)
+        sys.stdout.flush()  # the picture takes longer than the answer
     picture = _draw(instances, scene, reply, job, arguments)
     value = {"scene": arguments.scene, "question": arguments.question} | reply.to_json()
-    if answer_json(arguments, value | {"names": note, "picture": None if picture is None else str(picture)}):
-        return EXIT_DONE
-    answer(reply.text)
-    for line in (*reply.notes, f"names: {note}"):
-        remark(line, quiet=arguments.quiet)
-    if picture is not None:
+    is_json = answer_json(arguments, value | {"names": note, "picture": None if picture is None else str(picture)})
+    if picture is not None and not is_json:
         remark(f"picture: {picture}", quiet=arguments.quiet)
     return EXIT_DONE
 
@@ -122,7 +125,9 @@ def _estimate(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) ->
 def _solve(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> Answer:
     import numpy as np
 
+    from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
     from su3d_bench.questions.reasoning.language_solver import LanguageSolver
+    from su3d_bench.questions.reasoning.named_objects import nearest_by
     from su3d_bench.questions.reasoning.solver import Solver
 
     if arguments.solver == "llm":
@@ -130,15 +135,18 @@ def _solve(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> An
     eye = None if arguments.eye is None else np.array(arguments.eye, np.float64)
     if eye is not None and not np.isfinite(eye).all():
         raise ConfigError(f"--eye {arguments.eye}: expected three finite numbers of metres")
-    return Solver(scene, eye, _nearest_name).answer(arguments.question)
+    unnamed: dict[str, None] = {}  # nouns by which the map calls nothing, each once
 
+    def nearest_name(noun: str, names: Sequence[str]) -> tuple[str, float]:
+        unnamed[noun] = None
+        return nearest_by(encoder)(noun, names)
 
-def _nearest_name(noun: str, names: Sequence[str]) -> tuple[str, float]:
-    """The embedded encoder's opinion, which is loaded for it only now."""
-    from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
-    from su3d_bench.questions.reasoning.named_objects import nearest_by
-
-    return nearest_by(EmbeddedEncoder())(noun, names)
+    encoder = EmbeddedEncoder()  # whose files are read only where a name is looked for
+    reply = Solver(scene, eye, nearest_name).answer(arguments.question)
+    asked = arguments.question.split()
+    for noun in unnamed or asked[: len(asked) == 1]:  # of one word there is no question, only a noun
+        remark_unseen(encoder, noun, quiet=arguments.quiet)
+    return reply
 
 
 def _draw(

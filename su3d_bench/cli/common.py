@@ -14,7 +14,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
 from su3d_bench.cli.parser import JSON, JsonFlag
-from su3d_bench.core.errors import EXIT_DONE, StoreError, counted, shown
+from su3d_bench.core.errors import EXIT_DONE, StoreError, counted, printable, shown
 from su3d_bench.core.files import file_text
 from su3d_bench.core.printing import Door, escaped_json, one_line, stream_behind, terminal_width
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from su3d_bench.reports.tables.model import Prose, Table
     from su3d_bench.store.run_folder import RunFolder
 
+MOST_UNSEEN = 8  # words that are named
 MOST_OF_A_BAR = 80  # characters of its words
 WIDE, BAR, NARROW_BAR = 100, 24, 12  # characters: a terminal with room for a long bar, and both bars
 MOST_OF_AN_ANSWER = 1 << 28  # bytes of a file that is looked at before it is replaced
@@ -279,6 +280,16 @@ def remark(text: str, *, quiet: bool = False) -> None:
     """Print a remark to stderr."""
     if not quiet:
         print(one_line(text), file=sys.stderr)
+
+
+def remark_unseen(encoder: object, text: str, *, quiet: bool) -> None:
+    """Say which words of ``text`` the encoder never saw, where it knows that."""
+    from su3d_bench.core.interfaces import KnowsItsWords
+
+    if isinstance(encoder, KnowsItsWords) and (words := encoder.unseen_words(text)):
+        named = ", ".join(f"'{printable(word, 40)}'" for word in words[:MOST_UNSEEN])
+        more = f" and {len(words) - MOST_UNSEEN} more" if len(words) > MOST_UNSEEN else ""
+        remark(f"encoder {encoder.name} never saw {named}{more}; what it makes of that is a guess", quiet=quiet)
 
 
 PREFIX = ("perception", "language")

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, add_whose_map, answer, answer_json, file_name_of, remark
+from su3d_bench.cli.common import add_verb, add_whose_map, answer, answer_json, file_name_of, remark, remark_unseen
 from su3d_bench.core.errors import ConfigError, PredictionError
 
 if TYPE_CHECKING:
@@ -36,30 +37,41 @@ def add_parser(verbs: Any) -> None:
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.core.types import DenseFeatures, Instances
     from su3d_bench.questions.retrieval import rank
-    from su3d_bench.reports.pictures.maps import draw_heat_map
     from su3d_bench.runs.finished import encoder_of, map_of_scene
 
+    if not arguments.text.strip():
+        raise ConfigError('the text is empty; say what to look for, such as: su3d-bench query rooms/living0 "a plant"')
     if arguments.top < 1:
         raise ConfigError(f"--top {arguments.top}: at least 1 instance must be listed")
     run, job, prediction = map_of_scene(arguments.scene, arguments.method, arguments.run)
     if not isinstance(prediction, Instances):
         what = "one feature a point and no instances" if isinstance(prediction, DenseFeatures) else "no instances"
         raise PredictionError(f"{job.prediction}: has {what}, so there is nothing to rank; choose another --method")
-    ranking = rank(prediction, arguments.text, encoder_of(run, arguments.device))
+    encoder = encoder_of(run, arguments.device)
+    ranking = rank(prediction, arguments.text, encoder)
     rows = _rows(prediction, ranking, arguments.top)
     picture = arguments.out or job.picture(f"query-{file_name_of(arguments.text, 'text')}.png")
-    lines = [f"{row['rank']}. {row['name']}  {row['similarity']:.3f}" for row in rows]
-    draw_heat_map(prediction, ranking.similarity, picture, f'{arguments.scene}: "{arguments.text}"', lines)
+    remark_unseen(encoder, arguments.text, quiet=arguments.quiet)
+    if not arguments.json:
+        wide = max([4, *(len(str(row["id"])) for row in rows)])
+        answer(f"{'rank':>4}  {'id':>{wide}}  {'similarity':>10}  {'centroid (m)':<22}  name")
+        for row in rows:
+            x, y, z = row["centroid"]
+            place = f"{x:7.2f}{y:7.2f}{z:7.2f}"
+            answer(f"{row['rank']:>4}  {row['id']:>{wide}}  {row['similarity']:>10.3f}  {place:<22}  {row['name']}")
+        sys.stdout.flush()  # the picture takes longer than the answer
+    _draw(prediction, ranking, rows, picture, f'{arguments.scene}: "{arguments.text}"')
     value = {"scene": arguments.scene, "text": arguments.text, "picture": str(picture), "ranking": rows}
-    if answer_json(arguments, value):
-        return 0
-    answer(f"{'rank':>4}  {'id':>4}  {'similarity':>10}  {'centroid (m)':<22}  name")
-    for row in rows:
-        x, y, z = row["centroid"]
-        place = f"{x:7.2f}{y:7.2f}{z:7.2f}"
-        answer(f"{row['rank']:>4}  {row['id']:>4}  {row['similarity']:>10.3f}  {place:<22}  {row['name']}")
-    remark(f"heat map: {picture}", quiet=arguments.quiet)
+    if not answer_json(arguments, value):
+        remark(f"heat map: {picture}", quiet=arguments.quiet)
     return 0
+
+
+def _draw(instances: Instances, ranking: Ranking, rows: list[dict[str, Any]], picture: Path, title: str) -> None:
+    from su3d_bench.reports.pictures.maps import draw_heat_map
+
+    lines = [f"{row['rank']}. {row['name']}  {row['similarity']:.3f}" for row in rows]
+    draw_heat_map(instances, ranking.similarity, picture, title, lines)
 
 
 def _rows(instances: Instances, ranking: Ranking, top: int) -> list[dict[str, Any]]:

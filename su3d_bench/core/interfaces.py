@@ -424,6 +424,17 @@ class KnowsRelativeTexts(Protocol):
     def relative_remark(self) -> str: ...
 
 
+@runtime_checkable
+class KnowsItsWords(Protocol):
+    """An encoder that was trained on a vocabulary that is known."""
+
+    name: str
+
+    def unseen_words(self, text: str) -> tuple[str, ...]:
+        """The words of a text that stood in none that it was trained on."""
+        ...
+
+
 class Segmenter(Protocol):
     name: str
     digest: str

@@ -87,10 +87,34 @@ def llm(server: ChatServer, *more: str) -> list[str]:
 def test_a_question_is_answered_with_ids_and_a_picture(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["ask", SCENE, "Which sink is closer to bed?"]) == 0
     said = capsys.readouterr()
-    assert said.out == "sink #30 is closest to bed #10: 1.79 m; sink #20 2.77 m\n"
+    assert said.out == "sink #30 is closest to bed #10: 1.79 m between centres; sink #20 2.77 m\n"
     picture = job.pictures / "ask-which-sink-is-closer-to-bed.png"
     assert f"picture: {picture}" in said.err
     assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_answer_stands_before_the_picture_is_drawn(
+    job: JobFolder, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before: list[str] = []
+    monkeypatch.setattr(reasoning_picture, "draw_reasoning", lambda *words: before.append(capsys.readouterr().out))
+    assert main(["ask", SCENE, "How many sinks are there?"]) == 0
+    assert before == ["2: sink #20, sink #30\n"]
+    assert capsys.readouterr().err.startswith("picture: ")
+
+
+def test_a_misspelt_noun_gets_a_suggestion_and_a_word_that_nobody_saw_is_named(
+    job: JobFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["ask", SCENE, "Which sink is closer to the baed?"]) == 0
+    said = capsys.readouterr()
+    assert said.out == "I cannot settle this: the map has no 'baed'; did you mean 'bed'?\n"
+    assert "never saw 'baed'" in said.err
+    assert main(["ask", SCENE, "How many benches are there?"]) == 0
+    said = capsys.readouterr()  # a thing that is known and not there is no slip of the pen
+    assert (said.out, "never saw" in said.err) == ("0: the map has no 'benches'\n", False)
+    assert main(["ask", SCENE, "xqzzy"]) == 0
+    assert "never saw 'xqzzy'" in capsys.readouterr().err
 
 
 def test_json_tells_everything(job: JobFolder, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -333,7 +357,7 @@ def test_nothing_is_written_through_a_link_in_place_of_a_jobs_folder(
     before = {path: path.read_bytes() for path in elsewhere.rglob("*") if path.is_file()}
     for words in (["refine", "runs/made"], ["ask", SCENE, "Where is the bed?"]):
         assert main(words) == 2
-        assert capsys.readouterr().err == (
+        assert capsys.readouterr().err.endswith(
             f"su3d-bench: {job.path}: is a link, and a run writes into folders of its own alone; remove it\n"
         )
     assert {path: path.read_bytes() for path in elsewhere.rglob("*") if path.is_file()} == before

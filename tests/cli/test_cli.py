@@ -16,6 +16,7 @@ from places import SCENES
 from su3d_bench.cli.common import file_name_of, file_name_of_scene
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.core.errors import EXIT_INTERNAL
+from su3d_bench.reports.pictures import maps
 from su3d_bench.reports.tables.formats import FORMATS
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
@@ -188,6 +189,7 @@ def test_a_protocol_shows_every_rule(capsys: pytest.CaptureFixture[str]) -> None
             ["query", f"{PAINTED}/a", "x"],
             f"no run in runs/ holds {PAINTED}/a by opensu3d; run: su3d-bench run --scenes",
         ),
+        (["query", "rooms/living0", "  "], "the text is empty; say what to look for"),
         (["query", "rooms/living0", "x", "--top", "0"], "--top 0: at least 1 instance must be listed"),
         (
             ["query", "rooms/living0", "x", "--run", "r"],
@@ -320,10 +322,14 @@ def test_a_query_ranks_the_map_and_draws_it(
     assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a"]) == 0
     capsys.readouterr()
     words = ["query", "painted/a", "a red sofa", "--method", "collector"]
+    before, draw = [], maps.draw_heat_map
+    monkeypatch.setattr(maps, "draw_heat_map", lambda *a: before.append(capsys.readouterr().out) or draw(*a))
     assert main(words) == 0
+    (ranking_first,) = before
     answer = capsys.readouterr()
-    assert answer.out.splitlines()[1].split()[0] == "1"
-    assert answer.out.splitlines()[1].endswith("  sofa")
+    assert answer.out == ""  # the ranking stood before the picture was drawn
+    assert ranking_first.splitlines()[1].split()[0] == "1"
+    assert ranking_first.splitlines()[1].endswith("  sofa")
     picture = answer.err.removeprefix("heat map: ").strip()
     assert picture.endswith("collector/pictures/query-a-red-sofa.png")
     assert Path(picture).read_bytes().startswith(b"\x89PNG")

@@ -19,7 +19,18 @@ from su3d_bench.cli.main import build_parser, main
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import GroundTruth, LabelSet
 from su3d_bench.datasets.replica.dataset import Replica
-from su3d_bench.reports.pictures.scene import WIDTH, draw_scene_picture, facts_line
+from su3d_bench.reports.pictures.canvas import Canvas
+from su3d_bench.reports.pictures.colours import class_colours
+from su3d_bench.reports.pictures.scene import (
+    CAPTION,
+    HEADER,
+    MARGIN,
+    PANEL_HEIGHT,
+    PANEL_WIDTH,
+    WIDTH,
+    draw_scene_picture,
+    facts_line,
+)
 from su3d_bench.reports.pictures.scene_look import CAMERAS, SceneLook, look_at
 
 
@@ -79,7 +90,7 @@ def test_the_picture_shows_frames_classes_and_walk(whole: Path, tmp_path: Path) 
     draw_scene_picture(look_at(Replica(whole), "room0"), tmp_path / "new" / "room0.png")
     picture = pixels(tmp_path / "new" / "room0.png")
     height, width = picture.shape[:2]
-    assert width == WIDTH and 900 < height < 1300
+    assert width == WIDTH and 900 < height < 1400
     assert n_near(picture, (0xD6, 0x24, 0x6E)) > 300  # the walk
     assert n_near(picture, (0x1A, 0x98, 0x50)) > 30  # its start
     assert sum(n_near(picture, rgb) > 1000 for rgb in COLOURS) >= 4  # the frames
@@ -101,7 +112,27 @@ def test_nothing_reaches_over_the_margins(whole: Path, tmp_path: Path) -> None:
         picture = pixels(tmp_path / name)
         assert (picture[:, :10] > 240).all() and (picture[:, -10:] > 240).all() and (picture[:8] > 240).all()
         # The gaps between the three views are empty from the views' top to their bottom.
-        assert all((picture[110:590, 16 + k * 552 - 14 : 16 + k * 552 - 2] > 240).all() for k in (1, 2, 3))
+        step = PANEL_WIDTH + MARGIN
+        rows = slice(HEADER + CAPTION, HEADER + CAPTION + PANEL_HEIGHT)
+        assert all((picture[rows, k * step + 2 : k * step + 14] > 240).all() for k in (1, 2, 3))
+
+
+def test_every_class_is_in_the_legend_in_the_colour_that_it_has_in_a_map(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    look = look_at(Replica(whole), "room0")
+    assert look.truth is not None
+    names = ("book", "lamp", *(f"rare {k}" for k in range(58)))
+    rows = np.arange(len(look.truth.points), dtype=np.int32) % 60 + 1
+    truth = replace(look.truth, semantic=rows, instance=rows, labels=LabelSet("x", tuple(range(1, 61)), names))
+    written: list[str] = []
+    write = Canvas.text
+    monkeypatch.setattr(
+        Canvas, "text", lambda page, x, y, text, *a, **b: written.append(text) or write(page, x, y, text, *a, **b)
+    )
+    draw_scene_picture(replace(look, truth=truth), tmp_path / "a.png")
+    assert set(names) <= set(written) and not any("more" in text for text in written)
+    assert n_near(pixels(tmp_path / "a.png"), class_colours(["book"])["book"]) > 50  # in the panel by class
 
 
 def test_the_same_scene_gives_the_same_bytes(whole: Path, tmp_path: Path) -> None:

@@ -97,7 +97,7 @@ def test_a_distance_is_that_of_the_centroids(solver: Solver) -> None:
 def test_an_answer_names_what_it_was_held_against(solver: Solver) -> None:
     found = solver.answer("Which sink is closer to bed?")
     assert found.reference_ids == (1,)
-    assert found.text.startswith("sink #9 is closest to bed #1: 3.59 m; sink #10 5.32 m")
+    assert found.text.startswith("sink #9 is closest to bed #1: 3.59 m between centres; sink #10 5.32 m")
     assert solver.answer("What is on the shelf?").reference_ids == (11,)
 
 
@@ -158,7 +158,7 @@ def test_close_calls_are_said() -> None:
     )
     found = Solver(scene).answer("Which chair is closer to the bed?")
     assert found.object_ids == (1,)
-    assert found.notes == ("a close call: chair #2 is 1.01 m away",)
+    assert found.notes == ("a close call: chair #2 is 1.01 m away, between centres",)
 
 
 def test_an_empty_map_settles_presence_and_number_only() -> None:

@@ -1,20 +1,23 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from su3d_bench.core.types import DenseFeatures, Float32Array, GroundTruth, Instances, LabelSet, Partition
-from su3d_bench.reports.pictures.maps import (
+from su3d_bench.metrics.protocols.files import class_names
+from su3d_bench.reports.pictures.canvas import Canvas
+from su3d_bench.reports.pictures.colours import (
     NO_INSTANCE,
     ROOM_SURFACES,
     class_colours,
-    draw_heat_map,
-    draw_scene,
     heat_colours,
     instance_colours,
 )
+from su3d_bench.reports.pictures.items import OUTLINE
+from su3d_bench.reports.pictures.maps import draw_heat_map, draw_scene
 from su3d_bench.reports.pictures.render import BACKGROUND, Camera, colour, render, room_bounds, view_cameras
 
 
@@ -111,6 +114,47 @@ def test_names_have_one_colour_and_surfaces_of_the_room_are_pale() -> None:
     assert NO_INSTANCE not in many.values()
 
 
+def test_a_class_has_one_colour_whatever_else_is_in_the_picture() -> None:
+    known = [name for name in class_names() if name not in ROOM_SURFACES]
+    palette = class_colours(known)
+    assert len(set(palette.values())) == len(known) > 200
+    for name in ("book", "lamp", "no class table has this"):
+        assert class_colours([name])[name] == class_colours(["chair", name, "sofa"])[name]
+    assert class_colours(["book", "lamp"]).items() <= palette.items()
+
+
+def written(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The words that are written on pages from here on."""
+    texts: list[str] = []
+    write = Canvas.text
+
+    def text(page: Canvas, x: float, y: float, words: str, *more: Any, **style: Any) -> None:
+        texts.append(words)
+        write(page, x, y, words, *more, **style)
+
+    monkeypatch.setattr(Canvas, "text", text)
+    return texts
+
+
+def many_plates(n: int) -> Instances:
+    cloud = plate(0.0)
+    rows = np.array_split(np.arange(len(cloud)), n)
+    return Instances.of(cloud, rows, names=tuple(f"thing {k}" for k in range(n)), ids=list(range(n)))
+
+
+@pytest.mark.parametrize("with_truth", [False, True])
+def test_every_class_is_in_the_legend(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, with_truth: bool) -> None:
+    texts = written(monkeypatch)
+    cloud = plate(0.0)
+    rows = (np.arange(len(cloud)) % 60 + 1).astype(np.int32)
+    labels = LabelSet("x", tuple(range(1, 61)), tuple(f"true {k}" for k in range(60)))
+    truth = GroundTruth(cloud, rows, rows, labels, "mesh-vertices", "test") if with_truth else None
+    draw_scene(many_plates(70), truth, tmp_path, "x")
+    assert {f"thing {k}" for k in range(70)} <= set(texts)
+    assert not with_truth or set(labels.names) <= set(texts)
+    assert not any("more" in text for text in texts)
+
+
 def test_predictions_without_instances_or_names_draw_what_they_can(tmp_path: Path) -> None:
     points = plate(0.0)
     dense = DenseFeatures(points, np.zeros((len(points), 4), np.float16))
@@ -135,3 +179,24 @@ def test_a_heat_map_is_a_picture_even_of_an_empty_legend(tmp_path: Path, n: int)
     lines = [f"{k + 1}. thing" for k in range(n)]
     draw_heat_map(two_plates(), np.array([0.1, 0.9]), tmp_path / "q" / "heat.png", "query", lines)
     assert (tmp_path / "q" / "heat.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_heat_map_has_a_scale_ranks_at_the_instances_and_the_best_outlined(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from matplotlib.axes import Axes
+    from matplotlib.image import imread
+
+    texts, ranks = written(monkeypatch), []
+    write = Axes.text
+    monkeypatch.setattr(
+        Axes, "text", lambda axes, x, y, words, **style: ranks.append(words) or write(axes, x, y, words, **style)
+    )
+    draw_heat_map(
+        two_plates(), np.array([0.125, 0.875]), tmp_path / "heat.png", "query", ["1. lamp 0.875", "2. rug 0.125"]
+    )
+    assert {"0.125", "0.500", "0.875", "1. lamp 0.875", "2. rug 0.125"} <= set(texts)
+    assert "\u25a0" not in texts  # no swatches, which say nothing that the scale does not
+    assert {rank: ranks.count(rank) for rank in ("1", "2")} == {"1": 3, "2": 3}  # in each of the views
+    picture = np.rint(imread(tmp_path / "heat.png")[..., :3] * 255).astype(int)
+    assert (np.abs(picture - OUTLINE).sum(-1) < 12).sum() > 300

@@ -23,6 +23,7 @@ from su3d_bench.metrics.questions.truths import RefinedNames
 from su3d_bench.questions.files.files import figure_texts
 from su3d_bench.questions.model import new_question
 from su3d_bench.questions.reasoning.asking import built_in
+from su3d_bench.reports.pictures.colours import SCALES, scale_stops, similarity_colours
 from su3d_bench.reports.pictures.items import (
     ItemParts,
     Panel,
@@ -33,7 +34,6 @@ from su3d_bench.reports.pictures.items import (
     seen_in,
     zoomed,
 )
-from su3d_bench.reports.pictures.maps import SCALES, scale_stops, similarity_colours
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.executors.local import run_processes

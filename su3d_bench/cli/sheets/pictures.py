@@ -43,8 +43,8 @@ def add_parser(actions: Any) -> None:
 
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.questions.files.files import figure_texts
+    from su3d_bench.reports.pictures.colours import scale_stops
     from su3d_bench.reports.pictures.figures import draw_grid
-    from su3d_bench.reports.pictures.maps import scale_stops
     from su3d_bench.runs.finished import read_run
     from su3d_bench.sheets.making.figures import Figures
     from su3d_bench.sheets.making.run_source import RunSource

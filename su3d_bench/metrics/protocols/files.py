@@ -6,6 +6,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,13 @@ _ABSENT = re.compile(r"no (\w+)")
 def protocol_names() -> list[str]:
     """The names of the built-in protocols."""
     return sorted(path.stem for path in RULES.glob("*.toml") if not path.name.startswith(_TABLE_PREFIX))
+
+
+@cache
+def class_names() -> tuple[str, ...]:
+    """Every name of the class tables, each once, those of the smaller tables first."""
+    tables = [_read_toml(path)["classes"] for path in sorted(RULES.glob(f"{_TABLE_PREFIX}*.toml"))]
+    return tuple(dict.fromkeys(str(row[1]) for table in sorted(tables, key=len) for row in table))
 
 
 def rules_files(name: str) -> tuple[Path, ...]:

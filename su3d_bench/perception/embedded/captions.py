@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import TypeVar
 
 import numpy as np
@@ -17,12 +18,15 @@ from su3d_bench.perception.embedded.lexicon import (
     AFFORDANCES,
     COLOUR_WORDS,
     GROUPS,
+    MATERIALS,
     RELATION_WORDS,
     ROOM_NAMES,
     SIZE_WORDS,
     SURFACES,
     SYNONYMS,
 )
+from su3d_bench.perception.embedded.naming import COLOURS, vocabulary
+from su3d_bench.perception.embedded.text import words
 
 Word = TypeVar("Word")
 Generator = np.random.Generator
@@ -87,6 +91,17 @@ class Caption:
 def class_words(class_name: str) -> tuple[str, ...]:
     """Every name of a class, its own first: "tv screen", "tv", "television", ..."""
     return (class_name.replace("-", " "), *SYNONYMS.get(class_name, ()))
+
+
+@cache
+def trained_words() -> frozenset[str]:
+    """Every word that a caption may hold, as the tokenizer reads it."""
+    names = (*vocabulary(), *SURFACES, *SYNONYMS)
+    told = [*CLASS_TEMPLATES, *ANYTHING, *(word for name in names for word in class_words(name)), *GROUPS, *AFFORDANCES]
+    told += ["room", *(name for name, _ in COLOURS), *MATERIALS]
+    for table in (ROOM_NAMES, COLOUR_WORDS, SIZE_WORDS, RELATION_WORDS):
+        told += [word for spellings in table.values() for word in spellings]
+    return frozenset(word for text in told for word in words(text))
 
 
 def class_caption(class_name: str, random: Generator) -> Caption:

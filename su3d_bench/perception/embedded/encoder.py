@@ -17,7 +17,7 @@ from su3d_bench.core.devices import require
 from su3d_bench.core.errors import ModelMissing
 from su3d_bench.core.files import file_bytes
 from su3d_bench.core.types import Float32Array, UInt8Array
-from su3d_bench.perception.embedded.text import TOKENIZER_VERSION, token_ids
+from su3d_bench.perception.embedded.text import TOKENIZER_VERSION, token_ids, unknown_words
 from su3d_bench.perception.models.encoders.image_transform import check_image
 from su3d_bench.perception.models.onnx.session import open_session
 
@@ -126,6 +126,12 @@ class EmbeddedEncoder:
         for row, ids in enumerate(token_ids(texts)):
             features[row] = self._text_tower.run(None, {"ids": ids[None]})[0][0]
         return features
+
+    def unseen_words(self, text: str) -> tuple[str, ...]:
+        """The words of ``text`` that stood in none of the training's captions, of which only spellings are known."""
+        from su3d_bench.perception.embedded.captions import trained_words
+
+        return unknown_words(text, trained_words())
 
     @cached_property
     def _image_tower(self) -> Any:

@@ -23,3 +23,4 @@ AFFORDANCES = _words("uses")  # a phrase and every class of which it is true
 ROOM_NAMES = _words("rooms")
 COLOUR_WORDS, SIZE_WORDS, RELATION_WORDS = map(_words, ("colours", "sizes", "relations"))
 SURFACES = frozenset(_TABLE["surfaces"])  # what nearly everything stands on; captions prefer another neighbour
+MATERIALS = tuple(_TABLE["materials"])

@@ -7,7 +7,7 @@ hashed rows of its 4-grams, by which spellings that were never trained lean on t
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -25,6 +25,7 @@ TOKENIZER_VERSION = "1"
 
 _ARTICLES = frozenset({"a", "an", "the"})
 _NOT_PLURAL = ("ss", "us", "is", "as")
+_EDGES = ".,;:!?()[]{}<>/\\\"'\u201c\u201d\u2018\u2019-\u2013\u2014"  # around a word, and no part of it
 _WORD = re.compile(r"[a-z0-9]+")
 
 
@@ -38,6 +39,18 @@ def words(text: str) -> tuple[str, ...]:
     """
     parts = _WORD.findall(text.lower().replace("'", "").replace("’", ""))
     return tuple(singular(word) for word in parts if word not in _ARTICLES)[:N_WORDS]
+
+
+def unknown_words(text: str, known: Collection[str]) -> tuple[str, ...]:
+    """What of ``text`` is none of the ``known`` words, as it is written, each once; all of it where nothing is a word.
+
+    >>> unknown_words("the Xqzzy on a shelf", {"on", "shelf"}), unknown_words("??", {"on"})
+    (('Xqzzy',), ('??',))
+    """
+    parts = [part.strip(_EDGES) for part in text.split()]
+    read = {part: words(part) for part in parts if part and part.lower() not in _ARTICLES}
+    found = tuple(part for part, own in read.items() if not own or any(word not in known for word in own))
+    return found if read else (text.strip(),)
 
 
 def singular(word: str) -> str:

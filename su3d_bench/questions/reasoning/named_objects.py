@@ -12,6 +12,7 @@ from functools import cache
 import numpy as np
 
 from su3d_bench.core.english import words
+from su3d_bench.core.errors import suggest
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.perception.embedded.lexicon import GROUPS, SYNONYMS
 from su3d_bench.perception.embedded.naming import vocabulary
@@ -68,6 +69,17 @@ def meant_by(noun: str, scene: SceneMap, nearest: NearestName | None = None) -> 
     if noun_words in _class_of_words():
         return Meant(())  # a word that is known, for a thing that is not there
     return _by_encoder(noun, scene, nearest)
+
+
+def meant_instead(noun: str, scene: SceneMap) -> str:
+    """A clause ``; did you mean 'x'?`` for a noun that nobody knows and that is spelt nearly as a thing of the map."""
+    noun_words = words(noun)
+    if not noun_words or {noun_words, noun_words[-1:]} & (_class_of_words().keys() | groups().keys()):
+        return ""
+    names = {thing.name for thing in scene.objects if thing.name}
+    own = {_class_of_words().get(words(name)) for name in names}
+    names |= {other for name in own if name is not None for other in SYNONYMS.get(name, ())}
+    return suggest(noun, sorted(names)) or suggest(noun_words[-1], sorted(names))
 
 
 @cache

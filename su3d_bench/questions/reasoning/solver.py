@@ -13,7 +13,7 @@ import numpy as np
 from su3d_bench.core.types import Float64Array
 from su3d_bench.numerics.relations import NEAR_M, is_left_of
 from su3d_bench.questions.reasoning.answers import Answer, unsettled
-from su3d_bench.questions.reasoning.named_objects import Meant, NearestName, meant_by
+from su3d_bench.questions.reasoning.named_objects import Meant, NearestName, meant_by, meant_instead
 from su3d_bench.questions.reasoning.question_words import ANYTHING, Phrase, Question, Relation, Size, read_question
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap, is_room_surface
 
@@ -76,7 +76,7 @@ class Solver:
         meant: Meant = meant_by(phrase.head, self._scene, self._nearest)
         self._notes += meant.notes
         if not meant.objects:
-            raise _Unsettled(f"the map has no '{phrase.head}'")
+            raise _Unsettled(self._has_no(phrase.head))
         if phrase.relation is None:
             return meant.objects, ()
         others = [self._some(other) for other in phrase.others]
@@ -92,8 +92,11 @@ class Solver:
     def _some(self, phrase: Phrase) -> Objects:
         objects, _ = self._objects(phrase)
         if not objects:
-            raise _Unsettled(f"the map has no '{_shown(phrase)}'")
+            raise _Unsettled(self._has_no(_shown(phrase)))
         return objects
+
+    def _has_no(self, noun: str) -> str:
+        return f"the map has no '{noun}'{meant_instead(noun, self._scene)}"
 
     def _witnesses(self, thing: MapObject, relation: Relation, others: Sequence[Objects]) -> Objects:
         """Objects to which ``thing`` stands in ``relation``."""
@@ -146,10 +149,10 @@ class Solver:
         if len(ranked) == 1:
             self._notes.append(f"there is one '{_shown(question.subject)}' only")
         elif abs(ranked[1][0] - distance_m) < CLOSE_CALL_M:
-            self._notes.append(f"a close call: {ranked[1][1].shown} is {ranked[1][0]:.2f} m away")
+            self._notes.append(f"a close call: {ranked[1][1].shown} is {ranked[1][0]:.2f} m away, between centres")
         rest = "".join(f"; {thing.shown} {away_m:.2f} m" for away_m, thing, _ in ranked[1:4])
         end = "farthest from" if question.farthest else "closest to"
-        text = f"{best.shown} is {end} {reference.shown}: {distance_m:.2f} m{rest}"
+        text = f"{best.shown} is {end} {reference.shown}: {distance_m:.2f} m between centres{rest}"
         return text, (best,), (reference,), None
 
     def _option(self, option: Phrase, subject: Phrase) -> Objects:
@@ -169,7 +172,7 @@ class Solver:
         b_m, b, _ = _nearest_pair(self._some(question.options[0]), references)
         is_so = a_m > b_m if question.farthest else a_m < b_m
         self._note_several(references, question.other)
-        text = f"{_yes(is_so)}: {a.shown} is {a_m:.2f} m from {reference.shown}, {b.shown} {b_m:.2f} m"
+        text = f"{_yes(is_so)}: {a.shown} is {a_m:.2f} m from {reference.shown}, {b.shown} {b_m:.2f} m, between centres"
         return text, (a, b), (reference,), is_so
 
     def _distance(self, question: Question) -> _Solved:
@@ -180,17 +183,17 @@ class Solver:
             raise _Unsettled(f"'{_shown(question.subject)}' and '{_shown(question.other)}' are one thing in the map")
         self._note_several(first, question.subject)
         self._note_several(second, question.other)
-        return f"{distance_m:.2f} m between the centroids of {a.shown} and {b.shown}", (a, b), (), distance_m
+        return f"{distance_m:.2f} m between the centres of {a.shown} and {b.shown}", (a, b), (), distance_m
 
     def _count(self, question: Question) -> _Solved:
         things, held = self._found_or_none(question.subject)
-        text = f"{len(things)}: {_listed(things)}" if things else f"0: the map has no '{_shown(question.subject)}'"
+        text = f"{len(things)}: {_listed(things)}" if things else f"0: {self._has_no(_shown(question.subject))}"
         return text, things, held, len(things)
 
     def _exists(self, question: Question) -> _Solved:
         things, held = self._found_or_none(question.subject)
         if not things:
-            return f"no: the map has no '{_shown(question.subject)}'", (), (), False
+            return f"no: {self._has_no(_shown(question.subject))}", (), (), False
         return f"yes: {_listed(things)}", things, held, True
 
     def _found_or_none(self, phrase: Phrase) -> tuple[Objects, Objects]:
@@ -214,7 +217,7 @@ class Solver:
             things = tuple(thing for thing in things if any(self._scene.holds("near", thing, other) for other in held))
             self._notes.append(f"no farther than {NEAR_M:g} m from it")
         if not things:
-            return f"nothing: the map has no '{_shown(question.subject)}'", (), (), None
+            return f"nothing: {self._has_no(_shown(question.subject))}", (), (), None
         return _listed(things), things, held, None
 
     def _size(self, question: Question) -> _Solved:
@@ -230,7 +233,7 @@ class Solver:
     def _where(self, question: Question) -> _Solved:
         things, held = self._objects(question.subject)
         if not things:
-            raise _Unsettled(f"the map has no '{_shown(question.subject)}'")
+            raise _Unsettled(self._has_no(_shown(question.subject)))
         places = [f"{thing.shown} at ({', '.join(f'{value:.2f}' for value in thing.centroid)}) m" for thing in things]
         more = f" and {len(things) - MOST_LISTED} more" if len(things) > MOST_LISTED else ""
         return "; ".join(places[:MOST_LISTED]) + more, things, held, None

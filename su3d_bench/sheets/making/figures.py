@@ -14,10 +14,10 @@ from su3d_bench.core.types import Float64Array, Frame, Instances, UInt8Array
 from su3d_bench.metrics.questions.score import labels_n
 from su3d_bench.questions.reasoning.asking import built_in
 from su3d_bench.questions.retrieval import rank_all
+from su3d_bench.reports.pictures.colours import ROOM_SURFACES, Scale, class_colours, similarity_colours
 from su3d_bench.reports.pictures.figures import Cell, GridRow
 from su3d_bench.reports.pictures.items import Tag, seen_in
 from su3d_bench.reports.pictures.map_views import DrawnMap, MapView, drawn_map, pale
-from su3d_bench.reports.pictures.maps import ROOM_SURFACES, Scale, class_colours, similarity_colours
 from su3d_bench.sheets.making.drawing import ANSWER_COLOUR, OTHER_COLOUR, tags_of
 from su3d_bench.sheets.making.run_source import RunSource
 

@@ -7,8 +7,22 @@ import doctest
 import numpy as np
 import pytest
 
+from su3d_bench.datasets.rooms.classes import COLOURS, MATERIALS
+from su3d_bench.perception.embedded import lexicon
 from su3d_bench.perception.embedded import text as embedded_text
-from su3d_bench.perception.embedded.text import N_IDS, N_ROWS, N_WORDS, PADDING, fnv1a, token_ids, words
+from su3d_bench.perception.embedded.captions import CropTruth, Neighbour, draw, draw_caption, trained_words
+from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
+from su3d_bench.perception.embedded.naming import vocabulary
+from su3d_bench.perception.embedded.text import (
+    N_IDS,
+    N_ROWS,
+    N_WORDS,
+    PADDING,
+    fnv1a,
+    token_ids,
+    unknown_words,
+    words,
+)
 
 
 def test_examples_in_docstrings_run() -> None:
@@ -36,6 +50,30 @@ def test_spellings_of_one_thing_have_the_same_ids(one: str, other: str) -> None:
 def test_different_texts_have_different_ids(one: str, other: str) -> None:
     ids = token_ids([one, other])
     assert not np.array_equal(ids[0], ids[1])
+
+
+def test_words_that_no_caption_holds_are_named() -> None:
+    encoder = EmbeddedEncoder()
+    captions = ["A couch on the wooden table", "bowl next to a lamp in scene", "something to type with", "tv-screens"]
+    assert [encoder.unseen_words(text) for text in captions] == [()] * 4
+    assert encoder.unseen_words('"Xqzzy", plant; xqzzy') == ("Xqzzy", "xqzzy")
+    assert encoder.unseen_words("\u6905\u5b50") == ("\u6905\u5b50",)
+    assert encoder.unseen_words("the") == ("the",)  # nothing that it reads
+
+
+def test_the_words_for_materials_are_those_of_the_rooms() -> None:
+    assert lexicon.MATERIALS == MATERIALS
+
+
+def test_training_draws_no_caption_of_a_word_that_would_be_named() -> None:
+    random = np.random.default_rng(0)
+    names = [*vocabulary(), "wall", "floor", "ceiling"]
+    for k in range(2000):
+        relation, room = draw([*lexicon.RELATION_WORDS], random), draw([*lexicon.ROOM_NAMES], random)
+        neighbour = Neighbour(relation, draw(names, random), draw(COLOURS, random))
+        looks = draw(COLOURS, random), draw(MATERIALS, random), draw([*lexicon.SIZE_WORDS], random)
+        crop = CropTruth(names[k % len(names)], *looks, (neighbour,), room)
+        assert unknown_words(draw_caption(crop, random).text, trained_words()) == ()
 
 
 def test_ids_have_the_documented_shape_and_range() -> None:
