@@ -1,4 +1,4 @@
-"""The picture of one item of an annotation sheet, to be judged in two seconds: photograph, zoom, map and place.
+"""The picture of one item of an annotation sheet, to be judged in two seconds: photograph, zoom, room and place.
 
 Composed with Pillow: a sheet has hundreds of pictures, and a plotting library takes half a second for each.
 """
@@ -24,7 +24,7 @@ PHOTO_WIDTH, ZOOM_WIDTH = 560, 370
 TOP_HEIGHT, LOW_HEIGHT = 420, 320
 TITLE_SIZE, TITLE_LINE, MOST_TITLE_LINES = 25, 33, 3
 MOST_TAGS, MOST_TAG_TEXT, TAG_LINE = 8, 28, 19
-OUTLINE, HALO = (255, 64, 200), (255, 255, 255)  # a pink that neither heat scale has, on white
+OUTLINE, HALO = (255, 64, 200), (255, 255, 255)  # a pink that no heat scale has, on white
 INK, GREY, PAPER, PANEL = (26, 26, 26), (96, 96, 96), (255, 255, 255), (244, 244, 242)
 ROOM_COLUMNS, ROOM_GAP = 3, 6  # photographs of the room side by side, pixels between them
 ZOOM_GROWTH = 1.7  # sides of the part that is shown, as a multiple of those of the object
@@ -60,7 +60,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class ItemParts:
-    """What stands in the picture of an item; ``heat_scale`` (256, 3) are the colours of its legend, None for none.
+    """What stands in the picture of an item.
 
     ``title``: lines at the top, the first one large. ``photo`` is None where there is no object to be seen, and then
     ``room`` are photographs of the room.
@@ -68,9 +68,8 @@ class ItemParts:
 
     title: tuple[str, ...]
     photo: Panel | None
-    map_view: Panel
+    room_view: Panel
     place: Panel
-    heat_scale: UInt8Array | None = None
     room: tuple[UInt8Array, ...] = ()
 
 
@@ -91,10 +90,8 @@ def compose(parts: ItemParts) -> UInt8Array:
         _place(page, draw, zoomed(parts.photo), (right, top), (ZOOM_WIDTH, TOP_HEIGHT))
     else:
         _place_room(page, draw, parts.room, top)
-    _place(page, draw, parts.map_view, (MARGIN, low), (PHOTO_WIDTH, LOW_HEIGHT))
+    _place(page, draw, parts.room_view, (MARGIN, low), (PHOTO_WIDTH, LOW_HEIGHT))
     _place(page, draw, parts.place, (right, low), (ZOOM_WIDTH, LOW_HEIGHT))
-    if parts.heat_scale is not None:
-        _draw_scale(page, draw, parts.heat_scale, (MARGIN + 8, low + CAPTION + LOW_HEIGHT - 26))
     return np.asarray(page, np.uint8).copy()
 
 
@@ -237,18 +234,6 @@ def draw_tags(draw: Any, tags: tuple[Tag, ...], at: tuple[int, int], size: tuple
         box = draw.textbbox(place, text, font=font(13, False))
         draw.rectangle((box[0] - 3, box[1] - 2, box[2] + 3, box[3] + 2), fill=PAPER, outline=tag.colour)
         write_line(draw, place, text, 13, tag.colour)
-
-
-def _draw_scale(page: Any, draw: Any, scale: UInt8Array, at: tuple[int, int]) -> None:
-    """The legend of a heat map."""
-    from PIL import Image
-
-    bar = np.repeat(scale[None, ::2], 10, axis=0)
-    words, wide = "less similar", 88
-    draw.rectangle((at[0] - 4, at[1] - 4, at[0] + 2 * wide + bar.shape[1] + 20, at[1] + 20), fill=PAPER)
-    write_line(draw, (at[0], at[1]), words, 13, INK)
-    page.paste(Image.fromarray(bar), (at[0] + wide, at[1] + 4))
-    write_line(draw, (at[0] + wide + bar.shape[1] + 8, at[1]), "more similar", 13, INK)
 
 
 def _title_lines(title: tuple[str, ...]) -> list[tuple[str, int]]:

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from su3d_bench.core.types import BoolArray, Float64Array, Instances, Int32Array, Int64Array, UInt8Array
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Instances, Int32Array, Int64Array, UInt8Array
 from su3d_bench.reports.pictures.colours import NO_INSTANCE
 from su3d_bench.reports.pictures.maps import SQUARE_M, map_cloud, thinned_rows
 from su3d_bench.reports.pictures.render import (
@@ -75,12 +75,11 @@ class DrawnMap:
         return members
 
     def view(self, camera: Camera) -> MapView:
-        view = render(self.instances.points[self.rows], SQUARE_M, camera)
-        return MapView(camera, view, _filled_part(view, camera.width / camera.height))
+        return view_of(self.instances.points[self.rows], camera)
 
     def cameras(self, width: int, height: int) -> tuple[Camera, Camera, Camera]:
         """From above and from two opposite corners, for views of the shape of this size and at least as large."""
-        return view_cameras(room_bounds(self.instances.points), round(RENDERED * width), round(RENDERED * height))
+        return cameras_of(self.instances.points, width, height)
 
     def paint(self, view: MapView, colours: UInt8Array) -> UInt8Array:
         """The picture of a view, instance k in ``colours[k]``."""
@@ -90,6 +89,17 @@ class DrawnMap:
     def paint_points(self, view: MapView, colours: UInt8Array) -> UInt8Array:
         """The picture of a view, each drawn point in a colour (N, 3) of its own."""
         return colour(view.shown, colours)
+
+
+def view_of(points: Float32Array, camera: Camera) -> MapView:
+    """What a camera shows of ``points``."""
+    view = render(points, SQUARE_M, camera)
+    return MapView(camera, view, _filled_part(view, camera.width / camera.height))
+
+
+def cameras_of(points: Float32Array, width: int, height: int) -> tuple[Camera, Camera, Camera]:
+    """From above and from two opposite corners, for views of the shape of this size and at least as large."""
+    return view_cameras(room_bounds(points), round(RENDERED * width), round(RENDERED * height))
 
 
 def drawn_map(instances: Instances) -> DrawnMap:

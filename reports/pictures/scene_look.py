@@ -9,7 +9,7 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing
 from su3d_bench.core.interfaces import Dataset, SaysUp
-from su3d_bench.core.types import Float32Array, Float64Array, Frame, GroundTruth, UInt8Array, WorldUp
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, GroundTruth, UInt8Array, WorldUp
 from su3d_bench.numerics.geometry import back_project, turn_to_z, valid_depth
 
 CAMERAS = 48  # enough for the shape of a walk
@@ -121,14 +121,24 @@ def evenly(n: int, most: int) -> Sequence[int]:
     return sorted({int(place) for place in np.linspace(0, n - 1, min(n, most))})
 
 
-def chosen_pixels(frame: Frame, n_frames: int) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Pixels (H, W) with a depth, spread over the image: about one frame's share of ``SEEN_POINTS``."""
-    most = max(1, SEEN_POINTS // n_frames)
+def chosen_pixels(frame: Frame, n_frames: int, n_points: int = SEEN_POINTS) -> BoolArray:
+    """Pixels (H, W) with a depth, spread over the image: about one frame's share of ``n_points``."""
+    most = max(1, n_points // n_frames)
     is_valid = valid_depth(frame.depth_m, 0.0, np.inf)
     step = int(np.ceil(np.sqrt(max(1.0, is_valid.sum() / most))))
     chosen = np.zeros_like(is_valid)
     chosen[::step, ::step] = is_valid[::step, ::step]
     return chosen
+
+
+def seen_points(frames: Sequence[Frame], n_points: int) -> tuple[Float32Array, UInt8Array]:
+    """Points (n, 3) m in the world and their colours (n, 3): about ``n_points`` of what all ``frames`` see."""
+    points, colours = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)]
+    for frame in frames:
+        pixels = chosen_pixels(frame, len(frames), n_points)
+        points.append(back_project(frame.depth_m, frame.intrinsics, frame.camera_to_world, pixels).astype(np.float32))
+        colours.append(frame.rgb[pixels])
+    return np.concatenate(points), np.concatenate(colours)
 
 
 def _truth(dataset: Dataset, scene: str) -> tuple[GroundTruth | None, str]:

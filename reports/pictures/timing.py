@@ -18,6 +18,7 @@ from su3d_bench.store.atomic import write_bytes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 # Okabe and Ito's colours for the colour-blind; marker and dash tell the methods apart where there is no colour.
@@ -31,7 +32,14 @@ PANELS_A_ROW, LEGEND_COLUMNS = 3, 3
 LETTERS_AN_INCH = 15  # of a legend's type
 DPI = 150
 MIB = 2**20
+TITLE_SIZE = 10
+NARROW = 6  # times from one end of an axis to the other, where 1, 2 and 5 may be too few numbers
 POINTS, UPDATES = "points of the map", "updates so far"
+COST_TITLES = {
+    POINTS: "What an update of the map costs as the map grows",
+    UPDATES: "What an update of the map costs in the course of a scene",
+}
+MEMORY_TITLES = {"map_bytes": "Memory of the map as it grows", "rss_bytes": "Memory of the process, update by update"}
 
 
 def draw_timing(
@@ -115,23 +123,28 @@ def _update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, against: 
             continue
         growth = growth_exponent(sizes, costs)
         if growth is not None:
-            label += f": exponent {growth.exponent:.2f} [{growth.low:.2f}, {growth.high:.2f}], {growth.words}"
+            label += f": exponent {growth.exponent:z.2f} [{growth.low:z.2f}, {growth.high:z.2f}], {growth.words}"
         _draw_cost(axes, sizes[usable], costs[usable], index, label)
     axes.set(xscale="log", yscale="log", xlabel=against, ylabel="ms per update, without perception")
-    _number_by_1_2_5(axes)
+    axes.set_title(COST_TITLES[against], loc="left", fontsize=TITLE_SIZE)
+    _number_by_1_2_5(axes.xaxis)
+    _number_by_1_2_5(axes.yaxis)
     axes.grid(True, which="major", color="0.85", linewidth=0.6)
     if axes.get_legend_handles_labels()[0]:
         figure.legend(loc="outside lower center", fontsize=8, frameon=False, handlelength=4)
     return figure
 
 
-def _number_by_1_2_5(axes: Axes) -> None:
-    """Numbers such as 200 k and 5 M along x: a map often grows by less than a decade, which has one number else."""
-    from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
+def _number_by_1_2_5(axis: Axis) -> None:
+    """Numbers such as 0.5, 200 k and 5 M along a logarithmic axis: of a decade, powers of ten would name one value."""
+    from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.xaxis.set_major_formatter(EngFormatter())
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    large = EngFormatter()
+    low, high = axis.get_view_interval()
+    is_narrow = low > 0 and high / low < NARROW
+    axis.set_major_locator(MaxNLocator(5) if is_narrow else LogLocator(subs=(1, 2, 5)))
+    axis.set_major_formatter(FuncFormatter(lambda value, place: large(value) if value >= 1000 else f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def _draw_cost(axes: Axes, sizes: Float64Array, costs: Float64Array, index: int, label: str) -> None:
@@ -167,6 +180,7 @@ def _stages(times: Sequence[Sequence[UpdateTimes]], warm_up: int) -> Figure:
     axes.set_yticks(rows, _labels(times))
     axes.invert_yaxis()
     axes.set_xlabel("mean ms per update")
+    axes.set_title("Where the time of an update goes", loc="left", fontsize=TITLE_SIZE)
     figure.legend(loc="outside lower center", ncols=min(len(stages), 6), fontsize=8, frameon=False)
     return figure
 
@@ -190,8 +204,11 @@ def _memory(times: Sequence[Sequence[UpdateTimes]]) -> Figure:
             x, y = medians_by_size(sizes[sizes > 0], values[sizes > 0] / MIB)
             axes.plot(x, y, linewidth=1.2, markersize=4.5, markerfacecolor="white", label=label, **_style(index))
         what = "the map" if column == "map_bytes" else "the process"
-        axes.set(xscale="log", xlabel=against, ylabel=f"MiB of {what}", ylim=(0, None))
-        _number_by_1_2_5(axes)
+        axes.margins(y=0.12)  # the markers at the top stand whole
+        axes.set(xscale="log", xlabel=against, ylabel=f"MiB of {what}")
+        axes.set_ylim(bottom=0)
+        axes.set_title(MEMORY_TITLES[column], loc="left", fontsize=TITLE_SIZE)
+        _number_by_1_2_5(axes.xaxis)
         axes.tick_params(axis="x", labelsize=8)
         axes.grid(True, which="major", color="0.85", linewidth=0.6)
     _one_legend(figure, panels)
@@ -220,7 +237,8 @@ def _anytime(points: Sequence[AnytimePoint]) -> Figure:
             values = [100.0 * value if (value := point.metrics.get(name)) is not None else np.nan for point in mine]
             label = _label(method, run, several)
             axes.plot([point.seconds for point in mine], values, markersize=4, label=label, **_style(index))
-        axes.set(xlabel="seconds", ylabel=f"{name} (%)", title=protocol)
+        axes.set(xlabel="seconds until the map was there", ylabel=f"{name} (%)")
+        axes.set_title(f"{protocol}: {name} over time", loc="left", fontsize=TITLE_SIZE)
         axes.grid(True, color="0.85", linewidth=0.6)
     _one_legend(figure, all_axes)
     return figure

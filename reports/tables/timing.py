@@ -119,7 +119,7 @@ def _words(stage: StageSummary) -> str:
 
 
 def _growth(growth: Growth | None) -> str:
-    return NOT_MEASURED if growth is None else f"{growth.exponent:.2f} [{growth.low:.2f}, {growth.high:.2f}]"
+    return NOT_MEASURED if growth is None else f"{growth.exponent:z.2f} [{growth.low:z.2f}, {growth.high:z.2f}]"
 
 
 def _anytime_table(points: Sequence[AnytimePoint]) -> Iterator[list[str]]:

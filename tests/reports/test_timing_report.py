@@ -19,7 +19,7 @@ from su3d_bench.core.timing import peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.costs import UpdateTimes, pooled, summarise
 from su3d_bench.numerics.statistics import growth_exponent
-from su3d_bench.reports.pictures.timing import _memory
+from su3d_bench.reports.pictures.timing import POINTS, UPDATES, _memory, _update_cost
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run, read_update_times
 from su3d_bench.store.records import MapCost
@@ -175,6 +175,22 @@ def test_the_size_of_maps_is_drawn_where_a_method_tells_it(tells: bool) -> None:
     panels = _memory([[times(np.ones(8), **columns)]]).axes
     assert [axes.get_ylabel() for axes in panels] == [*["MiB of the map"] * tells, "MiB of the process"]
     assert all(axes.lines for axes in panels)
+
+
+@pytest.mark.parametrize("cost_ms", [(0.4, 60.0), (14.0, 18.0), (900.0, 40_000.0), (7.0, 7.0)])
+def test_a_plot_has_a_sentence_as_title_plain_numbers_and_room_for_its_line(cost_ms: tuple[float, float]) -> None:
+    sizes = np.linspace(5e4, 3e5, 40)
+    made = times(np.linspace(*cost_ms, 40), n_points=sizes, rss_bytes=np.linspace(1e9, 2e9, 40))
+    for figure in (_update_cost([[made]], 0, POINTS), _update_cost([[made]], 0, UPDATES), _memory([[made]])):
+        figure.canvas.draw()
+        for axes in figure.axes:
+            assert len(axes.get_title(loc="left").split()) > 4
+            labels = [label.get_text() for axis in (axes.xaxis, axes.yaxis) for label in axis.get_ticklabels()]
+            assert not any("$" in text or "^" in text for text in labels)
+            for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+                assert sum(low <= place <= high for place in axis.get_ticklocs()) >= 2
+    (axes,) = _memory([[made]]).axes
+    assert axes.get_ylim()[1] > 1.01 * axes.lines[0].get_ydata().max()
 
 
 def test_the_report_answers_in_json(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,7 +5,8 @@ import io
 import json
 import zipfile
 from collections import Counter
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from su3d_bench.metrics.questions.truths import RefinedNames
 from su3d_bench.questions.files.files import figure_texts
 from su3d_bench.questions.model import new_question
 from su3d_bench.questions.reasoning.asking import built_in
+from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
 from su3d_bench.reports.pictures.colours import SCALES, scale_stops, similarity_colours
 from su3d_bench.reports.pictures.items import (
     ItemParts,
@@ -48,6 +50,7 @@ from su3d_bench.sheets.items import (
     write_sheet,
 )
 from su3d_bench.sheets.making import run_source
+from su3d_bench.sheets.making.blinding import without_ids
 from su3d_bench.sheets.making.drafts import annotation_drafts, reasoning_drafts, retrieval_drafts
 from su3d_bench.sheets.making.drawing import Artist, SceneDrafts, _lost, draw_all, draw_scene
 from su3d_bench.sheets.making.run_source import RunSource
@@ -247,16 +250,15 @@ def test_answers_that_maps_share_are_judged_once(source: RunSource) -> None:
     drafts = reasoning_drafts(source, "painted/a", [question], 1, built_in(WordEncoder()))
     assert [one.methods for one in drafts] == [METHODS[:2], METHODS[2:]]
     assert drafts[0].text.startswith("How many chairs are there?\nAnswer: ")
+    assert not any("#" in one.text + "".join((*one.title, *one.names)) for one in drafts)
     assert all(one.automatic == {} for one in drafts)
 
 
 @pytest.mark.parametrize("kind", ["retrieval", "annotation", "reasoning", "questions"])
 def test_the_picture_of_an_item_is_small_and_shows_the_object(source: RunSource, kind: Any) -> None:
     draft = replace(drafts_of(kind, ["sofa"])[0], scene="painted/a", methods=("collector",), rows=(1,), names=())
-    if kind == "retrieval":
-        draft = replace(draft, similarity=np.array([0.1, 0.9, 0.2, 0.3]))
     if kind in ("reasoning", "questions"):
-        draft = replace(draft, names=("chair #1", "sofa #2", "table #3", "wall #4"), others=(0,))
+        draft = replace(draft, names=("chair", "sofa", "", ""), others=(0,))
     content = Artist(source).draw(draft)
     picture = np.asarray(Image.open(io.BytesIO(content)).convert("RGB")).astype(int)
     assert len(content) < 150_000 and picture.shape[1] == 960
@@ -265,10 +267,61 @@ def test_the_picture_of_an_item_is_small_and_shows_the_object(source: RunSource,
     assert content == Artist(source).draw(draft)
 
 
+@dataclass(frozen=True)
+class Shown:
+    """One map under any name, in the frames of a run."""
+
+    source: RunSource
+    a_map: Instances
+    opener: Any = None
+
+    def instances(self, scene: str, method: str) -> Instances:
+        return self.a_map
+
+    def frames(self, scene: str) -> tuple[Frame, ...]:
+        return self.source.frames(scene)
+
+
+@pytest.mark.parametrize("kind", ["retrieval", "annotation", "reasoning"])
+def test_a_picture_shows_nothing_of_a_map_but_what_is_judged(source: RunSource, kind: Any) -> None:
+    whole = source.instances("painted/a", "collector")
+    masks = [whole.mask(row) for row in range(len(whole))]
+    in_parts = [masks[1], *(part for mask in (masks[0], *masks[2:]) for part in np.array_split(mask, 7))]
+    ids = [400 + 3 * k for k in range(len(in_parts))]
+    other = Instances.of(whole.points, in_parts, names=tuple(f"other {k}" for k in ids), ids=ids)
+    draft = replace(drafts_of(kind, ["sofa"])[0], scene="painted/a", methods=("collector",), names=())
+    one = Artist(Shown(source, whole)).draw(replace(draft, rows=(1,)))
+    assert one == Artist(Shown(source, other)).draw(replace(draft, rows=(0,)))
+
+
+def test_frames_are_the_same_whatever_the_method(source: RunSource) -> None:
+    assert "method" not in signature(source.frames).parameters
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("lamp #60 is closest to sofa #26: 1.03 m; lamp #102761000071 2.77 m",
+         "lamp A is closest to sofa: 1.03 m; lamp B 2.77 m"),
+        ("2: lamp #60, sofa #26", "2: lamp, sofa"),
+        ("Take object 60, the lamp (ID: 60) (not #26, nor #7).",
+         "Take lamp, the lamp (not sofa, nor something unknown)."),
+        ("26 of them, 60 cm apart", "26 of them, 60 cm apart"),
+        ("object #5", "object"),
+    ],
+)  # fmt: skip
+def test_answers_name_things_without_the_ids_of_a_map(text: str, told: str) -> None:
+    box = np.array([[0, 0, 0], [1, 1, 1.0]])
+    named = {60: "lamp", 102761000071: "lamp", 26: "sofa", 5: ""}
+    scene = SceneMap(tuple(MapObject(number, name, "", box[0], box) for number, name in named.items()))
+    found, names = without_ids(text, scene, [26])
+    assert found == told and names[26] == "sofa"
+
+
 @pytest.mark.parametrize("text", HOSTILE)
 def test_hostile_titles_make_a_picture_of_the_usual_size(text: str) -> None:
     grey = Panel("panel", np.full((30, 40, 3), 120, np.uint8), np.zeros((30, 40), bool))
-    picture = compose(ItemParts((text, text), None, grey, grey, scale_stops("cividis")))
+    picture = compose(ItemParts((text, text), None, grey, grey))
     assert picture.shape[1] == 960 and 700 < picture.shape[0] < 1000
 
 
@@ -401,14 +454,14 @@ def test_pictures_of_somebody_else_stay(tmp_path: Path) -> None:
 
 def test_scenes_drawn_in_processes_give_the_pictures_in_order(source: RunSource, folder: Path) -> None:
     drafts = [
-        replace(one, scene="painted/a", methods=("collector",), rows=(k,), similarity=np.arange(4.0))
+        replace(one, scene="painted/a", methods=("collector",), rows=(k,))
         for k, one in enumerate(drafts_of("retrieval", TEXTS[:3]))
     ]
     told: list[tuple[int, int]] = []
-    drawn = draw_all(source, "paper", drafts, 1, lambda *counts: told.append(counts))
+    drawn = draw_all(source, drafts, 1, lambda *counts: told.append(counts))
     assert told == [(1, 3), (2, 3), (3, 3)]
     assert drawn == [Artist(source).draw(one) for one in drafts]
-    unit = SceneDrafts(source.opener, "paper", {0: drafts[0]})
+    unit = SceneDrafts(source.opener, {0: drafts[0]})
     (in_process,) = run_processes(draw_scene, [unit], lambda event: None, jobs=2, lost=_lost)
     assert in_process == {0: drawn[0]}
     with pytest.raises(DataError, match="try --jobs 1"):

@@ -93,7 +93,6 @@ def add_parser(actions: Any) -> None:
         "--overlap", type=float, default=0.25, metavar="SHARE", help="of all items that everybody gets (default: 0.25)"
     )
     parser.add_argument("--seed", type=int, default=0, help="of the drawing and shuffling (default: 0)")
-    parser.add_argument("--colours", choices=("paper", "cividis"), default="paper", help="of the heat maps")
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="scenes drawn side by side (default: 2)")
     parser.add_argument("--device", default="cpu", help="of the text's encoder (default: cpu)")
     parser.add_argument(
@@ -303,7 +302,6 @@ def _drawn(
     with progress(1, is_quiet=arguments.quiet, last_step="writing") as report:
         pictures = draw_all(
             source,
-            arguments.colours,
             flat,
             arguments.jobs,
             lambda n_done, n: report(Event(name, "pictures", n_done, n)),

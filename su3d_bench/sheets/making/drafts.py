@@ -10,7 +10,7 @@ import numpy as np
 
 from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import Float64Array, GroundTruth, Instances
+from su3d_bench.core.types import GroundTruth, Instances
 from su3d_bench.metrics.instance.score import Covered
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.score import (
@@ -33,6 +33,7 @@ from su3d_bench.questions.reasoning.scene_map import SceneMap
 from su3d_bench.questions.retrieval import rank_all
 from su3d_bench.questions.truths import own_questions, question_truth, scene_objects
 from su3d_bench.sheets.items import RIGHT, WRONG, SheetKind
+from su3d_bench.sheets.making.blinding import without_ids
 from su3d_bench.sheets.making.run_source import RunSource, mask_digest
 
 MOST_TEXT = 1000  # characters of a query, a label or an answer that a sheet shows
@@ -44,8 +45,8 @@ NO_ANSWER = "(no answer)"
 class Draft:
     """An item without number and picture. ``rows`` of the map of ``methods[0]`` are outlined, ``others`` drawn too.
 
-    ``title``: lines of the picture; ``text``: what the sheet shows; ``similarity`` (K,) of the map's instances to the
-    query, ``names`` (K) as the answer calls them.
+    ``title``: lines of the picture; ``text``: what the sheet shows; ``names`` (K) of the map's instances as the answer
+    calls them, '' of those that it does not speak of.
     """
 
     kind: SheetKind
@@ -60,7 +61,6 @@ class Draft:
     question_kind: str = ""
     stands_for: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     automatic: Mapping[str, str] = field(default_factory=dict)
-    similarity: Float64Array | None = None
     others: tuple[int, ...] = ()
     names: tuple[str, ...] = ()
 
@@ -131,7 +131,6 @@ def retrieval_drafts(source: RunSource, scene: str, questions: Sequence[Question
                     question_id=question.id,
                     question_kind=question.kind,
                     automatic=automatic,
-                    similarity=first.similarity,
                 )
             )
     return drafts
@@ -267,8 +266,8 @@ def reasoning_drafts(
         covered = source.covered(scene, rules, instances) if known else None
         shown = _Shown(scene, method, instances, a_map)
         for place, (text, answer) in enumerate(zip(texts, ask(a_map, texts), strict=True)):
-            rows = shown.rows(answer.object_ids)
-            key = text.encode() + b"\0" + told(answer).encode() + mask_digest(instances, rows)
+            rows, (text_told, names) = shown.rows(answer.object_ids), shown.told(answer)
+            key = text.encode() + b"\0" + text_told.encode() + mask_digest(instances, rows)
             if key in groups:
                 groups[key] = also(groups[key], method, shown.instance_id(rows))
                 continue
@@ -276,7 +275,8 @@ def reasoning_drafts(
             if covered is not None and rules is not None:
                 true = known[place]
                 automatic = _judged_answer(rules, true, given_answer(true, answer, a_map), covered)
-            groups[key] = shown.draft(text, known[place].kind if known else REASONING, answer, automatic)
+            kind = known[place].kind if known else REASONING
+            groups[key] = shown.draft(text, kind, answer, text_told, names, automatic)
     return list(groups.values())
 
 
@@ -305,11 +305,12 @@ class _Shown:
 
     def __init__(self, scene: str, method: str, instances: Instances, a_map: SceneMap) -> None:
         self._scene, self._method, self._instances = scene, method, instances
+        self._map = a_map
         self._row_of = {thing.id: thing.row for thing in a_map.objects}
-        names = [""] * len(instances)
-        for thing in a_map.objects:
-            names[thing.row] = thing.shown
-        self._names = tuple(names)
+
+    def told(self, answer: Answer) -> tuple[str, dict[int, str]]:
+        """The answer as people see it, and how it calls the objects that it rests on, by their ids."""
+        return without_ids(told(answer), self._map, (*answer.object_ids, *answer.reference_ids))
 
     def rows(self, ids: Sequence[int]) -> tuple[int, ...]:
         return tuple(self._row_of[object_id] for object_id in ids)
@@ -318,8 +319,16 @@ class _Shown:
         """That of the only instance; -1 of several or none."""
         return id_of(self._instances, rows[0]) if len(rows) == 1 else -1
 
-    def draft(self, question: str, kind: str, answer: Answer, automatic: Mapping[str, str]) -> Draft:
-        rows, text = self.rows(answer.object_ids), told(answer)
+    def draft(
+        self,
+        question: str,
+        kind: str,
+        answer: Answer,
+        text: str,
+        names: Mapping[int, str],
+        automatic: Mapping[str, str],
+    ) -> Draft:
+        rows = self.rows(answer.object_ids)
         asks = ("answer", "objects") if rows else ("answer",)
         return Draft(
             kind="reasoning",
@@ -334,8 +343,14 @@ class _Shown:
             question_kind=kind,
             automatic={ask: value for ask, value in automatic.items() if ask in asks},
             others=self.rows(answer.reference_ids),
-            names=self._names,
+            names=names_of_rows(names, self._row_of, len(self._instances)),
         )
+
+
+def names_of_rows(names: Mapping[int, str], row_of: Mapping[int, int], n_rows: int) -> tuple[str, ...]:
+    """The names of ids by the rows of a map; '' for the rest."""
+    of_row = {row_of[number]: name for number, name in names.items() if number in row_of}
+    return tuple(of_row.get(row, "") for row in range(n_rows))
 
 
 def _judged_answer(rules: ProtocolRules, true: TrueAnswer, given: GivenAnswer, covered: Covered) -> dict[str, str]:

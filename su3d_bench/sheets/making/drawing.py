@@ -1,4 +1,7 @@
-"""Drafts as pictures: the best frame of the object, the map around it and its place in the room."""
+"""Drafts as pictures: the best frame of the object, and its place in the room as the frames saw it.
+
+Of a map nothing is drawn but what is judged: the rest of it would give its method away.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ import numpy as np
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float64Array, Frame, Instances, UInt8Array
 from su3d_bench.reports.pictures.items import (
+    CAP_M,
     LOW_HEIGHT,
     PHOTO_WIDTH,
     ZOOM_WIDTH,
@@ -22,20 +26,23 @@ from su3d_bench.reports.pictures.items import (
     mask_in_frame,
     png_bytes,
 )
-from su3d_bench.reports.pictures.map_views import DrawnMap, MapView, drawn_map, pale
-from su3d_bench.reports.pictures.maps import Scale, instance_colours, scale_stops, similarity_colours
+from su3d_bench.reports.pictures.map_views import MapView, cameras_of, pale, view_of
+from su3d_bench.reports.pictures.maps import thinned_rows
+from su3d_bench.reports.pictures.render import colour
+from su3d_bench.reports.pictures.scene_look import seen_points
 from su3d_bench.runs.executors.local import Event, Report, run_inline, run_processes
 from su3d_bench.sheets.items import SheetKind
 from su3d_bench.sheets.making.drafts import Draft
 from su3d_bench.sheets.making.run_source import mask_digest
 
 ANSWER_COLOUR, OTHER_COLOUR = (222, 74, 22), (32, 98, 196)  # those of reasoning_picture
-PALE_SHARE = 0.3
+SEEN_POINTS = 1_500_000  # of all frames together, before they are thinned: floors are seen at a low angle
+ROOM_SHARE, PLACE_SHARE = 0.75, 0.5  # of the room's colours, so that what is judged stands out
 ROOM_PHOTOS = 6  # of the room, for answers that name nothing
-MAP_TITLES: Mapping[SheetKind, str] = {
-    "retrieval": "similarity of everything in the map to the text",
-    "annotation": "the map around it, the outlined mask in red",
-    "reasoning": "the map: red what the answer names, blue what it was held against",
+ROOM_TITLES: Mapping[SheetKind, str] = {
+    "retrieval": "the room, what was found in red",
+    "annotation": "the room, the mask in red",
+    "reasoning": "the room: red what the answer names, blue what it was held against",
     "questions": "the room: red what the answer names, blue what it was held against",
 }
 OUTLINED: Mapping[SheetKind, str] = {
@@ -55,14 +62,14 @@ class PictureSource(Protocol):
     @property
     def instances(self) -> Callable[[str, str], Instances]: ...
 
-    def frames(self, scene: str, method: str) -> Sequence[Frame]: ...
+    def frames(self, scene: str) -> Sequence[Frame]: ...
 
 
 class Artist:
     """Draws the items of a run, one scene after another; what a scene's items share is made once."""
 
-    def __init__(self, source: PictureSource, scale: Scale = "paper") -> None:
-        self._source, self._scale = source, scale
+    def __init__(self, source: PictureSource) -> None:
+        self._source = source
         self._maps: dict[bytes, _ShownMap] = {}
 
     def draw(self, draft: Draft) -> bytes:
@@ -72,66 +79,55 @@ class Artist:
     def picture(self, draft: Draft) -> UInt8Array:
         """The picture (h, 960, 3) of a draft."""
         shown = self._map(draft.scene, draft.methods[0])
-        members = shown.drawn.members(draft.rows)
+        room, members = shown.room, shown.members(draft.rows)
         photo, eye = self._photo(draft, shown)
-        best = max(shown.corners, key=lambda view: int(view.shows(members).sum()))
-        map_view = Panel(
-            MAP_TITLES[draft.kind] if draft.rows or draft.others else "the map",
-            shown.drawn.paint(best, self._colours(draft, shown)),
+        best = max(room.corners, key=lambda view: int(view.shows(members).sum()))
+        room_view = Panel(
+            ROOM_TITLES[draft.kind] if draft.rows or draft.others else "the room",
+            colour(best.shown, _coloured(draft, shown, ROOM_SHARE)),
             best.shows(members),
             _tags(draft, shown.instances, best),
             line=2,
         )
-        place_colours = pale(shown.colours, PALE_SHARE)
-        place_colours[list(draft.others)] = OTHER_COLOUR
-        place_colours[list(draft.rows)] = ANSWER_COLOUR
         place = Panel(
             ("its place, from above" if draft.rows else "from above")
             + (" (arrow: from the camera)" if eye is not None and draft.rows else ""),
-            shown.drawn.paint(shown.above, place_colours),
-            tags=_tags(draft, shown.instances, shown.above),
+            colour(room.above.shown, _coloured(draft, shown, PLACE_SHARE)),
+            tags=_tags(draft, shown.instances, room.above),
             ring=_ring(draft, shown),
-            eye=None if eye is None else _inside(shown.above.project(eye[None])[0]),
+            eye=None if eye is None else _inside(room.above.project(eye[None])[0]),
         )
-        scale = scale_stops(self._scale) if draft.similarity is not None else None
-        room = self._room(draft) if photo is None else ()
-        return compose(ItemParts(draft.title, photo, map_view, place, scale, room))
+        photos = self._room_photos(draft) if photo is None else ()
+        return compose(ItemParts(draft.title, photo, room_view, place, photos))
 
-    def _room(self, draft: Draft) -> tuple[UInt8Array, ...]:
+    def _room_photos(self, draft: Draft) -> tuple[UInt8Array, ...]:
         """Some of the frames, spread over the walk, where an answer names nothing that could be outlined."""
         if draft.rows:
             return ()
-        frames = self._source.frames(draft.scene, draft.methods[0])
+        frames = self._source.frames(draft.scene)
         chosen = np.unique(np.linspace(0, len(frames) - 1, min(ROOM_PHOTOS, len(frames))).astype(np.int64))
         return tuple(frames[k].rgb for k in chosen)
-
-    def _colours(self, draft: Draft, shown: _ShownMap) -> UInt8Array:
-        if draft.similarity is not None:
-            return similarity_colours(draft.similarity, self._scale)
-        colours = pale(shown.colours, 0.45)
-        colours[list(draft.others)] = OTHER_COLOUR
-        colours[list(draft.rows)] = ANSWER_COLOUR
-        return colours
 
     def _photo(self, draft: Draft, shown: _ShownMap) -> tuple[Panel | None, Float64Array | None]:
         """The frame that shows the object best, and where its camera was."""
         wanted = draft.rows or draft.others
         if not wanted:
             return None, None
-        photo = shown.photo(wanted, self._source.frames(draft.scene, draft.methods[0]))
+        photo = shown.photo(wanted, self._source.frames(draft.scene))
         if photo is None:
             return None, None
         title = OUTLINED[draft.kind] if draft.rows else "what the answer was held against"
         return Panel(f"outlined: {title}", photo.frame.rgb, photo.mask), photo.frame.camera_to_world[:3, 3]
 
     def _map(self, scene: str, method: str) -> _ShownMap:
-        """The views of a map; those of another method where it has the same masks."""
+        """What is shown of a map; that of another method where it has the same masks."""
         instances = self._source.instances(scene, method)
         key = mask_digest(instances, range(len(instances)))
         if key not in self._maps:
-            if any(scene != known.scene for known in self._maps.values()):
+            if any(scene != known.room.scene for known in self._maps.values()):
                 self._maps.clear()
-            self._maps[key] = _ShownMap(scene, instances)
+            rooms = [known.room for known in self._maps.values()]
+            self._maps[key] = _ShownMap(rooms[0] if rooms else _Room(scene, self._source.frames(scene)), instances)
         return self._maps[key]
 
 
@@ -143,20 +139,37 @@ class _Photo:
     mask: BoolArray
 
 
-class _ShownMap:
-    """A map with its views and the tree of its points."""
+class _Room:
+    """A scene in the colours that its frames saw, from above and from two corners: the same for every method."""
 
-    def __init__(self, scene: str, instances: Instances) -> None:
+    def __init__(self, scene: str, frames: Sequence[Frame]) -> None:
+        self.scene = scene
+        seen, rgb = seen_points(frames, SEEN_POINTS)
+        rows = thinned_rows(seen)
+        self.points, self.colours = seen[rows], rgb[rows]
+        self.above: MapView = view_of(self.points, cameras_of(self.points, ZOOM_WIDTH, LOW_HEIGHT)[0])
+        corners = cameras_of(self.points, PHOTO_WIDTH, LOW_HEIGHT)[1:]
+        self.corners: tuple[MapView, ...] = tuple(view_of(self.points, camera) for camera in corners)
+
+
+class _ShownMap:
+    """A map within its room, and the tree of its points."""
+
+    def __init__(self, room: _Room, instances: Instances) -> None:
         from scipy.spatial import KDTree
 
-        self.scene, self.instances = scene, instances
-        self.drawn: DrawnMap = drawn_map(instances)
-        self.above: MapView = self.drawn.view(self.drawn.cameras(ZOOM_WIDTH, LOW_HEIGHT)[0])
-        corners = self.drawn.cameras(PHOTO_WIDTH, LOW_HEIGHT)[1:]
-        self.corners: tuple[MapView, ...] = tuple(self.drawn.view(camera) for camera in corners)
-        self.colours = np.array(instance_colours(instances.names), np.uint8).reshape(-1, 3)
+        self.room, self.instances = room, instances
         self._tree: Any = KDTree(instances.points, balanced_tree=False, compact_nodes=False)
+        _, self._nearest = self._tree.query(room.points, distance_upper_bound=CAP_M)
         self._photos: dict[tuple[tuple[int, ...], tuple[int, ...]], _Photo | None] = {}
+
+    def members(self, rows: Sequence[int]) -> BoolArray:
+        """Which points of the room lie at these instances."""
+        is_member = np.zeros(len(self.instances.points) + 1, np.bool_)  # the last: near no point of the map
+        for row in rows:
+            is_member[self.instances.mask(row)] = True
+        members: BoolArray = is_member[self._nearest]
+        return members
 
     def photo(self, rows: tuple[int, ...], frames: Sequence[Frame]) -> _Photo | None:
         """The best of ``frames`` to see these instances in, found once; None where none shows them."""
@@ -176,6 +189,14 @@ class _ShownMap:
         frame = frames[view.frame]
         bounds = np.stack([points.min(axis=0), points.max(axis=0)]).astype(np.float64)
         return _Photo(frame, at_full_size(mask_in_frame(frame, self._tree, is_member, bounds), frame.rgb))
+
+
+def _coloured(draft: Draft, shown: _ShownMap, share: float) -> UInt8Array:
+    """The colours of the room's points, what is judged and what it was held against in strong ones."""
+    colours = pale(shown.room.colours, share)
+    colours[shown.members(draft.others)] = OTHER_COLOUR
+    colours[shown.members(draft.rows)] = ANSWER_COLOUR
+    return colours
 
 
 def _tags(draft: Draft, instances: Instances, view: MapView) -> tuple[Tag, ...]:
@@ -210,7 +231,7 @@ def _ring(draft: Draft, shown: _ShownMap) -> tuple[float, float, float] | None:
     points = shown.instances.points[shown.instances.mask(draft.rows[0])]
     if not len(points):
         return None
-    low, high = shown.above.project(np.percentile(points, [2, 98], axis=0).astype(np.float64))
+    low, high = shown.room.above.project(np.percentile(points, [2, 98], axis=0).astype(np.float64))
     x, y = (low + high) / 2
     return float(x), float(y), float(0.6 * np.abs(high - low).max())
 
@@ -239,13 +260,11 @@ class SceneDrafts:
     """What one process draws: the drafts of one scene by their places among all."""
 
     opener: Callable[[], PictureSource]
-    scale: Scale
     drafts: Mapping[int, Draft]
 
 
 def draw_all(
     source: PictureSource,
-    scale: Scale,
     drafts: Sequence[Draft],
     jobs: int,
     progress: Progress = lambda n_done, n: None,
@@ -254,7 +273,7 @@ def draw_all(
     units = []
     for scene in dict.fromkeys(draft.scene for draft in drafts):
         mine = {k: draft for k, draft in enumerate(drafts) if draft.scene == scene}
-        units.append(SceneDrafts(source.opener, scale, mine))
+        units.append(SceneDrafts(source.opener, mine))
     n_done = 0
 
     def report(event: Event) -> None:
@@ -274,7 +293,7 @@ def draw_all(
 
 def draw_scene(unit: SceneDrafts, report: Report) -> dict[int, bytes]:
     """The PNG of each draft of one scene by its place."""
-    artist = Artist(unit.opener(), unit.scale)
+    artist = Artist(unit.opener())
     pictures = {}
     for place, draft in unit.drafts.items():
         pictures[place] = artist.draw(draft)

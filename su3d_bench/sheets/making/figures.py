@@ -118,7 +118,7 @@ class Figures:
         """The map in the colours that the frames saw, where it is asked for."""
         if not self._with_photo:
             return ()
-        frames = self._source.frames(scene, self._source.methods[0])
+        frames = self._source.frames(scene)
         return (Cell(shown.paint_points(view, seen_colours(frames, shown.instances.points[shown.rows]))),)
 
 

@@ -13,7 +13,8 @@ from su3d_bench.questions.reasoning.scene_map import SceneMap
 from su3d_bench.questions.truths import MIN_VERTICES, questions_of, scene_objects
 from su3d_bench.sheets.items import ASKS
 from su3d_bench.sheets.judging.scores import OF_ALL_KINDS
-from su3d_bench.sheets.making.drafts import MOST_TEXT, Draft
+from su3d_bench.sheets.making.blinding import without_ids
+from su3d_bench.sheets.making.drafts import MOST_TEXT, Draft, names_of_rows
 from su3d_bench.sheets.making.truth_source import TruthSource
 
 
@@ -46,11 +47,13 @@ class _Shown:
         self._scene = scene
         ids = source.instances(scene).ids.tolist()
         self._row_of = {instance: row for row, instance in enumerate(ids)}
-        self._names = tuple(objects.by_id(instance).shown if instance in objects.ids else "" for instance in ids)
+        self._objects = objects
 
     def draft(
         self, asked: str, told: str, made_id: str, kind: str, answers: Sequence[int], references: Sequence[int] = ()
     ) -> Draft:
+        spoken_of = [number for number in (*answers, *references) if number in self._objects.ids]
+        told, names = without_ids(told, self._objects, spoken_of)
         lines = asked, f"Answer: {told}"
         rows = self._rows(answers)
         methods = kind, OF_ALL_KINDS  # no method answers: what is counted together is a kind
@@ -66,7 +69,7 @@ class _Shown:
             question_id=made_id,
             question_kind=kind,
             others=tuple(row for row in self._rows(references) if row not in rows),
-            names=self._names,
+            names=names_of_rows(names, self._row_of, len(self._row_of)),
         )
 
     def _rows(self, ids: Sequence[int]) -> tuple[int, ...]:

@@ -89,10 +89,10 @@ class RunSource:
         """The map as questions are put to it, under labels n' and without what they leave out, where it has them."""
         return map_of(self.instances(scene, method), self.refined(scene, method))
 
-    def frames(self, scene: str, method: str) -> tuple[Frame, ...]:
-        """Some of the frames that the map was made from, spread over the scene."""
+    def frames(self, scene: str) -> tuple[Frame, ...]:
+        """Some of the frames from which the maps were made, spread over the scene: the same whatever the method."""
         n = len(self.run.dataset(scene).frames(scene.partition("/")[2], 1))
-        of_views = np.unique(self.instances(scene, method).views[:, 0])
+        of_views = np.unique(np.concatenate([self.instances(scene, method).views[:, 0] for method in self.methods]))
         indices = of_views[(of_views >= 0) & (of_views < n)] if len(of_views) else np.arange(n)
         chosen = np.unique(np.linspace(0, len(indices) - 1, min(MOST_FRAMES, len(indices))).astype(np.int64))
         return self._frames_at(scene, tuple(int(indices[k]) for k in chosen))

@@ -40,8 +40,8 @@ class TruthSource:
         """Every instance of the truth, whatever the method."""
         return self._map_of(scene)
 
-    def frames(self, scene: str, method: str = "") -> tuple[Frame, ...]:
-        """Those in which it was looked up what can be asked about, whatever the method."""
+    def frames(self, scene: str) -> tuple[Frame, ...]:
+        """Those in which it was looked up what can be asked about."""
         return self._frames_of(scene)
 
     def _truth(self, scene: str) -> GroundTruth:
