@@ -280,6 +280,6 @@ def _place_views(page: Canvas, top: float, row: Row) -> list[Any]:
     for c, picture in enumerate(row.pictures):
         axes = page.picture(c * VIEW_WIDTH, top, VIEW_WIDTH, VIEW_HEIGHT, picture)
         label = f"{row.title} {VIEW_TITLES[c]}".strip()
-        axes.text(14, VIEW_HEIGHT - 14, label, fontsize=10, color=PALE, va="bottom")
+        axes.text(14, VIEW_HEIGHT - 14, label, fontsize=10, color=PALE, va="bottom", bbox=paper())
         placed.append(axes)
     return placed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,6 @@ def add_parser(verbs: Any) -> None:
 
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.analysis.attribution import attribute
-    from su3d_bench.reports.pictures.attribution import draw_attribution
     from su3d_bench.reports.tables.attribution import attribution_tables
 
     attribution = attribute(
@@ -42,8 +42,11 @@ def call(arguments: argparse.Namespace) -> int:
         protocols=arguments.protocols,
         oracle=arguments.oracle,
     ).to_json()
+    answer_tables(arguments, attribution, attribution_tables(attribution))
     if arguments.out is not None:
+        from su3d_bench.reports.pictures.attribution import draw_attribution
+
+        sys.stdout.flush()  # the plot takes longer than the answer
         draw_attribution(attribution, arguments.out)
         remark(f"plot: {arguments.out}", quiet=arguments.quiet)
-    answer_tables(arguments, attribution, attribution_tables(attribution))
     return EXIT_DONE

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -75,6 +76,7 @@ def _write(
     from su3d_bench.reports.pictures.timing import draw_timing
     from su3d_bench.store.atomic import make_folder, write_text
 
+    sys.stdout.flush()  # the plots take longer than the tables
     make_folder(arguments.out)
     for name, text in files.items():
         write_text(arguments.out / name, text)

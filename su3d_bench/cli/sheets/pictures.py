@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_verb, answer_either
+from su3d_bench.cli.common import add_verb, answer_either, remark_unseen
 from su3d_bench.core.errors import EXIT_DONE, ConfigError
 
 NAME = "pictures"
@@ -68,7 +68,10 @@ def call(arguments: argparse.Namespace) -> int:
     elif arguments.what == "reasoning":
         rows = figures.reasoning(texts, run.encoder(arguments.device))
     else:
-        rows = figures.similarity(texts, run.encoder(arguments.device), arguments.colours)
+        encoder = run.encoder(arguments.device)
+        for text in texts:
+            remark_unseen(encoder, text, quiet=arguments.quiet)
+        rows = figures.similarity(texts, encoder, arguments.colours)
         scale = scale_stops(arguments.colours)
     draw_grid(arguments.out, columns, rows, scale)
     value = {"picture": str(arguments.out), "columns": columns, "rows": [row.title for row in rows]}
