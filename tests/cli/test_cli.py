@@ -322,8 +322,14 @@ def test_a_query_ranks_the_map_and_draws_it(
     assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a"]) == 0
     capsys.readouterr()
     words = ["query", "painted/a", "a red sofa", "--method", "collector"]
-    before, draw = [], maps.draw_heat_map
-    monkeypatch.setattr(maps, "draw_heat_map", lambda *a: before.append(capsys.readouterr().out) or draw(*a))
+    before: list[str] = []
+    draw = maps.draw_heat_map
+
+    def draw_later(*words: Any) -> None:
+        before.append(capsys.readouterr().out)
+        draw(*words)
+
+    monkeypatch.setattr(maps, "draw_heat_map", draw_later)
     assert main(words) == 0
     (ranking_first,) = before
     answer = capsys.readouterr()

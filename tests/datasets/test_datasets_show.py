@@ -113,8 +113,8 @@ def test_nothing_reaches_over_the_margins(whole: Path, tmp_path: Path) -> None:
         assert (picture[:, :10] > 240).all() and (picture[:, -10:] > 240).all() and (picture[:8] > 240).all()
         # The gaps between the three views are empty from the views' top to their bottom.
         step = PANEL_WIDTH + MARGIN
-        rows = slice(HEADER + CAPTION, HEADER + CAPTION + PANEL_HEIGHT)
-        assert all((picture[rows, k * step + 2 : k * step + 14] > 240).all() for k in (1, 2, 3))
+        panels = slice(HEADER + CAPTION, HEADER + CAPTION + PANEL_HEIGHT)
+        assert all((picture[panels, k * step + 2 : k * step + 14] > 240).all() for k in (1, 2, 3))
 
 
 def test_every_class_is_in_the_legend_in_the_colour_that_it_has_in_a_map(
@@ -126,10 +126,11 @@ def test_every_class_is_in_the_legend_in_the_colour_that_it_has_in_a_map(
     rows = np.arange(len(look.truth.points), dtype=np.int32) % 60 + 1
     truth = replace(look.truth, semantic=rows, instance=rows, labels=LabelSet("x", tuple(range(1, 61)), names))
     written: list[str] = []
-    write = Canvas.text
-    monkeypatch.setattr(
-        Canvas, "text", lambda page, x, y, text, *a, **b: written.append(text) or write(page, x, y, text, *a, **b)
-    )
+
+    def text(page: Canvas, x: float, y: float, words: str, *more: Any, **style: Any) -> None:
+        written.append(words)
+
+    monkeypatch.setattr(Canvas, "text", text)
     draw_scene_picture(replace(look, truth=truth), tmp_path / "a.png")
     assert set(names) <= set(written) and not any("more" in text for text in written)
     assert n_near(pixels(tmp_path / "a.png"), class_colours(["book"])["book"]) > 50  # in the panel by class
