@@ -49,8 +49,7 @@ def load_verbs() -> None:
     import matplotlib.figure  # noqa: F401
     import openpyxl  # noqa: F401
 
-    import su3d_bench.analysis.page_maps
-    import su3d_bench.analysis.page_numbers
+    import su3d_bench.analysis.page.contents
     import su3d_bench.cli.sheets.make
     import su3d_bench.cli.sheets.score
     import su3d_bench.predictions.export

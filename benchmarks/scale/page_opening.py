@@ -22,10 +22,11 @@ from typing import Any
 import numpy as np
 from measured import write_measured
 
-from su3d_bench.analysis.page_maps import QUERIES, page_scenes, points_of_each
-from su3d_bench.analysis.page_numbers import page_numbers, scored_maps
+from su3d_bench.analysis.page.contents import Wishes, page_contents
+from su3d_bench.analysis.page.numbers import scored_maps
 from su3d_bench.reports.page.page import page_html
 from su3d_bench.runs.executors.local import limit_threads
+from su3d_bench.runs.finished import read_run
 
 N_SCENES, N_METHODS = 20, 8
 MOST_BYTES, MOST_MS = 30_000_000, 3000.0
@@ -48,9 +49,9 @@ FIRST_MAP = "document.querySelector('#maps .say').hidden && document.querySelect
 
 def simulated_page(run: Path) -> str:
     """The page of a run as if it had ``N_SCENES`` scenes and ``N_METHODS`` methods."""
-    most_points = points_of_each(N_SCENES * N_METHODS, MOST_BYTES)
-    made = [one for one in page_scenes(scored_maps([run]), QUERIES, most_points) if one.maps]
-    numbers = page_numbers([run])
+    n_maps = len(scored_maps([read_run(run)]))
+    page = page_contents([run], Wishes(most_bytes=MOST_BYTES * n_maps // (N_SCENES * N_METHODS)))
+    made, numbers = page.scenes, dict(page.numbers)
     numbers["runs"][0] |= {"scenes": SCENES, "methods": METHODS}
     for key in ("results", "confusions", "errors", "timing"):
         numbers[key] = list(_of_all_methods(numbers[key]))

@@ -7,9 +7,9 @@ the kinds of errors are is said in ``metrics.attribution`` and ``metrics.attribu
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
-from functools import cache
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,8 @@ import numpy as np
 from su3d_bench.analysis.sides import Side, refuse_unlike
 from su3d_bench.core.errors import ConfigError, PredictionError, printable
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import GroundTruth, Prediction
-from su3d_bench.metrics.attribution.arrays import EXPLAINED
+from su3d_bench.core.types import GroundTruth
+from su3d_bench.metrics.attribution.arrays import EXPLAINED, MendedScene
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.metric import Counts
 from su3d_bench.metrics.protocols.loading import load_protocol
@@ -30,6 +30,8 @@ from su3d_bench.store.predictions import read_prediction
 
 SCHEMA = 1
 Values = Mapping[str, float]
+MendedJob = Mapping[str, MendedScene]  # of a scene under a method, by protocol
+TruthOf = Callable[[str], GroundTruth]  # by the variant that a protocol asks for
 
 
 @dataclass(frozen=True)
@@ -85,34 +87,73 @@ def attribute(
     ``oracle``: a run of the same method on the same scenes with the profile ``oracle``, for the stage of the 2D masks.
     """
     run = read_run(path)
-    side = Side(run, _method_of(run, method))
-    names, remarks = _protocols_of(run, protocols)
-    other = None if oracle is None else Side(_oracle_run(oracle), side.method)
+    explained = explained_of(run, _method_of(run, method), protocols)
+    other = None if oracle is None else Side(_oracle_run(oracle), explained.method)
     if other is not None:
         other.run.check_method(other.method)
-    scores = run.scores(side.method)
-    gathered = {name: _Gathered(load_protocol(name)) for name in names}
     encoder = cache(run.encoder)
-
-    @cache
-    def truth_of(scene: str, variant: str) -> GroundTruth:
-        truth: GroundTruth = run.dataset(scene).ground_truth(scene.partition("/")[2], variant)
-        return truth
-
+    mended = {}
     for scene in run.scenes:
-        mine = [name for name in names if scene in scores[name]]
-        if mine:
-            prediction = read_prediction(run.folder.job(scene, side.method).prediction)
-            naming = encoder() if getattr(prediction, "labels", None) is None else None
-            for name in mine:
-                truth = truth_of(scene, gathered[name].rules.ground_truth)
-                gathered[name].add(scene, truth, prediction, naming, scores[name][scene])
-            truth_of.cache_clear()
-    explained = [counted for counted in gathered.values() if counted.scenes]
-    formed = tuple(counted.form(_oracle_values(counted.rules, side, other, counted.scenes)) for counted in explained)
-    if not formed:
-        raise ConfigError(f"{side.name}: no scene is scored under {', '.join(names)}; nothing to explain")
-    return RunAttribution(run.name, side.method, (*remarks, *_remarks(run)), formed)
+        truth_of = cache(partial(_truth_of, run, scene))
+        mended[scene] = explained.mend(scene, truth_of, encoder)
+    return explained.form(mended, other)
+
+
+def _truth_of(run: FinishedRun, scene: str, variant: str) -> GroundTruth:
+    truth: GroundTruth = run.dataset(scene).ground_truth(scene.partition("/")[2], variant)
+    return truth
+
+
+def explained_of(run: FinishedRun, method: str, wanted: Sequence[str] = ()) -> Explained:
+    """The protocols under which the errors of ``method`` are explained: those ``wanted``, else all that can be."""
+    names, remarks = _protocols_of(run, wanted)
+    return Explained(run, method, tuple(names), tuple(remarks))
+
+
+@dataclass(frozen=True)
+class Explained:
+    """A method of a run, whose errors are explained under ``protocols``."""
+
+    run: FinishedRun
+    method: str
+    protocols: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+    @cached_property
+    def _scores(self) -> Mapping[str, Mapping[str, SceneScore]]:
+        return self.run.scores(self.method)
+
+    def mend(self, scene: str, truth_of: TruthOf, encoder: Callable[[], Encoder]) -> MendedJob:
+        """The counts of ``scene`` as they are and with its errors mended, by protocol; of those that scored it."""
+        mine = [name for name in self.protocols if scene in self._scores[name]]
+        if not mine:
+            return {}
+        prediction = read_prediction(self.run.folder.job(scene, self.method).prediction)
+        naming = encoder() if getattr(prediction, "labels", None) is None else None
+        mended: dict[str, MendedScene] = {}
+        for name in mine:
+            rules = load_protocol(name)
+            truth = truth_of(rules.ground_truth)
+            if (reason := why_not_scorable(rules, prediction)) is not None:
+                raise PredictionError(f"{scene}: {reason}")
+            mended[name] = EXPLAINED[rules.kind][1](rules, truth, prediction, naming)
+            _refuse_other_counts(scene, rules, self._scores[name][scene].counts, mended[name].as_is)
+        return mended
+
+    def form(self, mended: Mapping[str, MendedJob], other: Side | None = None) -> RunAttribution:
+        """What the errors of all scenes cost; ``other`` is the side with perfect 2D masks."""
+        side = Side(self.run, self.method)
+        gathered = {name: _Gathered(load_protocol(name)) for name in self.protocols}
+        for scene, of_scene in mended.items():
+            for name, counts in of_scene.items():
+                gathered[name].add(scene, counts)
+        explained = [counted for counted in gathered.values() if counted.scenes]
+        formed = tuple(
+            counted.form(_oracle_values(counted.rules, side, other, counted.scenes)) for counted in explained
+        )
+        if not formed:
+            raise ConfigError(f"{side.name}: no scene is scored under {', '.join(self.protocols)}; nothing to explain")
+        return RunAttribution(self.run.name, self.method, (*self.remarks, *_remarks(self.run)), formed)
 
 
 def _method_of(run: FinishedRun, method: str | None) -> str:
@@ -183,15 +224,9 @@ class _Gathered:
     n: Counter[str] = field(default_factory=Counter)
     n_scored: int | None = None
 
-    def add(
-        self, scene: str, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None, score: SceneScore
-    ) -> None:
-        if (reason := why_not_scorable(self.rules, prediction)) is not None:
-            raise PredictionError(f"{scene}: {reason}")
-        mended = EXPLAINED[self.rules.kind][1](self.rules, truth, prediction, encoder)
+    def add(self, scene: str, mended: MendedScene) -> None:
         if mended.n_scored is not None:
             self.n_scored = (self.n_scored or 0) + mended.n_scored
-        _refuse_other_counts(scene, self.rules, score.counts, mended.as_is)
         self.scenes.append(scene)
         self.as_is.append(mended.as_is)
         self.all.append(mended.all)

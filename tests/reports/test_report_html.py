@@ -19,8 +19,8 @@ import pytest
 from painted import WordEncoder, colour_perception
 from places import SCENES
 
-from su3d_bench.analysis import page_maps
-from su3d_bench.analysis.page_maps import points_of_each
+from su3d_bench.analysis.page import maps as page_maps
+from su3d_bench.analysis.page.maps import points_of_each
 from su3d_bench.cli.main import main
 from su3d_bench.core.types import DenseFeatures, Instances
 from su3d_bench.reports.page import maps as html_map
@@ -62,7 +62,7 @@ def made(run: Path, page: Path, *words: str) -> str:
     """The page of a run, made with the encoder of painted scenes."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
-        assert main(["report", "html", str(run), "--out", str(page), "--quiet", *words]) == 0
+        assert main(["report", "html", str(run), "--out", str(page), "--quiet", "--jobs", "1", *words]) == 0
     return page.read_text(encoding="utf-8")
 
 

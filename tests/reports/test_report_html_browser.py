@@ -46,7 +46,9 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / "one" / "metrics.json").write_text(json.dumps(record))
         runs = [str(folder / "one"), str(folder / "two")]
         texts = ["--queries", "chair", "table"]
-        assert main(["report", "html", *runs, "--out", str(folder / "page.html"), "--quiet", *texts]) == 0
+        assert (
+            main(["report", "html", *runs, "--out", str(folder / "page.html"), "--quiet", "--jobs", "1", *texts]) == 0
+        )
     return folder / "page.html"
 
 

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, answer_either, remark, written
+from su3d_bench.cli.common import add_verb, answer_either, drawn_bars, remark, written
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, counted, printable
+from su3d_bench.runs.executors.local import SCENE_DONE, Event
+
+if TYPE_CHECKING:
+    from su3d_bench.analysis.page.contents import Amount
 
 NAME = "html"
 MEGABYTE = 10**6
@@ -37,34 +42,73 @@ def add_parser(actions: Any) -> None:
     parser.add_argument(
         "--most-megabytes", type=float, default=30.0, metavar="MB", help="maps are thinned for it (default: 30)"
     )
+    parser.add_argument(
+        "--jobs", type=int, default=0, metavar="N", help="scenes made side by side (default: the CPU cores)"
+    )
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.analysis.page_maps import MOST_POINTS, QUERIES, page_scenes, points_of_each
-    from su3d_bench.analysis.page_numbers import page_numbers, scored_maps
+    from su3d_bench.analysis.page.contents import QUERIES, Wishes, page_contents
     from su3d_bench.reports.page.page import page_html
 
     if not 0 < arguments.most_megabytes <= 1000:
         raise ConfigError(f"--most-megabytes {arguments.most_megabytes:g}: must be above 0 and at most 1000")
-    queries = QUERIES if arguments.queries is None else tuple(printable(text, 120) for text in arguments.queries)
-
-    def progress(line: str) -> None:
-        remark(line, quiet=arguments.quiet)
-
-    numbers = page_numbers(arguments.runs, with_errors=not arguments.no_errors, progress=progress)
-    maps = [] if arguments.no_maps else scored_maps(arguments.runs)
-    most_points = points_of_each(len(maps), round(arguments.most_megabytes * MEGABYTE)) if maps else MOST_POINTS
-    scenes = list(page_scenes(maps, queries, most_points, progress))
+    if arguments.jobs < 0:
+        raise ConfigError(f"--jobs {arguments.jobs}: must be 1 or more; 0 stands for the CPU cores")
+    wishes = Wishes(
+        queries=QUERIES if arguments.queries is None else tuple(printable(text, 120) for text in arguments.queries),
+        most_bytes=round(arguments.most_megabytes * MEGABYTE),
+        with_maps=not arguments.no_maps,
+        with_errors=not arguments.no_errors,
+        jobs=arguments.jobs,
+    )
+    with drawn_bars(is_quiet=arguments.quiet, tells_time_left=True) as bars:
+        progress = _Progress(bars, is_quiet=arguments.quiet)
+        contents = page_contents(arguments.runs, wishes, begin=progress.begin, report=progress.report)
     title = arguments.title or ", ".join(dict.fromkeys(run.resolve().name for run in arguments.runs))
-    shown = [page_map for scene in scenes for page_map in scene.maps]
+    maps = contents.maps
     page = page_html(
         printable(title, 200),
-        {**numbers, "maps": [page_map.listed() for page_map in shown]},
-        [scene.listed() for scene in scenes],
-        [page_map.content for page_map in shown],
+        {**contents.numbers, "maps": [page_map.listed() for page_map in maps]},
+        [scene.listed() for scene in contents.scenes],
+        [page_map.content for page_map in maps],
     )
     written(arguments.out, page)
     n_bytes = len(page.encode())
-    about = {"page": str(arguments.out), "n_bytes": n_bytes, "n_maps": len(shown), "most_points": most_points}
-    answer_either(arguments, about, f"{arguments.out}: {n_bytes / MEGABYTE:.1f} MB, {counted(len(shown), 'map')}")
+    about = {
+        "page": str(arguments.out), "n_bytes": n_bytes, "n_maps": len(maps), "most_points": contents.most_points,
+    }  # fmt: skip
+    answer_either(arguments, about, f"{arguments.out}: {n_bytes / MEGABYTE:.1f} MB, {counted(len(maps), 'map')}")
     return EXIT_DONE
+
+
+class _Progress:
+    """What of the page is made: a bar with the time that is left, or a line a scene where stderr is no terminal."""
+
+    def __init__(self, bars: Any, *, is_quiet: bool) -> None:
+        self._bars = bars
+        self._is_quiet = is_quiet
+        self._done: dict[str, int] = {}
+        self._n_scenes_done = 0
+
+    def begin(self, amount: Amount) -> None:
+        self._amount, self._since = amount, time.monotonic()
+        if amount.n_kept:
+            self._say(f"{counted(amount.n_kept, 'scene')} as made before")
+        if self._bars is not None and amount.n_steps:
+            self._task = self._bars.add_task("page", total=amount.n_steps, remark="")
+
+    def report(self, event: Event) -> None:
+        self._done[event.unit] = event.done
+        n_done, is_scene = sum(self._done.values()), event.label == SCENE_DONE
+        self._n_scenes_done += is_scene
+        doing = "done" if is_scene else event.label
+        if self._bars is not None:
+            self._bars.update(self._task, completed=n_done, description=f"{printable(event.unit, 60)}: {doing}")
+        elif is_scene:
+            left_s = (time.monotonic() - self._since) * (self._amount.n_steps / max(1, n_done) - 1)
+            left = f", about {left_s:.0f} s left" if n_done < self._amount.n_steps else ""
+            self._say(f"{printable(event.unit, 120)}: {self._n_scenes_done} of {self._amount.n_scenes} scenes{left}")
+
+    def _say(self, text: str) -> None:
+        remark(text, quiet=self._is_quiet)

@@ -11,7 +11,8 @@ import pytest
 from painted import colour_perception
 from places import SCENES
 
-from su3d_bench.analysis import page_numbers as page_sources
+from su3d_bench.analysis.page import numbers as page_sources
+from su3d_bench.analysis.page.contents import Wishes, page_contents
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
 from su3d_bench.metrics.instance import average_precision as instance_ap
@@ -23,6 +24,7 @@ from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import runner
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.executors.choose import run_units
+from su3d_bench.runs.finished import read_run
 from su3d_bench.store import atomic
 from su3d_bench.store import run_folder as store
 
@@ -202,17 +204,17 @@ def test_the_page_of_many_jobs_holds_the_records_and_says_what_it_lacks(
         raise AssertionError("nothing is scored again")
 
     monkeypatch.setattr(finished_run, "encoder_of", no_encoder)
-    whole = page_sources.page_numbers([finished], with_errors=False)
+    whole = page_contents([finished], Wishes(with_errors=False, with_maps=False)).numbers
     assert whole["left_out"] is None
     assert whole["timing"]
     monkeypatch.setattr(page_sources, "MOST_JOBS", 1)
     monkeypatch.setattr(page_sources, "MOST_MAPS", 1)
-    page = page_sources.page_numbers([finished])
+    page = page_contents([finished], Wishes(with_maps=False)).numbers
     assert page["results"] == whole["results"]
     assert page["runs"] == whole["runs"]
     assert [page[part] for part in ("confusions", "errors", "timing", "comparisons")] == [[], [], [], []]
     assert page["left_out"].startswith(f"{len(planned(finished))} jobs, more than 1: ")
-    assert len(page_sources.scored_maps([finished])) == 1
+    assert len(page_sources.scored_maps([read_run(finished)])) == 1
 
 
 def planned(run: Path) -> list[tuple[str, str]]:

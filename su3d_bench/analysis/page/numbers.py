@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
-from su3d_bench.analysis.attribution import attribute
 from su3d_bench.analysis.comparison import compare
 from su3d_bench.analysis.side_numbers import SideNumbers
 from su3d_bench.analysis.sides import Side
 from su3d_bench.core.config import KeyPath
-from su3d_bench.core.errors import Su3dError, printable, printable_json
+from su3d_bench.core.errors import Su3dError, printable_json
 from su3d_bench.metrics.costs import summarise
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, concatenate
 from su3d_bench.reports.page.numbers import confusion_cells, series_of, summary_data
 from su3d_bench.reports.tables.found import Found, Unscored, not_scored_lines
-from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
+from su3d_bench.runs.finished import FinishedRun, read_update_times
 from su3d_bench.runs.found import found_in, without_score
 from su3d_bench.store.records import ResultRecord, plain
 
@@ -35,49 +33,44 @@ LEFT_OUT = (
 # Of a record of results: what the page says elsewhere, or not at all.
 NOT_SHOWN = ("encoder_digest", "anytime")
 NUMBERS_NOT_SHOWN = ("protocol", "version", "headline", "n_scenes", "scene_mean")
-Progress = Callable[[str], None]
 
 
-def page_numbers(
-    folders: Sequence[Path], *, with_errors: bool = True, progress: Progress = lambda line: None
-) -> dict[str, Any]:
-    """Plain values for the page of the runs in ``folders``, every text in them on one line and printable.
+def page_numbers(runs: Sequence[FinishedRun], errors: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Plain values for the page of ``runs``, every text in them on one line and printable.
 
-    ``with_errors``: predictions are scored again with each kind of error mended, which takes as long as scoring them.
     Of more than ``MOST_JOBS`` jobs the page shows what the runs' own records say, and ``left_out`` says what it lacks.
-    Raises a ``StoreError`` where a folder holds no finished run; what cannot be had of one is a reason on the page.
     """
-    runs = [read_run(folder) for folder in dict.fromkeys(folders)]
-    n_jobs = _n_jobs(runs)
+    n_jobs, reads_all = _n_jobs(runs), are_all_read(runs)
     results: list[dict[str, Any]] = []
     confusions: list[dict[str, Any]] = []
     timing: list[dict[str, Any]] = []
-    errors: list[dict[str, Any]] = []
     for index, run in enumerate(runs):
-        progress(f"{run.name}: numbers")
         results += [{"run": index, **_shown(result)} for result in run.results.values()]
-        if n_jobs > MOST_JOBS:
-            continue
-        timing += [{"run": index, **times} for method in run.methods if (times := _times(run, method)) is not None]
-        for method in run.methods:
-            confusions += [{"run": index, **confusion} for confusion in _confusions(run, method)]
-            if with_errors and _is_scored(run):
-                progress(f"{run.name}: errors of {printable(method, 80)}")
-                errors.append({"run": index, **_errors(run, method)})
+        if reads_all:
+            timing += [{"run": index, **times} for method in run.methods if (times := _times(run, method)) is not None]
+            confusions += [{"run": index, **one} for method in run.methods for one in _confusions(run, method)]
     told = {result["protocol"] for result in results if result["result"] is not None or result["failed"]}
-    progress("comparisons")
     numbers = {
-        "left_out": f"{n_jobs} jobs, more than {MOST_JOBS}: {LEFT_OUT}" if n_jobs > MOST_JOBS else None,
+        "left_out": None if reads_all else f"{n_jobs} jobs, more than {MOST_JOBS}: {LEFT_OUT}",
         "runs": [_about(run) for run in runs],
         "results": [result for result in results if result["protocol"] in told],
-        "found": [{"run": index, **asdict(one)} for index, run in enumerate(runs) for one in _found(run, n_jobs)],
+        "found": [{"run": index, **asdict(one)} for index, run in enumerate(runs) for one in _found(run, reads_all)],
         "confusions": confusions,
         "errors": errors,
         "timing": timing,
-        "comparisons": _comparisons(runs) if n_jobs <= MOST_JOBS and any(map(_is_scored, runs)) else [],
+        "comparisons": _comparisons(runs) if reads_all and any(map(is_scored, runs)) else [],
     }
     plain: dict[str, Any] = printable_json(numbers)
     return plain
+
+
+def are_all_read(runs: Sequence[FinishedRun]) -> bool:
+    """Whether the files of each job are read, or there are too many."""
+    return _n_jobs(runs) <= MOST_JOBS
+
+
+def is_scored(run: FinishedRun) -> bool:
+    return any(result.result is not None for result in run.results.values())
 
 
 def _shown(result: ResultRecord) -> dict[str, Any]:
@@ -85,10 +78,6 @@ def _shown(result: ResultRecord) -> dict[str, Any]:
     if result.result is not None:
         shown["result"] = {key: value for key, value in shown["result"].items() if key not in NUMBERS_NOT_SHOWN}
     return shown | {"anytime": [plain(midway) for midway in result.anytime or ()]}
-
-
-def _is_scored(run: FinishedRun) -> bool:
-    return any(result.result is not None for result in run.results.values())
 
 
 def _about(run: FinishedRun) -> dict[str, Any]:
@@ -111,8 +100,8 @@ def _about(run: FinishedRun) -> dict[str, Any]:
     }
 
 
-def _found(run: FinishedRun, n_jobs: int) -> Iterator[Found]:
-    return found_in(run.folder, without_score(run) if n_jobs <= MOST_JOBS else ())
+def _found(run: FinishedRun, reads_all: bool) -> Iterator[Found]:
+    return found_in(run.folder, without_score(run) if reads_all else ())
 
 
 def _dotted(path: KeyPath) -> str:
@@ -134,13 +123,6 @@ def _confusions(run: FinishedRun, method: str) -> list[dict[str, Any]]:
         names = [entry.name for entry in rules.classes]
         confusions.append(confusion | {"names": names, "cells": confusion_cells(concatenate(counts).confusion)})
     return confusions
-
-
-def _errors(run: FinishedRun, method: str) -> dict[str, Any]:
-    try:
-        return {**attribute(run.folder.path, method=method).to_json(), "reason": None}
-    except Su3dError as error:
-        return {"method": method, "protocols": [], "remarks": [], "reason": str(error)}
 
 
 def _times(run: FinishedRun, method: str) -> dict[str, Any] | None:
@@ -177,12 +159,11 @@ def _n_jobs(runs: Sequence[FinishedRun]) -> int:
     return sum(len(run.scenes) * len(run.methods) for run in runs)
 
 
-def scored_maps(folders: Sequence[Path]) -> list[tuple[int, FinishedRun, str, str]]:
+def scored_maps(runs: Sequence[FinishedRun]) -> list[tuple[int, FinishedRun, str, str]]:
     """Index of the run, run, scene and method of every map there is, all methods of a scene together.
 
     Of more than ``MOST_JOBS`` jobs only the maps of the first scenes, at most ``MOST_MAPS``.
     """
-    runs = [read_run(folder) for folder in dict.fromkeys(folders)]
     maps = (
         (index, run, scene, method)
         for index, run in enumerate(runs)
@@ -190,4 +171,4 @@ def scored_maps(folders: Sequence[Path]) -> list[tuple[int, FinishedRun, str, st
         for method in run.methods
         if run.folder.job(scene, method).prediction.is_file()
     )
-    return list(itertools.islice(maps, MOST_MAPS) if _n_jobs(runs) > MOST_JOBS else maps)
+    return list(maps if are_all_read(runs) else itertools.islice(maps, MOST_MAPS))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -53,16 +53,6 @@ from su3d_bench.runs.finished import FinishedRun, OtherDataError
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.records import read_updates
 
-QUERIES = (
-    "somewhere to sit",
-    "somewhere to sleep",
-    "a lamp that gives light",
-    "a plant",
-    "something to read",
-    "an electronic device",
-    "a place to store things",
-    "something to eat or drink from",
-)
 MOST_POINTS, LEAST_POINTS = 60_000, 3_000  # of one map: what a phone draws at once, what still shows a room
 BYTES_A_POINT = 6.0  # in the page, measured on the rooms: position, colour, owner and truth, deflated, in base64
 SHARE_OF_POINTS = 0.6  # of the page; the rest is for instances, pictures and tables
@@ -99,6 +89,11 @@ class PageScene:
     maps: tuple[PageMap, ...]
     remarks: tuple[str, ...]
 
+    @property
+    def is_whole(self) -> bool:
+        """Whether nothing is missing, so that it would come out the same another time."""
+        return not self.remarks and all(page_map.reason is None for page_map in self.maps)
+
     def listed(self) -> dict[str, Any]:
         """The scene as the page holds it, its maps aside."""
         return {"scene": self.scene, "thumbnails": dict(self.thumbnails), "remarks": list(self.remarks)}
@@ -114,50 +109,79 @@ def points_of_each(n_maps: int, most_bytes: int) -> int:
     return min(MOST_POINTS, max(LEAST_POINTS, share))
 
 
-def page_scenes(
-    maps: Sequence[MapOfRun],
-    queries: Sequence[str],
-    most_points: int,
-    progress: Callable[[str], None] = lambda line: None,
-) -> Iterator[PageScene]:
-    """The scenes of ``maps`` in their order. What fails of a map is a reason on the page, never a page without it."""
-    known = _Known(tuple(queries))
-    for scene in dict.fromkeys(map_of_run[2] for map_of_run in maps):
-        progress(f"{printable(scene, 120)}: maps")
-        yield _Scene(scene, [map_of_run for map_of_run in maps if map_of_run[2] == scene], known).page(most_points)
-
-
-class _Known:
-    """Encoders of the runs and the features of the queries under each, made once."""
+class Spaces:
+    """The encoders of runs and the features of the queries under each, made once."""
 
     def __init__(self, queries: tuple[str, ...]) -> None:
         self.queries = queries
-        self._encoders: dict[Path, tuple[Encoder, Any]] = {}
+        self._encoders: dict[Path, Encoder] = {}
+        self._texts: dict[Path, Any] = {}
 
-    def encoder(self, run: FinishedRun) -> tuple[Encoder, Any]:
+    def encoder(self, run: FinishedRun) -> Encoder:
         path = run.folder.path
         if path not in self._encoders:
-            encoder = run.encoder()
-            self._encoders[path] = encoder, encoder.encode_texts(list(self.queries))
+            self._encoders[path] = run.encoder()
         return self._encoders[path]
+
+    def texts(self, run: FinishedRun) -> Any:
+        """The features (Q, D) of the queries."""
+        path = run.folder.path
+        if path not in self._texts:
+            self._texts[path] = self.encoder(run).encode_texts(list(self.queries))
+        return self._texts[path]
+
+
+class SharedTruths:
+    """The truths of one scene, each made once whoever asks."""
+
+    def __init__(self, scene: str) -> None:
+        self._scene = scene
+        self._truths: dict[tuple[int, str], GroundTruth] = {}
+
+    def of(self, dataset: Any, variant: str) -> GroundTruth:
+        key = id(dataset), variant  # a run keeps its datasets
+        if key not in self._truths:
+            self._truths[key] = dataset.ground_truth(self._scene.partition("/")[2], variant)
+        return self._truths[key]
+
+    def of_run(self, run: FinishedRun, variant: str) -> GroundTruth:
+        """The truth in the data of ``run``, which must be those that it was made from."""
+        return self.of(run.dataset(self._scene), variant)
+
+
+def page_scene(
+    scene: str,
+    maps: Sequence[MapOfRun],
+    spaces: Spaces,
+    truths: SharedTruths,
+    most_points: int,
+    tell: Callable[[str], None] = lambda doing: None,
+) -> PageScene:
+    """A scene with its ``maps``. What fails of a map is a reason on the page, never a page without it.
+
+    ``tell`` hears of each map before it is made.
+    """
+    return _Scene(scene, maps, spaces, truths).page(most_points, tell)
 
 
 class _Scene:
     """One scene under all methods of all runs."""
 
-    def __init__(self, scene: str, maps: Sequence[MapOfRun], known: _Known) -> None:
+    def __init__(self, scene: str, maps: Sequence[MapOfRun], spaces: Spaces, truths: SharedTruths) -> None:
         self._scene = scene
         self._maps = maps
-        self._known = known
+        self._spaces = spaces
+        self._truths = truths
         self._remarks: list[str] = []
         self._frame_of: dict[int, Frame | None] = {}
 
-    def page(self, most_points: int) -> PageScene:
+    def page(self, most_points: int, tell: Callable[[str], None]) -> PageScene:
         read = {key[:1] + key[3:]: self._read(key) for key in self._maps}
         chosen = self._chosen_frames([a_map for a_map in read.values() if isinstance(a_map, Instances)])
         frames = {index: frame for index in sorted(chosen) if (frame := self._frame(index)) is not None}
         made = []
         for index, run, scene, method in self._maps:
+            tell(f"map of {printable(method, 60)}")
             prediction = read[index, method]
             reason = prediction if isinstance(prediction, str) else None
             content = "" if isinstance(prediction, str) else self._pack(run, prediction, frames, most_points)
@@ -234,9 +258,7 @@ class _Scene:
     def _truth(self, rules: ProtocolRules) -> GroundTruth | None:
         if self._dataset is None:
             return None
-        return self._had(
-            "no truth", lambda: self._dataset.ground_truth(self._scene.partition("/")[2], rules.ground_truth)
-        )
+        return self._had("no truth", lambda: self._truths.of(self._dataset, rules.ground_truth))
 
     def _pack(self, run: FinishedRun, prediction: Prediction, frames: Mapping[int, Frame], most_points: int) -> str:
         cloud = thinned(prediction.points, most_points)
@@ -260,7 +282,7 @@ class _Scene:
                 planes["class"] = index_plane(classes)
         else:
             similarity = self._similarity(run, prediction)
-            about["queries"] = [] if similarity is None else list(self._known.queries)
+            about["queries"] = [] if similarity is None else list(self._spaces.queries)
             about["instances"] = [
                 _instance_data(prediction, k, classes, similarity, frames) for k in range(n_predictions(prediction))
             ]
@@ -283,14 +305,14 @@ class _Scene:
 
     def _encoder(self, run: FinishedRun, prediction: Prediction) -> Encoder | None:
         labels = getattr(prediction, "labels", None)
-        return None if labels is not None and all(labels) else self._known.encoder(run)[0]
+        return None if labels is not None and all(labels) else self._spaces.encoder(run)
 
     def _similarity(self, run: FinishedRun, prediction: Prediction) -> Any:
         """The cosine (K, Q) of each instance with each query; None where the map has no features."""
         features = prediction.features
-        if features is None or not len(features) or not self._known.queries:
+        if features is None or not len(features) or not self._spaces.queries:
             return None
-        texts = self._had("no similarities", lambda: self._known.encoder(run)[1])
+        texts = self._had("no similarities", lambda: self._spaces.texts(run))
         return cosines(features, texts) if texts is not None and texts.shape[1] == features.shape[1] else None
 
 

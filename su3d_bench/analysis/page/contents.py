@@ -1,0 +1,255 @@
+"""All that a page of some runs holds: its scenes are made side by side, or taken as they were kept."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, NoReturn
+
+from pydantic import TypeAdapter, ValidationError
+
+from su3d_bench.analysis.attribution import Explained, MendedJob, explained_of
+from su3d_bench.analysis.page.errors import errors_of, packed, unpacked
+from su3d_bench.analysis.page.kept import Piece, piece, state_of_job, state_of_run
+from su3d_bench.analysis.page.maps import MapOfRun, PageMap, PageScene, SharedTruths, Spaces, page_scene, points_of_each
+from su3d_bench.analysis.page.numbers import are_all_read, is_scored, page_numbers, scored_maps
+from su3d_bench.core.errors import DataError, Su3dError, printable
+from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report, run_inline, run_processes
+from su3d_bench.runs.finished import FinishedRun, read_run
+from su3d_bench.store.atomic import is_file
+
+QUERIES = (
+    "somewhere to sit",
+    "somewhere to sleep",
+    "a lamp that gives light",
+    "a plant",
+    "something to read",
+    "an electronic device",
+    "a place to store things",
+    "something to eat or drink from",
+)
+Job = tuple[int, str]  # index of the run, method
+_SCENES: TypeAdapter[PageScene] = TypeAdapter(PageScene)
+
+
+@dataclass(frozen=True)
+class Wishes:
+    """What a page shall hold: ``queries`` are texts that instances are compared with; ``most_bytes`` is about its size.
+
+    ``jobs`` scenes are made side by side, 0: as many as there are cores.
+    """
+
+    queries: tuple[str, ...] = QUERIES
+    most_bytes: int = 30_000_000
+    with_maps: bool = True
+    with_errors: bool = True
+    jobs: int = 0
+
+
+@dataclass(frozen=True)
+class Amount:
+    """What of a page must be made: ``n_steps`` of ``n_scenes``, while ``n_kept`` scenes were made before."""
+
+    n_scenes: int
+    n_steps: int
+    n_kept: int
+
+
+@dataclass(frozen=True)
+class Contents:
+    """Plain ``numbers``, and the ``scenes`` with their maps, none of more than ``most_points``."""
+
+    numbers: Mapping[str, Any]
+    scenes: tuple[PageScene, ...]
+    most_points: int
+
+    @property
+    def maps(self) -> list[PageMap]:
+        return [page_map for scene in self.scenes for page_map in scene.maps]
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is needed of one scene and was not kept: the ``errors`` of some jobs, and the scene with its ``maps``."""
+
+    scene: str
+    errors: tuple[tuple[Job, Piece], ...]
+    maps: tuple[Job, ...]
+    page: Piece | None
+
+    @property
+    def n_steps(self) -> int:
+        return len(self.errors) + len(self.maps)
+
+
+@dataclass
+class Made:
+    """What was made of one scene; the errors of a job are a text where they cannot be had."""
+
+    scene: str
+    errors: dict[Job, MendedJob | str] = field(default_factory=dict)
+    page: PageScene | None = None
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The scenes that one process makes."""
+
+    folders: tuple[Path, ...]
+    queries: tuple[str, ...]
+    most_points: int
+    scenes: tuple[Asked, ...]
+
+
+def page_contents(
+    folders: Sequence[Path],
+    wishes: Wishes,
+    *,
+    begin: Callable[[Amount], None] = lambda amount: None,
+    report: Report = lambda event: None,
+) -> Contents:
+    """The contents of the page of the runs in ``folders``.
+
+    ``begin`` is told once what there is to make, ``report`` of every step. Raises a ``StoreError`` where a folder holds
+    no finished run; what cannot be had of one is a reason on the page.
+    """
+    folders = tuple(dict.fromkeys(folders))
+    runs = [read_run(folder) for folder in folders]
+    maps = scored_maps(runs) if wishes.with_maps else []
+    most_points = points_of_each(len(maps), wishes.most_bytes)
+    explained = _explained(runs) if wishes.with_errors and are_all_read(runs) else {}
+    made, asked = _kept(runs, maps, [job for job, one in explained.items() if isinstance(one, Explained)], wishes)
+    begin(Amount(len(asked), sum(one.n_steps for one in asked), len(made) - len(asked)))
+    for fresh in _all_made(Batch(folders, wishes.queries, most_points, tuple(asked)), wishes.jobs, report):
+        made[fresh.scene].errors.update(fresh.errors)
+        made[fresh.scene].page = made[fresh.scene].page or fresh.page
+    errors = []
+    for (index, method), one in explained.items():
+        of_scenes = {
+            scene: made[scene].errors[index, method]
+            for scene in runs[index].scenes
+            if scene in made and (index, method) in made[scene].errors
+        }
+        errors.append({"run": index, **errors_of(one, method, of_scenes)})
+    pages = {scene: made[scene].page for scene in dict.fromkeys(scene for _, _, scene, _ in maps)}
+    return Contents(page_numbers(runs, errors), tuple(page for page in pages.values() if page is not None), most_points)
+
+
+def _explained(runs: Sequence[FinishedRun]) -> dict[Job, Explained | str]:
+    """What can be explained of each method, or the reason why nothing can."""
+    explained: dict[Job, Explained | str] = {}
+    for index, run in enumerate(runs):
+        for method in run.methods if is_scored(run) else ():
+            try:
+                explained[index, method] = explained_of(run, method)
+            except Su3dError as error:
+                explained[index, method] = str(error)
+    return explained
+
+
+def _kept(
+    runs: Sequence[FinishedRun], maps: Sequence[MapOfRun], explained: Sequence[Job], wishes: Wishes
+) -> tuple[dict[str, Made], list[Asked]]:
+    """What was made of the scenes before, and what is yet to be made."""
+    most_points = points_of_each(len(maps), wishes.most_bytes)
+    shown = {scene: [one for one in maps if one[2] == scene] for scene in dict.fromkeys(one[2] for one in maps)}
+    counted_jobs: dict[str, list[Job]] = {}
+    for index, method in explained:
+        for scene in runs[index].scenes:
+            if is_file(runs[index].folder.job(scene, method).counts):
+                counted_jobs.setdefault(scene, []).append((index, method))
+    made, asked = {}, []
+    for scene in dict.fromkeys([*shown, *counted_jobs]):
+        made[scene] = Made(scene)
+        state = cache(partial(_state, runs, scene))
+        places = {
+            job: piece(runs[job[0]], ("errors", scene, job[1]), state(job)) for job in counted_jobs.get(scene, ())
+        }
+        for job, place in places.items():
+            mended = None if (content := place.load()) is None else unpacked(content)
+            if mended is not None:
+                made[scene].errors[job] = mended
+        of_maps = [(index, method) for index, _, _, method in shown.get(scene, ())]
+        place_of_page = None
+        if of_maps:
+            made_from = [[[*job, state(job)] for job in of_maps], list(wishes.queries), most_points]
+            place_of_page = piece(runs[of_maps[0][0]], ("maps", scene), made_from)
+            made[scene].page = _read(place_of_page)
+        to_make = tuple((job, place) for job, place in places.items() if job not in made[scene].errors)
+        is_whole = made[scene].page is not None
+        if to_make or (of_maps and not is_whole):
+            asked.append(Asked(scene, to_make, () if is_whole else tuple(of_maps), place_of_page))
+    return made, asked
+
+
+def _state(runs: Sequence[FinishedRun], scene: str, job: Job) -> list[Any]:
+    index, method = job
+    return [state_of_run(runs[index], scene), state_of_job(runs[index], scene, method)]
+
+
+def _read(place: Piece) -> PageScene | None:
+    content = place.load()
+    with suppress(ValidationError):
+        return None if content is None else _SCENES.validate_json(content)
+    return None
+
+
+def _all_made(batch: Batch, jobs: int, report: Report) -> list[Made]:
+    """The scenes of ``batch``, dealt out to processes where there is more than one."""
+    n_workers = min(jobs or os.cpu_count() or 1, len(batch.scenes))
+    dealt = [replace(batch, scenes=batch.scenes[k::n_workers]) for k in range(n_workers)]
+    run = partial(run_processes, jobs=n_workers, lost=_lost) if n_workers > 1 else run_inline
+    return [made for of_batch in run(_make, dealt, report) for made in of_batch]
+
+
+def _lost(batch: Batch, cause: str) -> NoReturn:
+    scenes = printable(", ".join(asked.scene for asked in batch.scenes), 200)
+    raise DataError(f"{scenes}: {cause}; scenes that were made are kept")
+
+
+def _make(batch: Batch, report: Report) -> list[Made]:
+    """The scenes of ``batch``, each kept as soon as it is made."""
+    runs = [read_run(folder) for folder in batch.folders]
+    spaces = Spaces(batch.queries)
+    explained = cache(lambda index, method: explained_of(runs[index], method))
+    return [_make_scene(asked, runs, spaces, explained, batch.most_points, report) for asked in batch.scenes]
+
+
+def _make_scene(
+    asked: Asked,
+    runs: Sequence[FinishedRun],
+    spaces: Spaces,
+    explained: Callable[[int, str], Explained],
+    most_points: int,
+    report: Report,
+) -> Made:
+    made, truths, n_done = Made(asked.scene), SharedTruths(asked.scene), 0
+
+    def tell(doing: str) -> None:
+        nonlocal n_done
+        report(Event(asked.scene, doing, n_done, asked.n_steps))
+        n_done += 1
+
+    for (index, method), place in asked.errors:
+        tell(f"errors of {printable(method, 60)}")
+        run = runs[index]
+        try:
+            mended = explained(index, method).mend(
+                asked.scene, partial(truths.of_run, run), partial(spaces.encoder, run)
+            )
+        except Su3dError as error:
+            made.errors[index, method] = str(error)
+            continue
+        made.errors[index, method] = mended
+        place.save(packed(mended))
+    if asked.maps:
+        maps = [(index, runs[index], asked.scene, method) for index, method in asked.maps]
+        made.page = page_scene(asked.scene, maps, spaces, truths, most_points, tell)
+        if asked.page is not None and made.page.is_whole:
+            asked.page.save(_SCENES.dump_json(made.page))
+    report(Event(asked.scene, SCENE_DONE, asked.n_steps, asked.n_steps))
+    return made
