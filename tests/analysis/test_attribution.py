@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from su3d_bench.core.types import Int32Array, Int64Array, Masks
 from su3d_bench.metrics.attribution import masks as attribution
 from su3d_bench.metrics.attribution.masks import KINDS, LabelledMasks, ScoringRules, mend_scene, with_true_labels
-from su3d_bench.metrics.attribution.overlaps import measure_overlaps
+from su3d_bench.metrics.attribution.overlaps import Overlaps, measure_overlaps, true_instances
 from su3d_bench.metrics.instance import average_precision as instance_ap
 
 SIZE = 200  # points an instance
@@ -34,6 +34,10 @@ def points(instance: int, share: float = 1.0, start: float = 0.0) -> Int32Array:
 
 def perfect() -> tuple[list[Int32Array], list[int], list[float]]:
     return [points(k) for k in range(len(CLASSES))], list(CLASSES), [0.9] * len(CLASSES)
+
+
+def overlaps_of(truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules) -> Overlaps:
+    return measure_overlaps(true_instances(truth, rules), predicted, rules)
 
 
 def labelled(masks: list[Int32Array], classes: list[int], scores: list[float]) -> LabelledMasks:
@@ -210,7 +214,7 @@ def test_what_is_left_of_two_equal_merged_masks_is_found_once() -> None:
 
 def test_a_mask_of_just_half_an_instance_matches_nothing_and_counts_by_its_points() -> None:
     half, more = points(0, 0.5), np.concatenate([points(0, 0.6, 0.4), np.arange(1200, 1260, dtype=np.int32)])
-    overlaps = measure_overlaps(truth(), labelled([half, more], [3, 3], [0.9, 0.9]), RULES)
+    overlaps = overlaps_of(truth(), labelled([half, more], [3, 3], [0.9, 0.9]), RULES)
     assert overlaps.iou[:, 0].tolist() == [0.5, 120 / 260]
     assert overlaps.parts[0].parts == (1, 0)
     assert not overlaps.finds(0, 0)
@@ -223,7 +227,7 @@ def test_a_mask_is_a_part_where_it_raises_the_iou_and_a_duplicate_where_half_of_
     with_new = np.concatenate([points(0, 0.3, 0.375), void[:40]])  # 45 of its 100 points known, 15 new: 135 / 240
     half_known = np.concatenate([points(0, 0.4, 0.4)])  # 40 of its 80 points known
     better = points(0, 0.2, 0.6)  # 40 new points: 160 / 200
-    overlaps = measure_overlaps(truth(), labelled([first, with_new, half_known, better], [3] * 4, [0.9] * 4), RULES)
+    overlaps = overlaps_of(truth(), labelled([first, with_new, half_known, better], [3] * 4, [0.9] * 4), RULES)
     assert overlaps.parts[0].parts == (0, 3)
     assert overlaps.parts[0].duplicates == (2,)
 
@@ -231,28 +235,28 @@ def test_a_mask_is_a_part_where_it_raises_the_iou_and_a_duplicate_where_half_of_
 def test_the_best_part_is_the_match_of_the_right_class_then_any_match() -> None:
     void = np.arange(1200, 1315, dtype=np.int32)
     of_right_class, larger = points(0, 0.51), points(0, 0.6, 0.4)  # IoU 0.51 and 0.6
-    overlaps = measure_overlaps(truth(), labelled([larger, of_right_class], [4, 3], [0.9, 0.9]), RULES)
+    overlaps = overlaps_of(truth(), labelled([larger, of_right_class], [4, 3], [0.9, 0.9]), RULES)
     assert overlaps.parts[0].parts == (1, 0)
     match, no_match = points(0, 0.55), np.concatenate([points(0, 0.6, 0.4), void])  # 110 and 120 points, IoU 0.55, 0.38
-    overlaps = measure_overlaps(truth(), labelled([no_match, match], [3, 4], [0.9, 0.9]), RULES)
+    overlaps = overlaps_of(truth(), labelled([no_match, match], [3, 4], [0.9, 0.9]), RULES)
     assert overlaps.parts[0].parts == (1, 0)
 
 
 def test_instances_and_masks_count_from_the_minimum_size_on() -> None:
     values = np.repeat([3001, 3002, 4001], [100, 99, 100])
     masks = [np.arange(100), np.arange(99), np.arange(1)]
-    overlaps = measure_overlaps(values, labelled([m.astype(np.int32) for m in masks], [3] * 3, [0.9] * 3), RULES)
+    overlaps = overlaps_of(values, labelled([m.astype(np.int32) for m in masks], [3] * 3, [0.9] * 3), RULES)
     assert [members.tolist() for members in overlaps.members] == [list(range(100)), list(range(199, 299))]
     assert overlaps.is_large.tolist() == [True, False, False]
     assert overlaps.inside[:, 0].tolist() == [1.0, 1.0, 1.0]
     point = LabelledMasks(Masks.of_sets([np.zeros(1, np.int32)]), np.array([3]), np.ones(1))
-    assert measure_overlaps(np.array([3001, 3002]), point, ScoringRules((3,), 1)).iou.tolist() == [[1.0, 0.0]]
+    assert overlaps_of(np.array([3001, 3002]), point, ScoringRules((3,), 1)).iou.tolist() == [[1.0, 0.0]]
 
 
 @pytest.mark.parametrize(("share", "is_merged"), [(0.5, False), (0.505, True)])
 def test_a_mask_is_merged_where_it_has_more_than_half_of_several_instances(share: float, is_merged: bool) -> None:
     mask = np.concatenate([points(0), points(1, share)])
-    assert measure_overlaps(truth(), labelled([mask], [3], [0.9]), RULES).is_merged.tolist() == [is_merged]
+    assert overlaps_of(truth(), labelled([mask], [3], [0.9]), RULES).is_merged.tolist() == [is_merged]
 
 
 SPLITS = {
@@ -274,21 +278,21 @@ def test_an_instance_is_split_where_its_parts_match_it_together_under_its_class(
     parts, is_split = SPLITS[name]
     masks = [points(0, share, start) for share, start, _ in parts]
     predicted = labelled(masks, [class_id for *_, class_id in parts], [0.9] * len(parts))
-    assert measure_overlaps(truth(), predicted, RULES).is_split(0) == is_split
+    assert overlaps_of(truth(), predicted, RULES).is_split(0) == is_split
 
 
 def test_an_instance_that_a_merged_mask_finds_is_not_split() -> None:
     halves, merged = [points(0, 0.5), points(0, 0.5, 0.5)], np.concatenate([points(0), points(1, 0.6)])
     for masks, is_split in ((halves, True), ([*halves, merged], False)):
         n = len(masks)
-        assert measure_overlaps(truth(), labelled(masks, [3] * n, [0.9] * n), RULES).is_split(0) == is_split
+        assert overlaps_of(truth(), labelled(masks, [3] * n, [0.9] * n), RULES).is_split(0) == is_split
 
 
 def test_what_leaves_the_iou_as_it_is_is_no_part() -> None:
     first = points(0, 0.6)  # 120 of 200
     # 40 points of the first, 30 new ones and 50 void: together 150 of 250
     second = np.concatenate([points(0, 0.35, 0.4), np.arange(1200, 1250, dtype=np.int32)])
-    overlaps = measure_overlaps(truth(), labelled([first, second], [3, 3], [0.9, 0.9]), RULES)
+    overlaps = overlaps_of(truth(), labelled([first, second], [3, 3], [0.9, 0.9]), RULES)
     assert (overlaps.parts[0].parts, overlaps.parts[0].duplicates) == ((0,), ())
 
 
@@ -296,10 +300,10 @@ def test_true_labels_are_those_of_the_instances_that_masks_share_most_points_wit
     void = np.arange(1200, 1300, dtype=np.int32)
     masks = [np.concatenate([points(0, 0.3), points(3, 0.4)]), points(5, 0.1), void]
     predicted = labelled(masks, [3, 3, 3], [0.9, 0.8, 0.7])
-    named = with_true_labels(measure_overlaps(truth(), predicted, RULES))
+    named = with_true_labels(overlaps_of(truth(), predicted, RULES))
     assert named.class_ids.tolist() == [4, 5, 3]
     assert named.scores.tolist() == [0.9, 0.8, 0.7]
-    of_none = with_true_labels(measure_overlaps(np.zeros_like(truth()), predicted, RULES))
+    of_none = with_true_labels(overlaps_of(np.zeros_like(truth()), predicted, RULES))
     assert of_none.class_ids.tolist() == [3, 3, 3]
 
 

@@ -23,7 +23,7 @@ from su3d_bench.core.types import (
 )
 from su3d_bench.metrics.attribution import masks as instances
 from su3d_bench.metrics.attribution import points as semantic
-from su3d_bench.metrics.attribution.overlaps import LabelledMasks, ScoringRules, measure_overlaps
+from su3d_bench.metrics.attribution.overlaps import LabelledMasks, ScoringRules, measure_overlaps, true_instances
 from su3d_bench.metrics.attribution.points import LabelledPoints
 from su3d_bench.metrics.instance.score import masks_on_truth
 from su3d_bench.metrics.matching import nearest as transfer
@@ -64,9 +64,10 @@ def scored_points(
     mask = called.mask
     if mask is None:
         mask, _ = transfer_votes(rules, prediction, called.classes, called.targets, called.is_wanted, of_masks=True)
-    map_distance_m = np.full(len(called.targets), np.inf)
-    wanted = np.flatnonzero(called.is_wanted)
-    map_distance_m[wanted], _ = transfer.nearest(prediction.points, called.targets[wanted])
+    # a mask is part of the map: only beyond it can more of the map be nearer
+    map_distance_m = called.distance_m.copy()
+    far = np.flatnonzero(called.is_wanted & (called.distance_m > semantic.NEAR_M))
+    map_distance_m[far], _ = transfer.nearest(prediction.points, called.targets[far], semantic.NEAR_M)
     points = LabelledPoints(
         true_class=called.true_class,
         predicted=called.predicted,
@@ -97,7 +98,7 @@ def _mended_masks(
     mended = instances.mend_scene(values, masks, scoring)
     if rules.class_agnostic is not None:
         return mended
-    relabelled = instances.with_true_labels(measure_overlaps(values, masks, scoring))
+    relabelled = instances.with_true_labels(measure_overlaps(true_instances(values, scoring), masks, scoring))
     return replace(mended, with_true_labels=instances.count_masks(values, relabelled, scoring))
 
 

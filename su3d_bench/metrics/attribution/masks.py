@@ -42,7 +42,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array, Masks
-from su3d_bench.metrics.attribution.overlaps import HALF, LabelledMasks, Overlaps, ScoringRules, measure_overlaps
+from su3d_bench.metrics.attribution.overlaps import (
+    HALF,
+    LabelledMasks,
+    Overlaps,
+    ScoringRules,
+    measure_overlaps,
+    true_instances,
+)
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 
@@ -78,7 +85,8 @@ def mend_scene(truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules)
     >>> mended.n["merged"], mended.n["missed"]
     (1, 0)
     """
-    overlaps = measure_overlaps(truth, predicted, rules)
+    instances = true_instances(truth, rules)
+    overlaps = measure_overlaps(instances, predicted, rules)
     as_is = count_masks(truth, predicted, rules)
     alone, n = {}, {}
     for kind, mend in _MENDINGS.items():
@@ -86,7 +94,7 @@ def mend_scene(truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules)
         alone[kind] = count_masks(truth, mended, rules) if n[kind] else as_is
     everything = predicted
     for mend in _MENDINGS.values():
-        everything, _ = mend(measure_overlaps(truth, everything, rules))
+        everything, _ = mend(measure_overlaps(instances, everything, rules))
     return Mended(as_is, alone, count_masks(truth, everything, rules), n)
 
 

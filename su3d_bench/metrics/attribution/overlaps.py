@@ -125,28 +125,50 @@ class Overlaps:
         return not self.finds(k, g), not matches, -float(self.iou[k, g] if matches else self.shared[k, g]), k
 
 
-def measure_overlaps(truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules) -> Overlaps:
-    """The overlaps of one scene; ``truth`` (N,) is label * 1000 + instance, 0 where void."""
-    values = np.unique(truth)
-    segment_of_point = np.searchsorted(values, truth)
-    sizes = np.bincount(segment_of_point, minlength=len(values))
+@dataclass(frozen=True)
+class TrueInstances:
+    """The truth of a scene as masks meet it: the segment of each point, and which segments are counted instances.
+
+    ``size``, ``members`` and ``class_of_instance`` are of the counted ones alone, in the order of their values.
+    """
+
+    segment_of_point: Int64Array
+    is_instance: BoolArray
+    size: Int64Array
+    members: tuple[Int32Array, ...]
+    class_of_instance: Int64Array
+
+
+def true_instances(truth: Int64Array, rules: ScoringRules) -> TrueInstances:
+    """The instances of one scene; ``truth`` (N,) is label * 1000 + instance, 0 where void."""
+    segment_of_point, values, sizes = instance_ap.segments_of(truth)
     is_instance = np.isin(values // INSTANCES_PER_CLASS, rules.class_ids) & (sizes >= rules.min_region_size)
-    instances = np.flatnonzero(is_instance)
-    class_of_instance = (values[instances] // INSTANCES_PER_CLASS).astype(np.int64)
-    masks, size = predicted.masks, predicted.masks.sizes
-    shared = instance_ap.intersections(segment_of_point, len(values), masks.indptr, masks.indices, np.arange(len(size)))
-    n_ignored = shared[:, ~is_instance].sum(axis=1)
-    shared = shared[:, instances]
-    size_of_instance = sizes[instances][None, :]
-    at_least_one = np.maximum(size, 1)[:, None]
-    inside, cover = shared / at_least_one, shared / size_of_instance
     order = np.argsort(segment_of_point, kind="stable").astype(np.int32)
     starts = np.concatenate([[0], np.cumsum(sizes)])
+    return TrueInstances(
+        segment_of_point=segment_of_point,
+        is_instance=is_instance,
+        size=sizes[is_instance],
+        members=tuple(order[starts[s] : starts[s + 1]] for s in np.flatnonzero(is_instance)),
+        class_of_instance=(values[is_instance] // INSTANCES_PER_CLASS).astype(np.int64),
+    )
+
+
+def measure_overlaps(instances: TrueInstances, predicted: LabelledMasks, rules: ScoringRules) -> Overlaps:
+    """The overlaps of the masks of one scene with the instances that are there."""
+    masks, size = predicted.masks, predicted.masks.sizes
+    n_segments, every = len(instances.is_instance), np.arange(len(size))
+    shared = instance_ap.intersections(instances.segment_of_point, n_segments, masks.indptr, masks.indices, every)
+    n_ignored = shared[:, ~instances.is_instance].sum(axis=1)
+    shared = shared[:, instances.is_instance]
+    size_of_instance, class_of_instance = instances.size[None, :], instances.class_of_instance
+    at_least_one = np.maximum(size, 1)[:, None]
+    inside, cover = shared / at_least_one, shared / size_of_instance
     is_large = size >= rules.min_region_size
     has_own_class = predicted.class_ids[:, None] == class_of_instance[None, :]
     return Overlaps(
         predicted=predicted,
-        members=tuple(order[starts[s] : starts[s + 1]] for s in instances),
+        members=instances.members,
         class_of_instance=class_of_instance,
         shared=shared,
         inside=inside,

@@ -34,7 +34,8 @@ class LabelledPoints:
 
     ``true_class`` and ``predicted`` are class indices, -1 for none; ``is_scored`` marks the points that count;
     ``object_id`` is one number an object of the truth; ``mask`` the mask that gave the class, -1 where none did;
-    ``map_distance_m`` and ``mask_distance_m`` are to the nearest point of the map and of any mask, infinity for none.
+    ``map_distance_m`` and ``mask_distance_m`` are to the nearest point of the map and of any mask, infinity for none;
+    of those to the map it only counts whether they are above ``NEAR_M``.
     """
 
     true_class: Int64Array

@@ -182,7 +182,7 @@ def per_scene(
     _check_predictions(ground_truth, indptr, indices, len(scores) if labels is None else len(labels), scores)
     if any(class_id < 1 for class_id in class_ids):
         raise DataError(f"class ids: {min(class_ids)} cannot be scored; class ids start at 1")
-    segment_of_point, segment_value, segment_size = _segments(ground_truth)
+    segment_of_point, segment_value, segment_size = segments_of(ground_truth)
     segment_label = segment_value // INSTANCES_PER_CLASS
     size = np.diff(indptr)
     is_listed = np.ones((len(class_ids), len(size)), bool)
@@ -255,6 +255,8 @@ def _match(over: BoolArray, takes_part: BoolArray, scores: Float64Array) -> tupl
     """Scores of the true positives and of their duplicates, and how many instances nothing met: greedy, in order."""
     hits: list[float] = []
     duplicates: list[float] = []
+    if not len(scores):  # as for most classes of a scene
+        return hits, duplicates, int(takes_part.sum())
     n_missed = 0
     visited = np.zeros(len(scores), bool)
     for column in np.flatnonzero(takes_part):
@@ -359,7 +361,7 @@ def _check_predictions(
             )
 
 
-def _segments(ground_truth: IntArray) -> tuple[Int64Array, Int64Array, Int64Array]:
+def segments_of(ground_truth: IntArray) -> tuple[Int64Array, Int64Array, Int64Array]:
     """Each point's row in the ascending list of distinct values, that list, and how many points have each."""
     if not len(ground_truth):
         return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64)

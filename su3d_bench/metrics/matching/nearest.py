@@ -151,7 +151,8 @@ def first_rows(rows: Int64Array) -> Int64Array:
     >>> first_rows(np.array([[1, 5], [0, 5], [1, 5], [0, 6]])).tolist()
     [1, 0, 3]
     """
-    return np.unique(row_ids(rows), return_index=True)[1]
+    keys = _packed(rows)
+    return np.unique(row_ids(rows) if keys is None else keys, return_index=True)[1]
 
 
 def transfer_masks(
