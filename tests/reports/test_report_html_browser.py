@@ -245,8 +245,29 @@ def test_every_colouring_draws_another_picture_and_says_what_it_means(browser: C
     choose(browser, "maps", "Text", "table")
     assert picture(browser) != first
     assert column(browser, "maps", 0)[0] == "table"
+    assert headers(browser, "maps") == ["Instance", "Similarity", "Points"]
     choose(browser, "maps", "Colour by", kinds[0])
     assert browser.run(f"{SELECT.format(part='maps', label='Text')}.closest('.field').hidden")
+    assert headers(browser, "maps") == ["Instance", "Score", "Points"]
+
+
+def headers(browser: Chromium, part: str) -> list[str]:
+    found: list[str] = browser.run(f"[...document.querySelectorAll('#{part} thead th')].map((one) => one.innerText)")
+    return found
+
+
+def test_a_table_says_that_its_best_is_bold_where_something_is(browser: Chromium) -> None:
+    tables = "[...document.querySelectorAll('#summary table, #scenes table, #classes table')]"
+    said = browser.run(f"{tables}.map((one) => one.caption.innerText.includes('bold'))")
+    assert said == browser.run(f"{tables}.map((one) => !!one.querySelector('td.best'))")
+    assert True in said
+    assert "bold" not in browser.run("[...document.querySelectorAll('#summary > p.intro')].map((p) => p.innerText).join()")
+
+
+def test_all_classes_of_a_confusion_can_be_seen(browser: Chromium) -> None:
+    assert options(browser, "confusion", "Classes") == ["the 18 largest", "all"]
+    choose(browser, "confusion", "Classes", "all")
+    assert "all " in text_of(browser, "#confusion caption")
 
 
 def test_keys_turn_move_zoom_and_bring_the_whole_map_back(browser: Chromium) -> None:
@@ -400,6 +421,7 @@ CONTROLS = {
     ("classes", "input", "Filter classes"),
     ("confusion", "select", "Protocol"),
     ("confusion", "select", "Method"),
+    ("confusion", "select", "Classes"),
     ("confusion", "input", "Filter classes"),
     ("errors", "select", "Protocol"),
     ("errors", "select", "Metric"),
@@ -408,6 +430,7 @@ CONTROLS = {
     ("compare", "select", "B"),
     ("compare", "button", "Swap"),
     ("summary", "summary", "3 more remarks"),
+    ("summary", "summary", "What the columns mean"),
     ("provenance", "summary", "Rules and data"),
     ("provenance", "summary", "Settings"),
     ("provenance", "input", "Filter settings"),

@@ -2,7 +2,7 @@
 
 function compareSection() {
   if (!DATA.comparisons.length) return;
-  part('compare', 'Compare', 'B less A over the scenes that both have, in points of a per cent: the exact test that flips '
+  part('compare', 'Compare', 'B less A over the scenes that both have, in percentage points: the exact test that flips '
     + 'the signs of single scenes, with the least p that so many scenes can give; p of all, corrected by Holm for all '
     + 'metrics of the comparison; and the 95 % t interval from the differences without each scene. Bold: p of all below '
     + '0.05.', (section) => {

@@ -57,13 +57,14 @@ function compareValues(a, b) {
 const captionOf = (text) => h('caption', null, h('span', null, text));
 
 // A table that sorts by its headers and, with `filter`, shows the rows whose text holds what is typed.
-// Columns: {label, value(row), show(row), num, best}; rows of `onRow` can be chosen by mouse and keyboard.
-function dataTable({ caption, columns, rows, filter, tall, sortBy, descending, onRow, foot }) {
+// Columns: {label, title, value(row), show(row), num, best}; rows of `onRow` can be chosen by mouse and keyboard. Of
+// those that fit what is typed the first `most` stand there.
+function dataTable({ caption, columns, rows, filter, tall, sortBy, descending, onRow, foot, most = Infinity }) {
   const state = { column: sortBy === undefined ? null : sortBy, down: !!descending, text: '' };
   const body = h('tbody');
   const headers = columns.map((column, index) =>
     h('th', { scope: 'col', class: column.num ? 'num' : null },
-      h('button', { type: 'button', class: 'sort', onclick: () => sort(index) }, column.label)));
+      h('button', { type: 'button', class: 'sort', title: column.title, onclick: () => sort(index) }, column.label)));
   const head = h('thead', null, h('tr', null, headers));
   const node = h('table', null, captionOf(caption), head, body, foot || null);
   const counter = h('span', { class: 'count', role: 'status' });
@@ -95,8 +96,9 @@ function dataTable({ caption, columns, rows, filter, tall, sortBy, descending, o
       const order = (a, b) => (state.down ? -1 : 1) * compareValues(value(a), value(b));
       shown = [...shown].sort((a, b) => (missing(a) - missing(b)) || order(a, b));
     }
-    counter.textContent = `${shown.length === rows.length ? '' : `${shown.length} of `}${rows.length} rows`;
-    body.replaceChildren(...shown.map(line));
+    const cut = shown.length > most ? `, the first ${most} are shown` : '';
+    counter.textContent = `${shown.length === rows.length ? '' : `${shown.length} of `}${rows.length} rows${cut}`;
+    body.replaceChildren(...shown.slice(0, most).map(line));
   }
   function line(row) {
     const cells = columns.map((column, index) => {

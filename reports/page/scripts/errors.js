@@ -1,6 +1,6 @@
 // The sections of what goes wrong: confusion of classes, and what each kind of error costs.
 
-const MOST_CONFUSED = 18, MOST_PAIRS = 200;
+const MOST_CONFUSED = 18, MOST_PAIRS = 200; // that are shown until more are asked for
 
 function confusionSection() {
   const usable = DATA.confusions;
@@ -9,7 +9,9 @@ function confusionSection() {
     + 'row. The classes with most points come first.', (section) => {
     const names = [...new Set(usable.map((one) => one.protocol))], place = h('div');
     const protocols = protocolField(names), side = select('Method', [], null, draw);
-    section.append(h('div', { class: 'toolbar' }, protocols, side), place);
+    const amounts = [[MOST_CONFUSED, `the ${MOST_CONFUSED} largest`], [Infinity, 'all']];
+    const amount = select('Classes', amounts, MOST_CONFUSED, draw);
+    section.append(h('div', { class: 'toolbar' }, protocols, side, amount), place);
     chosen.listeners.push(refresh);
     function refresh() {
       const fitting = usable.map((one, k) => [k, one]).filter(([, one]) => one.protocol === protocols.protocol());
@@ -18,20 +20,22 @@ function confusionSection() {
     }
     function draw() {
       const one = usable[side.input.value];
-      if (one) place.replaceChildren(...(one.reason ? [h('p', { class: 'note' }, one.reason)] : confusionTables(one)));
+      if (!one) return;
+      const tables = one.reason ? [h('p', { class: 'note' }, one.reason)] : confusionTables(one, amount.input.value);
+      place.replaceChildren(...tables);
     }
     refresh();
   });
 }
 
-function confusionTables(one) {
+function confusionTables(one, most) {
   const total = new Map(), cells = new Map();
   for (const [truth, called, n] of one.cells) {
     total.set(truth, (total.get(truth) || 0) + n);
     cells.set(`${truth},${called}`, n);
   }
   const label = (k) => (k < 0 ? 'none' : one.names[k]);
-  const shown = [...total.keys()].sort((a, b) => total.get(b) - total.get(a) || a - b).slice(0, MOST_CONFUSED);
+  const shown = [...total.keys()].sort((a, b) => total.get(b) - total.get(a) || a - b).slice(0, Number(most));
   const columns = [...shown, -1];
   function cellOf(truth, called) {
     const n = cells.get(`${truth},${called}`) || 0, share = n / total.get(truth);
@@ -43,18 +47,19 @@ function confusionTables(one) {
     return cell;
   }
   const table = h('table', { class: 'confusion' },
-    captionOf(`${nameOf(one)}, ${one.protocol}: the ${shown.length} largest of ${total.size} true classes`),
+    captionOf(`${nameOf(one)}, ${one.protocol}: ${shown.length < total.size ? `the ${shown.length} largest of ` : 'all '}`
+      + `${total.size} true classes`),
     h('thead', null, h('tr', null, h('td'), columns.map((k) => h('th', { scope: 'col' }, h('span', null, label(k)))))),
     h('tbody', null, shown.map((truth) => h('tr', null, h('th', { scope: 'row' }, label(truth)),
       columns.map((called) => cellOf(truth, called))))));
   const wrong = one.cells.filter(([truth, called]) => truth !== called)
     .map(([truth, called, n]) => ({ truth: label(truth), called: label(called), n, share: n / total.get(truth) }))
-    .sort((a, b) => b.n - a.n).slice(0, MOST_PAIRS);
+    .sort((a, b) => b.n - a.n);
   return [
     h('div', { class: 'wide', tabindex: '0', role: 'region', 'aria-label': 'Confusion matrix' }, table),
     h('h3', null, 'Largest confusions'),
     dataTable({ caption: 'True class, what it is called instead, and how many points', rows: wrong,
-      filter: 'classes', tall: wrong.length > 10,
+      filter: 'classes', tall: wrong.length > 10, most: MOST_PAIRS,
       columns: [{ label: 'True class', value: (row) => row.truth }, { label: 'Called', value: (row) => row.called },
         { label: 'Points', num: true, value: (row) => row.n, show: (row) => countText(row.n) },
         { label: 'Of the class', num: true, value: (row) => row.share, show: (row) => `${percent(row.share)} %` }] }),
@@ -73,10 +78,16 @@ const CAUSES = {
   },
 };
 
+const LEFT = {
+  instance: 'masks that fit badly; mask and class wrong at once', semantic: 'what no class put right brings back',
+};
+const STAGES = { labels: 'every mask named by the truth', '2D masks': 'masks and names of each image from the truth' };
+
 function errorsSection() {
   if (!DATA.errors.length) return;
-  part('errors', 'Errors', 'What each kind of error costs: the gain in points of a per cent when it alone is mended '
-    + 'and everything is scored anew. The value, all gains, overlap and rest give 100.', (section) => {
+  part('errors', 'Errors', 'What each kind of error costs: by how many percentage points the score rises when that '
+    + 'kind alone is put right and everything is scored anew. The score, the rises and the two rows below them add up '
+    + 'to 100.', (section) => {
     const names = [...new Set(DATA.errors.flatMap((one) => one.protocols.map((p) => p.protocol)))];
     const reasons = DATA.errors.filter((one) => one.reason)
       .map((one) => `${nameOf(one)}: not explained: ${one.reason}`);
@@ -121,14 +132,15 @@ function errorsTable(all, protocol, name) {
   };
   const stages = [...new Set(all.flatMap((one) => Object.keys(one.stages)))];
   return h('table', null,
-    captionOf(`${protocol}: ${name}, in per cent`),
+    captionOf(`${protocol}: ${name}, the score in per cent and what would be added to it`),
     h('thead', null, h('tr', null, h('th', { scope: 'col' }, 'Kind of error'),
       all.map((one) => h('th', { scope: 'col', class: 'num' }, nameOf(one))))),
     h('tbody', null,
       row('As it is', null, (one) => percent(one.values[name])),
       Object.keys(all[0].causes).map((cause) => row(cause, about[cause], (one) => costOf(one, cause))),
-      row('Overlap', 'all mendings together beyond their sum', (one) => signed(one.overlap[name])),
-      row('Rest', 'what no mending reaches', (one) => signed(one.rest[name])),
-      stages.map((stage) => row(`With true ${stage}`, 'one stage replaced by the truth',
+      row('Several at once', 'what only putting several kinds right together adds or takes',
+        (one) => signed(one.overlap[name])),
+      row('Out of reach', LEFT[all[0].kind] || 'what is lost with every kind put right', (one) => signed(one.rest[name])),
+      stages.map((stage) => row(`Score with true ${stage}`, STAGES[stage] || 'one stage replaced by the truth',
         (one) => (one.stages[stage] ? percent(one.stages[stage][name]) : '–')))));
 }

@@ -48,7 +48,7 @@ function mapsContent(section) {
   section.append(h('div', { class: 'toolbar' }, scene, which, colouring, queryField, cutField),
     h('div', { class: 'viewer' }, h('div', null, stage, legend, keys), h('div', { class: 'side' }, detail, list)));
 
-  let view = null, map = null, current = null, picked = -1, rows = [], loads = 0;
+  let view = null, map = null, current = null, picked = -1, rows = [], listedBy = null, loads = 0;
   function tell(text) { say.textContent = text; say.hidden = !text; }
   function openView() {
     try {
@@ -92,8 +92,8 @@ function mapsContent(section) {
     colouring.setOptions(kinds, names.includes(before) ? before : names[0]);
     queryField.setOptions(map.queries.map((text, k) => [k, text]), queryField.input.value);
     if (view) { view.show(map); applyCut(); }
+    listedBy = null;
     paint();
-    listInstances();
     showDetail();
   }
 
@@ -112,10 +112,12 @@ function mapsContent(section) {
     if (view) view.colour(made.colours);
     legend.replaceChildren(...made.legend.map(legendEntry));
     canvas.setAttribute('aria-label', `3D view of ${name} by ${method}, coloured by ${kind}`);
-    if (kind === 'similarity' && rows.length) listInstances();
+    if (listedBy !== orderOfList()) listInstances();
   }
 
+  const orderOfList = () => (colouring.input.value === 'similarity' ? `similarity ${queryField.input.value}` : 'own');
   function listInstances() {
+    listedBy = orderOfList();
     rows = map.instances.map((one, index) => ({ one, index, selected: index === picked }));
     if (!rows.length) {
       list.replaceChildren(h('p', { class: 'intro' }, 'This map has one feature a point and no instances.'));

@@ -1,5 +1,5 @@
 // The sections of numbers by method, scene and class, and what all sections share. DATA is what
-// su3d_bench/page_sources.py gathers.
+// su3d_bench/analysis/page gathers.
 
 const DATA = JSON.parse(byId('data').textContent);
 const RUNS = DATA.runs;
@@ -125,7 +125,7 @@ const isPooled = (one) =>
 
 function summarySection() {
   part('summary', 'Summary', 'Per cent with the 95 % interval over scenes, which is rough over fewer than ten. The tick on '
-    + 'a line is what the truth itself scores, no bound. The best is bold where all rows are of the same scenes and frames.', (section) => {
+    + 'a line is what the truth itself scores, no bound.', (section) => {
     const warn = (...content) => section.append(h('p', { class: 'note warn' }, content));
     for (const [index, run] of RUNS.entries()) {
       const where = RUNS.length > 1 ? `${runNames[index]}: ` : '';
@@ -140,12 +140,38 @@ function summarySection() {
     if (DATA.left_out) warn(h('strong', null, 'LARGE. '), `${DATA.left_out}.`);
     for (const protocol of PROTOCOLS) {
       const rows = resultsOf(protocol);
-      fill(section, null, [h('h3', null, protocol), summaryTable(rows), noteList(notesOf(rows))]);
+      const below = [noteList(notesOf(rows)), meaningsOf(rows[0].headline)];
+      fill(section, null, [h('h3', null, protocol), summaryTable(rows), below]);
     }
     if (!PROTOCOLS.length) warn('No protocol scored these runs.');
     if (DATA.found.length) fill(section, null, [h('h3', null, 'Found, not scored'), foundTable(DATA.found)]);
     fill(section, null, [noteList(RUNS.flatMap((run) => run.unscored))]);
   });
+}
+
+// What the numbers mean, for tooltips and the list below the tables.
+const MEANINGS = new Map(Object.entries({
+  AP: 'average precision of the instances, mean over several IoU thresholds',
+  AP50: 'average precision where a mask and its object share half of their union',
+  AP25: 'average precision where a mask and its object share a quarter of their union',
+  centroid: 'boxes whose centre is right', class: 'boxes whose class is right',
+  mIoU: 'intersection over union of the points of a class, mean over the classes',
+  'F-mIoU': 'the same, classes weighted by how many points they have',
+  mAcc: 'share of the points of a class that are called so, mean over the classes',
+  'label n': 'the name that a method gave an instance while it mapped is right',
+  "label n'": 'the name made afterwards out of the names of an instance’s best views is right',
+  'well-merged': 'instances that are one object, whole', 'under-merged': 'instances that are part of one object',
+  'over-merged': 'instances that hold several objects',
+  "well-merged n'": 'the same, of instances that keep a name out of their best views',
+  "under-merged n'": 'the same, of instances that keep a name out of their best views',
+  "over-merged n'": 'the same, of instances that keep a name out of their best views',
+  answer: 'questions whose answer is right', objects: 'questions whose objects are right',
+}));
+
+function meaningsOf(metrics) {
+  const known = metrics.filter((metric) => MEANINGS.has(metric));
+  return !known.length ? null : h('details', null, h('summary', null, 'What the columns mean'),
+    h('dl', null, known.flatMap((metric) => [h('dt', null, metric), h('dd', null, MEANINGS.get(metric))])));
 }
 
 function foundTable(rows) {
@@ -176,22 +202,26 @@ function summaryTable(rows) {
     return isNumber(share) ? 1 - share : null;
   };
   const column = (metric) => ({
-    label: metric, num: true, value: (one) => at(one, metric),
+    label: metric, title: MEANINGS.get(metric), num: true, value: (one) => at(one, metric),
     best: (one) => best[metric] !== null && competes(one) && at(one, metric) === best[metric],
     show: (one) => valueCell(metric, at(one, metric), one.result && one.result.intervals[metric],
       one.ceiling && one.ceiling[metric]),
   });
+  const marks = metrics.some((metric) => best[metric] !== null);
   const ceilings = (one) => metrics.map((metric) => metricText(metric, one.ceiling[metric])).join(' / ');
   return dataTable({
-    caption: `Version ${rows[0].version}, ${isPooled(rows[0]) ? 'all scenes pooled' : 'mean of the scenes'}`,
+    caption: `Version ${rows[0].version}, ${isPooled(rows[0]) ? 'all scenes pooled' : 'mean of the scenes'}`
+      + `${marks ? '; the best is bold' : ''}`,
     rows,
     columns: [
       { label: 'Method', value: nameOf },
       ...metrics.map(column),
-      { label: 'Truth’s score', num: true, value: (one) => (one.ceiling ? one.ceiling[metrics[0]] : null),
+      { label: 'Truth’s score', title: 'What the truth itself scores where it is handed in as a map', num: true,
+        value: (one) => (one.ceiling ? one.ceiling[metrics[0]] : null),
         show: (one) => (one.ceiling ? ceilings(one) : '–') },
       { label: 'Scenes', num: true, value: (one) => (one.result ? one.result.scenes.length : 0), show: scenesText },
-      { label: 'Within 5 cm', num: true, value: covered, show: (one) => percent(covered(one)) },
+      { label: 'Within 5 cm', title: 'Share of the scored points with a point of the map that near', num: true,
+        value: covered, show: (one) => percent(covered(one)) },
     ],
   });
 }
@@ -230,9 +260,10 @@ function matrixTable(protocol, name, all, head, valuesOf) {
   const rows = keys.map((key) => ({ key, best: best(key) }))
     .filter((row) => all.some((one) => isNumber(at(one, row.key))));
   const pooled = (one) => one.result.metrics[name];
+  const marked = rows.some((row) => row.best !== null) ? '; the best of a row is bold' : '';
   const partial = all.some((one) => RUNS[one.run].is_partial) ? ' (PARTIAL)' : '';
   return dataTable({
-    caption: `${protocol}: ${name} in per cent${partial}`,
+    caption: `${protocol}: ${name} in per cent${partial}${marked}`,
     rows, filter: ofScenes ? 'scenes' : 'classes', tall: rows.length > 14,
     columns: [{ label: head, value: (row) => row.key }, ...all.map((one) => ({
       label: nameOf(one), num: true, value: (row) => at(one, row.key),
@@ -247,7 +278,7 @@ function matrixTable(protocol, name, all, head, valuesOf) {
 
 function scenesSection() {
   matrixSection({ id: 'scenes', title: 'Scenes', what: 'Metric', head: 'Scene',
-    intro: 'Each scene alone. The best of a row is bold where all methods saw the same frames.',
+    intro: 'Each scene alone.',
     metricsOf: (rows) => [...new Set(rows.flatMap((one) => [...one.headline, ...Object.keys(one.result.metrics)]))],
     valuesOf: (one) => (one.result ? one.result.per_scene : {}) });
 }
