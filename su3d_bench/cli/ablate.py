@@ -20,6 +20,7 @@ def add_parser(verbs: Any) -> None:
             "su3d-bench ablate --method conceptgraphs --vary sim_threshold=1.0,1.2 stride=5,10 --grid --dry-run",
         ),
         call,
+        takes_up=True,
     )
     parser.add_argument("--vary", nargs="+", required=True, metavar="KEY=V1,V2", help="settings and their values")
     parser.add_argument("--method", default="opensu3d", help="name or file.py:Class (default: opensu3d)")

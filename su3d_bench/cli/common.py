@@ -43,13 +43,15 @@ def add_verb(
     call: Callable[[argparse.Namespace], int],
     *,
     uses_all_cores: bool = False,
+    takes_up: bool = False,
 ) -> argparse.ArgumentParser:
     """A verb's parser: help that ends with two examples, ``--json``, ``--quiet`` and ``--debug``.
 
-    Numerical libraries are held to one thread unless the verb ``uses_all_cores``.
+    Numerical libraries are held to one thread unless the verb ``uses_all_cores``. One that ``takes_up`` goes on where
+    it was interrupted; others begin anew.
     """
     parser = _parser(verbs, name, summary, examples)
-    parser.set_defaults(call=call, uses_all_cores=uses_all_cores, json_file=None)
+    parser.set_defaults(call=call, uses_all_cores=uses_all_cores, takes_up=takes_up, json_file=None)
     parser.add_argument(JSON, action=JsonFlag, help="answer in JSON; with a file, write that there")
     parser.add_argument("--quiet", action="store_true", help="no progress and no remarks on stderr")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
@@ -330,6 +332,7 @@ def chat_client(arguments: argparse.Namespace, run: RunFolder) -> tuple[ChatClie
     given = tuple(Setting((*PREFIX, key), value, flag) for key, flag, value in flags if value is not None)
     config = resolve(settings + assigned + Settings(given), PREFIX, LanguageConfig)
     store = ReplyStore(run.path / "language")
+    arguments.takes_up = True  # with every reply that is there
     return ChatClient(config, store, offline=arguments.offline, ask_failed_again=arguments.ask_failed_again), config
 
 

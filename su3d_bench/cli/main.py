@@ -101,6 +101,7 @@ def _refuse_records(arguments: argparse.Namespace) -> None:
 
 def _exit_code(words: Sequence[str]) -> int:
     """What ``words`` ask for, done; whatever goes wrong is one line on stderr, with ``--debug`` below its traceback."""
+    arguments = argparse.Namespace()
     try:
         arguments = build_parser().parse_args(words)
         _refuse_records(arguments)
@@ -111,7 +112,8 @@ def _exit_code(words: Sequence[str]) -> int:
         return code
     except KeyboardInterrupt as end:
         how = f"ended by {end}" if isinstance(end, Ended) else "interrupted"
-        remark(f"su3d-bench: {how}; the same command takes it up again")
+        again = "takes it up again" if getattr(arguments, "takes_up", False) else "begins anew"
+        remark(f"su3d-bench: {how}; the same command {again}")
         return end.exit_code if isinstance(end, Ended) else EXIT_INTERRUPTED
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else EXIT_WRONG_INPUT if stop.code else EXIT_DONE

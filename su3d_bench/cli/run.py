@@ -35,6 +35,7 @@ def add_parser(verbs: Any) -> None:
             "su3d-bench run --scenes 'rooms/*' --limit 5 --set opensu3d.top_m=10 --dry-run",
         ),
         call,
+        takes_up=True,
     )
     parser.add_argument(
         "--methods", nargs="+", metavar="METHOD", help="names, variants, file.py:Class, or all (default: opensu3d)"

@@ -261,7 +261,9 @@ def test_a_table_says_that_its_best_is_bold_where_something_is(browser: Chromium
     said = browser.run(f"{tables}.map((one) => one.caption.innerText.includes('bold'))")
     assert said == browser.run(f"{tables}.map((one) => !!one.querySelector('td.best'))")
     assert True in said
-    assert "bold" not in browser.run("[...document.querySelectorAll('#summary > p.intro')].map((p) => p.innerText).join()")
+    assert "bold" not in browser.run(
+        "[...document.querySelectorAll('#summary > p.intro')].map((p) => p.innerText).join()"
+    )
 
 
 def test_all_classes_of_a_confusion_can_be_seen(browser: Chromium) -> None:

@@ -103,6 +103,7 @@ def _add_make(actions: Any) -> None:
             "su3d-bench datasets make rooms --layout scannet --out small --scenes living0 --set n_frames=200",
         ),
         _later("make"),
+        takes_up=True,
     )
     parser.add_argument("dataset", help="what to make scenes of: rooms")
     parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="names or patterns (default: 'DATASET/*')")

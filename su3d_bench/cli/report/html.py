@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,7 @@ def add_parser(actions: Any) -> None:
             'su3d-bench report html runs/a runs/b --queries "a place to sit" "a plant" --no-errors',
         ),
         call,
+        takes_up=True,
     )
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders of finished runs")
     parser.add_argument(
@@ -62,6 +64,7 @@ def call(arguments: argparse.Namespace) -> int:
         with_errors=not arguments.no_errors,
         jobs=arguments.jobs,
     )
+    arguments.takes_up = all(os.access(run, os.W_OK) for run in arguments.runs)  # else nothing is kept
     with drawn_bars(is_quiet=arguments.quiet, tells_time_left=True) as bars:
         progress = _Progress(bars, is_quiet=arguments.quiet)
         contents = page_contents(arguments.runs, wishes, begin=progress.begin, report=progress.report)

@@ -1,0 +1,199 @@
+"""What of a page was made before: taken where nothing moved it, made anew where anything did, and never in the way."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from painted import WordEncoder, colour_perception
+from places import SCENES
+
+from su3d_bench.analysis.page import contents
+from su3d_bench.analysis.page.errors import packed, unpacked
+from su3d_bench.analysis.page.kept import FOLDER, MOST_OF_EACH
+from su3d_bench.cli.main import EXIT_INTERRUPTED, main
+from su3d_bench.core.digests import digest_file
+from su3d_bench.runs import finished as finished_run
+from su3d_bench.runs import scene as scene_run
+from su3d_bench.store.predictions import read_prediction, write_prediction
+
+PAINTED = f"{SCENES}/painted.py"
+WORDS = ["--queries", "chair", "table"]
+
+
+@pytest.fixture(scope="module")
+def made_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("kept") / "run"
+    words = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--jobs", "1", "--no-pictures"]
+    words += ["--methods", f"{PAINTED}:Collector", "--protocols", "rooms-semantic", "rooms-instance"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", colour_perception)
+        assert main([*words, "--out", str(folder)]) == 0
+    return folder
+
+
+@pytest.fixture
+def run(made_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the run, in the folder from which the command is given."""
+    shutil.copytree(made_run, tmp_path / "run")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
+    return Path("run")
+
+
+def page(*words: str, runs: tuple[str, ...] = ("run",), out: str = "page.html") -> bytes:
+    assert main(["report", "html", *runs, "--out", out, "--jobs", "1", *(words or WORDS)]) == 0
+    return Path(out).read_bytes()
+
+
+def pieces(run: Path) -> list[Path]:
+    return sorted((run / FOLDER).glob("*")) if (run / FOLDER).is_dir() else []
+
+
+def refuse(*_: Any, **__: Any) -> Any:
+    raise AssertionError("nothing is made again")
+
+
+def nothing_is_made(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(contents, "page_scene", refuse)
+    patch.setattr(contents.Explained, "mend", refuse)
+
+
+def test_a_second_page_makes_nothing_and_has_the_same_bytes(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = page()
+    assert len(pieces(run)) == 4  # of two scenes the map and the errors of one job
+    assert "painted/b: 2 of 2 scenes" in capsys.readouterr().err
+    nothing_is_made(monkeypatch)
+    assert page() == first
+    assert "2 scenes as made before" in capsys.readouterr().err
+
+
+def test_the_files_of_the_run_stay_as_they_are(run: Path) -> None:
+    before = {path: digest_file(path) for path in run.rglob("*") if path.is_file()}
+    page()
+    after = {path: digest_file(path) for path in run.rglob("*") if path.is_file() and FOLDER.parts[0] not in path.parts}
+    assert after == before
+
+
+def test_what_is_kept_goes_with_the_folder(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = page("--title", "one", *WORDS)
+    shutil.copytree(run, "elsewhere")
+    nothing_is_made(monkeypatch)
+    moved = page("--title", "one", *WORDS, runs=("elsewhere",))
+    assert moved.replace(b"elsewhere", b"run") == first
+
+
+@pytest.mark.parametrize("place", [0, 70, -1], ids=["seal", "content", "end"])
+def test_a_damaged_piece_counts_as_absent(run: Path, place: int) -> None:
+    first = page()
+    for piece in pieces(run):
+        content = bytearray(piece.read_bytes())
+        content[place] ^= 1
+        piece.write_bytes(content)
+    assert page() == first
+
+
+@pytest.mark.parametrize("content", [b"", b"{}", b"\n" * 100])
+def test_what_is_no_piece_counts_as_absent(run: Path, content: bytes) -> None:
+    first = page()
+    for piece in pieces(run):
+        piece.write_bytes(content)
+    assert page() == first
+
+
+def test_a_link_is_neither_read_nor_written_through(run: Path) -> None:
+    Path("other").mkdir()
+    (run / FOLDER.parts[0]).symlink_to(Path("other").resolve())
+    first = page()
+    assert not list(Path("other").iterdir())
+    (run / FOLDER.parts[0]).unlink()
+    assert page() == first
+
+
+def test_a_folder_that_takes_no_files_has_a_page_all_the_same(run: Path) -> None:
+    (run / FOLDER.parts[0]).write_text("a file in the place of the folder")
+    first = page()
+    (run / FOLDER.parts[0]).unlink()
+    assert page() == first
+
+
+def test_another_map_is_made_anew_and_the_other_scene_is_not(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page("--no-errors", *WORDS)
+    place = run / "scenes" / "painted.a" / "collector" / "prediction.npz"
+    prediction = read_prediction(place)
+    prediction.points[:] += np.float32(0.5)
+    write_prediction(place, prediction)
+    made: list[str] = []
+    make = contents.page_scene
+    monkeypatch.setattr(contents, "page_scene", lambda scene, *rest: made.append(scene) or make(scene, *rest))
+    page("--no-errors", *WORDS)
+    assert made == ["painted/a"]
+
+
+def test_what_moves_a_map_moves_its_key_and_few_of_each_are_kept(run: Path) -> None:
+    for k in range(MOST_OF_EACH + 2):
+        page("--no-errors", "--queries", f"chair {k}")
+        assert len(pieces(run)) == 2 * min(k + 1, MOST_OF_EACH)
+
+
+def test_what_could_not_be_had_is_asked_for_again(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = page()
+    shutil.rmtree(run / FOLDER)
+
+    def no_encoder(folder: Any, device: str = "cpu") -> Any:
+        raise finished_run.PredictionError("the encoder is not here")
+
+    monkeypatch.setattr(finished_run, "encoder_of", no_encoder)
+    assert b"the encoder is not here" in page()
+    monkeypatch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
+    assert page() == first
+
+
+def test_an_interrupt_says_that_the_page_goes_on_and_it_does(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    made: list[str] = []
+    make = contents.page_scene
+
+    def interrupted(scene: str, *rest: Any) -> Any:
+        if made:
+            raise KeyboardInterrupt
+        made.append(scene)
+        return make(scene, *rest)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(contents, "page_scene", interrupted)
+        assert main(["report", "html", "run", "--out", "page.html", "--jobs", "1", *WORDS]) == EXIT_INTERRUPTED
+    assert capsys.readouterr().err.endswith("su3d-bench: interrupted; the same command takes it up again\n")
+    assert not Path("page.html").exists()
+    monkeypatch.setattr(contents, "page_scene", lambda scene, *rest: made.append(scene) or make(scene, *rest))
+    page()
+    assert made == ["painted/a", "painted/b"]
+
+
+def test_processes_side_by_side_give_the_same_bytes(run: Path) -> None:
+    first = page()
+    shutil.rmtree(run / FOLDER)
+    command = [sys.executable, str(SCENES / "painted_cli.py"), "report", "html", "run", "--out", "two.html"]
+    subprocess.run([*command, "--jobs", "2", *WORDS], check=True, timeout=300)
+    assert Path("two.html").read_bytes() == first
+    assert len(pieces(run)) == 4
+
+
+def test_counts_come_back_as_they_went(run: Path) -> None:
+    finished = finished_run.read_run(run)
+    explained = contents.explained_of(finished, "collector")
+    truths = contents.SharedTruths("painted/a")
+    mended = explained.mend("painted/a", lambda variant: truths.of_run(finished, variant), WordEncoder)
+    back = unpacked(packed(mended))
+    assert back is not None
+    assert explained.form({"painted/a": back}).to_json() == explained.form({"painted/a": mended}).to_json()
+    assert list(back) == sorted(mended)
+    assert unpacked(b"nothing") is None
