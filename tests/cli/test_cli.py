@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fuzz_words import verbs as every_verb
 from painted import colour_perception
 from places import SCENES
 
 from su3d_bench.cli.common import file_name_of, file_name_of_scene
-from su3d_bench.cli.main import build_parser, main
+from su3d_bench.cli.main import EXIT_INTERRUPTED, build_parser, main
 from su3d_bench.core.errors import EXIT_INTERNAL
 from su3d_bench.reports.pictures import maps
 from su3d_bench.reports.tables.formats import FORMATS
@@ -247,6 +248,25 @@ def test_an_internal_error_is_one_line_and_exit_code_4(
     assert main(["methods"]) == EXIT_INTERNAL
     line = "su3d-bench: internal error: KeyError: 'method'; run again with --debug for the traceback\n"
     assert capsys.readouterr().err == line
+
+
+def test_an_interrupt_says_whether_the_same_command_goes_on() -> None:
+    on = {" ".join(verb) for verb, parser in every_verb() if parser.get_default("takes_up")}
+    assert on == {"run", "ablate", "datasets make", "report html"}
+
+
+def test_a_verb_that_keeps_nothing_begins_anew(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from su3d_bench.core import registry
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(registry, "names", interrupted)
+    monkeypatch.setattr(registry, "load", interrupted)
+    assert main(["methods"]) == EXIT_INTERRUPTED
+    assert capsys.readouterr().err == "su3d-bench: interrupted; the same command begins anew\n"
 
 
 def test_a_closed_pipe_is_no_error() -> None:

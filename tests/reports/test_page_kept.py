@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +14,17 @@ import pytest
 from painted import WordEncoder, colour_perception
 from places import SCENES
 
+from su3d_bench.analysis.attribution import Explained, explained_of
 from su3d_bench.analysis.page import contents
 from su3d_bench.analysis.page.errors import packed, unpacked
 from su3d_bench.analysis.page.kept import FOLDER, MOST_OF_EACH
+from su3d_bench.analysis.page.maps import PageScene, SharedTruths, page_scene
 from su3d_bench.cli.main import EXIT_INTERRUPTED, main
 from su3d_bench.core.digests import digest_file
+from su3d_bench.core.errors import PredictionError
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
+from su3d_bench.runs.finished import read_run
 from su3d_bench.store.predictions import read_prediction, write_prediction
 
 PAINTED = f"{SCENES}/painted.py"
@@ -59,9 +64,19 @@ def refuse(*_: Any, **__: Any) -> Any:
     raise AssertionError("nothing is made again")
 
 
+def noting(made: list[str]) -> Callable[..., PageScene]:
+    """What makes a scene of a page, and notes which."""
+
+    def make(scene: str, *rest: Any) -> PageScene:
+        made.append(scene)
+        return page_scene(scene, *rest)
+
+    return make
+
+
 def nothing_is_made(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(contents, "page_scene", refuse)
-    patch.setattr(contents.Explained, "mend", refuse)
+    patch.setattr(Explained, "mend", refuse)
 
 
 def test_a_second_page_makes_nothing_and_has_the_same_bytes(
@@ -131,8 +146,7 @@ def test_another_map_is_made_anew_and_the_other_scene_is_not(run: Path, monkeypa
     prediction.points[:] += np.float32(0.5)
     write_prediction(place, prediction)
     made: list[str] = []
-    make = contents.page_scene
-    monkeypatch.setattr(contents, "page_scene", lambda scene, *rest: made.append(scene) or make(scene, *rest))
+    monkeypatch.setattr(contents, "page_scene", noting(made))
     page("--no-errors", *WORDS)
     assert made == ["painted/a"]
 
@@ -148,7 +162,7 @@ def test_what_could_not_be_had_is_asked_for_again(run: Path, monkeypatch: pytest
     shutil.rmtree(run / FOLDER)
 
     def no_encoder(folder: Any, device: str = "cpu") -> Any:
-        raise finished_run.PredictionError("the encoder is not here")
+        raise PredictionError("the encoder is not here")
 
     monkeypatch.setattr(finished_run, "encoder_of", no_encoder)
     assert b"the encoder is not here" in page()
@@ -160,20 +174,18 @@ def test_an_interrupt_says_that_the_page_goes_on_and_it_does(
     run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made: list[str] = []
-    make = contents.page_scene
 
     def interrupted(scene: str, *rest: Any) -> Any:
         if made:
             raise KeyboardInterrupt
-        made.append(scene)
-        return make(scene, *rest)
+        return noting(made)(scene, *rest)
 
     with monkeypatch.context() as patch:
         patch.setattr(contents, "page_scene", interrupted)
         assert main(["report", "html", "run", "--out", "page.html", "--jobs", "1", *WORDS]) == EXIT_INTERRUPTED
     assert capsys.readouterr().err.endswith("su3d-bench: interrupted; the same command takes it up again\n")
     assert not Path("page.html").exists()
-    monkeypatch.setattr(contents, "page_scene", lambda scene, *rest: made.append(scene) or make(scene, *rest))
+    monkeypatch.setattr(contents, "page_scene", noting(made))
     page()
     assert made == ["painted/a", "painted/b"]
 
@@ -188,9 +200,9 @@ def test_processes_side_by_side_give_the_same_bytes(run: Path) -> None:
 
 
 def test_counts_come_back_as_they_went(run: Path) -> None:
-    finished = finished_run.read_run(run)
-    explained = contents.explained_of(finished, "collector")
-    truths = contents.SharedTruths("painted/a")
+    finished = read_run(run)
+    explained = explained_of(finished, "collector")
+    truths = SharedTruths("painted/a")
     mended = explained.mend("painted/a", lambda variant: truths.of_run(finished, variant), WordEncoder)
     back = unpacked(packed(mended))
     assert back is not None

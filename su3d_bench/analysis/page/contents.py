@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from pydantic import TypeAdapter, ValidationError
 
@@ -202,11 +202,14 @@ def _all_made(batch: Batch, jobs: int, report: Report) -> list[Made]:
     """The scenes of ``batch``, dealt out to processes where there is more than one."""
     n_workers = min(jobs or os.cpu_count() or 1, len(batch.scenes))
     dealt = [replace(batch, scenes=batch.scenes[k::n_workers]) for k in range(n_workers)]
-    run = partial(run_processes, jobs=n_workers, lost=_lost) if n_workers > 1 else run_inline
-    return [made for of_batch in run(_make, dealt, report) for made in of_batch]
+    if n_workers > 1:
+        outcomes = run_processes(_make, dealt, report, jobs=n_workers, lost=_lost)
+    else:
+        outcomes = run_inline(_make, dealt, report)
+    return [made for of_batch in outcomes for made in of_batch]
 
 
-def _lost(batch: Batch, cause: str) -> NoReturn:
+def _lost(batch: Batch, cause: str) -> list[Made]:
     scenes = printable(", ".join(asked.scene for asked in batch.scenes), 200)
     raise DataError(f"{scenes}: {cause}; scenes that were made are kept")
 
