@@ -237,9 +237,11 @@ def score_on_vertices(
 
 def _melted(scene: str, rules: ProtocolRules, values: Int64Array) -> list[str]:
     """What must be said where a rule makes one object of those that share a number, as its original does."""
+    if rules.class_agnostic != "everything":
+        return []
     objects = np.unique(values[values >= instance_ap.INSTANCES_PER_CLASS])
     n = len(objects) - len(np.unique(objects % instance_ap.INSTANCES_PER_CLASS))
-    if rules.class_agnostic != "everything" or not n:
+    if not n:
         return []
     return [
         f"{scene}: the instance numbers begin anew with each class, and {n} of {len(objects)} objects melt with another"
@@ -309,7 +311,7 @@ def _ids_of_masks(
 
 def _instance_ceiling(rules: ProtocolRules, truth: VertexTruth, values: Int64Array) -> SceneScore:
     """What the annotated objects themselves score."""
-    distinct, row = np.unique(truth.values, return_inverse=True)
+    row, distinct, _ = instance_ap.segments(truth.values)
     is_object = distinct >= instance_ap.INSTANCES_PER_CLASS
     n_void = int((~is_object).sum())
     masks = transfer.masks_of_partition(row - n_void, len(distinct) - n_void)

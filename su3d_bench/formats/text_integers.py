@@ -13,6 +13,13 @@ IntegerArray = NDArray[np.integer[Any]]
 DIGIT_AND_NEWLINE = 0x0A30  # "0\n" as a little-endian pair
 MOST_DIGITS = 18  # of a number that int64 surely holds
 LIMIT = 1 << 62
+WORD = 8  # characters, the first of which is the lowest byte
+ZEROS = 0x3030303030303030  # "00000000"
+# Neighbours become one number of twice their width: two digits, then two pairs of digits, then two of four.
+PAIRS = tuple(
+    (np.uint64(bits), np.uint64(factor), np.uint64(kept))
+    for bits, factor, kept in ((8, 10, 0x00FF00FF00FF00FF), (16, 100, 0x0000FFFF0000FFFF), (32, 10_000, 0xFFFFFFFF))
+)
 
 
 def integer_lines(content: bytes, where: str) -> IntegerArray:
@@ -51,12 +58,22 @@ def _plain_numbers(content: bytes) -> IntegerArray | None:
     lengths = ends - starts
     if np.count_nonzero(digits > 9) != len(ends) or lengths.min() < 1 or lengths.max() > MOST_DIGITS:
         return None
-    values = np.zeros(len(ends), np.int64)
-    for place in range(int(lengths.max())):
-        has_digit = lengths > place
-        at = np.where(has_digit, starts + place, 0)
-        values = np.where(has_digit, values * 10 + digits[at], values)
-    return values
+    before = b"0" * MOST_DIGITS + content  # no number reaches beyond its beginning
+    eights = np.ndarray((len(before) - WORD + 1,), "<u8", before, strides=(1,))  # from every byte on
+    values = np.zeros(len(ends), np.uint64)
+    for place in range(0, int(lengths.max()), WORD):
+        of_line = eights[ends + (MOST_DIGITS - WORD - place)]
+        values += _eight_digits(of_line, lengths - place) * np.uint64(10**place)
+    return values.astype(np.int64)
+
+
+def _eight_digits(words: NDArray[np.uint64], n_digits: NDArray[np.int64]) -> NDArray[np.uint64]:
+    """The numbers that the last ``n_digits`` characters of each eight stand for, all eight side by side in a word."""
+    others = (8 * np.clip(WORD - n_digits, 0, WORD)).astype(np.uint64)  # bits; all 64 where no digit is left
+    words = ((words ^ np.uint64(ZEROS)) >> others) << others
+    for bits, factor, kept in PAIRS:
+        words = (words * factor + (words >> bits)) & kept
+    return words
 
 
 def _any_numbers(content: bytes, where: str) -> IntegerArray:

@@ -203,7 +203,7 @@ def _read_mask(folder: Path, line: Line, where: str) -> tuple[int, Int32Array]:
     if file.suffix == ".json":
         return _run_length_mask(content, place)
     values = integer_lines(content, place)
-    return len(values), np.flatnonzero(values).astype(np.int32)
+    return len(values), np.flatnonzero(values != 0).astype(np.int32)  # of booleans they are found at once
 
 
 def _run_length_mask(content: bytes, where: str) -> tuple[int, Int32Array]:

@@ -182,7 +182,7 @@ def per_scene(
     _check_predictions(ground_truth, indptr, indices, len(scores) if labels is None else len(labels), scores)
     if any(class_id < 1 for class_id in class_ids):
         raise DataError(f"class ids: {min(class_ids)} cannot be scored; class ids start at 1")
-    segment_of_point, segment_value, segment_size = segments_of(ground_truth)
+    segment_of_point, segment_value, segment_size = segments(ground_truth)
     segment_label = segment_value // INSTANCES_PER_CLASS
     size = np.diff(indptr)
     is_listed = np.ones((len(class_ids), len(size)), bool)
@@ -227,39 +227,42 @@ def count_class(
     thresholds: Sequence[float],
 ) -> InstanceCounts:
     """The counts of one class: ``iou`` (R, G) of its predictions, in line order, with its instances, ascending."""
-    at: list[int] = []
-    score: list[float] = []
-    is_true: list[bool] = []
-    n_missed = np.zeros((1, len(thresholds)), np.int64)
-    for t, threshold in enumerate(thresholds):
-        over = iou > threshold
-        hits, duplicates, n_missed[0, t] = _match(over, takes_part, scores)
-        # a prediction that met any instance of its class, even a small or a taken one, is no false positive here
-        unmatched = scores[~over.any(axis=1) & (ignored_share <= threshold)].tolist()
-        at += [t] * (len(hits) + len(duplicates) + len(unmatched))
-        score += hits + duplicates + unmatched
-        is_true += [True] * len(hits) + [False] * (len(duplicates) + len(unmatched))
+    limits = np.array(thresholds, np.float64)[:, None]
+    over = iou > limits[:, :, None]
+    nothing: tuple[list[float], list[float], int] = ([], [], int(takes_part.sum()))
+    matches = [
+        _match(of_threshold, takes_part, scores) if is_met else nothing
+        for of_threshold, is_met in zip(over, over.any(axis=(1, 2)).tolist(), strict=True)
+    ]
+    met = [(t, *row) for t, match in enumerate(matches) for row in _hits_first(*match)]
+    # a prediction that met any instance of its class, even a small or a taken one, is no false positive here
+    at, unmet = np.nonzero(~over.any(axis=2) & (ignored_share <= limits))
+    at = np.concatenate([np.array([t for t, _, _ in met], np.int64), at])
+    order = np.argsort(at, kind="stable")
     return InstanceCounts(
         class_index=np.full(len(at), class_index, np.int32),
-        threshold_index=np.array(at, np.int32),
-        score=np.array(score, np.float64),
-        is_true=np.array(is_true, bool),
-        n_missed=n_missed,
+        threshold_index=at[order].astype(np.int32),
+        score=np.concatenate([np.array([score for _, score, _ in met], np.float64), scores[unmet]])[order],
+        is_true=np.concatenate([np.array([is_true for _, _, is_true in met], bool), np.zeros(len(unmet), bool)])[order],
+        n_missed=np.array([[n_missed for _, _, n_missed in matches]], np.int64),
         n_truth=np.array([takes_part.sum()], np.int64),
         n_small_truth=np.array([(~takes_part).sum()], np.int64),
         n_predictions=np.array([len(scores)], np.int64),
     )
 
 
+def _hits_first(hits: list[float], duplicates: list[float], _: int) -> list[tuple[float, bool]]:
+    return [(score, True) for score in hits] + [(score, False) for score in duplicates]
+
+
 def _match(over: BoolArray, takes_part: BoolArray, scores: Float64Array) -> tuple[list[float], list[float], int]:
     """Scores of the true positives and of their duplicates, and how many instances nothing met: greedy, in order."""
     hits: list[float] = []
     duplicates: list[float] = []
-    if not len(scores):  # as for most classes of a scene
-        return hits, duplicates, int(takes_part.sum())
-    n_missed = 0
+    is_met = takes_part & over.any(axis=0)
+    n_missed = int(takes_part.sum() - is_met.sum())
     visited = np.zeros(len(scores), bool)
-    for column in np.flatnonzero(takes_part):
+    for column in np.flatnonzero(is_met):
         matching = np.flatnonzero(over[:, column] & ~visited)
         if not len(matching):
             n_missed += 1
@@ -361,7 +364,7 @@ def _check_predictions(
             )
 
 
-def segments_of(ground_truth: IntArray) -> tuple[Int64Array, Int64Array, Int64Array]:
+def segments(ground_truth: IntArray) -> tuple[Int64Array, Int64Array, Int64Array]:
     """Each point's row in the ascending list of distinct values, that list, and how many points have each."""
     if not len(ground_truth):
         return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64)

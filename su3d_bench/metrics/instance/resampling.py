@@ -11,9 +11,9 @@ import numpy as np
 
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 from su3d_bench.metrics.instance.average_precision import THRESHOLDS, InstanceCounts, ap_columns
-from su3d_bench.metrics.instance.precision_recall import MANY_ROWS
 from su3d_bench.numerics.statistics import row_means
 
+MANY_ROWS = 20_000  # from there on compiled loops win back the time that they take to load
 AT_ONCE = 64  # resamples that go through the rows side by side: their counts stay in the nearest cache
 _MAX_CELLS = 4_000_000  # of a (resamples, rows) block: 32 MB of float64
 
