@@ -258,7 +258,8 @@ def _semantic_score(rules: ProtocolRules, labels: Int64Array, class_ids: np.ndar
 def _instance_score(
     rules: ProtocolRules, values: Int64Array, masks: Masks, scores: Float64Array, ids: Int64Array
 ) -> SceneScore:
-    n_scored = int(np.isin(values // instance_ap.INSTANCES_PER_CLASS, _class_ids(rules)).sum())
+    _, distinct, n_points = instance_ap.segments(values)
+    n_scored = int(n_points[np.isin(distinct // instance_ap.INSTANCES_PER_CLASS, _class_ids(rules))].sum())
     return _score(rules, _instance_counts(rules, values, masks, scores, ids), len(masks), n_scored)
 
 

@@ -1,6 +1,7 @@
 """The ground truth of an evaluation: a dataset's, text files in the layout of ScanNet's benchmark, or OpenLex3D's.
 
-Each kind opens its scenes, finds the prediction of each, and says which protocols are meant for it.
+Each kind opens its scenes, finds the prediction of each, and says which protocols are meant for it. What only datasets
+need is imported where they are opened: texts are scored before that would be there.
 """
 
 from __future__ import annotations
@@ -43,8 +44,6 @@ from su3d_bench.predictions.base import scene_files
 from su3d_bench.predictions.scenes import Match, Source, match_scenes, planned_scenes
 from su3d_bench.questions.files.queries import VARIANT as QUERY_OBJECTS
 from su3d_bench.questions.files.queries import query_truth, read_query_file
-from su3d_bench.questions.truths import question_truth
-from su3d_bench.runs.planning.scenes import data_root
 
 NOT_MEANT = "is not meant for"
 LARGEST_VALUE = 10_000 * INSTANCES_PER_CLASS  # as the instance metric has it
@@ -141,7 +140,11 @@ class DatasetTruths(SceneTruths):
     def of_scene(self, rules: ProtocolRules, scene: str) -> Truth:
         if rules.ground_truth != QUERY_OBJECTS:
             truth = self._truth(scene, rules.ground_truth)
-            return question_truth(rules, self._dataset, scene, truth) if rules.is_judged else truth
+            if not rules.is_judged:
+                return truth
+            from su3d_bench.questions.truths import question_truth
+
+            return question_truth(rules, self._dataset, scene, truth)
         assert self._queries is not None
         if scene not in self._queries:
             raise GroundTruthMissing(f"{self.where}/{scene}: the file of queries has none of this scene")
@@ -172,6 +175,8 @@ def _dataset_of(sources: Sequence[Source]) -> str:
 
 def open_dataset(name: str) -> Any:
     """The dataset called ``name`` with its default settings, below the data root."""
+    from su3d_bench.runs.planning.scenes import data_root
+
     dataset_class = registry.load("dataset", name)
     return dataset_class(data_root(), dataset_class.Options())
 
@@ -206,6 +211,8 @@ class OpenLexTruths(SceneTruths):
     """OpenLex3D's labels and queries, which lie beside the mesh of the dataset."""
 
     def __init__(self, request: Request, sources: Sequence[Source]) -> None:
+        from su3d_bench.runs.planning.scenes import data_root
+
         assert request.ground_truth is not None
         self._release = OpenLexRelease(request.ground_truth, data_root())
         self.where, self.dataset_name, known = shown(request.ground_truth), None, self._release.scenes()

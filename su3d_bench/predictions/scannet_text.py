@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -173,9 +174,9 @@ def _plain_path(text: str, where: str) -> str:
 def _read_masks(folder: Path, lines: Sequence[Line], where: str) -> tuple[list[Int32Array], int | None]:
     """The points in the mask of each line, and of how many points all are; None without any."""
     members: list[Int32Array] = []
-    n_members, n_points = 0, None
+    n_members, n_points, places = 0, None, _Places(folder)
     for line in lines:
-        n, indices = _read_mask(folder, line, where)
+        n, indices = _read_mask(places, line, where)
         if n_points not in {None, n}:
             raise PredictionError(
                 f"{where}:{line.number}: mask '{printable(line.file, 120)}' is of {n} points and "
@@ -187,13 +188,33 @@ def _read_masks(folder: Path, lines: Sequence[Line], where: str) -> tuple[list[I
     return members, n_points
 
 
-def _read_mask(folder: Path, line: Line, where: str) -> tuple[int, Int32Array]:
+class _Places:
+    """Where the mask files of a list lie in truth; a folder of many is followed to its own place once."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._root = folder.resolve()
+        self._real: dict[str, Path] = {}
+
+    def is_inside(self, file: str) -> bool:
+        """Whether a regular file inside the folder stands behind ``file``; ``OSError`` where there is none at all."""
+        parent, name = os.path.split(file)
+        if parent not in self._real:
+            self._real[parent] = (self.folder / parent).resolve(strict=True)
+        target = self._real[parent] / name
+        mode = os.lstat(target).st_mode
+        if stat.S_ISLNK(mode):
+            target = target.resolve(strict=True)
+            mode = os.lstat(target).st_mode
+        return stat.S_ISREG(mode) and target.is_relative_to(self._root)
+
+
+def _read_mask(places: _Places, line: Line, where: str) -> tuple[int, Int32Array]:
     """The number of points of a mask and those in it."""
-    file = folder / line.file
+    file = places.folder / line.file
     place = f"{where}:{line.number}: mask '{printable(line.file, 120)}'"
     try:
-        target = file.resolve(strict=True)
-        is_inside = target.is_relative_to(folder.resolve()) and target.is_file()
+        is_inside = places.is_inside(line.file)
     except (OSError, RuntimeError) as error:
         reason = "does not exist" if isinstance(error, FileNotFoundError) else "cannot be read"
         raise PredictionError(f"{place} {reason}") from error

@@ -19,8 +19,8 @@ from su3d_bench.metrics.instance import precision_recall as dot_product
 from su3d_bench.metrics.matching import labelling
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import most_similar
+from su3d_bench.metrics.matching.duplicates import duplicate_pairs
 from su3d_bench.metrics.matching.nearest import (
-    duplicate_pairs,
     nearest,
     reduce_to_voxels,
     transfer_masks,

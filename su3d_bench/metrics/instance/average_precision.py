@@ -227,32 +227,34 @@ def count_class(
     thresholds: Sequence[float],
 ) -> InstanceCounts:
     """The counts of one class: ``iou`` (R, G) of its predictions, in line order, with its instances, ascending."""
-    limits = np.array(thresholds, np.float64)[:, None]
-    over = iou > limits[:, :, None]
-    nothing: tuple[list[float], list[float], int] = ([], [], int(takes_part.sum()))
-    matches = [
-        _match(of_threshold, takes_part, scores) if is_met else nothing
-        for of_threshold, is_met in zip(over, over.any(axis=(1, 2)).tolist(), strict=True)
-    ]
-    met = [(t, *row) for t, match in enumerate(matches) for row in _hits_first(*match)]
+    limits, n_objects = np.array(thresholds, np.float64)[:, None], int(takes_part.sum())
     # a prediction that met any instance of its class, even a small or a taken one, is no false positive here
-    at, unmet = np.nonzero(~over.any(axis=2) & (ignored_share <= limits))
-    at = np.concatenate([np.array([t for t, _, _ in met], np.int64), at])
-    order = np.argsort(at, kind="stable")
+    is_unmet = ignored_share <= limits
+    n_missed = [n_objects] * len(limits)
+    rows: list[tuple[int, float, bool]] = []
+    over = iou > limits[:, :, None]
+    if over.any():
+        is_unmet &= ~over.any(axis=2)
+        for t in np.flatnonzero(over.any(axis=(1, 2))).tolist():
+            hits, duplicates, n_missed[t] = _match(over[t], takes_part, scores)
+            rows += [(t, score, True) for score in hits] + [(t, score, False) for score in duplicates]
+    at, unmet = np.nonzero(is_unmet)
+    score, is_true = scores[unmet], np.zeros(len(unmet), bool)
+    if rows:  # before those of their threshold that met nothing
+        at = np.concatenate([np.array([t for t, _, _ in rows]), at])
+        order = np.argsort(at, kind="stable")
+        at, score = at[order], np.concatenate([np.array([score for _, score, _ in rows]), score])[order]
+        is_true = np.concatenate([np.array([is_hit for _, _, is_hit in rows]), is_true])[order]
     return InstanceCounts(
         class_index=np.full(len(at), class_index, np.int32),
-        threshold_index=at[order].astype(np.int32),
-        score=np.concatenate([np.array([score for _, score, _ in met], np.float64), scores[unmet]])[order],
-        is_true=np.concatenate([np.array([is_true for _, _, is_true in met], bool), np.zeros(len(unmet), bool)])[order],
-        n_missed=np.array([[n_missed for _, _, n_missed in matches]], np.int64),
-        n_truth=np.array([takes_part.sum()], np.int64),
-        n_small_truth=np.array([(~takes_part).sum()], np.int64),
+        threshold_index=at.astype(np.int32),
+        score=score.astype(np.float64, copy=False),
+        is_true=is_true,
+        n_missed=np.array([n_missed], np.int64),
+        n_truth=np.array([n_objects], np.int64),
+        n_small_truth=np.array([len(takes_part) - n_objects], np.int64),
         n_predictions=np.array([len(scores)], np.int64),
     )
-
-
-def _hits_first(hits: list[float], duplicates: list[float], _: int) -> list[tuple[float, bool]]:
-    return [(score, True) for score in hits] + [(score, False) for score in duplicates]
 
 
 def _match(over: BoolArray, takes_part: BoolArray, scores: Float64Array) -> tuple[list[float], list[float], int]:

@@ -16,6 +16,7 @@ from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.average_precision import InstanceAP, InstanceCounts
 from su3d_bench.metrics.instance.resampling import resampled_ap
 from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching.duplicates import duplicate_pairs
 from su3d_bench.metrics.matching.labelling import (
     candidate_classes,
     class_index_of_ids,
@@ -231,7 +232,7 @@ def _mask_warnings(rules: ProtocolRules, truth: GroundTruth, scored: ScoredMasks
     if rules.confidence == "prediction" and len(scores) > 1 and scores.min() == scores.max():
         warnings.append(f"{CONSTANT_CONFIDENCE} {scores[0]:g}: AP of a class is then recall (1 + precision) / 2")
     large = np.flatnonzero(scored.masks.sizes >= rules.min_region_size)
-    pairs = transfer.duplicate_pairs(transfer.select(scored.masks, large), len(truth.points), DUPLICATE_IOU)
+    pairs = duplicate_pairs(transfer.select(scored.masks, large), len(truth.points), DUPLICATE_IOU)
     if pairs:
         first, second = large[list(pairs[0])]
         what = "1 pair of predictions overlaps" if len(pairs) == 1 else f"{len(pairs)} pairs of predictions overlap"

@@ -9,7 +9,7 @@ import numpy as np
 
 from su3d_bench.core.errors import PredictionError, counted, printable
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array, Masks
-from su3d_bench.metrics.matching.nearest import duplicate_pairs
+from su3d_bench.metrics.matching.duplicates import duplicate_pairs
 from su3d_bench.metrics.protocols.model import ProtocolRules
 
 NEAR_IOU = 0.9  # pairs above it are the same object twice

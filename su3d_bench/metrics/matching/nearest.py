@@ -233,20 +233,6 @@ def n_farther(distance: Float64Array) -> Int64Array:
     return np.array([(distance > radius).sum() for radius in COVERAGE_RADII_M], np.int64)
 
 
-def duplicate_pairs(masks: Masks, n_points: int, iou: float) -> list[tuple[int, int]]:
-    """Pairs of masks, the lower first, whose IoU is above ``iou``."""
-    from scipy.sparse import csr_array
-
-    member = csr_array(
-        (np.ones(len(masks.indices), np.int32), masks.indices, masks.indptr), shape=(len(masks), n_points)
-    )
-    shared = (member @ member.T).tocoo()
-    size = masks.sizes
-    union = size[shared.row] + size[shared.col] - shared.data
-    is_pair = (shared.row < shared.col) & (shared.data > iou * union)
-    return sorted(zip(shared.row[is_pair].tolist(), shared.col[is_pair].tolist(), strict=True))
-
-
 def select(masks: Masks, keep: IntArray) -> Masks:
     """The masks ``keep``, in that order.
 
