@@ -61,7 +61,7 @@ def main() -> None:
     if arguments.json is not None:
         command = "python benchmarks startup --json build/measured/startup.json"
         notes = (
-            f"Best of {arguments.rounds} rounds, all commands in turn in each; the marks are 300 ms for `--help` and "
+            f"Best of {arguments.rounds} rounds, all commands in turn in each; the marks are 100 ms for `--help` and "
             "400 ms for lists.",
         )
         write_measured(

@@ -17,7 +17,6 @@ from su3d_bench.cli.parser import JSON, JsonFlag
 from su3d_bench.core.errors import EXIT_DONE, StoreError, counted, printable, shown
 from su3d_bench.core.files import file_text
 from su3d_bench.core.printing import Door, escaped_json, one_line, stream_behind, terminal_width
-from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
     from su3d_bench.perception.language.client import ChatClient
     from su3d_bench.perception.language.config import LanguageConfig
     from su3d_bench.reports.tables.model import Prose, Table
+    from su3d_bench.runs.executors.local import Event, Report
     from su3d_bench.store.run_folder import RunFolder
 
 MOST_UNSEEN = 8  # words that are named
@@ -404,6 +404,8 @@ class _Board:
         self._tasks: dict[tuple[str, str], TaskID] = {}
 
     def report(self, event: Event) -> None:
+        from su3d_bench.runs.executors.local import SCENE_DONE
+
         self._bars.update(self._scenes, remark=event.doing if event.label == SCENE_DONE else "")
         if event.label == SCENE_DONE:
             if not event.doing:

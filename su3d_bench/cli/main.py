@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-import traceback
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
@@ -22,7 +21,6 @@ from su3d_bench.core.errors import (
     printable,
 )
 from su3d_bench.core.printing import doors
-from su3d_bench.runs.executors.local import limit_threads
 
 # Modules of this folder with ``add_parser(verbs)``, in the order of the help.
 VERBS = (
@@ -44,6 +42,7 @@ VERBS = (
     "new",
     "models",
     "protocols",
+    "texts",
     "export",
     "cache",
     "completion",
@@ -57,8 +56,8 @@ EPILOG = """examples:
 """
 
 
-def build_parser() -> Parser:
-    """The parser of all verbs; nothing heavy is imported for it."""
+def build_parser(verb: str | None = None) -> Parser:
+    """The parser of all verbs, or of ``verb`` alone where it is one; nothing heavy is imported for it."""
     parser = Parser(
         prog="su3d-bench",
         description=DESCRIPTION,
@@ -67,7 +66,7 @@ def build_parser() -> Parser:
     )
     parser.add_argument("--version", action="version", version=f"su3d-bench {__version__}")
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
-    for name in VERBS:
+    for name in [name for name in VERBS if name.partition(".")[0] == verb] or VERBS:
         import_module(f"su3d_bench.cli.{name}").add_parser(verbs)
     return parser
 
@@ -103,7 +102,9 @@ def _exit_code(words: Sequence[str]) -> int:
     """What ``words`` ask for, done; whatever goes wrong is one line on stderr, with ``--debug`` below its traceback."""
     arguments = argparse.Namespace()
     try:
-        arguments = build_parser().parse_args(words)
+        arguments = build_parser(words[0] if words else None).parse_args(words)
+        from su3d_bench.runs.executors.local import limit_threads  # late: --help does without what it imports
+
         _refuse_records(arguments)
         if not arguments.uses_all_cores:
             limit_threads()  # before numerical libraries are loaded
@@ -120,6 +121,8 @@ def _exit_code(words: Sequence[str]) -> int:
     except Exception as error:  # noqa: BLE001 - the one place where whatever else went wrong becomes a line
         is_debug = "--debug" in words
         if is_debug:
+            import traceback
+
             traceback.print_exc()
         if isinstance(error, Su3dError):
             remark(f"su3d-bench: {error}")

@@ -83,7 +83,8 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
     add_settings(parser, "a setting of perception, such as perception.models.folder=/data/models")
 
 
-def _perception_config(arguments: argparse.Namespace) -> PerceptionConfig:
+def perception_config(arguments: argparse.Namespace) -> PerceptionConfig:
+    """What ``--set`` says of perception, and ``--device`` where the verb has it."""
     from su3d_bench.core.config import Setting, Settings, read_assignments, resolve
     from su3d_bench.perception.profiles import PerceptionConfig
 
@@ -116,7 +117,7 @@ def _states(arguments: argparse.Namespace, names: tuple[str, ...]) -> list[Model
     from su3d_bench.perception.models.catalogue import MODELS, model_entry
     from su3d_bench.perception.models.inspection import model_state
 
-    config = _perception_config(arguments).models
+    config = perception_config(arguments).models
     entries = [model_entry(name) for name in names] or list(MODELS.values())
     return [model_state(entry, config.paths.get(entry.name), config.folder) for entry in entries]
 
@@ -179,7 +180,7 @@ def call_export(arguments: argparse.Namespace) -> int:
     from su3d_bench.perception.models.catalogue import model_entry
     from su3d_bench.perception.models.onnx.export_model import export_model
 
-    config = _perception_config(arguments).models
+    config = perception_config(arguments).models
     entry = model_entry(arguments.name)
     export = export_model(entry, arguments.out, path=config.paths.get(entry.name), folder=config.folder)
     value = {"folder": str(arguments.out), "files": export.files, "parity": [asdict(p) for p in export.parity]}
@@ -207,7 +208,7 @@ def _warm(arguments: argparse.Namespace) -> WarmUp:
     from su3d_bench.perception.models.inspection import warm_encoder, warm_perception, warm_scene
     from su3d_bench.perception.models.loading import load_encoder
 
-    config = _perception_config(arguments)
+    config = perception_config(arguments)
     if arguments.name is not None:
         if arguments.profile is not None:
             raise ConfigError("models warm: give an encoder or --profile, not both")

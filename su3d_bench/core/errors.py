@@ -14,17 +14,33 @@ import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from su3d_bench.core.english import plural
 from su3d_bench.core.printing import escaped
 
-# What readers raise on a damaged file, an .npz above all; RuntimeError is zipfile's, of a compression unknown to it.
-DAMAGE = (
-    OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, RuntimeError,
-    SyntaxError, tokenize.TokenError, zipfile.BadZipFile, zlib.error, struct.error,
-)  # fmt: skip
+# What readers raise on a damaged file, an .npz above all.
+DAMAGE: tuple[type[Exception], ...]
 MESSAGE_CHARACTERS = 500  # of one message: a hostile file may hold a line of any length
+
+
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> tuple[type[Exception], ...]:
+        """``DAMAGE``, put together where it is first asked for: ``--help`` does without the modules that it needs."""
+        if name != "DAMAGE":
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        import struct
+        import tokenize
+        import zipfile
+        import zlib
+
+        known = (OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, SyntaxError)
+        # RuntimeError is zipfile's, of a compression unknown to it
+        globals()["DAMAGE"] = (
+            *known, RuntimeError, tokenize.TokenError, zipfile.BadZipFile, zlib.error, struct.error
+        )  # fmt: skip
+        return DAMAGE
 
 
 def printable(text: str, limit: int = MESSAGE_CHARACTERS) -> str:
@@ -137,6 +153,8 @@ def some(names: Sequence[str], most: int) -> str:
 
 def nearest(word: str, known: Iterable[str]) -> str:
     """A clause ``; did you mean 'x'?`` for the known word nearest to ``word``, or nothing when none is near."""
+    import difflib
+
     near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
     return f"; did you mean '{near[0]}'?" if near else ""
 

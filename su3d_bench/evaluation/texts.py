@@ -1,17 +1,19 @@
-"""Features of class names: out of a file that the user gives, or of the encoder that is here."""
+"""Features of class names: out of a file that the user gives, or of the encoder that is here; and that file, made here."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from su3d_bench.core.digests import digest_file
-from su3d_bench.core.errors import DataError, PredictionError, converted, printable, shown
+from su3d_bench.core.errors import ConfigError, DataError, PredictionError, converted, printable, shown
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.formats.numpy_files import read_npz
@@ -38,9 +40,7 @@ class TextFeatures:
 
     def missing(self, rules: ProtocolRules) -> list[str]:
         """The classes of the protocol among which a classifier may choose and that have no feature here."""
-        known = set(self.names)
-        candidates = rules.classes if rules.vocabulary == "all" else rules.scored
-        names = [entry.name for entry in candidates]
+        known, names = set(self.names), candidate_names(rules)
         return [name for name in names if name not in known and not known.issuperset(rules.texts_of(name))]
 
 
@@ -146,3 +146,52 @@ def _loaded(name: str, folder: Path) -> Encoder:
     from su3d_bench.perception.models.loading import load_encoder
 
     return load_encoder(ModelsConfig(encoder=name, paths={name: folder}))
+
+
+# ---- the file, made here
+
+
+def candidate_names(rules: ProtocolRules) -> list[str]:
+    """The classes among which a protocol may choose the one whose text a feature is nearest to."""
+    return [entry.name for entry in (rules.classes if rules.vocabulary == "all" else rules.scored)]
+
+
+def named_texts(rules: ProtocolRules, queries: Path | None) -> dict[str, tuple[str, ...]]:
+    """The texts that stand for each name that a protocol compares features with: its classes, or those of a file.
+
+    ``ConfigError`` where it compares none, where it has classes and a file is given, or has none and there is no file.
+    """
+    if rules.prompt is None and not rules.prompts:
+        raise ConfigError(f"protocol '{rules.name}' compares no features with texts; there is nothing to encode")
+    if rules.classes and queries is not None:
+        raise ConfigError(f"protocol '{rules.name}' has classes of its own as texts; leave --queries out")
+    if not rules.classes and queries is None:
+        raise ConfigError(
+            f"protocol '{rules.name}' has no texts of its own; give them with --queries FILE: .toml or .csv as "
+            "evaluate takes them, .json of OpenLex3D, or .txt with one a line"
+        )
+    names = candidate_names(rules) if queries is None else dict.fromkeys(_texts_of_file(queries))
+    return {name: rules.texts_of(name) for name in names}
+
+
+def _texts_of_file(path: Path) -> list[str]:
+    """Every text of a file of queries, whatever it says of their objects, or of a list with one text a line."""
+    from su3d_bench.datasets.openlex3d import read_prompts, read_queries
+    from su3d_bench.questions.files.queries import read_query_rows
+
+    if path.suffix.lower() == ".txt":
+        return list(read_prompts(path, shown(path)))
+    if path.suffix.lower() == ".json":
+        return [query.text for query in read_queries(path, shown(path))]
+    return [row.text for row in read_query_rows(path)]
+
+
+def distinct_texts(named: Mapping[str, Sequence[str]]) -> list[str]:
+    """What is to be encoded, each text once, in the order of the names."""
+    return list(dict.fromkeys(text for texts in named.values() for text in texts))
+
+
+def text_arrays(texts: Sequence[str], encoder: Encoder) -> dict[str, NDArray[Any]]:
+    """The arrays of a file that ``read_text_features`` takes: a feature a text, from which the protocol forms means."""
+    features = encoder.encode_texts(texts)
+    return {"names": np.array(texts, np.str_), "features": features, "encoder": np.array(encoder.name, np.str_)}

@@ -133,8 +133,8 @@ def share_interval(share: float, n: int, level: float = LEVEL) -> Interval | Non
     return (0.0 if share <= 0 else float(middle - half)), (1.0 if share >= 1 else float(middle + half))
 
 
-# Student's t at 0.975 with 1, 2, ... degrees of freedom, as scipy has it: what intervals over a few scenes need, without
-# the quarter of a second that scipy.special takes to load.
+# Student's t at 0.975 with 1, 2, ... degrees of freedom, as scipy has it: what intervals over a few scenes need,
+# without the quarter of a second that scipy.special takes to load.
 T_975 = (
     12.706204736174694, 4.302652729749462, 3.1824463052837078, 2.7764451051977934, 2.5705818356363146,
     2.4469118511449786, 2.364624251592784, 2.306004135204166, 2.262157162798205, 2.228138851986274, 2.200985160091639,

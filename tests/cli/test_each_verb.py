@@ -59,6 +59,7 @@ CASES: dict[str, tuple[list[str], int, str]] = {
     "models export": (["clip-vit-h-14", "--out", "exported"], 2, "clip-vit-h-14"),
     "models warm": (["--profile", "embedded"], 0, ""),
     "protocols": (["show", "rooms-semantic"], 0, "rooms-semantic"),
+    "texts make": (["--protocol", "rooms-semantic", "--encoder", "embedded", "--out", "texts.npz"], 0, "texts.npz"),
     "new": (["method", "my_method.py"], 0, "my_method.py"),
     "cache list": ([], 0, "perception"),
     "cache size": ([], 0, "MB in "),
@@ -87,6 +88,7 @@ PLACES = {
     "ask": ("out/scenes/rooms.living0/opensu3d/pictures",),
     "refine": ("out/scenes/rooms.living0/opensu3d",),
     "datasets show": (".",),
+    "texts make": (".",),
     "datasets make": ("made",),
     "export": (".",),
 }

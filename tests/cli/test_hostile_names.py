@@ -67,12 +67,18 @@ CASES: dict[str, list[list[str]]] = {
     "models check": [[HOSTILE]],
     "models export": [[HOSTILE, "--out", "out/model"]],
     "models warm": [["--profile", HOSTILE]],
-    "protocols": [["show", "rules.toml"], ["show", "rules.toml", "--json"]],
     "cache list": [[], ["--json"]],
     "cache size": [[]],
     "cache clear": [["all"], [HOSTILE]],
     "completion": [["bash"], ["zsh"], [HOSTILE]],
     "doctor": [[]],
+    "protocols": [["show", "rules.toml"], ["show", "rules.toml", "--json"], ["show", "rules.toml", "--names", "--json"],
+                  ["show", "query-ap", "--names", "--queries", "lines.txt"],
+                  ["show", "query-ap", "--names", "--queries", IN_A_PATH]],
+    "texts make": [["--protocol", "rules.toml", "--encoder", "embedded", "--out", "out/t.npz"],
+                   ["--protocol", "rooms-semantic", "--encoder", HOSTILE, "--out", f"out/{IN_A_PATH}.npz"],
+                   ["--protocol", "query-ap", "--encoder", "embedded", "--queries", "lines.txt", "--out",
+                    f"out/{IN_A_PATH}.npz"]],
     "export": [["RUN", "--to", "openlex3d", "--method", "METHOD", "--out", "out/exported"],
                ["RUN", "--to", "openlex3d", "--method", HOSTILE, "--out", "out/other"]],
 }  # fmt: skip
@@ -178,6 +184,7 @@ def write_files(whole: Path) -> None:
         f'extends = "rooms-semantic"\nname = {quoted}\nsummary = {quoted}\n# {HOSTILE[:12]}\n'
     )
     Path("questions.toml").write_text(f"[[query]]\nscene = {quoted}\ntext = {quoted}\nobjects = [1]\n")
+    Path("lines.txt").write_text(f"a chair\n{HOSTILE}\n")
     Path("audit.csv").write_text(f'number,scene,kind,text,answer,verdict,remark\n1,a,b,"{HOSTILE}",c,right,d\n')
     Path("answers.csv").write_text(f'sheet_id,item_id,annotator,ask,answer\n"{HOSTILE}",1,a,b,c\n')
     for folder in ("predictions", "truth"):

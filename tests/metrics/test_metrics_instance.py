@@ -25,7 +25,7 @@ from su3d_bench.metrics.instance.average_precision import (
     last_line_of_each_mask_file,
     per_scene,
 )
-from su3d_bench.metrics.instance.precision_recall import dot
+from su3d_bench.metrics.instance.precision_recall import dots
 from su3d_bench.metrics.instance.score import NO_OBJECT, covered_objects
 from su3d_bench.metrics.protocols.loading import load_protocol
 
@@ -333,7 +333,7 @@ def test_the_dot_product_adds_in_the_order_of_the_reference_answers() -> None:
     rng = np.random.default_rng(0)
     for n in (*range(1, 70), 129):
         left, right = rng.random(n), rng.random(n) - 0.3
-        assert dot(left, right) == avx512_dot(left.tolist(), right.tolist())
+        assert dots(left, right, np.array([0]), np.array([n])).tolist() == [avx512_dot(left.tolist(), right.tolist())]
 
 
 def avx512_dot(x: list[float], y: list[float]) -> float:

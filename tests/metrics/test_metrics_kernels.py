@@ -1,14 +1,17 @@
-"""From 20,000 counted predictions on, compiled loops form the curves: the same bits as one curve after another."""
+"""Curves are formed many at a time: the bits are those of one curve after another, worked out with exact sums."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pytest
 
-from su3d_bench.core.types import Float64Array
-from su3d_bench.metrics.instance import kernels, resampling
+from su3d_bench.core.types import BoolArray, Float64Array
+from su3d_bench.metrics.instance import precision_recall, resampling
 from su3d_bench.metrics.instance.average_precision import THRESHOLDS, InstanceCounts, combine, combine_each
-from su3d_bench.metrics.instance.precision_recall import MANY_ROWS, average_precision, average_precisions, dot
+from su3d_bench.metrics.instance.precision_recall import average_precision, average_precisions, dots
+from su3d_bench.metrics.instance.resampling import MANY_ROWS
 
 N_CLASSES = 3
 
@@ -38,13 +41,46 @@ def one_by_one(counts: InstanceCounts) -> Float64Array:
     for c in np.flatnonzero(counts.n_truth):
         for t in range(len(THRESHOLDS)):
             own = (counts.class_index == c) & (counts.threshold_index == t)
-            table[c, t] = average_precision(counts.score[own], counts.is_true[own], int(counts.n_missed[c, t]))
+            table[c, t] = area(counts.score[own], counts.is_true[own], int(counts.n_missed[c, t]))
     return table
 
 
+def area(score: Float64Array, is_true: BoolArray, n_missed: int) -> float:
+    """The area of one curve as the official script forms it, products added as OpenBLAS adds them: sums by ``fsum``."""
+    order = np.argsort(score, kind="stable")
+    n_true_up_to = np.cumsum(is_true[order])
+    _, first = np.unique(score[order], return_index=True)
+    if not len(first):
+        return 0.0
+    n_true_below = np.where(first > 0, n_true_up_to[first - 1], 0)
+    hits = n_true_up_to[-1] - n_true_below
+    precision = np.append(hits / (len(score) - first), 1.0)
+    recall = hits / (hits + n_true_below + n_missed)
+    width = np.convolve(np.concatenate([recall[:1], recall, [0.0, 0.0]]), [-0.5, 0, 0.5], "valid")
+    return exact_dot(precision, width)
+
+
+def exact_dot(left: Float64Array, right: Float64Array) -> float:
+    """The products in 32 lanes, then 16, then one by one: each added with a single rounding."""
+    product, error = (each.tolist() for each in precision_recall._exact_products(left, right))
+    n = len(product)
+    n16, n32 = n - n % 16, n - n % 32
+    wide = [0.0] * 32
+    for i in range(n32):
+        wide[i % 32] = math.fsum((product[i], error[i], wide[i % 32]))
+    lanes = [wide[8 * r + i] + wide[8 * r + i + 4] for r in range(4) for i in range(4)]
+    for i in range(n32, n16):
+        lanes[i % 16] = math.fsum((product[i], error[i], lanes[i % 16]))
+    four = [((lanes[i] + lanes[i + 4]) + lanes[i + 8]) + lanes[i + 12] for i in range(4)]
+    total = (four[0] + four[2]) + (four[1] + four[3])
+    for i in range(n16, n):
+        total = math.fsum((product[i], error[i], total))
+    return total
+
+
 @pytest.mark.parametrize("levels", [1, 7, 40, 10**9])
-def test_above_the_limit_every_curve_has_the_bits_of_the_curve_by_itself(levels: int) -> None:
-    counts = many(np.random.default_rng(levels), MANY_ROWS + 500, levels)
+def test_every_curve_of_many_has_the_bits_of_the_curve_by_itself(levels: int) -> None:
+    counts = many(np.random.default_rng(levels), 20_500, levels)
     found = combine([counts])
     assert np.array_equal(found.table, one_by_one(counts), equal_nan=True)
     assert found.table[1].tolist() == [0.0] * len(THRESHOLDS)
@@ -52,41 +88,47 @@ def test_above_the_limit_every_curve_has_the_bits_of_the_curve_by_itself(levels:
     assert 0 < found.ap < 1
 
 
-@pytest.mark.parametrize("beyond", [-1, 0])
-def test_at_the_limit_both_ways_agree(beyond: int) -> None:
-    counts = many(np.random.default_rng(3), MANY_ROWS + beyond, 50)
+@pytest.mark.parametrize("at_once", [1, 700, 3000])
+def test_curves_formed_in_portions_are_those_formed_together(at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(precision_recall, "ROWS_AT_ONCE", at_once)
+    counts = many(np.random.default_rng(3), 5000, 50)
     assert np.array_equal(combine([counts]).table, one_by_one(counts), equal_nan=True)
 
 
-def test_scenes_side_by_side_above_the_limit_are_those_alone() -> None:
+def test_scenes_side_by_side_are_those_alone() -> None:
     rng = np.random.default_rng(5)
-    scenes = [many(rng, n, 9) for n in (MANY_ROWS, 40, 0, 900)]
+    scenes = [many(rng, n, 9) for n in (6000, 40, 0, 900)]
     for each, alone in zip(combine_each(scenes), scenes, strict=True):
         assert np.array_equal(each.table, one_by_one(alone), equal_nan=True)
 
 
 def test_a_wanted_cell_without_rows_is_zero_and_an_unwanted_one_no_number() -> None:
-    score, is_true = np.linspace(0, 1, MANY_ROWS), np.ones(MANY_ROWS, bool)
-    cell = np.full(MANY_ROWS, 1)
+    score, is_true = np.linspace(0, 1, 500), np.ones(500, bool)
+    cell = np.full(500, 1)
     areas = average_precisions(cell, score, is_true, np.zeros(4, np.int64), np.array([True, True, False, True]))
     assert areas[[0, 1, 3]].tolist() == [0.0, average_precision(score, is_true, 0), 0.0]
     assert np.isnan(areas[2])
+    nothing = np.zeros(0)
+    assert average_precision(nothing, nothing.astype(bool), 2) == 0.0
 
 
-@pytest.mark.parametrize("n", [1, 5, 40])
-def test_the_loops_stay_within_their_arrays(n: int) -> None:
-    score, is_true = np.linspace(0, 1, n), np.arange(n) % 3 > 0
-    of_cell = np.full(1, np.nan)
-    # as Python runs them, which looks where the compiled loops write
-    kernels.areas.py_func(score, is_true, np.array([0, n]), np.array([2]), np.array([True]), of_cell)
-    assert of_cell.tolist() == [average_precision(score, is_true, 2)]
+def test_products_of_many_stretches_add_up_as_those_of_each_alone() -> None:
+    rng = np.random.default_rng(0)
+    lengths = np.array([0, 1, 15, 16, 17, 31, 32, 33, 47, 48, 63, 64, 65, 97, 1000])
+    starts = np.cumsum(lengths) - lengths
+    left, right = rng.random(lengths.sum()), rng.standard_normal(lengths.sum()) / 7
+    expected = [exact_dot(left[at : at + n], right[at : at + n]) for at, n in zip(starts, lengths, strict=True)]
+    assert dots(left, right, starts, lengths).tolist() == expected
 
 
-@pytest.mark.parametrize("n", [0, 1, 15, 16, 17, 31, 32, 33, 47, 48, 63, 64, 65, 97, 1000])
-def test_compiled_products_add_up_in_the_order_of_the_others(n: int) -> None:
-    rng = np.random.default_rng(n)
-    left, right = rng.random(n + 3), rng.random(n + 3) / 7
-    assert kernels._dot(left, right, n) == dot(left[:n], right[:n])
+@pytest.mark.parametrize("scale", [1.0, 1e-8, 1e-17])
+def test_a_sum_is_rounded_once(scale: float) -> None:
+    rng = np.random.default_rng(1)
+    few_bits = rng.integers(-(1 << 53), 1 << 53, 20_000) * 2.0 ** -rng.integers(20, 80, 20_000)  # with ties in plenty
+    for total in (rng.standard_normal(20_000), few_bits):
+        product, error = precision_recall._exact_products(rng.random(20_000), rng.standard_normal(20_000) * scale)
+        expected = list(map(math.fsum, zip(product.tolist(), error.tolist(), total.tolist(), strict=True)))
+        assert precision_recall._rounded_once(product, error, total).tolist() == expected
 
 
 @pytest.mark.parametrize("levels", [1, 6])

@@ -15,11 +15,10 @@ from su3d_bench.core.types import Float64Array, Masks, Partition
 from su3d_bench.metrics import scoring
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import precision_recall, resampling
-from su3d_bench.metrics.instance import precision_recall as dot_product
-from su3d_bench.metrics.matching import labelling
+from su3d_bench.metrics.matching import duplicates, labelling
 from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.matching.labelling import most_similar
 from su3d_bench.metrics.matching.duplicates import duplicate_pairs
+from su3d_bench.metrics.matching.labelling import most_similar
 from su3d_bench.metrics.matching.nearest import (
     nearest,
     reduce_to_voxels,
@@ -31,7 +30,7 @@ from su3d_bench.metrics.semantic import confusion as semantic
 
 @pytest.mark.parametrize(
     "module",
-    [dot_product, instance_ap, labelling, precision_recall, resampling, scoring, semantic, transfer],
+    [duplicates, instance_ap, labelling, precision_recall, resampling, scoring, semantic, transfer],
     ids=lambda m: m.__name__,
 )
 def test_the_examples_in_the_docstrings_run(module: object) -> None:
@@ -153,6 +152,22 @@ def test_duplicates_are_pairs_strictly_above_the_iou() -> None:
     masks = Masks(np.array([0, 10, 19, 28]), np.concatenate([tens, tens[:9], tens[1:]]))
     assert duplicate_pairs(masks, 10, 0.9) == []
     assert duplicate_pairs(masks, 10, 0.89) == [(0, 1), (0, 2)]
+
+
+@settings(max_examples=150, deadline=None)
+@given(seed=st.integers(0, 10_000), n=st.integers(1, 160), iou=st.sampled_from([0.0, 0.1, 0.5, 0.89, 0.9, 0.95, 0.99]))
+def test_duplicates_are_those_of_a_comparison_of_every_pair(seed: int, n: int, iou: float) -> None:
+    rng = np.random.default_rng(seed)
+    sets: list[set[int]] = []
+    for _ in range(rng.integers(0, 14)):
+        if sets and rng.random() < 0.6:  # almost one of those before
+            sets.append(sets[rng.integers(len(sets))] ^ set(rng.integers(0, n, rng.integers(0, 6)).tolist()))
+        else:
+            sets.append(set(np.flatnonzero(rng.random(n) < rng.random()).tolist()))
+    masks = Masks.of_sets([np.array(sorted(one), np.int64) for one in sets])
+    pairs = [(k, m) for m, other in enumerate(sets) for k, one in enumerate(sets[:m])
+             if len(one & other) > iou * len(one | other)]  # fmt: skip
+    assert duplicate_pairs(masks, n, iou) == sorted(pairs)
 
 
 def test_features_that_no_class_may_name_are_none_of_the_classes() -> None:

@@ -6,6 +6,7 @@ import doctest
 
 import numpy as np
 import pytest
+import scipy.special
 import scipy.stats
 
 import su3d_bench.numerics.statistics
@@ -101,6 +102,8 @@ def test_wilson_s_interval_is_that_of_scipy(n_right: int, n: int, low: float, hi
 
 def test_a_quantile_of_infinite_freedom_is_the_normal_one() -> None:
     assert t_quantile(0.975, np.inf) == pytest.approx(scipy.stats.norm.ppf(0.975), rel=1e-12)
+    for n_free in range(1, 40):  # the first from a table; releases of scipy may differ in the last bit
+        assert t_quantile(0.975, n_free) == pytest.approx(float(scipy.special.stdtrit(n_free, 0.975)), rel=4e-16)
     assert t_quantile(0.9, 5.5) == pytest.approx(scipy.stats.t.ppf(0.9, 5.5), rel=1e-9)
 
 

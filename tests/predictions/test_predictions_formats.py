@@ -346,6 +346,16 @@ def test_a_scene_that_is_not_there_is_named(tmp_path: Path, format: str) -> None
 # ---- integers a line
 
 
+def test_numbers_of_any_length_and_with_zeros_before_them_are_read_digit_by_digit() -> None:
+    numbers = [
+        n for digits in range(1, 19) for n in (10 ** (digits - 1), 10**digits - 1, 123456789012345678 % 10**digits)
+    ]
+    for texts in ([str(n) for n in numbers], [f"{n:018d}" for n in numbers], ["7", "0000000000", "12345678", "5"]):
+        content = "".join(f"{text}\n" for text in texts).encode()
+        values = text_integers._plain_numbers(content)
+        assert values is not None and values.tolist() == [int(text) for text in texts]
+
+
 def test_examples_of_integer_lines_are_true() -> None:
     assert doctest.testmod(text_integers) == (0, 2)
 

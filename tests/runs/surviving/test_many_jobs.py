@@ -16,7 +16,7 @@ from su3d_bench.analysis.page.contents import Wishes, page_contents
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
 from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.instance import precision_recall, resampling
+from su3d_bench.metrics.instance import resampling
 from su3d_bench.metrics.scoring import pack_scores, unpack_scores
 from su3d_bench.numerics.statistics import growth_exponent
 from su3d_bench.runs import finished as finished_run
@@ -146,7 +146,6 @@ def test_compiled_curves_give_the_same_bits(
     weights = rng.multinomial(n_scenes, np.full(n_scenes, 1 / n_scenes), size=90)
     found = {}
     for many in (10**9, 0):
-        monkeypatch.setattr(precision_recall, "MANY_ROWS", many)
         monkeypatch.setattr(resampling, "MANY_ROWS", many)
         together, each = instance_ap.combine(counts), instance_ap.combine_each(counts)
         assert not np.isnan(together.ap)

@@ -1,0 +1,152 @@
+"""``texts make`` and ``protocols show --names``: what is encoded here names features as the run does, bit for bit."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from su3d_bench.cli.main import main
+from su3d_bench.evaluation.result import KEYS
+from su3d_bench.evaluation.texts import GivenTexts, candidate_names, read_text_features
+from su3d_bench.metrics.matching.labelling import text_features
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
+
+TWO_PROMPTS = "replica-hovsg"
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SU3D_MODELS", str(tmp_path / "models"))
+
+
+def make(protocol: str, out: str, *more: str) -> int:
+    return main(["texts", "make", "--protocol", protocol, "--encoder", "embedded", "--out", out, *more])
+
+
+def test_texts_made_here_give_the_numbers_of_the_run_itself(
+    rooms_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SU3D_DATA", str(rooms_data))
+    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+    protocols = ["rooms-semantic", "rooms-instance"]
+    words = ["--scenes", "rooms/living0", "--methods", "opensu3d", "--stride", "200", "--jobs", "1"]
+    assert main(["run", *words, "--protocols", *protocols, "--no-pictures", "--quiet", "--out", "out"]) == 0
+    own = json.loads(Path("out/metrics.json").read_text())["results"]
+    for name in protocols:
+        assert make(name, f"{name}.npz") == 0
+        words = ["evaluate", "out/scenes/rooms.living0/opensu3d", "--dataset", "rooms", "--protocols", name, "--quiet"]
+        assert main([*words, "--json=run.json"]) == 0
+        assert main([*words, "--text-features", f"{name}.npz", "--json=texts.json"]) == 0
+        assert Path("texts.json").read_bytes() == Path("run.json").read_bytes()
+        found = json.loads(Path("texts.json").read_text())["protocols"][name]["metrics"]
+        of_run = next(entry["result"]["metrics"] for entry in own if entry["protocol"] == name)
+        assert [found[KEYS[key]] for key in load_protocol(name).headline] == [
+            of_run[key] for key in load_protocol(name).headline
+        ]
+
+
+def test_the_mean_over_several_prompts_is_formed_as_with_the_encoder_itself() -> None:
+    assert make(TWO_PROMPTS, "texts.npz") == 0
+    rules, encoder, given = load_protocol(TWO_PROMPTS), EmbeddedEncoder(), read_text_features(Path("texts.npz"))
+    assert given is not None
+    assert given.missing(rules) == []
+    names, features = candidate_names(rules), np.ones((1, encoder.dim), np.float32)
+    assert len(given.names) == 2 * len(names)
+    expected = text_features(rules, names, features, encoder)
+    assert np.array_equal(text_features(rules, names, features, GivenTexts(given, rules)), expected)
+    assert given.encoder == encoder.name
+
+
+def test_the_texts_of_a_protocol_are_listed_one_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["protocols", "show", TWO_PROMPTS, "--names"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[:2] == ["background", "There is the background in the scene."]
+    assert main(["protocols", "show", TWO_PROMPTS, "--names", "--json"]) == 0
+    value = json.loads(capsys.readouterr().out)
+    assert (value["protocol"], value["encoder"]) == (TWO_PROMPTS, "ViT-H-14/laion2b_s32b_b79k")
+    assert value["names"][0] == {"name": "background", "texts": lines[:2]}
+    assert [text for entry in value["names"] for text in entry["texts"]] == lines
+    assert main(["texts", "make", "--protocol", TWO_PROMPTS, "--encoder", "embedded", "--out", "t.npz"]) == 0
+    with np.load("t.npz") as made:
+        assert made["names"].tolist() == lines
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("q.txt", "a place to sit\nsomething to eat at\na place to sit\n"),
+        ("q.csv", 'scene,text,objects\nroom0,a place to sit,1\nroom1,"something to eat at",\n'),
+        ("q.toml", '[[query]]\nscene = "r"\ntext = "a place to sit"\nobjects = []\n'
+                   '[[query]]\nscene = "r"\ntext = "something to eat at"\nobjects = [3]\n'),
+        ("q.json", '{"synonyms": {"a place to sit": [1], "something to eat at": ["2"]}}'),
+    ],
+)  # fmt: skip
+def test_queries_are_encoded_from_every_form_in_which_they_come(
+    name: str, content: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path(name).write_text(content)
+    assert make("query-ap", "texts.npz", "--queries", name) == 0
+    assert ("--queries" in capsys.readouterr().err) == (name in ("q.csv", "q.toml"))
+    with np.load("texts.npz") as made:
+        assert made["names"].tolist() == ["a place to sit", "something to eat at"]
+        expected = EmbeddedEncoder().encode_texts(made["names"].tolist())
+        assert np.array_equal(made["features"], expected)
+    assert main(["protocols", "show", "query-ap", "--names", "--queries", name]) == 0
+    assert capsys.readouterr().out == "a place to sit\nsomething to eat at\n"
+
+
+def test_the_protocol_s_own_encoder_is_the_default_under_either_of_its_names(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for more in ([], ["--encoder", "clip-vit-h-14"], ["--encoder", "ViT-H-14/laion2b_s32b_b79k"]):
+        assert main(["texts", "make", "--protocol", TWO_PROMPTS, "--out", "t.npz", *more]) == 2
+        assert "model 'clip-vit-h-14': not found" in capsys.readouterr().err
+    assert main(["texts", "make", "--protocol", "query-ap", "--out", "t.npz", "--encoder", "su3d-embedded"]) == 2
+    assert "has no texts of its own; give them with --queries FILE" in capsys.readouterr().err
+    assert not Path("t.npz").exists()
+
+
+REFUSED = [
+    (["--protocol", "rooms-semantic"], "protocol 'rooms-semantic' names no encoder; name one with --encoder: embedded"),
+    (["--protocol", "rooms-semantic", "--encoder", "embeded"], "unknown encoder 'embeded'; did you mean 'embedded'?"),
+    (["--protocol", "rooms-semantic", "--encoder", "x"], "unknown encoder 'x'; known: embedded, clip-vit-h-14"),
+    (["--protocol", "class-agnostic-open3dis"], "compares no features with texts; there is nothing to encode"),
+    (["--protocol", "rooms-reasoning"], "compares no features with texts; there is nothing to encode"),
+    (["--protocol", "rooms-semantic", "--queries", "q.txt"], "has classes of its own as texts; leave --queries out"),
+    (["--protocol", "query-ap", "--queries", "q.txt", "--encoder", "embedded"], "q.txt: is not there"),
+    (["--protocol", "rooms-semantc"], "did you mean 'rooms-semantic'?"),
+    (["--protocol", "rooms-semantic", "--encoder", "embedded", "--out", "texts.txt"], "give a file that ends in .npz"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("words", "message"), REFUSED)
+def test_what_cannot_be_encoded_is_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["texts", "make", "--out", "texts.npz", *words]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not list(Path().glob("texts*"))
+
+
+def test_flags_of_the_texts_stand_with_names_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    for words, message in (
+        (["--names"], "--names belongs to show NAME"),
+        (["show", "query-ap", "--queries", "q.txt"], "--queries belongs to show NAME --names"),
+    ):
+        assert main(["protocols", *words]) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_a_file_of_a_run_stays_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    place = Path("run/scenes/rooms.living0/opensu3d/prediction.npz")
+    place.parent.mkdir(parents=True)
+    Path("run/run.json").write_text("{}")
+    place.write_bytes(b"kept")
+    assert make("rooms-semantic", str(place)) == 2
+    assert "stays as it is" in capsys.readouterr().err
+    assert place.read_bytes() == b"kept"
