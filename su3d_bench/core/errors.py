@@ -6,41 +6,15 @@ in lower case, without a full stop.
 
 from __future__ import annotations
 
-import difflib
-import struct
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from su3d_bench.core.english import plural
 from su3d_bench.core.printing import escaped
 
-# What readers raise on a damaged file, an .npz above all.
-DAMAGE: tuple[type[Exception], ...]
 MESSAGE_CHARACTERS = 500  # of one message: a hostile file may hold a line of any length
-
-
-if not TYPE_CHECKING:
-
-    def __getattr__(name: str) -> tuple[type[Exception], ...]:
-        """``DAMAGE``, put together where it is first asked for: ``--help`` does without the modules that it needs."""
-        if name != "DAMAGE":
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        import struct
-        import tokenize
-        import zipfile
-        import zlib
-
-        known = (OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, SyntaxError)
-        # RuntimeError is zipfile's, of a compression unknown to it
-        globals()["DAMAGE"] = (
-            *known, RuntimeError, tokenize.TokenError, zipfile.BadZipFile, zlib.error, struct.error
-        )  # fmt: skip
-        return DAMAGE
 
 
 def printable(text: str, limit: int = MESSAGE_CHARACTERS) -> str:

@@ -1,4 +1,4 @@
-"""Features of class names: out of a file that the user gives, or of the encoder that is here; and that file, made here."""
+"""Features of class names: out of a file of the user, or of the encoder that is here; and such a file, made here."""
 
 from __future__ import annotations
 

@@ -24,7 +24,8 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import DAMAGE, StoreError, reading
+from su3d_bench.core.damage import DAMAGE
+from su3d_bench.core.errors import StoreError, reading
 from su3d_bench.core.files import file_text, opened
 from su3d_bench.core.printing import escaped_json
 from su3d_bench.store.unfinished import SHARED, beside, clear_unfinished, new_file, own_file

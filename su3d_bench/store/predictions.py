@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import DAMAGE, PredictionError, StoreError, counted
+from su3d_bench.core.damage import DAMAGE
+from su3d_bench.core.errors import PredictionError, StoreError, counted
 from su3d_bench.core.files import regular
 from su3d_bench.core.types import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.store.atomic import read_npz, remove_file, replacing, write_npz
