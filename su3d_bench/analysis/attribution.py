@@ -22,7 +22,6 @@ from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.attribution.arrays import EXPLAINED, MendedScene
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.metric import Counts
-from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import SceneScore, metric_of, plain_json
 from su3d_bench.runs.finished import FinishedRun, read_run
@@ -132,7 +131,7 @@ class Explained:
         naming = encoder() if getattr(prediction, "labels", None) is None else None
         mended: dict[str, MendedScene] = {}
         for name in mine:
-            rules = load_protocol(name)
+            rules = self.run.rules(name)
             truth = truth_of(rules.ground_truth)
             if (reason := why_not_scorable(rules, prediction)) is not None:
                 raise PredictionError(f"{scene}: {reason}")
@@ -143,7 +142,7 @@ class Explained:
     def form(self, mended: Mapping[str, MendedJob], other: Side | None = None) -> RunAttribution:
         """What the errors of all scenes cost; ``other`` is the side with perfect 2D masks."""
         side = Side(self.run, self.method)
-        gathered = {name: _Gathered(load_protocol(name)) for name in self.protocols}
+        gathered = {name: _Gathered(self.run.rules(name)) for name in self.protocols}
         for scene, of_scene in mended.items():
             for name, counts in of_scene.items():
                 gathered[name].add(scene, counts)
@@ -170,12 +169,7 @@ def _protocols_of(run: FinishedRun, wanted: Sequence[str]) -> tuple[list[str], l
         run.check_protocol(name)
     chosen, remarks = [], []
     for name in wanted or run.protocols:
-        rules = load_protocol(name)
-        if rules.version != run.protocols[name].version:
-            raise ConfigError(
-                f"{run.name}: was scored under {name} version {run.protocols[name].version}, here is version "
-                f"{rules.version}; score it again"
-            )
+        rules = run.rules(name)
         if rules.kind in EXPLAINED:
             chosen.append(name)
         elif wanted:

@@ -21,13 +21,11 @@ from su3d_bench.analysis.sides import (
     parse_side,
     protocols_in_both,
     refuse_unlike,
-    rules_of,
     settings_that_differ,
 )
 from su3d_bench.core.errors import ConfigError, counted, printable
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.metric import SceneScore
-from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.score import ANSWERED_BY, REFINED_BY, RELATIVE, said_by
 from su3d_bench.metrics.scoring import plain_json
@@ -185,7 +183,7 @@ def _compare_methods(
                 f"{left.name} and {right.name}: no scene in common that is scored under {name}; compare runs of the "
                 "same scenes"
             )
-        rules = rules_of(left, name)
+        rules = left.run.rules(name)
         over_scenes = []
         for of_run in every:
             own = {scene: scores[id(of_run)][scene] for scene in common}
@@ -295,7 +293,7 @@ def _own_remarks(sides: Sequence[Side], protocol: str) -> list[str]:
         warnings = () if record is None or record.result is None else record.result.warnings
         for start in (RELATIVE, ANSWERED_BY, REFINED_BY):
             lines += [f"{side.name}: {start}{printable(said, 200)}" for said in said_by(warnings, start)]
-    if load_protocol(protocol).digest != sides[0].run.protocols[protocol].digest:
+    if sides[0].run.rules(protocol).digest != sides[0].run.protocols[protocol].digest:
         lines.append(f"the rules of {protocol} here are not to the letter those that scored both runs (same version)")
     return lines
 

@@ -51,6 +51,7 @@ class Entry:
     method: str
     protocol: str
     version: int
+    digest: str
     headline: tuple[str, ...]
     values: tuple[float | None, ...]
     intervals: tuple[Interval | None, ...]
@@ -102,8 +103,10 @@ def leaderboard(folder: Path, protocols: Sequence[str] = (), *, with_ranks: bool
     if not entries and not refused:
         raise ConfigError(f"{printable(str(folder), 200)}: holds no run below it; a run has a run.json")
     boards: list[tuple[Entry, ...]] = []
-    for key in dict.fromkeys((entry.protocol, entry.scenes) for entry in entries):
-        alike, others = _of_same_data([entry for entry in entries if (entry.protocol, entry.scenes) == key])
+    # Two people may call their own rules alike: a ranking is of one set of rules.
+    for key in dict.fromkeys((entry.protocol, entry.digest, entry.scenes) for entry in entries):
+        ranked_together = [entry for entry in entries if (entry.protocol, entry.digest, entry.scenes) == key]
+        alike, others = _of_same_data(ranked_together)
         board = tuple(sorted(alike, key=_rank))
         boards.append(ranked(board) if with_ranks else board)
         refused += others
@@ -152,6 +155,7 @@ def _entries(name: str, run: FinishedRun, protocols: Sequence[str]) -> Iterator[
             method=printable(method, 120),
             protocol=protocol,
             version=result.version,
+            digest=rules.digest,
             headline=result.headline,
             values=tuple(recomputed["metrics"].get(key) for key in result.headline),
             intervals=tuple(result.intervals.get(key) for key in result.headline),
@@ -168,8 +172,9 @@ def _why_not(run: FinishedRun, protocol: str, failed: Sequence[str]) -> str | No
         return f"is partial: the first {run.limit} frames of each scene"
     if failed:
         return f"is incomplete: {counted(len(failed), 'scene')} failed"
-    # A file of rules that somebody else's run names is not looked for.
-    return None if protocol in protocol_names() else "its protocol is none of those installed here"
+    if protocol in protocol_names() or (protocol in run.protocols and run.protocols[protocol].rules is not None):
+        return None
+    return "its protocol is none of those installed here"  # a file that somebody else's run names is not looked for
 
 
 def _of_same_data(entries: Sequence[Entry]) -> tuple[list[Entry], list[Refused]]:

@@ -16,7 +16,6 @@ from su3d_bench.analysis.sides import (
     protocols_in_both,
     refuse_other_requests,
     refuse_unlike,
-    rules_of,
 )
 from su3d_bench.core.errors import ConfigError, counted, printable
 from su3d_bench.core.types import BoolArray, Float64Array
@@ -110,7 +109,7 @@ def plan(
                 points,
                 power,
             )
-            for metric in rules_of(sides[0][0], name).headline
+            for metric in sides[0][0].run.rules(name).headline
         }
     seeds = tuple(run.record.seed or 0 for run in read)
     return Plan(*pair, tuple(run.name for run in read), seeds, tuple(scenes), power, plans)
@@ -130,7 +129,7 @@ def _over_common_scenes(
         )
     for _, other in sides:
         refuse_unlike(first, other, protocol, common)
-    rules = rules_of(first, protocol)
+    rules = first.run.rules(protocol)
 
     def over_scenes(side: Side) -> OverScenes:
         own = {scene: scores[id(side)][scene] for scene in common}

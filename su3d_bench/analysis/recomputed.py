@@ -8,8 +8,6 @@ from typing import Any
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, Su3dError, printable
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import ProtocolResult, SceneScore, combine
 from su3d_bench.runs.finished import FinishedRun
@@ -23,26 +21,10 @@ SAID = ("metrics", "pooled", "scene_mean", "per_scene", "per_class", "groups", "
 
 
 def rules_of_run(run: FinishedRun, protocol: str) -> ProtocolRules:
-    """The rules here that scored ``run``, to the digest; a ``ConfigError`` where there are none."""
+    """The rules that scored ``run``, to the digest; a ``ConfigError`` where there are none."""
     if protocol not in run.protocols:
         raise ConfigError("its protocol is none of those that run.json names")
-    here, then = _rules_here(run, protocol), run.protocols[protocol]
-    if here is None:
-        raise ConfigError("its protocol is none of those installed here")
-    if then.version != here.version:
-        raise ConfigError(f"was scored under version {then.version} of the protocol, here it is {here.version}")
-    if then.digest != here.digest:
-        raise ConfigError("its protocol has the version of the one here and other rules")
-    return here
-
-
-def _rules_here(run: FinishedRun, protocol: str) -> ProtocolRules | None:
-    if protocol in protocol_names():
-        return load_protocol(protocol)
-    asked = run.settings.get(("protocols",), ())
-    files = [str(name) for name in asked if str(name).endswith(".toml")] if isinstance(asked, list | tuple) else []
-    made = (load_protocol(name) for name in files)
-    return next((rules for rules in made if rules.name == protocol), None)
+    return run.rules(protocol, to_the_letter=True)
 
 
 def contradiction(said: NumbersRecord, counted: ProtocolResult) -> str | None:

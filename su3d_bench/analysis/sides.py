@@ -8,7 +8,6 @@ from pathlib import Path
 
 from su3d_bench.core.config import MOVES_NO_NUMBER
 from su3d_bench.core.errors import ConfigError, printable
-from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import SceneScore, metric_of
 from su3d_bench.runs.finished import FinishedRun, read_run
@@ -186,18 +185,6 @@ def refuse_unlike(left: Side, right: Side, protocol: str, scenes: Sequence[str])
 
 def _short(value: int | str | None) -> str:
     return printable(str(value)[:12]) if value is not None else "not recorded"
-
-
-def rules_of(side: Side, protocol: str) -> ProtocolRules:
-    """The rules here, which must be those of the run as far as a version says so."""
-    rules = load_protocol(protocol)
-    version = side.run.protocols[protocol].version
-    if rules.version != version:
-        raise ConfigError(
-            f"{side.run.name}: was scored under {protocol} version {version}, here is version {rules.version}; score "
-            "both runs again"
-        )
-    return rules
 
 
 def check_shapes(rules: ProtocolRules, side: Side, scores: Mapping[str, SceneScore]) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from su3d_bench.analysis.sides import Side, refuse_unlike, rules_of
+from su3d_bench.analysis.sides import Side, refuse_unlike
 from su3d_bench.core.errors import ConfigError, Su3dError, counted, printable, reading, suggest
 from su3d_bench.core.files import file_bytes
 from su3d_bench.core.registry import CEILING_METHOD
@@ -279,7 +279,7 @@ class _Recomputed:
             run.check_method(origin.method)
             if origin.protocol not in run.protocols:
                 raise ConfigError(f"{run.name}: was not scored under '{printable(origin.protocol, 80)}'")
-            rules = rules_of(Side(run, origin.method), origin.protocol)
+            rules = run.rules(origin.protocol)
             scores = run.scores(origin.method)[rules.name]
             if origin.what == "ceiling":
                 perfect = run.scores(CEILING_METHOD)[rules.name]

@@ -215,7 +215,7 @@ def _labelled(content: Content, source: Source, arguments: argparse.Namespace) -
     if "/" not in source.address:
         raise PredictionError(f"which dataset it is of is not known; name it, such as --scenes replica/{source.scene}")
     dataset, scene = _scene_of(source, is_quiet=arguments.quiet)
-    rules = _rules(arguments.protocol, dataset)
+    rules = _rules(arguments.protocol, dataset, source.run)
     encoder = _encoder(content, source, rules, arguments.text_features)
     return masks_on_truth(content, rules, dataset.ground_truth(scene, rules.ground_truth), encoder)
 
@@ -232,7 +232,7 @@ def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:
     ]
 
 
-def _rules(name: str | None, dataset: Any) -> ProtocolRules:
+def _rules(name: str | None, dataset: Any, run: Path | None) -> ProtocolRules:
     """The protocol of ``name``, or the dataset's only one of instances with classes."""
     from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
     from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for
@@ -243,11 +243,22 @@ def _rules(name: str | None, dataset: Any) -> ProtocolRules:
             known = ", ".join(fitting) or "none fits by itself"
             raise ConfigError(f"{dataset.name}: whose classes? name a protocol with --protocol ({known})")
         return next(iter(fitting.values()))
-    rules = load_protocol(name)
+    rules = _of_run(name, run) or load_protocol(name)
     reason = why_not_truth(rules, TruthFacts.of_dataset(dataset))
     if reason is not None or not _has_masks(rules):
         raise ConfigError(f"--protocol {name}: {reason or 'has no classes of instances'}")
     return rules
+
+
+def _of_run(name: str, run: Path | None) -> ProtocolRules | None:
+    """Somebody's own rules that ``run`` was scored by; None where it has none of that name."""
+    from su3d_bench.metrics.protocols.files import protocol_names
+    from su3d_bench.runs.finished import read_run
+
+    if run is None or name in protocol_names() or name.endswith(".toml"):
+        return None
+    finished = read_run(run)
+    return finished.rules(name) if name in finished.protocols else None
 
 
 def _has_masks(rules: ProtocolRules) -> bool:

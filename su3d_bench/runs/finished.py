@@ -19,6 +19,9 @@ from su3d_bench.core.files import file_bytes
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.types import Prediction
 from su3d_bench.metrics.costs import UpdateTimes
+from su3d_bench.metrics.protocols.files import protocol_names
+from su3d_bench.metrics.protocols.loading import load_protocol, read_rules
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import SceneScore, unpack_scores
 from su3d_bench.runs.job import build_dataset, part_of
 from su3d_bench.runs.planning.scenes import cache_root, data_root, dataset_targets
@@ -124,6 +127,37 @@ class FinishedRun:
     def name(self) -> str:
         return printable(str(self.folder.path), 200)
 
+    def rules(self, protocol: str, *, to_the_letter: bool = False) -> ProtocolRules:
+        """The rules that scored the run: the program's own, else those that ``run.json`` keeps.
+
+        A ``ConfigError`` where they are not here, or are those of another version; ``to_the_letter``: or other ones
+        under the same version.
+        """
+        then, shown = self.protocols[protocol], printable(protocol, 80)
+        here = load_protocol(protocol) if protocol in protocol_names() else self._own_rules(then)
+        if here.version != then.version:
+            raise ConfigError(
+                f"{self.name}: was scored under {shown} version {then.version}, here is version {here.version}; score "
+                "it again"
+            )
+        if here.digest != then.digest and (to_the_letter or then.rules is not None):
+            raise ConfigError(f"{self.name}: the rules of {shown} are not those that scored it (same version)")
+        return here
+
+    def _own_rules(self, then: ProtocolRecord) -> ProtocolRules:
+        """Somebody's own rules; of a run that an earlier version made those in the file that its request names."""
+        where = f"{self.name}: the rules of {printable(then.name, 80)}"
+        if then.rules is not None:
+            own = read_rules(then.rules, where)
+            if own.name == then.name:
+                return own
+        asked = self.settings.get(("protocols",), ())
+        for name in asked if isinstance(asked, list | tuple) else ():
+            with suppress(ConfigError):
+                if str(name).endswith(".toml") and (found := load_protocol(str(name))).name == then.name:
+                    return found
+        raise ConfigError(f"{where} are neither the program's nor in run.json; run its command again")
+
     def check_method(self, method: str) -> None:
         """A ``ConfigError`` where the run holds no scores of ``method``."""
         if method not in self.methods and not self.has_scores(method):
@@ -186,6 +220,12 @@ class _Rules(dict[str, ProtocolRecord]):
 
     def __missing__(self, protocol: str) -> ProtocolRecord:
         raise StoreError(f"{self._shown}: run.json does not name the protocol '{protocol}'; run its command again")
+
+
+def record_of_rules(rules: ProtocolRules) -> ProtocolRecord:
+    """What ``run.json`` says of the rules that scored a run."""
+    own = None if rules.name in protocol_names() else rules.as_json
+    return ProtocolRecord(rules.name, rules.version, rules.digest, own)
 
 
 def read_run(path: Path) -> FinishedRun:

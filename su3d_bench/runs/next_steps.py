@@ -48,17 +48,18 @@ def _query(result: RunResult, run: str) -> list[list[str]]:
         features = read_prediction(job.prediction).features if is_map else None
         if features is None or not features.size:
             continue
-        known = sorted(_classes(job, outcome.scene), key=lambda pair: -pair[1])
+        known = sorted(_classes(result, job, outcome.scene), key=lambda pair: -pair[1])
         if known:
             method = [] if outcome.method == "opensu3d" else ["--method", outcome.method]
             return [["query", outcome.scene, known[0][0], "--run", run, *method]]
     return []
 
 
-def _classes(job: JobFolder, scene: str) -> Iterator[tuple[str, float]]:
+def _classes(result: RunResult, job: JobFolder, scene: str) -> Iterator[tuple[str, float]]:
     """The classes that the scene has, each with what the map scores on it, of the first protocol that tells classes."""
     scores = unpack_scores(file_bytes(job.counts))
-    rules = {name: load_protocol(name) for name in scores}
+    asked = dict.fromkeys(name for scene_job in result.plan.jobs for name in scene_job.protocols)
+    rules = {rules.name: rules for rules in map(load_protocol, asked)}
     for name in sorted(scores, key=lambda name: rules[name].kind not in THINGS_FIRST):
         rows: Mapping[str, Mapping[str, float]]
         rows = combine(rules[name], {scene: scores[name]}, with_intervals=False).per_class

@@ -30,6 +30,7 @@ from su3d_bench.perception.profiles import PerceptionConfig
 from su3d_bench.reports.tables.found import Found, Unscored, not_scored_lines
 from su3d_bench.runs.executors.choose import ELSEWHERE, run_units
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
+from su3d_bench.runs.finished import record_of_rules
 from su3d_bench.runs.found import found_in
 from su3d_bench.runs.job import MethodOutcome, SceneJob
 from su3d_bench.runs.planning.plan import Plan
@@ -45,7 +46,6 @@ from su3d_bench.store.records import (
     MetricsRecord,
     MidwayRecord,
     NumbersRecord,
-    ProtocolRecord,
     ResultRecord,
     RunRecord,
     UnscoredRecord,
@@ -360,7 +360,7 @@ def record(plan: Plan, outcomes: Sequence[MethodOutcome], status: str) -> RunRec
         encoder=_join(outcome.encoder for outcome in outcomes),
         encoder_digest=_join(outcome.encoder_digest for outcome in outcomes),
         data_digests={outcome.scene: outcome.data_digest for outcome in outcomes if outcome.data_digest is not None},
-        protocols=tuple(ProtocolRecord(rules.name, rules.version, rules.digest) for rules in _rules(plan)),
+        protocols=tuple(map(record_of_rules, _rules(plan))),
         methods=plan.methods,
         scenes=tuple(job.scene for job in plan.jobs),
         failed=tuple(

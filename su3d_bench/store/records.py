@@ -56,11 +56,12 @@ Values = Annotated[Mapping[str, Number | None], AfterValidator(_possible)]
 
 @dataclass(frozen=True)
 class ProtocolRecord:
-    """The rules that scored a run."""
+    """The rules that scored a run. ``rules``: all of them, where they are somebody's own and not the program's."""
 
     name: str
     version: int
     digest: str
+    rules: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -245,6 +246,9 @@ def plain(record: Any) -> dict[str, Any]:
     for result in written["results"] if isinstance(record, MetricsRecord) else ():
         if result["anytime"] is None:
             del result["anytime"]
+    for protocol in written["protocols"] if isinstance(record, RunRecord) else ():
+        if protocol["rules"] is None:
+            del protocol["rules"]
     return written
 
 

@@ -16,7 +16,6 @@ from fuzz_targets_runs import copied_run
 from numpy.typing import NDArray
 
 from su3d_bench.analysis.leaderboard import leaderboard
-from su3d_bench.analysis.sides import Side, rules_of
 from su3d_bench.analysis.tables import check_paper
 from su3d_bench.cli.main import main
 from su3d_bench.core.config import parse_value, read_file
@@ -174,7 +173,7 @@ def test_results_under_a_protocol_that_the_record_does_not_name_stand_in_no_rank
     missing = record["protocols"][1]["name"]
     assert any("none of those that run.json names" in one.reason for one in leaderboard(run.parent).refused)
     with pytest.raises(StoreError, match=f"run\\.json does not name the protocol '{missing}'"):
-        rules_of(Side(read_run(run), "collector"), missing)
+        read_run(run).rules(missing)
 
 
 def test_a_list_of_scenes_that_are_no_names_is_refused(tmp_path: Path) -> None:

@@ -170,7 +170,7 @@ def _kept(
             job: piece(runs[job[0]], ("errors", scene, job[1]), state(job)) for job in counted_jobs.get(scene, ())
         }
         for job, place in places.items():
-            mended = None if (content := place.load()) is None else unpacked(content)
+            mended = None if (content := place.load()) is None else unpacked(content, runs[job[0]].rules)
             if mended is not None:
                 made[scene].errors[job] = mended
         of_maps = [(index, method) for index, _, _, method in shown.get(scene, ())]
@@ -248,7 +248,7 @@ def _make_scene(
             made.errors[index, method] = str(error)
             continue
         made.errors[index, method] = mended
-        place.save(packed(mended))
+        place.save(packed(mended, run.rules))
     if asked.maps:
         maps = [(index, runs[index], asked.scene, method) for index, method in asked.maps]
         made.page = page_scene(asked.scene, maps, spaces, truths, most_points, tell)

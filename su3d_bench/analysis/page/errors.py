@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -16,10 +16,10 @@ from su3d_bench.metrics.attribution.points import MendedPoints
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.matching.nearest import COVERAGE_RADII_M
 from su3d_bench.metrics.metric import Counts, SceneScore
-from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import metric_of, pack_scores, unpack_scores
 
+RulesOf = Callable[[str], ProtocolRules]
 AS_IS, ALL, LABELLED = "as it is", "all mended", "true labels"  # beside the kinds of errors, each mended alone
 
 
@@ -35,25 +35,25 @@ def errors_of(explained: Explained | str, method: str, of_scenes: Mapping[str, M
     return {"method": method, "protocols": [], "remarks": [], "reason": reasons[0]}
 
 
-def packed(mended: MendedJob) -> bytes:
-    """The counts of a scene under a method as the bytes of an npz file."""
+def packed(mended: MendedJob, rules_of: RulesOf) -> bytes:
+    """The counts of a scene under a method as the bytes of an npz file; ``rules_of`` finds a protocol by its name."""
     scores: dict[str, SceneScore] = {}
     for protocol, of_scene in mended.items():
         parts = {AS_IS: of_scene.as_is, ALL: of_scene.all, LABELLED: of_scene.with_true_labels, **of_scene.alone}
         for part, counts in parts.items():
             if counts is not None:
                 name, n = f"{protocol} {part}", of_scene.n.get(part, 0)
-                version, nowhere = load_protocol(protocol).version, np.zeros(len(COVERAGE_RADII_M), np.int64)
+                version, nowhere = rules_of(protocol).version, np.zeros(len(COVERAGE_RADII_M), np.int64)
                 scores[name] = SceneScore(name, version, counts, n, of_scene.n_scored or 0, nowhere, ())
     return pack_scores(scores)
 
 
-def unpacked(content: bytes) -> MendedJob | None:
+def unpacked(content: bytes, rules_of: RulesOf) -> MendedJob | None:
     """What ``packed`` packed; None for anything else."""
     with suppress(Su3dError, KeyError):
         scores = unpack_scores(content)
         names = dict.fromkeys(name.partition(" ")[0] for name in scores)
-        return {name: _of_protocol(load_protocol(name), scores) for name in names}
+        return {name: _of_protocol(rules_of(name), scores) for name in names}
     return None
 
 

@@ -26,7 +26,6 @@ from su3d_bench.core.digests import (
 )
 from su3d_bench.core.errors import StoreError, Su3dError
 from su3d_bench.core.files import file_bytes
-from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.atomic import filling
 from su3d_bench.store.predictions import features_beside
@@ -95,7 +94,7 @@ def state_of_run(run: FinishedRun, scene: str) -> list[Any]:
     """What moves each piece of a scene of a run: its records, the rules here, and whether its data are here."""
     return [
         *(_digest(run.folder.path / name) for name in ("run.json", "run.toml")),
-        {name: _fault(partial(load_protocol, name)) or load_protocol(name).digest for name in run.protocols},
+        {name: _fault(partial(run.rules, name)) or run.rules(name).digest for name in run.protocols},
         _fault(partial(run.dataset, scene)),
     ]
 

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from su3d_bench.core.errors import Su3dError, printable, printable_json
+from su3d_bench.core.errors import ConfigError, Su3dError, printable, printable_json
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import (
     DenseFeatures,
@@ -32,7 +32,6 @@ from su3d_bench.metrics.matching.labelling import (
     scored_classes,
 )
 from su3d_bench.metrics.metric import n_predictions, present
-from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.score import has_feature
 from su3d_bench.numerics.geometry import back_project
@@ -251,8 +250,10 @@ class _Scene:
 
     def _rules(self, run: FinishedRun) -> ProtocolRules | None:
         """The rules whose classes the map is shown in: of points before those of instances."""
-        fitting = [rules for rules in map(load_protocol, run.protocols) if rules.vocabulary is not None]
-        fitting = [rules for rules in fitting if rules.version == run.protocols[rules.name].version]
+        fitting: list[ProtocolRules] = []
+        for name in run.protocols:
+            with suppress(ConfigError):  # those of another version are passed over
+                fitting += [rules for rules in (run.rules(name),) if rules.vocabulary is not None]
         return min(fitting, key=lambda rules: not rules.takes_dense, default=None)
 
     def _truth(self, rules: ProtocolRules) -> GroundTruth | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
 
@@ -11,9 +12,9 @@ from su3d_bench.analysis.comparison import compare
 from su3d_bench.analysis.side_numbers import SideNumbers
 from su3d_bench.analysis.sides import Side
 from su3d_bench.core.config import KeyPath
-from su3d_bench.core.errors import Su3dError, printable_json
+from su3d_bench.core.errors import ConfigError, Su3dError, printable_json
 from su3d_bench.metrics.costs import summarise
-from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, concatenate
 from su3d_bench.reports.page.numbers import confusion_cells, series_of, summary_data
 from su3d_bench.reports.tables.found import Found, Unscored, not_scored_lines
@@ -92,7 +93,7 @@ def _about(run: FinishedRun) -> dict[str, Any]:
         "scenes": run.scenes,
         "methods": run.methods,
         **{key: of_record[key] for key in shared},
-        "protocols": of_record["protocols"],
+        "protocols": [{key: rules[key] for key in ("name", "version", "digest")} for rules in of_record["protocols"]],
         "settings": [{"key": _dotted(path), "value": value} for path, value in run.settings.items()],
         "failed": [f"{failure.scene} {failure.method} {failure.error}" for failure in record.failed],
         "warnings": list(record.warnings),
@@ -112,12 +113,14 @@ def _confusions(run: FinishedRun, method: str) -> list[dict[str, Any]]:
     """The confusion of every semantic protocol, its scenes added up; none where the rules here are not the run's."""
     confusions = []
     for name, of_scene in run.scores(method).items():
+        rules: ProtocolRules | None = None
         counts = [score.counts for score in of_scene.values() if isinstance(score.counts, SemanticCounts)]
         if not counts:
             continue
-        rules = load_protocol(name)
         confusion: dict[str, Any] = {"method": method, "protocol": name}
-        if rules.digest != run.protocols[name].digest or any(len(c.is_present) != len(rules.classes) for c in counts):
+        with suppress(ConfigError):
+            rules = run.rules(name, to_the_letter=True)
+        if rules is None or any(len(c.is_present) != len(rules.classes) for c in counts):
             confusions.append(confusion | {"reason": f"the rules of {name} here are not those that scored the run"})
             continue
         names = [entry.name for entry in rules.classes]

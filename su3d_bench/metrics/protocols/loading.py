@@ -6,7 +6,7 @@ of one line that name the file and the key.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -48,10 +48,22 @@ def read_protocol(path: Path) -> ProtocolRules:
     """The rules in a TOML file and in those that it extends."""
     content = read_content(path)
     try:
-        rules = RULES_OF_KIND.get(str(content.values.get("kind")), ProtocolRules)
-        return rules.model_validate(_with_tuples(content.values))
+        return _made(content.values)
     except ValidationError as error:
         raise ConfigError(_first_line(content.files, error)) from error
+
+
+def read_rules(values: Mapping[str, Any], where: str) -> ProtocolRules:
+    """The rules that ``as_json`` of some gave; a ``ConfigError`` that begins with ``where`` if these are none."""
+    try:
+        return _made(values)
+    except (ValidationError, RecursionError) as error:
+        raise ConfigError(f"{where}: are not as a run writes them; run its command again") from error
+
+
+def _made(values: Mapping[str, Any]) -> ProtocolRules:
+    rules = RULES_OF_KIND.get(str(values.get("kind")), ProtocolRules)
+    return rules.model_validate(_with_tuples(values))
 
 
 def _with_tuples(value: Any) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -37,7 +37,7 @@ _OWN_FIELDS = {
 
 
 class _Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
 class ClassEntry(_Strict):
@@ -279,6 +279,11 @@ class ProtocolRules(_Strict):
     def digest(self) -> str:
         """A content key of all rules; a field that a later version adds leaves it alone where it has its default."""
         return hashlib.sha256(self.model_dump_json(exclude_defaults=True).encode()).hexdigest()
+
+    @property
+    def as_json(self) -> dict[str, Any]:
+        """All that ``digest`` counts, as plain values; ``read_rules`` makes the rules of them again."""
+        return self.model_dump(mode="json", exclude_defaults=True)
 
 
 class SemanticRules(ProtocolRules):

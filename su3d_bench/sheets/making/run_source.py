@@ -104,8 +104,10 @@ class RunSource:
     def rules(self, scene: str, kind: str) -> ProtocolRules | None:
         """The rules that judge a scene automatically, the first that fit; None where there are none."""
         name = scene.partition("/")[0]
-        for rules in map(load_protocol, protocol_names()):
-            is_meant = rules.kind == kind and name in rules.datasets
+        known = protocol_names()
+        own = [self.run.rules(protocol) for protocol in self.run.protocols if protocol not in known]
+        for rules in (*own, *map(load_protocol, known)):
+            is_meant = rules.kind == kind and (name in rules.datasets or rules in own)
             if is_meant and why_not_truth(rules, TruthFacts.of_dataset(self.run.dataset(scene))) is None:
                 return rules
         return None

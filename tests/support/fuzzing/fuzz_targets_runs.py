@@ -53,9 +53,9 @@ def copied_run(folder: Path) -> Path:
 
 
 def _checked_counts(side: Any, protocol: str) -> None:
-    from su3d_bench.analysis.sides import check_shapes, rules_of
+    from su3d_bench.analysis.sides import check_shapes
 
-    check_shapes(rules_of(side, protocol), side, side.run.scores(side.method).get(protocol, {}))
+    check_shapes(side.run.rules(protocol), side, side.run.scores(side.method).get(protocol, {}))
 
 
 def _run(folder: Path) -> Read:

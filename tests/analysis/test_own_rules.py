@@ -1,0 +1,125 @@
+"""A run under protocols of one's own is read by all verbs after their files are gone: it keeps its rules."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from painted import WordEncoder, colour_perception
+from places import SCENES
+
+from su3d_bench.analysis.leaderboard import leaderboard
+from su3d_bench.cli.main import main
+from su3d_bench.core.errors import ConfigError
+from su3d_bench.metrics.protocols.files import protocol_names
+from su3d_bench.metrics.protocols.loading import load_protocol, read_rules
+from su3d_bench.runs import finished
+from su3d_bench.runs import scene as scene_run
+from su3d_bench.runs.finished import read_run
+from su3d_bench.sheets.making.run_source import RunSource
+
+PAINTED = f"{SCENES}/painted.py"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two runs under two protocols of one's own, whose files are gone."""
+    folder = tmp_path_factory.mktemp("own")
+    rules = []
+    for name in ("semantic", "instance"):
+        rules.append(folder / f"mine-{name}.toml")
+        lines = [f'extends = "rooms-{name}"', f'name = "mine-{name}"', "version = 4", 'prompt = "my {}"']
+        rules[-1].write_text("\n".join(lines))
+    words = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--no-pictures", "--jobs", "1"]
+    words += ["--methods", f"{PAINTED}:Collector", f"{PAINTED}:Collector@drop=1", "--protocols", *map(str, rules)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", colour_perception)
+        for name in ("first", "second"):
+            assert main([*words, "--out", str(folder / "runs" / name)]) == 0
+    for file in rules:
+        file.unlink()
+    load_protocol.cache_clear()
+    return folder / "runs"
+
+
+VERBS = {
+    "attribute": ["attribute", "{first}", "--method", "collector"],
+    "one protocol": ["attribute", "{first}", "--method", "collector", "--protocol", "mine-instance"],
+    "compare": ["compare", "{first}:collector", "{second}:collector@drop=1", "--per-class"],
+    "plan": ["plan", "{first}", "--methods", "collector", "collector@drop=1", "--points", "5"],
+    "page": ["report", "html", "{first}", "--out", "{out}/page.html"],
+    "learn": ["check", "--learn", "{first}", "{second}", "--out", "{out}/reference.json"],
+}
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_verb_knows_the_rules_by_their_name(
+    verb: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(finished, "encoder_of", lambda run, device: WordEncoder())
+    places = {"first": made / "first", "second": made / "second", "out": tmp_path}
+    assert main([word.format(**places) for word in VERBS[verb]]) == 0, capsys.readouterr().err
+    written = "".join(file.read_text() for file in tmp_path.iterdir() if file.is_file())
+    assert "mine-instance" in capsys.readouterr().out + written
+    assert "those that scored the run" not in written
+
+
+def test_the_gate_recomputes_under_them(made: Path, tmp_path: Path) -> None:
+    reference = str(tmp_path / "reference.json")
+    assert main(["check", "--learn", str(made / "first"), str(made / "second"), "--out", reference]) == 0
+    assert main(["check", str(made / "first"), "--against", reference]) == 0
+
+
+def test_they_are_ranked_and_another_s_of_the_same_name_apart(made: Path, tmp_path: Path) -> None:
+    runs = tmp_path / "runs"
+    shutil.copytree(made, runs)
+    found = leaderboard(runs)
+    assert not found.refused
+    assert [len(board) for board in found.boards] == [4, 4]
+    record = json.loads((runs / "second/run.json").read_text())
+    for rules in record["protocols"]:
+        rules["rules"]["summary"] = "of somebody else"
+        rules["digest"] = read_rules(rules["rules"], "here").digest
+    (runs / "second/run.json").write_text(json.dumps(record))
+    assert [len(board) for board in leaderboard(runs).boards] == [2, 2, 2, 2]
+    assert main(["report", "leaderboard", str(runs)]) == 0
+
+
+def test_what_run_json_keeps_is_what_scored_it(made: Path) -> None:
+    run = read_run(made / "first")
+    for name, kept in run.protocols.items():
+        assert run.rules(name, to_the_letter=True).digest == kept.digest
+    builtin = [load_protocol(name) for name in protocol_names()]
+    assert all(read_rules(rules.as_json, "here") == rules for rules in builtin)
+    assert json.loads(json.dumps([rules.as_json for rules in builtin])) == [rules.as_json for rules in builtin]
+
+
+CHANGES: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
+    "other rules": (lambda kept: kept["rules"].update(min_region_size=7), "are not those that scored it"),
+    "another name": (lambda kept: kept["rules"].update(name="theirs"), "neither the program's nor in run.json"),
+    "no rules": (lambda kept: kept["rules"].update(kind="wishes"), "are not as a run writes them"),
+    "an unknown key": (lambda kept: kept["rules"].update(least=7), "are not as a run writes them"),
+    "none kept": (lambda kept: kept.pop("rules"), "neither the program's nor in run.json; run its command again"),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_rules_that_are_not_those_of_the_run_are_refused(change: str, made: Path, tmp_path: Path) -> None:
+    shutil.copytree(made / "first", tmp_path / "run")
+    record = json.loads((tmp_path / "run/run.json").read_text())
+    make, said = CHANGES[change]
+    make(record["protocols"][1])
+    (tmp_path / "run/run.json").write_text(json.dumps(record))
+    with pytest.raises(ConfigError, match=said):
+        read_run(tmp_path / "run").rules("mine-instance")
+
+
+def test_sheets_judge_by_the_rules_of_the_run(made: Path) -> None:
+    source = RunSource(read_run(made / "first"), ["collector"])
+    found = source.rules("painted/a", "instance")
+    assert found is not None and found.name == "mine-instance"
+    assert source.rules("painted/a", "annotation") is None
