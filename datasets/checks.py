@@ -18,7 +18,15 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing, Su3dError, printable
+from su3d_bench.core.errors import (
+    DataError,
+    FramesMissing,
+    GroundTruthMissing,
+    PlugInError,
+    Su3dError,
+    error_line,
+    printable,
+)
 from su3d_bench.core.files import opened
 from su3d_bench.core.interfaces import Dataset, HasProblems, SaysUp
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, WorldUp
@@ -172,7 +180,7 @@ class _Findings:
 
     def add_fault(self, check: str, where: str, error: Exception) -> None:
         """A finding of what was raised, unless it is about a file whose fault is known."""
-        text = str(error) if isinstance(error, Su3dError | OSError) else f"{type(error).__name__}: {error}"
+        text = str(error) if isinstance(error, OSError) else error_line(error)
         text = printable(text.removeprefix(f"{self.scene}: "))
         first = text.partition(" ")[0].rstrip(":")
         is_of_a_file = "." in first and not FRAME_OF_A_FILE.search(text)  # of a recording, another frame may be broken
@@ -183,6 +191,8 @@ class _Findings:
         """What ``work`` gives; None where it fails, which is a finding."""
         try:
             return work()
+        except PlugInError:  # the code is at fault, not the data
+            raise
         except (Su3dError, OSError) as error:
             self.add_fault(check, "", error)
             return None
@@ -227,6 +237,8 @@ def _counted_frames(dataset: Dataset, scene: str, findings: _Findings) -> Sequen
             raise DataError("the scene has no frames")
     except FramesMissing as error:  # nothing that is here is at fault
         findings.add(Finding("warning", "frame", "", str(error)))
+    except PlugInError:
+        raise
     except (Su3dError, OSError) as error:
         findings.add_fault("frame", "", error)
     else:
@@ -274,6 +286,8 @@ def _ask_for_problems(dataset: Dataset, scene: str, findings: _Findings) -> int:
     try:
         for line in dataset.problems(scene):
             findings.add(Finding("error", "file", "", line))
+    except PlugInError:
+        raise
     except (Su3dError, OSError) as error:
         findings.add_fault("file", "", error)
     return findings.n

@@ -18,6 +18,8 @@ from su3d_bench.core.errors import (
     EXIT_INTERNAL,
     EXIT_WRONG_INPUT,
     Su3dError,
+    error_line,
+    own_line,
     printable,
 )
 from su3d_bench.core.printing import doors
@@ -127,8 +129,6 @@ def _exit_code(words: Sequence[str]) -> int:
         if isinstance(error, Su3dError):
             remark(f"su3d-bench: {error}")
             return error.exit_code
-        from su3d_bench.runs.plug_ins import error_line, own_line
-
         if own_line(error):  # the mistake is in somebody's own method or dataset
             remark(f"su3d-bench: {error_line(error)}")
             return EXIT_WRONG_INPUT

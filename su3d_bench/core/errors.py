@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +79,10 @@ class ConfigError(Su3dError):
 
 class DataError(Su3dError):
     """A dataset, scene or file that is missing, damaged or contradicts itself."""
+
+
+class PlugInError(ConfigError):
+    """Somebody's own dataset or method that is not as it must be; the line begins with its file and line."""
 
 
 class GroundTruthMissing(DataError):
@@ -160,3 +165,38 @@ def converted(known: type[Su3dError], wanted: type[Su3dError]) -> Iterator[None]
         yield
     except known as error:
         raise wanted(str(error)) from error
+
+
+@cache
+def _not_theirs() -> tuple[str, ...]:
+    """Where the code of the program lies, and of what is installed; what lies elsewhere is somebody's own."""
+    import sysconfig
+
+    package = Path(__file__).resolve().parents[1]
+    links = (link.resolve() for link in package.iterdir() if link.is_dir())
+    installed = (Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+    return tuple(str(folder) for folder in (package, *links, *installed))
+
+
+def own_line(error: BaseException) -> str:
+    """``my_method.py:12``: the deepest line of somebody's own file that ``error`` passed through; empty without one."""
+    import traceback
+
+    if isinstance(error, SyntaxError) and error.filename and not error.filename.startswith(_not_theirs()):
+        return printable(f"{Path(error.filename).name}:{error.lineno}", 200)
+    for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
+        file = frame.f_code.co_filename
+        if not file.startswith((*_not_theirs(), "<")):
+            return printable(f"{Path(file).name}:{line}", 200)
+    return ""
+
+
+def error_line(error: BaseException) -> str:
+    """One line for any error; one that is not ours says its type, and where in somebody's own file it arose."""
+    text = printable(str(error), MOST_CHARACTERS)
+    if isinstance(error, MemoryError):
+        return f"out of memory ({text or 'no details'}); try fewer --jobs, or a machine with more"
+    if isinstance(error, Su3dError):
+        return text
+    place = own_line(error)
+    return f"{place}{': ' if place else ''}{type(error).__name__}: {text}"

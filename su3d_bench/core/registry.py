@@ -9,12 +9,16 @@ from __future__ import annotations
 import difflib
 import importlib
 import importlib.util
+import inspect
+import os
+import sys
 from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.core.errors import ConfigError, suggest
+from su3d_bench.core.digests import digest_json
+from su3d_bench.core.errors import ConfigError, PlugInError, own_line, suggest
 
 DATASETS = {
     "rooms": "su3d_bench.datasets.rooms.dataset:Rooms",
@@ -39,6 +43,7 @@ CEILING_METHOD = "oracle"  # is told the truth: what it scores stands beside eve
 GROUPS = {"dataset": "su3d_bench.datasets", "method": "su3d_bench.methods"}
 BUILT_IN = {"dataset": DATASETS, "method": METHODS}
 OF_THE_CLASS = {"dataset": ("name", "Options", "label_space", "variants"), "method": ("name", "Config")}
+TEXTS_OF_THE_CLASS: dict[str, type] = {"name": str, "label_space": str, "variants": tuple}
 LEAST_LIKENESS = 0.84  # of a name to the one that was meant: a letter missing, added, changed or in the wrong place
 
 
@@ -78,13 +83,45 @@ def _from_file(kind: str, target: str) -> Any:
     path, _, attribute = target.rpartition(":")
     if not Path(path).is_file():
         raise ConfigError(f"{kind} '{target}': there is no file {path}")
-    spec = importlib.util.spec_from_file_location(Path(path).stem, path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    state = os.stat(path)
+    module = _module_of(Path(path).resolve(), (state.st_mtime_ns, state.st_size))
     if not hasattr(module, attribute):
-        raise ConfigError(f"{kind} '{target}': {path} defines no '{attribute}'")
-    return getattr(module, attribute)
+        classes = [name for name, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__]
+        raise ConfigError(f"{kind} '{target}': {path} defines no '{attribute}'{suggest(attribute, classes)}")
+    found = getattr(module, attribute)
+    if not isinstance(found, type):
+        what = "function" if callable(found) else type(found).__name__
+        raise PlugInError(f"{_line_of(found, Path(path).name)}: '{attribute}' is a {what}; name a class")
+    return found
+
+
+@cache
+def _module_of(path: Path, state: tuple[int, int]) -> Any:
+    """The module in a file of somebody's own, read once for each ``state`` of the file.
+
+    It is listed among the modules under a name that is nobody's, since dataclasses look theirs up there.
+    """
+    name = f"su3d_own_{path.stem}_{digest_json([str(path), state])[:12]}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None and spec.loader is not None
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except BaseException as error:
+        del sys.modules[name]
+        if isinstance(error, SystemExit):
+            place = own_line(error) or path.name
+            raise PlugInError(f"{place}: ends the program when it is imported; put that under __main__") from error
+        raise
+    return module
+
+
+def _line_of(plug_in: Any, file: str) -> str:
+    """``my_method.py:12``, where a class or function is written."""
+    try:
+        return f"{file}:{inspect.getsourcelines(plug_in)[1]}"
+    except (OSError, TypeError):
+        return file
 
 
 @cache
@@ -95,6 +132,8 @@ def checked(kind: str, target: str, plug_in: Any) -> Any:
     if not isinstance(plug_in, type):
         return plug_in
     interface = INTERFACES[kind]
+    file = _file_of(plug_in)
+    where = f"{_line_of(plug_in, file)}: {kind} '{target}'" if file else f"{kind} '{target}'"
     own = {name: is_called for base in plug_in.__mro__[:-1] for name, is_called in _members(base).items()}
     known = {name: called for each in (interface, *ABILITIES[kind]) for name, called in _members(each).items()}
     required = {*OF_THE_CLASS[kind], *(name for name, called in _members(interface).items() if called)}
@@ -103,10 +142,21 @@ def checked(kind: str, target: str, plug_in: Any) -> Any:
         meant = difflib.get_close_matches(name, absent, 1, LEAST_LIKENESS)
         # ``points`` is a name of its own beside ``n_points``, and a value ``closed`` beside a function ``close``
         if meant and meant[0].count("_") == name.count("_"):
-            raise ConfigError(f"{kind} '{target}': a {kind} has no '{name}'; did you mean '{meant[0]}'?")
+            raise PlugInError(f"{where}: a {kind} has no '{name}'; did you mean '{meant[0]}'?")
     if missing := sorted(required - set(own)):
-        raise ConfigError(f"{kind} '{target}': lacks '{missing[0]}'; a {kind} has {', '.join(sorted(required))}")
+        raise PlugInError(f"{where}: lacks '{missing[0]}'; a {kind} has {', '.join(sorted(required))}")
+    for name, wanted in TEXTS_OF_THE_CLASS.items():
+        value = getattr(plug_in, name, wanted())
+        if name in required and not isinstance(value, wanted):
+            raise PlugInError(f"{where}: its {name} is {value!r}; a {wanted.__name__} is expected")
     return plug_in
+
+
+def _file_of(plug_in: type) -> str:
+    """The name of the file that holds a class of somebody's own; empty for ours."""
+    module = sys.modules.get(plug_in.__module__)
+    own = not plug_in.__module__.startswith("su3d_bench.")
+    return Path(getattr(module, "__file__", None) or "").name if own else ""
 
 
 def _members(plug_in: type) -> dict[str, bool]:

@@ -13,7 +13,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import DataError, PredictionError
+from su3d_bench.core.errors import DataError, PredictionError, Su3dError
+from su3d_bench.core.given import features_given, points_given, scores_given, sets_given, views_given
 
 BoolArray = NDArray[np.bool_]
 UInt8Array = NDArray[np.uint8]
@@ -22,6 +23,7 @@ Int64Array = NDArray[np.int64]
 Float32Array = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.integer[Any]]
+FloatArray = NDArray[np.floating[Any]]
 
 ImageDomain = Literal["rendered-rooms", "camera"]
 UpAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
@@ -45,16 +47,23 @@ class Frame:
 
     def __post_init__(self) -> None:
         where = f"frame {self.index}"
+        _check_arrays(self, where, ("rgb", "depth_m", "camera_to_world", "intrinsics"), DataError)
         if self.rgb.ndim != 3 or self.rgb.shape[2] != 3 or self.rgb.dtype != np.uint8:
             raise DataError(f"{where}: colour is {self.rgb.shape} {self.rgb.dtype}; expected (height, width, 3) uint8")
         if self.depth_m.shape != self.rgb.shape[:2]:
             raise DataError(
                 f"{where}: depth is {_size(self.depth_m)} and colour is {_size(self.rgb)}; both must have one size"
             )
+        if self.depth_m.dtype.kind != "f":
+            raise DataError(
+                f"{where}: depth is {self.depth_m.dtype.name}; expected float32 metres, 0 where there is none"
+            )
         if self.camera_to_world.shape != (4, 4) or not np.isfinite(self.camera_to_world).all():
             raise DataError(f"{where}: the pose is not a finite 4x4 matrix; drop the frame or mend the trajectory")
         if self.intrinsics.shape != (3, 3) or not np.isfinite(self.intrinsics).all():
             raise DataError(f"{where}: the intrinsics are not a finite 3x3 matrix")
+        for name, kind in (("depth_m", np.float32), ("camera_to_world", np.float64), ("intrinsics", np.float64)):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), kind))
 
 
 def _size(image: NDArray[Any]) -> str:
@@ -145,6 +154,7 @@ class GroundTruth:
     boxes: ObjectBoxes | None = None
 
     def __post_init__(self) -> None:
+        _check_arrays(self, f"ground truth '{self.variant}'", ("points", "semantic", "instance"), DataError)
         n = len(self.points)
         if self.points.shape != (n, 3) or self.semantic.shape != (n,) or self.instance.shape != (n,):
             raise DataError(
@@ -408,6 +418,8 @@ class Instances(Masks):
     view_scores: Float64Array | None = None
 
     def __post_init__(self) -> None:
+        arrays = ("points", "indptr", "indices", "scores", "boxes", "centroids", "view_indptr", "views", "ids")
+        _check_arrays(self, "instances", arrays, PredictionError)
         k = len(self.scores)
         if len(self.indptr) != k + 1 or len(self.names) != k or len(self.captions) != k:
             raise PredictionError(f"instances: {k} scores, {len(self.indptr) - 1} masks, {len(self.names)} names")
@@ -426,25 +438,33 @@ class Instances(Masks):
     def of(
         cls,
         points: Float32Array,
-        masks: Masks | Sequence[IntArray],
-        scores: Float64Array | None = None,
-        features: Float32Array | None = None,
+        masks: Masks | Sequence[IntArray | BoolArray] | IntArray | BoolArray,
+        scores: FloatArray | Sequence[float] | None = None,
+        features: FloatArray | None = None,
         *,
-        labels: tuple[str, ...] | None = None,
-        names: tuple[str, ...] | None = None,
-        captions: tuple[str, ...] | None = None,
+        labels: Sequence[str] | None = None,
+        names: Sequence[str] | None = None,
+        captions: Sequence[str] | None = None,
         centroids: Float32Array | None = None,
         views: Sequence[Sequence[tuple[int, int]]] | None = None,
         view_names: tuple[str, ...] | None = None,
         view_scores: Float64Array | None = None,
         ids: Sequence[int] | IntArray = (),
     ) -> Instances:
-        """The map of ``masks`` over ``points``; ``views`` are those of each instance.
+        """The map of ``masks`` over ``points`` (M, 3); ``views`` are those of each instance.
 
-        Scores are 1, names and captions empty where none are given; boxes and centroids are those of the points, zeros
-        for an empty mask.
+        ``masks``: of each instance the indices of its points, or a bool for each point; or of each point the number
+        (M,) of its instance, from 0 without gaps, -1 for none. Scores are 1, names and captions empty where none are
+        given; boxes and centroids are those of the points, zeros for an empty mask. A ``PredictionError`` where
+        something has another shape or other values.
+
+        >>> points = np.zeros((4, 3), np.float32)
+        >>> whole = Instances.of(points, [np.array([True, True, False, False]), np.array([3])], [0.9, 0.4])
+        >>> [mask.tolist() for mask in whole.sets()], Instances.of(points, np.array([0, 0, -1, 1])).indices.tolist()
+        ([[0, 1], [3]], [0, 1, 3])
         """
-        masks = masks if isinstance(masks, Masks) else Masks.of_sets(masks)
+        points = points_given(points)
+        masks = masks if isinstance(masks, Masks) else Masks.of_sets(sets_given(masks, len(points)))
         _check_masks(masks, len(points))
         k = len(masks)
         boxes, means = np.zeros((k, 2, 3), np.float32), np.zeros((k, 3), np.float32)
@@ -452,24 +472,29 @@ class Instances(Masks):
             members = points[masks.mask(row)]
             boxes[row] = members.min(axis=0), members.max(axis=0)
             means[row] = members.mean(axis=0, dtype=np.float64)
-        rows = [view for of_instance in views or () for view in of_instance]
         return cls(
             masks.indptr,
             masks.indices,
             points=points,
-            scores=np.ones(k) if scores is None else scores,
-            features=features,
-            labels=labels,
-            names=("",) * k if names is None else names,
-            captions=("",) * k if captions is None else captions,
+            scores=scores_given(scores, k),
+            features=features_given(features, k),
+            labels=None if labels is None else tuple(labels),
+            names=("",) * k if names is None else tuple(names),
+            captions=("",) * k if captions is None else tuple(captions),
             boxes=boxes,
             centroids=means if centroids is None else centroids,
             view_indptr=np.zeros(k + 1, np.int64) if views is None else starts_of(map(len, views)),
-            views=np.array(rows, np.int32).reshape(-1, 2),
+            views=views_given(views, k),
             ids=np.array(ids, np.int64),
             view_names=view_names,
             view_scores=view_scores,
         )
+
+
+def _check_arrays(value: Any, where: str, names: Sequence[str], error: type[Su3dError]) -> None:
+    for name in names:
+        if not isinstance(array := getattr(value, name), np.ndarray):
+            raise error(f"{where}: {name} is a {type(array).__name__}; an array is expected")
 
 
 def _check_masks(masks: Masks, n_points: int) -> None:

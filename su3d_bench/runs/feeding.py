@@ -41,6 +41,7 @@ from su3d_bench.core.types import (
 )
 from su3d_bench.perception.profiles import Perception
 from su3d_bench.runs.executors.local import Event, Report
+from su3d_bench.runs.own.watch import told
 from su3d_bench.store.predictions import write_prediction
 from su3d_bench.store.records import updates_text
 
@@ -244,8 +245,8 @@ class Feeding:
             method.update(frame, detections, timer)
         total_ms = (time.perf_counter() - start) * 1e3
         own: Row = {"update": update, "frame": frame.index, "n_detections": len(detections)}
-        of_method: Row = {name: int(getattr(method, name)) for name in SIZES if hasattr(method, name)}
-        of_method |= dict(method.losses) if isinstance(method, CountsLosses) else {}
+        of_method: Row = {name: int(told(method, name)) for name in SIZES if hasattr(method, name)}
+        of_method |= dict(told(method, "losses")) if isinstance(method, CountsLosses) else {}
         of_method |= {"rss_bytes": memory_bytes()}
         of_method |= {f"{name}_ms": round(ms, 3) for name, ms in timer.take().items()}
         # What is measured here goes before what a method calls by the same name.
@@ -264,7 +265,7 @@ class Feeding:
             prediction = self._method.finish()
         spent = self._clock.take("finish")
         write_prediction(path, prediction)
-        costs = dict(self._method.finish_costs) if isinstance(self._method, HasFinishCosts) else {}
+        costs = dict(told(self._method, "finish_costs")) if isinstance(self._method, HasFinishCosts) else {}
         own = {"n_updates": len(self._rows), "finish_ms": spent.total_ms, "perception_ms": spent.perception_ms}
         self.maps.append({**own, **costs, **{name: round(value, 3) for name, value in own.items()}})
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from su3d_bench.core import registry
 from su3d_bench.core.config import Settings, flatten, resolve
-from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_json, package_versions
+from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_json, package_versions, source_digest
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.interfaces import HasCaveat, HasInputs, HasOwnPerception, Method, ReadsMadeRooms
 from su3d_bench.core.types import SceneInfo
@@ -18,7 +18,7 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.perception.profiles import Perception, PerceptionConfig
 from su3d_bench.questions.reasoning.language_solver import answers_digest
 from su3d_bench.questions.refined_names import refined_digest
-from su3d_bench.runs.plug_ins import checked_dataset, checked_method
+from su3d_bench.runs.own.watch import checked_dataset, checked_method, made, settings_model, told
 from su3d_bench.store.run_folder import JobFolder
 
 # Settings of perception that move no number, or whose part that does is in perception's digest.
@@ -109,12 +109,20 @@ def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
             key[".".join((prefix, *path))] = json.dumps(value, ensure_ascii=False)
     key = {name: text for name, text in key.items() if not name.startswith(NOT_IN_KEY)}
     if isinstance(method, HasInputs):
-        key |= {f"input.{name}": digest for name, digest in method.inputs.items()}
+        key |= {f"input.{name}": digest for name, digest in told(method, "inputs").items()}
+    for kind, target in (("method", part.target), ("dataset", job.dataset.target)):
+        if digest := own_code(target):
+            key[f"code.{kind}"] = digest
     return (
         key
         | {f"packages.{name}": text for name, text in package_versions(NUMERIC_PACKAGES).items()}
         | {"code": code_digest()}
     )
+
+
+def own_code(target: str) -> str | None:
+    """A key of the file of somebody's own dataset or method, which is no part of the program's code."""
+    return source_digest(Path(target.rpartition(":")[0]))[:16] if ".py:" in target else None
 
 
 def refuse_other_run(folder: JobFolder, key: Mapping[str, str], known_later: Sequence[str] = ()) -> None:
@@ -127,7 +135,7 @@ def refuse_other_run(folder: JobFolder, key: Mapping[str, str], known_later: Seq
 
 def options_model(kind: str, target: str) -> Any:
     """The model of the options of a dataset, or of the settings of a method."""
-    return getattr(registry.load(kind, target), "Config" if kind == "method" else "Options")
+    return settings_model(registry.load(kind, target), "Config" if kind == "method" else "Options")
 
 
 def part_of(kind: str, target: str, settings: Settings) -> Part:
@@ -139,13 +147,13 @@ def part_of(kind: str, target: str, settings: Settings) -> Part:
 def build_dataset(part: Part, data_root: Path) -> Any:
     """The dataset of ``part``, reading below ``data_root``."""
     dataset_class = registry.load("dataset", part.target)
-    return checked_dataset(dataset_class(data_root, dataset_class.Options.model_validate_json(part.options)))
+    return checked_dataset(made(dataset_class, data_root, dataset_class.Options.model_validate_json(part.options)))
 
 
 def build_method(part: Part) -> Any:
     """A fresh method of ``part``."""
     method_class = registry.load("method", part.target)
-    return checked_method(method_class(method_class.Config.model_validate_json(part.options)))
+    return checked_method(made(method_class, method_class.Config.model_validate_json(part.options)))
 
 
 TRUE_PROPOSALS_CAVEAT = "proposals from the ground truth; a ceiling, not a result"
@@ -203,7 +211,7 @@ class JobInputs:
 
 def caveat_of(method: Method, perception: Perception, scene: SceneInfo) -> str | None:
     """What must be said beside every number: where the scenes, the masks, or the method's own proposals come from."""
-    own = method.caveat if isinstance(method, HasCaveat) else None
+    own = told(method, "caveat") if isinstance(method, HasCaveat) else None
     if method.needs.true_proposals:
         own = TRUE_PROPOSALS_CAVEAT
     has_own_perception = isinstance(method, HasOwnPerception) and method.has_own_perception

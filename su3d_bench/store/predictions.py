@@ -39,6 +39,9 @@ FIELDS = {
 }
 
 
+ROWS = {"points": (3,), "boxes": (2, 3), "centroids": (3,), "views": (2,)}  # the shape of each row, where it is fixed
+
+
 def _fields_of(kind: type[Prediction]) -> list[str]:
     return [name for name in FIELDS if name in kind.__dataclass_fields__]
 
@@ -84,6 +87,9 @@ def array_fault(arrays: Mapping[str, NDArray[Any]]) -> str | None:
         if array.ndim != n_dimensions or array.dtype.kind != kind or (name == "indptr" and not array.size):
             wanted = f"{kinds[kind]} in {counted(n_dimensions, 'dimension')}"
             return f"'{name}' is an array of shape {array.shape} {array.dtype.name}, not {wanted}"
+        if array.shape[1:] != ROWS.get(name, array.shape[1:]):
+            wanted = ", ".join(map(str, ("N", *ROWS[name])))
+            return f"'{name}' is an array of shape {array.shape}, not ({wanted})"
     return None
 
 

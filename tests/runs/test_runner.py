@@ -187,6 +187,7 @@ def test_other_protocols_score_the_same_predictions_again(monkeypatch: pytest.Mo
 
 
 PLUG_IN = (SCENES / "painted.py").read_text().splitlines()
+MADE = 1 + next(k for k, line in enumerate(PLUG_IN) if "return Frame(" in line)
 CRASHES = 1 + next(k for k, line in enumerate(PLUG_IN) if "a mistake in a plug-in" in line)
 
 
@@ -194,8 +195,14 @@ CRASHES = 1 + next(k for k, line in enumerate(PLUG_IN) if "a mistake in a plug-i
     ("fault", "line"),
     [
         ("missing-frame", "painted/b: frame 2 is missing; copy it again"),
-        ("nan-pose", "painted/b: frame 2: the pose is not a finite 4x4 matrix; drop the frame or mend the trajectory"),
-        ("depth-size", "painted/b: frame 2: depth is 32x23 and colour is 32x24; both must have one size"),
+        (
+            "nan-pose",
+            f"painted/b: painted.py:{MADE}: frame 2: the pose is not a finite 4x4 matrix; drop the frame or mend the trajectory",
+        ),
+        (
+            "depth-size",
+            f"painted/b: painted.py:{MADE}: frame 2: depth is 32x23 and colour is 32x24; both must have one size",
+        ),
         ("empty-depth", "painted/b frame 2: depth is empty, no pixel is above 0 m"),
         ("unknown-class", "painted/b: class id 777 is unknown; the label set ends at 101"),
         ("crash", f"painted/b: painted.py:{CRASHES}: ZeroDivisionError: a mistake in a plug-in"),

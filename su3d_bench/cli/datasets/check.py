@@ -18,6 +18,7 @@ from su3d_bench.datasets.checks import Inspection, TruthVariant, inspect
 from su3d_bench.datasets.checks_of_frames import Finding
 from su3d_bench.runs.executors.local import Event
 from su3d_bench.runs.job import build_dataset, part_of
+from su3d_bench.runs.own.trial import try_dataset
 from su3d_bench.runs.planning.scenes import data_root, dataset_targets, expand_scenes
 
 MOST_OF_A_KIND = 10  # findings of one kind that are printed; --json has all
@@ -46,6 +47,7 @@ def check(arguments: argparse.Namespace) -> int:
 
 
 def _inspect(dataset: Any, scene: str, n_threads: int, arguments: argparse.Namespace) -> Inspection:
+    try_dataset(dataset, scene)
     # A bar of its own for each scene: while a bar is drawn, what is printed would go where the bar goes.
     with progress(1, is_quiet=arguments.quiet, last_step="ground truth") as report:
         return inspect(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,6 +29,7 @@ from su3d_bench.core.errors import ConfigError, StoreError, printable, suggest
 from su3d_bench.core.interfaces import HasPresets, IsSystem
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
+from su3d_bench.metrics.protocols.files import protocol_names
 from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
 from su3d_bench.runs.executors.choose import ELSEWHERE, check_execution
@@ -39,6 +40,7 @@ from su3d_bench.runs.job import (
     build_method,
     config_key,
     options_model,
+    own_code,
     part_of,
     refuse_other_run,
 )
@@ -182,6 +184,7 @@ def make_plan(settings: Settings, assignments: Sequence[str] = (), out: Path | s
     )
     n_here = len(jobs) if config.executor in ELSEWHERE else os.cpu_count() or 1
     n_workers = min(config.jobs or n_here, len(jobs))
+    notes += tuple(_notes_on_protocols(parts.protocols, config.protocols))
     plan = Plan(config, settings, RunFolder(folder), jobs, n_workers, notes, store, data)
     if store is not None:
         fetch_seals(store, folder)
@@ -256,7 +259,7 @@ def _method_targets(methods: Sequence[str]) -> list[str]:
 def protocols_of_run(wanted: Sequence[str], targets: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """Dataset target -> protocols that score it: those asked for that fit it, or its own where none is asked for."""
     if not wanted:
-        return {target: tuple(protocols_for(registry.load("dataset", target).name)) for target in targets}
+        return {target: _usual_protocols(registry.load("dataset", target)) for target in targets}
     wanted = list(dict.fromkeys(wanted))
     rules = [load_protocol(name) for name in wanted]
     _check_one_a_name("--protocols", [(rule.name, rule) for rule in rules])
@@ -269,6 +272,28 @@ def protocols_of_run(wanted: Sequence[str], targets: Sequence[str]) -> dict[str,
         target: tuple(name for name, rule in zip(wanted, rules, strict=True) if why_not_truth(rule, truth) is None)
         for target, truth in truths.items()
     }
+
+
+def _usual_protocols(dataset: Any) -> tuple[str, ...]:
+    """The protocols of a dataset; of one that no protocol names those that its truth fits."""
+    if own := protocols_for(dataset.name):
+        return tuple(own)
+    truth = TruthFacts.of_dataset(dataset)
+    known = (rules for rules in map(load_protocol, protocol_names()) if rules.by_default)
+    return tuple(rules.name for rules in known if truth.variants and why_not_truth(rules, truth) is None)
+
+
+def _notes_on_protocols(protocols: Mapping[str, Sequence[str]], wanted: Sequence[str]) -> Iterator[str]:
+    """Which protocols score somebody's own datasets, that did not name any."""
+    for target, names in protocols.items():
+        dataset = registry.load("dataset", target)
+        if wanted or not dataset.variants or protocols_for(dataset.name):
+            continue
+        if names:
+            yield f"{dataset.name}: scored under the protocols that its truth fits; --protocols chooses among them"
+            continue
+        truth = f"ground truth {', '.join(dataset.variants)} with labels of '{dataset.label_space}'"
+        yield f"{dataset.name}: no protocol fits its {truth}; su3d-bench new protocol FILE writes one of your own"
 
 
 def asks_questions(protocols: Sequence[str]) -> bool:
@@ -285,7 +310,8 @@ def _folder(out: Path | str | None, config: RunConfig, parts: _Parts) -> Path:
 def _run_name(config: RunConfig, parts: _Parts) -> str:
     request = config.model_dump(mode="json", exclude=set(MOVES_NO_NUMBER))
     options = [part.options for part in (*parts.methods, *parts.datasets.values())]
-    key = digest_json([request, options, parts.perception, code_digest()])[:8]
+    own = [digest for part in (*parts.methods, *parts.datasets.values()) if (digest := own_code(part.target))]
+    key = digest_json([request, options, parts.perception, code_digest(), *own])[:8]
     return "-".join([*(part.name for part in parts.datasets.values()), config.profile, key])
 
 

@@ -1,0 +1,281 @@
+"""What is wrong in somebody's own method or dataset is one line with their file, the line and what is expected.
+
+What README and docs show runs as it stands.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from places import ROOT
+
+from su3d_bench.cli.main import main
+
+METHOD, DATASET = "my_method.py:MyMethod", "my_dataset.py:MyDataset/near"
+
+
+@pytest.fixture(autouse=True)
+def _place(tmp_path: Path, rooms_data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SU3D_DATA", str(rooms_data))
+    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+
+
+def written(what: str, as_it_is: str, wrong: str) -> str:
+    """The template with a mistake in it."""
+    assert main(["new", what, f"my_{what}.py"]) == 0
+    text = Path(f"my_{what}.py").read_text()
+    assert as_it_is in text
+    Path(f"my_{what}.py").write_text(text.replace(as_it_is, wrong, 1))
+    return text
+
+
+def told(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The only line on stderr of a call that ends with exit code 2."""
+    capsys.readouterr()
+    assert main(words) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "internal" not in line
+    return line
+
+
+# What is made of the method, and what is said of it beside the file and the line.
+METHODS = {
+    "no import": ("import pydantic\n", "", "NameError: name 'pydantic' is not defined"),
+    "an import that is not here": ("import pydantic\n", "import pydantci\n", "ModuleNotFoundError: No module named"),
+    "no Python": ("    def start(", "    def start", "SyntaxError"),
+    "an end": ("class MyMethod:", "raise SystemExit(0)\n\n\nclass MyMethod:", "ends the program when it is imported"),
+    "a function": (
+        "class MyMethod:",
+        "def MyMethod(): ...\n\n\nclass Other:",
+        "'MyMethod' is a function; name a class",
+    ),
+    "no update": ("    def update(", "    def _update(", "lacks 'update'; a method has Config, finish, name"),
+    "a name that is none": ('name = "my-method"', "name = None", "its name is None; a str is expected"),
+    "plain settings": (
+        "class Config(pydantic.BaseModel):",
+        "class Config:",
+        "MyMethod.Config is a class; a pydantic.Ba",
+    ),
+    "no settings taken": (
+        "def __init__(self, config: Config)",
+        "def __init__(self)",
+        "takes 1 positional argument but 2",
+    ),
+    "no needs": ("return PerceptionNeeds", "PerceptionNeeds", "needs gave None; a PerceptionNeeds is expected"),
+    "needs to be called": ("    @property\n", "", "MyMethod.needs gave a method; a PerceptionNeeds is expected"),
+    "unknown masks": ('masks="grounded"', 'masks="boxes"', "needs: masks is 'boxes'; 'grounded', 'class-agnostic' or"),
+    "another update": (
+        "detections: Detections, timer: Timer",
+        "detections: Detections",
+        "MyMethod.update: MyMethod.update",
+    ),
+    "no map": ("return Instances.of", "Instances.of", "MyMethod.finish gave None; an Instances or a Partition or"),
+    "another map": (
+        "return Instances.of",
+        "return list, ",
+        "MyMethod.finish gave a tuple; an Instances or a Partition",
+    ),
+    "a word": ("clouds = [", "clouds = [None for _ in known] + [", "NameError: name 'known' is not defined"),
+    "rows of scores": ("np.ones(len(kept))", "np.ones((len(kept), 1))", "scores are float64 ("),
+    "undefined scores": (
+        "np.ones(len(kept))",
+        "np.full(len(kept), np.nan)",
+        "finish: 'scores' holds a value that is not f",
+    ),
+    "a size": ("    def start(", "    n_points = 'many'\n\n    def start(", "n_points gave a str; an int is expected"),
+}
+
+
+@pytest.mark.parametrize("mistake", METHODS)
+def test_a_mistake_in_a_method(mistake: str, capsys: pytest.CaptureFixture[str]) -> None:
+    as_it_is, wrong, said = METHODS[mistake]
+    written("method", as_it_is, wrong)
+    line = told(["methods", "check", METHOD], capsys)
+    assert said in line
+    assert re.search(r"my_method\.py:\d+: ", line) or mistake == "a size"
+
+
+DATASETS = {
+    "no info": ("return SceneInfo(", "SceneInfo(", "MyDataset.info gave None; a SceneInfo is expected"),
+    "a share of frames": (
+        "SceneInfo(self.name, scene, len(",
+        "SceneInfo(self.name, scene, 0.5 * len(",
+        "info: n_frames is",
+    ),
+    "another domain": ('stride, "camera")', 'stride, "photo")', "info: image_domain is 'photo'; 'rendered-rooms' or"),
+    "no frames": ("return [self._frame", "[self._frame", "MyDataset.frames gave None; a sequence is expected"),
+    "a generator": (
+        "return [self._frame(scene, index) for index in range(0, self._options.n_frames, stride)]",
+        "return (self._frame(scene, index) for index in range(0, self._options.n_frames, stride))",
+        "MyDataset.frames gave a generator; a sequence is expected",
+    ),
+    "no frame": (
+        "return [self._frame",
+        "return [None and self._frame",
+        "frames(...)[0] gave None; a Frame is expected",
+    ),
+    "a stride that counts for nothing": (
+        "for index in range(0, self._options.n_frames, stride)]",
+        "for index in range(0, self._options.n_frames)]",
+        "MyDataset.frames gave 80 frames at stride 2, its info counts 40",
+    ),
+    "millimetres": (
+        "rgb, depth_m, camera",
+        "rgb, (depth_m * 1000).astype(np.uint16), camera",
+        "depth is uint16; expected",
+    ),
+    "depth below": (
+        "rgb, depth_m, camera",
+        "rgb, -depth_m, camera",
+        "[0]: depth holds values that are negative or not",
+    ),
+    "a list of depths": (
+        "rgb, depth_m, camera",
+        "rgb, depth_m.tolist(), camera",
+        "depth_m is a list; an array is expected",
+    ),
+    "shares of colour": (
+        "rgb, depth_m, camera",
+        "rgb / 255, depth_m, camera",
+        "colour is (240, 320, 3) float64; expected",
+    ),
+    "a pose that scales": ("camera_to_world, INTR", "2 * camera_to_world, INTR", "the pose is no rigid motion"),
+    "three rows of a pose": (
+        "camera_to_world, INTR",
+        "camera_to_world[:3], INTR",
+        "the pose is not a finite 4x4 matrix",
+    ),
+    "no scenes": ('return ("near", "far")', "pass", "MyDataset.scenes gave None; a sequence is expected"),
+    "numbers of scenes": ('return ("near", "far")', "return (1, 2)", "scenes: entry 0 is 1, a int; a str is expected"),
+    "texts of files": ("return ()", 'return ("a.png",)', "files: entry 0 is 'a.png', a str; a Path is expected"),
+    "no digest": ('return f"{self.name} 1', 'f"{self.name} 1', "MyDataset.digest gave None; a str is expected"),
+    "no truth": ("return GroundTruth(", "GroundTruth(", "MyDataset.ground_truth gave None; a GroundTruth is expected"),
+    "a flat truth": ("return GroundTruth(points,", "return GroundTruth(points[:, :2],", "do not agree"),
+    "unknown classes": (
+        "[0, *LABELS.ids]",
+        "[0, 7, 8, 9]",
+        "ground_truth: semantic holds the class id 7, which its labels",
+    ),
+    "shares of classes": (
+        "[0, *LABELS.ids], np.int32",
+        "[0, *LABELS.ids], np.float32",
+        "semantic is an array of float32",
+    ),
+    "another space": (
+        'label_space = "replica"',
+        'label_space = "mine"',
+        "its labels are of 'replica', and the class says",
+    ),
+    "one variant": (
+        'variants = ("mesh-vertices",)',
+        'variants = "mesh-vertices"',
+        "variants is 'mesh-vertices'; a tuple",
+    ),
+    "no mesh": (
+        "return InstanceMesh(",
+        "InstanceMesh(",
+        "MyDataset.instance_mesh gave None; an InstanceMesh is expected",
+    ),
+    "a corner beyond": (
+        "np.arange(3 * len(points)",
+        "1 + np.arange(3 * len(points)",
+        "instance_mesh: triangles holds 1 to",
+    ),
+    "no classes of instances": ("enumerate(LABELS.ids)}", "enumerate(LABELS.ids[:1])}", "has no class for instance 2"),
+    "an exception": ("points, instance = self._surface(scene)", "points = {}[scene]", "KeyError: 'near'"),
+}
+
+
+@pytest.mark.parametrize("mistake", DATASETS)
+def test_a_mistake_in_a_dataset(mistake: str, capsys: pytest.CaptureFixture[str]) -> None:
+    as_it_is, wrong, said = DATASETS[mistake]
+    written("dataset", as_it_is, wrong)
+    line = told(["datasets", "check", DATASET, "--quick"], capsys)
+    assert said in line
+    assert re.search(r"my_dataset\.py:\d+: ", line)
+
+
+@pytest.mark.parametrize("mistake", ["no info", "no frame", "no truth", "unknown classes", "a corner beyond"])
+def test_a_run_names_the_same(mistake: str, capsys: pytest.CaptureFixture[str]) -> None:
+    as_it_is, wrong, said = DATASETS[mistake]
+    written("dataset", as_it_is, wrong)
+    words = ["run", "--scenes", DATASET, "--profile", "oracle", "--protocols", "rooms-instance", "--limit", "1"]
+    assert main([*words, "--methods", "oracle", "opensu3d", "--jobs", "1", "--out", "out", "--no-pictures"]) in (2, 3)
+    error = capsys.readouterr().err
+    assert said in error and re.search(r"my_dataset\.py:\d+: ", error)
+
+
+def test_what_is_merely_missing_is_found_with_the_rest(capsys: pytest.CaptureFixture[str]) -> None:
+    written("dataset", "        return ()", '        return (Path("gone.png"),)')
+    capsys.readouterr()
+    assert main(["datasets", "check", DATASET, "--quick"]) == 1
+    assert "gone.png is missing" in capsys.readouterr().out
+
+
+def test_a_file_may_hold_dataclasses_and_is_read_anew_when_it_changed(capsys: pytest.CaptureFixture[str]) -> None:
+    text = written("method", "class MyMethod:", "@dataclass\nclass Mine:\n    a: int = 1\n\n\nclass MyMethod:")
+    mine = Path("my_method.py")
+    mine.write_text(
+        mine.read_text().replace("import itertools\n", "import itertools\nfrom dataclasses import dataclass\n")
+    )
+    assert main(["methods", METHOD]) == 0
+    mine.write_text(text.replace("stride: int = 40", "stride: int = 7"))
+    capsys.readouterr()
+    assert main(["methods", METHOD]) == 0
+    assert "stride = 7" in capsys.readouterr().out
+
+
+def test_a_map_that_the_file_before_made_is_not_taken_up(capsys: pytest.CaptureFixture[str]) -> None:
+    text = written("method", "", "")
+    words = ["run", "--scenes", "rooms/living0", "--set", "rooms.n_frames=8", "--profile", "oracle", "--limit", "1"]
+    words += ["--methods", METHOD, "--protocols", "rooms-instance", "--jobs", "1", "--no-pictures", "--out", "out"]
+    assert main(words) == 0
+    Path("my_method.py").write_text(text + "\n# nothing that counts\n")
+    assert main(words) == 0
+    Path("my_method.py").write_text(
+        text.replace("least_points: int = 20", "least_points: int = 21").replace("< 0.5", "< 0.6")
+    )
+    assert "holds another run" in told(words, capsys)
+
+
+def test_a_truth_that_no_protocol_names_is_scored_by_those_that_it_fits(capsys: pytest.CaptureFixture[str]) -> None:
+    written("dataset", "", "")
+    words = ["run", "--scenes", DATASET, "--methods", "oracle", "--limit", "1", "--jobs", "1", "--no-pictures"]
+    assert main([*words, "--profile", "oracle", "--out", "out"]) == 0
+    assert "my-dataset: scored under the protocols that its truth fits; --protocols chooses" in capsys.readouterr().err
+    found = json.loads(Path("out/metrics.json").read_text())["results"]
+    assert {"rooms-instance", "rooms-semantic", "replica-openmask3d"} <= {one["protocol"] for one in found}
+    assert all(one["result"]["metrics"][one["headline"][0]] == 1 for one in found)
+
+
+def test_a_truth_that_no_protocol_fits_is_said_to_be_so(capsys: pytest.CaptureFixture[str]) -> None:
+    text = written("dataset", "", "")
+    Path("my_dataset.py").write_text(text.replace('"replica"', '"mine"'))
+    words = ["run", "--scenes", DATASET, "--methods", "opensu3d", "--limit", "1", "--jobs", "1", "--no-pictures"]
+    assert main([*words, "--profile", "oracle", "--out", "out"]) == 0
+    said = "my-dataset: no protocol fits its ground truth mesh-vertices with labels of 'mine'; su3d-bench new protocol"
+    assert said in capsys.readouterr().err
+
+
+def blocks(page: str, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", (ROOT / page).read_text(), re.MULTILINE | re.DOTALL)
+
+
+def test_the_method_of_the_readme_runs_as_it_stands(capsys: pytest.CaptureFixture[str]) -> None:
+    (text,) = [block for block in blocks("README.md", "python") if "class " in block]
+    Path("my_method.py").write_text(text)
+    assert main(["methods", "check", METHOD]) == 0
+    assert "instances, with features: nothing found wrong" in capsys.readouterr().out
+
+
+def test_the_commands_of_the_page_run_one_after_another(capsys: pytest.CaptureFixture[str]) -> None:
+    quick = ["--limit", "1", "--no-pictures", "--jobs", "1", "--profile", "oracle"]
+    commands = [shlex.split(line) for block in blocks("docs/own-code.md", "sh") for line in block.splitlines()]
+    assert [command[0] for command in commands] == ["su3d-bench"] * 9
+    for command in commands:
+        assert main([*command[1:], *(quick if command[1] == "run" else [])]) == 0, capsys.readouterr().err
