@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError
 
+KINDS = {"U": "texts", "O": "objects"}
+
 
 def points_given(points: Any) -> NDArray[Any]:
     """Points (M, 3), of floats."""
@@ -119,7 +121,7 @@ def _array(name: str, value: Any) -> NDArray[Any]:
 
 
 def _described(array: NDArray[Any]) -> str:
-    return f"{array.dtype.name} {array.shape}"
+    return f"{KINDS.get(array.dtype.kind, array.dtype.name)} {array.shape}"
 
 
 def _named(value: Any) -> str:

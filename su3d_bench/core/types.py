@@ -438,7 +438,7 @@ class Instances(Masks):
     def of(
         cls,
         points: Float32Array,
-        masks: Masks | Sequence[IntArray | BoolArray] | IntArray | BoolArray,
+        masks: Masks | Sequence[IntArray | BoolArray | Sequence[int]] | IntArray | BoolArray,
         scores: FloatArray | Sequence[float] | None = None,
         features: FloatArray | None = None,
         *,

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, printable, shown
 from su3d_bench.core.files import regular
-from su3d_bench.core.types import DenseFeatures, Instances, Partition, Prediction
-from su3d_bench.formats.arrays import kind_of
+from su3d_bench.core.types import DenseFeatures, Prediction
 from su3d_bench.formats.numpy_files import npy_header_of, npz_names, read_npz
 from su3d_bench.predictions.base import Reader, ScenePrediction
-from su3d_bench.store.predictions import features_beside, prediction_from_arrays
+from su3d_bench.store.predictions import features_beside, prediction_from_arrays, value_fault
 from su3d_bench.store.run_folder import JOBS, scene_of_folder
 
 FILE = "prediction.npz"
@@ -70,22 +69,8 @@ def _mapped_features(file: Path) -> NDArray[Any]:
 
 def _check_points(where: str, content: Prediction) -> None:
     """Refuses what is no point, and a partition or features that do not go with their points."""
-    n = len(content.points)
-    if content.points.shape[1] != 3:
-        raise PredictionError(f"{where}: 'points' is {kind_of(content.points)}; expected three coordinates a point")
-    scores = content.scores if isinstance(content, Instances) else np.zeros(0)
-    for name, values in (("points", content.points), ("scores", scores)):
-        if not np.isfinite(values).all():
-            raise PredictionError(f"{where}: '{name}' has values that are NaN or infinite; run the scene again")
-    if isinstance(content, DenseFeatures) and len(content.features) != n:
-        raise PredictionError(f"{where}: {n} points and {len(content.features)} features; run the scene again")
-    if isinstance(content, Partition):
-        rows, n_rows = content.instance, len(content.features)
-        if len(rows) != n or (len(rows) and not -1 <= int(rows.min()) <= int(rows.max()) < n_rows):
-            raise PredictionError(
-                f"{where}: {n} points, {len(rows)} instance numbers to {int(rows.max(initial=-1))} and {n_rows} "
-                "features; run the scene again"
-            )
+    if fault := value_fault(content):
+        raise PredictionError(f"{where}: {fault}; run the scene again")
 
 
 def _files(path: Path) -> dict[str, Path]:

@@ -93,6 +93,22 @@ def array_fault(arrays: Mapping[str, NDArray[Any]]) -> str | None:
     return None
 
 
+def value_fault(prediction: Prediction) -> str | None:
+    """Which values of a prediction cannot be, or do not go with its points; None where all can."""
+    n = len(prediction.points)
+    scores = prediction.scores if isinstance(prediction, Instances) else np.zeros(0)
+    for name, values in (("points", prediction.points), ("scores", scores)):
+        if not np.isfinite(values).all():
+            return f"'{name}' has values that are NaN or infinite"
+    if isinstance(prediction, DenseFeatures) and len(prediction.features) != n:
+        return f"{n} points and {len(prediction.features)} features"
+    if isinstance(prediction, Partition):
+        rows, n_rows = prediction.instance, len(prediction.features)
+        if len(rows) != n or (len(rows) and not -1 <= int(rows.min()) <= int(rows.max()) < n_rows):
+            return f"{n} points, {len(rows)} instance numbers to {int(rows.max(initial=-1))} and {n_rows} features"
+    return None
+
+
 def features_beside(path: Path) -> Path:
     """Where the features of a dense prediction at ``path`` are: a file of their own, read without loading it."""
     return path.with_name(f"{path.name.removesuffix('.npz')}.features.npy")

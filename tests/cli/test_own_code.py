@@ -85,7 +85,7 @@ METHODS = {
     "undefined scores": (
         "np.ones(len(kept))",
         "np.full(len(kept), np.nan)",
-        "finish: 'scores' holds a value that is not f",
+        "finish: 'scores' has values that are NaN",
     ),
     "a size": ("    def start(", "    n_points = 'many'\n\n    def start(", "n_points gave a str; an int is expected"),
 }

@@ -216,7 +216,7 @@ def test_wrong_shapes_in_torch_files_are_refused(tmp_path: Path) -> None:
     [
         ({"kind": np.array("Picture")}, "holds no 'kind' out of"),
         ({"kind": np.array(3)}, "holds no 'kind' out of"),
-        ({"points": np.zeros((6, 2), np.float32)}, "expected three coordinates"),
+        ({"points": np.zeros((6, 2), np.float32)}, "'points' is an array of shape (6, 2), not (N, 3)"),
         ({"points": np.zeros(6, np.float32)}, "'points' is an array of shape (6,)"),
         ({"points": np.full((6, 3), np.nan, np.float32)}, "'points' has values that are NaN"),
         ({"scores": np.array([1.0, np.inf])}, "'scores' has values that are NaN"),

@@ -197,7 +197,8 @@ CRASHES = 1 + next(k for k, line in enumerate(PLUG_IN) if "a mistake in a plug-i
         ("missing-frame", "painted/b: frame 2 is missing; copy it again"),
         (
             "nan-pose",
-            f"painted/b: painted.py:{MADE}: frame 2: the pose is not a finite 4x4 matrix; drop the frame or mend the trajectory",
+            f"painted/b: painted.py:{MADE}: frame 2: the pose is not a finite 4x4 matrix; drop the frame or mend the "
+            "trajectory",
         ),
         (
             "depth-size",

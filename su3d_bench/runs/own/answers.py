@@ -24,7 +24,7 @@ from su3d_bench.core.types import (
     SceneInfo,
     Surface,
 )
-from su3d_bench.store.predictions import array_fault, prediction_arrays
+from su3d_bench.store.predictions import array_fault, prediction_arrays, value_fault
 
 # The types in which arrays are kept. What is of the same kind is brought into them, what is of another is refused.
 FORMS: dict[str, type] = {
@@ -185,30 +185,13 @@ def _fault_of_prediction(prediction: Instances | Partition | DenseFeatures) -> s
             return f"'{name}' is a {type(value).__name__}; an array is expected"
     if fault := array_fault(prediction_arrays(prediction)):
         return fault
-    values: dict[str, NDArray[Any] | None] = {"points": prediction.points}
-    if not isinstance(prediction, DenseFeatures):
-        values["features"] = prediction.features
-    if isinstance(prediction, Instances):
-        values["scores"] = prediction.scores
-    for name, array in values.items():
-        if array is not None and not np.isfinite(array).all():
-            row = int(np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))[0])
-            return f"'{name}' holds a value that is not finite, first in row {row}"
-    return _fault_of_masks(prediction) if isinstance(prediction, Instances) else _fault_of_owners(prediction)
-
-
-def _fault_of_owners(prediction: Partition | DenseFeatures) -> str | None:
-    n_points = len(prediction.points)
-    if isinstance(prediction, DenseFeatures):
-        n_rows = len(prediction.features)
-        return None if n_rows == n_points else f"'features' has {n_rows} rows for {n_points} points"
-    if len(prediction.instance) != n_points:
-        return f"'instance' has {len(prediction.instance)} rows for {n_points} points"
-    least, most = (-1, len(prediction.features) - 1)
-    if n_points and not least <= prediction.instance.min() <= prediction.instance.max() <= most:
-        held = f"{prediction.instance.min()} to {prediction.instance.max()}"
-        return f"'instance' holds {held}; rows of features lie from 0 to {most}, -1 is none"
-    return None
+    if fault := value_fault(prediction):
+        return fault
+    features = None if isinstance(prediction, DenseFeatures) else prediction.features
+    if features is not None and not np.isfinite(features).all():
+        row = int(np.flatnonzero(~np.isfinite(features).all(axis=1))[0])
+        return f"'features' has values that are NaN or infinite, first in row {row}"
+    return _fault_of_masks(prediction) if isinstance(prediction, Instances) else None
 
 
 def _fault_of_masks(instances: Instances) -> str | None:

@@ -1,0 +1,77 @@
+"""``Instances.of`` takes masks as methods have them, and says by name what it cannot take."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.types import Instances
+
+POINTS = np.arange(18, dtype=np.float32).reshape(6, 3)
+SETS = [[0, 1, 4], [3]]
+
+FORMS: dict[str, Any] = {
+    "indices": [np.array([0, 1, 4]), np.array([3])],
+    "plain lists": SETS,
+    "in any order, some twice": [np.array([4, 0, 1, 0]), np.array([3, 3])],
+    "bools": [np.isin(np.arange(6), members) for members in SETS],
+    "a table of bools": np.array([np.isin(np.arange(6), members) for members in SETS]),
+    "numbers of instances": np.array([0, 0, -1, 1, 0, -1]),
+    "small numbers of instances": np.array([0, 0, -1, 1, 0, -1], np.int8),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_every_form_of_masks_gives_the_same_map(form: str) -> None:
+    found = Instances.of(POINTS, FORMS[form], [1, 2], np.eye(2))
+    assert [mask.tolist() for mask in found.sets()] == SETS
+    assert found.scores.tolist() == [1.0, 2.0] and found.scores.dtype == np.float64
+    assert found.boxes[0].tolist() == [[0, 1, 2], [12, 13, 14]]
+
+
+@pytest.mark.parametrize("masks", [[], np.zeros((0, 6), bool), np.full(6, -1)])
+def test_a_map_without_instances_is_a_map(masks: Any) -> None:
+    assert len(Instances.of(POINTS, masks, [], np.array([]))) == 0
+
+
+def test_a_scene_without_points_is_a_map() -> None:
+    assert len(Instances.of(POINTS[:0], np.zeros(0, np.int64))) == 0
+
+
+WRONG: dict[str, tuple[dict[str, Any], str]] = {
+    "flat points": ({"points": POINTS[:, :2]}, "points are float32 (6, 2); floats (M, 3) in metres are expected"),
+    "whole points": ({"points": POINTS.astype(int)}, "points are int64 (6, 3); floats"),
+    "no masks": ({"masks": None}, "masks is None; a list of point indices or bools"),
+    "one mask": ({"masks": np.ones(6, bool)}, "masks is one array, bool (6,); a list of masks is expected"),
+    "numbers of too few": ({"masks": np.zeros(5, int)}, "masks is one array, int64 (5,)"),
+    "numbers below": ({"masks": np.array([0, 1, -2, 0, 0, 0])}, "masks holds numbers -2 to 1"),
+    "numbers with gaps": ({"masks": np.array([0, 0, 2, 2, 2, 0])}, "masks numbers no point 1, but higher ones"),
+    "too few bools": ({"masks": [np.ones(5, bool)] * 2}, "the mask of instance 0 has 5 bools for 6 points"),
+    "shares": ({"masks": [[0], [0.5, 0.7]]}, "the mask of instance 1 is float64 (2,); indices of points, or a bool"),
+    "masks of images": ({"masks": np.ones((2, 4, 5), bool)}, "the mask of instance 0 is bool (4, 5)"),
+    "beyond": ({"masks": [[0], [6]]}, "instance 1: mask holds index 6, the map has 6 points (0..5)"),
+    "a score too many": ({"scores": np.ones(3)}, "scores are float64 (3,); one number for each of 2 masks"),
+    "words as scores": ({"scores": ["high", "low"]}, "scores are texts (2,)"),
+    "a feature of all": ({"features": np.ones(4)}, "features are float64 (4,); floats (2, D), one row a mask"),
+    "whole features": ({"features": np.ones((2, 4), int)}, "features are int64 (2, 4); floats (2, D)"),
+    "uneven features": ({"features": [[1.0], [1.0, 2.0]]}, "features: is no array"),
+    "half views": ({"views": [[(0.5, 1)], []]}, "views are float64 (1, 2); pairs of integers"),
+    "views of one": ({"views": [[(0, 1)]]}, "views of 1 instances for 2 masks"),
+    "one label": ({"labels": ["chair"]}, "2 masks and 1 labels"),
+}
+
+
+@pytest.mark.parametrize("mistake", WRONG)
+def test_what_cannot_be_is_named(mistake: str) -> None:
+    changed, said = WRONG[mistake]
+    words: dict[str, Any] = {"points": POINTS, "masks": SETS, **changed}
+    with pytest.raises(PredictionError) as error:
+        Instances.of(words.pop("points"), words.pop("masks"), **words)
+    assert said in str(error.value)
+
+
+def test_labels_may_be_a_list() -> None:
+    assert Instances.of(POINTS, SETS, labels=["chair", "table"]).labels == ("chair", "table")
