@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     )
     from su3d_bench.metrics.protocols.loading import load_protocol
     from su3d_bench.metrics.scoring import combine, score_scene
+    from su3d_bench.numerics.geometry import back_project
     from su3d_bench.store.predictions import read_prediction
 
 __version__ = "0.1.0"
@@ -41,6 +42,7 @@ __all__ = [
     "PerceptionNeeds",
     "SceneInfo",
     "Timer",
+    "back_project",
     "combine",
     "load_protocol",
     "read_prediction",
@@ -49,6 +51,7 @@ __all__ = [
 # Where those names are that are no types of ``core.types``.
 _ELSEWHERE = {
     "Timer": "core.timing",
+    "back_project": "numerics.geometry",
     "combine": "metrics.scoring",
     "load_protocol": "metrics.protocols.loading",
     "read_prediction": "store.predictions",

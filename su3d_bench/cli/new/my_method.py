@@ -7,8 +7,7 @@ import itertools
 import numpy as np
 import pydantic
 
-from su3d_bench import Detections, Frame, Instances, PerceptionNeeds, SceneInfo, Timer
-from su3d_bench.numerics.geometry import back_project
+from su3d_bench import Detections, Frame, Instances, PerceptionNeeds, SceneInfo, Timer, back_project
 
 
 class MyMethod:
