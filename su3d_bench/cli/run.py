@@ -21,6 +21,7 @@ from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE, counted
 
 if TYPE_CHECKING:
     from su3d_bench.core.config import KeyPath, Settings
+    from su3d_bench.runs.planning.held import Into
     from su3d_bench.runs.planning.plan import Plan
     from su3d_bench.runs.runner import RunResult
 
@@ -45,6 +46,7 @@ def add_parser(verbs: Any) -> None:
 
 def add_run_flags(parser: argparse.ArgumentParser) -> None:
     """The flags of every verb that runs methods, but which methods."""
+    parser.add_argument("scene", nargs="*", metavar="SCENE", help="addresses or patterns, as --scenes takes them")
     parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="addresses or patterns (default: 'rooms/*')")
     parser.add_argument(
         "--profile", help="who supplies perception: auto, embedded, oracle, stored, paper (default: auto)"
@@ -91,6 +93,13 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="run folder, or URL of one such as s3://bucket/run (default: runs/<name made from the request>)",
     )
+    into = parser.add_mutually_exclusive_group()
+    into.add_argument(
+        "--extend",
+        action="store_true",
+        help="add these scenes, methods and protocols to the run in --out, whose other values stay",
+    )
+    into.add_argument("--replace", action="store_true", help="put this run in the place of the one in --out")
     parser.add_argument("--dry-run", action="store_true", help="print what would be done, with a time estimate")
     add_table_format(parser)
 
@@ -105,7 +114,11 @@ def add_executor_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--executor", metavar="WHERE", help="inline, processes, ray or slurm (default: processes, inline for one job)"
     )
-    parser.add_argument("--ray-address", metavar="ADDRESS", help="of the Ray cluster (default: this machine's)")
+    parser.add_argument(
+        "--ray-address",
+        metavar="ADDRESS",
+        help="of a Ray cluster, or local to start one on this machine (default: the one that runs here already)",
+    )
     parser.add_argument("--gpus-per-job", type=float, metavar="N", help="that ray or slurm gives a scene, such as 0.5")
     parser.add_argument("--retries", type=int, metavar="N", help="of a scene whose machine was lost (default: 2)")
     parser.add_argument(
@@ -124,7 +137,8 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
     """The plan of what was asked for, in a process that leaves the cores to the scenes side by side."""
     from su3d_bench.runs.planning.plan import make_plan
 
-    return make_plan(settings_of(arguments), arguments.set, arguments.out)
+    into: Into = "extend" if arguments.extend else "replace" if arguments.replace else "own"
+    return make_plan(settings_of(arguments), arguments.set, arguments.out, into=into)
 
 
 def settings_of(arguments: argparse.Namespace) -> Settings:
@@ -132,7 +146,10 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
     from su3d_bench.core.config import RunConfig, Setting, Settings, read_file
 
     settings = Settings() if arguments.config is None else read_file(arguments.config)
-    flags: list[tuple[KeyPath, Any]] = [((name,), getattr(arguments, name)) for name in RunConfig.model_fields]
+    scenes = [*arguments.scene, *(arguments.scenes or ())] or None
+    flags: list[tuple[KeyPath, Any]] = [
+        ((name,), scenes if name == "scenes" else getattr(arguments, name)) for name in RunConfig.model_fields
+    ]
     flags.append((("perception", "models", "device"), arguments.device))
     return settings + Settings(
         tuple(Setting(key, value, f"--{key[-1].replace('_', '-')}") for key, value in flags if value is not None)

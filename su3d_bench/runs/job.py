@@ -19,10 +19,13 @@ from su3d_bench.perception.profiles import Perception, PerceptionConfig
 from su3d_bench.questions.reasoning.language_solver import answers_digest
 from su3d_bench.questions.refined_names import refined_digest
 from su3d_bench.runs.own.watch import checked_dataset, checked_method, made, settings_model, told
+from su3d_bench.runs.plug_ins import checked_dataset, checked_method
+from su3d_bench.store.records import SealRecord
 from su3d_bench.store.run_folder import JobFolder
 
 # Settings of perception that move no number, or whose part that does is in perception's digest.
 NOT_IN_KEY = ("perception.cache", "perception.models.folder", "perception.models.paths", "perception.language.")
+INSTEAD = "--replace puts this one in its place, or choose another folder with --out"
 FIELDS_KNOWN_LATER = ("data", "profile", "perception", "packages.torch", "packages.transformers")
 
 
@@ -39,7 +42,8 @@ class Part:
 class SceneJob:
     """Everything that a worker needs to know of one scene; ``index`` counts the scenes of the run.
 
-    ``doubts``: what must be said of its poses, None where whoever made the job could not look at its data.
+    ``replaces``: a map that was made from other inputs is made anew, where it would be refused. ``doubts``: what must be
+    said of its poses, None where whoever made the job could not look at its data.
     """
 
     scene: str
@@ -61,6 +65,7 @@ class SceneJob:
     is_offline: bool = False
     solver: str = "built-in"
     accepts_poses: bool = False
+    replaces: bool = False
     doubts: tuple[str, ...] | None = None
 
     @property
@@ -128,9 +133,7 @@ def own_code(target: str) -> str | None:
 def refuse_other_run(folder: JobFolder, key: Mapping[str, str], known_later: Sequence[str] = ()) -> None:
     """A ``StoreError`` where ``folder`` was sealed under another key, fields in ``known_later`` aside."""
     if changed := folder.changed_field("predict", key, known_later=known_later):
-        raise StoreError(
-            f"{folder.path}: holds another run ({changed}); choose another folder with --out or delete this one"
-        )
+        raise StoreError(f"{folder.path}: holds another run ({changed}); {INSTEAD}")
 
 
 def options_model(kind: str, target: str) -> Any:
@@ -191,6 +194,12 @@ class JobInputs:
         if self.job.solver == "llm" and any(protocol.answers is not None for protocol in rules.values()):
             key["solver"] = answers_digest(PerceptionConfig.model_validate_json(self.job.perception).language)
         return key | refined_digest(folder) if any(protocol.goes_by_names for protocol in rules.values()) else key
+
+    def is_scored(self, folder: JobFolder, seal: SealRecord | None, key: Mapping[str, str]) -> bool:
+        """Whether ``seal`` vouches for scores under ``key``; pictures that nobody asks for now may be beside them."""
+        if seal is not None and not self.job.pictures and seal.key.get("pictures") == str(True):
+            key = {**key, "pictures": str(True)}
+        return folder.is_whole(seal, key)
 
     def outcome(self, remarks: Mapping[str, Any], *, was_resumed: bool) -> MethodOutcome:
         """The outcome once both steps are sealed; ``remarks`` stand beside the seal of the scores."""

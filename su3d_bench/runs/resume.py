@@ -64,7 +64,7 @@ class FinishedScenes:
             return None
         key = inputs.predict_key()
         is_done = folder.is_whole(seals["predict"], key)
-        if not is_done or not folder.is_whole(seals["score"], inputs.score_key(key, folder)):
+        if not is_done or not inputs.is_scored(folder, seals["score"], inputs.score_key(key, folder)):
             return None
         return inputs.outcome(seals["score"].remarks, was_resumed=True)
 

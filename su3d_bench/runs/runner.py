@@ -6,7 +6,6 @@ workers and however often a run was killed and taken up again.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -16,10 +15,10 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.core.config import KeyPath, flatten, write_toml
+from su3d_bench.core.config import KeyPath, write_toml
 from su3d_bench.core.digests import code_digest, git_state, package_versions
 from su3d_bench.core.errors import StoreError
-from su3d_bench.core.files import file_bytes
+from su3d_bench.core.files import file_bytes, file_text
 from su3d_bench.core.registry import CEILING_METHOD, DATASETS
 from su3d_bench.core.timing import hardware_line, processor_digest
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
@@ -28,18 +27,26 @@ from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import EVERY_SCENE, SceneScore, combine, combined_metrics, plain_json, unpack_scores
 from su3d_bench.perception.profiles import PerceptionConfig
 from su3d_bench.reports.tables.found import Found, Unscored, not_scored_lines
-from su3d_bench.runs.executors.choose import ELSEWHERE, run_units
+from su3d_bench.runs.executors.choose import ELSEWHERE, reached, run_units
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
 from su3d_bench.runs.finished import record_of_rules
 from su3d_bench.runs.found import found_in
 from su3d_bench.runs.job import MethodOutcome, SceneJob
+from su3d_bench.runs.planning.held import differences, kept_jobs, replaced_jobs
 from su3d_bench.runs.planning.plan import Plan
 from su3d_bench.runs.planning.poses import judged
 from su3d_bench.runs.planning.scenes import cache_root
-from su3d_bench.runs.remote.scene import DistantJob, failed_distant, fetch_results, run_distant_scene, send_records
+from su3d_bench.runs.remote.scene import (
+    DistantJob,
+    failed_distant,
+    fetch_results,
+    remove_jobs,
+    run_distant_scene,
+    send_records,
+)
 from su3d_bench.runs.resume import FinishedScenes
 from su3d_bench.runs.scene import failed_outcomes, run_scene
-from su3d_bench.store.atomic import remove_file, write_json, write_text
+from su3d_bench.store.atomic import is_file, json_text, remove_file, write_json, write_text
 from su3d_bench.store.records import (
     FailureRecord,
     GitRecord,
@@ -79,36 +86,94 @@ class RunResult:
 def run_plan(plan: Plan, report: Report) -> RunResult:
     """Do every job of ``plan`` that is not done yet and write the run's records.
 
-    ``PosesContradicted``, before anything is written, where the depth of a recording contradicts its poses.
+    The records of a run that is finished stay until those of its extension, or of jobs made anew, are there to take
+    their place. Before anything is written: ``PosesContradicted`` where the depth of a recording contradicts its poses,
+    and an error where the executor does not answer.
     """
     if plan.data is None:  # else each worker looks at the data that it fetches
         plan = replace(plan, jobs=_judged(plan.jobs))
-    with plan.folder.locked(), _without_abandoned():
-        metrics_file = plan.folder.path / "metrics.json"
-        remove_file(metrics_file)  # what stands there may be of another plan
-        write_text(plan.folder.path / "run.toml", write_toml(resolved_values(plan)))
-        write_json(plan.folder.path / "run.json", plain(record(plan, (), "running")))
-        publish(plan)
+    place = plan.folder.path
+    with reached(plan.config, plan.n_workers, place) as through, plan.folder.locked(), _without_abandoned():
+        _refuse_what_came_meanwhile(plan)
+        if plan.into == "replace":
+            _remove_replaced(plan)
+        is_kept = plan.held is not None and plan.held.is_finished  # asked again, for its metrics may be gone by now
+        if not is_kept:
+            _begin(plan)
         try:
-            outcomes = _execute(plan, report)
+            outcomes = _execute(plan, report, through)
         except BaseException:
-            write_json(plan.folder.path / "run.json", plain(record(plan, (), "interrupted")))
-            with suppress(StoreError):  # what ended the run says more
-                publish(plan)
+            if not is_kept:
+                write_json(place / "run.json", plain(record(plan, (), "interrupted")))
+                with suppress(StoreError):  # what ended the run says more
+                    publish(plan)
             raise
         if plan.store is not None:
-            fetch_results(plan.store, plan.folder.path)
+            fetch_results(plan.store, place)
         report(Event("", SCENE_DONE, doing="adding up"))
         failed = [(outcome.scene, outcome.method, outcome.error) for outcome in outcomes if outcome.error is not None]
         failures = tuple(each for each in failed if each[1] in plan.methods)
         metrics = plain(summarise(plan, outcomes))
-        write_json(metrics_file, metrics)
-        status = "incomplete" if failures else "complete"
-        write_json(plan.folder.path / "run.json", plain(record(plan, outcomes, status)))
-        publish(plan)
+        if not (is_kept and _is_unchanged(plan, outcomes, metrics)):
+            if is_kept:
+                _begin(plan, is_new=False)
+            write_json(place / "metrics.json", metrics)
+            write_json(place / "run.json", plain(record(plan, outcomes, "incomplete" if failures else "complete")))
+            publish(plan)
     without_score = _without_score(plan, outcomes)
     found = tuple(found_in(plan.folder, without_score))
     return RunResult(plan, metrics, outcomes, failures, _remarks(plan, outcomes, without_score), found)
+
+
+def _begin(plan: Plan, *, is_new: bool = True) -> None:
+    """The records of a run under way: its request, and no metrics where it ``is_new``."""
+    place = plan.folder.path
+    if is_new:
+        remove_file(place / "metrics.json")
+    write_text(place / "run.toml", write_toml(resolved_values(plan)))
+    write_json(place / "run.json", plain(record(plan, (), "running")))
+    if is_new:
+        publish(plan)
+
+
+def _refuse_what_came_meanwhile(plan: Plan) -> None:
+    """A ``StoreError`` where another command has written its request here since this one was planned."""
+    file = plan.folder.path / "run.toml"
+    planned = None if plan.held is None else plan.held.text
+    if is_file(file) and planned != file_text(file) and plan.into != "replace":
+        raise StoreError(
+            f"{plan.store or plan.folder.path}: another run was begun here just now; give the command again"
+        )
+
+
+def _remove_replaced(plan: Plan) -> None:
+    """What stands in the folder goes, but the maps that the new request asks for as they are. The records go last but
+    the request, so that a command that is killed here begins again where it was."""
+    going = replaced_jobs(plan.folder, plan.jobs)
+    if not going and (plan.held is None or not differences(plan.held, plan.request)):
+        return  # the run that replaced another is taken up again
+    for name in ("metrics.json", "ablation.json"):
+        remove_file(plan.folder.path / name)
+    publish(plan)
+    if plan.store is not None:
+        remove_jobs(plan.store, plan.folder.path, kept_jobs(plan.folder, plan.jobs))
+    for job in going:
+        job.remove()
+
+
+def _is_unchanged(plan: Plan, outcomes: Sequence[MethodOutcome], metrics: Mapping[str, Any]) -> bool:
+    """Whether all was done before, so that the records that stand there, with what they say of the machine that did
+    the work, are those of this command too."""
+    held = plan.held
+    return (
+        held is not None
+        and held.record is not None
+        and held.record.status == "complete"
+        and held.text is not None
+        and all(outcome.was_resumed for outcome in outcomes)
+        and not differences(held, plan.request)
+        and file_bytes(plan.folder.path / "metrics.json") == json_text(metrics).encode()
+    )
 
 
 @contextmanager
@@ -168,8 +233,10 @@ def _remarks(
     return tuple(dict.fromkeys(lines))
 
 
-def _execute(plan: Plan, report: Report) -> tuple[MethodOutcome, ...]:
-    start = partial(run_units, report=report, config=plan.config, n_workers=plan.n_workers, folder=plan.folder.path)
+def _execute(plan: Plan, report: Report, through: Any) -> tuple[MethodOutcome, ...]:
+    """``through``: what the executor works through, as ``reached`` gave it."""
+    how = {"config": plan.config, "n_workers": plan.n_workers, "folder": plan.folder.path, "through": through}
+    start = partial(run_units, report=report, **how)
     by_scene: dict[str, tuple[MethodOutcome, ...]] = {}
 
     def note(outcomes: tuple[MethodOutcome, ...]) -> None:
@@ -206,14 +273,7 @@ def _distant(plan: Plan) -> list[DistantJob]:
 
 def resolved_values(plan: Plan) -> list[tuple[KeyPath, Any, str]]:
     """Every value of the run with where it came from, parts in the order of the run."""
-    leaves = flatten(plan.config.model_dump(mode="json"))
-    job_of_dataset = {job.dataset.name: job for job in plan.jobs}
-    sections: list[tuple[KeyPath, str]] = [(("method", part.name), part.options) for part in plan.jobs[0].methods]
-    sections += [(("dataset", name), job.dataset.options) for name, job in job_of_dataset.items()]
-    sections.append((("perception",), plan.jobs[0].perception))
-    for prefix, options in sections:
-        leaves += [((*prefix, *path), value) for path, value in flatten(json.loads(options))]
-    return [(path, value, plan.settings.source(path)) for path, value in leaves]
+    return [(path, value, plan.settings.source(path)) for path, value in plan.values]
 
 
 def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> MetricsRecord:

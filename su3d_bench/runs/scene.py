@@ -240,6 +240,9 @@ class _Scene:
         config = config_key(self.job, part, method)
         inputs = JobInputs(self.job, part.name, config, method, info, perception, self.data_digest)
         key = inputs.predict_key()
+        if self.job.replaces and folder.changed_field("predict", key) is not None:
+            folder.remove()
+            folder.prepare()
         refuse_other_run(folder, key)
         was_resumed = folder.is_done("predict", key)
         if was_resumed:
@@ -247,7 +250,7 @@ class _Scene:
         else:
             self._predict(part, info, perception, folder, key, log)
         score_key = inputs.score_key(key, folder)
-        if not folder.is_done("score", score_key):
+        if not inputs.is_scored(folder, folder.seals().get("score"), score_key):
             self._score(part, perception, folder, score_key, log)
             was_resumed = False
         return inputs.outcome(folder.remarks("score"), was_resumed=was_resumed)

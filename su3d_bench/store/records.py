@@ -125,8 +125,11 @@ class RunRecord:
 class RequestRecord:
     """What ``run.json`` says of a run that may not be finished."""
 
+    status: str = ""
+    profile: str | None = None
     encoder: str | None = None
     encoder_digest: str | None = None
+    protocols: tuple[ProtocolRecord, ...] = ()
     methods: tuple[str, ...] = ()
     scenes: tuple[str, ...] = ()
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -22,12 +23,18 @@ from su3d_bench.core.errors import StoreError, shown
 from su3d_bench.store.atomic import make_folder, read_json, write_error, write_json
 from su3d_bench.store.predictions import features_beside
 from su3d_bench.store.records import SCHEMA, SealRecord, checked, plain
-from su3d_bench.store.unfinished import LOCK_FILE, clear_unfinished, hold_folder, is_unfinished
+from su3d_bench.store.unfinished import LOCK_FILE, beside, clear_unfinished, hold_folder, is_unfinished
 
 JOBS = "scenes"
 WRITTEN_BY_ALL = ("language", "language/images")  # where all jobs of a run write; a job clears its own folders
 MARKS = ("run.toml", "run.json")  # by which a folder is known for a run's; the first is the first that a run writes
-RECORDS = ("run.toml", "run.json", "metrics.json", "ablation.json")  # the files of a run beside its jobs
+RECORDS = (*MARKS, "metrics.json", "ablation.json")
+FILLED_FREELY = ("language", "slurm", ".cache")  # folders of a run whose files have names of many forms
+# What stands in the folder of a job; "refined_names.json" is what the verb refine leaves beside a map.
+_OF_A_JOB = re.compile(
+    r"(prediction|anytime-[0-9.e+-]+)(\.npz|\.features\.npy)|anytime-[0-9.e+-]+-counts\.npz|counts\.npz|updates\.csv"
+    r"|log\.txt|done\.json|refined_names\.json"
+)
 BEFORE_MARKS = (JOBS, "language", LOCK_FILE)  # what a run may hold of which a power cut took them
 # What a folder's name says otherwise, so that each scene has a folder of its own; "." ends the dataset's name.
 _ESCAPES = {"%": "%25", "/": "%2F", ".": "%2E"}
@@ -103,6 +110,35 @@ class RunFolder:
                 f"{shown(self.path)}: holds '{strangers[0]}' and is no folder of a run; choose a new folder with --out"
             )
 
+    def jobs(self) -> list[JobFolder]:
+        """The folder of each job that is there, of this run's request or not."""
+        return [JobFolder(path) for path in sorted(self.path.glob(f"{JOBS}/*/*")) if path.is_dir()]
+
+    def strangers(self) -> Iterator[str]:
+        """What stands in the folder and was written by no run, nor by a verb beside its map; links count among it."""
+        for above, folders, files in os.walk(self.path, followlinks=False):
+            where = Path(above).relative_to(self.path)
+            links = [name for name in folders if Path(above, name).is_symlink()]
+            known = [name for name in files if _is_of_a_run(where, name) and not Path(above, name).is_symlink()]
+            yield from ((where / name).as_posix() for name in sorted({*files, *links} - {*known}))
+            if not where.parts:
+                yield from (name for name in sorted(folders) if not is_unfinished(name) and name not in _FOLDERS)
+
+    def remove(self) -> None:
+        """Remove the folder with all that it holds, at once or not at all; ``StoreError`` where a run writes there."""
+        with self.locked():
+            place = beside(self.path)
+            try:
+                os.rename(self.path, place)
+            except OSError as error:
+                reason = error.strerror or error
+                raise StoreError(
+                    f"{shown(self.path)}: cannot be removed: {reason}; nothing in it was changed"
+                ) from error
+            shutil.rmtree(place, ignore_errors=True)
+        if place.exists():
+            raise StoreError(f"{shown(place)}: a part of what was removed cannot be; remove it yourself")
+
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Hold the folder against a second run; the lock dies with the process and leaves no file behind."""
@@ -121,6 +157,25 @@ class RunFolder:
             yield
         finally:
             os.close(handle)
+
+
+_FOLDERS = (JOBS, *FILLED_FREELY)
+
+
+def _is_of_a_run(where: Path, name: str) -> bool:
+    """Whether a run, or a verb beside its map, writes a file ``name`` in the folder ``where`` of a run."""
+    if is_unfinished(name) or any(is_unfinished(part) for part in where.parts):
+        return True
+    match where.parts:
+        case ():
+            return name in (*RECORDS, LOCK_FILE)
+        case (top, *_) if top in FILLED_FREELY:
+            return True
+        case (top, _, _) if top == JOBS:
+            return _OF_A_JOB.fullmatch(name) is not None
+        case (top, _, _, "pictures") if top == JOBS:
+            return name.endswith(".png")
+    return False
 
 
 @dataclass(frozen=True)
@@ -175,6 +230,16 @@ class JobFolder:
         self.refuse_links()
         make_folder(self.path)
         clear_unfinished(self.pictures)
+
+    def remove(self) -> None:
+        """Remove the folder, and that of its scene where it was the last there."""
+        self.refuse_links()
+        place = beside(self.path)
+        with suppress(FileNotFoundError):
+            os.rename(self.path, place)
+            shutil.rmtree(place, ignore_errors=True)
+        with suppress(OSError):
+            self.path.parent.rmdir()
 
     def seals(self) -> dict[str, SealRecord]:
         """The sealed steps; nothing where ``done.json`` is missing or damaged."""

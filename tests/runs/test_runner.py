@@ -161,8 +161,10 @@ def test_another_key_in_the_same_folder_is_refused_by_name(
     before = Path("out/metrics.json").read_bytes()
     capsys.readouterr()
     assert run(*more, scenes="a") == 2
-    line = f"out/scenes/painted.a/collector: holds another run ({field}); choose another folder with --out"
-    assert capsys.readouterr().err.startswith(f"su3d-bench: {line}")
+    line = (
+        f"out: holds another run ({field}); --replace puts this one in its place, or choose another folder with --out"
+    )
+    assert capsys.readouterr().err == f"su3d-bench: {line}\n"
     assert Path("out/metrics.json").read_bytes() == before
 
 
@@ -181,7 +183,7 @@ def test_changed_perception_is_refused_by_name(
 def test_other_protocols_score_the_same_predictions_again(monkeypatch: pytest.MonkeyPatch) -> None:
     assert run(scenes="a") == 0
     made = (job() / "prediction.npz").stat().st_mtime_ns
-    assert run("--protocols", "replica-mesh-ex6", scenes="a") == 0
+    assert run("--protocols", "replica-mesh-ex6", "--replace", scenes="a") == 0
     assert [one["protocol"] for one in metrics()["results"]] == ["replica-mesh-ex6"]
     assert (job() / "prediction.npz").stat().st_mtime_ns == made
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +59,28 @@ def slurm_parameters(config: RunConfig) -> dict[str, Any]:
     return parameters
 
 
+@contextmanager
+def reached(config: RunConfig, n_workers: int, folder: Path) -> Iterator[Any]:
+    """What the executor of ``config`` works through, for ``run_units`` in the block; nothing is written for it.
+
+    A ``Su3dError`` where no cluster answers, before a run has left anything in ``folder``.
+    """
+    executor = executor_of(config, n_workers)
+    if executor == "ray":
+        from su3d_bench.runs.executors.ray import connected
+
+        with connected(config) as ray:
+            yield ray
+    elif executor == "slurm":
+        from su3d_bench.runs.executors.slurm import slurm_executor
+
+        at = folder.absolute() / "slurm"
+        refuse_links(at.parent, at)
+        yield slurm_executor(at, slurm_parameters(config), int(config.gpus_per_job), n_workers)
+    else:
+        yield None
+
+
 def run_units(
     work: Work[Unit, Outcome],
     units: Sequence[Unit],
@@ -66,9 +89,11 @@ def run_units(
     config: RunConfig,
     n_workers: int,
     folder: Path,
+    through: Any,
     lost: Callable[[Unit, str], Outcome],
 ) -> Iterator[Outcome]:
-    """Outcomes of ``units`` as they come in, from the executor of ``config``; ``folder`` is the run's."""
+    """Outcomes of ``units`` as they come in, from the executor of ``config``; ``folder`` is the run's, and ``through``
+    what ``reached`` gave."""
     executor = executor_of(config, n_workers)
     if executor == "inline":
         return run_inline(work, units, report)
@@ -77,9 +102,8 @@ def run_units(
     if executor == "ray":
         from su3d_bench.runs.executors.ray import run_ray
 
-        return run_ray(work, units, report, jobs=n_workers, config=config, lost=lost)
+        return run_ray(work, units, report, jobs=n_workers, config=config, ray=through, lost=lost)
     from su3d_bench.runs.executors.slurm import run_slurm
 
-    at, parameters = folder.absolute() / "slurm", slurm_parameters(config)
-    refuse_links(at.parent, at)
-    return run_slurm(work, units, report, jobs=n_workers, config=config, folder=at, parameters=parameters, lost=lost)
+    at = folder.absolute() / "slurm"
+    return run_slurm(work, units, report, jobs=n_workers, config=config, folder=at, executor=through, lost=lost)

@@ -6,6 +6,7 @@ worker or machine was lost runs again, a bounded number of times, and what its w
 
 from __future__ import annotations
 
+import os
 import socket
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -30,31 +31,32 @@ def run_ray(
     *,
     jobs: int,
     config: RunConfig,
+    ray: Any,
     lost: Callable[[Unit, str], Outcome],
 ) -> Iterator[Outcome]:
     """Outcomes of ``units`` as they come in, at most ``jobs`` of them handed to the cluster at once.
 
-    A unit whose worker or machine was lost ``config.retries`` + 1 times has the outcome that ``lost`` makes. A
-    ``Su3dError`` that leaves ``work``, or an interrupt, stops all. ``report`` hears nothing from inside a unit.
+    ``ray`` is what ``connected`` gave. A unit whose worker or machine was lost ``config.retries`` + 1 times has the
+    outcome that ``lost`` makes. A ``Su3dError`` that leaves ``work``, or an interrupt, stops all. ``report`` hears
+    nothing from inside a unit.
     """
-    with _connected(config) as ray:
-        remote = ray.remote(num_cpus=1, num_gpus=config.gpus_per_job, max_retries=0, max_calls=1)(_on_node)
-        versions = _versions()
-        waiting = deque((unit, 1) for unit in units)
-        running: dict[Any, tuple[Unit, int]] = {}
-        while waiting or running:
-            while waiting and len(running) < min(jobs, MOST_AT_ONCE):
-                unit, attempt = waiting.popleft()
-                running[remote.remote(work, unit, versions)] = unit, attempt
-            for reference in ray.wait(list(running), num_returns=1)[0]:
-                unit, attempt = running.pop(reference)
-                answer, reason = _answer(ray, reference)
-                if reason is None:
-                    yield unwrap(answer)
-                elif attempt <= config.retries:
-                    waiting.appendleft((unit, attempt + 1))
-                else:
-                    yield lost(unit, f"{reason}, {attempt} times; see the cluster's logs, or raise --retries")
+    remote = ray.remote(num_cpus=1, num_gpus=config.gpus_per_job, max_retries=0, max_calls=1)(_on_node)
+    versions = _versions()
+    waiting = deque((unit, 1) for unit in units)
+    running: dict[Any, tuple[Unit, int]] = {}
+    while waiting or running:
+        while waiting and len(running) < min(jobs, MOST_AT_ONCE):
+            unit, attempt = waiting.popleft()
+            running[remote.remote(work, unit, versions)] = unit, attempt
+        for reference in ray.wait(list(running), num_returns=1)[0]:
+            unit, attempt = running.pop(reference)
+            answer, reason = _answer(ray, reference)
+            if reason is None:
+                yield unwrap(answer)
+            elif attempt <= config.retries:
+                waiting.appendleft((unit, attempt + 1))
+            else:
+                yield lost(unit, f"{reason}, {attempt} times; see the cluster's logs, or raise --retries")
 
 
 def _answer(ray: Any, reference: Any) -> tuple[Any, str | None]:
@@ -96,8 +98,11 @@ def _versions() -> dict[str, str]:
 
 
 @contextmanager
-def _connected(config: RunConfig) -> Iterator[Any]:
-    """The module ``ray``, connected to the cluster that ``config`` names, which has a machine for each job."""
+def connected(config: RunConfig) -> Iterator[Any]:
+    """The module ``ray``, connected to the cluster that ``config`` names, which has a machine for each job.
+
+    The address ``local`` starts a cluster of this machine alone, for the time of the block.
+    """
     try:
         import ray
     except ImportError as error:
@@ -105,7 +110,7 @@ def _connected(config: RunConfig) -> Iterator[Any]:
     was_connected = ray.is_initialized()
     if not was_connected:
         _refuse_silent(config.ray_address)
-        _connect(ray, config.ray_address or "auto")
+        _connect(ray, config.ray_address)
     try:
         _refuse_too_many_gpus(ray, config.gpus_per_job)
         yield ray
@@ -117,8 +122,15 @@ def _connected(config: RunConfig) -> Iterator[Any]:
 def _connect(ray: Any, address: str) -> None:
     try:
         with kept_handlers():  # Ray's own would end the process as if a check had failed
-            ray.init(address=address, log_to_driver=False, logging_level="error")
+            ray.init(address=address or "auto", log_to_driver=False, logging_level="error")
     except (ConnectionError, RuntimeError, ValueError, OSError, TimeoutError) as error:
+        if not address and isinstance(error, ConnectionError):
+            named = os.environ.get("RAY_ADDRESS")
+            where = f"at RAY_ADDRESS={named}" if named else "on this machine"
+            raise ConfigError(
+                f"no Ray cluster runs {where}; add --ray-address local to start one here for this run, or name another "
+                "with --ray-address HOST:PORT"
+            ) from error
         line = " ".join(str(error).split())[:300]
         raise ConfigError(
             f"no Ray cluster at '{address}' takes this run: {line}; start one with ray start --head, or name another "

@@ -110,8 +110,10 @@ def _bare(value: Any) -> str:
     return value if isinstance(value, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]*", value) else toml_value(value)
 
 
-def write_rows(folder: Path, rows: Sequence[SweepRow]) -> None:
-    """Leave the rows beside the run's metrics, for whoever makes a table of them."""
+def write_rows(folder: Path, rows: Sequence[SweepRow], *, joins: bool = False) -> None:
+    """Leave the rows beside the run's metrics, for whoever makes a table of them; behind those there if it ``joins``."""
+    before = read_rows(folder) if joins and (folder / FILE).is_file() else ()
+    rows = list(dict.fromkeys([*before, *rows]))
     write_json(folder / FILE, {"rows": [asdict(row) for row in rows]})
 
 

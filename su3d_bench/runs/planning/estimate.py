@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import glob
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.runs.job import Part, SceneJob, build_dataset, build_method, stride_of
+from su3d_bench.runs.planning.held import kept_jobs
 from su3d_bench.runs.planning.plan import Plan
 from su3d_bench.store.records import read_updates
 
@@ -39,17 +41,23 @@ def estimate(plan: Plan) -> list[JobEstimate]:
     roots = {job.dataset: job.data_root for job in plan.jobs}
     datasets = {part: build_dataset(part, root) for part, root in roots.items()}
     needs_frames = {part: bool(build_method(part).needs.frames) for part in plan.jobs[0].methods}
+    kept = kept_jobs(plan.folder, plan.jobs) if plan.into == "replace" else None
     return [
-        _of_job(plan, job, part, update_s[part.name], datasets[job.dataset] if needs_frames[part] else None)
+        _of_job(plan, job, part, update_s[part.name], datasets[job.dataset] if needs_frames[part] else None, kept)
         for job in plan.jobs
         for part in job.methods
     ]
 
 
-def _of_job(plan: Plan, job: SceneJob, part: Part, measured: float | None, dataset: Any) -> JobEstimate:
-    """``measured``: seconds an update; ``dataset`` None where the method looks at no frame."""
+def _of_job(
+    plan: Plan, job: SceneJob, part: Part, measured: float | None, dataset: Any, kept: Collection[Path] | None
+) -> JobEstimate:
+    """``measured``: seconds an update; ``dataset`` None where the method looks at no frame.
+
+    ``kept``: the folders of jobs that stay where the plan replaces a run.
+    """
     folder = plan.folder.job(job.scene, part.name)
-    is_done = {"predict", "score"} <= set(folder.seals())
+    is_done = {"predict", "score"} <= set(folder.seals()) and (kept is None or folder.path in kept)
     n_updates, remark = 0, None
     if dataset is not None:
         try:

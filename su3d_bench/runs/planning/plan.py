@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -13,6 +14,7 @@ from typing import Any
 from su3d_bench.core import registry
 from su3d_bench.core.config import (
     MOVES_NO_NUMBER,
+    KeyPath,
     RunConfig,
     Setting,
     Settings,
@@ -25,7 +27,7 @@ from su3d_bench.core.config import (
 )
 from su3d_bench.core.devices import device_for
 from su3d_bench.core.digests import code_digest, digest_json
-from su3d_bench.core.errors import ConfigError, StoreError, printable, suggest
+from su3d_bench.core.errors import ConfigError, StoreError, counted, printable, some, suggest
 from su3d_bench.core.interfaces import HasPresets, IsSystem
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
@@ -44,12 +46,23 @@ from su3d_bench.runs.job import (
     part_of,
     refuse_other_run,
 )
+from su3d_bench.runs.planning.held import (
+    HeldRun,
+    Into,
+    Request,
+    extended,
+    held_run,
+    refuse_other_request,
+    remembered,
+    replaced_jobs,
+)
 from su3d_bench.runs.planning.scenes import cache_root, data_root, dataset_targets, expand_scenes
 from su3d_bench.runs.remote.data import DataPlace, RemoteData, data_place
 from su3d_bench.runs.remote.folder import is_url
-from su3d_bench.runs.remote.scene import fetch_seals, mirror_of
-from su3d_bench.store.run_folder import RunFolder
+from su3d_bench.runs.remote.scene import fetch_state, mirror_of
+from su3d_bench.store.run_folder import RunFolder, scene_of_folder
 
+MOST_NAMED = 4  # scenes and methods whose maps go
 MOST_CHARACTERS = 120  # the name is a folder's name too
 _COMMA_OUTSIDE_BRACKETS = re.compile(r",(?![^\[]*\])")
 
@@ -112,7 +125,8 @@ def _assigned(text: str, variant: str) -> Mapping[str, Any]:
 class Plan:
     """What a run will do: one job a scene; ``notes`` are remarks for whoever asked.
 
-    ``store``: URL of the run folder where it is in a store; ``folder`` then holds its small files.
+    ``store``: URL of the run folder where it is in a store; ``folder`` then holds its small files. ``held``: the run
+    that the folder held when the plan was made, which this one resumes, or does ``into``.
     """
 
     config: RunConfig
@@ -123,6 +137,30 @@ class Plan:
     notes: tuple[str, ...]
     store: str | None = None
     data: RemoteData | None = None
+    held: HeldRun | None = None
+    into: Into = "own"
+
+    @property
+    def values(self) -> list[tuple[KeyPath, Any]]:
+        """Every resolved value with its path, parts in the order of the run."""
+        leaves = flatten(self.config.model_dump(mode="json"))
+        job_of_dataset = {job.dataset.name: job for job in self.jobs}
+        sections: list[tuple[KeyPath, str]] = [(("method", part.name), part.options) for part in self.jobs[0].methods]
+        sections += [(("dataset", name), job.dataset.options) for name, job in job_of_dataset.items()]
+        sections.append((("perception",), self.jobs[0].perception))
+        for prefix, options in sections:
+            leaves += [((*prefix, *path), value) for path, value in flatten(json.loads(options))]
+        return leaves
+
+    @property
+    def protocols(self) -> tuple[str, ...]:
+        """Names of the protocols that score some scene."""
+        names = dict.fromkeys(name for job in self.jobs for name in job.protocols)
+        return tuple(dict.fromkeys(load_protocol(name).name for name in names))
+
+    @property
+    def request(self) -> Request:
+        return Request(tuple(job.scene for job in self.jobs), self.methods, self.protocols, dict(self.values))
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -134,14 +172,23 @@ class Plan:
         return self.config.limit > 0
 
 
-def make_plan(settings: Settings, assignments: Sequence[str] = (), out: Path | str | None = None) -> Plan:
+def make_plan(
+    settings: Settings, assignments: Sequence[str] = (), out: Path | str | None = None, *, into: Into = "own"
+) -> Plan:
     """The plan of what was asked for; everything wrong with the request itself is found here, before any work.
 
     ``assignments`` are ``KEY=VALUE`` texts as ``read_assignments`` takes them. ``out`` None: a folder below ``runs/``
     named after datasets, profile and a key of the request, so that the same command resumes its own run; a text: the
-    URL of a store.
+    URL of a store. A folder that holds a run of another request is refused, or extended or replaced where ``into`` says
+    so.
     """
+    store = out if isinstance(out, str) else None
+    held = None if out is None else _held(out, into)
+    if into != "own" and out is None:
+        raise ConfigError(f"--{into}: say which run with --out, such as --out runs/demo")
     check_keys(settings)
+    if into == "extend":
+        settings = extended(settings, held, str(out))
     config = resolve(settings, (), RunConfig)
     check_execution(config)
     if config.profile not in PROFILES:
@@ -170,8 +217,8 @@ def make_plan(settings: Settings, assignments: Sequence[str] = (), out: Path | s
         raise ConfigError(
             "--solver llm: answers the questions of reasoning protocols; add such as --protocols rooms-reasoning"
         )
-    store = out if isinstance(out, str) else None
     folder = _folder(out, config, parts)
+    held = held_run(folder) if out is None else held
     if store is None:
         RunFolder(folder).refuse_other_content()
     named = os.environ.get("SU3D_DATA") or ""
@@ -179,20 +226,39 @@ def make_plan(settings: Settings, assignments: Sequence[str] = (), out: Path | s
         chosen, notes = expand_scenes(config.scenes, parts.datasets, place.root)
         data = place.needed({parts.datasets[target] for target, _ in chosen})
     jobs = tuple(
-        replace(_scene_job(config, parts, folder, place.root, target, scene), index=index)
+        replace(_scene_job(config, parts, folder, place.root, target, scene), index=index, replaces=into == "replace")
         for index, (target, scene) in enumerate(chosen)
     )
     n_here = len(jobs) if config.executor in ELSEWHERE else os.cpu_count() or 1
     n_workers = min(config.jobs or n_here, len(jobs))
     notes += tuple(_notes_on_protocols(parts.protocols, config.protocols))
-    plan = Plan(config, settings, RunFolder(folder), jobs, n_workers, notes, store, data)
-    if store is not None:
-        fetch_seals(store, folder)
+    plan = Plan(config, settings, RunFolder(folder), jobs, n_workers, notes, store, data, held, into)
     try:
+        if held is not None:
+            refuse_other_request(held, plan.request, into, str(store or folder))
+            plan = replace(plan, settings=remembered(settings, held) if into == "extend" else settings)
         _refuse_other_runs(plan)
+        return replace(plan, notes=(*notes, *_what_goes(plan))) if into == "replace" else plan
     except StoreError as error:
         raise StoreError(str(error).replace(str(folder), str(store or folder))) from error
-    return plan
+
+
+def _held(out: Path | str, into: Into) -> HeldRun | None:
+    if isinstance(out, Path):
+        return held_run(out, into=into)
+    mirror = mirror_of(out, cache_root())
+    fetch_state(out, mirror)
+    return held_run(mirror, into=into)
+
+
+def _what_goes(plan: Plan) -> list[str]:
+    going = [job.path.parts[-2:] for job in replaced_jobs(plan.folder, plan.jobs)]
+    if not going:
+        return []
+    scenes, methods = (list(dict.fromkeys(names)) for names in zip(*going, strict=True))
+    which = f"{some([scene_of_folder(name) for name in scenes], MOST_NAMED)} by {some(methods, MOST_NAMED)}"
+    n_all = len(plan.folder.jobs())
+    return [f"--replace: {len(going)} of the {counted(n_all, 'map')} in {plan.store or plan.folder.path} go: {which}"]
 
 
 def _check_one_a_name(flag: str, named: Iterable[tuple[str, Any]]) -> None:
@@ -346,4 +412,6 @@ def _refuse_other_runs(plan: Plan) -> None:
                 keys[job.dataset, part] = config_key(job, part, build_method(part))
             folder = plan.folder.job(job.scene, part.name)
             folder.refuse_links()
+            if plan.into == "replace":
+                continue
             refuse_other_run(folder, keys[job.dataset, part], FIELDS_KNOWN_LATER)

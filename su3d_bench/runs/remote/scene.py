@@ -7,7 +7,8 @@ after them: a job that was sent in part has no seal, or one that its files do no
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,7 +20,7 @@ from su3d_bench.runs.job import MethodOutcome, SceneJob
 from su3d_bench.runs.remote.folder import RemoteFolder
 from su3d_bench.runs.scene import failed_outcomes, run_scene
 from su3d_bench.store.atomic import make_folder, write_bytes
-from su3d_bench.store.run_folder import RECORDS, RunFolder
+from su3d_bench.store.run_folder import JOBS, RECORDS, RunFolder
 from su3d_bench.store.scratch import TemporaryFolder
 from su3d_bench.store.unfinished import is_unfinished
 
@@ -105,14 +106,23 @@ def mirror_of(url: str, cache_root: Path) -> Path:
     return cache_root / "runs" / f"{url.rstrip('/').rpartition('/')[2]}-{digest_bytes(url.rstrip('/').encode())[:8]}"
 
 
-def fetch_seals(url: str, mirror: Path) -> None:
-    """Make ``mirror`` hold the seals of the store and no others, so that a plan meets what was sealed there."""
+def fetch_state(url: str, mirror: Path) -> None:
+    """Make ``mirror`` hold the records and seals of the store and no others, so that a plan meets what is there."""
+    store = RemoteFolder(url)
+    names = [name for name in store.files() if name in RECORDS or re.fullmatch(rf"{JOBS}/[^/]+/[^/]+/{SEAL}", name)]
+    if not names and not mirror.exists():
+        return
     with RunFolder(mirror).locked():
-        store = RemoteFolder(url)
-        seals = [name for name in store.files("scenes") if name.endswith(f"/{SEAL}")]
-        for path in mirror.glob(f"scenes/*/*/{SEAL}"):
-            path.unlink()
-        _write(mirror, store, seals)
+        for path in (*mirror.glob(f"{JOBS}/*/*/{SEAL}"), *(mirror / name for name in RECORDS)):
+            path.unlink(missing_ok=True)
+        _write(mirror, store, names)
+
+
+def remove_jobs(url: str, mirror: Path, kept: Collection[Path]) -> None:
+    """Remove from the store all jobs but those whose folders in ``mirror`` are ``kept``, first their seals."""
+    store = RemoteFolder(url)
+    going = [name for name in store.files(JOBS) if mirror.joinpath(*Path(name).parts[:3]) not in kept]
+    store.remove(sorted(going, key=lambda name: (not name.endswith(f"/{SEAL}"), name)))
 
 
 def fetch_results(url: str, mirror: Path) -> None:

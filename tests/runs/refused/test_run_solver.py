@@ -100,7 +100,7 @@ def test_another_solver_scores_the_same_map_again(folder: Path, server: ChatServ
     seal = folder.joinpath("run").rglob("prediction.npz")
     made = {path: path.stat().st_mtime_ns for path in seal}
     server.answer = lambda body: Answered('{"answer": "I cannot determine this", "object_ids": []}')
-    assert main(llm(server)) == 0
+    assert main(llm(server, "--replace")) == 0
     assert result(folder / "run")["metrics"]["answer"] == 0.0
     assert "painted/a: questions that the solver could not settle count as wrong" in result(folder / "run")["warnings"]
     assert {path: path.stat().st_mtime_ns for path in made} == made

@@ -97,8 +97,34 @@ def test_another_run_in_the_store_is_refused_by_name(store: Any, capsys: pytest.
     assert run(*TWO, out=URL) == 0
     capsys.readouterr()
     assert run(*TWO, "--seed", "5", out=URL) == 2
-    line = f"su3d-bench: {URL}/scenes/painted.a/collector: holds another run (seed was 0, now 5); choose another folder"
+    line = f"su3d-bench: {URL}: holds another run (seed was 0, now 5); --replace puts this one in its place"
     assert capsys.readouterr().err.startswith(line)
+
+
+def test_a_run_in_a_store_is_extended_and_replaced_from_any_machine(
+    store: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(*TWO, out="local") == 0
+    assert run("--scenes", f"{PAINTED}/a", "--jobs", "1", out=URL) == 0
+    before = brought(URL, tmp_path / "before")
+    for mirror in (tmp_path / "cache" / "runs").iterdir():
+        shutil.rmtree(mirror)  # as on a machine that never saw the run
+    capsys.readouterr()
+    assert run("--scenes", f"{PAINTED}/d", "--jobs", "1", out=URL) == 2
+    assert "(scene painted/a is not asked for now, scene painted/d is new); --extend adds" in capsys.readouterr().err
+    assert_equal_files(before, brought(URL, tmp_path / "refused"))
+    assert main(["run", f"{PAINTED}/d", "--extend", "--jobs", "1", "--quiet", "--out", URL]) == 0
+    assert_equal_runs("local", brought(URL, tmp_path / "extended"))
+    assert run("--scenes", f"{PAINTED}/d", "--jobs", "1", "--replace", out=URL) == 0
+    left = brought(URL, tmp_path / "replaced")
+    assert [path.name for path in (left / "scenes").iterdir()] == ["painted.d"]
+
+
+def assert_equal_files(one: Path, other: Path) -> None:
+    first, second = (
+        {path.relative_to(at): path.read_bytes() for path in at.rglob("*") if path.is_file()} for at in (one, other)
+    )
+    assert first == second
 
 
 def test_workers_of_their_own_reach_a_store_too(tmp_path: Path) -> None:
