@@ -91,7 +91,7 @@ def leaderboard(folder: Path, protocols: Sequence[str] = (), *, with_ranks: bool
     """
     entries: list[Entry] = []
     refused: list[Refused] = []
-    for path in _runs_below(folder):
+    for path in runs_below(folder):
         name = printable(path.relative_to(folder).as_posix(), 200)
         try:
             run = read_run(path)
@@ -113,7 +113,8 @@ def leaderboard(folder: Path, protocols: Sequence[str] = (), *, with_ranks: bool
     return Leaderboard(tuple(boards), tuple(refused))
 
 
-def _runs_below(folder: Path) -> Iterator[Path]:
+def runs_below(folder: Path) -> Iterator[Path]:
+    """The folders of runs below ``folder``, in the order of their names; links are not followed."""
     if not folder.is_dir():
         raise ConfigError(f"{printable(str(folder), 200)}: is no folder; name one that holds runs")
     n_runs = 0

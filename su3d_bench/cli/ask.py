@@ -16,6 +16,7 @@ from su3d_bench.cli.common import (
     answer_json,
     answer_nothing_to_pay,
     chat_client,
+    check_scene_first,
     file_name_of,
     remark,
     remark_unseen,
@@ -78,6 +79,7 @@ def call(arguments: argparse.Namespace) -> int:
         raise ConfigError(
             'the question is empty; ask such as: su3d-bench ask rooms/living0 "How many lamps are there?"'
         )
+    check_scene_first("ask", arguments.scene, arguments.question)
     run, job, instances = map_of_scene(arguments.scene, arguments.method, arguments.run)
     if not isinstance(instances, Instances):
         raise PredictionError(f"{job.prediction}: holds no instances, so there is nothing to ask about")

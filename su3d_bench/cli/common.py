@@ -102,6 +102,18 @@ def add_whose_map(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--method", default="opensu3d", help="whose map (default: opensu3d)")
 
 
+def check_scene_first(verb: str, scene: str, text: str) -> None:
+    """A ``ConfigError`` where what stands in the scene's place of ``verb`` is none, and what stands behind it is."""
+    import shlex
+
+    from su3d_bench.core.errors import ConfigError
+    from su3d_bench.runs.planning.scenes import looks_like_scene
+
+    if not looks_like_scene(scene) and looks_like_scene(text):
+        command = shlex.join(["su3d-bench", verb, text, scene])
+        raise ConfigError(f"'{scene}' is no scene: the scene comes first, then the text; {command}")
+
+
 def add_table_format(parser: argparse.ArgumentParser, flag: str = "--format") -> None:
     """The form in which a verb gives its tables; the flag has another name where ``--format`` means the input's."""
     parser.add_argument(

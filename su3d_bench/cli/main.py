@@ -34,6 +34,7 @@ VERBS = (
     "plan",
     "attribute",
     "report",
+    "runs",
     "sheets",
     "query",
     "questions",

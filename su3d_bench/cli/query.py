@@ -7,7 +7,16 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, add_whose_map, answer, answer_json, file_name_of, remark, remark_unseen
+from su3d_bench.cli.common import (
+    add_verb,
+    add_whose_map,
+    answer,
+    answer_json,
+    check_scene_first,
+    file_name_of,
+    remark,
+    remark_unseen,
+)
 from su3d_bench.core.errors import ConfigError, PredictionError
 
 if TYPE_CHECKING:
@@ -43,6 +52,7 @@ def call(arguments: argparse.Namespace) -> int:
         raise ConfigError('the text is empty; say what to look for, such as: su3d-bench query rooms/living0 "a plant"')
     if arguments.top < 1:
         raise ConfigError(f"--top {arguments.top}: at least 1 instance must be listed")
+    check_scene_first("query", arguments.scene, arguments.text)
     run, job, prediction = map_of_scene(arguments.scene, arguments.method, arguments.run)
     if not isinstance(prediction, Instances):
         what = "one feature a point and no instances" if isinstance(prediction, DenseFeatures) else "no instances"

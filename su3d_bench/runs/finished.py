@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 from su3d_bench.core.config import KeyPath, Settings, flatten, read_file, resolve, toml_value
-from su3d_bench.core.errors import ConfigError, DataError, PredictionError, StoreError, printable, suggest
+from su3d_bench.core.errors import ConfigError, DataError, PredictionError, StoreError, printable, shown, some, suggest
 from su3d_bench.core.files import file_bytes
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.types import Prediction
@@ -24,7 +25,13 @@ from su3d_bench.metrics.protocols.loading import load_protocol, read_rules
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import SceneScore, unpack_scores
 from su3d_bench.runs.job import build_dataset, part_of
-from su3d_bench.runs.planning.scenes import cache_root, data_root, dataset_targets
+from su3d_bench.runs.planning.scenes import (
+    cache_root,
+    data_root,
+    dataset_targets,
+    looks_like_scene,
+    nearest_scene,
+)
 from su3d_bench.store.atomic import is_file
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.records import (
@@ -44,6 +51,9 @@ if TYPE_CHECKING:
     import pandas
 
     from su3d_bench.core.interfaces import Encoder
+
+
+MOST_NAMED = 8  # scenes or methods of a run in a message
 
 
 class OtherDataError(DataError):
@@ -272,23 +282,37 @@ def latest_run(scene: str, method: str) -> RunFolder:
     runs = [RunFolder(path) for path in Path("runs").glob("*") if path.is_dir()]
     made = [(run.job(scene, method).prediction, run) for run in runs if run.job(scene, method).prediction.is_file()]
     if not made:
-        raise StoreError(
-            f"no run in runs/ holds {scene} by {method}; run: su3d-bench run --scenes {scene} --methods {method}"
-        )
+        records = [_request_of(run) for run in runs]
+        known = dict.fromkeys(name for record in records for name in record.scenes)
+        hint = nearest_scene(scene, known)
+        if not hint and looks_like_scene(scene):
+            command = shlex.join(["su3d-bench", "run", scene, "--methods", method])
+            hint = f"; make one: {printable(command, 300)}"
+        raise StoreError(f"no run in runs/ holds {printable(scene, 120)} by {printable(method, 80)}{hint}")
     return max(made, key=lambda pair: pair[0].stat().st_mtime)[1]
 
 
 def _no_map(run: RunFolder, scene: str, method: str) -> StoreError:
-    """The error of a run without such a map: the names that it has instead, else the command that would make it."""
-    record = RequestRecord()
+    """The error of a run without such a map: the names that it has instead. No command is named that would write into
+    the folder: it belongs to another request."""
+    record = _request_of(run)
+    if not record.scenes:
+        return StoreError(f"{shown(run.path)}: holds no run; name the folder of one: su3d-bench runs list")
+    if scene not in record.scenes:
+        known = [printable(name, 80) for name in record.scenes]
+        hint = nearest_scene(scene, record.scenes) or f"; the run has {some(known, MOST_NAMED)}"
+    elif method not in record.methods:
+        hint = suggest(method, record.methods, "the run has")
+    else:
+        hint = ", for the run is not finished; give its command again"
+    return StoreError(f"{shown(run.path)}: holds no map of {printable(scene, 120)} by {printable(method, 80)}{hint}")
+
+
+def _request_of(run: RunFolder) -> RequestRecord:
+    """What the run was asked for; nothing where its record is missing or damaged."""
     with suppress(StoreError):
-        record = read_record(RequestRecord, run.path / "run.json", str(run.path))
-    scenes, methods = record.scenes, record.methods
-    hint = suggest(scene, scenes, "it has") if scene not in scenes else ""
-    if scene in scenes and method not in methods:
-        hint = suggest(method, methods, "it has")
-    hint = hint or f"; run: su3d-bench run --scenes {scene} --methods {method} --out {run.path}"
-    return StoreError(f"{run.path}: holds no map of {scene} by {method}{hint}")
+        return read_record(RequestRecord, run.path / "run.json", shown(run.path))
+    return RequestRecord()
 
 
 def data_of_map(run: Path, scene: str, map_file: Path) -> RunData:

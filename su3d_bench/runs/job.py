@@ -19,7 +19,6 @@ from su3d_bench.perception.profiles import Perception, PerceptionConfig
 from su3d_bench.questions.reasoning.language_solver import answers_digest
 from su3d_bench.questions.refined_names import refined_digest
 from su3d_bench.runs.own.watch import checked_dataset, checked_method, made, settings_model, told
-from su3d_bench.runs.plug_ins import checked_dataset, checked_method
 from su3d_bench.store.records import SealRecord
 from su3d_bench.store.run_folder import JobFolder
 
@@ -42,8 +41,8 @@ class Part:
 class SceneJob:
     """Everything that a worker needs to know of one scene; ``index`` counts the scenes of the run.
 
-    ``replaces``: a map that was made from other inputs is made anew, where it would be refused. ``doubts``: what must be
-    said of its poses, None where whoever made the job could not look at its data.
+    ``replaces``: a map that was made from other inputs is made anew instead of refused. ``doubts``: what must be said
+    of its poses, None where whoever made the job could not look at its data.
     """
 
     scene: str

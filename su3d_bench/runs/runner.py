@@ -235,8 +235,8 @@ def _remarks(
 
 def _execute(plan: Plan, report: Report, through: Any) -> tuple[MethodOutcome, ...]:
     """``through``: what the executor works through, as ``reached`` gave it."""
-    how = {"config": plan.config, "n_workers": plan.n_workers, "folder": plan.folder.path, "through": through}
-    start = partial(run_units, report=report, **how)
+    config, folder = plan.config, plan.folder.path
+    start = partial(run_units, report=report, config=config, n_workers=plan.n_workers, folder=folder, through=through)
     by_scene: dict[str, tuple[MethodOutcome, ...]] = {}
 
     def note(outcomes: tuple[MethodOutcome, ...]) -> None:

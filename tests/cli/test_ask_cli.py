@@ -193,10 +193,10 @@ def test_prices_and_budget_come_from_a_file(
     [
         (["ask", SCENE, " "], "the question is empty"),
         (["ask", "rooms/none", "x"], "no run in runs/ holds rooms/none by opensu3d"),
-        (["ask", SCENE, "x", "--run", "runs/none"], "runs/none: holds no map of rooms/made by opensu3d; run: su3d-be"),
+        (["ask", SCENE, "x", "--run", "runs/none"], "runs/none: holds no run; name the folder of one: su3d-bench run"),
         (["ask", "rooms/mode", "x", "--run", "runs/made"], "of rooms/mode by opensu3d; did you mean 'rooms/made'?"),
         (["query", SCENE, "x", "--run", "runs/made", "--method", "opensud"], "by opensud; did you mean 'opensu3d'?"),
-        (["query", SCENE, "x", "--run", "runs/made", "--method", "sam3d"], "by sam3d; it has opensu3d"),
+        (["query", SCENE, "x", "--run", "runs/made", "--method", "sam3d"], "by sam3d; the run has opensu3d"),
         (["ask", SCENE, "x", "--names", "refined"], "has no labels n'; make them with su3d-bench refine"),
         (["ask", SCENE, "x", "--solver", "lm"], "unknown --solver 'lm'; did you mean 'llm'?"),
         (["ask", SCENE, "x", "--eye", "nan", "0", "0"], "expected three finite numbers of metres"),

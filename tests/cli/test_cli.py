@@ -190,14 +190,24 @@ def test_a_protocol_shows_every_rule(capsys: pytest.CaptureFixture[str]) -> None
         (["methods", "orcle"], "unknown method 'orcle'; did you mean 'oracle'?"),
         (
             ["query", f"{PAINTED}/a", "x"],
-            f"no run in runs/ holds {PAINTED}/a by opensu3d; run: su3d-bench run --scenes",
+            f"no run in runs/ holds {PAINTED}/a by opensu3d; make one: su3d-bench run {PAINTED}/a --methods opensu3d",
         ),
         (["query", "rooms/living0", "  "], "the text is empty; say what to look for"),
         (["query", "rooms/living0", "x", "--top", "0"], "--top 0: at least 1 instance must be listed"),
         (
             ["query", "rooms/living0", "x", "--run", "r"],
-            "r: holds no map of rooms/living0 by opensu3d; run: su3d-bench",
+            "r: holds no run; name the folder of one: su3d-bench runs list",
         ),
+        (["query", "a plant", "rooms/living0"], "'a plant' is no scene: the scene comes first, then the text; su3d-"),
+        (["ask", "A plant?", "rooms/living0"], "'A plant?' is no scene: the scene comes first, then the text; su3d-"),
+        (["run", "living0"], "no scene matches 'living0'; did you mean 'rooms/living0'?"),
+        (["run", "--scenes", "livng0"], "no scene matches 'livng0'; did you mean 'rooms/living0'?"),
+        (["ablate", "livi*", "--vary", "m=1"], "no scene matches 'livi*'; did you mean 'rooms/livi*'?"),
+        (["run", "rooms"], "'rooms' is a dataset; name its scenes, such as 'rooms/*'"),
+        (["run", "--methods", "oracle", "rooms/living0"], "--methods rooms/living0: is a scene; write it before the"),
+        (["run", "--extend"], "--extend: say which run with --out, such as --out runs/demo"),
+        (["run", "--replace"], "--replace: say which run with --out, such as --out runs/demo"),
+        ([*RUN, "--extend", "--out", "none"], "--extend: none holds no run.toml of a run; leave --extend out to begin"),
     ],
 )
 def test_wrong_input_is_one_line_and_exit_code_2(

@@ -96,6 +96,11 @@ def slurm_executor(folder: Path, given: Mapping[str, Any], n_gpus: int, jobs: in
     cluster = parameters.pop("cluster", CLUSTERS[0])
     if cluster not in CLUSTERS:
         raise ConfigError(f"--slurm cluster={cluster}: expected {' or '.join(CLUSTERS)}")
+    if cluster == CLUSTERS[0] and shutil.which("srun") is None:
+        raise ConfigError(
+            "no Slurm cluster is here: there is no srun; give the command where there is, or add --slurm cluster=local "
+            "to try it on this machine"
+        )
     if n_gpus:
         parameters["gpus_per_node"] = n_gpus
     try:

@@ -111,7 +111,7 @@ def _bare(value: Any) -> str:
 
 
 def write_rows(folder: Path, rows: Sequence[SweepRow], *, joins: bool = False) -> None:
-    """Leave the rows beside the run's metrics, for whoever makes a table of them; behind those there if it ``joins``."""
+    """Leave the rows beside the run's metrics, for whoever makes a table of them; ``joins``: behind those there."""
     before = read_rows(folder) if joins and (folder / FILE).is_file() else ()
     rows = list(dict.fromkeys([*before, *rows]))
     write_json(folder / FILE, {"rows": [asdict(row) for row in rows]})

@@ -196,7 +196,7 @@ def _is_same(path: KeyPath, before: Any, after: Any, held: HeldRun) -> bool:
     if path == ("profile",) and "auto" in (before, after):  # which came out as the one that is named
         came_out = None if held.record is None else held.record.profile
         return before == after or came_out in (before, after)
-    return _plain(before) == _plain(after)
+    return bool(_plain(before) == _plain(after))
 
 
 def _plain(value: Any) -> Any:

@@ -56,7 +56,13 @@ from su3d_bench.runs.planning.held import (
     remembered,
     replaced_jobs,
 )
-from su3d_bench.runs.planning.scenes import cache_root, data_root, dataset_targets, expand_scenes
+from su3d_bench.runs.planning.scenes import (
+    cache_root,
+    data_root,
+    dataset_targets,
+    expand_scenes,
+    looks_like_scene,
+)
 from su3d_bench.runs.remote.data import DataPlace, RemoteData, data_place
 from su3d_bench.runs.remote.folder import is_url
 from su3d_bench.runs.remote.scene import fetch_state, mirror_of
@@ -317,6 +323,9 @@ def _all_systems() -> list[str]:
 def _method_targets(methods: Sequence[str]) -> list[str]:
     named = [name for method in methods for name in (_all_systems() if method == "all" else [method])]
     targets = list(dict.fromkeys(named))
+    for target in targets:
+        if target not in registry.names("method") and looks_like_scene(target):
+            raise ConfigError(f"--methods {target}: is a scene; write it before the flags, or behind --scenes")
     if not targets:
         raise ConfigError("no method was named; known: " + ", ".join(registry.names("method")))
     return targets

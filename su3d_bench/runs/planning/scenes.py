@@ -5,14 +5,16 @@ from __future__ import annotations
 import difflib
 import fnmatch
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from su3d_bench.core import registry
-from su3d_bench.core.errors import ConfigError, DataError, suggest
+from su3d_bench.core.config import Settings
+from su3d_bench.core.errors import ConfigError, DataError, Su3dError, printable, suggest
 from su3d_bench.core.interfaces import Dataset, HasGroups
-from su3d_bench.runs.job import Part, build_dataset
+from su3d_bench.runs.job import Part, build_dataset, part_of
 from su3d_bench.runs.remote.folder import is_url
 from su3d_bench.runs.remote.scene import CACHE_ROOT
 
@@ -42,6 +44,34 @@ def split_address(address: str) -> tuple[str, str]:
     return target, scene
 
 
+def looks_like_scene(text: str) -> bool:
+    """Whether ``text`` has the form of a scene's address, ``<dataset>/<scene>``, whatever is there."""
+    target, scene = split_address(text)
+    return bool(scene) and (target in registry.names("dataset") or ".py:" in target)
+
+
+def nearest_scene(text: str, known: Iterable[str]) -> str:
+    """A clause for the address among ``known`` whose scene is called like ``text``, with or without its dataset.
+
+    Nothing where none is near; the name of the dataset, which many share, makes none near.
+
+    >>> nearest_scene("living0", ["rooms/living0"]), nearest_scene("rooms/livng0", ["rooms/living0"])
+    ("; did you mean 'rooms/living0'?", "; did you mean 'rooms/living0'?")
+    >>> nearest_scene("rooms/studio0", ["rooms/bedroom0"])
+    ''
+    """
+    of_name: dict[str, str] = {}
+    for address in known:
+        of_name.setdefault(split_address(address)[1], address)
+    target, name = split_address(text) if "/" in text else ("", text)
+    near = difflib.get_close_matches(name, of_name, n=1, cutoff=0.7)
+    if not near:
+        return ""
+    address = of_name[near[0]]
+    is_alike = not target or difflib.SequenceMatcher(None, target, split_address(address)[0]).ratio() >= 0.6
+    return f"; did you mean '{printable(address, 120)}'?" if is_alike else ""
+
+
 def dataset_targets(addresses: Sequence[str]) -> list[str]:
     """The datasets that ``addresses`` speak of, in order; addresses that are mere files are passed over."""
     targets: dict[str, None] = {}
@@ -52,9 +82,8 @@ def dataset_targets(addresses: Sequence[str]) -> list[str]:
         elif not os.path.exists(address):
             raise ConfigError(f"no scene matches '{address}'{_nearest_address(address)}")
     if not targets:
-        raise ConfigError(
-            f"no scene among {', '.join(addresses) or 'no --scenes'}; such as: rooms/living0 or 'rooms/*'"
-        )
+        hint = next(filter(None, map(_with_dataset, addresses)), "; such as: rooms/living0 or 'rooms/*'")
+        raise ConfigError(f"no scene among {', '.join(addresses) or 'no --scenes'}{hint}")
     return list(targets)
 
 
@@ -78,6 +107,8 @@ def expand_scenes(
         elif not scenes:
             assert dataset is not None
             known = [f"{target}/{scene}" for scene in (*dataset.scenes(), *_groups(dataset))]
+            if not pattern:
+                raise ConfigError(f"'{address}' is a dataset; name its scenes, such as '{target}/*'")
             raise ConfigError(f"no scene matches '{address}'{suggest(address, known) or _some(known)}")
         chosen.update(dict.fromkeys((target, scene) for scene in scenes))
     if not chosen:
@@ -122,9 +153,25 @@ def _some(known: Sequence[str]) -> str:
     return "; known: " + ", ".join(known[:8]) + (", ..." if len(known) > 8 else "") if known else ""
 
 
+def _with_dataset(name: str) -> str:
+    """A clause for the address of a scene, group or pattern that was named without its built-in dataset."""
+    if "/" in name or is_url(os.environ.get("SU3D_DATA") or ""):
+        return ""
+    known: list[str] = []
+    for target in registry.DATASETS:
+        with suppress(Su3dError):  # no data of it here
+            dataset = build_dataset(part_of("dataset", target, Settings()), data_root())
+            if _matching_scenes(dataset, name):
+                return f"; did you mean '{target}/{name}'?"
+            known += [f"{target}/{scene}" for scene in (*dataset.scenes(), *_groups(dataset))]
+    return nearest_scene(name, known)
+
+
 def _nearest_address(address: str) -> str:
     target, slash, pattern = address.partition("/")
     near = difflib.get_close_matches(target, registry.names("dataset"), n=1, cutoff=0.6)
+    if not slash and (hint := _with_dataset(address)):
+        return hint
     if not near:
         return "; known datasets: " + ", ".join(registry.names("dataset"))
     return f"; did you mean '{near[0]}{slash or '/'}{pattern or '*'}'?"

@@ -182,3 +182,35 @@ def test_an_option_that_means_nothing_is_one_line(
     error = capsys.readouterr().err
     assert error.startswith(f"su3d-bench: {line}")
     assert error.count("\n") == 1
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize(
+    ("executor", "line"),
+    [
+        ("ray", "no Ray cluster runs on this machine; add --ray-address local to start one here for this run, or"),
+        (
+            "slurm",
+            "no Slurm cluster is here: there is no srun; give the command where there is, or add --slurm cluster",
+        ),
+    ],
+)
+def test_a_cluster_that_is_not_there_is_one_line_that_leaves_nothing(
+    executor: str, line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setenv("RAY_TMPDIR", str(Path.cwd()))  # where Ray looks for clusters of this machine
+    monkeypatch.setenv("PATH", "/nowhere")
+    assert run("--executor", executor, out="new/out") == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"su3d-bench: {line}")
+    assert error.count("\n") == 1
+    assert not Path("new").exists()
+
+
+def test_a_cluster_of_this_machine_alone_is_started_for_the_run(tmp_path: Path) -> None:
+    scenes = ("--scenes", f"{PAINTED}/[ad]")
+    assert run(*scenes, "--jobs", "1", out="inline") == 0
+    command = [sys.executable, str(SCENES / "painted_cli.py"), *words(*scenes, "--executor", "ray", out="ray")]
+    subprocess.run([*command, "--ray-address", "local"], check=True, env={**os.environ, "RAY_USAGE_STATS_ENABLED": "0"})
+    assert_equal_runs("inline", "ray")
