@@ -46,7 +46,7 @@ from su3d_bench.runs.remote.scene import (
 )
 from su3d_bench.runs.resume import FinishedScenes
 from su3d_bench.runs.scene import failed_outcomes, run_scene
-from su3d_bench.store.atomic import is_file, json_text, remove_file, write_json, write_text
+from su3d_bench.store.atomic import is_file, read_json, remove_file, write_json, write_text
 from su3d_bench.store.records import (
     FailureRecord,
     GitRecord,
@@ -93,7 +93,7 @@ def run_plan(plan: Plan, report: Report) -> RunResult:
     if plan.data is None:  # else each worker looks at the data that it fetches
         plan = replace(plan, jobs=_judged(plan.jobs))
     place = plan.folder.path
-    with reached(plan.config, plan.n_workers, place) as through, plan.folder.locked(), _without_abandoned():
+    with reached(plan.config, plan.n_workers) as through, plan.folder.locked(), _without_abandoned():
         _refuse_what_came_meanwhile(plan)
         if plan.into == "replace":
             _remove_replaced(plan)
@@ -161,19 +161,26 @@ def _remove_replaced(plan: Plan) -> None:
         job.remove()
 
 
-def _is_unchanged(plan: Plan, outcomes: Sequence[MethodOutcome], metrics: Mapping[str, Any]) -> bool:
+def _is_unchanged(plan: Plan, outcomes: Sequence[MethodOutcome], metrics: Any) -> bool:
     """Whether all was done before, so that the records that stand there, with what they say of the machine that did
     the work, are those of this command too."""
     held = plan.held
-    return (
-        held is not None
-        and held.record is not None
-        and held.record.status == "complete"
-        and held.text is not None
-        and all(outcome.was_resumed for outcome in outcomes)
-        and not differences(held, plan.request)
-        and file_bytes(plan.folder.path / "metrics.json") == json_text(metrics).encode()
-    )
+    if held is None or held.record is None or held.record.status != "complete" or held.text is None:
+        return False
+    if differences(held, plan.request) or not all(outcome.was_resumed for outcome in outcomes):
+        return False
+    try:
+        before = read_json(plan.folder.path / "metrics.json")
+    except StoreError:  # damaged: it is written anew
+        return False
+    return bool(_without_order(before) == _without_order(metrics))
+
+
+def _without_order(value: Any) -> Any:
+    """A value of JSON with the items of its lists sorted: the order in which scenes were named is no difference."""
+    if isinstance(value, Mapping):
+        return {key: _without_order(item) for key, item in value.items()}
+    return sorted(map(_without_order, value), key=repr) if isinstance(value, list | tuple) else value
 
 
 @contextmanager

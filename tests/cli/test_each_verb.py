@@ -10,6 +10,7 @@ import pytest
 from fuzz_words import verbs
 
 from su3d_bench.cli.main import main
+from su3d_bench.core.digests import digest_file
 
 SCENE = "rooms/living0"
 FEW = ["--set", "rooms.n_frames=8"]
@@ -38,6 +39,9 @@ CASES: dict[str, tuple[list[str], int, str]] = {
     "report html": (["out", "--no-maps", "--out", "page.html"], 0, "page.html"),
     "report leaderboard": (["out", "--out", "board.md"], 0, "board.md"),
     "report verify": (["tables.tex"], 0, ""),
+    "runs list": (["."], 0, "opensu3d"),
+    "runs show": (["out"], 0, "take it up again: su3d-bench run --config out/run.toml --out out"),
+    "runs remove": (["sweep", "--yes"], 0, "removed sweep: complete"),
     "sheets make": (["out", "--kind", "retrieval", "--per-kind", "1", "--jobs", "1", "--out", "sheets"], 0, "sheets"),
     "sheets score": (["--key", "sheets-key", "--out", "scores"], 0, "scores/scores.json"),
     "sheets pictures": (["out", "--what", "labels", "--out", "labels.png"], 0, "labels.png"),
@@ -92,6 +96,7 @@ PLACES = {
     "datasets make": ("made",),
     "export": (".",),
 }
+FINISHED: dict[str, str] = {}  # the files of the run, by name, as the verb run left them
 LEFT_BY_A_KILLED_PROCESS = ".half.0123456789ab.unfinished"
 
 
@@ -126,3 +131,10 @@ def test_the_verb_does_its_work(verb: str, capsys: pytest.CaptureFixture[str]) -
     assert not answer.out.startswith(("{", "[")), "the answer in words stands beside the file"
     assert code == 2 or json.loads(json_file.read_text()) is not None
     assert not [path for path in half if path.exists()], "what a killed process left goes"
+    if verb == "run":
+        files = [path for path in Path("out").rglob("*") if path.is_file()]
+        FINISHED.update({path.as_posix(): digest_file(path) for path in files})
+    changed = [
+        name for name, digest in FINISHED.items() if not Path(name).is_file() or digest_file(Path(name)) != digest
+    ]
+    assert not changed, "a verb may add to a finished run what it is asked to, and changes nothing"

@@ -11,6 +11,7 @@ from su3d_bench.core.config import RunConfig, parse_value
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.runs.executors.local import Outcome, Report, Unit, Work, run_inline, run_processes
 from su3d_bench.store.run_folder import refuse_links
+from su3d_bench.store.scratch import TemporaryFolder
 
 # The options of executors on other machines; a value other than the default is refused elsewhere.
 USED_BY = {
@@ -60,11 +61,9 @@ def slurm_parameters(config: RunConfig) -> dict[str, Any]:
 
 
 @contextmanager
-def reached(config: RunConfig, n_workers: int, folder: Path) -> Iterator[Any]:
-    """What the executor of ``config`` works through, for ``run_units`` in the block; nothing is written for it.
-
-    A ``Su3dError`` where no cluster answers, before a run has left anything in ``folder``.
-    """
+def reached(config: RunConfig, n_workers: int) -> Iterator[Any]:
+    """What the executor of ``config`` works through, for ``run_units`` in the block; a ``Su3dError`` where no cluster
+    answers, before a run has left anything."""
     executor = executor_of(config, n_workers)
     if executor == "ray":
         from su3d_bench.runs.executors.ray import connected
@@ -74,9 +73,9 @@ def reached(config: RunConfig, n_workers: int, folder: Path) -> Iterator[Any]:
     elif executor == "slurm":
         from su3d_bench.runs.executors.slurm import slurm_executor
 
-        at = folder.absolute() / "slurm"
-        refuse_links(at.parent, at)
-        yield slurm_executor(at, slurm_parameters(config), int(config.gpus_per_job), n_workers)
+        with TemporaryFolder("su3d-slurm-") as scratch:  # submitit makes the folder when it only looks
+            slurm_executor(scratch, slurm_parameters(config), int(config.gpus_per_job), n_workers)
+        yield None
     else:
         yield None
 
@@ -105,5 +104,6 @@ def run_units(
         return run_ray(work, units, report, jobs=n_workers, config=config, ray=through, lost=lost)
     from su3d_bench.runs.executors.slurm import run_slurm
 
-    at = folder.absolute() / "slurm"
-    return run_slurm(work, units, report, jobs=n_workers, config=config, folder=at, executor=through, lost=lost)
+    at, parameters = folder.absolute() / "slurm", slurm_parameters(config)
+    refuse_links(at.parent, at)
+    return run_slurm(work, units, report, jobs=n_workers, config=config, folder=at, parameters=parameters, lost=lost)

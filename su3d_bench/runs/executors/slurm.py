@@ -21,7 +21,6 @@ CLUSTERS = ("slurm", "local")  # submitit takes this machine for a cluster in si
 DEFAULTS = {"timeout_min": 240}  # submitit's own limit is 5 minutes, less than a long scene takes
 MOST_AT_ONCE = 1000  # Slurm's MaxArraySize is 1001 where nobody set it
 POLL_S = 0.5
-SlurmExecutor = tuple[Any, tuple[type[Exception], ...]]
 
 
 def run_slurm(
@@ -32,24 +31,24 @@ def run_slurm(
     jobs: int,
     config: RunConfig,
     folder: Path,
-    executor: SlurmExecutor,
+    parameters: Mapping[str, Any],
     lost: Callable[[Unit, str], Outcome],
 ) -> Iterator[Outcome]:
     """Outcomes of ``units`` as they come in, at most ``jobs`` of them submitted at once, as job arrays.
 
-    ``executor`` is what ``slurm_executor`` gave for ``folder``, which is on a shared disk. A unit
+    ``parameters`` are those of submitit's ``AutoExecutor``, and ``cluster``; ``folder`` is on a shared disk. A unit
     whose job died ``config.retries`` + 1 times has the outcome that ``lost`` makes. A ``Su3dError`` that leaves
     ``work``, or an interrupt, stops all. ``report`` hears nothing from inside a unit.
     """
     n_at_once = min(jobs, MOST_AT_ONCE)
-    submitter, failures = executor
+    executor, failures = slurm_executor(folder, parameters, int(config.gpus_per_job), n_at_once)
     waiting = deque((unit, 1) for unit in units)
     running: list[tuple[Any, Unit, int]] = []
     is_clean = True
     try:
         while waiting or running:
             fresh = [waiting.popleft() for _ in range(min(len(waiting), n_at_once - len(running)))]
-            running += _submit(submitter, work, fresh) if fresh else []
+            running += _submit(executor, work, fresh) if fresh else []
             ended = [job for job in running if job[0].done()]
             running = [job for job in running if job not in ended]
             for job, unit, attempt in ended:
@@ -83,16 +82,15 @@ def _in_job(work: Work[Unit, Outcome], unit: Unit) -> tuple[str, Any]:
     return answer_of(work, unit, lambda event: None)
 
 
-def slurm_executor(folder: Path, given: Mapping[str, Any], n_gpus: int, jobs: int) -> SlurmExecutor:
-    """submitit's executor, and the errors by which it says that a job died; it writes nothing into ``folder`` yet.
-
-    ``given`` are parameters of submitit's ``AutoExecutor``, and ``cluster``.
-    """
+def slurm_executor(
+    folder: Path, given: Mapping[str, Any], n_gpus: int, n_at_once: int
+) -> tuple[Any, tuple[type[Exception], ...]]:
+    """submitit's executor, which may make ``folder``, and the errors by which it says that a job died."""
     try:
         import submitit
     except ImportError as error:
         raise ModelMissing("the executor 'slurm' needs the slurm extra: pip install 'su3d-bench[slurm]'") from error
-    parameters = {**DEFAULTS, "slurm_array_parallelism": min(jobs, MOST_AT_ONCE), **given}
+    parameters = {**DEFAULTS, "slurm_array_parallelism": n_at_once, **given}
     cluster = parameters.pop("cluster", CLUSTERS[0])
     if cluster not in CLUSTERS:
         raise ConfigError(f"--slurm cluster={cluster}: expected {' or '.join(CLUSTERS)}")

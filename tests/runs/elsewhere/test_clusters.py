@@ -19,7 +19,7 @@ from waiting import wait_until
 from su3d_bench.cli.main import main
 from su3d_bench.runs import scene as scene_run
 
-pytest.importorskip("ray", reason="the ray extra is not installed")
+ray = pytest.importorskip("ray", reason="the ray extra is not installed")
 pytest.importorskip("submitit", reason="the slurm extra is not installed")
 
 PAINTED = f"{SCENES}/painted_anywhere.py:Painted"
@@ -198,8 +198,11 @@ def test_an_option_that_means_nothing_is_one_line(
 def test_a_cluster_that_is_not_there_is_one_line_that_leaves_nothing(
     executor: str, line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    def nothing_runs(**_: Any) -> None:
+        raise ConnectionError("Could not find any running Ray instance. Please specify it by `--address`.")
+
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
-    monkeypatch.setenv("RAY_TMPDIR", str(Path.cwd()))  # where Ray looks for clusters of this machine
+    monkeypatch.setattr(ray, "init", nothing_runs)
     monkeypatch.setenv("PATH", "/nowhere")
     assert run("--executor", executor, out="new/out") == 2
     error = capsys.readouterr().err

@@ -1,0 +1,203 @@
+"""A folder belongs to one request: another one extends it, replaces it or is refused."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+from painted import colour_perception
+from places import SCENES
+
+from su3d_bench.cli.main import main
+from su3d_bench.runs import feeding as scene_feeding
+from su3d_bench.runs import resume as finished_scenes
+from su3d_bench.runs import scene as scene_run
+from su3d_bench.runs.planning.ablation import read_rows
+from su3d_bench.store.run_folder import RunFolder
+
+PAINTED = f"{SCENES}/painted.py:Painted"
+COLLECTOR = f"{SCENES}/painted.py:Collector"
+REST = ["--no-pictures", "--jobs", "1", "--quiet"]
+
+
+@pytest.fixture(autouse=True)
+def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for module in (scene_run, finished_scenes):
+        monkeypatch.setattr(module, "build_perception", colour_perception)
+    monkeypatch.chdir(tmp_path)
+
+
+def run(scenes: str, *more: str, methods: tuple[str, ...] = (COLLECTOR,), out: str = "out") -> int:
+    return main(["run", f"{PAINTED}/{scenes}", "--methods", *methods, "--protocols", "rooms-semantic", *REST,
+                 "--out", out, *more])  # fmt: skip
+
+
+def extend(*more: str, out: str = "out") -> int:
+    return main(["run", *more, "--extend", *REST, "--out", out])
+
+
+def record(name: str, out: str = "out") -> Any:
+    return json.loads(Path(out, name).read_text())
+
+
+def test_scenes_methods_and_protocols_join_and_no_finished_job_is_run_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    dropping = f"{COLLECTOR}@drop=1"
+    assert run("[ab]", "--set", "collector.noise_m=0.02") == 0
+    made = {path: path.stat().st_mtime_ns for path in Path("out").rglob("prediction.npz")}
+    assert extend(f"{PAINTED}/c") == 0
+    assert extend("--methods", dropping) == 0
+    assert extend("--protocols", "rooms-instance") == 0
+    assert {path: path.stat().st_mtime_ns for path in made} == made
+    whole = ["--protocols", "rooms-semantic", "rooms-instance", "--set", "collector.noise_m=0.02"]
+    assert run("[abc]", *whole, methods=(COLLECTOR, dropping), out="whole") == 0
+    assert Path("out/metrics.json").read_bytes() == Path("whole/metrics.json").read_bytes()
+    for name in ("status", "scenes", "methods", "protocols", "data_digests"):
+        assert record("run.json")[name] == record("run.json", "whole")[name]
+    text = Path("out/run.toml").read_text()
+    assert f'scenes = ["{PAINTED}/[ab]", "{PAINTED}/c"]  # --scenes\n' in text
+    assert "noise_m = 0.02  # --set collector.noise_m\n" in text and "drop = 0  # default\n" in text
+    monkeypatch.setattr(scene_feeding, "write_prediction", None)
+    assert main(["run", "--config", "out/run.toml", *REST, "--out", "out"]) == 0  # its own file is its request
+
+
+@pytest.mark.parametrize(
+    ("more", "clause"),
+    [
+        (["--seed", "1"], "seed was 0, now 1"),
+        (["--limit", "1"], "limit was none, now 1"),
+        (["--stride", "2"], "stride was 1, now 2"),
+        (["--set", "collector.drop=1"], "method.collector.drop was 0, now 1"),
+        (["--set", "painted.n_frames=3"], "dataset.painted.n_frames was 6, now 3"),
+        (["--profile", "oracle"], 'profile was "auto", now "oracle"'),
+        (["--anytime", "0.5"], "anytime was [], now [0.5]"),
+    ],
+)
+def test_what_cannot_be_joined_is_refused_by_name(
+    more: list[str], clause: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("a") == 0
+    capsys.readouterr()
+    assert extend(f"{PAINTED}/b", *more) == 2
+    said = f"su3d-bench: out: cannot be extended by this ({clause}); --replace puts this one in its place, or choose "
+    assert capsys.readouterr().err.startswith(said)
+    assert [path.name for path in Path("out/scenes").iterdir()] == ["painted.a"]
+
+
+def test_an_unfinished_run_is_as_safe_as_a_finished_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(scene_run._Scene, "_score", stop)
+        assert run("[ab]") == 130
+    assert record("run.json")["status"] == "interrupted"
+    before = Path("out/run.json").read_bytes(), Path("out/run.toml").read_bytes()
+    capsys.readouterr()
+    assert run("a") == 2
+    assert "holds another run (scene painted/b is not asked for now); --extend adds" in capsys.readouterr().err
+    assert (Path("out/run.json").read_bytes(), Path("out/run.toml").read_bytes()) == before
+    assert extend(f"{PAINTED}/c") == 0
+    assert run("[abc]", out="whole") == 0
+    assert Path("out/metrics.json").read_bytes() == Path("whole/metrics.json").read_bytes()
+
+
+def test_a_run_is_replaced_but_for_the_maps_that_are_asked_for_as_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("[abc]") == 0
+    kept = RunFolder(Path("out")).job("painted/a", "collector").prediction
+    made = kept.stat().st_mtime_ns
+    capsys.readouterr()
+    assert main(["run", f"{PAINTED}/a", "--methods", COLLECTOR, "--protocols", "rooms-semantic", "--no-pictures",
+                 "--jobs", "1", "--replace", "--out", "out"]) == 0  # fmt: skip
+    went = "--replace: 4 of the 6 maps in out go: painted/b, painted/c by collector, oracle\n"
+    assert capsys.readouterr().err.startswith(went)
+    assert run("a", out="whole") == 0
+    assert Path("out/metrics.json").read_bytes() == Path("whole/metrics.json").read_bytes()
+    assert [path.name for path in Path("out/scenes").iterdir()] == ["painted.a"]
+    assert kept.stat().st_mtime_ns == made
+    assert run("a", "--seed", "3", "--set", "collector.noise_m=0.1", "--replace") == 0
+    assert record("metrics.json")["seed"] == 3 and kept.stat().st_mtime_ns != made
+
+
+def test_a_map_of_other_data_is_made_anew_only_where_the_run_is_replaced(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("a") == 0
+    before = {path: path.read_bytes() for path in Path("out").rglob("*") if path.is_file()}
+    other = colour_perception()
+    other.digest = "colours-2"
+    for module in (scene_run, finished_scenes):
+        monkeypatch.setattr(module, "build_perception", lambda *_, **__: other)
+    capsys.readouterr()
+    assert run("a") == 2
+    assert "(perception was colours-1, now colours-2); --replace puts this one in its place" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in before} == before
+    assert run("a", "--replace") == 0
+    assert RunFolder(Path("out")).job("painted/a", "collector").seals()["predict"].key["perception"] == "colours-2"
+
+
+def test_files_of_others_are_not_removed_with_a_run_that_is_replaced(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("[ab]") == 0
+    Path("out/notes.txt").write_text("mine")
+    notes = Path("out/scenes/painted.b/collector/notes.txt")
+    notes.write_text("mine")
+    capsys.readouterr()
+    assert run("a", "--replace") == 2
+    assert "notes.txt: is of no run and would go with what --replace removes; move it" in capsys.readouterr().err
+    assert len(record("run.json")["scenes"]) == 2
+    notes.unlink()
+    assert run("a", "--replace") == 0
+    assert Path("out/notes.txt").read_text() == "mine"
+
+
+def test_a_replacement_that_is_killed_midway_goes_on_where_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert run("[abc]") == 0
+    removed = 0
+
+    def stop_after_one(self: Any) -> None:
+        nonlocal removed
+        removed += 1
+        if removed == 2:
+            raise KeyboardInterrupt
+        remove(self)
+
+    remove = scene_run.JobFolder.remove
+    with monkeypatch.context() as patch:
+        patch.setattr(scene_run.JobFolder, "remove", stop_after_one)
+        assert run("a", "--seed", "1", "--replace") == 130
+    assert not Path("out/metrics.json").exists()
+    assert run("a", "--seed", "1", "--replace") == 0
+    assert run("a", "--seed", "1", out="whole") == 0
+    assert Path("out/metrics.json").read_bytes() == Path("whole/metrics.json").read_bytes()
+    assert not list(Path("out").rglob("*.unfinished"))
+
+
+def test_a_sweep_grows_by_its_rows(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["ablate", f"{PAINTED}/a", "--method", COLLECTOR, "--protocols", "rooms-semantic", *REST, "--out", "out"]
+    assert main([*words, "--vary", "drop=0,1"]) == 0
+    assert main([*words, "--vary", "stride=1,2"]) == 2
+    assert main([*words, "--vary", "stride=1,2", "--extend"]) == 0
+    assert [row.method for row in read_rows(Path("out"))] == [
+        "collector", "collector@drop=1", "collector", "collector@stride=2"
+    ]  # fmt: skip
+    assert record("run.json")["methods"] == ["collector", "collector@drop=1", "collector@stride=2"]
+    assert main([*words, "--vary", "drop=0,2", "--replace"]) == 0
+    assert [row.method for row in read_rows(Path("out"))] == ["collector", "collector@drop=2"]
+
+
+def test_a_request_that_nobody_can_read_any_more_is_not_taken_for_the_same(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("a") == 0
+    Path("out/run.toml").write_text("scenes = [")
+    capsys.readouterr()
+    assert run("a") == 2
+    assert "so nobody can tell what run this folder holds: mend the file; --replace puts" in capsys.readouterr().err
+    assert run("a", "--replace") == 0
+    os.unlink("out/run.toml")
+    assert run("b") == 2
+    assert "holds another run (scene painted/a is not asked for now" in capsys.readouterr().err
+    assert run("a") == 0
+    assert Path("out/run.toml").is_file()
