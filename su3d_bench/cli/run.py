@@ -32,7 +32,7 @@ def add_parser(verbs: Any) -> None:
         "run",
         "Run methods over scenes and score them; the same command again resumes.",
         (
-            "su3d-bench run --scenes rooms/living0 --methods opensu3d oracle",
+            "su3d-bench run rooms/living0 --methods opensu3d oracle",
             "su3d-bench run --scenes 'rooms/*' --limit 5 --set opensu3d.top_m=10 --dry-run",
         ),
         call,
@@ -117,7 +117,7 @@ def add_executor_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--ray-address",
         metavar="ADDRESS",
-        help="of a Ray cluster, or local to start one on this machine (default: the one that runs here already)",
+        help="of a Ray cluster, or local to start one here (default: RAY_ADDRESS, or the one that runs here)",
     )
     parser.add_argument("--gpus-per-job", type=float, metavar="N", help="that ray or slurm gives a scene, such as 0.5")
     parser.add_argument("--retries", type=int, metavar="N", help="of a scene whose machine was lost (default: 2)")

@@ -71,7 +71,7 @@ SLIPS: dict[str, tuple[list[str], int, str]] = {
     "replaced by itself": ([*SAME, "--replace"], 0, "run folder: runs/demo"),
     "both at once": ([*SAME, "--replace", "--extend"], 2, "su3d-bench: run: argument --extend: not allowed with"),
     "a sweep": (
-        ["ablate", f"{PAINTED}/[ab]", "--method", COLLECTOR, "--vary", "drop=0,1", "--protocols", "rooms-semantic", *INTO],
+        ["ablate", f"{PAINTED}/[ab]", "--method", COLLECTOR, "--vary", "drop=0,1", *INTO, *WHAT[2:4]],
         2,
         f"{OTHER}method collector@drop=1 is new, protocol rooms-instance is not asked for now)",
     ),
@@ -96,6 +96,11 @@ SLIPS: dict[str, tuple[list[str], int, str]] = {
         "su3d-bench: runs/demo: both sides are the same",
     ),
     "a table": (["report", "tables", "runs/demo"], 0, ""),
+    "a table over its record": (
+        ["report", "tables", "runs/demo", "--out", "runs/demo/metrics.json"],
+        2,
+        "su3d-bench: runs/demo/metrics.json: is a file of the run itself, and stays as it is; choose another name",
+    ),
     "a board": (["report", "leaderboard", "runs"], 0, "2 entries in 2 rankings, 0 left out"),
     "a page": (["report", "html", "runs/demo", "--out", "page.html"], 0, ""),
     "timing": (["report", "timing", "runs/demo", "--out", "timing"], 0, ""),

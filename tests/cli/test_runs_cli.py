@@ -50,8 +50,11 @@ def test_runs_are_listed_with_their_state_and_first_numbers(capsys: pytest.Captu
     found = {entry["name"]: entry for entry in json.loads(capsys.readouterr().out)}
     states = {name: entry["state"] for name, entry in found.items()}
     assert states == {
-        "one": "complete", "two": "complete, first 2 frames only", "killed": "not finished", "broken": "run.json is damaged"
-    }  # fmt: skip
+        "one": "complete",
+        "two": "complete, first 2 frames only",
+        "killed": "not finished",
+        "broken": "run.json is damaged",
+    }
     (number,) = found["one"]["headlines"]
     assert number == {"method": "collector", "protocol": "rooms-semantic", "metric": "mAcc", "value": 1.0}
     with RunFolder(Path("runs/one")).locked():

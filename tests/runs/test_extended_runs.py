@@ -16,7 +16,7 @@ from su3d_bench.runs import feeding as scene_feeding
 from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.planning.ablation import read_rows
-from su3d_bench.store.run_folder import RunFolder
+from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 PAINTED = f"{SCENES}/painted.py:Painted"
 COLLECTOR = f"{SCENES}/painted.py:Collector"
@@ -165,9 +165,9 @@ def test_a_replacement_that_is_killed_midway_goes_on_where_it_was(monkeypatch: p
             raise KeyboardInterrupt
         remove(self)
 
-    remove = scene_run.JobFolder.remove
+    remove = JobFolder.remove
     with monkeypatch.context() as patch:
-        patch.setattr(scene_run.JobFolder, "remove", stop_after_one)
+        patch.setattr(JobFolder, "remove", stop_after_one)
         assert run("a", "--seed", "1", "--replace") == 130
     assert not Path("out/metrics.json").exists()
     assert run("a", "--seed", "1", "--replace") == 0
