@@ -254,7 +254,7 @@ def replaced_jobs(folder: RunFolder, jobs: Sequence[SceneJob]) -> list[JobFolder
     going = [job for job in folder.jobs() if job.path not in kept]
     names = {job.path.relative_to(folder.path).as_posix() for job in going}
     for stranger in folder.strangers():
-        if any(stranger == name or stranger.startswith(f"{name}/") for name in names):
+        if any(f"{stranger}/".startswith(f"{name}/") or name.startswith(f"{stranger}/") for name in names):
             raise StoreError(
                 f"{shown(folder.path / stranger)}: is of no run and would go with what --replace removes; move it"
             )
