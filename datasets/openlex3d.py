@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from su3d_bench.core.digests import digest_file, digest_json
 from su3d_bench.core.errors import DataError, GroundTruthMissing, printable
 from su3d_bench.core.types import Float32Array, Int64Array
 from su3d_bench.datasets.recordings.recorded_frames import parsed_json, read_text
@@ -159,6 +160,11 @@ class OpenLexRelease:
     def scenes(self) -> tuple[str, ...]:
         """The scenes with labels, in alphabetical order."""
         return tuple(sorted(path.parent.name for path in (self.folder / DATASET).glob(f"*/{CATEGORIES_NAME}")))
+
+    def digest(self, scene: str) -> str:
+        """A key of the labels and queries of a scene; the mesh is that of Replica's release."""
+        files = [self.folder / DATASET / PROMPTS_NAME, *sorted((self.folder / DATASET / scene).iterdir())]
+        return digest_json({file.name: digest_file(file) for file in files if file.is_file()})
 
     def truth(self, scene: str, variant: str) -> OpenLexTruth | QueryTruth:
         """The truth of a scene; ``GroundTruthMissing`` where one of its files is not there."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.errors import printable
+from su3d_bench.core.errors import counted, printable
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, UInt8Array
 from su3d_bench.reports.pictures.canvas import DARK, GREY, Canvas, hex_of, paper
 from su3d_bench.reports.pictures.colours import NO_INSTANCE, Colour, class_colours, instance_colours
@@ -81,7 +81,7 @@ def facts_line(look: SceneLook) -> str:
         ]
     if look.truth is not None:
         counts = look.counts
-        words.append(f"{counts['n_objects']} objects of {counts['n_classes']} classes")
+        words.append(f"{counted(counts['n_objects'], 'object')} of {counted(counts['n_classes'], 'class')}")
         words.append(f"{counts['n_points']:,} points of ground truth ({printable(look.truth.variant, 40)})")
     else:
         words.append("no ground truth")

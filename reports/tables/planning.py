@@ -37,6 +37,7 @@ def plan_tables(plan: Mapping[str, Any]) -> list[Table | Prose]:
         notes.append("one seed: how much seeds move the difference is not known; name runs of other seeds too")
     if n_seeds == 2:
         notes.append("two seeds: no interval, for of so few it would hold the truth too seldom; name a run of a third")
+    notes += plan["remarks"]
     notes += [line for line in (few_scenes(len(plan["scenes"])),) if line]
     return [*tables, Prose(tuple(notes), is_list=True)]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from su3d_bench.core.errors import some
+from su3d_bench.core.errors import counted, some
 from su3d_bench.reports.tables.formats import markdown
 from su3d_bench.reports.tables.found import Found, found_table
 from su3d_bench.reports.tables.model import (
@@ -21,6 +21,7 @@ from su3d_bench.reports.tables.model import (
 )
 
 # What stands below the methods: the prefix of a metric's name, and what the row is called.
+MOST_SCENES = 20  # that a line names
 CHEAP = {"chance": "by chance", "names-alone": "by names alone"}
 
 
@@ -61,7 +62,7 @@ def _protocol_table(rows: Sequence[Mapping[str, Any]], metrics: Mapping[str, Any
     names = list(first["headline"])
     title = f"{first['protocol']} (version {first['version']})"
     if metrics["is_partial"]:
-        title += f": PARTIAL, only the first {metrics['limit']} frames of each scene"
+        title += f": PARTIAL, only the first {counted(int(metrics['limit']), 'frame')} of each scene"
     header = ["method", *names, f"truth's score ({' / '.join(names)})", "scenes", "covered at 2.5 / 5 / 10 cm"]
     body = [[row["method"], *(_value_text(row, name) for name in names), *_context(row, names)] for row in rows]
     body += _cheap_rows(rows, names, len(header))
@@ -110,7 +111,7 @@ def _notes(row: Mapping[str, Any]) -> Iterable[str]:
     if row["failed"]:
         yield f"INCOMPLETE: {method} failed on {', '.join(row['failed'])}"
     if row["unscored"]:
-        yield f"{method} is unscored on {', '.join(row['unscored'])}"
+        yield f"{method} is unscored on {some(row['unscored'], MOST_SCENES)}"
     if row["caveat"]:
         yield f"{method}: {row['caveat']}"
     scenes_of: dict[str, list[str]] = {}

@@ -9,16 +9,19 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
-from functools import cache, cached_property, partial
+from functools import cache, cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from su3d_bench.analysis.sides import Side, refuse_unlike
-from su3d_bench.core.errors import ConfigError, PredictionError, printable
+from su3d_bench.core.errors import ConfigError, DataError, PredictionError, counted, printable
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import GroundTruth
+from su3d_bench.core.types import GroundTruth, Prediction
+from su3d_bench.evaluation.explained import FilesOfTruth
+from su3d_bench.evaluation.scoring import with_confidences_of_files
+from su3d_bench.evaluation.texts import GivenTexts, read_text_features
 from su3d_bench.metrics.attribution.arrays import EXPLAINED, MendedScene
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.metric import Counts
@@ -98,11 +101,6 @@ def attribute(
     return explained.form(mended, other)
 
 
-def _truth_of(run: FinishedRun, scene: str, variant: str) -> GroundTruth:
-    truth: GroundTruth = run.dataset(scene).ground_truth(scene.partition("/")[2], variant)
-    return truth
-
-
 def explained_of(run: FinishedRun, method: str, wanted: Sequence[str] = ()) -> Explained:
     """The protocols under which the errors of ``method`` are explained: those ``wanted``, else all that can be."""
     names, remarks = _protocols_of(run, wanted)
@@ -122,19 +120,28 @@ class Explained:
     def _scores(self) -> Mapping[str, Mapping[str, SceneScore]]:
         return self.run.scores(self.method)
 
+    @cached_property
+    def _inputs(self) -> _Inputs:
+        return _Inputs(self.run, self.method)
+
+    def _rules(self, protocol: str) -> ProtocolRules:
+        """The rules by which the counts were made: of files, their confidences may count where a rule has 1."""
+        rules, elsewhere = self.run.rules(protocol), self.run.made_elsewhere.get(self.method)
+        takes_files = elsewhere is not None and elsewhere.confidences == "file"
+        return with_confidences_of_files(rules) if takes_files else rules
+
     def mend(self, scene: str, truth_of: TruthOf, encoder: Callable[[], Encoder]) -> MendedJob:
         """The counts of ``scene`` as they are and with its errors mended, by protocol; of those that scored it."""
         mine = [name for name in self.protocols if scene in self._scores[name]]
         if not mine:
             return {}
-        prediction = read_prediction(self.run.folder.job(scene, self.method).prediction)
-        naming = encoder() if getattr(prediction, "labels", None) is None else None
         mended: dict[str, MendedScene] = {}
         for name in mine:
-            rules = self.run.rules(name)
-            truth = truth_of(rules.ground_truth)
+            rules = self._rules(name)
+            truth, prediction = self._inputs.of_scene(scene, rules, truth_of)
             if (reason := why_not_scorable(rules, prediction)) is not None:
                 raise PredictionError(f"{scene}: {reason}")
+            naming = self._inputs.encoder(rules, prediction, encoder)
             mended[name] = EXPLAINED[rules.kind][1](rules, truth, prediction, naming)
             _refuse_other_counts(scene, rules, self._scores[name][scene].counts, mended[name].as_is)
         return mended
@@ -142,7 +149,7 @@ class Explained:
     def form(self, mended: Mapping[str, MendedJob], other: Side | None = None) -> RunAttribution:
         """What the errors of all scenes cost; ``other`` is the side with perfect 2D masks."""
         side = Side(self.run, self.method)
-        gathered = {name: _Gathered(self.run.rules(name)) for name in self.protocols}
+        gathered = {name: _Gathered(self._rules(name)) for name in self.protocols}
         for scene, of_scene in mended.items():
             for name, counts in of_scene.items():
                 gathered[name].add(scene, counts)
@@ -153,6 +160,44 @@ class Explained:
         if not formed:
             raise ConfigError(f"{side.name}: no scene is scored under {', '.join(self.protocols)}; nothing to explain")
         return RunAttribution(self.run.name, self.method, (*self.remarks, *_remarks(self.run)), formed)
+
+
+def _truth_of(run: FinishedRun, scene: str, variant: str) -> GroundTruth:
+    truth: GroundTruth = run.dataset(scene).ground_truth(scene.partition("/")[2], variant)
+    return truth
+
+
+class _Inputs:
+    """The truth, the maps and the encoder of a method of a run, be its predictions made here or elsewhere."""
+
+    def __init__(self, run: FinishedRun, method: str) -> None:
+        self._run, self._method = run, method
+        self._files = FilesOfTruth(run)
+        self._map = lru_cache(maxsize=1)(self._read_map)
+
+    def of_scene(self, scene: str, rules: ProtocolRules, truth_of: TruthOf) -> tuple[GroundTruth, Prediction]:
+        if self._run.data.truth_files is not None:
+            truth = self._files.truth(scene, rules)
+            return truth, self._files.prediction(scene, self._method, rules, len(truth.points))
+        return truth_of(rules.ground_truth), self._map(scene)
+
+    def _read_map(self, scene: str) -> Prediction:
+        return read_prediction(self._run.folder.job(scene, self._method).prediction)
+
+    def encoder(self, rules: ProtocolRules, prediction: Prediction, own: Callable[[], Encoder]) -> Encoder | None:
+        """What named the instances; None where they have names."""
+        if getattr(prediction, "labels", None) is not None:
+            return None
+        elsewhere = self._run.made_elsewhere.get(self._method)
+        if elsewhere is None or elsewhere.texts is None:
+            return own()
+        path, digest = elsewhere.texts
+        given = read_text_features(Path(path))
+        assert given is not None
+        texts = GivenTexts(given, rules)
+        if texts.digest != digest:
+            raise DataError(f"{printable(path, 200)}: is not the file that {self._run.name} was scored with")
+        return texts
 
 
 def _method_of(run: FinishedRun, method: str | None) -> str:
@@ -273,9 +318,9 @@ def _refuse_other_counts(scene: str, rules: ProtocolRules, stored: Counts, forme
 
 
 def _remarks(run: FinishedRun) -> list[str]:
-    lines = []
+    lines = run.elsewhere_lines()
     if run.record.is_partial:
-        lines.append(f"PARTIAL: only the first {run.limit} frames of each scene")
+        lines.append(f"PARTIAL: only the first {counted(run.limit, 'frame')} of each scene")
     if run.is_incomplete:
         lines.append("INCOMPLETE: scenes that failed are not in these numbers")
     return lines

@@ -311,7 +311,7 @@ def _remarks(left: Side, right: Side, methods: Set[str]) -> list[str]:
     lines = []
     for run in {run.name: run for side in (left, right) for run in side.runs}.values():
         if run.record.is_partial:
-            lines.append(f"PARTIAL: {run.name} has only the first {run.limit} frames of each scene")
+            lines.append(f"PARTIAL: {run.name} has only the first {counted(run.limit, 'frame')} of each scene")
         if run.is_incomplete:
             lines.append(f"INCOMPLETE: {run.name} lacks scenes that failed")
     aside = ("seed",) if left.others or right.others else ()

@@ -34,6 +34,7 @@ from su3d_bench.reports.tables.model import (
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 MOST_RUNS = 10_000
+ELSEWHERE = "made elsewhere"  # in the place of a profile
 MOST_NAMED = 4  # methods of what is left out
 MOST_FOLDERS = 1_000_000  # a folder that holds more was not meant
 MOST_RANKED = 60  # rows whose ranks have an interval: 1,770 tests of pairs, some minutes at worst
@@ -101,7 +102,10 @@ def leaderboard(folder: Path, protocols: Sequence[str] = (), *, with_ranks: bool
         for each in _entries(name, run, protocols):
             (entries if isinstance(each, Entry) else refused).append(each)  # type: ignore[arg-type]
     if not entries and not refused:
-        raise ConfigError(f"{printable(str(folder), 200)}: holds no run below it; a run has a run.json")
+        raise ConfigError(
+            f"{printable(str(folder), 200)}: holds no run below it; su3d-bench run writes one, and evaluate --out "
+            "of predictions made elsewhere"
+        )
     boards: list[tuple[Entry, ...]] = []
     # Two people may call their own rules alike: a ranking is of one set of rules.
     for key in dict.fromkeys((entry.protocol, entry.digest, entry.scenes) for entry in entries):
@@ -116,6 +120,8 @@ def leaderboard(folder: Path, protocols: Sequence[str] = (), *, with_ranks: bool
 def runs_below(folder: Path) -> Iterator[Path]:
     """The folders of runs below ``folder``, in the order of their names; links are not followed."""
     if not folder.is_dir():
+        if folder.is_file():
+            read_run(folder)  # says what the file is
         raise ConfigError(f"{printable(str(folder), 200)}: is no folder; name one that holds runs")
     n_runs = 0
     for n_folders, (path, folders, files) in enumerate(os.walk(folder, followlinks=False)):
@@ -162,7 +168,7 @@ def _entries(name: str, run: FinishedRun, protocols: Sequence[str]) -> Iterator[
             intervals=tuple(result.intervals.get(key) for key in result.headline),
             of_scenes=tuple(recomputed["per_scene"][scene][result.headline[0]] for scene in sorted(result.scenes)),
             data=tuple((scene, run.record.data_digests[scene]) for scene in sorted(result.scenes)),
-            profile=printable(run.record.profile or "", 40),
+            profile=ELSEWHERE if method in run.made_elsewhere else printable(run.record.profile or "", 40),
             confidences=None if record.confidences is None else printable(record.confidences, 80),
             is_ceiling="a ceiling, not a result" in (record.caveat or "") or method == CEILING_METHOD,
         )
@@ -170,7 +176,7 @@ def _entries(name: str, run: FinishedRun, protocols: Sequence[str]) -> Iterator[
 
 def _why_not(run: FinishedRun, protocol: str, failed: Sequence[str]) -> str | None:
     if run.record.is_partial:
-        return f"is partial: the first {run.limit} frames of each scene"
+        return f"is partial: the first {counted(run.limit, 'frame')} of each scene"
     if failed:
         return f"is incomplete: {counted(len(failed), 'scene')} failed"
     if protocol in protocol_names() or (protocol in run.protocols and run.protocols[protocol].rules is not None):

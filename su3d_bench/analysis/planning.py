@@ -72,6 +72,7 @@ class Plan:
     scenes: tuple[str, ...]
     power: float
     protocols: Mapping[str, Mapping[str, MetricPlan]]
+    remarks: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Plain values in full precision, null where undefined."""
@@ -112,7 +113,8 @@ def plan(
             for metric in sides[0][0].run.rules(name).headline
         }
     seeds = tuple(run.record.seed or 0 for run in read)
-    return Plan(*pair, tuple(run.name for run in read), seeds, tuple(scenes), power, plans)
+    remarks = tuple(dict.fromkeys(line for run in read for line in run.elsewhere_lines()))
+    return Plan(*pair, tuple(run.name for run in read), seeds, tuple(scenes), power, plans, remarks)
 
 
 def _over_common_scenes(

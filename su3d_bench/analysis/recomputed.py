@@ -10,9 +10,10 @@ from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, Su3dError, printable
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import ProtocolResult, SceneScore, combine
+from su3d_bench.predictions.own_runs import read_stored
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.atomic import is_file
-from su3d_bench.store.predictions import features_beside, read_prediction
+from su3d_bench.store.predictions import features_beside
 from su3d_bench.store.records import ROUNDING, NumbersRecord, plain
 from su3d_bench.store.run_folder import JobFolder
 
@@ -120,7 +121,7 @@ def _damage(job: JobFolder) -> str | None:
 
 def _unreadable(file: Path) -> str | None:
     try:
-        read_prediction(file)
+        read_stored(file)
     except Su3dError as error:
         return f"holds no map: {error}"
     return None

@@ -10,8 +10,8 @@ from datetime import datetime
 from pathlib import Path
 
 from su3d_bench.analysis.leaderboard import runs_below
-from su3d_bench.core.errors import StoreError, counted, printable, shown
-from su3d_bench.reports.tables.model import Cell, Table, TableRow, percent, some
+from su3d_bench.core.errors import StoreError, counted, printable, shown, some
+from su3d_bench.reports.tables.model import Cell, Table, TableRow, percent
 from su3d_bench.store.atomic import is_file
 from su3d_bench.store.records import MetricsRecord, RequestRecord, read_record
 from su3d_bench.store.run_folder import MARKS, RunFolder

@@ -10,6 +10,7 @@ from su3d_bench.core.config import MOVES_NO_NUMBER
 from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import SceneScore, metric_of
+from su3d_bench.questions.files.queries import VARIANT as QUERY_OBJECTS
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 # They move no number of a common scene.
@@ -47,6 +48,9 @@ def parse_side(text: str, method: str | None) -> tuple[tuple[FinishedRun, ...], 
         if method is not None and method != name:
             raise ConfigError(f"{printable(text, 200)}: names the method '{name}', --method names '{method}'")
         return tuple(map(read_run, folders)), name
+    for path in (Path(text), Path(before)):
+        if path.is_file():
+            read_run(path)  # says what the file is
     raise ConfigError(f"{printable(text, 200)}: there is no such folder; name that of a run, such as runs/my-run")
 
 
@@ -131,6 +135,8 @@ def settings_that_differ(
     left: FinishedRun, right: FinishedRun, methods: Set[str], aside: Sequence[str] = ()
 ) -> list[str]:
     """What moves numbers and is set otherwise in the two runs, with both values, but for the keys ``aside``."""
+    if bool(left.record.predictions) != bool(right.record.predictions):
+        return []  # predictions made elsewhere have no settings here
     changed = []
     for path in dict.fromkeys([*left.settings, *right.settings]):
         pair = (left.settings.get(path, "not set"), right.settings.get(path, "not set"))
@@ -158,7 +164,8 @@ def protocols_in_both(left: Side, right: Side, wanted: Sequence[str]) -> list[st
 def refuse_unlike(left: Side, right: Side, protocol: str, scenes: Sequence[str]) -> None:
     """A ``ConfigError`` that names the first field in which the two differ and that forbids to compare them.
 
-    The encoder counts where it named the instances of both.
+    The encoder counts where it named the instances of both, unless predictions were made elsewhere: there it is the
+    method's own.
     """
     where = f"{left.name} and {right.name} cannot be compared"
     rules, others = left.run.protocols[protocol], right.run.protocols[protocol]
@@ -176,9 +183,14 @@ def refuse_unlike(left: Side, right: Side, protocol: str, scenes: Sequence[str])
                 f"{where}: data digest of {printable(scene, 100)} is {_short(pair[0])} and {_short(pair[1])}; run both "
                 "on the same data"
             )
+    truths = [side.run.record.ground_truth for side in (left, right)]
+    queries = [None if truth is None else truth.queries for truth in truths]
+    if queries[0] != queries[1] and left.run.rules(protocol).ground_truth == QUERY_OBJECTS:
+        raise ConfigError(f"{where}: their queries are of different files; evaluate both with the same --queries")
     records = [side.run.results.get((side.method, protocol)) for side in (left, right)]
     named = [record for record in records if record is not None and record.encoder is not None]
-    if len(named) == 2 and named[0].encoder_digest != named[1].encoder_digest:
+    are_elsewhere = left.method in left.run.made_elsewhere or right.method in right.run.made_elsewhere
+    if len(named) == 2 and not are_elsewhere and named[0].encoder_digest != named[1].encoder_digest:
         shown = [f"{record.encoder} ({_short(record.encoder_digest)})" for record in named]
         raise ConfigError(f"{where}: encoder is {printable(' and '.join(shown), 200)}; run both with the same one")
 

@@ -20,7 +20,7 @@ from su3d_bench.reports.tables.judged import WHO_DID
 from su3d_bench.reports.tables.model import BY_PEOPLE, Measured, Origin, Table, is_count
 from su3d_bench.reports.tables.papers.latex import PrintedCell, printed_cells
 from su3d_bench.reports.tables.timing import AnytimePoint
-from su3d_bench.runs.finished import FinishedRun, read_run
+from su3d_bench.runs.finished import FinishedRun, is_numbers_alone, read_run
 from su3d_bench.runs.found import found_in, without_score
 from su3d_bench.sheets.judging.scores import FILE as SCORES_FILE
 from su3d_bench.sheets.judging.scores import LABEL_METRICS, ScoreCell, Scores, read_scores
@@ -77,7 +77,9 @@ def found_tables(paths: Sequence[Path], methods: Sequence[str] = (), datasets: S
 
 def is_scores(path: Path) -> bool:
     """Whether ``path`` is what ``sheets score`` writes, rather than a run."""
-    return path.suffix == ".json" or (is_file(path / SCORES_FILE) and not is_file(path / "run.json"))
+    if path.suffix == ".json":
+        return not is_numbers_alone(path)
+    return is_file(path / SCORES_FILE) and not is_file(path / "run.json")
 
 
 def _judged_by_people(path: Path) -> list[Measured]:

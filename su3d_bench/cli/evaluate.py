@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import shlex
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.common import add_protocols, add_table_format, add_verb, answer_tables, remark
-from su3d_bench.core.errors import EXIT_DONE
+from su3d_bench.core.errors import EXIT_DONE, ConfigError
+
+if TYPE_CHECKING:
+    from su3d_bench.evaluation.request import Request
+    from su3d_bench.evaluation.result import Evaluation
+
+SCHEMA = 1  # of the JSON file of several methods
 
 
 def add_parser(verbs: Any) -> None:
@@ -16,17 +24,31 @@ def add_parser(verbs: Any) -> None:
         "evaluate",
         "Score predictions made elsewhere, under every protocol that fits; the format is recognised.",
         (
-            "su3d-bench evaluate predictions/ --dataset replica --json numbers.json",
-            "su3d-bench evaluate pred/ --ground-truth gt/ --protocols scannet-instance --per-class",
+            "su3d-bench evaluate pred/ --ground-truth gt/ --protocols scannet-instance --out runs/mine",
+            "su3d-bench evaluate --name mine=predA theirs=predB --dataset replica --out runs/both",
         ),
         call,
     )
     parser.add_argument(
         "predictions",
-        nargs="+",
+        nargs="*",
         type=Path,
         metavar="PREDICTIONS",
         help="a folder of predictions, a run folder, or files",
+    )
+    parser.add_argument(
+        "--name",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="METHOD=PREDICTIONS",
+        help="several methods side by side; METHOD alone names PREDICTIONS (default: as the folder of --out)",
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        metavar="DIR",
+        help="write a run folder there, which compare, attribute, report, check, sheets, query and export take",
     )
     parser.add_argument(
         "--dataset", metavar="NAME", help="whose ground truth, below $SU3D_DATA: replica, scannet, rooms"
@@ -69,32 +91,93 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.evaluation.evaluate import NOT_MEANT, Request, evaluate
-    from su3d_bench.reports.tables.evaluation import evaluation_tables
+    from su3d_bench.evaluation.as_run import evaluate_methods
+    from su3d_bench.evaluation.evaluate import evaluate
+    from su3d_bench.reports.tables.evaluation import evaluation_tables, side_by_side_tables
+    from su3d_bench.store.records import plain
 
-    result = evaluate(
-        Request(
-            tuple(arguments.predictions),
-            dataset=arguments.dataset,
-            ground_truth=arguments.ground_truth,
-            truth_values=arguments.truth_values,
-            protocols=tuple(arguments.protocols),
-            scenes=tuple(arguments.scenes),
-            format=arguments.format,
-            text_features=arguments.text_features,
-            confidences=arguments.confidences,
-            queries=arguments.queries,
-        )
+    requests = {method: _request(paths, arguments) for method, paths in _named(arguments).items()}
+    was_there = False
+    if len(requests) == 1 and arguments.out is None:
+        results = {method: evaluate(request) for method, request in requests.items()}
+    else:
+        run = evaluate_methods(requests, arguments.out)
+        results, was_there = dict(run.evaluations), run.was_there
+    documents = {method: result.to_json() for method, result in results.items()}
+    if len(results) == 1:
+        (document,) = documents.values()
+        tables = evaluation_tables(document, per_class=arguments.per_class)
+    else:
+        document = {"schema": SCHEMA, "methods": documents}
+        tables = side_by_side_tables(plain(run.metrics), documents, per_class=arguments.per_class)
+    answer_tables(arguments, document, tables)
+    for method, result in results.items():
+        _say(result, f"{method}: " if len(results) > 1 else "", is_quiet=arguments.quiet)
+    if arguments.out is not None:
+        _say_next(arguments.out, list(results), was_there=was_there, is_quiet=arguments.quiet)
+    return EXIT_DONE
+
+
+def _request(paths: Sequence[Path], arguments: argparse.Namespace) -> Request:
+    from su3d_bench.evaluation.request import Request
+
+    return Request(
+        tuple(paths),
+        dataset=arguments.dataset,
+        ground_truth=arguments.ground_truth,
+        truth_values=arguments.truth_values,
+        protocols=tuple(arguments.protocols),
+        scenes=tuple(arguments.scenes),
+        format=arguments.format,
+        text_features=arguments.text_features,
+        confidences=arguments.confidences,
+        queries=arguments.queries,
     )
-    document = result.to_json()
-    answer_tables(arguments, document, evaluation_tables(document, per_class=arguments.per_class))
-    remark(f"format: {', '.join(result.formats)}; ground truth: {result.ground_truth}", quiet=arguments.quiet)
+
+
+def _named(arguments: argparse.Namespace) -> dict[str, list[Path]]:
+    """The predictions by the method that they are called."""
+    if not arguments.predictions and not arguments.name:
+        raise ConfigError("evaluate: no predictions were named; give a folder or files, or --name METHOD=PREDICTIONS")
+    named: dict[str, list[Path]] = {}
+    for text in arguments.name:
+        method, equals, path = text.partition("=")
+        if equals and method and path and not arguments.predictions:
+            named.setdefault(method, []).append(Path(path))
+        elif equals or not arguments.predictions or len(arguments.name) > 1:
+            raise ConfigError(
+                f"evaluate: --name {text}: expected METHOD=PREDICTIONS of each method, or PREDICTIONS... --name METHOD"
+            )
+        else:
+            named[text] = list(arguments.predictions)
+    if len(named) == 1 and arguments.out is None:
+        raise ConfigError("evaluate: --name calls a method of a run; give --out DIR too, or several methods")
+    own = "predictions" if arguments.out is None else arguments.out.resolve().name
+    return named or {own: list(arguments.predictions)}
+
+
+def _say(result: Evaluation, whose: str, *, is_quiet: bool) -> None:
+    """Remarks on one method's predictions: what they are, and which protocols cannot score them."""
+    from su3d_bench.evaluation.evaluate import NOT_MEANT
+
+    remark(f"{whose}format: {', '.join(result.formats)}; ground truth: {result.ground_truth}", quiet=is_quiet)
     for line in result.remarks:
-        remark(line, quiet=arguments.quiet)
+        remark(f"{whose}{line}", quiet=is_quiet)
     reasons: dict[str, list[str]] = {}
     for name, reason in result.not_scored.items():
         reasons.setdefault(reason, []).append(name)
     for reason, names in reasons.items():
         if not reason.startswith(NOT_MEANT):
-            remark(f"not scored under {', '.join(names)}: {reason}", quiet=arguments.quiet)
-    return EXIT_DONE
+            remark(f"{whose}not scored under {', '.join(names)}: {reason}", quiet=is_quiet)
+
+
+def _say_next(out: Path, methods: Sequence[str], *, was_there: bool, is_quiet: bool) -> None:
+    """Where the run is, and what takes it."""
+    run, method = shlex.quote(str(out)), shlex.quote(methods[0])
+    pair = f"{run}:{method} " + (f"{run}:{shlex.quote(methods[1])}" if len(methods) > 1 else "OTHER_RUN")
+    whose = f" --method {method}" if len(methods) > 1 else ""
+    state = " (held this evaluation already, and is as it was)" if was_there else ""
+    remark(f"run folder: {out}{state}", quiet=is_quiet)
+    remark(f"next: su3d-bench compare {pair}", quiet=is_quiet)
+    remark(f"      su3d-bench attribute {run}{whose}", quiet=is_quiet)
+    remark(f"      su3d-bench report tables {run} --format latex", quiet=is_quiet)

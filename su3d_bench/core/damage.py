@@ -7,7 +7,7 @@ import tokenize
 import zipfile
 import zlib
 
-DAMAGE: tuple[type[Exception], ...] = (
+DAMAGE = (
     OSError,
     EOFError,
     ValueError,

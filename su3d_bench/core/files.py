@@ -10,6 +10,8 @@ import errno
 import io
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
@@ -19,11 +21,25 @@ KINDS = (
     (stat.S_ISBLK, "a device"),
     (stat.S_ISSOCK, "a socket"),
 )
+_NOTED: list[dict[Path, None]] = []
+
+
+@contextmanager
+def noted() -> Iterator[dict[Path, None]]:
+    """The files that are read in the block, each once, in the order in which they were opened first."""
+    files: dict[Path, None] = {}
+    _NOTED.append(files)
+    try:
+        yield files
+    finally:
+        _NOTED.pop()
 
 
 def regular(path: Path) -> Path:
     """``path``, for a library that opens files itself; an ``OSError`` where no regular file is there."""
     _refuse_others(os.stat(path).st_mode, path)
+    for files in _NOTED:
+        files[path] = None
     return path
 
 

@@ -40,6 +40,7 @@ METHODS = {
     "command": "su3d_bench.baselines.command.method:Command",
 }
 CEILING_METHOD = "oracle"  # is told the truth: what it scores stands beside every number, and is no bound
+FILES_OF_TRUTH = "ground-truth"  # before scenes whose truth are files of a dataset that is not known
 GROUPS = {"dataset": "su3d_bench.datasets", "method": "su3d_bench.methods"}
 BUILT_IN = {"dataset": DATASETS, "method": METHODS}
 OF_THE_CLASS = {"dataset": ("name", "Options", "label_space", "variants"), "method": ("name", "Config")}

@@ -48,6 +48,7 @@ class SceneOutcomes:
     skipped: list[str] = field(default_factory=list)
     unscored: dict[str, str] = field(default_factory=dict)
     has_coverage: bool = False
+    encoder: tuple[str, str] | None = None
 
     def add(self, scene: str, outcome: SceneOutcome) -> None:
         self.scores[scene] = outcome.score
@@ -66,8 +67,9 @@ class ProtocolEvaluation:
     ``with_ones``: what 1 for every confidence gives, where the protocol has that and the files' own count.
 
     ``missed`` scenes have no prediction and count as missed, ``skipped`` ones are left out as the original does.
-    ``coverage``: by radius in metres the share of scored points with a predicted point that near, None without
-    coordinates.
+    ``scores`` and ``ceilings`` are by scene, ``unscored`` has a reason for each of the others; ``encoder``: name and
+    digest of what named the features. ``coverage``: by radius in metres the share of scored points with a predicted
+    point that near, None without coordinates.
     """
 
     rules: ProtocolRules
@@ -80,6 +82,10 @@ class ProtocolEvaluation:
     missed: tuple[str, ...]
     skipped: tuple[str, ...]
     warnings: tuple[str, ...]
+    scores: Mapping[str, SceneScore]
+    ceilings: Mapping[str, SceneScore]
+    unscored: Mapping[str, str]
+    encoder: tuple[str, str] | None = None
 
     @property
     def n_duplicates(self) -> tuple[int, int]:
@@ -207,6 +213,10 @@ def _form(rules: ProtocolRules, kept: SceneOutcomes, file_confidences: bool) -> 
         missed=tuple(kept.missed),
         skipped=tuple(kept.skipped),
         warnings=(),
+        scores=kept.scores,
+        ceilings=ceilings,
+        unscored=kept.unscored,
+        encoder=kept.encoder,
     )
     lines = [*_scene_warnings(kept), *_confidence_warnings(rules, evaluation, file_confidences), *kept.warnings]
     # of kind 'instance' said above, for all scenes at once
@@ -235,10 +245,12 @@ def _scene_warnings(kept: SceneOutcomes) -> list[str]:
     if kept.skipped:
         lines.append(
             f"{len(kept.skipped)} of {n} scenes have no prediction and are left out, as the original evaluator does; "
-            f"their objects do not count as missed: {_some(kept.skipped)}"
+            f"their objects do not count as missed: {some_names(kept.skipped)}"
         )
     if kept.missed:
-        lines.append(f"{len(kept.missed)} of {n} scenes have no prediction and count as missed: {_some(kept.missed)}")
+        lines.append(
+            f"{len(kept.missed)} of {n} scenes have no prediction and count as missed: {some_names(kept.missed)}"
+        )
     return lines + [f"{scene}: not scored: {reason}" for scene, reason in kept.unscored.items()]
 
 
@@ -264,7 +276,8 @@ def _confidence_warnings(rules: ProtocolRules, evaluation: ProtocolEvaluation, f
     return []
 
 
-def _some(names: Sequence[str]) -> str:
+def some_names(names: Sequence[str]) -> str:
+    """The first five of ``names``, and how many more there are."""
     return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
 
 

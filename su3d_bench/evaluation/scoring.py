@@ -12,6 +12,7 @@ from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, P
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import (
     DenseFeatures,
+    Float32Array,
     Float64Array,
     GroundTruth,
     Instances,
@@ -106,8 +107,15 @@ class Scoring:
         if self._first is None and not _is_empty(prediction.content):
             self._first = prediction.content
 
-    def add_missed(self, scenes: Sequence[str]) -> None:
-        """Scenes without a prediction: left out where the original leaves them out, otherwise counted as missed."""
+    def rules_of(self, scene: str) -> list[ProtocolRules]:
+        """The rules under which a scene has a score."""
+        return [rules for name, rules in self.tally.rules.items() if scene in self.tally.outcomes[name].scores]
+
+    def add_missed(self, scenes: Sequence[str]) -> Content:
+        """Scenes without a prediction: left out where the original leaves them out, otherwise counted as missed.
+
+        What stands for the prediction of one that is counted.
+        """
         nothing = nothing_like(self._first)
         for rules in self.tally.rules.values():
             kept = self.tally.outcomes[rules.name]
@@ -120,6 +128,7 @@ class Scoring:
                     raise DataError(f"{rules.name}: {reason}")
                 if scene not in kept.unscored:
                     kept.missed.append(scene)
+        return nothing
 
     def _score(self, rules: ProtocolRules, scene: str, prediction: ScenePrediction) -> str | None:
         """The reason why a scene cannot be scored under the protocol; None where it was."""
@@ -134,6 +143,8 @@ class Scoring:
             encoder = encoder_for(rules, n_dimensions, self._texts, is_own=prediction.format == OwnRuns.name)
         if isinstance(encoder, str):
             return encoder
+        if encoder is not None:
+            self.tally.outcomes[rules.name].encoder = encoder.name, encoder.digest
         return self._score_content(rules, scene, prediction.content, encoder)
 
     def _score_content(self, rules: ProtocolRules, scene: str, content: Content, encoder: Encoder | None) -> str | None:
@@ -145,8 +156,7 @@ class Scoring:
                 kept.unscored[scene] = str(error)
                 return None
             return str(error)
-        changes = self.tally.counts_file_confidences and rules.confidence == "ones"
-        used = rules.model_copy(update={"confidence": "prediction"}) if changes else rules
+        used = with_confidences_of_files(rules) if self.tally.counts_file_confidences else rules
         if isinstance(truth, VertexTruth):
             if (reason := why_not_length(facts, len(truth.values))) is not None:
                 raise PredictionError(f"{scene}: {reason}")
@@ -161,6 +171,11 @@ class Scoring:
         kept.has_coverage = self._truths.has_points
         kept.add(scene, outcome)
         return None
+
+
+def with_confidences_of_files(rules: ProtocolRules) -> ProtocolRules:
+    """The rules with the predictions' own confidences where a protocol has 1 for every mask."""
+    return rules.model_copy(update={"confidence": "prediction"}) if rules.confidence == "ones" else rules
 
 
 def _is_empty(content: Content) -> bool:
@@ -325,15 +340,13 @@ def score_on_truth(
     rules: ProtocolRules, truth: GroundTruth, scene: str, content: Content, encoder: Encoder | None
 ) -> SceneOutcome:
     """The outcome against the truth of a dataset; what has no points of its own stands on those of the truth."""
-    prediction: Prediction
+    prediction = map_of(content, truth.points, rules)
     if isinstance(content, VertexMasks):
-        prediction = content.on(truth.points, rules)
         warnings = class_warnings(scene, rules, content.class_numbers, content.class_ids(rules))
     elif isinstance(content, VertexLabels):
-        prediction = content.masks().on(truth.points, rules)
         warnings = label_warnings(scene, rules, content.class_ids.astype(np.int64))
     else:
-        prediction, warnings = content, check_cloud(scene, content.points, truth.points)
+        warnings = check_cloud(scene, content.points, truth.points)
     facts = bound = None
     if not isinstance(prediction, DenseFeatures):
         masks, scores = masks_and_scores(prediction)
@@ -347,6 +360,13 @@ def score_on_truth(
             bound = _instance_counts(rules, values, moved, scores, None)
     score = score_scene(rules, truth, prediction, encoder)
     return SceneOutcome(score, _oracle_score(rules, truth), bound, facts, tuple(warnings))
+
+
+def map_of(content: Content, points: Float32Array, rules: ProtocolRules) -> Prediction:
+    """The map of ``content``; what has no points of its own stands on those of the truth."""
+    if isinstance(content, VertexLabels):
+        return content.masks().on(points, rules)
+    return content.on(points, rules) if isinstance(content, VertexMasks) else content
 
 
 def _oracle_score(rules: ProtocolRules, truth: GroundTruth) -> SceneScore | None:

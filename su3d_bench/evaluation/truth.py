@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core import registry
+from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import (
     ConfigError,
     DataError,
@@ -29,6 +30,7 @@ from su3d_bench.core.errors import (
     suggest,
 )
 from su3d_bench.core.files import file_bytes
+from su3d_bench.core.registry import FILES_OF_TRUTH
 from su3d_bench.core.types import GroundTruth, Int64Array
 from su3d_bench.datasets.openlex3d import FACE_CORNERS, VISIBLE, OpenLexRelease
 from su3d_bench.evaluation.request import Request
@@ -44,6 +46,8 @@ from su3d_bench.predictions.base import scene_files
 from su3d_bench.predictions.scenes import Match, Source, match_scenes, planned_scenes
 from su3d_bench.questions.files.queries import VARIANT as QUERY_OBJECTS
 from su3d_bench.questions.files.queries import query_truth, read_query_file
+from su3d_bench.runs.planning.scenes import data_root
+from su3d_bench.store.records import TruthRecord
 
 NOT_MEANT = "is not meant for"
 LARGEST_VALUE = 10_000 * INSTANCES_PER_CLASS  # as the instance metric has it
@@ -73,6 +77,24 @@ class SceneTruths(ABC):
     scenes: tuple[str, ...]
     matches: list[Match]
     remarks: list[str]
+
+    @property
+    @abstractmethod
+    def record(self) -> TruthRecord:
+        """What a run says that it was held against."""
+
+    @property
+    def target(self) -> str:
+        """What the addresses of the scenes begin with in the settings of a run."""
+        return self.dataset_name or FILES_OF_TRUTH
+
+    def address(self, scene: str) -> str:
+        """The scene as a run calls it."""
+        return f"{self.dataset_name or FILES_OF_TRUTH}/{scene}"
+
+    @abstractmethod
+    def digest(self, scene: str) -> str:
+        """A key of the data of a scene."""
 
     def take_queries(self, path: Path) -> None:
         """Score the texts in a file too, over the objects that they speak of."""
@@ -107,7 +129,8 @@ class DatasetTruths(SceneTruths):
     """Truth with coordinates, read when it is asked for; that of one scene is kept."""
 
     def __init__(self, request: Request, sources: Sequence[Source]) -> None:
-        self._dataset = open_dataset(request.dataset or _dataset_of(sources))
+        self._target = request.dataset or _dataset_of(sources)
+        self._dataset = open_dataset(self._target)
         self.where = self.dataset_name = name = str(self._dataset.name)
         known = list(self._dataset.scenes())
         requested = choose_scenes(request.scenes, known, name) if _are_all(request.scenes, known) else []
@@ -123,12 +146,25 @@ class DatasetTruths(SceneTruths):
         self.scenes = tuple(scenes)
         self.matches = [match for match in matches if match.scene in scenes]
         self._queries: Mapping[str, tuple[TextQuery, ...]] | None = None
+        self._queries_digest: str | None = None
         self._kept: dict[tuple[str, str], GroundTruth] = {}
+
+    @property
+    def record(self) -> TruthRecord:
+        return TruthRecord(self.dataset_name, None, queries=self._queries_digest)
+
+    @property
+    def target(self) -> str:
+        return self._target
+
+    def digest(self, scene: str) -> str:
+        return str(self._dataset.digest(scene))
 
     def take_queries(self, path: Path) -> None:
         if not self._dataset.variants:
             super().take_queries(path)
         self._queries = read_query_file(path)
+        self._queries_digest = digest_file(path)
 
     def why_not(self, rules: ProtocolRules, *, is_named: bool) -> str | None:
         if rules.ground_truth == QUERY_OBJECTS:
@@ -175,7 +211,6 @@ def _dataset_of(sources: Sequence[Source]) -> str:
 
 def open_dataset(name: str) -> Any:
     """The dataset called ``name`` with its default settings, below the data root."""
-    from su3d_bench.runs.planning.scenes import data_root
 
     dataset_class = registry.load("dataset", name)
     return dataset_class(data_root(), dataset_class.Options())
@@ -211,15 +246,22 @@ class OpenLexTruths(SceneTruths):
     """OpenLex3D's labels and queries, which lie beside the mesh of the dataset."""
 
     def __init__(self, request: Request, sources: Sequence[Source]) -> None:
-        from su3d_bench.runs.planning.scenes import data_root
 
         assert request.ground_truth is not None
+        self._path = request.ground_truth
         self._release = OpenLexRelease(request.ground_truth, data_root())
         self.where, self.dataset_name, known = shown(request.ground_truth), None, self._release.scenes()
         self.scenes = tuple(choose_scenes(request.scenes, known, self.where)) if request.scenes else known
         requested = self.scenes if request.scenes else ()
         matches, self.remarks = match_scenes(sources, known, None, self.where, requested)
         self.matches = [match for match in matches if match.scene in self.scenes]
+
+    @property
+    def record(self) -> TruthRecord:
+        return TruthRecord(None, str(self._path))
+
+    def digest(self, scene: str) -> str:
+        return self._release.digest(scene)
 
     def why_not(self, rules: ProtocolRules, *, is_named: bool) -> str | None:
         return None if rules.ground_truth in (VISIBLE, FACE_CORNERS) else f"{NOT_MEANT} the labels of OpenLex3D"
@@ -254,11 +296,19 @@ class TextTruths(SceneTruths):
         self.matches, self.remarks = match_scenes(sources, chosen, self.dataset_name, self.where, requested)
         self._values = {match.scene: read_values(self._files[match.scene]) for match in self.matches}
         self._said = request.truth_values
+        self._path = request.ground_truth
         self._range = self._all = TruthValues.of(self._values.values(), self._said)
         if self.matches and self.dataset_name is None and not request.protocols:
             raise ConfigError(
                 f"{self.where}: whose labels are these? name the protocol with --protocol or the dataset with --dataset"
             )
+
+    @property
+    def record(self) -> TruthRecord:
+        return TruthRecord(None, str(self._path), self._said)
+
+    def digest(self, scene: str) -> str:
+        return digest_file(self._files[scene])
 
     def why_not(self, rules: ProtocolRules, *, is_named: bool) -> str | None:
         if rules.ground_truth == QUERY_OBJECTS:

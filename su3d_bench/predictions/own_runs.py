@@ -12,9 +12,18 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import PredictionError, printable, shown
 from su3d_bench.core.files import regular
 from su3d_bench.core.types import DenseFeatures, Prediction
+from su3d_bench.formats.arrays import kind_of
 from su3d_bench.formats.numpy_files import npy_header_of, npz_names, read_npz
-from su3d_bench.predictions.base import Reader, ScenePrediction
-from su3d_bench.store.predictions import features_beside, prediction_from_arrays, value_fault
+from su3d_bench.predictions.base import Content, Reader, ScenePrediction, VertexLabels, VertexMasks
+from su3d_bench.store.atomic import write_npz
+from su3d_bench.store.predictions import (
+    OVER_VERTICES,
+    features_beside,
+    prediction_from_arrays,
+    read_prediction,
+    value_fault,
+    write_prediction,
+)
 from su3d_bench.store.run_folder import JOBS, scene_of_folder
 
 FILE = "prediction.npz"
@@ -40,6 +49,8 @@ class OwnRuns(Reader):
 
     def read_scene(self, place: Path, scene: str) -> ScenePrediction:
         where, arrays = shown(place), read_npz(place)
+        if str(arrays.get("kind")) in OVER_VERTICES:
+            return ScenePrediction(scene, self.name, place, _over_vertices(arrays, where))
         if str(arrays.get("kind")) == DenseFeatures.__name__ and "features" not in arrays:
             arrays["features"] = _mapped_features(features_beside(place))
         try:
@@ -48,6 +59,79 @@ class OwnRuns(Reader):
             raise PredictionError(f"{where}: {str(error).removeprefix(f'{where}: ')}") from error
         _check_points(where, content)
         return ScenePrediction(scene, self.name, place, content)
+
+
+def write_content(path: Path, content: Content) -> None:
+    """Store what a reader gave at ``path``, so that ``OwnRuns`` reads the same."""
+    if isinstance(content, VertexLabels):
+        write_npz(path, {"kind": np.array("VertexLabels"), "class_ids": content.class_ids})
+    elif isinstance(content, VertexMasks):
+        arrays = {
+            "kind": np.array("VertexMasks"),
+            "indptr": content.indptr,
+            "indices": content.indices,
+            "n_points": np.array(-1 if content.n_points is None else content.n_points),
+            "scores": content.scores,
+            "class_numbers": content.class_numbers,
+            "numbering": np.array(content.numbering),
+            "features": content.features,
+            "keys": np.array(content.keys, dtype=np.str_),
+        }
+        write_npz(path, {name: array for name, array in arrays.items() if array is not None})
+    else:
+        write_prediction(path, content)
+
+
+def read_stored(path: Path) -> Content:
+    """What ``write_content`` stored at ``path``, or the map of a run."""
+    if str(read_npz(path, ("kind",)).get("kind")) in OVER_VERTICES:
+        return _over_vertices(read_npz(path), shown(path))
+    return read_prediction(path)
+
+
+# Dimensions and kind of numbers of each array of masks and labels over points without coordinates.
+_VERTEX_ARRAYS = {
+    "indptr": (1, "i"),
+    "indices": (1, "i"),
+    "n_points": (0, "i"),
+    "scores": (1, "f"),
+    "numbering": (0, "U"),
+    "keys": (1, "U"),
+    "class_numbers": (1, "i"),
+    "features": (2, "f"),
+    "class_ids": (1, "i"),
+}
+_OPTIONAL = ("class_numbers", "features")
+
+
+def _over_vertices(arrays: Mapping[str, NDArray[Any]], where: str) -> VertexMasks | VertexLabels:
+    """The masks or labels in ``arrays``; a ``PredictionError`` where they are none."""
+    are_labels = str(arrays["kind"]) == "VertexLabels"
+    for name, (n_axes, kind) in _VERTEX_ARRAYS.items():
+        array = arrays.get(name)
+        is_asked = (name == "class_ids") == are_labels and name not in _OPTIONAL
+        if array is None and is_asked:
+            raise PredictionError(f"{where}: lacks '{name}'; evaluate again with --out")
+        if array is not None and (array.ndim != n_axes or array.dtype.kind != kind):
+            raise PredictionError(f"{where}: '{name}' is {kind_of(array)}; evaluate again with --out")
+    if are_labels:
+        return VertexLabels(arrays["class_ids"])
+    numbering, n_points = str(arrays["numbering"]), int(arrays["n_points"])
+    if numbering not in ("id", "index") or not len(arrays["indptr"]):
+        raise PredictionError(f"{where}: holds no masks; evaluate again with --out")
+    try:
+        return VertexMasks(
+            arrays["indptr"],
+            arrays["indices"],
+            n_points=None if n_points < 0 else n_points,
+            scores=arrays["scores"],
+            class_numbers=arrays.get("class_numbers"),
+            numbering="id" if numbering == "id" else "index",
+            features=arrays.get("features"),
+            keys=tuple(str(key) for key in arrays["keys"]),
+        )
+    except PredictionError as error:
+        raise PredictionError(f"{where}: {error}") from error
 
 
 def _mapped_features(file: Path) -> NDArray[Any]:

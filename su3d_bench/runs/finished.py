@@ -15,7 +15,17 @@ from typing import TYPE_CHECKING, Any
 from pydantic import ValidationError
 
 from su3d_bench.core.config import KeyPath, Settings, flatten, read_file, resolve, toml_value
-from su3d_bench.core.errors import ConfigError, DataError, PredictionError, StoreError, printable, shown, some, suggest
+from su3d_bench.core.errors import (
+    ConfigError,
+    DataError,
+    PredictionError,
+    StoreError,
+    Su3dError,
+    printable,
+    shown,
+    some,
+    suggest,
+)
 from su3d_bench.core.files import file_bytes
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.types import Prediction
@@ -24,6 +34,7 @@ from su3d_bench.metrics.protocols.files import protocol_names
 from su3d_bench.metrics.protocols.loading import load_protocol, read_rules
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import SceneScore, unpack_scores
+from su3d_bench.predictions.formats import recognise
 from su3d_bench.runs.job import build_dataset, part_of
 from su3d_bench.runs.planning.scenes import (
     cache_root,
@@ -32,15 +43,17 @@ from su3d_bench.runs.planning.scenes import (
     looks_like_scene,
     nearest_scene,
 )
-from su3d_bench.store.atomic import is_file
+from su3d_bench.store.atomic import is_file, read_json
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.records import (
     CostsRecord,
     MetricsRecord,
+    PredictionsRecord,
     ProtocolRecord,
     RequestRecord,
     ResultRecord,
     RunRecord,
+    TruthRecord,
     checked,
     read_record,
     read_updates,
@@ -56,16 +69,25 @@ if TYPE_CHECKING:
 MOST_NAMED = 8  # scenes or methods of a run in a message
 
 
+def made_elsewhere(formats: Sequence[str]) -> str:
+    """What stands beneath every table of predictions that were not made here."""
+    return f"predictions made elsewhere, read from files ({printable(', '.join(formats), 120)})"
+
+
 class OtherDataError(DataError):
     """The data here are not those that a run was made from."""
 
 
 @dataclass(frozen=True)
 class RunData:
-    """The data of a run, opened with the options that it had; ``digests`` are those of its scenes."""
+    """The data of a run, opened with the options that it had; ``digests`` are those of its scenes.
+
+    ``truth_files``: the folder of ground truth that predictions made elsewhere were held against in place of a dataset.
+    """
 
     settings: Settings
     digests: Mapping[str, str]
+    truth_files: str | None = None
 
     @cached_property
     def _datasets(self) -> dict[str, Any]:
@@ -79,6 +101,11 @@ class RunData:
     def dataset(self, scene: str) -> Any:
         """The dataset of ``scene``; a ``DataError`` where it is not known, or its data are not those of the run."""
         name, _, of_dataset = scene.partition("/")
+        if self.truth_files is not None:
+            raise DataError(
+                f"{printable(scene, 100)}: was evaluated against the files in {printable(self.truth_files, 200)}, "
+                "which have no frames, colours and places; evaluate against the dataset itself with --dataset"
+            )
         if name not in self._datasets:
             raise DataError(f"{printable(scene, 100)}: run.toml names no dataset '{printable(name, 60)}'")
         dataset = self._datasets[name]
@@ -136,6 +163,16 @@ class FinishedRun:
     @property
     def name(self) -> str:
         return printable(str(self.folder.path), 200)
+
+    @cached_property
+    def made_elsewhere(self) -> Mapping[str, PredictionsRecord]:
+        """The predictions that were made elsewhere, by the method that they are called."""
+        return {record.method: record for record in self.record.predictions}
+
+    def elsewhere_lines(self) -> list[str]:
+        """A line a method whose predictions were made elsewhere."""
+        of_methods = self.made_elsewhere.items()
+        return [f"{printable(method, 80)}: {made_elsewhere(record.formats)}" for method, record in of_methods]
 
     def rules(self, protocol: str, *, to_the_letter: bool = False) -> ProtocolRules:
         """The rules that scored the run: the program's own, else those that ``run.json`` keeps.
@@ -242,7 +279,7 @@ def read_run(path: Path) -> FinishedRun:
     """The run in the folder ``path``; a ``StoreError`` where it holds none, or one that is not finished."""
     shown = printable(str(path), 200)
     if not is_file(path / "run.json"):
-        raise StoreError(f"{shown}: holds no run.json; name the folder of a run, such as runs/my-run")
+        raise StoreError(f"{shown}: {_why_no_run(path)}")
     if not is_file(path / "metrics.json"):
         raise StoreError(f"{shown}: holds no metrics.json, so the run is not finished; run its command again")
     record = read_record(RunRecord, path / "run.json", shown)
@@ -257,8 +294,40 @@ def read_run(path: Path) -> FinishedRun:
         protocols=_Rules({rules.name: rules for rules in record.protocols}, shown),
         results={(result.method, result.protocol): result for result in metrics.results},
         limit=metrics.limit,
-        data=RunData(read_file(path / "run.toml"), record.data_digests),
+        data=RunData(read_file(path / "run.toml"), record.data_digests, _path_of(record.ground_truth)),
     )
+
+
+def _why_no_run(path: Path) -> str:
+    """What is at ``path`` in place of a run, and what would be one."""
+    if is_file(path):
+        if is_numbers_alone(path):
+            return (
+                "holds numbers without the counts of scenes, from which this is made anew; evaluate again with --out "
+                "runs/mine, and name that folder"
+            )
+        return "is a file; name the folder of a run, such as runs/my-run"
+    with suppress(Su3dError, OSError):
+        reader = recognise(path)
+        if reader.scenes(path):
+            made = f"su3d-bench evaluate {shlex.quote(str(path))} --out runs/mine"
+            return f"holds predictions ({reader.name}) and no run.json; make a run of them with: {made}"
+    return "holds no run.json; name the folder of a run, such as runs/my-run"
+
+
+def is_numbers_alone(file: Path) -> bool:
+    """Whether ``file`` is what ``evaluate --json`` writes."""
+    try:
+        value = read_json(file)
+    except StoreError:
+        return False
+    methods = value.get("methods") if isinstance(value, dict) else None
+    first = next(iter(methods.values()), None) if isinstance(methods, dict) else value
+    return isinstance(first, dict) and {"formats", "ground_truth", "protocols"} <= first.keys()
+
+
+def _path_of(truth: TruthRecord | None) -> str | None:
+    return None if truth is None else truth.path
 
 
 def _named_once(where: str, what: str, names: Sequence[str]) -> None:
@@ -318,7 +387,11 @@ def _request_of(run: RunFolder) -> RequestRecord:
 def data_of_map(run: Path, scene: str, map_file: Path) -> RunData:
     """The data from which ``map_file`` was made, a sealed map of ``scene`` in the folder ``run``, finished or not."""
     seal = JobFolder(map_file.parent).seals().get("predict")
-    return RunData(read_file(run / "run.toml"), {} if seal is None else {scene: seal.key.get("data", "")})
+    digests = {} if seal is None else {scene: seal.key.get("data", "")}
+    request = RequestRecord()
+    with suppress(StoreError):
+        request = read_record(RequestRecord, run / "run.json", printable(str(run), 200))
+    return RunData(read_file(run / "run.toml"), digests, _path_of(request.ground_truth))
 
 
 def encoder_of(run: RunFolder, device: str = "cpu") -> Encoder:

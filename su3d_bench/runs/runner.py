@@ -62,6 +62,7 @@ from su3d_bench.store.run_folder import JobFolder
 from su3d_bench.store.scratch import remove_abandoned
 
 Scores = Mapping[tuple[str, str], SceneScore]
+BY_THE_METHOD = "computed by the method"
 
 
 @dataclass(frozen=True)
@@ -387,7 +388,7 @@ def confidences_of(rules: ProtocolRules, numbers: NumbersRecord) -> str | None:
         return f"{what}, by the protocol"
     said = {warning.partition(": ")[0] for warning in numbers.warnings if CONSTANT_CONFIDENCE in warning}
     are_equal = EVERY_SCENE in said or said >= {scene for scene, n in numbers.n_predictions.items() if n > 1}
-    return "the same for all instances of a scene" if are_equal else "computed by the method"
+    return "the same for all instances of a scene" if are_equal else BY_THE_METHOD
 
 
 def _protocol_names(job: SceneJob) -> list[str]:

@@ -306,7 +306,10 @@ def read_record(path: Path, kind: type[Read], schema: int, maker: str, again: st
     try:
         record = TypeAdapter(kind).validate_json(content, strict=True)
     except ValidationError as error:
-        place = printable(".".join(map(str, error.errors()[0]["loc"])), 120) or "it"
+        first = error.errors()[0]
+        place = printable(".".join(map(str, first["loc"])), 120) or "it"
+        if first["type"] == "missing" and len(first["loc"]) == 1:
+            raise DataError(f"{where}: is no file that su3d-bench {maker} writes: it has no '{place}'") from error
         raise DataError(f"{where}: {place} is not as su3d-bench {maker} writes it; {again}") from error
     if record.schema_version != schema:
         raise DataError(f"{where}: has schema {record.schema_version}, this version reads {schema}; {again}")

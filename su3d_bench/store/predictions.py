@@ -40,6 +40,9 @@ FIELDS = {
 
 
 ROWS = {"points": (3,), "boxes": (2, 3), "centroids": (3,), "views": (2,)}  # the shape of each row, where it is fixed
+# Kinds of what is kept of predictions over the points of files that have no coordinates; ``predictions.own_runs`` reads
+# them.
+OVER_VERTICES = ("VertexMasks", "VertexLabels")
 
 
 def _fields_of(kind: type[Prediction]) -> list[str]:
@@ -60,6 +63,11 @@ def prediction_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Pr
     """The reverse of ``prediction_arrays``; ``where`` begins the message when the arrays are no prediction."""
     kinds = {kind.__name__: kind for kind in (Instances, Partition, DenseFeatures)}
     kind = kinds.get(str(arrays.get("kind")))
+    if str(arrays.get("kind")) in OVER_VERTICES:
+        raise PredictionError(
+            f"{where}: is over the points of ground-truth files, which have no coordinates, so that there is no map; "
+            "evaluate against the dataset itself (--dataset) for one"
+        )
     if kind is None:
         raise PredictionError(f"{where}: holds no 'kind' out of {', '.join(kinds)}; it is not a prediction")
     if fault := array_fault(arrays):

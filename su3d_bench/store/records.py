@@ -84,6 +84,36 @@ class UnscoredRecord:
 
 
 @dataclass(frozen=True)
+class TruthRecord:
+    """What predictions made elsewhere were held against: a dataset, or the files at ``path``.
+
+    ``values``: what a text was said to hold; ``queries``: SHA-256 of the file of queries.
+    """
+
+    dataset: str | None
+    path: str | None
+    values: str | None = None
+    queries: str | None = None
+
+
+@dataclass(frozen=True)
+class PredictionsRecord:
+    """Predictions made elsewhere that a run took for those of ``method``.
+
+    ``files``: SHA-256 of every file that was read, by scene and path. ``confidences`` is ``file`` where those of the
+    files count even where a protocol has 1 for every mask. ``texts``: the file of the features of class names and its
+    SHA-256.
+    """
+
+    method: str
+    formats: tuple[str, ...]
+    paths: tuple[str, ...]
+    files: Mapping[str, Mapping[str, str]]
+    confidences: str
+    texts: tuple[str, str] | None = None
+
+
+@dataclass(frozen=True)
 class GitRecord:
     """The checkout that the code ran from."""
 
@@ -95,7 +125,8 @@ class GitRecord:
 class RunRecord:
     """``run.json``: where the numbers come from. ``models`` holds the SHA-256 of weight files by model and file name.
 
-    ``status`` is ``running``, ``interrupted``, ``incomplete`` or ``complete``.
+    ``status`` is ``running``, ``interrupted``, ``incomplete`` or ``complete``. ``predictions`` are those that were made
+    elsewhere, ``ground_truth`` what they were held against.
     """
 
     schema: int = SCHEMA
@@ -119,6 +150,8 @@ class RunRecord:
     failed: tuple[FailureRecord, ...] = ()
     unscored: tuple[UnscoredRecord, ...] = ()
     warnings: tuple[str, ...] = ()
+    predictions: tuple[PredictionsRecord, ...] = ()
+    ground_truth: TruthRecord | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,6 +165,7 @@ class RequestRecord:
     protocols: tuple[ProtocolRecord, ...] = ()
     methods: tuple[str, ...] = ()
     scenes: tuple[str, ...] = ()
+    ground_truth: TruthRecord | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,6 +280,8 @@ _ADAPTERS: dict[Any, TypeAdapter[Any]] = {
 def plain(record: Any) -> dict[str, Any]:
     """``record`` as it is written."""
     written = asdict(record)
+    if isinstance(record, RunRecord) and record.ground_truth is None:
+        del written["predictions"], written["ground_truth"]
     for result in written["results"] if isinstance(record, MetricsRecord) else ():
         if result["anytime"] is None:
             del result["anytime"]

@@ -102,7 +102,17 @@ def test_protocols_that_do_not_fit_are_told_with_the_reason(capsys: pytest.Captu
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["evaluate"], "evaluate: the following arguments are required: PREDICTIONS; see su3d-bench evaluate --help"),
+        (["evaluate"], "evaluate: no predictions were named; give a folder or files, or --name METHOD=PREDICTIONS"),
+        (
+            [*WORDS, "--name", "a", "b"],
+            "evaluate: --name a: expected METHOD=PREDICTIONS of each method, or PREDICTIONS",
+        ),
+        (
+            [*WORDS, "--name", "mine"],
+            "evaluate: --name calls a method of a run; give --out DIR too, or several methods",
+        ),
+        ([*WORDS, "--out", "runs/mine", "--name", "oracle"], "--name: 'oracle' is what the truth itself scores"),
+        ([*WORDS, "--out", "runs/mine", "--name", "../up"], "--name: '../up' cannot be the name of a folder"),
         (
             ["evaluate", "prde", "--ground-truth", "gt"],
             "prde: no such file or folder; give the folder of the predictions",
@@ -169,3 +179,22 @@ def test_the_oracle_of_the_rooms_says_exactly_one(
         assert set(one["ceiling"].values()) == {1.0}, name
     metrics = json.loads(Path("run/metrics.json").read_text())["results"]
     assert {one["protocol"] for one in metrics} == set(protocols)
+
+
+def test_warnings_that_several_scenes_share_are_one_with_their_numbers_added(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for name, n in (("scene0001_00", 1), ("scene0001_01", 2)):
+        masks = np.zeros((n + 1, N), bool)
+        masks[0, :200] = True
+        files = [f"masks/{name}_{k}.txt" for k in range(n + 1)]
+        labels, scores = np.array([5, 39, 40])[: n + 1], np.array([0.9, 0.8, 0.7])[: n + 1]
+        write_scannet_text(
+            Path("pred"), {"name": name, "masks": masks, "labels": labels, "scores": scores, "files": files}
+        )
+    assert main([*WORDS, "--json", "numbers.json", "--quiet"]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if "WARNING" in line]
+    assert "- WARNING: 3 empty masks, in 2 scenes (scene0001_00, scene0001_01)" in lines
+    assert not [line for line in lines if "scene0001_01: " in line and "empty" in line]
+    warnings = json.loads(Path("numbers.json").read_text())["protocols"]["scannet-instance"]["warnings"]
+    assert [line for line in warnings if line.startswith("scene0001_01: 2 empty masks, the first is mask 1")]

@@ -19,8 +19,8 @@ from su3d_bench.analysis.leaderboard import leaderboard
 from su3d_bench.analysis.tables import check_paper
 from su3d_bench.cli.main import main
 from su3d_bench.core.config import parse_value, read_file
+from su3d_bench.core.damage import DAMAGE
 from su3d_bench.core.errors import (
-    DAMAGE,
     MOST_CHARACTERS,
     ConfigError,
     DataError,

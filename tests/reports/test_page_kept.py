@@ -204,8 +204,8 @@ def test_counts_come_back_as_they_went(run: Path) -> None:
     explained = explained_of(finished, "collector")
     truths = SharedTruths("painted/a")
     mended = explained.mend("painted/a", lambda variant: truths.of_run(finished, variant), WordEncoder)
-    back = unpacked(packed(mended))
+    back = unpacked(packed(mended, finished.rules), finished.rules)
     assert back is not None
     assert explained.form({"painted/a": back}).to_json() == explained.form({"painted/a": mended}).to_json()
     assert list(back) == sorted(mended)
-    assert unpacked(b"nothing") is None
+    assert unpacked(b"nothing", finished.rules) is None

@@ -29,6 +29,8 @@ DESCRIBED = (
     records.ProtocolRecord,
     records.FailureRecord,
     records.UnscoredRecord,
+    records.PredictionsRecord,
+    records.TruthRecord,
     MetricsRecord,
     ResultRecord,
     NumbersRecord,

@@ -338,7 +338,7 @@ def run_notes(rows: Sequence[Measured], labels: Sequence[str]) -> list[str]:
     notes: dict[str, list[str]] = {}
     for row, label in zip(rows, labels, strict=True):
         if row.limit:
-            notes.setdefault(f"PARTIAL: only the first {row.limit} frames of each scene", []).append(label)
+            notes.setdefault(f"PARTIAL: only the first {counted(row.limit, 'frame')} of each scene", []).append(label)
         if row.changed:
             notes.setdefault(f"with {some(row.changed, 8)}", []).append(label)
         if row.failed:

@@ -73,6 +73,7 @@ def _remarks(run: FinishedRun, reference: Reference) -> Iterator[str]:
         yield _other_machine(run, reference)
     elif (busy := busy_remark(run, reference.calibration_ms)) is not None:
         yield busy
+    yield from run.elsewhere_lines()
     known = {result.method for result in reference.results}
     others = [*(method for method in run.methods if method not in known)]
     others += [name for name in run.protocols if name not in reference.protocols]

@@ -84,6 +84,8 @@ def _of_scene(times: UpdateTimes, most_calibration_ms: float) -> dict[Part, floa
 
 def why_no_cost(run: FinishedRun, method: str) -> str | None:
     """Why a run says nothing of the cost of ``method``; None where it does."""
+    if method in run.made_elsewhere:
+        return "was made elsewhere and brings no times"
     timed = read_update_times(run, method)
     n_most = max((len(times) for times in timed), default=0)
     if n_most <= WARM_UP:

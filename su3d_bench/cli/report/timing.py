@@ -53,7 +53,9 @@ def call(arguments: argparse.Namespace) -> int:
     timed = [read_update_times(run, method) for run in runs for method in arguments.methods or run.methods]
     times = [each for each in timed if each]
     if not times:
-        raise ConfigError("no update was timed in these runs: their methods look at no frame")
+        are_elsewhere = any(run.made_elsewhere for run in runs)
+        why = "predictions made elsewhere bring no times" if are_elsewhere else "their methods look at no frame"
+        raise ConfigError(f"no update was timed in these runs: {why}")
     summaries = [summarise(each, arguments.warm_up) for each in times]
     anytime = [point for each in times for point in anytime_points(runs, each)]
     hardware = {run.name: run.record.hardware for run in runs}

@@ -93,8 +93,8 @@ def dots(left: Float64Array, right: Float64Array, starts: Int64Array, lengths: I
     # the halves of each 512-bit register fold into one of 256 bits, which takes the last block of 16
     halves = wide.reshape(-1, 4, 2, 4)
     lanes = (halves[:, :, 0] + halves[:, :, 1]).reshape(-1, 16)
-    lanes = _chains(*products, starts + n_wide, (n_blocked - n_wide) // 16, lanes).reshape(-1, 4, 4)
-    four = ((lanes[:, 0] + lanes[:, 1]) + lanes[:, 2]) + lanes[:, 3]
+    fours = _chains(*products, starts + n_wide, (n_blocked - n_wide) // 16, lanes).reshape(-1, 4, 4)
+    four = ((fours[:, 0] + fours[:, 1]) + fours[:, 2]) + fours[:, 3]
     total = (four[:, 0] + four[:, 2]) + (four[:, 1] + four[:, 3])
     return _chains(*products, starts + n_blocked, lengths - n_blocked, total[:, None])[:, 0]
 

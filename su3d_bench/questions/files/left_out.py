@@ -20,7 +20,7 @@ def read_left_out(path: Path) -> frozenset[str]:
     where = printable(str(path), 200)
     if path.is_file() and path.stat().st_size > MOST_BYTES:
         raise DataError(f"{where}: has more than {MOST_BYTES >> 20} MiB; it lists no questions")
-    text = read_text(path, where)
+    text = read_text(path, where, "name a CSV file, such as sheets score --disputed writes")
     separator = max(",;\t", key=text.partition("\n")[0].count)
     try:
         rows = separated_rows(text, separator)

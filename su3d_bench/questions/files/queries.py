@@ -27,6 +27,7 @@ from su3d_bench.reports.tables.formats import meant
 COLUMNS = ("scene", "text", "objects")
 MORE_COLUMNS = ("kind", "source")  # may be there, in any order behind the others
 MOST_OBJECTS_ID = 2**31 - 1
+ADVICE = "name a file of queries, TOML or CSV, such as su3d-bench questions make --out queries.toml writes"
 MOST_BYTES = 16 << 20  # some hundred thousand queries
 MOST_CHARACTERS = 20_000  # of one text
 VARIANT = "query-objects"
@@ -49,7 +50,7 @@ def read_query_rows(path: Path) -> list[QueryRow]:
     where = printable(str(path), 200)
     if path.is_file() and path.stat().st_size > MOST_BYTES:
         raise DataError(f"{where}: has more than {MOST_BYTES >> 20} MiB; split it")
-    text = read_text(path, where)
+    text = read_text(path, where, ADVICE)
     rows = list(_csv_rows(text, where) if path.suffix.lower() == ".csv" else _toml_rows(text, where))
     for row in rows:
         if len(set(row.objects)) != len(row.objects):

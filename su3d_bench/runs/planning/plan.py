@@ -271,13 +271,18 @@ def _check_one_a_name(flag: str, named: Iterable[tuple[str, Any]]) -> None:
     """A ``ConfigError`` where a name cannot be that of a folder, or two things that differ share one."""
     found: dict[str, Any] = {}
     for name, value in named:
-        is_plain = name.isprintable() and "/" not in name and len(name) <= MOST_CHARACTERS
-        if not name or name.startswith(".") or not is_plain:
-            raise ConfigError(
-                f"{flag}: '{printable(name, 80)}' cannot be the name of a folder; call it by letters and digits"
-            )
+        check_folder_name(flag, name)
         if found.setdefault(name, value) != value:
             raise ConfigError(f"{flag}: two different ones are called '{name}'; give one of them another name")
+
+
+def check_folder_name(flag: str, name: str) -> None:
+    """A ``ConfigError`` where ``name``, which ``flag`` gave, cannot be that of a folder."""
+    is_plain = name.isprintable() and "/" not in name and len(name) <= MOST_CHARACTERS
+    if not name or name.startswith(".") or not is_plain:
+        raise ConfigError(
+            f"{flag}: '{printable(name, 80)}' cannot be the name of a folder; call it by letters and digits"
+        )
 
 
 @dataclass(frozen=True)

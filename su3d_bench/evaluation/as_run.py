@@ -1,0 +1,412 @@
+"""Predictions made elsewhere as a run folder: what ``run`` writes of a method, but for what a method alone can tell.
+
+The counts are those of the evaluation, so that every number of the run is the one that it answers, to the last bit.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from su3d_bench.core.config import write_toml
+from su3d_bench.core.digests import code_digest, digest_file, digest_json, git_state, package_versions
+from su3d_bench.core.errors import ConfigError, StoreError, printable, shown
+from su3d_bench.core.registry import CEILING_METHOD
+from su3d_bench.core.timing import hardware_line, processor_digest
+from su3d_bench.core.types import GroundTruth, Instances
+from su3d_bench.evaluation.evaluate import evaluate
+from su3d_bench.evaluation.request import Request
+from su3d_bench.evaluation.result import Evaluation, ProtocolEvaluation
+from su3d_bench.evaluation.scoring import map_of
+from su3d_bench.evaluation.truth import SceneTruths
+from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.scoring import EVERY_SCENE, SceneScore, combine, pack_scores, plain_json
+from su3d_bench.predictions.base import Content
+from su3d_bench.predictions.own_runs import write_content
+from su3d_bench.predictions.scenes import Source
+from su3d_bench.runs.finished import made_elsewhere
+from su3d_bench.runs.planning.plan import check_folder_name
+from su3d_bench.runs.runner import BY_THE_METHOD, confidences_of
+from su3d_bench.store.atomic import (
+    is_file,
+    json_text,
+    make_folder,
+    read_json,
+    write_bytes,
+    write_error,
+    write_json,
+    write_text,
+)
+from su3d_bench.store.records import (
+    GitRecord,
+    MetricsRecord,
+    NumbersRecord,
+    PredictionsRecord,
+    ProtocolRecord,
+    ResultRecord,
+    RunRecord,
+    TruthRecord,
+    UnscoredRecord,
+    plain,
+    read_record,
+    updates_text,
+)
+from su3d_bench.store.run_folder import RunFolder
+from su3d_bench.store.unfinished import become, unfinished_folder
+
+OF_FILES = "those of the files"
+AGAINST_THE_RULE = "those of the files, where the protocol has 1 for every mask"
+_SCENE_AND_SENTENCE = re.compile(r"([^:]*): (.*)", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class EvaluatedRun:
+    """Evaluations by method, and as a run.  ``was_there``: the folder held them already and stayed as it was."""
+
+    evaluations: Mapping[str, Evaluation]
+    metrics: MetricsRecord
+    was_there: bool = False
+
+
+@dataclass
+class _Kept:
+    """What is known of one method's predictions; the maps go to ``folder``, where there is one."""
+
+    method: str
+    request: Request
+    folder: RunFolder | None
+    files: dict[str, Mapping[str, str]] = field(default_factory=dict)
+
+    def begin(self, truths: SceneTruths, sources: Sequence[Source], *, counts_file_confidences: bool) -> None:
+        self.truths = truths
+        self.formats = tuple(dict.fromkeys(source.reader.name for source in sources))
+        self.confidences = "file" if counts_file_confidences else "protocol"
+
+    def keep(self, scene: str, content: Content, files: Iterable[Path], rules: Sequence[ProtocolRules]) -> None:
+        if self.folder is None:
+            return
+        address = self.truths.address(scene)
+        self.files[address] = {str(file): digest_file(file) for file in files}
+        self._write(address, self._shown(scene, content, rules))
+
+    def _shown(self, scene: str, content: Content, rules: Sequence[ProtocolRules]) -> Content:
+        """The map as it is scored: on the points of the truth, under the names of the first protocol with classes."""
+        for each in sorted(rules, key=lambda one: one.class_agnostic is not None):
+            truth = self.truths.of_scene(each, scene)
+            if isinstance(truth, GroundTruth):
+                return map_of(content, truth.points, each)
+        return content
+
+    def keep_nothing(self, address: str) -> None:
+        """That a scene of another method has no score of this one."""
+        self._write(address, Instances.of(np.zeros((0, 3), np.float32), [], labels=()))
+        self.files[address] = {}
+
+    def _write(self, address: str, content: Content) -> None:
+        assert self.folder is not None
+        job = self.folder.job(address, self.method)
+        job.prepare()
+        write_content(job.prediction, content)
+        write_text(job.updates, updates_text([]))
+
+    @property
+    def record(self) -> PredictionsRecord:
+        texts = self.request.text_features
+        return PredictionsRecord(
+            method=self.method,
+            formats=self.formats,
+            paths=tuple(str(path) for path in self.request.predictions),
+            files=dict(sorted(self.files.items())),
+            confidences=self.confidences,
+            texts=None if texts is None else (str(texts), digest_file(texts)),
+        )
+
+
+def evaluate_methods(requests: Mapping[str, Request], out: Path | None = None) -> EvaluatedRun:
+    """The numbers of each method's predictions, written as one run to ``out`` where it is given.
+
+    A folder that holds the same evaluation stays as it is, byte for byte; a ``StoreError`` where it holds another one,
+    or anything else.
+    """
+    for method in requests:
+        check_method_name(method)
+    if out is None:
+        kept = [_Kept(method, request, None) for method, request in requests.items()]
+        return _evaluated(kept)
+    _refuse_other_runs(out)
+    place = out.absolute()
+    make_folder(place.parent)
+    with _told_of(out), unfinished_folder(place) as filled:
+        folder = RunFolder(filled)
+        kept = [_Kept(method, request, folder) for method, request in requests.items()]
+        run = _evaluated(kept)
+        record = _write(kept, run, folder)
+        if is_file(out / "run.json"):
+            _refuse_other_evaluation(out, record, run.metrics)
+            return replace(run, was_there=True)
+        become(filled, place)
+    return run
+
+
+def check_method_name(name: str) -> None:
+    """A ``ConfigError`` where predictions cannot be called so."""
+    check_folder_name("--name", name)
+    if name == CEILING_METHOD:
+        raise ConfigError(f"--name: '{name}' is what the truth itself scores; call the predictions otherwise")
+
+
+def _evaluated(kept: Sequence[_Kept]) -> EvaluatedRun:
+    evaluations = {one.method: evaluate(one.request, one) for one in kept}
+    return EvaluatedRun(evaluations, _metrics(kept, evaluations))
+
+
+@contextmanager
+def _told_of(out: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise write_error(out, error) from error
+
+
+def _refuse_other_runs(out: Path) -> None:
+    """A ``StoreError`` where ``out`` holds something that no evaluation wrote, before anything is scored."""
+    if out.is_symlink() or (out.exists() and not out.is_dir()):
+        raise StoreError(f"{shown(out)}: is no folder; choose another with --out")
+    RunFolder(out).refuse_other_content()
+    if is_file(out / "run.json") and not read_record(RunRecord, out / "run.json", shown(out)).predictions:
+        raise StoreError(
+            f"{shown(out)}: holds a run, and no evaluation of predictions made elsewhere; choose another with --out"
+        )
+
+
+def _refuse_other_evaluation(out: Path, record: RunRecord, metrics: MetricsRecord) -> None:
+    """A ``StoreError`` where ``out`` holds another evaluation than the one of ``record``, which says in what."""
+    there = read_record(RunRecord, out / "run.json", shown(out))
+    pairs = {what: (of(there), of(record)) for what, of in _IDENTITY.items()}
+    other = next((what for what, (before, now) in pairs.items() if before != now), None)
+    if other is None and read_json(out / "metrics.json") != json.loads(json_text(plain(metrics))):
+        other = "numbers, though of the same files" if there.code == record.code else "numbers of another version"
+    if other is not None:
+        raise StoreError(
+            f"{shown(out)}: holds another evaluation (other {other}); choose another folder with --out, or remove it"
+        )
+
+
+def _without_paths(record: RunRecord) -> list[object]:
+    """The predictions of a run by what they hold, wherever they lay."""
+    return [
+        [one.formats, one.confidences, one.texts and one.texts[1]]
+        + [(scene, sorted(digests.values())) for scene, digests in one.files.items()]
+        for one in record.predictions
+    ]
+
+
+_IDENTITY: dict[str, Callable[[RunRecord], object]] = {
+    "methods": lambda record: record.methods,
+    "scenes": lambda record: record.scenes,
+    "ground truth": lambda record: (dict(record.data_digests), _truth_key(record.ground_truth)),
+    "protocols": lambda record: record.protocols,
+    "predictions": _without_paths,
+}
+
+
+def _truth_key(truth: TruthRecord | None) -> object:
+    return truth and (truth.dataset, truth.values, truth.queries)
+
+
+# ---- numbers
+
+
+def _metrics(kept: Sequence[_Kept], evaluations: Mapping[str, Evaluation]) -> MetricsRecord:
+    rules = {protocol.rules.name: protocol.rules for one in evaluations.values() for protocol in one.protocols}
+    results = tuple(_result(one, evaluations[one.method], each) for each in rules.values() for one in kept)
+    return MetricsRecord(limit=0, scenes=_scenes(kept, evaluations), results=results)
+
+
+def _scenes(kept: Sequence[_Kept], evaluations: Mapping[str, Evaluation]) -> tuple[str, ...]:
+    """The scenes that any method has a score of, in the order of the truth."""
+    scored = {scene for one in evaluations.values() for protocol in one.protocols for scene in protocol.scores}
+    truths = kept[0].truths
+    known = dict.fromkeys(scene for one in kept for scene in one.truths.scenes)
+    return tuple(truths.address(scene) for scene in known if scene in scored)
+
+
+def _result(kept: _Kept, evaluation: Evaluation, rules: ProtocolRules) -> ResultRecord:
+    found = next((one for one in evaluation.protocols if one.rules.name == rules.name), None)
+    scenes = kept.truths.scenes
+    scores = {} if found is None else found.scores
+    encoder, digest = (None, None) if found is None or found.encoder is None else found.encoder
+    return ResultRecord(
+        method=kept.method,
+        protocol=rules.name,
+        version=rules.version,
+        kind=rules.kind,
+        headline=rules.headline,
+        profile=None,
+        caveat=made_elsewhere(kept.formats),
+        encoder=encoder,
+        encoder_digest=digest,
+        n_planned=len(scenes),
+        failed=(),
+        unscored=tuple(kept.truths.address(scene) for scene in scenes if scene not in scores),
+        ceiling=None if found is None or found.ceiling is None else plain_json(found.ceiling),
+        result=None if found is None else _numbers(kept, found),
+        confidences=None if found is None else _confidences(kept, found),
+    )
+
+
+def _addressed(kept: _Kept, scores: Mapping[str, SceneScore]) -> dict[str, SceneScore]:
+    return {kept.truths.address(scene): score for scene, score in scores.items()}
+
+
+def _numbers(kept: _Kept, found: ProtocolEvaluation) -> NumbersRecord:
+    numbers = combine(found.rules, _addressed(kept, found.scores)).to_json()
+    if found.coverage is None:
+        numbers["coverage"] = {}
+    return NumbersRecord(**numbers | {"warnings": tuple(_warning(kept, line) for line in found.warnings)})
+
+
+def _warning(kept: _Kept, line: str) -> str:
+    """A warning with the address of its scene before it, or what stands there where it is of all."""
+    parts = _SCENE_AND_SENTENCE.fullmatch(line)
+    if parts is None or (parts[1] not in kept.truths.scenes and parts[1] != EVERY_SCENE):
+        return f"{EVERY_SCENE}: {line}"
+    return line if parts[1] == EVERY_SCENE else f"{kept.truths.address(parts[1])}: {parts[2]}"
+
+
+def _confidences(kept: _Kept, found: ProtocolEvaluation) -> str | None:
+    if kept.confidences == "file" and found.with_ones is not None:
+        return AGAINST_THE_RULE
+    said = confidences_of(found.rules, NumbersRecord(**found.result.to_json()))
+    return OF_FILES if said == BY_THE_METHOD else said
+
+
+# ---- files
+
+
+def _write(kept: Sequence[_Kept], run: EvaluatedRun, folder: RunFolder) -> RunRecord:
+    """Write everything but the maps, which are there; the record of the run."""
+    record = _record(kept, run)
+    for one in kept:
+        for address in record.scenes:
+            if address not in one.files:
+                one.keep_nothing(address)
+            _seal(one, run.evaluations[one.method], address, record, folder)
+    record = replace(record, predictions=tuple(one.record for one in kept))
+    _write_ceilings(kept, run.evaluations, folder)
+    write_text(folder.path / "run.toml", write_toml(_settings(kept, record)))
+    write_json(folder.path / "metrics.json", plain(run.metrics))
+    write_json(folder.path / "run.json", plain(record))
+    return record
+
+
+def _seal(kept: _Kept, evaluation: Evaluation, address: str, record: RunRecord, folder: RunFolder) -> None:
+    job = folder.job(address, kept.method)
+    scores = {
+        one.rules.name: score
+        for one in evaluation.protocols
+        for scene, score in one.scores.items()
+        if kept.truths.address(scene) == address
+    }
+    write_bytes(job.counts, pack_scores(scores))
+    unscored = {each.protocol: each.reason for each in record.unscored if _is_of(each, address, kept.method)}
+    write_text(job.log, "".join(f"{line}\n" for line in (made_elsewhere(kept.formats), "done")))
+    key = {"data": record.data_digests[address], "method": kept.method, "predictions": digest_json(kept.files[address])}
+    job.seal("predict", key, [job.prediction, job.updates])
+    job.seal(
+        "score",
+        {"predict": digest_json(key)} | {f"protocol.{each.name}": each.digest for each in record.protocols},
+        [job.counts, job.log],
+        {"unscored": unscored, "warnings": [], "doubts": []},
+    )
+
+
+def _is_of(unscored: UnscoredRecord, scene: str, method: str) -> bool:
+    return (unscored.scene, unscored.method) == (scene, method)
+
+
+def _write_ceilings(kept: Sequence[_Kept], evaluations: Mapping[str, Evaluation], folder: RunFolder) -> None:
+    """What the truth itself scores, where a run has it: as the counts of the method that is told the truth."""
+    ceilings: dict[str, dict[str, SceneScore]] = {}
+    for one in kept:
+        for found in evaluations[one.method].protocols:
+            for address, score in _addressed(one, found.ceilings).items():
+                ceilings.setdefault(address, {})[found.rules.name] = score
+    for address, scores in ceilings.items():
+        job = folder.job(address, CEILING_METHOD)
+        job.prepare()
+        write_bytes(job.counts, pack_scores(scores))
+
+
+def _record(kept: Sequence[_Kept], run: EvaluatedRun) -> RunRecord:
+    git = git_state()
+    truths = kept[0].truths
+    rules = {found.rules.name: found.rules for one in run.evaluations.values() for found in one.protocols}
+    encoders = list(dict.fromkeys(
+        found.encoder for one in run.evaluations.values() for found in one.protocols if found.encoder is not None
+    ))  # fmt: skip
+    scenes = run.metrics.scenes
+    digests = {truths.address(scene): truths.digest(scene) for scene in _names(kept) if truths.address(scene) in scenes}
+    return RunRecord(
+        status="complete",
+        is_partial=False,
+        code=code_digest(),
+        git=None if git is None else GitRecord(**git),
+        packages=package_versions(),
+        hardware=hardware_line(),
+        processor=processor_digest(),
+        profile=None,
+        encoder=", ".join(name for name, _ in encoders) or None,
+        encoder_digest=", ".join(digest for _, digest in encoders) or None,
+        data_digests=digests,
+        protocols=tuple(ProtocolRecord(each.name, each.version, each.digest) for each in rules.values()),
+        methods=tuple(one.method for one in kept),
+        scenes=scenes,
+        unscored=tuple(_unscored(kept, run, list(rules))),
+        warnings=tuple(dict.fromkeys(line for one in run.evaluations.values() for line in one.remarks)),
+        predictions=tuple(one.record for one in kept),
+        ground_truth=truths.record,
+    )
+
+
+def _names(kept: Sequence[_Kept]) -> list[str]:
+    return list(dict.fromkeys(scene for one in kept for scene in one.truths.scenes))
+
+
+def _unscored(kept: Sequence[_Kept], run: EvaluatedRun, protocols: Sequence[str]) -> Iterable[UnscoredRecord]:
+    """Why scenes of the run have no score of a method under a protocol."""
+    for one in kept:
+        evaluation = run.evaluations[one.method]
+        found = {each.rules.name: each for each in evaluation.protocols}
+        for name in protocols:
+            scores = found[name].scores if name in found else {}
+            for scene in _names(kept):
+                address = one.truths.address(scene)
+                if address in run.metrics.scenes and scene not in scores:
+                    yield UnscoredRecord(address, one.method, name, _why_not(evaluation, found.get(name), name, scene))
+
+
+def _why_not(evaluation: Evaluation, found: ProtocolEvaluation | None, protocol: str, scene: str) -> str:
+    if found is None:
+        return printable(evaluation.not_scored.get(protocol, "is not scored"))
+    return printable(found.unscored.get(scene, "has no prediction, and is left out as the original evaluator does"))
+
+
+def _settings(kept: Sequence[_Kept], record: RunRecord) -> list[tuple[tuple[str, ...], object, str]]:
+    """What was asked for, as far as a run has it."""
+    request, target = kept[0].request, kept[0].truths.target
+    name = record.scenes[0].partition("/")[0]
+    scenes = [f"{target}/{address.removeprefix(f'{name}/')}" for address in record.scenes]
+    leaves: list[tuple[tuple[str, ...], object, str]] = [
+        (("scenes",), scenes, "evaluate"),
+        (("methods",), list(record.methods), "--name" if len(kept) > 1 else "evaluate"),
+        (("protocols",), list(request.protocols) or [each.name for each in record.protocols], "evaluate"),
+    ]
+    leaves += [(("method", one.method, "confidences"), one.confidences, "evaluate") for one in kept]
+    return leaves

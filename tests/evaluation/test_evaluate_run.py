@@ -1,0 +1,332 @@
+"""``evaluate --out``: predictions made elsewhere as a run, which every verb takes with equal numbers."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluated_text import scene
+from painted import Painted
+from places import SCENES
+from prediction_files import write_openmask3d, write_scannet_text
+
+from su3d_bench.cli.main import main
+from su3d_bench.core.digests import digest_file
+from su3d_bench.evaluation.as_run import AGAINST_THE_RULE
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
+from su3d_bench.runs.finished import read_run
+
+PAINTED = f"{SCENES}/painted.py:Painted"
+NAMES = ("chair", "sofa", "table")
+IDS = [20, 76, 80]
+MINE = "predictions made elsewhere, read from files (openmask3d)"
+THEIRS = "predictions made elsewhere, read from files (scannet-text)"
+
+
+@cache
+def _features() -> Any:
+    return EmbeddedEncoder().encode_texts(list(NAMES)).astype(np.float64)
+
+
+@pytest.fixture(autouse=True)
+def _files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two methods' masks of three scenes: OpenMask3D's with features, and ScanNet's text with classes."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
+    dataset = Painted(tmp_path, Painted.Options())
+    generator = np.random.default_rng(0)
+    for share, name in zip((0.02, 0.1, 0.3), "abc", strict=True):
+        truth = dataset.ground_truth(name, "mesh-vertices")
+        masks = [np.flatnonzero(truth.instance == k) for k in (1, 2, 3)]
+        rough = [mask[generator.random(len(mask)) > share] for mask in masks]
+        write_openmask3d(Path("predA"), scene(rough, IDS, name=name, n=len(truth.points)), _features())
+        labels = IDS if name == "a" else [20, 20, 80]
+        text = scene([mask[::2] for mask in masks], labels, [0.9, 0.5, 0.7], name=name, n=len(truth.points))
+        write_scannet_text(Path("predB"), text)
+
+
+BOTH = ["evaluate", "--name", "mine=predA", "theirs=predB", "--dataset", PAINTED, "--scenes", "[abc]"]
+PROTOCOLS = ["--protocol", "rooms-instance", "rooms-semantic"]
+RUN = "runs/both"
+
+
+def both(*more: str) -> int:
+    return main([*BOTH, *PROTOCOLS, "--out", RUN, *more])
+
+
+def files_of(folder: str) -> dict[str, str]:
+    return {str(file): digest_file(file) for file in sorted(Path(folder).rglob("*")) if file.is_file()}
+
+
+def answered(capsys: pytest.CaptureFixture[str], *words: str, code: int = 0) -> str:
+    capsys.readouterr()
+    assert main(list(words)) == code, capsys.readouterr().err
+    answer = capsys.readouterr()
+    return answer.out if code == 0 else answer.err
+
+
+def test_predictions_in_two_formats_go_through_every_verb_with_the_same_numbers(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert both("--json", "numbers.json") == 0
+    printed = capsys.readouterr()
+    assert f"- mine: {MINE}" in printed.out and f"- theirs: {THEIRS}" in printed.out
+    assert f"next: su3d-bench compare {RUN}:mine {RUN}:theirs\n" in printed.err
+    documents = json.loads(Path("numbers.json").read_text())["methods"]
+    run = read_run(Path(RUN))
+    for (method, protocol), result in run.results.items():
+        known = documents[method]["protocols"][protocol]
+        assert result.result is not None
+        numbers = {name.lower().replace("-", ""): result.result.metrics[name] for name in result.headline}
+        assert numbers == {name: known["metrics"][name] for name in numbers}  # to the last bit
+        assert [result.result.per_scene[f"painted/{name}"][result.headline[0]] for name in "abc"] == [
+            known["per_scene"][name][next(iter(known["metrics"]))] for name in "abc"
+        ]
+    frame = run.to_frame().set_index(["method", "protocol", "metric"])["value"]
+    ap = {method: float(frame[method, "rooms-instance", "AP"]) for method in run.methods}
+    assert 0 < ap["theirs"] < ap["mine"] < 1
+    before = files_of(RUN)
+
+    compared = json.loads(answered(capsys, "compare", f"{RUN}:mine", f"{RUN}:theirs", "--json"))
+    of_ap = compared["protocols"][0]["metrics"]["AP"]
+    assert (of_ap["left"], of_ap["right"]) == (ap["mine"], ap["theirs"])
+    assert [f"{RUN}:mine: {MINE}", f"{RUN}:theirs: {THEIRS}"] == compared["remarks"]
+    for method, line in (("mine", MINE), ("theirs", THEIRS)):
+        explained = json.loads(answered(capsys, "attribute", RUN, "--method", method, "--json"))
+        assert explained["protocols"][0]["values"]["AP"] == ap[method]
+        assert f"{method}: {line}" in explained["remarks"]
+    latex = answered(capsys, "report", "tables", RUN, "--format", "latex", "--truth-scores", "--intervals")
+    assert f"value={ap['mine']!r}" in latex and "predictions made elsewhere" in latex
+    Path("paper.tex").write_text(latex)
+    assert " 0 differ" in answered(capsys, "report", "verify", "paper.tex")
+    answered(capsys, "report", "html", RUN, "--out", "page.html", "--no-errors")
+    assert MINE in Path("page.html").read_text() and '"reason":null' in Path("page.html").read_text().replace(" ", "")
+    board = json.loads(answered(capsys, "report", "leaderboard", "runs", "--json"))
+    entries = {entry["method"]: entry for entry in board["boards"][0]}
+    assert {method: entry["values"][0] for method, entry in entries.items()} == ap
+    assert {entry["profile"] for entry in entries.values()} == {"made elsewhere"} and not board["refused"]
+    answered(capsys, "check", "--learn", RUN, "--out", "reference.json")
+    assert answered(capsys, "check", RUN, "--against", "reference.json").startswith("passed")
+    assert "predictions made elsewhere bring no times" in answered(capsys, "report", "timing", RUN, code=2)
+    words = ("sheets", "make", RUN, "--kind", "annotation", "--methods", "mine", "--jobs", "1", "--out", "sheets")
+    answered(capsys, *words, "--scenes", "painted/a", "--per-kind", "1")
+    assert Path("sheets").is_dir()
+    ranking = json.loads(
+        answered(capsys, "query", "painted/a", "sofa", "--run", RUN, "--method", "mine", "--out", "q.png", "--json")
+    )
+    assert ranking["ranking"][0]["id"] == 1
+    planned = json.loads(answered(capsys, "plan", RUN, "--protocol", "rooms-instance", "--json"))
+    assert planned["remarks"] == [f"mine: {MINE}", f"theirs: {THEIRS}"]
+    answered(capsys, "export", RUN, "--method", "mine", "--to", "openlex3d", "--out", "clouds")
+    assert files_of(RUN) == before
+    again = ["evaluate", f"{RUN}/scenes/painted.a/mine", "--dataset", PAINTED, *PROTOCOLS[:2], "--json", "again.json"]
+    assert main([*again, "--quiet"]) == 0
+    found = json.loads(Path("again.json").read_text())["protocols"]["rooms-instance"]["metrics"]["ap"]
+    assert found == documents["mine"]["protocols"]["rooms-instance"]["per_scene"]["a"]["ap"]
+
+
+def test_the_same_again_leaves_the_folder_as_it_is_and_another_evaluation_is_refused(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert both() == 0
+    before = files_of(RUN)
+    capsys.readouterr()
+    assert both() == 0
+    assert f"run folder: {RUN} (held this evaluation already, and is as it was)" in capsys.readouterr().err
+    others = (
+        ([*BOTH, "--protocol", "rooms-instance", "--out", RUN], "protocols"),
+        (["evaluate", "predA", "--name", "mine", *BOTH[4:], *PROTOCOLS, "--out", RUN], "methods"),
+        ([*BOTH[:-1], "a", *PROTOCOLS, "--out", RUN], "scenes"),
+    )
+    for words, what in others:
+        assert main(words) == 2
+        line = f"su3d-bench: {RUN}: holds another evaluation (other {what}); choose another folder with --out"
+        assert capsys.readouterr().err.startswith(line)
+    mask = next(Path("predB").glob("masks/a_0.txt"))
+    mask.write_text(mask.read_text().replace("1", "0", 1))
+    assert both() == 2
+    assert "holds another evaluation (other predictions)" in capsys.readouterr().err
+    assert files_of(RUN) == before
+    assert not [name for name in Path("runs").iterdir() if name.name != "both"]  # nothing is left of what was refused
+
+
+def test_a_folder_of_something_else_is_refused_before_anything_is_scored(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("notes").mkdir()
+    Path("notes/paper.txt").write_text("mine")
+    assert main([*BOTH, *PROTOCOLS, "--out", "notes"]) == 2
+    assert "notes: holds 'paper.txt' and is no folder of a run" in capsys.readouterr().err
+    assert both() == 0
+    record = json.loads(Path(RUN, "run.json").read_text())
+    del record["predictions"]
+    Path(RUN, "run.json").write_text(json.dumps(record))
+    capsys.readouterr()
+    assert both() == 2
+    assert f"{RUN}: holds a run, and no evaluation of predictions made elsewhere" in capsys.readouterr().err
+
+
+def test_the_record_says_where_the_predictions_come_from() -> None:
+    assert both("--quiet") == 0
+    mine, theirs = read_run(Path(RUN)).record.predictions
+    assert (mine.method, mine.formats, mine.paths, mine.confidences) == (
+        "mine",
+        ("openmask3d",),
+        ("predA",),
+        "protocol",
+    )
+    read = {f"predA/a{end}": digest_file(Path(f"predA/a{end}")) for end in ("_masks.pt", "_openmask3d_features.npy")}
+    assert mine.files["painted/a"] == read
+    assert set(theirs.files["painted/b"]) == {"predB/b.txt", *(f"predB/masks/b_{k}.txt" for k in range(3))}
+    assert theirs.confidences == "file"
+
+
+@pytest.fixture
+def _texts() -> None:
+    """Ground truth as text, in which a chair and a table lie, and predictions of it."""
+    Path("gt").mkdir()
+    for name, n in (("scene0001_00", 2), ("scene0001_01", 1), ("scene0002_00", 2)):
+        Path(f"gt/{name}.txt").write_text("".join(f"{value}\n" for value in np.repeat([5001, 7002, 1003], 200)))
+        masks = [np.arange(150), np.arange(220, 400)][:n]
+        write_scannet_text(Path("pred"), scene(masks, [5, 7][:n], [0.9, 0.8][:n], name=name))
+
+
+TEXTS = ["evaluate", "pred", "--ground-truth", "gt", "--protocol", "scannet-instance", "--out", "runs/mine"]
+
+
+@pytest.mark.usefixtures("_texts")
+def test_text_truth_makes_a_run_whose_errors_are_told_and_whose_verbs_say_what_it_lacks(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main([*TEXTS, "--json", "numbers.json"]) == 0
+    known = json.loads(Path("numbers.json").read_text())["protocols"]["scannet-instance"]["metrics"]
+    run = read_run(Path("runs/mine"))
+    numbers = run.results["mine", "scannet-instance"].result
+    assert numbers is not None and numbers.metrics["AP"] == known["ap"] and numbers.coverage == {}
+    assert run.scenes == ("scannet/scene0001_00", "scannet/scene0001_01", "scannet/scene0002_00")
+    explained = json.loads(answered(capsys, "attribute", "runs/mine", "--json"))
+    assert explained["protocols"][0]["values"]["AP"] == known["ap"]
+    assert explained["protocols"][0]["causes"]["missed"]["n"] == 1
+    query = answered(capsys, "query", "scannet/scene0001_00", "chair", "--run", "runs/mine", "--method", "mine", code=2)
+    assert "is over the points of ground-truth files, which have no coordinates" in query
+    sheets = answered(capsys, "sheets", "make", "runs/mine", "--kind", "annotation", "--out", "sheets", code=2)
+    assert sheets.count("\n") == 1 and "gt" in sheets
+    answered(capsys, "export", "runs/mine", "--to", "scannet", "--out", "exported")
+    assert main([*TEXTS[:1], "exported", *TEXTS[2:-2], "--json", "again.json", "--quiet"]) == 0
+    again = json.loads(Path("again.json").read_text())["protocols"]["scannet-instance"]["metrics"]
+    assert again == known
+    Path("gt/scene0001_00.txt").write_text("0\n" * 600)
+    assert "is not the one of runs/mine" in answered(capsys, "attribute", "runs/mine", code=2)
+
+
+@pytest.mark.usefixtures("_texts")
+def test_a_scene_that_one_method_lacks_is_said_and_compared_over_the_others(capsys: pytest.CaptureFixture[str]) -> None:
+    write_scannet_text(Path("other"), scene([np.arange(180)], [5], name="scene0001_00"))
+    write_scannet_text(Path("other"), scene([np.arange(170)], [5], name="scene0001_01"))
+    words = ["evaluate", "--name", "mine=pred", "theirs=other", *TEXTS[2:]]
+    assert main(words) == 0
+    assert "- theirs is unscored on scannet/scene0002_00" in capsys.readouterr().out
+    compared = json.loads(answered(capsys, "compare", "runs/mine:mine", "runs/mine:theirs", "--json"))
+    assert compared["protocols"][0]["scenes"] == ["scannet/scene0001_00", "scannet/scene0001_01"]
+    answered(capsys, "check", "--learn", "runs/mine", "--out", "reference.json")
+    assert answered(capsys, "check", "runs/mine", "--against", "reference.json").startswith("passed")
+
+
+@pytest.mark.usefixtures("_texts")
+def test_an_own_protocol_in_a_file_scores_a_run_that_is_compared_and_explained(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    rules = 'name = "mine"\nversion = 1\nextends = "scannet-instance"\nmin_region_size = 10\n'
+    Path("mine.toml").write_text(rules)
+    words = ["evaluate", "--name", "mine=pred", "theirs=pred", "--ground-truth", "gt", "--protocol", "mine.toml"]
+    assert main([*words, "--out", "runs/own"]) == 0
+    assert "mine" in answered(capsys, "compare", "runs/own:mine", "runs/own:theirs")
+    assert "as it is" in answered(capsys, "attribute", "runs/own", "--method", "theirs")
+    assert "Protocol mine" in answered(capsys, "report", "tables", "runs/own", "--format", "latex")
+    answered(capsys, "report", "html", "runs/own", "--out", "page.html")
+
+
+def test_confidences_of_files_against_a_rule_are_said_and_explained(capsys: pytest.CaptureFixture[str]) -> None:
+    rules = 'name = "ones"\nversion = 1\nextends = "rooms-instance"\nconfidence = "ones"\n'
+    Path("ones.toml").write_text(rules)
+    words = ["evaluate", "predB", "--dataset", PAINTED, "--scenes", "[abc]", "--protocol", "ones.toml"]
+    assert main([*words, "--out", "runs/theirs"]) == 0
+    result = read_run(Path("runs/theirs")).results["theirs", "ones"]
+    assert result.confidences == AGAINST_THE_RULE and result.result is not None
+    explained = json.loads(answered(capsys, "attribute", "runs/theirs", "--json"))
+    assert explained["protocols"][0]["values"]["AP"] == result.result.metrics["AP"]
+
+
+def test_texts_of_a_file_name_the_features_and_must_be_there_to_explain(capsys: pytest.CaptureFixture[str]) -> None:
+    names = [entry.name for entry in load_protocol("rooms-instance").classes]
+    features = EmbeddedEncoder().encode_texts(names)
+    np.savez("texts.npz", names=np.array(names), features=features, encoder=np.array("theirs/v1"))
+    words = ["evaluate", "predA", "--dataset", PAINTED, "--scenes", "[abc]", "--protocol", "rooms-instance"]
+    assert main([*words, "--text-features", "texts.npz", "--out", "runs/mine"]) == 0
+    result = read_run(Path("runs/mine")).results["mine", "rooms-instance"]
+    assert result.encoder == "theirs/v1" and result.result is not None
+    explained = json.loads(answered(capsys, "attribute", "runs/mine", "--json"))
+    assert explained["protocols"][0]["values"]["AP"] == result.result.metrics["AP"]
+    np.savez("texts.npz", names=np.array(names[::-1]), features=features)
+    assert "texts.npz: is not the file that runs/mine was scored with" in answered(
+        capsys, "attribute", "runs/mine", code=2
+    )
+
+
+NUMBERS_ALONE = "holds numbers without the counts of scenes, from which this is made anew; evaluate again with --out"
+PREDICTIONS = (
+    "pred: holds predictions (scannet-text) and no run.json; make a run of them with: su3d-bench evaluate pred"
+)
+
+
+@pytest.mark.usefixtures("_texts")
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (("compare", "numbers.json", "runs/mine"), f"numbers.json: {NUMBERS_ALONE}"),
+        (("compare", "runs/mine", "both.json:mine"), f"both.json: {NUMBERS_ALONE}"),
+        (("compare", "pred", "runs/mine"), PREDICTIONS),
+        (("compare", "nowhere", "runs/mine"), "nowhere: there is no such folder"),
+        (("attribute", "numbers.json"), f"numbers.json: {NUMBERS_ALONE}"),
+        (("attribute", "pred"), PREDICTIONS),
+        (("plan", "both.json"), f"both.json: {NUMBERS_ALONE}"),
+        (("check", "numbers.json", "--against", "reference.json"), f"numbers.json: {NUMBERS_ALONE}"),
+        (("sheets", "make", "pred", "--kind", "annotation", "--out", "sheets"), PREDICTIONS),
+        (("report", "tables", "numbers.json"), f"numbers.json: {NUMBERS_ALONE}"),
+        (("report", "tables", "both.json"), f"both.json: {NUMBERS_ALONE}"),
+        (("report", "tables", "pred"), PREDICTIONS),
+        (
+            ("report", "tables", "reference.json"),
+            "reference.json: is no file that su3d-bench sheets score writes: it has",
+        ),
+        (("report", "html", "numbers.json"), f"numbers.json: {NUMBERS_ALONE}"),
+        (("report", "timing", "pred"), PREDICTIONS),
+        (("report", "leaderboard", "numbers.json"), f"numbers.json: {NUMBERS_ALONE}"),
+        (
+            ("report", "leaderboard", "pred"),
+            "pred: holds no run below it; su3d-bench run writes one, and evaluate --out",
+        ),
+        (("questions", "show", "nope.toml"), "nope.toml is missing; name a file of queries, TOML or CSV"),
+    ],
+    ids=lambda value: "-".join(value[:3]) if isinstance(value, tuple) else "",
+)
+def test_what_is_no_run_is_refused_with_the_truth_and_what_makes_one(
+    words: tuple[str, ...], line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main([*TEXTS, "--json", "numbers.json", "--quiet"])
+    Path("both.json").write_text(
+        json.dumps({"schema": 1, "methods": {"mine": json.loads(Path("numbers.json").read_text())}})
+    )
+    main(["check", "--learn", "runs/mine", "--out", "reference.json"])
+    told = answered(capsys, *words, code=2)
+    assert told.startswith(f"su3d-bench: {line}") and told.count("\n") == 1
+
+
+@pytest.mark.usefixtures("_texts")
+def test_one_run_is_one_run(capsys: pytest.CaptureFixture[str]) -> None:
+    main([*TEXTS, "--quiet"])
+    learnt = answered(capsys, "check", "--learn", "runs/mine", "--out", "reference.json")
+    assert learnt == "reference.json: 3 headline values from 1 run, 3 of them exact\n"
