@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from evaluated_text import scene
-from painted import Painted
+from painted import Painted, colour_perception
 from places import SCENES
 from prediction_files import write_openmask3d, write_scannet_text
 
@@ -19,6 +19,7 @@ from su3d_bench.core.digests import digest_file
 from su3d_bench.evaluation.as_run import AGAINST_THE_RULE
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
+from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run
 
 PAINTED = f"{SCENES}/painted.py:Painted"
@@ -330,3 +331,16 @@ def test_one_run_is_one_run(capsys: pytest.CaptureFixture[str]) -> None:
     main([*TEXTS, "--quiet"])
     learnt = answered(capsys, "check", "--learn", "runs/mine", "--out", "reference.json")
     assert learnt == "reference.json: 3 headline values from 1 run, 3 of them exact\n"
+
+
+def test_a_run_under_an_own_protocol_is_compared_and_explained(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    Path("own.toml").write_text('name = "own"\nversion = 1\nextends = "rooms-instance"\nmin_region_size = 10\n')
+    words = ["run", "--scenes", f"{PAINTED}/a", "--methods", "oracle", "--protocols", "own.toml", "--no-pictures"]
+    for folder in ("before", "after"):
+        assert main([*words, "--jobs", "1", "--out", f"runs/{folder}", "--quiet"]) == 0
+    assert "own (version 1)" in answered(capsys, "compare", "runs/before", "runs/after")
+    assert "as it is" in answered(capsys, "attribute", "runs/before")
+    answered(capsys, "report", "html", "runs/before", "--out", "page.html", "--no-maps")
