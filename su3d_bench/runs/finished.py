@@ -418,7 +418,8 @@ def encoder_of(run: RunFolder, device: str = "cpu") -> Encoder:
         return encoder
     raise PredictionError(
         f"{run.path}: its features were made by encoder {record.encoder} ({made_with[:12]}), here is "
-        f"{encoder.name} ({encoder.digest[:12]}); run it again"
+        f"{encoder.name} ({encoder.digest[:12]}); "
+        + ("run it again" if record.ground_truth is None else "only texts of that one can be held against them")
     )
 
 

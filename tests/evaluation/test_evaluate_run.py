@@ -271,6 +271,8 @@ def test_texts_of_a_file_name_the_features_and_must_be_there_to_explain(capsys: 
     assert result.encoder == "theirs/v1" and result.result is not None
     explained = json.loads(answered(capsys, "attribute", "runs/mine", "--json"))
     assert explained["protocols"][0]["values"]["AP"] == result.result.metrics["AP"]
+    told = answered(capsys, "query", "painted/a", "sofa", "--run", "runs/mine", "--method", "mine", code=2)
+    assert "made by encoder theirs/v1" in told and "only texts of that one can be held against them" in told
     np.savez("texts.npz", names=np.array(names[::-1]), features=features)
     assert "texts.npz: is not the file that runs/mine was scored with" in answered(
         capsys, "attribute", "runs/mine", code=2
