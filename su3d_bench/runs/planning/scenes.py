@@ -109,7 +109,7 @@ def expand_scenes(
             known = [f"{target}/{scene}" for scene in (*dataset.scenes(), *_groups(dataset))]
             if not pattern:
                 raise ConfigError(f"'{address}' is a dataset; name its scenes, such as '{target}/*'")
-            raise ConfigError(f"no scene matches '{address}'{suggest(address, known) or _some(known)}")
+            raise ConfigError(f"no scene matches '{address}'{suggest(address, known)}")
         chosen.update(dict.fromkeys((target, scene) for scene in scenes))
     if not chosen:
         raise ConfigError(f"no scene matches {', '.join(addresses)}; such as: rooms/living0 or 'rooms/*'")
@@ -147,10 +147,6 @@ def _whole_group(dataset: Dataset, name: str, here: set[str]) -> list[str]:
             "get them or name the scenes that are"
         )
     return list(group)
-
-
-def _some(known: Sequence[str]) -> str:
-    return "; known: " + ", ".join(known[:8]) + (", ..." if len(known) > 8 else "") if known else ""
 
 
 def _with_dataset(name: str) -> str:
