@@ -16,6 +16,8 @@ from numba.core.dispatcher import Dispatcher
 from su3d_bench.core.damage import DAMAGE
 from su3d_bench.core.digests import digest_file
 
+UNREADABLE: tuple[type[Exception], ...] = (*DAMAGE, LookupError, AttributeError, ImportError, pickle.UnpicklingError)
+
 
 class MendingCache(FunctionCache):
     """Numba's own store of one function; what cannot be read is compiled again, what cannot be kept is used once.
@@ -33,7 +35,7 @@ class MendingCache(FunctionCache):
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:
             return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
-        except (*DAMAGE, LookupError, AttributeError, ImportError, pickle.UnpicklingError):
+        except UNREADABLE:
             self._forget()
             return None
 
