@@ -273,7 +273,7 @@ def _semantic_score(rules: ProtocolRules, labels: Int64Array, class_ids: np.ndar
 def _instance_score(
     rules: ProtocolRules, values: Int64Array, masks: Masks, scores: Float64Array, ids: Int64Array
 ) -> SceneScore:
-    _, distinct, n_points = instance_ap.segments(values)
+    _, distinct, n_points = instance_ap.segments_of(values)
     n_scored = int(n_points[np.isin(distinct // instance_ap.INSTANCES_PER_CLASS, _class_ids(rules))].sum())
     return _score(rules, _instance_counts(rules, values, masks, scores, ids), len(masks), n_scored)
 
@@ -327,7 +327,7 @@ def _ids_of_masks(
 
 def _instance_ceiling(rules: ProtocolRules, truth: VertexTruth, values: Int64Array) -> SceneScore:
     """What the annotated objects themselves score."""
-    row, distinct, _ = instance_ap.segments(truth.values)
+    row, distinct, _ = instance_ap.segments_of(truth.values)
     is_object = distinct >= instance_ap.INSTANCES_PER_CLASS
     n_void = int((~is_object).sum())
     masks = transfer.masks_of_partition(row - n_void, len(distinct) - n_void)

@@ -192,7 +192,7 @@ def write_files(whole: Path) -> None:
         f'extends = "rooms-semantic"\nname = {quoted}\nsummary = {quoted}\n# {HOSTILE[:12]}\n'
     )
     Path("questions.toml").write_text(f"[[query]]\nscene = {quoted}\ntext = {quoted}\nobjects = [1]\n")
-    Path("lines.txt").write_text(f"a chair\n{HOSTILE}\n")
+    Path("lines.txt").write_text("a chair\n" + " ".join(HOSTILE.splitlines()) + "\n")  # a text a line
     Path("audit.csv").write_text(f'number,scene,kind,text,answer,verdict,remark\n1,a,b,"{HOSTILE}",c,right,d\n')
     Path("answers.csv").write_text(f'sheet_id,item_id,annotator,ask,answer\n"{HOSTILE}",1,a,b,c\n')
     for folder in ("predictions", "truth"):

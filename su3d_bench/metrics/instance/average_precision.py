@@ -182,7 +182,7 @@ def per_scene(
     _check_predictions(ground_truth, indptr, indices, len(scores) if labels is None else len(labels), scores)
     if any(class_id < 1 for class_id in class_ids):
         raise DataError(f"class ids: {min(class_ids)} cannot be scored; class ids start at 1")
-    segment_of_point, segment_value, segment_size = segments(ground_truth)
+    segment_of_point, segment_value, segment_size = segments_of(ground_truth)
     segment_label = segment_value // INSTANCES_PER_CLASS
     size = np.diff(indptr)
     is_listed = np.ones((len(class_ids), len(size)), bool)
@@ -366,7 +366,7 @@ def _check_predictions(
             )
 
 
-def segments(ground_truth: IntArray) -> tuple[Int64Array, Int64Array, Int64Array]:
+def segments_of(ground_truth: IntArray) -> tuple[Int64Array, Int64Array, Int64Array]:
     """Each point's row in the ascending list of distinct values, that list, and how many points have each."""
     if not len(ground_truth):
         return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64)
