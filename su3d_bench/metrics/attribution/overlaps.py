@@ -141,7 +141,7 @@ class TrueInstances:
 
 def true_instances(truth: Int64Array, rules: ScoringRules) -> TrueInstances:
     """The instances of one scene; ``truth`` (N,) is label * 1000 + instance, 0 where void."""
-    segment_of_point, values, sizes = instance_ap.segments(truth)
+    segment_of_point, values, sizes = instance_ap.segments_of(truth)
     is_instance = np.isin(values // INSTANCES_PER_CLASS, rules.class_ids) & (sizes >= rules.min_region_size)
     order = np.argsort(segment_of_point, kind="stable").astype(np.int32)
     starts = np.concatenate([[0], np.cumsum(sizes)])
