@@ -50,26 +50,12 @@ function errorAt(map, k) {
   return called < 0 ? 4 : 1;
 }
 
-// The classes of the truth, else of the map, by their points: the first ones get the most distinct colours.
-function classOrder(map) {
-  if (map.order) return map.order;
-  const counts = new Map();
-  for (let k = 0; k < map.n; k++) {
-    const c = map.truth && map.truth[k] < NOT_SCORED ? map.truth[k] : classAt(map, k);
-    counts.set(c, (counts.get(c) || 0) + 1);
-  }
-  const coloured = [...counts].filter(([c]) => c >= 0 && !PALE[map.classes[c]]).sort((a, b) => b[1] - a[1]);
-  map.order = new Map(coloured.map(([c], place) => [c, place]));
-  return map.order;
-}
-
 // The colours of all points in one way, and the legend as pairs of a colour (null where there is none) and a text.
 function painted(map, kind, query) {
-  const colours = new Uint8Array(3 * map.n), counts = new Map(), order = classOrder(map);
+  const colours = new Uint8Array(3 * map.n), counts = new Map();
   const count = (what) => { counts.set(what, (counts.get(what) || 0) + 1); return what; };
   const share = (n) => `${((100 * n) / Math.max(1, map.n)).toFixed(0)} %`;
-  const tint = (c) =>
-    (c < 0 || c >= map.classes.length ? NOTHING : PALE[map.classes[c]] || distinct(order.get(c) ?? c));
+  const tint = (c) => map.class_colours[c] || NOTHING; // those of the pictures
   const values = kind === 'similarity' ? map.instances.map((one) => one.similarity[query]) : [];
   const low = Math.min(...values), high = Math.max(...values);
   const owned = (k, rgb) => (map.owner[k] === NEAR_NONE ? NOTHING : rgb(map.owner[k]));

@@ -47,6 +47,7 @@ from su3d_bench.reports.page.maps import (
     point_owners,
     thinned,
 )
+from su3d_bench.reports.pictures.colours import class_colours
 from su3d_bench.reports.pictures.scene_look import chosen_pixels, evenly
 from su3d_bench.runs.finished import FinishedRun, OtherDataError
 from su3d_bench.store.predictions import read_prediction
@@ -269,10 +270,12 @@ class _Scene:
         colours = None if self._seen is None else nearest_colours(cloud.points, *self._seen)
         if colours is not None:
             planes["colour"] = colour_plane(colours)
-        about: dict[str, Any] = {"protocol": None, "classes": [], "instances": [], "queries": []}
+        about: dict[str, Any] = {"protocol": None, "classes": [], "class_colours": [], "instances": [], "queries": []}
         classes: Int64Array | None = None
         if rules is not None:
-            about |= {"protocol": rules.name, "classes": [entry.name for entry in rules.classes]}
+            names = [entry.name for entry in rules.classes]
+            colours = class_colours(names)
+            about |= {"protocol": rules.name, "classes": names, "class_colours": [colours[name] for name in names]}
             of_truth = None if truth is None else class_index_of_ids(rules, truth.semantic)
             if truth is not None and of_truth is not None:
                 of_truth = np.where((of_truth >= 0) & scored_classes(rules)[of_truth], of_truth, -1)
