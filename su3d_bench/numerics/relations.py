@@ -1,9 +1,9 @@
 """How the things of a scene lie to one another: on, in, under, above, next to, near, between.
 
 One code for the truth of the built-in rooms, for questions made from any ground truth and for what is answered of a
-map. It sees axis-aligned boxes, z up, in metres; docs/relations.md has a picture of every rule and the reason for it.
-Boxes say less than surfaces: what lies on an inner board of a shelf and what lies in a basket look alike, so that "on"
-and "in" take which things are containers.
+map. It sees axis-aligned boxes, z up, in metres; docs/questions/relations.md has a picture of every rule and the reason for
+it. Boxes say less than surfaces: what lies on an inner board of a shelf and what lies in a basket look alike, so that
+"on" and "in" take which things are containers.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Point = Float64Array | tuple[float, ...]
 Relation = Literal["on", "under", "in", "above", "next to", "near"]
 RELATIONS: tuple[Relation, ...] = ("on", "under", "in", "above", "next to", "near")
 
-# Every threshold is ours, for the field has no agreed ones; the reasons stand in docs/relations.md.
+# Every threshold is ours, for the field has no agreed ones; the reasons stand in docs/questions/relations.md.
 CONTACT_M = 0.04  # what touches may miss by the paper's voxel of 0.02 m on either side
 SAME_TOP_M = 0.01  # one thing lies on several whose tops are so level; what is deeper is under the first of them
 ON_SHARE = 0.3  # of the smaller footprint: less, and it would fall
