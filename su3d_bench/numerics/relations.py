@@ -1,8 +1,8 @@
 """How the things of a scene lie to one another: on, in, under, above, next to, near, between.
 
 One code for the truth of the built-in rooms, for questions made from any ground truth and for what is answered of a
-map. It sees axis-aligned boxes, z up, in metres; docs/questions/relations.md has a picture of every rule and the reason for
-it. Boxes say less than surfaces: what lies on an inner board of a shelf and what lies in a basket look alike, so that
+map. It sees axis-aligned boxes, z up, in metres; docs/questions/relations.md has a picture and the reason of every
+rule. Boxes say less than surfaces: what lies on an inner board of a shelf and what lies in a basket look alike, so that
 "on" and "in" take which things are containers.
 """
 
