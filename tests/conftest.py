@@ -20,6 +20,9 @@ sys.path += sorted({str(file.parent) for file in TESTS.rglob("*.py")} - {*sys.pa
 
 from chat_server import ChatServer, chat_server  # noqa: E402 (it is found by the line above)
 
+# Tables are folded for who says how wide he sees them, as pytest-xdist does to its workers.
+os.environ.pop("COLUMNS", None)
+
 # Every file of a run is brought to the disk before it counts; thousands of small runs would wait for nothing else.
 if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > MOST_KEPT_BYTES:
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))

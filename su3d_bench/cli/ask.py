@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +19,7 @@ from su3d_bench.cli.common import (
     file_name_of,
     remark,
     remark_unseen,
+    show,
 )
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, StoreError
 
@@ -92,7 +92,7 @@ def call(arguments: argparse.Namespace) -> int:
         answer(reply.text)
         for line in (*reply.notes, f"names: {note}"):
             remark(line, quiet=arguments.quiet)
-        sys.stdout.flush()  # the picture takes longer than the answer
+        show()  # the picture takes longer than the answer
     picture = _draw(instances, scene, reply, job, arguments)
     value = {"scene": arguments.scene, "question": arguments.question} | reply.to_json()
     is_json = answer_json(arguments, value | {"names": note, "picture": None if picture is None else str(picture)})

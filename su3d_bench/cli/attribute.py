@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_protocols, add_table_format, add_verb, answer_tables, remark
+from su3d_bench.cli.common import add_protocols, add_table_format, add_verb, answer_tables, remark, show
 from su3d_bench.core.errors import EXIT_DONE
 
 
@@ -46,7 +45,7 @@ def call(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         from su3d_bench.reports.pictures.attribution import draw_attribution
 
-        sys.stdout.flush()  # the plot takes longer than the answer
+        show()  # the plot takes longer than the answer
         draw_attribution(attribution, arguments.out)
         remark(f"plot: {arguments.out}", quiet=arguments.quiet)
     return EXIT_DONE

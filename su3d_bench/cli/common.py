@@ -216,6 +216,11 @@ def answer_tables(arguments: argparse.Namespace, value: Any, parts: Sequence[Tab
         answer_document(formatted(parts, arguments))
 
 
+def show() -> None:
+    """Have what was answered so far shown, before something that takes its time."""
+    sys.stdout.flush()
+
+
 def answer_commands(lines: Sequence[str]) -> None:
     """Print commands to the machine that runs the job, which escape what they quote."""
     for line in lines:

@@ -89,8 +89,8 @@ def _choices(action: argparse.Action) -> tuple[str, ...]:
 def quoted(text: str) -> str:
     """``text`` as one word of bash and zsh, whatever it holds.
 
-    >>> print(quoted("it's $HOME"))
-    'it'\\''s $HOME'
+    >>> quoted("it's") == "'it'" + chr(92) + "''s'"
+    True
     """
     return "'" + text.replace("'", "'\\''") + "'"
 
@@ -98,8 +98,8 @@ def quoted(text: str) -> str:
 def quoted_for_fish(text: str) -> str:
     """``text`` as one word of fish, whatever it holds.
 
-    >>> print(quoted_for_fish("it's $HOME"))
-    'it\\'s $HOME'
+    >>> quoted_for_fish("it's") == "'it" + chr(92) + "'s'"
+    True
     """
     return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +15,7 @@ from su3d_bench.cli.common import (
     file_name_of,
     remark,
     remark_unseen,
+    show,
 )
 from su3d_bench.core.errors import ConfigError, PredictionError
 
@@ -69,7 +69,7 @@ def call(arguments: argparse.Namespace) -> int:
             x, y, z = row["centroid"]
             place = f"{x:7.2f}{y:7.2f}{z:7.2f}"
             answer(f"{row['rank']:>4}  {row['id']:>{wide}}  {row['similarity']:>10.3f}  {place:<22}  {row['name']}")
-        sys.stdout.flush()  # the picture takes longer than the answer
+        show()  # the picture takes longer than the answer
     _draw(prediction, ranking, rows, picture, f'{arguments.scene}: "{arguments.text}"')
     value = {"scene": arguments.scene, "text": arguments.text, "picture": str(picture), "ranking": rows}
     if not answer_json(arguments, value):

@@ -34,7 +34,7 @@ def add_parser(verbs: Any) -> None:
     add_queries(parser)
     parser.add_argument("--device", help="cpu, cuda or cuda:1 (default: cpu)")
     add_settings(parser, "a setting of perception, such as perception.models.folder=/data/models")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE.npz", help="where names and features go")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="where names and features go")
 
 
 def add_queries(parser: argparse.ArgumentParser) -> None:

@@ -310,7 +310,7 @@ def test_a_dry_run_says_what_would_be_done_and_does_nothing(capsys: pytest.Captu
 def test_a_dry_run_over_a_finished_run_knows_what_is_done(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a", "--out", "runs/x"]) == 0
     capsys.readouterr()
-    assert main([*RUN, "--scenes", f"{PAINTED}/[ab]", "--out", "runs/x", "--dry-run", "--json"]) == 0
+    assert main([*RUN, "--scenes", f"{PAINTED}/[ab]", "--extend", "--out", "runs/x", "--dry-run", "--json"]) == 0
     jobs = json.loads(capsys.readouterr().out)["jobs"]
     assert [(one["is_done"], one["is_measured"]) for one in jobs] == [(True, True), (False, True)]
 

@@ -39,6 +39,8 @@ def test_list_tells_datasets_places_and_scenes_and_how_to_get_what_is_not_here(
     assert main(["datasets", "list"]) == 0
     text = capsys.readouterr().out
     assert "rooms/living0    1600 frames" in text
+    assert main(["datasets", "list", "replica"]) == 0
+    text = capsys.readouterr().out
     assert f"looked for in: {tmp_path / 'data' / 'Replica'}" in text
     assert "Replica.zip there, set SU3D_DATA to where it is, or make rooms in this layout" in text
 

@@ -52,9 +52,9 @@ def test_there_are_examples() -> None:
 
 
 @pytest.mark.parametrize("block", EXAMPLES)
-def test_an_example_runs_and_uses_names_of_the_package_alone(block: str) -> None:
+def test_an_example_runs_and_uses_names_of_the_package_alone(block: str, tmp_path: Path) -> None:
     for node in ast.walk(ast.parse(block)):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("su3d_bench"):
             assert node.module == "su3d_bench"
             assert {each.name for each in node.names} <= set(su3d_bench.__all__)
-    subprocess.run([sys.executable, "-c", block], check=True)
+    subprocess.run([sys.executable, "-c", block], cwd=tmp_path, check=True)

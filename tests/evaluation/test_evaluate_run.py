@@ -61,7 +61,9 @@ def both(*more: str) -> int:
 
 
 def files_of(folder: str) -> dict[str, str]:
-    return {str(file): digest_file(file) for file in sorted(Path(folder).rglob("*")) if file.is_file()}
+    """The digests of all files but those of the run's cache."""
+    files = (file for file in sorted(Path(folder).rglob("*")) if file.is_file() and ".cache" not in file.parts)
+    return {str(file): digest_file(file) for file in files}
 
 
 def answered(capsys: pytest.CaptureFixture[str], *words: str, code: int = 0) -> str:

@@ -151,7 +151,7 @@ def test_what_an_error_quotes_can_be_shown_on_a_terminal() -> None:
         (["methods", "opensu3d", ""], "su3d-bench: methods: unknown argument ''"),
         (["report", "a\"b'c"], "su3d-bench: report: unknown"),
         (["sheets", "make", "--kind", "'", "--out", "x", "y"], "su3d-bench: sheets make: unknown --kind"),
-        (["\x1b[31m"], r"su3d-bench: unknown VERB '\x1b[31m'"),
+        (["\x1b[31m"], r"su3d-bench: unknown verb '\x1b[31m'"),
     ],
 )
 def test_odd_words_are_answered_in_one_line(words: list[str], line: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -146,7 +146,7 @@ def test_the_maps_midway_are_scored_and_their_numbers_stand_in_the_metrics(run: 
 def test_a_run_with_other_shares_is_another_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = [*WORDS[:-2], "0.25", "--out", str(run)]
     assert main(words) == 2
-    assert "anytime was (0.1, 0.5), now (0.25,)" in capsys.readouterr().err
+    assert "anytime was [0.5, 0.1], now [0.25]" in capsys.readouterr().err
 
 
 def test_the_report_prints_tables_and_writes_them_with_plots(

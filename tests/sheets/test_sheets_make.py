@@ -179,7 +179,7 @@ def test_a_changed_sheet_is_refused(tmp_path: Path, change: dict[str, Any], told
 def test_files_that_are_no_json_are_refused(tmp_path: Path) -> None:
     for content in (b"", b"[" * 100_000, b"\xff\xfe", b"{}"):
         (tmp_path / "key.json").write_bytes(content)
-        with pytest.raises(DataError, match="is not as"):
+        with pytest.raises(DataError, match=r"is not as|is no file that"):
             read_key(tmp_path / "key.json")
     with pytest.raises(DataError, match="cannot be read"):
         read_key(tmp_path / "none.json")

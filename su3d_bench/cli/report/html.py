@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.common import add_verb, answer_either, drawn_bars, remark, written
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, counted, printable
-from su3d_bench.runs.executors.local import SCENE_DONE, Event
 
 if TYPE_CHECKING:
     from su3d_bench.analysis.page.contents import Amount
+    from su3d_bench.runs.executors.local import Event
 
 NAME = "html"
 MEGABYTE = 10**6
@@ -102,6 +102,8 @@ class _Progress:
             self._task = self._bars.add_task("page", total=amount.n_steps, remark="")
 
     def report(self, event: Event) -> None:
+        from su3d_bench.runs.executors.local import SCENE_DONE
+
         self._done[event.unit] = event.done
         n_done, is_scene = sum(self._done.values()), event.label == SCENE_DONE
         self._n_scenes_done += is_scene

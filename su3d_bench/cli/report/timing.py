@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_table_format, add_verb, answer_tables, remark
+from su3d_bench.cli.common import add_table_format, add_verb, answer_tables, remark, show
 
 if TYPE_CHECKING:
     from su3d_bench.metrics.costs import UpdateTimes
@@ -78,7 +77,7 @@ def _write(
     from su3d_bench.reports.pictures.timing import draw_timing
     from su3d_bench.store.atomic import make_folder, write_text
 
-    sys.stdout.flush()  # the plots take longer than the tables
+    show()  # the plots take longer than the tables
     make_folder(arguments.out)
     for name, text in files.items():
         write_text(arguments.out / name, text)

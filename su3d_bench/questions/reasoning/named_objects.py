@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 
 from su3d_bench.core.english import words
-from su3d_bench.core.errors import suggest
+from su3d_bench.core.errors import nearest
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.perception.embedded.lexicon import GROUPS, SYNONYMS
 from su3d_bench.perception.embedded.naming import vocabulary
@@ -79,7 +79,7 @@ def meant_instead(noun: str, scene: SceneMap) -> str:
     names = {thing.name for thing in scene.objects if thing.name}
     own = {_class_of_words().get(words(name)) for name in names}
     names |= {other for name in own if name is not None for other in SYNONYMS.get(name, ())}
-    return suggest(noun, sorted(names)) or suggest(noun_words[-1], sorted(names))
+    return nearest(noun, sorted(names)) or nearest(noun_words[-1], sorted(names))
 
 
 @cache
