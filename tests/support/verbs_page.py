@@ -45,12 +45,12 @@ MORE = {
     "`report verify` recomputes every cell.",
     "report html": "One page that works offline: tables that sort, confusion, errors, timing, every map in 3D.",
     "check": "The gate for CI: [running/ci-gate.md](running/ci-gate.md), `action.yml`.",
-    "ask": "By the built-in solver or a language model: [reasoning.md](reasoning.md).",
+    "ask": "By the built-in solver or a language model: [reasoning.md](questions/reasoning.md).",
     "questions": "From the ground truth of any dataset; `--protocols rooms-retrieval` scores maps by such. "
-    "`questions audit` draws a sample as contact sheets: [human-evaluation.md](human-evaluation.md).",
+    "`questions audit` draws a sample as contact sheets: [human-evaluation.md](questions/human-evaluation.md).",
     "sheets make": "Blind sheets with pictures, as an offline page, a workbook and a CSV: "
-    "[human-evaluation.md](human-evaluation.md).",
-    "sheets score": "The paper's Tables IV and V with agreement: [human-evaluation.md](human-evaluation.md).",
+    "[human-evaluation.md](questions/human-evaluation.md).",
+    "sheets score": "The paper's Tables IV and V with agreement: [human-evaluation.md](questions/human-evaluation.md).",
     "compare": "Exact sign-flip test with the smallest p that so many scenes allow, corrected where much is "
     "compared, and the paired difference with its interval; other data, rules or encoders are "
     "refused: [statistics.md](statistics.md).",

@@ -274,8 +274,8 @@ class _Scene:
         classes: Int64Array | None = None
         if rules is not None:
             names = [entry.name for entry in rules.classes]
-            colours = class_colours(names)
-            about |= {"protocol": rules.name, "classes": names, "class_colours": [colours[name] for name in names]}
+            tints = class_colours(names)
+            about |= {"protocol": rules.name, "classes": names, "class_colours": [tints[name] for name in names]}
             of_truth = None if truth is None else class_index_of_ids(rules, truth.semantic)
             if truth is not None and of_truth is not None:
                 of_truth = np.where((of_truth >= 0) & scored_classes(rules)[of_truth], of_truth, -1)
