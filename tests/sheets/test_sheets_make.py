@@ -437,18 +437,32 @@ def test_a_figure_has_its_words_as_text(
         assert "unknown form" in capsys.readouterr().err
 
 
-def test_pictures_of_an_older_set_do_not_stay(tmp_path: Path) -> None:
-    write_sheets(made("retrieval", TEXTS), tmp_path / "out", tmp_path / "key")
-    write_sheets(made("retrieval", TEXTS[:2]), tmp_path / "out", tmp_path / "key")
-    assert len(list((tmp_path / "out" / "pictures").iterdir())) == 2
+def test_a_folder_of_another_set_and_one_with_answers_are_refused_and_stay(tmp_path: Path) -> None:
+    out, key = tmp_path / "out", tmp_path / "key"
+
+    def files() -> dict[Path, bytes]:
+        return {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+
+    write_sheets(made("retrieval", TEXTS), out, key)
+    before = files()
+    write_sheets(made("retrieval", TEXTS), out, key)
+    assert files() == before
+    for folders in ((out, key), (out, tmp_path / "other"), (tmp_path / "other", key)):
+        with pytest.raises(ConfigError, match=r"holds the sheets retrieval-\w+; name another folder"):
+            write_sheets(made("retrieval", TEXTS[:2]), *folders)
+    table = out / "annotator-1/sheet.csv"
+    table.write_text(table.read_text().replace(",,", ",right,", 1))
+    answered = files()
+    with pytest.raises(ConfigError, match=r"sheet\.csv holds answers, or another set; name another folder"):
+        write_sheets(made("retrieval", TEXTS), out, key)
+    assert files() == answered
 
 
 def test_pictures_of_somebody_else_stay(tmp_path: Path) -> None:
     theirs = tmp_path / "out/pictures/item-9999.png"
     theirs.parent.mkdir(parents=True)
     theirs.write_bytes(b"theirs")
-    for texts in (TEXTS, TEXTS[:2]):
-        write_sheets(made("retrieval", texts), tmp_path / "out", tmp_path / "key")
+    write_sheets(made("retrieval", TEXTS), tmp_path / "out", tmp_path / "key")
     assert theirs.read_bytes() == b"theirs"
 
 

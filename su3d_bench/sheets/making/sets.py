@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import base64
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,11 +12,13 @@ import numpy as np
 
 from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.errors import ConfigError, DataError, printable
+from su3d_bench.core.files import file_bytes
 from su3d_bench.reports.sheet.page import page_html
 from su3d_bench.reports.tables.formats import csv_lines
 from su3d_bench.sheets.items import (
     ANSWER_COLUMNS,
     ASKS,
+    KEY_FILE,
     PICTURES,
     SHEET_FILE,
     AnnotatorShare,
@@ -26,6 +27,7 @@ from su3d_bench.sheets.items import (
     Sheet,
     SheetKind,
     new_item,
+    read_key,
     read_sheet,
     sheet_id_of,
     write_key,
@@ -33,10 +35,9 @@ from su3d_bench.sheets.items import (
 )
 from su3d_bench.sheets.making.drafts import Draft
 from su3d_bench.sheets.making.workbook import workbook_bytes
-from su3d_bench.store.atomic import make_folder, remove_file, write_bytes, write_text
+from su3d_bench.store.atomic import is_file, make_folder, write_bytes, write_text
 
 MOST_ANNOTATORS = 100
-PICTURE_NAME = re.compile(r"item-[0-9]{4,}\.png")
 PAGE, WORKBOOK, TABLE = "sheet.html", "sheet.xlsx", "sheet.csv"
 TITLES = {
     "retrieval": "Is the outlined object what is asked for?",
@@ -149,13 +150,21 @@ def _key_item(item_id: str, draft: Draft) -> KeyItem:
 
 
 def write_sheets(made: MadeSheets, folder: Path, key_folder: Path) -> list[Path]:
-    """Write everything into ``folder`` and the key into ``key_folder``; the files for annotators, a folder each."""
+    """Write everything into ``folder`` and the key into ``key_folder``; the files for annotators, a folder each.
+
+    Raises ``ConfigError``, before anything is written, where the folders hold another set, or answers.
+    """
     if key_folder.resolve() == folder.resolve() or folder.resolve() in key_folder.resolve().parents:
         raise ConfigError(f"--key {printable(str(key_folder), 200)}: lies where the sheets are; keep the key apart")
+    tables: dict[Path, bytes] = {}
+    for share in made.sheet.annotators:
+        tables[folder / share.name / WORKBOOK] = workbook_bytes(
+            made.sheet, share, made.pictures, TITLES[made.sheet.kind]
+        )
+        tables[folder / share.name / TABLE] = table_csv(made.sheet, share).encode()
+    _refuse_other_sheets(made.sheet.id, folder, key_folder, tables)
     for path in (folder, key_folder, folder / PICTURES):
         make_folder(path)
-    for name in _pictures_of_set(folder) - made.pictures.keys():
-        remove_file(folder / PICTURES / name)
     for name, content in made.pictures.items():
         write_bytes(folder / PICTURES / name, content)
     written = []
@@ -163,21 +172,37 @@ def write_sheets(made: MadeSheets, folder: Path, key_folder: Path) -> list[Path]
         own = folder / share.name
         make_folder(own)
         write_text(own / PAGE, page_html(TITLES[made.sheet.kind], page_data(made, share)))
-        write_bytes(own / WORKBOOK, workbook_bytes(made.sheet, share, made.pictures, TITLES[made.sheet.kind]))
-        write_text(own / TABLE, table_csv(made.sheet, share))
+        for path in (own / WORKBOOK, own / TABLE):
+            write_bytes(path, tables[path])
         written += [own / PAGE, own / WORKBOOK, own / TABLE]
     write_sheet(folder, made.sheet)
     write_key(key_folder, made.key)
     return written
 
 
-def _pictures_of_set(folder: Path) -> set[str]:
-    """Names of the pictures of the set that stands in ``folder``; none where there is none that can be read."""
+def _refuse_other_sheets(sheet_id: str, folder: Path, key_folder: Path, tables: Mapping[Path, bytes]) -> None:
+    """Answers belong to one set and its key: neither gives way to another, and no answer to an empty table."""
+    for place, flag, held in (
+        (folder, "--out", _id_in(folder / SHEET_FILE, lambda file: read_sheet(file).id)),
+        (key_folder, "--key", _id_in(key_folder / KEY_FILE, lambda file: read_key(file).sheet_id)),
+    ):
+        if held not in (None, sheet_id):
+            where = printable(str(place), 200)
+            raise ConfigError(f"{flag} {where}: holds the sheets {printable(held or '')}; name another folder")
+    for path, content in tables.items():
+        if is_file(path) and file_bytes(path) != content:
+            where = printable(str(path), 200)
+            raise ConfigError(f"--out: {where} holds answers, or another set; name another folder")
+
+
+def _id_in(file: Path, read: Callable[[Path], str]) -> str | None:
+    """The id of the set that ``file`` is of; None where there is no such file."""
+    if not is_file(file):
+        return None
     try:
-        sheet = read_sheet(folder / SHEET_FILE)
+        return read(file)
     except DataError:
-        return set()
-    return {name for item in sheet.items for name in item.pictures if PICTURE_NAME.fullmatch(name)}
+        return "of a file that cannot be read"
 
 
 def page_data(made: MadeSheets, share: AnnotatorShare) -> dict[str, Any]:
