@@ -31,6 +31,7 @@ from su3d_bench.predictions.base import Content
 from su3d_bench.predictions.own_runs import write_content
 from su3d_bench.predictions.scenes import Source
 from su3d_bench.runs.finished import made_elsewhere
+from su3d_bench.runs.planning.held import sealed
 from su3d_bench.runs.planning.plan import check_folder_name
 from su3d_bench.runs.runner import BY_THE_METHOD, confidences_of
 from su3d_bench.store.atomic import (
@@ -300,7 +301,7 @@ def _write(kept: Sequence[_Kept], run: EvaluatedRun, folder: RunFolder) -> RunRe
             _seal(one, run.evaluations[one.method], address, record, folder)
     record = replace(record, predictions=tuple(one.record for one in kept))
     _write_ceilings(kept, run.evaluations, folder)
-    write_text(folder.path / "run.toml", write_toml(_settings(kept, record)))
+    write_text(folder.path / "run.toml", sealed(write_toml(_settings(kept, record))))
     write_json(folder.path / "metrics.json", plain(run.metrics))
     write_json(folder.path / "run.json", plain(record))
     return record

@@ -18,7 +18,7 @@ from typing import Any
 from su3d_bench.core.config import KeyPath, write_toml
 from su3d_bench.core.digests import code_digest, git_state, package_versions
 from su3d_bench.core.errors import StoreError
-from su3d_bench.core.files import file_bytes, file_text
+from su3d_bench.core.files import file_bytes
 from su3d_bench.core.registry import CEILING_METHOD, DATASETS
 from su3d_bench.core.timing import hardware_line, processor_digest
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
@@ -32,7 +32,7 @@ from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
 from su3d_bench.runs.finished import record_of_rules
 from su3d_bench.runs.found import found_in
 from su3d_bench.runs.job import MethodOutcome, SceneJob
-from su3d_bench.runs.planning.held import differences, kept_jobs, replaced_jobs
+from su3d_bench.runs.planning.held import differences, kept_jobs, replaced_jobs, sealed
 from su3d_bench.runs.planning.plan import Plan
 from su3d_bench.runs.planning.poses import judged
 from su3d_bench.runs.planning.scenes import cache_root
@@ -131,7 +131,7 @@ def _begin(plan: Plan, *, is_new: bool = True) -> None:
     place = plan.folder.path
     if is_new:
         remove_file(place / "metrics.json")
-    write_text(place / "run.toml", write_toml(resolved_values(plan)))
+    write_text(place / "run.toml", sealed(write_toml(resolved_values(plan))))
     write_json(place / "run.json", plain(record(plan, (), "running")))
     if is_new:
         publish(plan)
@@ -140,8 +140,8 @@ def _begin(plan: Plan, *, is_new: bool = True) -> None:
 def _refuse_what_came_meanwhile(plan: Plan) -> None:
     """A ``StoreError`` where another command has written its request here since this one was planned."""
     file = plan.folder.path / "run.toml"
-    planned = None if plan.held is None else plan.held.text
-    if is_file(file) and planned != file_text(file) and plan.into != "replace":
+    planned = None if plan.held is None else plan.held.content
+    if is_file(file) and planned != file_bytes(file) and plan.into != "replace":
         raise StoreError(
             f"{plan.store or plan.folder.path}: another run was begun here just now; give the command again"
         )
@@ -166,7 +166,7 @@ def _is_unchanged(plan: Plan, outcomes: Sequence[MethodOutcome], metrics: Any) -
     """Whether all was done before, so that the records that stand there, with what they say of the machine that did
     the work, are those of this command too."""
     held = plan.held
-    if held is None or held.record is None or held.record.status != "complete" or held.text is None:
+    if held is None or not held.is_known or held.record is None or held.record.status != "complete":
         return False
     if differences(held, plan.request) or not all(outcome.was_resumed for outcome in outcomes):
         return False

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -189,15 +190,33 @@ def test_a_sweep_grows_by_its_rows(capsys: pytest.CaptureFixture[str]) -> None:
     assert [row.method for row in read_rows(Path("out"))] == ["collector", "collector@drop=2"]
 
 
-def test_a_request_that_nobody_can_read_any_more_is_not_taken_for_the_same(capsys: pytest.CaptureFixture[str]) -> None:
+DAMAGE: dict[str, Callable[[bytes], bytes]] = {
+    "cut within a line": lambda content: content[: content.index(b"[method") + 3],
+    "cut between lines": lambda content: content[: content.index(b"[method")],
+    "empty": lambda content: b"",
+    "zeros": lambda content: bytes(len(content)),
+    "zeros at the end": lambda content: content[:100] + bytes(len(content) - 100),
+    "written in by hand": lambda content: content.replace(b"seed = 0", b"seed = 1"),
+}
+
+
+@pytest.mark.parametrize(
+    ("damage", "has_record"), [*((damage, known) for damage in DAMAGE for known in (True, False)), ("missing", True)]
+)
+def test_a_request_that_a_power_cut_spoilt_is_taken_up_by_the_same_command_and_by_no_other(
+    damage: str, has_record: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run("a") == 0
-    Path("out/run.toml").write_text("scenes = [")
-    capsys.readouterr()
-    assert run("a") == 2
-    assert "so nobody can tell what run this folder holds: mend the file; --replace puts" in capsys.readouterr().err
-    assert run("a", "--replace") == 0
-    os.unlink("out/run.toml")
-    assert run("b") == 2
-    assert "holds another run (scene painted/a is not asked for now" in capsys.readouterr().err
+    request, numbers = Path("out/run.toml"), Path("out/metrics.json")
+    whole = request.read_bytes(), numbers.read_bytes()
+    request.unlink() if damage == "missing" else request.write_bytes(DAMAGE[damage](whole[0]))
+    if not has_record:
+        os.unlink("out/run.json")
+    assert run("a", "--seed", "1") == 2  # its maps are of another request
+    if has_record:
+        assert run("b") == 2
+        assert "holds another run (scene painted/a is not asked for now" in capsys.readouterr().err
+        assert numbers.read_bytes() == whole[1]
     assert run("a") == 0
-    assert Path("out/run.toml").is_file()
+    assert (request.read_bytes(), numbers.read_bytes()) == whole
+    assert record("run.json")["status"] == "complete"

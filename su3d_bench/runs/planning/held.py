@@ -9,13 +9,14 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from su3d_bench.core.config import MOVES_NO_NUMBER, KeyPath, Settings, read_file
+from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.errors import ConfigError, StoreError, counted, printable, shown
-from su3d_bench.core.files import file_text
+from su3d_bench.core.files import file_bytes
 from su3d_bench.questions.reasoning.language_solver import MOVES_ANSWERS
 from su3d_bench.runs.job import FIELDS_KNOWN_LATER, INSTEAD, NOT_IN_KEY, SceneJob, build_method, config_key
 from su3d_bench.store.atomic import is_file
@@ -27,6 +28,7 @@ JOINED = ("scenes", "methods", "protocols")
 OF_THIS_CALL = MOVES_NO_NUMBER - {"pictures", "accept_poses"}  # where scenes run, which an extension does not inherit
 FINISHED = ("complete", "incomplete")
 MOST_NAMED = 3
+SEAL = "# whole: "
 
 
 @dataclass(frozen=True)
@@ -41,20 +43,23 @@ class Request:
 
 @dataclass(frozen=True)
 class HeldRun:
-    """The run in a folder: ``run.toml`` as text and settings, and what ``run.json`` says, None where it is not there.
+    """The run in a folder: what ``run.json`` says, None where it is not there, and the settings of its ``run.toml``.
 
-    ``remarks`` say where each value came from when the run was first asked for.
+    ``content`` is ``run.toml`` as it lies there; ``is_known`` says whether it is whole. ``remarks`` say where each
+    value came from when the run was first asked for.
     """
 
     folder: Path
-    text: str | None
-    settings: Settings
-    remarks: Mapping[KeyPath, str]
+    content: bytes | None
     record: RequestRecord | None
+    is_known: bool = False
+    settings: Settings = field(default_factory=Settings)
+    remarks: Mapping[KeyPath, str] = field(default_factory=dict)
 
     @property
     def is_finished(self) -> bool:
-        return self.record is not None and self.record.status in FINISHED and is_file(self.folder / "metrics.json")
+        has_metrics = is_file(self.folder / "metrics.json")
+        return self.is_known and has_metrics and self.record is not None and self.record.status in FINISHED
 
     @property
     def values(self) -> dict[KeyPath, Any]:
@@ -72,37 +77,37 @@ class HeldRun:
         return own or self.asked("protocols")
 
 
-def held_run(folder: Path, *, into: Into = "own") -> HeldRun | None:
-    """The run in ``folder``; None where there is none.
+def sealed(text: str) -> str:
+    """``run.toml`` with a last line that tells whether all of it is there, as after a power cut it may not be."""
+    return f"{text}{SEAL}{digest_bytes(text.encode())}\n"
 
-    ``StoreError`` where nobody can tell what it was asked for, unless it is to be replaced.
-    """
+
+def held_run(folder: Path) -> HeldRun | None:
+    """The run in ``folder``; None where there is none. Of a ``run.toml`` that is not whole nothing is believed."""
     record = None
     if is_file(folder / "run.json"):
         with suppress(StoreError):  # what stands in run.toml counts then
             record = read_record(RequestRecord, folder / "run.json", shown(folder))
     if not is_file(folder / "run.toml"):
-        return None if record is None else HeldRun(folder, None, Settings(), {}, record)
-    try:
-        text = file_text(folder / "run.toml")
-        settings = read_file(folder / "run.toml")
-    except (ConfigError, OSError, UnicodeDecodeError) as error:
-        if into == "replace":
-            return HeldRun(folder, None, Settings(), {}, record)
-        raise StoreError(f"{error}; so nobody can tell what run this folder holds: mend the file; {INSTEAD}") from error
-    lines = text.splitlines()
+        return None if record is None else HeldRun(folder, None, record)
+    content = file_bytes(folder / "run.toml")
+    text, seal, digest = content.rpartition(SEAL.encode())
+    if not seal or digest != f"{digest_bytes(text)}\n".encode():
+        return HeldRun(folder, content, record)
+    settings = read_file(folder / "run.toml")
+    lines = text.decode().splitlines()
     numbers = {entry.path: int(entry.source.rpartition(":")[2]) for entry in settings.entries}
     remarks = {
         path: lines[n - 1].rpartition("  # ")[2].strip() for path, n in numbers.items() if "  # " in lines[n - 1]
     }
-    return HeldRun(folder, text, settings, remarks, record)
+    return HeldRun(folder, content, record, True, settings, remarks)
 
 
 def extended(asked: Settings, held: HeldRun | None, where: str) -> Settings:
     """What ``held`` was asked for and what is asked for now; ``where`` is the run's folder, or its URL."""
-    if held is None or held.text is None:
+    if held is None or not held.is_known:
         raise ConfigError(
-            f"--extend: {printable(where, 300)} holds no run.toml of a run; leave --extend out to begin one"
+            f"--extend: {printable(where, 300)} holds no run.toml as a run wrote it; leave --extend out to begin one"
         )
     joined = []
     for name in JOINED:
@@ -138,7 +143,9 @@ class Difference:
 
 def differences(held: HeldRun, now: Request) -> list[Difference]:
     """In what the request of the run in a folder differs from ``now``; none where the same command was given again."""
-    found = []
+    found: list[Difference] = []
+    if held.record is None and not held.is_known:
+        return found
     for noun, name in (("scene", "scenes"), ("method", "methods"), ("protocol", "protocols")):
         before = held.asked(name) if held.record is None else _names(held.record, name)
         after = getattr(now, name) if held.record is not None else tuple(map(str, now.values[(name,)]))
@@ -147,7 +154,7 @@ def differences(held: HeldRun, now: Request) -> list[Difference]:
             found.append(Difference(f"{_some(noun, gone)} not asked for now", can_join=True))
         if new:
             found.append(Difference(f"{_some(noun, new)} new", can_join=True))
-    if held.text is not None:
+    if held.is_known:
         found += [Difference(clause) for clause in _changed_values(held, now)]
     return found
 

@@ -189,7 +189,7 @@ def make_plan(
     so.
     """
     store = out if isinstance(out, str) else None
-    held = None if out is None else _held(out, into)
+    held = None if out is None else _held(out)
     if into != "own" and out is None:
         raise ConfigError(f"--{into}: say which run with --out, such as --out runs/demo")
     check_keys(settings)
@@ -249,12 +249,12 @@ def make_plan(
         raise StoreError(str(error).replace(str(folder), str(store or folder))) from error
 
 
-def _held(out: Path | str, into: Into) -> HeldRun | None:
+def _held(out: Path | str) -> HeldRun | None:
     if isinstance(out, Path):
-        return held_run(out, into=into)
+        return held_run(out)
     mirror = mirror_of(out, cache_root())
     fetch_state(out, mirror)
-    return held_run(mirror, into=into)
+    return held_run(mirror)
 
 
 def _what_goes(plan: Plan) -> list[str]:
