@@ -96,7 +96,8 @@ def _views(text: str) -> Iterator[bytes]:
     """The letters of what ``text`` says where it is taken for escaped or encoded."""
     for _ in range(MOST_ROUNDS):
         yield from map(_plain, _decoded(text))
-        plain = unquote_to_bytes(html.unescape(ESCAPE.sub(_unescaped, text))).decode("utf-8", "replace")
+        whole = html.unescape(ESCAPE.sub(_unescaped, text)).encode("utf-8", "surrogatepass")  # a half of a pair, too
+        plain = unquote_to_bytes(whole).decode("utf-8", "replace")
         if plain == text:
             return
         text = plain

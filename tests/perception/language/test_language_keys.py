@@ -112,6 +112,12 @@ def test_a_key_in_pieces_over_several_fields_is_not_kept(server: ChatServer, tmp
     assert (reply.text, reply.model, reply.finish_reason) == ("a lamp", "(key)", "(key)")
 
 
+@pytest.mark.parametrize("text", [r"\ud800", r"&#xd800;\udc00", r"%ed%a0%80 \ud83d"])
+def test_half_of_a_pair_of_characters_in_an_escape_ends_nothing(text: str) -> None:
+    assert Secret(KEY).cleaned(text) == text
+    assert Secret(KEY).cleaned(text + KEY) != text + KEY
+
+
 def test_a_key_said_in_numbers_is_not_kept(server: ChatServer, tmp_path: Path) -> None:
     server.script = [Answered(usage=(int.from_bytes(KEY.encode()), 1)), Answered("a lamp")]
     reply = ChatClient(quick_config(server), ReplyStore(tmp_path)).ask(request("x"))
