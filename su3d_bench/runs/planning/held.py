@@ -107,7 +107,7 @@ def extended(asked: Settings, held: HeldRun | None, where: str) -> Settings:
     """What ``held`` was asked for and what is asked for now; ``where`` is the run's folder, or its URL."""
     if held is None or not held.is_known:
         raise ConfigError(
-            f"--extend: {printable(where, 300)} holds no run.toml as a run wrote it; leave --extend out to begin one"
+            f"--extend: {printable(where, 300)} holds no run.toml of a run; leave --extend out to begin one"
         )
     joined = []
     for name in JOINED:
