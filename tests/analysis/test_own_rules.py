@@ -42,7 +42,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
             assert main([*words, "--out", str(folder / "runs" / name)]) == 0
     for file in rules:
         file.unlink()
-    load_protocol.cache_clear()
     return folder / "runs"
 
 

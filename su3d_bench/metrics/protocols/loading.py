@@ -7,7 +7,7 @@ of one line that name the file and the key.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -30,18 +30,36 @@ def not_comparable_with(rules: ProtocolRules) -> list[str]:
     return sorted({*rules.not_comparable_with, *naming})
 
 
-@lru_cache(maxsize=64)
 def load_protocol(name: str) -> ProtocolRules:
     """The rules called ``name``, or those in the file ``name`` when it ends in ``.toml``."""
     known = protocol_names()
     if name in known:
-        return read_protocol(rules_file(name))
+        return _built_in(name)
     if name.endswith(".toml"):
-        rules = read_protocol(Path(name))
+        rules = _own(Path(name).absolute(), Path(name), _state(Path(name)))
         if rules.name in known:
             raise ConfigError(f"{name}: the protocol name '{rules.name}' is built in; choose another name")
         return rules
     raise ConfigError(f"unknown protocol '{name}'{suggest(name, known)}")
+
+
+@cache
+def _built_in(name: str) -> ProtocolRules:
+    return read_protocol(rules_file(name))
+
+
+@lru_cache(maxsize=64)
+def _own(place: Path, shown: Path, state: tuple[int, int] | None) -> ProtocolRules:
+    """The rules in a file, read once for each ``place`` and ``state`` of it; errors name it as ``shown``."""
+    return read_protocol(shown)
+
+
+def _state(path: Path) -> tuple[int, int] | None:
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size
 
 
 def read_protocol(path: Path) -> ProtocolRules:

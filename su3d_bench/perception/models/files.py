@@ -72,7 +72,7 @@ class ModelFiles:
 
 def models_folder(configured: Path | None = None) -> Path:
     """Where models are put: ``configured``, else ``$SU3D_MODELS``, else the user's cache."""
-    return (configured or Path(os.environ.get("SU3D_MODELS") or DEFAULT_FOLDER)).expanduser()
+    return (configured or Path(os.environ.get("SU3D_MODELS") or DEFAULT_FOLDER)).expanduser().absolute()
 
 
 def hub_cache() -> Path:
@@ -98,7 +98,7 @@ def locate(
     read = tuple(form for form in entry.forms if form.is_read)
     wanted = read if forms is None else tuple(entry.form(form) for form in forms)
     if path is not None:
-        return _at(entry, wanted, path.expanduser())
+        return _at(entry, wanted, path.expanduser().absolute())
     for form in wanted:
         for candidate in _folders(entry, form, folder):
             if (weights := _weights(form, candidate)) is not None and not _lacking(form, candidate):

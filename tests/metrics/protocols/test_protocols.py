@@ -324,6 +324,18 @@ def test_a_protocol_may_be_a_file(tmp_path: Path) -> None:
     assert load_protocol(edited(tmp_path, "rooms-semantic", "version = 1", "version = 7")).version == 7
 
 
+def test_a_file_is_read_as_it_is_now_wherever_the_name_of_it_leads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for folder, base in (("first", "rooms-instance"), ("second", "replica-openmask3d")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "mine.toml").write_text(f'extends = "{base}"\nname = "mine"\n')
+        monkeypatch.chdir(tmp_path / folder)
+        assert load_protocol("mine.toml").datasets == load_protocol(base).datasets
+    Path("mine.toml").write_text('extends = "rooms-semantic"\nname = "mine"\n')
+    assert load_protocol("mine.toml").kind == "semantic"
+
+
 def test_a_file_may_list_its_own_classes(tmp_path: Path) -> None:
     rows = '[[40, "floor"], [93, "wall"], [31, "ceiling"], [20, "chair"]]'
     path = edited(tmp_path, "rooms-semantic", 'classes = "rooms"', f"classes = {rows}")
