@@ -6,7 +6,7 @@ import hashlib
 import re
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -89,6 +89,7 @@ class BuiltRoom:
     scene: str
     options: RoomOptions
     folder: Path | None
+    _coarser: Renderer | None = field(default=None, init=False)
 
     @cached_property
     def plan(self) -> Plan:
@@ -125,6 +126,15 @@ class BuiltRoom:
         from su3d_bench.datasets.rooms.rendering.render import Renderer
 
         return Renderer(self.mesh, self.options.width, self.options.height)
+
+    def coarser(self, width: int) -> Renderer:
+        """A renderer of the same tree, kept until another width is asked for."""
+        from su3d_bench.datasets.rooms.rendering.render import Renderer
+
+        if self._coarser is None or self._coarser.width != width:
+            height = max(1, round(self.options.height * width / self.options.width))
+            self._coarser = Renderer(self.mesh, width, height, self.renderer)
+        return self._coarser
 
     @cached_property
     def trajectory(self) -> Float64Array:
@@ -219,6 +229,18 @@ class Rooms:
         rng = _generator("noise", scene, self.options.seed_offset, index)
         rgb, depth_m = add_noise(image.rgb, image.depth_m, self.options.noise, rng)
         return Frame(index, index / FRAMES_PER_SECOND, rgb, depth_m, self.trajectory(scene)[index], self.intrinsics)
+
+    def sketch(self, scene: str, index: int, width: int) -> Frame:
+        """Frame ``index`` with fewer pixels, free of noise: colours and depths where the thinned rays hit."""
+        from su3d_bench.datasets.rooms.rendering.render import camera_intrinsics
+
+        if width >= self.options.width:
+            return self.frame(scene, index)
+        room = self._room(scene)
+        renderer, pose = room.coarser(width), room.trajectory[index]
+        image = renderer.render(pose)
+        intrinsics = camera_intrinsics(width, renderer.height)
+        return Frame(index, index / FRAMES_PER_SECOND, image.rgb, image.depth_m, pose, intrinsics)
 
     def scan(self, scene: str) -> RoomScan:
         """The ground-truth surface; made once, then read from the cache."""

@@ -121,6 +121,19 @@ def evenly(n: int, most: int) -> Sequence[int]:
     return sorted({int(place) for place in np.linspace(0, n - 1, min(n, most))})
 
 
+def spread(n: int, most: int) -> list[int]:
+    """The places of ``evenly``, so ordered that the first few lie far apart as well.
+
+    >>> spread(9, 9)
+    [0, 8, 4, 2, 6, 1, 3, 5, 7]
+    """
+    places = list(evenly(n, most))
+    taken, step = dict.fromkeys((*places[:1], *places[-1:])), 1 << max(0, len(places) - 1).bit_length()
+    while step := step // 2:
+        taken |= dict.fromkeys(places[step::step])
+    return list(taken)
+
+
 def chosen_pixels(frame: Frame, n_frames: int, n_points: int = SEEN_POINTS) -> BoolArray:
     """Pixels (H, W) with a depth, spread over the image: about one frame's share of ``n_points``."""
     most = max(1, n_points // n_frames)

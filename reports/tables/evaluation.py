@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from su3d_bench.core.errors import counted, printable, some
@@ -17,6 +16,7 @@ from su3d_bench.reports.tables.model import (
     with_interval,
 )
 from su3d_bench.reports.tables.run import run_tables
+from su3d_bench.reports.tables.warnings import summed
 
 NAMES = {"ap": "AP", "ap50": "AP50", "ap25": "AP25", "macc": "mAcc", "miou": "mIoU", "fmiou": "F-mIoU"}
 MOST_NOTES = 12  # warnings that are printed; the file has all
@@ -86,49 +86,13 @@ def _context(scored: Mapping[str, Any]) -> Iterable[str]:
         yield f"scored points with a predicted one within 2.5 / 5 / 10 cm: {shares} %"
     if any(scored["intervals"].values()) and (line := few_scenes(int(scored["n_scenes"]))):
         yield line
-    warnings = summed(scored["warnings"], scored["per_scene"])
+    warnings = [
+        f"{said}, in {len(scenes)} scenes ({some(scenes, 3)})" if len(scenes) > 1 else ": ".join([*scenes, said])
+        for said, scenes in summed(scored["warnings"], scored["per_scene"])
+    ]
     yield from (f"WARNING: {printable(line)}" for line in warnings[:MOST_NOTES])
     if len(warnings) > MOST_NOTES:
         yield f"and {len(warnings) - MOST_NOTES} more warnings, all in the --json file"
-
-
-def summed(warnings: Sequence[str], scenes: Collection[str]) -> list[str]:
-    """Warnings of single ``scenes`` that say the same of several as one, with their numbers added up.
-
-    >>> summed(["a: 1 empty mask, the first is mask 3", "b: 2 empty masks, the first is mask 0", "c"], ["a", "b"])
-    ['3 empty masks, in 2 scenes (a, b)', 'c']
-    >>> summed(["a: 1 of 4 masks has no class: 1 of class 7", "b: 2 of 6 masks have no class: 2 of class 9"], "ab")
-    ['3 of 10 masks have no class, in 2 scenes (a, b)']
-    """
-    groups: dict[str, list[tuple[str, str, re.Match[str] | None]]] = {}
-    for line in warnings:
-        scene, _, sentence = line.partition(": ")
-        found = _COUNTED.fullmatch(sentence) if scene in scenes else None
-        key = _in_plural(found["what"]) if found is not None else sentence if scene in scenes else line
-        groups.setdefault(key, []).append((scene, line, found))
-    lines = []
-    for key, group in groups.items():
-        if len(group) == 1:
-            lines.append(group[0][1])
-            continue
-        counts = [found for _, _, found in group if found is not None]
-        total = f"{sum(int(found['n']) for found in counts)} " if counts else ""
-        if counts and all(found["of"] for found in counts):
-            total += f"of {sum(int(found['of']) for found in counts)} "
-        lines.append(f"{total}{key}, in {len(group)} scenes ({some([scene for scene, _, _ in group], 3)})")
-    return lines
-
-
-# A number of things in a scene, and what is said of them before the first of them is named.
-_COUNTED = re.compile(r"(?P<n>\d+) (?:of (?P<of>\d+) )?(?P<what>[^,:;(]+)(?:[,:;(].*)?", re.DOTALL)
-_PLURAL = {"mask": "masks", "pair": "pairs", "has": "have", "counts": "count", "is": "are"}
-
-
-def _in_plural(words: str) -> str:
-    first, *rest = words.strip().split(" ")
-    verb = next((k for k, word in enumerate(rest) if word in ("has", "have")), len(rest))
-    plural = [_PLURAL.get(word, word) if k <= verb or word == "counts" else word for k, word in enumerate(rest)]
-    return " ".join([_PLURAL.get(first, first), *plural])
 
 
 def _confidences(scored: Mapping[str, Any]) -> str:

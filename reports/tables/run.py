@@ -19,6 +19,7 @@ from su3d_bench.reports.tables.model import (
     text_table,
     with_interval,
 )
+from su3d_bench.reports.tables.warnings import summed
 
 # What stands below the methods: the prefix of a metric's name, and what the row is called.
 MOST_SCENES = 20  # that a line names
@@ -114,9 +115,6 @@ def _notes(row: Mapping[str, Any]) -> Iterable[str]:
         yield f"{method} is unscored on {some(row['unscored'], MOST_SCENES)}"
     if row["caveat"]:
         yield f"{method}: {row['caveat']}"
-    scenes_of: dict[str, list[str]] = {}
-    for warning in [] if row["result"] is None else row["result"]["warnings"]:
-        scene, _, sentence = str(warning).partition(": ")
-        scenes_of.setdefault(sentence or scene, []).append(scene)
-    for sentence, scenes in scenes_of.items():
-        yield f"{method}: {sentence} ({some(scenes, 3)})"
+    warnings = [] if row["result"] is None else [str(line) for line in row["result"]["warnings"]]
+    for said, scenes in summed(warnings, {line.partition(": ")[0] for line in warnings if ": " in line}):
+        yield f"{method}: {said}" + (f" ({some(scenes, 3)})" if scenes else "")

@@ -175,6 +175,13 @@ class RendersFrames(Protocol):
 
 
 @runtime_checkable
+class HasSketches(Protocol):
+    """A frame ``width`` pixels wide, in far less time than the whole; ``index`` is its place among all frames."""
+
+    def sketch(self, scene: str, index: int, width: int) -> Frame: ...
+
+
+@runtime_checkable
 class ReadsMadeRooms(Protocol):
     """True where rooms that the program makes are written in its layout, which are not its scenes."""
 
@@ -367,6 +374,7 @@ ABILITIES = {
         HasQueries,
         KnowsObjects,
         RendersFrames,
+        HasSketches,
         ReadsMadeRooms,
         NamesScenes,
     ),

@@ -38,6 +38,7 @@ from su3d_bench.reports.page.maps import (
     thinned,
 )
 from su3d_bench.reports.page.page import page_html
+from su3d_bench.reports.pictures import scene_look
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.predictions import read_prediction, write_prediction
@@ -379,7 +380,9 @@ def test_a_box_in_a_view_is_where_the_points_project() -> None:
     assert box_in_view(points[2:], np.eye(4), intrinsics, 100, 80) is None
 
 
-@pytest.mark.parametrize("module", [html_data, html_map, html_page, page_maps], ids=lambda module: module.__name__)
+@pytest.mark.parametrize(
+    "module", [html_data, html_map, html_page, page_maps, scene_look], ids=lambda module: module.__name__
+)
 def test_the_examples_in_docstrings_hold(module: Any) -> None:
     found: Mapping[str, int] = doctest.testmod(module)._asdict()
     assert found["attempted"] > 0

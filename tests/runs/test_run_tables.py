@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import doctest
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 from su3d_bench.core.types import PerceptionNeeds, SceneInfo
 from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.reports.tables import warnings
 from su3d_bench.reports.tables.run import headline, markdown_table
 from su3d_bench.runs.job import caveat_of
 from su3d_bench.runs.runner import confidences_of
@@ -76,6 +78,17 @@ def test_a_warning_of_many_scenes_stands_once() -> None:
     assert "- opensu3d: 3 classes have no points (rooms/a, rooms/b)" in table(result())
 
 
+def test_the_masks_that_scenes_are_warned_of_are_added_up() -> None:
+    lines = ["a: 1 of 4 masks has no point: it counts for nothing", "b: 2 of 6 masks have no point: they count for"]
+    scored = result()["result"] | {"warnings": [*lines, "a: 1 class has no points", "b: 2 classes have no points"]}
+    notes = [line for line in table(result(result=scored)).splitlines() if line.startswith("- opensu3d")]
+    assert notes == [
+        "- opensu3d: 3 of 10 masks have no point (a, b)",
+        "- opensu3d: 1 class has no points (a)",
+        "- opensu3d: 2 classes have no points (b)",
+    ]
+
+
 def test_what_was_not_measured_is_a_dash() -> None:
     text = table(result(result=None, ceiling=None, unscored=["rooms/a"]), result(method="other"))
     row = next(line for line in text.splitlines() if line.startswith("| opensu3d"))
@@ -129,3 +142,8 @@ def test_a_mix_of_confidences_is_shouted_and_one_kind_is_said() -> None:
     alike = table(result("a", confidences=ones), result("b", confidences=ones), result("c", confidences=None))
     assert f"- confidences: {ones}" in alike and "MIXED" not in alike
     assert "onfidences" not in table(result("a"), result("b", confidences=None))
+
+
+def test_the_examples_hold() -> None:
+    found = doctest.testmod(warnings)
+    assert found.attempted and not found.failed

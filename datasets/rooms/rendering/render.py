@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -28,12 +29,12 @@ def camera_intrinsics(width: int, height: int) -> Float64Array:
 
 
 class Renderer:
-    """Renders one room at one image size."""
+    """Renders one room at one image size; ``like`` is another renderer of the same mesh, whose tree it shares."""
 
-    def __init__(self, mesh: RoomMesh, width: int, height: int) -> None:
+    def __init__(self, mesh: RoomMesh, width: int, height: int, like: Renderer | None = None) -> None:
         self.width, self.height = width, height
         self._mesh = mesh
-        self._scene = caster(mesh.vertices, mesh.triangles)
+        self._scene: Any = caster(mesh.vertices, mesh.triangles) if like is None else like._scene
         focal_inverse = np.linalg.inv(camera_intrinsics(width, height))
         u, v = np.meshgrid(np.arange(width), np.arange(height))
         pixels = np.stack([u.ravel(), v.ravel(), np.ones(width * height)], axis=1)
@@ -67,7 +68,7 @@ class Renderer:
 
         rays = np.empty((self.width * self.height, 6), np.float32)
         aim(self._directions, pose, rays)
-        answer = self._scene.cast_rays(o3d.core.Tensor(rays))  # type: ignore[attr-defined]
+        answer = self._scene.cast_rays(o3d.core.Tensor(rays))
         return rays, answer["t_hit"].numpy(), answer["primitive_ids"].numpy(), answer["primitive_uvs"].numpy()
 
 

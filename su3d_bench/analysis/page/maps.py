@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from su3d_bench.core.errors import ConfigError, Su3dError, printable, printable_json
-from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.interfaces import Encoder, HasSketches
 from su3d_bench.core.types import (
     DenseFeatures,
     Float32Array,
@@ -31,11 +31,12 @@ from su3d_bench.metrics.matching.labelling import (
     cosines,
     scored_classes,
 )
+from su3d_bench.metrics.matching.nearest import nearest
 from su3d_bench.metrics.metric import n_predictions, present
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.score import has_feature
-from su3d_bench.numerics.geometry import back_project
 from su3d_bench.reports.page.maps import (
+    COLOUR_NEAR_M,
     Cloud,
     box_in_view,
     colour_plane,
@@ -48,7 +49,7 @@ from su3d_bench.reports.page.maps import (
     thinned,
 )
 from su3d_bench.reports.pictures.colours import class_colours
-from su3d_bench.reports.pictures.scene_look import chosen_pixels, evenly
+from su3d_bench.reports.pictures.scene_look import SEEN_POINTS, seen_points, spread
 from su3d_bench.runs.finished import FinishedRun, OtherDataError
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.records import read_updates
@@ -57,11 +58,15 @@ MOST_POINTS, LEAST_POINTS = 60_000, 3_000  # of one map: what a phone draws at o
 BYTES_A_POINT = 6.0  # in the page, measured on the rooms: position, colour, owner and truth, deflated, in base64
 SHARE_OF_POINTS = 0.6  # of the page; the rest is for instances, pictures and tables
 THUMBNAILS = 14  # frames of a scene that are shown
-MORE_FRAMES = 48  # that are read for the colours of the map: with fewer, corners of a room stay grey
+MORE_FRAMES, FRAMES_AT_ONCE = 48, 6  # that are read at most for the colours of the map, and before it is looked again
+GREY_SHARE = 0.01  # of the points may stay without a colour when there are frames left
+EVERY = 8  # of the points is asked whether it was seen
 THUMBNAIL_WIDTH, JPEG_QUALITY = 240, 62
+SKETCH_WIDTH, SHOWN_WIDTH = 160, 320  # of a frame for its colours alone, of one that is shown: where that saves time
 MOST_VIEWS = 12  # frames of an instance that are named
 MOST_CAPTION = 240  # characters
 MapOfRun = tuple[int, FinishedRun, str, str]
+Seen = tuple[Float32Array, UInt8Array]  # points (n, 3) m and their colours (n, 3)
 Made = TypeVar("Made")
 
 
@@ -178,13 +183,19 @@ class _Scene:
     def page(self, most_points: int, tell: Callable[[str], None]) -> PageScene:
         read = {key[:1] + key[3:]: self._read(key) for key in self._maps}
         chosen = self._chosen_frames([a_map for a_map in read.values() if isinstance(a_map, Instances)])
-        frames = {index: frame for index in sorted(chosen) if (frame := self._frame(index)) is not None}
+        frames = {
+            index: frame for index in sorted(chosen) if (frame := self._frame(index, SHOWN_WIDTH)) is not None
+        }
+        clouds = {key: thinned(one.points, most_points) for key, one in read.items() if not isinstance(one, str)}
+        seen = self._seen([cloud.points for cloud in clouds.values()])
         made = []
         for index, run, scene, method in self._maps:
             tell(f"map of {printable(method, 60)}")
             prediction = read[index, method]
             reason = prediction if isinstance(prediction, str) else None
-            content = "" if isinstance(prediction, str) else self._pack(run, prediction, frames, most_points)
+            content = ""
+            if not isinstance(prediction, str):
+                content = self._pack(run, prediction, clouds[index, method], frames, seen)
             made.append(PageMap(index, printable(scene, 200), printable(method, 200), content, reason))
         thumbnails = tuple((index, _jpeg(frame)) for index, frame in frames.items())
         remarks = tuple(printable(line) for line in dict.fromkeys(self._remarks))
@@ -223,27 +234,34 @@ class _Scene:
             frames = self._had("no views", lambda: self._dataset.frames(self._scene.partition("/")[2], 1))
         return () if frames is None else frames
 
-    def _frame(self, index: int) -> Frame | None:
-        """Frame ``index`` of the full sequence, read once; None where it is not there."""
+    def _frame(self, index: int, width: int) -> Frame | None:
+        """Frame ``index`` of the full sequence, read once; None where it is not there. ``width`` pixels are enough."""
         if index not in self._frame_of:
-            frames = self._sequence
-            frame = self._had("no views", lambda: frames[index]) if 0 <= index < len(frames) else None
+            is_there = 0 <= index < len(self._sequence)
+            frame = self._had("no views", lambda: self._read_frame(index, width)) if is_there else None
             self._frame_of[index] = frame if frame is not None and frame.index == index else None
         return self._frame_of[index]
 
-    @cached_property
-    def _seen(self) -> tuple[Float32Array, UInt8Array] | None:
-        """Points (n, 3) m and colours (n, 3) of what the methods saw: in the frames shown, and in more."""
+    def _read_frame(self, index: int, width: int) -> Frame:
+        if isinstance(self._dataset, HasSketches):
+            return self._dataset.sketch(self._scene.partition("/")[2], index, width)
+        return self._sequence[index]
+
+    def _seen(self, clouds: Sequence[Float32Array]) -> Seen | None:
+        """What the methods saw: in the frames shown, and in as many more as show nearly all of ``clouds``."""
         fed = sorted({index for _, run, scene, method in self._maps for index in _fed_frames(run, scene, method)})
         fed = fed or list(range(len(self._sequence)))
-        for place in evenly(len(fed), MORE_FRAMES):
-            self._frame(fed[place])
+        unseen = np.concatenate([np.zeros((0, 3), np.float32), *(points[::EVERY] for points in clouds)])
+        few = GREY_SHARE * len(unseen)
+        unseen = _not_near([frame for frame in self._frame_of.values() if frame is not None], unseen)
+        places = spread(len(fed), MORE_FRAMES)
+        for start in range(0, len(places), FRAMES_AT_ONCE):
+            if len(unseen) <= few:
+                break
+            more = (self._frame(fed[place], SKETCH_WIDTH) for place in places[start : start + FRAMES_AT_ONCE])
+            unseen = _not_near([frame for frame in more if frame is not None], unseen)
         read = [frame for frame in self._frame_of.values() if frame is not None]
-        if not read:
-            return None
-        seen = [(frame, chosen_pixels(frame, len(read))) for frame in read]
-        points = [back_project(one.depth_m, one.intrinsics, one.camera_to_world, pixels) for one, pixels in seen]
-        return np.concatenate(points).astype(np.float32), np.concatenate([frame.rgb[pixels] for frame, pixels in seen])
+        return seen_points(read, SEEN_POINTS) if read else None
 
     def _chosen_frames(self, maps: Sequence[Instances]) -> Sequence[int]:
         """The frames that are shown: as few as can be that show every instance, from those that the maps name."""
@@ -262,12 +280,13 @@ class _Scene:
             return None
         return self._had("no truth", lambda: self._truths.of(self._dataset, rules.ground_truth))
 
-    def _pack(self, run: FinishedRun, prediction: Prediction, frames: Mapping[int, Frame], most_points: int) -> str:
-        cloud = thinned(prediction.points, most_points)
+    def _pack(
+        self, run: FinishedRun, prediction: Prediction, cloud: Cloud, frames: Mapping[int, Frame], seen: Seen | None
+    ) -> str:
         rules = self._rules(run)
         truth = None if rules is None else self._truth(rules)
         planes: dict[str, Any] = {"owner": index_plane(point_owners(prediction, cloud.rows))}
-        colours = None if self._seen is None else nearest_colours(cloud.points, *self._seen)
+        colours = None if seen is None else nearest_colours(cloud.points, *seen)
         if colours is not None:
             planes["colour"] = colour_plane(colours)
         about: dict[str, Any] = {"protocol": None, "classes": [], "class_colours": [], "instances": [], "queries": []}
@@ -326,6 +345,12 @@ def _fed_frames(run: FinishedRun, scene: str, method: str) -> list[int]:
     with suppress(Su3dError, OSError):
         return [int(index) for index in read_updates(updates, updates.name).get("frame", ())]
     return []
+
+
+def _not_near(frames: Sequence[Frame], points: Float32Array) -> Float32Array:
+    """Those of ``points`` that none of ``frames`` gives a colour."""
+    seen, _ = seen_points(frames, SEEN_POINTS * len(frames) // MORE_FRAMES)
+    return points[nearest(seen, points, COLOUR_NEAR_M)[1] < 0]
 
 
 def _frames_of(instances: Instances, k: int) -> list[int]:

@@ -63,6 +63,19 @@ def test_frames_can_be_read_in_any_order(rooms: Rooms) -> None:
         frames[2]
 
 
+def test_a_sketch_sees_what_its_frame_sees_with_fewer_pixels(tmp_path: Path) -> None:
+    rooms = Rooms(tmp_path, SMALL.model_copy(update={"noise": 0}))
+    frame, sketch = rooms.frame(SCENE, 40), rooms.sketch(SCENE, 40, 32)
+    assert (sketch.index, sketch.rgb.shape, sketch.depth_m.shape) == (40, (24, 32, 3), (24, 32))
+    seen = [back_project(one.depth_m, one.intrinsics, one.camera_to_world, one.depth_m > 0) for one in (frame, sketch)]
+    distance, nearest = cKDTree(seen[0]).query(seen[1])
+    assert np.quantile(distance, 0.9) < 0.03
+    colour = [one.rgb[one.depth_m > 0].astype(int) for one in (frame, sketch)]
+    assert np.median(np.abs(colour[0][nearest] - colour[1])) <= 2
+    assert rooms.sketch(SCENE, 40, 16).rgb.shape == (12, 16, 3)
+    assert rooms.sketch(SCENE, 40, 96).rgb.tobytes() == frame.rgb.tobytes()
+
+
 @pytest.mark.parametrize("name", ["kitchn0", "living", "living-1", "living00", "cellar3", "office 1", "living1000000"])
 def test_a_name_that_is_no_scene_is_refused(rooms: Rooms, name: str) -> None:
     with pytest.raises(DataError, match="no scene"):
