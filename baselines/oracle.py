@@ -6,7 +6,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
-from su3d_bench.core.types import Detections, Frame, GroundTruth, Instances, Int32Array, PerceptionNeeds, SceneInfo
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import Detections, Frame, GroundTruth, Int32Array, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.embedded.naming import scene_caption
 
 

@@ -27,8 +27,8 @@ from su3d_bench.core.errors import (
     error_line,
     printable,
 )
-from su3d_bench.core.files import opened
 from su3d_bench.core.interfaces import Dataset, HasProblems, SaysUp
+from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, WorldUp
 from su3d_bench.datasets.checks_of_frames import (
     Finding,

@@ -9,20 +9,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from su3d_bench.core.timing import Timer
-    from su3d_bench.core.types import (
-        DenseFeatures,
-        Detections,
-        Frame,
-        GroundTruth,
-        InstanceMesh,
-        Instances,
-        LabelSet,
-        Masks,
-        Partition,
-        PerceptionNeeds,
-        SceneInfo,
-    )
+    from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition
+    from su3d_bench.core.system.timing import Timer
+    from su3d_bench.core.types import Detections, Frame, GroundTruth, InstanceMesh, LabelSet, PerceptionNeeds, SceneInfo
     from su3d_bench.metrics.protocols.loading import load_protocol
     from su3d_bench.metrics.scoring import combine, score_scene
     from su3d_bench.numerics.geometry import back_project
@@ -50,7 +39,11 @@ __all__ = [
 ]
 # Where those names are that are no types of ``core.types``.
 _ELSEWHERE = {
-    "Timer": "core.timing",
+    "DenseFeatures": "core.maps",
+    "Instances": "core.maps",
+    "Masks": "core.maps",
+    "Partition": "core.maps",
+    "Timer": "core.system.timing",
     "back_project": "numerics.geometry",
     "combine": "metrics.scoring",
     "load_protocol": "metrics.protocols.loading",

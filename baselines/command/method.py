@@ -27,7 +27,8 @@ from su3d_bench.baselines.command.process import ContainerWatch, Finished, Leavi
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError, printable
 from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
-from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, Prediction, SceneInfo, Surface
+from su3d_bench.core.maps import Prediction
+from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, SceneInfo, Surface
 from su3d_bench.store.atomic import is_file
 from su3d_bench.store.scratch import TemporaryFolder
 

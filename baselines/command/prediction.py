@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError, printable
-from su3d_bench.core.types import Instances, Prediction, Surface
+from su3d_bench.core.maps import Instances, Prediction
+from su3d_bench.core.types import Surface
 from su3d_bench.metrics.matching.nearest import masks_of_partition, select
 from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks

@@ -20,7 +20,7 @@ from typing import IO, Any
 from su3d_bench.baselines.command import supervisor
 from su3d_bench.baselines.command.supervisor import AFTERWARDS_S, DONE, END, STOP
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.core.files import file_text
+from su3d_bench.core.system.files import file_text
 
 SUPERVISOR = Path(supervisor.__file__)
 ENDING_S = supervisor.ENDING_S + AFTERWARDS_S + 5.0  # for the supervisor to end the program, and a container

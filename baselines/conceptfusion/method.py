@@ -22,7 +22,8 @@ from su3d_bench.baselines.conceptfusion.pixel_features import (
 from su3d_bench.baselines.conceptfusion.point_fusion import ABSENT, PointFusion, View, view_of
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
-from su3d_bench.core.types import DenseFeatures, Detections, Frame, Int64Array, PerceptionNeeds, SceneInfo
+from su3d_bench.core.maps import DenseFeatures
+from su3d_bench.core.types import Detections, Frame, Int64Array, PerceptionNeeds, SceneInfo
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 PAPER = "Jatavallabhula et al.: ConceptFusion: Open-set Multimodal 3D Mapping, RSS 2023"

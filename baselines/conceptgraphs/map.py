@@ -23,7 +23,8 @@ from su3d_bench.baselines.conceptgraphs.objects import (
 )
 from su3d_bench.baselines.conceptgraphs.regions import LiftedRegion, kept_regions, lift, subtract_contained
 from su3d_bench.core.interfaces import StageTimer
-from su3d_bench.core.types import Detections, Float32Array, Frame, Instances, Masks, starts_of
+from su3d_bench.core.maps import Instances, Masks, starts_of
+from su3d_bench.core.types import Detections, Float32Array, Frame
 
 
 class ObjectMap:

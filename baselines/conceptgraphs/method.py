@@ -12,7 +12,8 @@ from pydantic import Field
 from su3d_bench.baselines.conceptgraphs.config import Cosine, Fraction, Interval, MappingConfig
 from su3d_bench.baselines.conceptgraphs.map import ObjectMap
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
-from su3d_bench.core.types import Detections, Frame, Instances, PerceptionNeeds, SceneInfo
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, SceneInfo
 
 CROP_PADDING_PX = 20  # the original's crops: the box and 20 px on every side
 

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from su3d_bench.core.types import Float32Array, Float64Array, Int64Array, Masks, Proposals
+from su3d_bench.core.maps import Masks, Proposals
+from su3d_bench.core.types import Float32Array, Float64Array, Int64Array
 
 NOISE = -1
 

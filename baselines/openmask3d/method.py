@@ -24,14 +24,8 @@ from su3d_bench.baselines.openmask3d.views import (
 )
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
-from su3d_bench.core.types import (
-    Detections,
-    Float64Array,
-    Frame,
-    Instances,
-    PerceptionNeeds,
-    SceneInfo,
-)
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import Detections, Float64Array, Frame, PerceptionNeeds, SceneInfo
 
 Pixels = Annotated[int, Field(ge=2, le=65536)]
 

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from su3d_bench.core.digests import digest_file, digest_json
 from su3d_bench.core.errors import PredictionError, shown
-from su3d_bench.core.types import Proposals, Surface
+from su3d_bench.core.maps import Proposals
+from su3d_bench.core.types import Surface
 from su3d_bench.predictions.base import VertexMasks
 
 

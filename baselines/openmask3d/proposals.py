@@ -14,7 +14,8 @@ from su3d_bench.baselines.openmask3d.proposal_files import digest_of_folder, rea
 from su3d_bench.baselines.openmask3d.surface_proposals import SOURCE, NodeChoice, segments_of, surface_proposals
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import SceneTools
-from su3d_bench.core.types import Int64Array, Proposals, Surface
+from su3d_bench.core.maps import Proposals
+from su3d_bench.core.types import Int64Array, Surface
 from su3d_bench.metrics.matching.nearest import transfer_masks
 
 Kind = Literal["auto", "files", "surface", "oracle"]

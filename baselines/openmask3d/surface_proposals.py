@@ -12,7 +12,8 @@ import numpy as np
 
 from su3d_bench.baselines.mesh_segments.segments import MIN_VERTICES, THRESHOLD, mesh_segments
 from su3d_bench.baselines.openmask3d.segment_tree import SegmentTree, contacts_of, is_within, merge_tree
-from su3d_bench.core.types import Float64Array, Int64Array, Masks, Proposals, Surface
+from su3d_bench.core.maps import Masks, Proposals
+from su3d_bench.core.types import Float64Array, Int64Array, Surface
 
 SOURCE = "weight-free proposals from the mesh's shape, not a network's"
 # Square metres of surface from which on size no longer speaks for a part. Chosen on rooms/living0 and rooms/office0.

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int32Array, Int64Array, Proposals
+from su3d_bench.core.maps import Proposals
+from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int32Array, Int64Array
 
 NO_VIEW = -1
 

@@ -30,14 +30,14 @@ from su3d_bench.baselines.sam3d.overlap import (
 )
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
-from su3d_bench.core.timing import Timer
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import (
     BoolArray,
     Detections,
     Float32Array,
     Float64Array,
     Frame,
-    Instances,
     Int64Array,
     PerceptionNeeds,
     SceneInfo,

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.timing import hardware_line
+from su3d_bench.core.system.timing import hardware_line
 from su3d_bench.metrics.costs import (
     MAP,
     NOT_MAP,

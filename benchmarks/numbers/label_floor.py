@@ -14,7 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.types import GroundTruth, Instances
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import GroundTruth
 from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules

@@ -20,7 +20,8 @@ import numpy as np
 from su3d_bench.baselines.openmask3d.method import OpenMask3DConfig, OpenMask3DSegment3DConfig
 from su3d_bench.baselines.openmask3d.proposals import ProposalConfig, make_proposals
 from su3d_bench.core import registry
-from su3d_bench.core.types import Float64Array, GroundTruth, Proposals
+from su3d_bench.core.maps import Proposals
+from su3d_bench.core.types import Float64Array, GroundTruth
 from su3d_bench.metrics.matching.nearest import transfer_masks
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules

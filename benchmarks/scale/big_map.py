@@ -23,7 +23,7 @@ from dense_memory import RandomDirections
 from measured import write_measured
 from wall import view
 
-from su3d_bench.core.timing import Timer, peak_memory_bytes, start_memory_watch
+from su3d_bench.core.system.timing import Timer, peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Detections, Float32Array, Float64Array, GroundTruth, Int32Array, LabelSet, SceneInfo
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene

@@ -27,17 +27,9 @@ from folders import BENCHMARKS
 from measured import write_measured
 
 from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig
-from su3d_bench.core.timing import Timer, peak_memory_bytes, start_memory_watch
-from su3d_bench.core.types import (
-    DenseFeatures,
-    Detections,
-    Float32Array,
-    Frame,
-    GroundTruth,
-    LabelSet,
-    SceneInfo,
-    UInt8Array,
-)
+from su3d_bench.core.maps import DenseFeatures
+from su3d_bench.core.system.timing import Timer, peak_memory_bytes, start_memory_watch
+from su3d_bench.core.types import Detections, Float32Array, Frame, GroundTruth, LabelSet, SceneInfo, UInt8Array
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.runs.feeding import warm_up

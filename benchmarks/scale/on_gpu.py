@@ -32,9 +32,9 @@ from tiny_models import DINO_PX, SAM_PX, blocks, tiny_dino, tiny_sam, tiny_token
 from torch_devices import TORCH_ON_CPU
 
 from su3d_bench.cli.main import main as command_line
-from su3d_bench.core.devices import device_for, make_deterministic
 from su3d_bench.core.errors import ConfigError, ModelMissing
-from su3d_bench.core.timing import Timer, synchronise_device
+from su3d_bench.core.system.devices import device_for, make_deterministic
+from su3d_bench.core.system.timing import Timer, synchronise_device
 from su3d_bench.metrics.matching.labelling import cosines, most_similar
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.devices import make_deterministic, precision_for, require_transformers
+from su3d_bench.core.system.devices import make_deterministic, precision_for, require_transformers
 from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.perception.models.encoders.towers_transformers import TransformersTowers

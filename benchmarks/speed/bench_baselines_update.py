@@ -19,7 +19,7 @@ from su3d_bench.baselines.conceptgraphs.objects import MapObject, Sighting
 from su3d_bench.baselines.conceptgraphs.regions import box_of
 from su3d_bench.baselines.sam3d.method import SAM3D, SAM3DConfig
 from su3d_bench.baselines.sam3d.overlap import GroupedCloud, voxelise
-from su3d_bench.core.timing import Timer
+from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, Float64Array, Frame, Int64Array, SceneInfo
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from su3d_bench.core.types import Float32Array, Partition, UInt8Array
+from su3d_bench.core.maps import Partition
+from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.metrics.matching.nearest import nearest
 from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels, OpenLexTruth
 from su3d_bench.metrics.protocols.loading import load_protocol

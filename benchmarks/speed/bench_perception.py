@@ -14,7 +14,7 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 from replica_files import write_replica
 
-from su3d_bench.core.timing import Timer
+from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Frame
 from su3d_bench.datasets.replica.frames import ReplicaFrames
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms

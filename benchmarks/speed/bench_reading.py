@@ -25,7 +25,7 @@ from PIL import Image
 from pytest_benchmark.fixture import BenchmarkFixture
 from replica_files import SCALE, write_replica
 
-from su3d_bench.core.timing import calibration_ms
+from su3d_bench.core.system.timing import calibration_ms
 from su3d_bench.core.types import Float32Array, Frame, UInt8Array
 from su3d_bench.datasets.replica.frames import ReplicaFrames
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms

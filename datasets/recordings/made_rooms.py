@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.files import file_text
+from su3d_bench.core.system.files import file_text
 
 MARKER = "rooms.json"  # in the folder of the scenes
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.files import opened
+from su3d_bench.core.system.files import opened
 from su3d_bench.datasets.recordings.recorded_frames import reading
 from su3d_bench.datasets.replica.boxes import SLACK_M, objects_outside_boxes, read_boxes
 from su3d_bench.datasets.replica.frames import (

@@ -10,7 +10,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict
 
 from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing, counted, suggest
-from su3d_bench.core.files import file_bytes
+from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh, OrientedBox, SceneInfo, Surface
 from su3d_bench.datasets.recordings.made_rooms import read_marker
 from su3d_bench.datasets.recordings.meshes import read_surface

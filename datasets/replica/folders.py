@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 
 from su3d_bench.core.errors import ScenesMissing
-from su3d_bench.core.files import file_text
+from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import LabelSet
 
 LABEL_SPACE = "replica"

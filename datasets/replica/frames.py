@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.files import file_bytes, file_text
+from su3d_bench.core.system.files import file_bytes, file_text
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.recordings.recorded_frames import (
     Folder,

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import DataError, reading
-from su3d_bench.core.files import opened
+from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import Float32Array, GroundTruth, Int32Array
 from su3d_bench.datasets.recordings.meshes import vertex_positions
 from su3d_bench.datasets.replica.folders import replica_label_set

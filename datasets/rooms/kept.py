@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.damage import DAMAGE
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.system.damage import DAMAGE
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.rooms.rendering.mesh import RoomMesh
 from su3d_bench.datasets.rooms.scan import RoomScan

@@ -15,7 +15,7 @@ from functools import cache
 from pathlib import Path
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.files import file_text
+from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import LabelSet
 from su3d_bench.datasets.recordings.recorded_frames import read_text
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from su3d_bench.core.digests import digest_bytes, digest_file
 from su3d_bench.core.errors import DataError, counted
-from su3d_bench.core.files import opened
+from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.recordings.exported_frames import (
     EXPORT_AGAIN,

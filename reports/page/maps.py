@@ -18,15 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.types import (
-    DenseFeatures,
-    Float32Array,
-    Float64Array,
-    Int32Array,
-    Int64Array,
-    Prediction,
-    UInt8Array,
-)
+from su3d_bench.core.maps import DenseFeatures, Prediction
+from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array, UInt8Array
 from su3d_bench.metrics.matching.nearest import first_rows, nearest
 from su3d_bench.numerics.geometry import voxel_coordinates
 from su3d_bench.reports.pictures.maps import map_cloud

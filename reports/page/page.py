@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.core.files import file_text
 from su3d_bench.core.printing import escaped_json, plain_value
+from su3d_bench.core.system.files import file_text
 
 HERE = Path(__file__).parent
 SCRIPTS = (  # in the order in which they run

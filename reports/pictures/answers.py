@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import printable
-from su3d_bench.core.types import Float64Array, Instances, UInt8Array
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import Float64Array, UInt8Array
 from su3d_bench.reports.pictures.canvas import DARK, GREY, Canvas, drawable, hex_of, paper
 from su3d_bench.reports.pictures.colours import NO_INSTANCE, Colour, instance_colours
 from su3d_bench.reports.pictures.maps import SQUARE_M, Cloud, map_cloud, thinned

@@ -8,7 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Instances, Int32Array, Int64Array, UInt8Array
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array, UInt8Array
 from su3d_bench.reports.pictures.colours import NO_INSTANCE
 from su3d_bench.reports.pictures.maps import SQUARE_M, map_cloud, thinned_rows
 from su3d_bench.reports.pictures.render import (

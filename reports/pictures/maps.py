@@ -10,17 +10,8 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import printable
-from su3d_bench.core.types import (
-    DenseFeatures,
-    Float32Array,
-    Float64Array,
-    GroundTruth,
-    Instances,
-    Int32Array,
-    Int64Array,
-    Prediction,
-    UInt8Array,
-)
+from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
+from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, Int64Array, UInt8Array
 from su3d_bench.numerics.geometry import voxel_coordinates
 from su3d_bench.reports.pictures.canvas import DARK, GREY, Canvas, hex_of, paper
 from su3d_bench.reports.pictures.colours import (

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.core.files import file_text
+from su3d_bench.core.system.files import file_text
 from su3d_bench.reports.page.page import rendered
 
 HERE = Path(__file__).parent

@@ -18,7 +18,8 @@ import numpy as np
 from su3d_bench.analysis.sides import Side, refuse_unlike
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, counted, printable
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import GroundTruth, Prediction
+from su3d_bench.core.maps import Prediction
+from su3d_bench.core.types import GroundTruth
 from su3d_bench.evaluation.explained import FilesOfTruth
 from su3d_bench.evaluation.scoring import with_confidences_of_files
 from su3d_bench.evaluation.texts import GivenTexts, read_text_features

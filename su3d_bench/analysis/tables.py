@@ -10,8 +10,8 @@ from pathlib import Path
 
 from su3d_bench.analysis.sides import Side, refuse_unlike
 from su3d_bench.core.errors import ConfigError, Su3dError, counted, printable, reading, suggest
-from su3d_bench.core.files import file_bytes
 from su3d_bench.core.registry import CEILING_METHOD
+from su3d_bench.core.system.files import file_bytes
 from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.scoring import ProtocolResult, combine
 from su3d_bench.numerics.statistics import SignFlipTest

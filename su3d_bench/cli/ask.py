@@ -26,7 +26,7 @@ from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, Stor
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from su3d_bench.core.types import Instances
+    from su3d_bench.core.maps import Instances
     from su3d_bench.metrics.questions.truths import RefinedNames
     from su3d_bench.questions.reasoning.answers import Answer
     from su3d_bench.questions.reasoning.scene_map import SceneMap
@@ -71,7 +71,7 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.core.types import Instances
+    from su3d_bench.core.maps import Instances
     from su3d_bench.questions.reasoning.scene_map import map_of
     from su3d_bench.runs.finished import map_of_scene
 

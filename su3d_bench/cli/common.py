@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from su3d_bench.cli.parser import JSON, JsonFlag
 from su3d_bench.core.errors import EXIT_DONE, StoreError, counted, printable, shown
-from su3d_bench.core.files import file_text
 from su3d_bench.core.printing import Door, escaped_json, one_line, stream_behind, terminal_width
+from su3d_bench.core.system.files import file_text
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID

@@ -12,7 +12,6 @@ from pathlib import Path
 from su3d_bench import __version__
 from su3d_bench.cli.common import remark
 from su3d_bench.cli.parser import Parser
-from su3d_bench.core.endings import Ended, ending_in_order
 from su3d_bench.core.errors import (
     EXIT_DONE,
     EXIT_INTERNAL,
@@ -23,6 +22,7 @@ from su3d_bench.core.errors import (
     printable,
 )
 from su3d_bench.core.printing import doors
+from su3d_bench.core.system.endings import Ended, ending_in_order
 
 # Modules of this folder with ``add_parser(verbs)``, in the order of the help.
 VERBS = (

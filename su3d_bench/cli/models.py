@@ -204,7 +204,7 @@ def call_warm(arguments: argparse.Namespace) -> int:
 
 
 def _warm(arguments: argparse.Namespace) -> WarmUp:
-    from su3d_bench.core.devices import device_for
+    from su3d_bench.core.system.devices import device_for
     from su3d_bench.perception.models.inspection import warm_encoder, warm_perception, warm_scene
     from su3d_bench.perception.models.loading import load_encoder
 

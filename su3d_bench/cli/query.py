@@ -20,7 +20,7 @@ from su3d_bench.cli.common import (
 from su3d_bench.core.errors import ConfigError, PredictionError
 
 if TYPE_CHECKING:
-    from su3d_bench.core.types import Instances
+    from su3d_bench.core.maps import Instances
     from su3d_bench.questions.retrieval import Ranking
 
 
@@ -44,7 +44,7 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.core.types import DenseFeatures, Instances
+    from su3d_bench.core.maps import DenseFeatures, Instances
     from su3d_bench.questions.retrieval import rank
     from su3d_bench.runs.finished import encoder_of, map_of_scene
 

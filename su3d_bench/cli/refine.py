@@ -21,7 +21,7 @@ from su3d_bench.cli.common import (
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, StoreError, counted, suggest
 
 if TYPE_CHECKING:
-    from su3d_bench.core.types import Instances
+    from su3d_bench.core.maps import Instances
     from su3d_bench.questions.refined_names import NameRecords
     from su3d_bench.questions.refinement import RefinedName, TopNames
     from su3d_bench.questions.undesired import FilterConfig
@@ -135,7 +135,7 @@ def _scenes(run: RunFolder) -> list[str]:
 
 
 def _map(job: JobFolder) -> Instances:
-    from su3d_bench.core.types import Instances
+    from su3d_bench.core.maps import Instances
     from su3d_bench.store.predictions import read_prediction
 
     prediction = read_prediction(job.prediction)

@@ -18,8 +18,8 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from su3d_bench.core.errors import ConfigError, suggest
-from su3d_bench.core.files import file_text
 from su3d_bench.core.printing import one_line
+from su3d_bench.core.system.files import file_text
 from su3d_bench.core.toml import parse_toml
 
 HEADER = re.compile(r"^\s*\[+([^\[\]]+)\]+\s*(?:#.*)?$")

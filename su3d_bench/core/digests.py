@@ -16,7 +16,7 @@ from importlib.util import cache_from_source
 from pathlib import Path
 from typing import Any, Self
 
-from su3d_bench.core.files import file_bytes, file_text, opened
+from su3d_bench.core.system.files import file_bytes, file_text, opened
 
 PACKAGE_ROOT = Path(__file__).resolve().parents[1]
 # What shows numbers and moves none; everything else of the package counts, in whatever folder it stands.

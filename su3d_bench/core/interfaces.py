@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+from su3d_bench.core.maps import Prediction, Proposals
 from su3d_bench.core.types import (
     BoolArray,
     Detections,
@@ -20,8 +21,6 @@ from su3d_bench.core.types import (
     InstanceMesh,
     Int64Array,
     PerceptionNeeds,
-    Prediction,
-    Proposals,
     Regions,
     SceneInfo,
     Surface,

@@ -17,9 +17,10 @@ import numpy as np
 from su3d_bench.core.config import write_toml
 from su3d_bench.core.digests import code_digest, digest_file, digest_json, git_state, package_versions
 from su3d_bench.core.errors import ConfigError, StoreError, printable, shown
+from su3d_bench.core.maps import Instances
 from su3d_bench.core.registry import CEILING_METHOD
-from su3d_bench.core.timing import hardware_line, processor_digest
-from su3d_bench.core.types import GroundTruth, Instances
+from su3d_bench.core.system.timing import hardware_line, processor_digest
+from su3d_bench.core.types import GroundTruth
 from su3d_bench.evaluation.evaluate import evaluate
 from su3d_bench.evaluation.request import Request
 from su3d_bench.evaluation.result import Evaluation, ProtocolEvaluation

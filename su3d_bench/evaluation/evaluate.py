@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Protocol
 
 from su3d_bench.core.errors import PredictionError, shown
-from su3d_bench.core.files import noted
+from su3d_bench.core.system.files import noted
 from su3d_bench.evaluation.request import Request
 from su3d_bench.evaluation.result import Evaluation, ProtocolEvaluation, some_names
 from su3d_bench.evaluation.scoring import Scoring

@@ -13,7 +13,8 @@ import numpy as np
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, DataError, printable, shown
-from su3d_bench.core.types import Float32Array, GroundTruth, LabelSet, Prediction
+from su3d_bench.core.maps import Prediction
+from su3d_bench.core.types import Float32Array, GroundTruth, LabelSet
 from su3d_bench.evaluation.request import Request, ValuesForm
 from su3d_bench.evaluation.scoring import map_of
 from su3d_bench.evaluation.truth import TextTruths, VertexTruth, text_scenes

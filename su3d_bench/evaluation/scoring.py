@@ -10,17 +10,8 @@ import numpy as np
 from su3d_bench.core import registry
 from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, PredictionError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import (
-    DenseFeatures,
-    Float32Array,
-    Float64Array,
-    GroundTruth,
-    Instances,
-    Int64Array,
-    Masks,
-    Partition,
-    Prediction,
-)
+from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition, Prediction
+from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int64Array
 from su3d_bench.evaluation.request import Request
 from su3d_bench.evaluation.result import SceneOutcome, Tally
 from su3d_bench.evaluation.texts import encoder_for, read_text_features

@@ -29,8 +29,8 @@ from su3d_bench.core.errors import (
     shown,
     suggest,
 )
-from su3d_bench.core.files import file_bytes
 from su3d_bench.core.registry import FILES_OF_TRUTH
+from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import GroundTruth, Int64Array
 from su3d_bench.datasets.openlex3d import FACE_CORNERS, VISIBLE, OpenLexRelease
 from su3d_bench.evaluation.request import Request

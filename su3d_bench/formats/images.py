@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.files import file_bytes
+from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Float32Array, Int32Array, UInt8Array
 from su3d_bench.formats.ply import ListColumn
 

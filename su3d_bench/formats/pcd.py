@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, printable, reading
-from su3d_bench.core.files import file_bytes
+from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
 from su3d_bench.store.atomic import write_bytes
 from su3d_bench.store.unpacking import Allowance, UnpackingError

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, reading
-from su3d_bench.core.files import file_bytes, opened
+from su3d_bench.core.system.files import file_bytes, opened
 from su3d_bench.core.types import Int64Array
 from su3d_bench.formats.ply_parts import (
     NAMES_OF_TYPES,

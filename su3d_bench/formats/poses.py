@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.files import opened_text
+from su3d_bench.core.system.files import opened_text
 from su3d_bench.core.types import Float32Array, Float64Array
 from su3d_bench.numerics.geometry import are_rigid
 

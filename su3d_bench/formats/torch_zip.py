@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, reading, shown
-from su3d_bench.core.files import opened
+from su3d_bench.core.system.files import opened
 from su3d_bench.formats.numpy_files import opened_zip, read_member
 from su3d_bench.formats.pickles.pickle_constructors import (
     CONSTRUCTORS,

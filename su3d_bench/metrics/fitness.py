@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.types import Instances, Partition, Prediction
+from su3d_bench.core.maps import Instances, Partition, Prediction
 from su3d_bench.metrics.matching.labelling import has_every_label
 from su3d_bench.metrics.open_vocabulary.score import NEEDS_FEATURES
 from su3d_bench.metrics.protocols.model import ProtocolRules

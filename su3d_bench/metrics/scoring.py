@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.damage import DAMAGE
 from su3d_bench.core.errors import DataError, PredictionError, printable
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, Partition, Prediction
+from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
+from su3d_bench.core.system.damage import DAMAGE
+from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.instance.box_score import BoxMetric
 from su3d_bench.metrics.instance.score import InstanceMetric

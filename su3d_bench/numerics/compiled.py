@@ -13,8 +13,8 @@ import numba
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 
-from su3d_bench.core.damage import DAMAGE
 from su3d_bench.core.digests import digest_file
+from su3d_bench.core.system.damage import DAMAGE
 
 UNREADABLE: tuple[type[Exception], ...] = (*DAMAGE, LookupError, AttributeError, ImportError, pickle.UnpicklingError)
 

@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from su3d_bench.core.devices import CPU
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
-from su3d_bench.core.types import Detections, Frame, Instances, Int32Array, Int64Array, PerceptionNeeds, SceneInfo
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.system.devices import CPU
+from su3d_bench.core.types import Detections, Frame, Int32Array, Int64Array, PerceptionNeeds, SceneInfo
 from su3d_bench.opensu3d.association import assign_ids, count_overlaps, overlap_ratios
 from su3d_bench.opensu3d.config import SCHEMES, OpenSU3DConfig, crop_levels
 from su3d_bench.opensu3d.frame_cloud import NO_DETECTION, FrameCloud, frame_cloud

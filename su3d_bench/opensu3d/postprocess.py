@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.core.english import with_article
-from su3d_bench.core.types import Float64Array, Instances, Int32Array, Int64Array, Masks, starts_of
+from su3d_bench.core.maps import Instances, Masks, starts_of
+from su3d_bench.core.types import Float64Array, Int32Array, Int64Array
 from su3d_bench.opensu3d.config import InstanceScore, OpenSU3DConfig
 from su3d_bench.opensu3d.feature_fusion import fuse_views
 from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View

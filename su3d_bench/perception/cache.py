@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.damage import DAMAGE
 from su3d_bench.core.errors import StoreError
+from su3d_bench.core.system.damage import DAMAGE
 from su3d_bench.core.types import BoolArray, Float64Array, Frame, UInt8Array
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.store.atomic import filling, read_arrays

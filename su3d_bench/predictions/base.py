@@ -11,17 +11,8 @@ from typing import Literal
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError, printable, reading, shown
-from su3d_bench.core.types import (
-    DenseFeatures,
-    Float32Array,
-    Float64Array,
-    Instances,
-    Int32Array,
-    Int64Array,
-    Masks,
-    Partition,
-    starts_of,
-)
+from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition, starts_of
+from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array
 from su3d_bench.formats.arrays import MOST_MASKS, MOST_POINTS, check_members
 from su3d_bench.metrics.matching.nearest import masks_of_partition
 from su3d_bench.metrics.protocols.model import ProtocolRules

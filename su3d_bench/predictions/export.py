@@ -14,16 +14,8 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, StoreError, printable
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import (
-    DenseFeatures,
-    Float32Array,
-    Float64Array,
-    GroundTruth,
-    Instances,
-    Int64Array,
-    Masks,
-    Partition,
-)
+from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition
+from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int64Array
 from su3d_bench.formats.pcd import write_pcd_points
 from su3d_bench.metrics.instance.score import masks_and_scores, named_classes
 from su3d_bench.metrics.matching import nearest as transfer

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, PredictionError, StoreError, converted, shown
-from su3d_bench.core.types import DenseFeatures, Float32Array
+from su3d_bench.core.maps import DenseFeatures
+from su3d_bench.core.types import Float32Array
 from su3d_bench.formats.arrays import checked_points
 from su3d_bench.formats.hdf5 import n_columns_of, read_rows, row_blocks
 from su3d_bench.formats.poses import moved, read_first_pose

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError, shown
-from su3d_bench.core.types import Int32Array, Partition
+from su3d_bench.core.maps import Partition
+from su3d_bench.core.types import Int32Array
 from su3d_bench.formats.arrays import checked_points, feature_table, kind_of, without_nonfinite
 from su3d_bench.formats.numpy_files import read_npy
 from su3d_bench.predictions.base import SceneFolders, ScenePrediction

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError, printable, reading, shown
-from su3d_bench.core.files import file_bytes, opened
+from su3d_bench.core.system.files import file_bytes, opened
 from su3d_bench.core.types import Int32Array
 from su3d_bench.formats.arrays import check_members, run_members
 from su3d_bench.formats.text_integers import integer_lines

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.english import last_word, with_article, words
-from su3d_bench.core.files import file_text
+from su3d_bench.core.system.files import file_text
 from su3d_bench.core.toml import parse_toml
 from su3d_bench.numerics.relations import RELATIONS
 from su3d_bench.questions.known_objects import is_called

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import StoreError
-from su3d_bench.core.types import Instances
+from su3d_bench.core.maps import Instances
 from su3d_bench.metrics.questions.truths import RefinedNames
 from su3d_bench.questions.refinement import RefinedName, TopNames
 from su3d_bench.questions.truths import voted_names

@@ -10,7 +10,7 @@ import numpy as np
 
 from su3d_bench.core.english import words
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.types import Instances
+from su3d_bench.core.maps import Instances
 from su3d_bench.perception.language.captioner import REFINE, REFINE_FORM, list_of_names, reason_of
 from su3d_bench.perception.language.chat import ChatRequest
 from su3d_bench.perception.language.client import LanguageModel

@@ -9,7 +9,8 @@ import numpy as np
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import Float64Array, Instances, Int64Array
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.opensu3d.feature_fusion import cosine
 
 

@@ -8,7 +8,8 @@ from typing import Any
 
 from su3d_bench.core.errors import FramesMissing, GroundTruthMissing
 from su3d_bench.core.interfaces import Encoder, HasQueries, KnowsObjects
-from su3d_bench.core.types import GroundTruth, Instances
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.truths import (
     AnnotationTruth,

@@ -14,7 +14,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.core.errors import PredictionError, printable
-from su3d_bench.core.types import Float64Array, Instances
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import Float64Array
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.perception.background import is_background
 

@@ -24,8 +24,9 @@ from su3d_bench.core.interfaces import (
     Method,
     RegionPerception,
 )
+from su3d_bench.core.maps import Proposals, starts_of
 from su3d_bench.core.printing import one_line, plain_text
-from su3d_bench.core.timing import MethodClock, Timer, calibration_ms, memory_bytes
+from su3d_bench.core.system.timing import MethodClock, Timer, calibration_ms, memory_bytes
 from su3d_bench.core.types import (
     BoolArray,
     Detections,
@@ -34,10 +35,8 @@ from su3d_bench.core.types import (
     GroundTruth,
     Int64Array,
     PerceptionNeeds,
-    Proposals,
     SceneInfo,
     Surface,
-    starts_of,
 )
 from su3d_bench.perception.profiles import Perception
 from su3d_bench.runs.executors.local import Event, Report

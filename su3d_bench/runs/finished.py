@@ -26,9 +26,9 @@ from su3d_bench.core.errors import (
     some,
     suggest,
 )
-from su3d_bench.core.files import file_bytes
+from su3d_bench.core.maps import Prediction
 from su3d_bench.core.registry import CEILING_METHOD
-from su3d_bench.core.types import Prediction
+from su3d_bench.core.system.files import file_bytes
 from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.protocols.files import protocol_names
 from su3d_bench.metrics.protocols.loading import load_protocol, read_rules

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from su3d_bench.core.errors import printable
-from su3d_bench.core.types import Instances, Partition, Prediction
+from su3d_bench.core.maps import Instances, Partition, Prediction
 from su3d_bench.reports.tables.found import Found
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.atomic import is_file

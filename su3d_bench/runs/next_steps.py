@@ -9,8 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from su3d_bench.core.errors import Su3dError
-from su3d_bench.core.files import file_bytes
 from su3d_bench.core.registry import CEILING_METHOD
+from su3d_bench.core.system.files import file_bytes
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, unpack_scores
 from su3d_bench.runs.runner import RunResult

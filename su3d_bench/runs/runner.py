@@ -18,9 +18,9 @@ from typing import Any
 from su3d_bench.core.config import KeyPath, write_toml
 from su3d_bench.core.digests import code_digest, git_state, package_versions
 from su3d_bench.core.errors import StoreError
-from su3d_bench.core.files import file_bytes
 from su3d_bench.core.registry import CEILING_METHOD, DATASETS
-from su3d_bench.core.timing import hardware_line, processor_digest
+from su3d_bench.core.system.files import file_bytes
+from su3d_bench.core.system.timing import hardware_line, processor_digest
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules

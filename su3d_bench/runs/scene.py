@@ -15,7 +15,6 @@ from dataclasses import replace
 from functools import cache, cached_property, partial
 from typing import Any
 
-from su3d_bench.core.devices import device_for
 from su3d_bench.core.errors import GroundTruthMissing, StoreError, counted, error_line
 from su3d_bench.core.interfaces import (
     Closes,
@@ -27,9 +26,11 @@ from su3d_bench.core.interfaces import (
     TakesTruth,
     WarmsUp,
 )
+from su3d_bench.core.maps import Prediction, Proposals
 from su3d_bench.core.printing import one_line
-from su3d_bench.core.timing import MethodClock, device_memory_bytes, peak_memory_bytes, start_memory_watch
-from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, ObjectBoxes, Prediction, Proposals, SceneInfo
+from su3d_bench.core.system.devices import device_for
+from su3d_bench.core.system.timing import MethodClock, device_memory_bytes, peak_memory_bytes, start_memory_watch
+from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, ObjectBoxes, SceneInfo
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules

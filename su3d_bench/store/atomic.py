@@ -24,10 +24,10 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.damage import DAMAGE
 from su3d_bench.core.errors import StoreError, reading
-from su3d_bench.core.files import file_text, opened
 from su3d_bench.core.printing import escaped_json
+from su3d_bench.core.system.damage import DAMAGE
+from su3d_bench.core.system.files import file_text, opened
 from su3d_bench.store.unfinished import SHARED, beside, clear_unfinished, new_file, own_file
 from su3d_bench.store.unpacking import Allowance, allowance_of, check_member, member_bytes
 

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.damage import DAMAGE
 from su3d_bench.core.errors import PredictionError, StoreError, counted
-from su3d_bench.core.files import regular
-from su3d_bench.core.types import DenseFeatures, Instances, Partition, Prediction
+from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
+from su3d_bench.core.system.damage import DAMAGE
+from su3d_bench.core.system.files import regular
 from su3d_bench.store.atomic import read_npz, remove_file, replacing, write_npz
 from su3d_bench.store.scratch import row_blocks
 

@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from su3d_bench.core.types import Int32Array, Int64Array, Masks
+from su3d_bench.core.maps import Masks
+from su3d_bench.core.types import Int32Array, Int64Array
 from su3d_bench.metrics.attribution import masks as attribution
 from su3d_bench.metrics.attribution.masks import KINDS, LabelledMasks, ScoringRules, mend_scene, with_true_labels
 from su3d_bench.metrics.attribution.overlaps import Overlaps, measure_overlaps, true_instances

@@ -19,7 +19,8 @@ import su3d_bench.reports.tables.attribution
 from su3d_bench.analysis.attribution import attribute
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError
-from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, Partition, Prediction
+from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
+from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.attribution import points as attribution_semantic
 from su3d_bench.metrics.attribution.arrays import EXPLAINED as EXPLAINED_KINDS
 from su3d_bench.metrics.attribution.arrays import scored_masks, scored_points

@@ -17,7 +17,7 @@ from su3d_bench.analysis.gate.costs import LEAST_SHARE, MOST, Cost, cost_finding
 from su3d_bench.analysis.gate.reference import Reference, learn, read_reference
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.core.timing import MethodClock
+from su3d_bench.core.system.timing import MethodClock
 from su3d_bench.reports.gate import Finding
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run, read_update_times

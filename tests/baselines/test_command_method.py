@@ -23,8 +23,9 @@ from su3d_bench.baselines.command.placeholders import check_placeholders
 from su3d_bench.baselines.command.prediction import as_prediction, class_names
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, PredictionError
-from su3d_bench.core.timing import Timer
-from su3d_bench.core.types import Instances, Surface
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.system.timing import Timer
+from su3d_bench.core.types import Surface
 from su3d_bench.datasets.recordings.meshes import read_surface
 from su3d_bench.datasets.rgbd.dataset import Rgbd
 from su3d_bench.predictions.base import VertexLabels, vertex_masks

@@ -15,7 +15,7 @@ from su3d_bench.baselines.conceptfusion.feature_table import FeatureTable
 from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig, ConceptFusionSam
 from su3d_bench.baselines.conceptfusion.pixel_features import mixed_features, mixing_weights, paint
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.timing import Timer
+from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, Float32Array, Frame, SceneInfo
 from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.datasets.scannet.dataset import ScanNet

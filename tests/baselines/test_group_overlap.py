@@ -29,7 +29,7 @@ from su3d_bench.baselines.sam3d.overlap import (
     without_small_groups,
 )
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.timing import Timer
+from su3d_bench.core.system.timing import Timer
 
 RULES = MergeRules()
 

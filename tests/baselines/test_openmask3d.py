@@ -31,8 +31,9 @@ from su3d_bench.baselines.openmask3d.views import (
 from su3d_bench.core import registry
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import SceneTools
-from su3d_bench.core.timing import Timer
-from su3d_bench.core.types import BoolArray, Float32Array, Frame, Instances, Int64Array, Proposals, SceneInfo, Surface
+from su3d_bench.core.maps import Instances, Proposals
+from su3d_bench.core.system.timing import Timer
+from su3d_bench.core.types import BoolArray, Float32Array, Frame, Int64Array, SceneInfo, Surface
 from su3d_bench.metrics.matching.labelling import most_similar
 from su3d_bench.perception.regions import region_under
 from su3d_bench.runs.feeding import no_detections

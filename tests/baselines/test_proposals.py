@@ -31,7 +31,8 @@ from su3d_bench.baselines.openmask3d.surface_proposals import (
 )
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.interfaces import SceneTools
-from su3d_bench.core.types import Proposals, Surface
+from su3d_bench.core.maps import Proposals
+from su3d_bench.core.types import Surface
 
 MASKS = np.array([[1, 1, 0, 0, 0, 0], [0, 1, 1, 1, 0, 0], [0, 0, 0, 0, 0, 0]], bool)  # two overlap, one is empty
 SCENE: dict[str, Any] = {

@@ -14,8 +14,9 @@ from pydantic import ValidationError
 from su3d_bench.baselines.sam3d.method import SAM3D, SAM3DConfig, paint
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import SceneTools
-from su3d_bench.core.timing import Timer
-from su3d_bench.core.types import Detections, Frame, Instances, Proposals, SceneInfo, Surface
+from su3d_bench.core.maps import Instances, Proposals
+from su3d_bench.core.system.timing import Timer
+from su3d_bench.core.types import Detections, Frame, SceneInfo, Surface
 
 SCENE = SceneInfo("made", "plates", 4, 1, "rendered-rooms")
 TREE, INCREMENTAL = SAM3DConfig(), SAM3DConfig(schedule="incremental")

@@ -16,7 +16,7 @@ from chat_server import KEY, Answered, ChatServer, error
 from scored_room import instances
 
 from su3d_bench.cli.main import build_parser, main
-from su3d_bench.core.types import Instances
+from su3d_bench.core.maps import Instances
 from su3d_bench.questions.undesired import FilterConfig
 from su3d_bench.reports.pictures import answers as reasoning_picture
 from su3d_bench.reports.pictures.answers import SpokenOf, draw_reasoning

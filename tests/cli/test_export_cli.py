@@ -12,7 +12,7 @@ from places import SCENES
 from prediction_files import TOY, write_open3dis, write_scannet_text
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.types import Instances, Partition
+from su3d_bench.core.maps import Instances, Partition
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.predictions.base import VertexMasks
 from su3d_bench.predictions.formats import READERS, recognise

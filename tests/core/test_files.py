@@ -15,12 +15,12 @@ from places import ROOT
 from su3d_bench.cli.main import main
 from su3d_bench.core.config import read_file
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.core.files import file_bytes, file_text, opened, opened_text, regular
+from su3d_bench.core.system.files import file_bytes, file_text, opened, opened_text, regular
 from su3d_bench.core.toml import parse_toml
 
 PACKAGES = ("su3d_bench", "baselines", "datasets", "reports")
 # The door; what looks at /proc alone; what a resource of the package hands out.
-OTHER_DOORS = {"su3d_bench/core/files.py", "su3d_bench/core/timing.py", "baselines/command/supervisor.py"}
+OTHER_DOORS = {"su3d_bench/core/system/files.py", "su3d_bench/core/system/timing.py", "baselines/command/supervisor.py"}
 OWN_RESOURCE = 'files("su3d_bench.'
 READS_A_PATH = {"load", "memmap", "open_memmap", "fromfile", "loadtxt", "genfromtxt", "imread", "ZipFile", "File"}
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.types import Instances
+from su3d_bench.core.maps import Instances
 
 POINTS = np.arange(18, dtype=np.float32).reshape(6, 3)
 SETS = [[0, 1, 4], [3]]

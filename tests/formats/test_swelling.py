@@ -22,8 +22,8 @@ from bombs import MIB, Member, deflated, gzip_of, jpeg_of_scans, npy_head, npz_o
 from damage import lacked_memory
 from memory import bounded_addresses, peak_bytes, reset_peak
 
-from su3d_bench.core.damage import DAMAGE
 from su3d_bench.core.errors import DataError, PredictionError, StoreError, Su3dError
+from su3d_bench.core.system.damage import DAMAGE
 from su3d_bench.evaluation.texts import read_text_features
 from su3d_bench.formats.arrays import MOST_MEMBERS, column_members, run_members
 from su3d_bench.formats.hdf5 import read_rows

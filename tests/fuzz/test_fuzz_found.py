@@ -19,7 +19,6 @@ from su3d_bench.analysis.leaderboard import leaderboard
 from su3d_bench.analysis.tables import check_paper
 from su3d_bench.cli.main import main
 from su3d_bench.core.config import parse_value, read_file
-from su3d_bench.core.damage import DAMAGE
 from su3d_bench.core.errors import (
     MOST_CHARACTERS,
     ConfigError,
@@ -28,6 +27,7 @@ from su3d_bench.core.errors import (
     StoreError,
     Su3dError,
 )
+from su3d_bench.core.system.damage import DAMAGE
 from su3d_bench.formats.numpy_files import read_npy
 from su3d_bench.metrics.protocols.loading import load_protocol, read_protocol
 from su3d_bench.metrics.scoring import combine, unpack_scores

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from su3d_bench.core.types import Masks
+from su3d_bench.core.maps import Masks
 from su3d_bench.metrics.instance import score as score_instances
 from su3d_bench.metrics.matching import votes as neighbours
 from su3d_bench.metrics.matching.votes import transfer_each_mask, transfer_votes

@@ -14,7 +14,7 @@ from open_scene import ENCODER, OBJECTS, WordEncoder, instances_with, nothing_at
 from places import CASES
 
 from su3d_bench.core.errors import DataError, PredictionError
-from su3d_bench.core.types import DenseFeatures, Instances, Masks
+from su3d_bench.core.maps import DenseFeatures, Instances, Masks
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.precision_recall import average_precision

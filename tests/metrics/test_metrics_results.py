@@ -28,7 +28,8 @@ from scored_room import (
 
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import LabelSet, Prediction
+from su3d_bench.core.maps import Prediction
+from su3d_bench.core.types import LabelSet
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.open_vocabulary.object_means import ObjectCounts
 from su3d_bench.metrics.protocols.loading import load_protocol

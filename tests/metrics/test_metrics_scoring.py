@@ -21,7 +21,8 @@ from scored_room import (
 )
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.types import DenseFeatures, GroundTruth, LabelSet, Partition
+from su3d_bench.core.maps import DenseFeatures, Partition
+from su3d_bench.core.types import GroundTruth, LabelSet
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from places import CASES
 from scored_room import instances
 
-from su3d_bench.core.types import DenseFeatures, Partition
+from su3d_bench.core.maps import DenseFeatures, Partition
 from su3d_bench.metrics.semantic.confusion import (
     SemanticCounts,
     SemanticMetrics,

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from scored_room import ROOM, OneHotEncoder
 from threadpoolctl import threadpool_info
 
-from su3d_bench.core.types import Float64Array, Masks, Partition
+from su3d_bench.core.maps import Masks, Partition
+from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics import scoring
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import precision_recall, resampling

@@ -10,7 +10,7 @@ from test_opensu3d_pipeline import SCENE, TWINS, contents, look
 from torch_devices import TORCH_ON_CPU, needs_torch, on_each_device
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.timing import Timer
+from su3d_bench.core.system.timing import Timer
 from su3d_bench.metrics.matching.labelling import cosines, most_similar
 from su3d_bench.opensu3d.config import Density, OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D

@@ -15,8 +15,9 @@ from literal_settings import OURS, config_of, settings_of
 from places import SUPPORT
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.timing import Timer
-from su3d_bench.core.types import Instances, SceneInfo
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.system.timing import Timer
+from su3d_bench.core.types import SceneInfo
 from su3d_bench.opensu3d.config import SCHEMES, OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 

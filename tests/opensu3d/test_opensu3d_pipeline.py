@@ -12,8 +12,9 @@ import pytest
 from pydantic import ValidationError
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.timing import Timer
-from su3d_bench.core.types import Detections, Float32Array, Frame, Instances, SceneInfo
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.system.timing import Timer
+from su3d_bench.core.types import Detections, Float32Array, Frame, SceneInfo
 from su3d_bench.opensu3d.config import Density, OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.runs.feeding import Feeding, ReadAhead

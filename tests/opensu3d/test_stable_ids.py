@@ -13,8 +13,9 @@ from literal_problems import Problem, random_problem
 from literal_settings import config_of
 from numpy.typing import NDArray
 
-from su3d_bench.core.timing import Timer
-from su3d_bench.core.types import Instances, SceneInfo
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.system.timing import Timer
+from su3d_bench.core.types import SceneInfo
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 
 N_SEQUENCES, OF_ONE_TEST = 200, 50

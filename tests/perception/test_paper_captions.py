@@ -14,7 +14,7 @@ from tiny_encoders import needs_models
 from tiny_models import paper_words, write_models
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.types import Instances
+from su3d_bench.core.maps import Instances
 from su3d_bench.perception.language.captioner import DESCRIBE
 from su3d_bench.store.atomic import read_json
 from su3d_bench.store.predictions import read_prediction

@@ -14,7 +14,7 @@ from perception_fakes import CountingEncoder, still_life
 from PIL import Image
 
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError
-from su3d_bench.core.timing import Timer
+from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Float32Array, Frame, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.crops import crop_window
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception

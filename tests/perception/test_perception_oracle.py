@@ -11,7 +11,7 @@ from perception_fakes import INTRINSICS, CountingEncoder, quad_mesh, still_life
 
 from su3d_bench.baselines.oracle import Oracle
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.core.timing import Timer
+from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Frame, GroundTruth, Int32Array, LabelSet, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.oracle.noise import OracleNoise, disturb
 from su3d_bench.perception.oracle.segmenter import MeshProjector, OracleConfig, OracleSegmenter

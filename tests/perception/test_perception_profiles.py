@@ -11,7 +11,7 @@ from perception_fakes import CountingEncoder, still_life
 from pydantic import ValidationError
 
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.core.timing import Timer
+from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import ImageDomain, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.detections import regions_to_keep
 from su3d_bench.perception.embedded.naming import (

@@ -10,7 +10,7 @@ import pytest
 from perception_fakes import CountingEncoder, still_life
 
 from su3d_bench.core.errors import ConfigError, DataError
-from su3d_bench.core.timing import Timer
+from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
 from su3d_bench.perception.stored.npz_files import read_stored, stored_path, write_stored

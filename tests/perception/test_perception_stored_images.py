@@ -15,7 +15,7 @@ from perception_fakes import CountingEncoder, still_life
 
 from su3d_bench.core.config import Setting, Settings, resolve
 from su3d_bench.core.errors import ConfigError, DataError
-from su3d_bench.core.timing import Timer
+from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import PerceptionNeeds, SceneInfo
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
 from su3d_bench.perception.stored.label_images import LabelImages, read_names

@@ -16,8 +16,9 @@ from su3d_bench.cli.main import main
 from su3d_bench.core import registry
 from su3d_bench.core.config import write_toml
 from su3d_bench.core.errors import ConfigError, ModelMissing
-from su3d_bench.core.timing import Timer
-from su3d_bench.core.types import Instances, PerceptionNeeds, SceneInfo, UInt8Array
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.system.timing import Timer
+from su3d_bench.core.types import PerceptionNeeds, SceneInfo, UInt8Array
 from su3d_bench.perception import paper as profile_paper
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.language.captioner import CropCaption

@@ -34,7 +34,7 @@ from prediction_files import (
 )
 
 from su3d_bench.core.errors import ConfigError, PredictionError
-from su3d_bench.core.types import DenseFeatures, Instances, Partition, Prediction
+from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.formats import text_integers
 from su3d_bench.formats.arrays import run_members
 from su3d_bench.formats.text_integers import integer_lines

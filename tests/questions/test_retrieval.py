@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.types import Float32Array, Float64Array, Instances, UInt8Array
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
 from su3d_bench.questions.retrieval import rank, rank_all
 
 

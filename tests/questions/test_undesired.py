@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.types import Instances
+from su3d_bench.core.maps import Instances
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.questions.undesired import FilterConfig, undesired
 

@@ -22,7 +22,7 @@ from places import SCENES
 from su3d_bench.analysis.page import maps as page_maps
 from su3d_bench.analysis.page.maps import points_of_each
 from su3d_bench.cli.main import main
-from su3d_bench.core.types import DenseFeatures, Instances
+from su3d_bench.core.maps import DenseFeatures, Instances
 from su3d_bench.reports.page import maps as html_map
 from su3d_bench.reports.page import numbers as html_data
 from su3d_bench.reports.page import page as html_page

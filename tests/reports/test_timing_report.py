@@ -15,7 +15,7 @@ from places import SCENES
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.timing import peak_memory_bytes, start_memory_watch
+from su3d_bench.core.system.timing import peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.costs import UpdateTimes, pooled, summarise
 from su3d_bench.numerics.statistics import growth_exponent

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from su3d_bench.core.types import DenseFeatures, Float32Array, GroundTruth, Instances, LabelSet, Partition
+from su3d_bench.core.maps import DenseFeatures, Instances, Partition
+from su3d_bench.core.types import Float32Array, GroundTruth, LabelSet
 from su3d_bench.metrics.protocols.files import class_names
 from su3d_bench.reports.pictures.canvas import Canvas
 from su3d_bench.reports.pictures.colours import (

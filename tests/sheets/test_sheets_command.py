@@ -14,7 +14,7 @@ from made_sheets import METHODS, RUN
 from painted import colour_perception
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.types import Instances
+from su3d_bench.core.maps import Instances
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.questions.model import question_id
 from su3d_bench.runs import finished as finished_run

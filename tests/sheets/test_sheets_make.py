@@ -18,7 +18,8 @@ from PIL import Image
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, DataError
-from su3d_bench.core.types import Frame, Instances
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import Frame
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.truths import RefinedNames
 from su3d_bench.questions.files.files import figure_texts

@@ -23,8 +23,9 @@ from su3d_bench.baselines.conceptfusion.feature_table import FeatureTable
 from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError, StoreError
-from su3d_bench.core.timing import Timer
-from su3d_bench.core.types import DenseFeatures, Detections, Frame, Partition, SceneInfo
+from su3d_bench.core.maps import DenseFeatures, Partition
+from su3d_bench.core.system.timing import Timer
+from su3d_bench.core.types import Detections, Frame, SceneInfo
 from su3d_bench.metrics.matching.labelling import most_similar
 from su3d_bench.metrics.semantic.score import has_feature
 from su3d_bench.predictions.own_runs import OwnRuns

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, reading
-from su3d_bench.core.files import opened
+from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import Float64Array, Int64Array, UInt8Array
 from su3d_bench.datasets.recordings.source import SensorPair
 from su3d_bench.datasets.scannet.sens.header import COUNT, MAX_FRAMES, MAX_HEADER_BYTES, SensHeader, parse_header

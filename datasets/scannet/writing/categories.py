@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.files import file_text
+from su3d_bench.core.system.files import file_text
 from su3d_bench.core.toml import parse_toml
 
 ROOM_NAME, SCAN_NAME = re.compile(r"([a-z]+)(\d{1,2})"), re.compile(r"scene9(\d)(\d\d)_00")

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.files import file_bytes
+from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Float64Array, Frame
 from su3d_bench.datasets.scannet.labels import TABLE_NAME
 from su3d_bench.datasets.scannet.sens.header import SensHeader

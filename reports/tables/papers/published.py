@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from su3d_bench.core.errors import ConfigError, printable, reading, suggest
-from su3d_bench.core.files import file_bytes
+from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.toml import parse_toml
 
 FILE = Path(__file__).resolve().parent / "published.toml"

@@ -25,7 +25,7 @@ from su3d_bench.core.digests import (
     package_versions,
 )
 from su3d_bench.core.errors import StoreError, Su3dError
-from su3d_bench.core.files import file_bytes
+from su3d_bench.core.system.files import file_bytes
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.atomic import filling
 from su3d_bench.store.predictions import features_beside

@@ -14,16 +14,8 @@ import numpy as np
 
 from su3d_bench.core.errors import ConfigError, Su3dError, printable, printable_json
 from su3d_bench.core.interfaces import Encoder, HasSketches
-from su3d_bench.core.types import (
-    DenseFeatures,
-    Float32Array,
-    Frame,
-    GroundTruth,
-    Instances,
-    Int64Array,
-    Prediction,
-    UInt8Array,
-)
+from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
+from su3d_bench.core.types import Float32Array, Frame, GroundTruth, Int64Array, UInt8Array
 from su3d_bench.metrics.matching.labelling import (
     candidate_classes,
     class_index_of_ids,
@@ -183,9 +175,7 @@ class _Scene:
     def page(self, most_points: int, tell: Callable[[str], None]) -> PageScene:
         read = {key[:1] + key[3:]: self._read(key) for key in self._maps}
         chosen = self._chosen_frames([a_map for a_map in read.values() if isinstance(a_map, Instances)])
-        frames = {
-            index: frame for index in sorted(chosen) if (frame := self._frame(index, SHOWN_WIDTH)) is not None
-        }
+        frames = {index: frame for index in sorted(chosen) if (frame := self._frame(index, SHOWN_WIDTH)) is not None}
         clouds = {key: thinned(one.points, most_points) for key, one in read.items() if not isinstance(one, str)}
         seen = self._seen([cloud.points for cloud in clouds.values()])
         made = []

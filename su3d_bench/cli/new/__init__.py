@@ -33,7 +33,7 @@ def add_parser(verbs: Any) -> None:
 
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.cli.common import written
-    from su3d_bench.core.files import file_text
+    from su3d_bench.core.system.files import file_text
 
     what, file = arguments.what, arguments.file
     if file.suffix != SUFFIX[what]:

@@ -12,15 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import (
-    BoolArray,
-    DenseFeatures,
-    GroundTruth,
-    Instances,
-    Int64Array,
-    Partition,
-    Prediction,
-)
+from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
+from su3d_bench.core.types import BoolArray, GroundTruth, Int64Array
 from su3d_bench.metrics.attribution import masks as instances
 from su3d_bench.metrics.attribution import points as semantic
 from su3d_bench.metrics.attribution.overlaps import LabelledMasks, ScoringRules, measure_overlaps, true_instances

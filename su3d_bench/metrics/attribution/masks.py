@@ -41,7 +41,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array, Masks
+from su3d_bench.core.maps import Masks
+from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array
 from su3d_bench.metrics.attribution.overlaps import (
     HALF,
     LabelledMasks,

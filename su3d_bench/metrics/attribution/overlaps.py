@@ -7,7 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array, Masks
+from su3d_bench.core.maps import Masks
+from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Instances, Int64Array, OrientedBox, Partition
+from su3d_bench.core.maps import Instances, Partition
+from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array, OrientedBox
 from su3d_bench.metrics.instance.box_counts import BoxCounts, class_values, count_boxes, share_values
 from su3d_bench.metrics.instance.box_overlap import box_iou, smallest_box
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE, masks_and_scores

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Instances, Int64Array, Masks, Partition
+from su3d_bench.core.maps import Instances, Masks, Partition
+from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.average_precision import InstanceAP, InstanceCounts
 from su3d_bench.metrics.instance.resampling import resampled_ap

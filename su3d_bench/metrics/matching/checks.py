@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError, counted, printable
-from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array, Masks
+from su3d_bench.core.maps import Masks
+from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array
 from su3d_bench.metrics.matching.duplicates import duplicate_pairs
 from su3d_bench.metrics.protocols.model import ProtocolRules
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from su3d_bench.core.types import Int64Array, Masks
+from su3d_bench.core.maps import Masks
+from su3d_bench.core.types import Int64Array
 
 
 def duplicate_pairs(masks: Masks, n_points: int, iou: float) -> list[tuple[int, int]]:

@@ -11,7 +11,8 @@ from threadpoolctl import threadpool_limits
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Instances, Int64Array, Prediction
+from su3d_bench.core.maps import Instances, Prediction
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.store.scratch import row_blocks
 

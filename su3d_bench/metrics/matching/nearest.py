@@ -7,17 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.types import (
-    BoolArray,
-    Float32Array,
-    Float64Array,
-    Instances,
-    Int64Array,
-    IntArray,
-    Masks,
-    Partition,
-    starts_of,
-)
+from su3d_bench.core.maps import Instances, Masks, Partition, starts_of
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, IntArray
 from su3d_bench.numerics.geometry import voxel_coordinates
 
 Points = Float32Array | Float64Array

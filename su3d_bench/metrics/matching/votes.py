@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.types import BoolArray, Float64Array, Int64Array, Masks
+from su3d_bench.core.maps import Masks
+from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 from su3d_bench.metrics.matching.nearest import Points, row_ids
 
 _MAX_CELLS = 4_000_000  # neighbours held at once

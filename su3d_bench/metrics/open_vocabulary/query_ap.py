@@ -12,7 +12,8 @@ from typing import Literal
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.types import Float32Array, Float64Array, Int64Array, Masks
+from su3d_bench.core.maps import Masks
+from su3d_bench.core.types import Float32Array, Float64Array, Int64Array
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 

@@ -10,16 +10,8 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import (
-    DenseFeatures,
-    Float32Array,
-    Float64Array,
-    Instances,
-    Int64Array,
-    Masks,
-    Partition,
-    Prediction,
-)
+from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition, Prediction
+from su3d_bench.core.types import Float32Array, Float64Array, Int64Array
 from su3d_bench.metrics.instance.score import CurveMetric, score_of_masks
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, has_every_label, text_features

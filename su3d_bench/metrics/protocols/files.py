@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.errors import ConfigError, suggest
-from su3d_bench.core.files import file_text
+from su3d_bench.core.system.files import file_text
 from su3d_bench.core.toml import parse_toml
 
 RULES = Path(__file__).parents[1] / "rules"

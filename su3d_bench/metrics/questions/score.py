@@ -10,7 +10,8 @@ import numpy as np
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.interfaces import Encoder, KnowsRelativeTexts
-from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Instances, Int64Array, Partition
+from su3d_bench.core.maps import Instances, Partition
+from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array
 from su3d_bench.metrics.instance.score import NO_OBJECT, Covered, covered_objects, score_of_masks
 from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, text_features
 from su3d_bench.metrics.metric import Metric, Pooled, SceneScore, n_predictions

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import BoolArray, GroundTruth, Instances, Int64Array
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import BoolArray, GroundTruth, Int64Array
 
 
 @dataclass(frozen=True)

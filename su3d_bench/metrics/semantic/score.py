@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import BoolArray, DenseFeatures, Float64Array, GroundTruth, Int64Array, Partition, Prediction
+from su3d_bench.core.maps import DenseFeatures, Partition, Prediction
+from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching import votes as neighbours
 from su3d_bench.metrics.matching.labelling import (

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.devices import require
 from su3d_bench.core.errors import ModelMissing
-from su3d_bench.core.files import file_bytes
+from su3d_bench.core.system.devices import require
+from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.perception.embedded.text import TOKENIZER_VERSION, token_ids, unknown_words
 from su3d_bench.perception.models.encoders.image_transform import check_image

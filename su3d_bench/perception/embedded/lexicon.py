@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.core.files import file_text
+from su3d_bench.core.system.files import file_text
 from su3d_bench.core.toml import parse_toml
 
 Words = Mapping[str, tuple[str, ...]]

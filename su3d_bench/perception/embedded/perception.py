@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from su3d_bench.core.interfaces import Encoder, RegionPerception, StageTimer
-from su3d_bench.core.timing import Timer
+from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, Regions, SceneInfo
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.detections import Assembler, captioned_by_colour

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from su3d_bench.core.devices import make_deterministic, require
+from su3d_bench.core.system.devices import make_deterministic, require
 from su3d_bench.core.types import Float32Array
 from su3d_bench.perception.embedded.encoder import DIM
 from su3d_bench.perception.embedded.text import N_ROWS, PADDING

@@ -7,7 +7,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from su3d_bench.core.devices import DEVICE, EXPECTED_DEVICE
+from su3d_bench.core.system.devices import DEVICE, EXPECTED_DEVICE
 from su3d_bench.perception.models.catalogue import MODELS
 from su3d_bench.perception.models.masks.automatic_masks import AutomaticMaskConfig
 from su3d_bench.perception.models.masks.grounded_sam import GroundedConfig

@@ -6,9 +6,9 @@ from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import partial
 from importlib.util import find_spec
 
-from su3d_bench.core.devices import device_for, precision_for, require, require_installed
 from su3d_bench.core.errors import ConfigError, ModelMissing
 from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.system.devices import device_for, precision_for, require, require_installed
 from su3d_bench.perception.cache import content_key
 from su3d_bench.perception.models.catalogue import FormName
 from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, PaperConfig

@@ -13,7 +13,7 @@ import numpy as np
 
 from su3d_bench.core.errors import ConfigError, DataError, ModelMissing
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.timing import Timer
+from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Frame, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.models.catalogue import PROFILE_MODELS, ModelEntry, model_entry
 from su3d_bench.perception.models.config import ModelsConfig

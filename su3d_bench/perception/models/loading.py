@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from typing import Any
 
-from su3d_bench.core.devices import CPU, device_for, precision_for, require, require_installed
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.system.devices import CPU, device_for, precision_for, require, require_installed
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.models.catalogue import FormName, model_entry
 from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, Runtime

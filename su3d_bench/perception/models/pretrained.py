@@ -7,8 +7,8 @@ from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
-from su3d_bench.core.devices import make_deterministic, require, require_transformers
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.system.devices import make_deterministic, require, require_transformers
 from su3d_bench.perception.models.files import ModelFiles, bounded, load_pretrained, read_settings, read_weights
 from su3d_bench.perception.models.masks.grounding_dino import GroundingDino
 from su3d_bench.perception.models.masks.sam import TorchSam

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.files import file_bytes
 from su3d_bench.core.interfaces import Encoder, RegionPerception, StageTimer
+from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, Regions
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.detections import Assembler, captioned_by_colour

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.errors import DataError, printable
-from su3d_bench.core.files import file_bytes, opened
+from su3d_bench.core.system.files import file_bytes, opened
 from su3d_bench.questions.files.queries import MOST_OBJECTS_ID, is_text
 from su3d_bench.questions.model import REASONING, Question, new_question
 

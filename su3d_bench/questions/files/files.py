@@ -14,7 +14,7 @@ from typing import Any
 
 from su3d_bench.core.config import toml_value
 from su3d_bench.core.errors import DataError, printable
-from su3d_bench.core.files import file_text
+from su3d_bench.core.system.files import file_text
 from su3d_bench.core.toml import parse_toml
 from su3d_bench.questions.files.datasets import is_foreign, read_foreign
 from su3d_bench.questions.files.queries import COLUMNS, MORE_COLUMNS, read_query_rows

@@ -21,9 +21,9 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
-from su3d_bench.core.endings import Ended, ending_in_order
 from su3d_bench.core.errors import Su3dError
 from su3d_bench.core.printing import doors
+from su3d_bench.core.system.endings import Ended, ending_in_order
 
 ENDING_S = 20.0  # for a worker without a parent to let go of what it holds; Slurm ends what it asked to end after 30 s
 # For a worker whose parent was asked to end. One that loads a library or searches a tree hears of nothing meanwhile; it

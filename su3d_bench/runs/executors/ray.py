@@ -15,8 +15,8 @@ from typing import Any
 
 from su3d_bench.core.config import RunConfig
 from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, package_versions
-from su3d_bench.core.endings import Ended, ending_in_order, kept_handlers
 from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError
+from su3d_bench.core.system.endings import Ended, ending_in_order, kept_handlers
 from su3d_bench.runs.executors.local import Outcome, Report, Unit, Work, answer_of, limit_threads, unwrap
 
 CONNECT_S = 5.0  # a machine of a cluster in one network answers within milliseconds

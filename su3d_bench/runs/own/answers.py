@@ -10,16 +10,13 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition
 from su3d_bench.core.types import (
-    DenseFeatures,
     Frame,
     GroundTruth,
     ImageDomain,
     InstanceMesh,
-    Instances,
     LabelSet,
-    Masks,
-    Partition,
     PerceptionNeeds,
     SceneInfo,
     Surface,

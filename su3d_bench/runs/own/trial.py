@@ -12,7 +12,7 @@ from typing import Any
 
 from su3d_bench.core.config import KeyPath, Setting, Settings
 from su3d_bench.core.errors import ConfigError, DataError, PlugInError
-from su3d_bench.core.types import DenseFeatures
+from su3d_bench.core.maps import DenseFeatures
 from su3d_bench.datasets.checks_of_frames import check_frames, facts_of
 from su3d_bench.metrics.metric import n_predictions
 from su3d_bench.runs.own.watch import is_ours, place_of

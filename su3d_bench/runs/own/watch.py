@@ -15,18 +15,8 @@ from pydantic import BaseModel
 
 from su3d_bench.core import given, types
 from su3d_bench.core.errors import PlugInError, Su3dError, own_line, printable
-from su3d_bench.core.types import (
-    DenseFeatures,
-    Frame,
-    GroundTruth,
-    InstanceMesh,
-    Instances,
-    Partition,
-    PerceptionNeeds,
-    SceneInfo,
-    Surface,
-    WorldUp,
-)
+from su3d_bench.core.maps import DenseFeatures, Instances, Partition
+from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, PerceptionNeeds, SceneInfo, Surface, WorldUp
 from su3d_bench.runs.own.answers import fault_of, fault_of_list, in_stored_form
 
 Kinds = tuple[type, ...]

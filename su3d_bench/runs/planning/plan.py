@@ -25,11 +25,11 @@ from su3d_bench.core.config import (
     read_assignments,
     resolve,
 )
-from su3d_bench.core.devices import device_for
 from su3d_bench.core.digests import code_digest, digest_json
 from su3d_bench.core.errors import ConfigError, StoreError, counted, printable, some, suggest
 from su3d_bench.core.interfaces import HasPresets, IsSystem
 from su3d_bench.core.registry import CEILING_METHOD
+from su3d_bench.core.system.devices import device_for
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.protocols.files import protocol_names
 from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from su3d_bench.core.errors import DataError, nearest, printable, reading, suggest
-from su3d_bench.core.files import file_bytes
+from su3d_bench.core.system.files import file_bytes
 from su3d_bench.formats.tables.separated import separated_rows
 from su3d_bench.formats.tables.workbooks import read_workbook
 from su3d_bench.questions.model import KINDS

@@ -10,7 +10,8 @@ import numpy as np
 
 from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import GroundTruth, Instances
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.instance.score import Covered
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.score import (

@@ -12,7 +12,8 @@ from typing import Any, NoReturn, Protocol
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.types import BoolArray, Float64Array, Frame, Instances, UInt8Array
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import BoolArray, Float64Array, Frame, UInt8Array
 from su3d_bench.reports.pictures.items import (
     CAP_M,
     LOW_HEIGHT,

@@ -10,7 +10,8 @@ import numpy as np
 
 from su3d_bench.core.errors import printable
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import Float64Array, Frame, Instances, UInt8Array
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import Float64Array, Frame, UInt8Array
 from su3d_bench.metrics.questions.score import labels_n
 from su3d_bench.questions.reasoning.asking import built_in
 from su3d_bench.questions.retrieval import rank_all

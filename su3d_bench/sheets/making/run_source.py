@@ -18,7 +18,8 @@ from su3d_bench.core.errors import (
     printable,
     suggest,
 )
-from su3d_bench.core.types import Frame, GroundTruth, Instances
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import Frame, GroundTruth
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.instance.score import Covered, covered_objects
 from su3d_bench.metrics.protocols.files import protocol_names

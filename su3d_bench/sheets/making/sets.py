@@ -12,7 +12,7 @@ import numpy as np
 
 from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.errors import ConfigError, DataError, printable
-from su3d_bench.core.files import file_bytes
+from su3d_bench.core.system.files import file_bytes
 from su3d_bench.reports.sheet.page import page_html
 from su3d_bench.reports.tables.formats import csv_lines
 from su3d_bench.sheets.items import (

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.config import read_assignments
-from su3d_bench.core.types import Frame, GroundTruth, Instances
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import Frame, GroundTruth
 from su3d_bench.questions.sight import instance_rows, looked_at
 from su3d_bench.questions.truths import fullest_truth
 from su3d_bench.runs.finished import read_run

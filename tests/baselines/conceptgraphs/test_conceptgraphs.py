@@ -25,7 +25,7 @@ from places import SCENES
 from su3d_bench.baselines.conceptgraphs.config import MappingConfig
 from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs
 from su3d_bench.cli.main import main
-from su3d_bench.core.timing import Timer
+from su3d_bench.core.system.timing import Timer
 from su3d_bench.opensu3d.config import Density, OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.runs import scene as scene_run

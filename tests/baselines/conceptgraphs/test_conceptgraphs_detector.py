@@ -11,7 +11,7 @@ from conceptgraphs_scene import SCENE, Plate, at_cosine, axis, contents, look, m
 from su3d_bench.baselines.conceptgraphs.config import MappingConfig
 from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs, ConceptGraphsDetector, DetectorConfig
 from su3d_bench.core import registry
-from su3d_bench.core.timing import Timer
+from su3d_bench.core.system.timing import Timer
 
 QUIET = DetectorConfig(noise_m=0.0, max_bbox_area_ratio=1.0)
 LEFT, RIGHT = Plate((-0.5, 0.0), name="desk"), Plate((0.0, 0.5), name="lamp", feature=axis(1), text=axis(1))

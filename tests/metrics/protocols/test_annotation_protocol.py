@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scored_room import NAMES, instances, room, truth_as_prediction
 
-from su3d_bench.core.types import Instances, Partition
+from su3d_bench.core.maps import Instances, Partition
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.instance.score import Covered
 from su3d_bench.metrics.protocols.loading import load_protocol

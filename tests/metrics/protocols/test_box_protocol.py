@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.errors import ConfigError, DataError
-from su3d_bench.core.types import Float64Array, GroundTruth, Instances, LabelSet, ObjectBoxes, OrientedBox
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import Float64Array, GroundTruth, LabelSet, ObjectBoxes, OrientedBox
 from su3d_bench.datasets.replica.boxes import box_truth
 from su3d_bench.metrics.fitness import ContentFacts, TruthFacts, why_not_content, why_not_truth
 from su3d_bench.metrics.instance.box_counts import THRESHOLDS, BoxCounts, count_boxes

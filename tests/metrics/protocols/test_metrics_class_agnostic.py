@@ -12,7 +12,8 @@ from places import CASES
 from scored_room import instances
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, LabelSet, Masks, Partition
+from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition
+from su3d_bench.core.types import GroundTruth, LabelSet
 from su3d_bench.metrics.instance.average_precision import combine as combine_counts
 from su3d_bench.metrics.instance.average_precision import per_scene
 from su3d_bench.metrics.instance.score import encode_without_classes

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from places import CASES
 from scored_room import ENCODER, ID, LABELS, OneHotEncoder, instances, noisy, nothing, room, truth_as_prediction
 
-from su3d_bench.core.types import DenseFeatures, Float32Array, GroundTruth, Instances, LabelSet, Partition, UInt8Array
+from su3d_bench.core.maps import DenseFeatures, Instances, Partition
+from su3d_bench.core.types import Float32Array, GroundTruth, LabelSet, UInt8Array
 from su3d_bench.metrics.matching.labelling import text_features
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules

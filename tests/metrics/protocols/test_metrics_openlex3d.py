@@ -24,7 +24,7 @@ from open_scene import (
 from places import CASES
 
 from su3d_bench.core.errors import DataError, PredictionError
-from su3d_bench.core.types import DenseFeatures, Partition, Prediction
+from su3d_bench.core.maps import DenseFeatures, Partition, Prediction
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.open_vocabulary import openlex3d, score

@@ -16,7 +16,7 @@ from scored_room import instances
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.core.types import DenseFeatures, Partition
+from su3d_bench.core.maps import DenseFeatures, Partition
 from su3d_bench.datasets.rooms.classes import CLASSES
 from su3d_bench.metrics.fitness import (
     ContentFacts,

@@ -13,7 +13,7 @@ from scored_room import ENCODER, NAMES, OneHotEncoder, instances, nothing, room,
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, PredictionError
-from su3d_bench.core.types import Partition
+from su3d_bench.core.maps import Partition
 from su3d_bench.evaluation.scoring import facts_of, score_on_objects
 from su3d_bench.metrics.fitness import why_not_content, why_not_scorable
 from su3d_bench.metrics.instance.score import covered_objects

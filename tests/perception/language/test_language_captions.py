@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from scored_room import instances
 
 from su3d_bench.core.errors import PredictionError, StoreError
-from su3d_bench.core.types import Instances
+from su3d_bench.core.maps import Instances
 from su3d_bench.perception.language.captioner import Captioner
 from su3d_bench.perception.language.chat import ChatRequest, Reply
 from su3d_bench.perception.language.client import ChatClient

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from tiny_encoders import needs_models
 
-from su3d_bench.core.devices import Batches, device_for, first_batch, precision_for
 from su3d_bench.core.errors import ConfigError
+from su3d_bench.core.system.devices import Batches, device_for, first_batch, precision_for
 from su3d_bench.core.types import Float32Array
 
 

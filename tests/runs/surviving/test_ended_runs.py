@@ -17,7 +17,7 @@ import pytest
 from places import SCENES
 from waiting import wait_until
 
-from su3d_bench.core.endings import Ended, ending_in_order
+from su3d_bench.core.system.endings import Ended, ending_in_order
 
 EXECUTORS = {"inline": ("--jobs", "1"), "processes": ("--jobs", "2")}
 WORKER = "spawn_main"

@@ -14,7 +14,7 @@ import pytest
 from places import CASES
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.types import Instances
+from su3d_bench.core.maps import Instances
 from su3d_bench.formats.ply import PlyElement, write_ply
 from su3d_bench.predictions.formats import READERS
 from su3d_bench.store.predictions import write_prediction

@@ -114,7 +114,7 @@ def _own_prediction(kind: str) -> Make:
     def make(folder: Path) -> Read:
         from prediction_files import own_instances
 
-        from su3d_bench.core.types import DenseFeatures, Partition, Prediction
+        from su3d_bench.core.maps import DenseFeatures, Partition, Prediction
         from su3d_bench.store.predictions import read_prediction, write_prediction
 
         points = np.zeros((3, 3), np.float32)

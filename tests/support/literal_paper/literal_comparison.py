@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from literal_paper import NONE, Array, PaperProgram, Thing
 
-from su3d_bench.core.types import Instances
+from su3d_bench.core.maps import Instances
 
 SAME_POINT_M = 1e-5  # maps are given in float32
 

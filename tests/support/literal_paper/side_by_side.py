@@ -7,7 +7,8 @@ from literal_paper import PaperProgram
 from literal_settings import settings_of
 
 from su3d_bench.core.interfaces import StageTimer
-from su3d_bench.core.types import Detections, Frame, Instances, SceneInfo
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import Detections, Frame, SceneInfo
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 
 

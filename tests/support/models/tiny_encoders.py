@@ -27,7 +27,7 @@ def write_tiny_clip(folder: Path, seed: int = 0, weights: str = "model.safetenso
     """A CLIP of two layers as transformers saves it; ``weights`` may be ``pytorch_model.bin``, the older form."""
     import torch
 
-    from su3d_bench.core.devices import require_transformers
+    from su3d_bench.core.system.devices import require_transformers
 
     require_transformers("this test")  # quiet from here on
     from transformers import CLIPConfig, CLIPModel
@@ -64,7 +64,7 @@ def write_tiny_siglip(folder: Path, seed: int = 0) -> Path:
     import torch
     from tokenizers import Tokenizer, models, pre_tokenizers
 
-    from su3d_bench.core.devices import require_transformers
+    from su3d_bench.core.system.devices import require_transformers
 
     require_transformers("this test")
     from transformers import SiglipConfig, SiglipModel

@@ -14,7 +14,7 @@ from painted import Painted
 from su3d_bench.baselines.command.method import Command, CommandConfig
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.interfaces import SceneTools
-from su3d_bench.core.timing import Timer
+from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Frame, SceneInfo, Surface
 from su3d_bench.runs.feeding import no_detections
 

@@ -10,8 +10,9 @@ import numpy as np
 from su3d_bench.baselines.conceptgraphs.clouds import bounding_box
 from su3d_bench.baselines.conceptgraphs.config import MappingConfig
 from su3d_bench.baselines.conceptgraphs.objects import MapObject, Sighting
-from su3d_bench.core.timing import Timer
-from su3d_bench.core.types import Detections, Frame, Instances, SceneInfo
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.system.timing import Timer
+from su3d_bench.core.types import Detections, Frame, SceneInfo
 from su3d_bench.perception.crops import mask_boxes
 
 SCENE = SceneInfo("made", "plates", 4, 1, "rendered-rooms", seed=7)

@@ -18,7 +18,8 @@ if str(Path(__file__).parent) not in sys.path:
 from painted import Collector, ColourPerception, Painted
 
 from su3d_bench.core.interfaces import StageTimer
-from su3d_bench.core.types import DenseFeatures, Detections, Frame, PerceptionNeeds, Prediction
+from su3d_bench.core.maps import DenseFeatures, Prediction
+from su3d_bench.core.types import Detections, Frame, PerceptionNeeds
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import scene as scene_run

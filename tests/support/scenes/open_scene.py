@@ -9,7 +9,8 @@ import numpy as np
 from scored_room import instances
 
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import Float32Array, Instances, UInt8Array
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels, OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
 

@@ -19,16 +19,15 @@ from pydantic import BaseModel, ConfigDict
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.interfaces import StageTimer
+from su3d_bench.core.maps import Instances, Prediction
 from su3d_bench.core.types import (
     Detections,
     Float32Array,
     Frame,
     GroundTruth,
     InstanceMesh,
-    Instances,
     LabelSet,
     PerceptionNeeds,
-    Prediction,
     SceneInfo,
     UInt8Array,
 )

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from su3d_bench.core.types import Proposals
+from su3d_bench.core.maps import Proposals
 
 
 def made_proposals(points: np.ndarray, *masks: Sequence[int], scores: Sequence[float] | None = None) -> Proposals:

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import Float32Array, GroundTruth, Instances, LabelSet, Prediction, UInt8Array
+from su3d_bench.core.maps import Instances, Prediction
+from su3d_bench.core.types import Float32Array, GroundTruth, LabelSet, UInt8Array
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import SceneScore, combine, score_scene
 

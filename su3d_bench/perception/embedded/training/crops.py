@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from su3d_bench.core import registry
-from su3d_bench.core.files import file_text, regular
+from su3d_bench.core.system.files import file_text, regular
 from su3d_bench.core.types import Float32Array, Frame, Int32Array, Int64Array, Regions, UInt8Array
 from su3d_bench.perception.crops import crop_window, mask_boxes
 from su3d_bench.perception.embedded.captions import CropTruth, Neighbour

@@ -22,8 +22,8 @@ import jinja2
 import numpy as np
 
 from su3d_bench.core.errors import ModelMissing, Su3dError
-from su3d_bench.core.files import file_bytes, file_text
 from su3d_bench.core.printing import doors
+from su3d_bench.core.system.files import file_bytes, file_text
 from su3d_bench.perception.embedded.encoder import DIM, IMAGE_FILE, IMAGE_SIZE, TEXT_FILE, EmbeddedEncoder
 from su3d_bench.perception.embedded.text import N_IDS, N_WORDS, token_ids
 from su3d_bench.perception.embedded.training.crops import (

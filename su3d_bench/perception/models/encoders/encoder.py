@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 
-from su3d_bench.core.devices import CPU, Batches, first_batch, make_deterministic, require
 from su3d_bench.core.errors import DataError, printable
+from su3d_bench.core.system.devices import CPU, Batches, first_batch, make_deterministic, require
 from su3d_bench.core.types import Float32Array, Int64Array, UInt8Array
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.models.encoders.image_transform import LARGEST_SIZE, ImageTransform

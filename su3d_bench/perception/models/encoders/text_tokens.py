@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from su3d_bench.core.devices import require, require_transformers
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.system.devices import require, require_transformers
 from su3d_bench.core.types import Int64Array
 from su3d_bench.perception.models.encoders.plain_text import plain_text, without_marks
 from su3d_bench.perception.models.files import bounded, check_settings_size, read_settings

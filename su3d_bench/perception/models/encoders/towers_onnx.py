@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.devices import CPU
 from su3d_bench.core.errors import CheckFailed, DataError, StoreError
+from su3d_bench.core.system.devices import CPU
 from su3d_bench.core.types import Float32Array, Int64Array
 from su3d_bench.perception.models.encoders import towers_transformers
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec, check_spec, unit_rows

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.devices import require
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.system.devices import require
 from su3d_bench.core.types import Int64Array
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec, TorchTowers
 from su3d_bench.perception.models.encoders.image_transform import Convention, ImageTransform

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from su3d_bench.core.devices import require_transformers
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.system.devices import require_transformers
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec, TorchTowers, check_spec
 from su3d_bench.perception.models.encoders.image_transform import Convention, read_transform
 from su3d_bench.perception.models.files import ModelFiles, load_pretrained, read_settings

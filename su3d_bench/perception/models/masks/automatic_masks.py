@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from su3d_bench.core.devices import Batches
+from su3d_bench.core.system.devices import Batches
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, Regions, UInt8Array
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.models.masks.box_suppression import suppress

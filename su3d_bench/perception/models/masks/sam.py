@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from su3d_bench.core.devices import Batches
+from su3d_bench.core.system.devices import Batches
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
 from su3d_bench.perception.models.encoders.model_images import normalised_bytes, resized, size_with_longest_side
 

@@ -9,10 +9,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from su3d_bench.core.devices import make_deterministic, require
 from su3d_bench.core.errors import DataError, ModelMissing
-from su3d_bench.core.files import file_text
 from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.system.devices import make_deterministic, require
+from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.perception.cache import content_key
 from su3d_bench.perception.embedded.naming import PromptedWords, listed_words, vocabulary

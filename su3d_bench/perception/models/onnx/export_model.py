@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from su3d_bench.core.devices import require
 from su3d_bench.core.errors import ConfigError
+from su3d_bench.core.system.devices import require
 from su3d_bench.perception.models.catalogue import MODELS, ModelEntry
 from su3d_bench.perception.models.encoders.towers_onnx import export_encoder
 from su3d_bench.perception.models.files import locate

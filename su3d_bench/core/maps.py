@@ -1,0 +1,225 @@
+"""What a method makes: the map of a scene, as masks, as one instance a point, or as one feature a point."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.given import features_given, points_given, scores_given, sets_given, views_given
+from su3d_bench.core.types import (
+    BoolArray,
+    Float32Array,
+    Float64Array,
+    FloatArray,
+    Int32Array,
+    Int64Array,
+    IntArray,
+    check_arrays,
+)
+
+
+def starts_of(sizes: Iterable[int]) -> Int64Array:
+    """Where parts of these sizes begin in a list of all, and where the last ends.
+
+    >>> starts_of([2, 0, 3]).tolist()
+    [0, 2, 2, 5]
+    """
+    return np.cumsum([0, *sizes]).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class Masks:
+    """K sets of points, which may overlap: mask k is ``indices[indptr[k]:indptr[k + 1]]``, ascending.
+
+    >>> masks = Masks.of_sets([np.array([4, 5]), np.array([6])])
+    >>> masks.indptr.tolist(), masks.mask(1).tolist()
+    ([0, 2, 3], [6])
+    """
+
+    indptr: Int64Array
+    indices: Int32Array
+
+    @staticmethod
+    def of_sets(sets: Sequence[IntArray]) -> Masks:
+        """The masks that hold these points, each list ascending."""
+        indices = np.concatenate([np.zeros(0, np.int32), *sets]).astype(np.int32, copy=False)
+        return Masks(starts_of(map(len, sets)), indices)
+
+    def __len__(self) -> int:
+        return len(self.indptr) - 1
+
+    @property
+    def sizes(self) -> Int64Array:
+        """The number of points (K,) of each mask."""
+        return np.diff(self.indptr)
+
+    @property
+    def owners(self) -> Int64Array:
+        """The mask of each entry of ``indices``."""
+        return np.repeat(np.arange(len(self.sizes)), self.sizes)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether ``indptr`` describes a list of the length of ``indices``."""
+        ends = self.indptr[0] == 0 and self.indptr[-1] == len(self.indices)
+        return bool(ends and (self.sizes >= 0).all())
+
+    def mask(self, k: int) -> Int32Array:
+        """Point indices of mask ``k``."""
+        return self.indices[self.indptr[k] : self.indptr[k + 1]]
+
+    def sets(self) -> list[Int32Array]:
+        """The point indices of each mask."""
+        return np.split(self.indices, self.indptr[1:-1]) if len(self) else []
+
+    def owner_at(self, entry: int) -> int:
+        """The mask to which entry ``entry`` of ``indices`` belongs."""
+        return int(np.searchsorted(self.indptr, entry, side="right") - 1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Proposals(Masks):
+    """Class-agnostic masks over N points.
+
+    ``points`` (N, 3) float32 m; ``scores`` (K,) float64, the best first is not implied; ``source`` says who made them.
+    """
+
+    points: Float32Array
+    scores: Float64Array
+    source: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Instances(Masks):
+    """A map of K instances over M shared points, one mask an instance.
+
+    ``points`` (M, 3) float32 m; ``scores`` (K,) float64; ``features`` (K, D) float32 where the method has features,
+    ``labels`` one class name each where the method itself decides, '' for what it leaves to the feature; ``boxes`` (K,
+    2, 3) float32 axis-aligned minimum and maximum corners; ``centroids`` (K, 3) float32; ``views`` (V, 2) int32 rows
+    (frame index, row of the file or image that the detection came from), those of instance k at
+    ``view_indptr[k]:view_indptr[k + 1]``; where the method keeps them, ``view_names`` and ``view_scores`` (V,) float64
+    are the names and prediction scores that perception gave in those views.
+    """
+
+    points: Float32Array
+    scores: Float64Array
+    features: Float32Array | None
+    labels: tuple[str, ...] | None
+    names: tuple[str, ...]
+    captions: tuple[str, ...]
+    boxes: Float32Array
+    centroids: Float32Array
+    view_indptr: Int64Array
+    views: Int32Array
+    ids: Int64Array = field(default_factory=lambda: np.zeros(0, np.int64))
+    view_names: tuple[str, ...] | None = None
+    view_scores: Float64Array | None = None
+
+    def __post_init__(self) -> None:
+        arrays = ("points", "indptr", "indices", "scores", "boxes", "centroids", "view_indptr", "views", "ids")
+        check_arrays(self, "instances", arrays, PredictionError)
+        k = len(self.scores)
+        if len(self.indptr) != k + 1 or len(self.names) != k or len(self.captions) != k:
+            raise PredictionError(f"instances: {k} scores, {len(self.indptr) - 1} masks, {len(self.names)} names")
+        _check_masks(self, len(self.points))
+        if self.features is not None and len(self.features) != k:
+            raise PredictionError(f"instances: {k} masks and {len(self.features)} features")
+        if self.labels is not None and len(self.labels) != k:
+            raise PredictionError(f"instances: {k} masks and {len(self.labels)} labels")
+        for of_views in (self.view_names, self.view_scores):
+            if of_views is not None and len(of_views) != len(self.views):
+                raise PredictionError(
+                    f"instances: {len(self.views)} views and {len(of_views)} names or scores of views"
+                )
+
+    @classmethod
+    def of(
+        cls,
+        points: Float32Array,
+        masks: Masks | Sequence[IntArray | BoolArray | Sequence[int]] | IntArray | BoolArray,
+        scores: FloatArray | Sequence[float] | None = None,
+        features: FloatArray | None = None,
+        *,
+        labels: Sequence[str] | None = None,
+        names: Sequence[str] | None = None,
+        captions: Sequence[str] | None = None,
+        centroids: Float32Array | None = None,
+        views: Sequence[Sequence[tuple[int, int]]] | None = None,
+        view_names: tuple[str, ...] | None = None,
+        view_scores: Float64Array | None = None,
+        ids: Sequence[int] | IntArray = (),
+    ) -> Instances:
+        """The map of ``masks`` over ``points`` (M, 3); ``views`` are those of each instance.
+
+        ``masks``: of each instance the indices of its points, or a bool for each point; or of each point the number
+        (M,) of its instance, from 0 without gaps, -1 for none. Scores are 1, names and captions empty where none are
+        given; boxes and centroids are those of the points, zeros for an empty mask. A ``PredictionError`` where
+        something has another shape or other values.
+
+        >>> points = np.zeros((4, 3), np.float32)
+        >>> whole = Instances.of(points, [np.array([True, True, False, False]), np.array([3])], [0.9, 0.4])
+        >>> [mask.tolist() for mask in whole.sets()], Instances.of(points, np.array([0, 0, -1, 1])).indices.tolist()
+        ([[0, 1], [3]], [0, 1, 3])
+        """
+        points = points_given(points)
+        masks = masks if isinstance(masks, Masks) else Masks.of_sets(sets_given(masks, len(points)))
+        _check_masks(masks, len(points))
+        k = len(masks)
+        boxes, means = np.zeros((k, 2, 3), np.float32), np.zeros((k, 3), np.float32)
+        for row in np.flatnonzero(masks.sizes).tolist():
+            members = points[masks.mask(row)]
+            boxes[row] = members.min(axis=0), members.max(axis=0)
+            means[row] = members.mean(axis=0, dtype=np.float64)
+        return cls(
+            masks.indptr,
+            masks.indices,
+            points=points,
+            scores=scores_given(scores, k),
+            features=features_given(features, k),
+            labels=None if labels is None else tuple(labels),
+            names=("",) * k if names is None else tuple(names),
+            captions=("",) * k if captions is None else tuple(captions),
+            boxes=boxes,
+            centroids=means if centroids is None else centroids,
+            view_indptr=np.zeros(k + 1, np.int64) if views is None else starts_of(map(len, views)),
+            views=views_given(views, k),
+            ids=np.array(ids, np.int64),
+            view_names=view_names,
+            view_scores=view_scores,
+        )
+
+
+def _check_masks(masks: Masks, n_points: int) -> None:
+    if not masks.is_whole:
+        raise PredictionError("instances: indptr does not describe the list of point indices")
+    indices = masks.indices
+    if len(indices) and (indices.min() < 0 or indices.max() >= n_points):
+        worst = int(np.flatnonzero((indices < 0) | (indices >= n_points))[0])
+        raise PredictionError(
+            f"instance {masks.owner_at(worst)}: mask holds index {int(indices[worst])}, the map has {n_points} points "
+            f"(0..{n_points - 1})"
+        )
+
+
+@dataclass(frozen=True)
+class Partition:
+    """One instance a point: ``instance`` (M,) int32 rows of ``features`` (K, D), -1 for none."""
+
+    points: Float32Array
+    instance: Int32Array
+    features: Float32Array
+
+
+@dataclass(frozen=True)
+class DenseFeatures:
+    """One feature a point: ``features`` (M, D) float16, usually memory-mapped; all-zero rows have no feature."""
+
+    points: Float32Array
+    features: NDArray[np.float16]
+
+
+Prediction = Instances | Partition | DenseFeatures
