@@ -305,6 +305,8 @@ def load_pretrained(files: ModelFiles, model_class: Any, **more: Any) -> Any:
 
     ``more`` goes to ``from_pretrained``.
     """
+    from safetensors import SafetensorError
+
     if files.weights.suffix in PICKLED:
         read_weights(files.weights, "meta")  # says in our words what is wrong with the file
     try:
@@ -317,12 +319,8 @@ def load_pretrained(files: ModelFiles, model_class: Any, **more: Any) -> Any:
             output_loading_info=True,
             **more,
         )
-    except Exception as error:
-        # safetensors has an error of its own, which cannot be named without importing it
-        known = OSError | ValueError | RuntimeError | KeyError | ImportError
-        if type(error).__module__.startswith("safetensors") or isinstance(error, known):
-            raise DataError(f"{files.weights}: cannot be loaded: {bounded(error)}; fetch the folder anew") from error
-        raise
+    except (OSError, ValueError, RuntimeError, KeyError, ImportError, SafetensorError) as error:
+        raise DataError(f"{files.weights}: cannot be loaded: {bounded(error)}; fetch the folder anew") from error
     if missing := sorted(info["missing_keys"]):
         raise DataError(
             f"{files.weights}: lacks {len(missing)} tensors, such as {missing[0][:80]}; it is no "

@@ -40,11 +40,8 @@ def open_session(path: Path, provider: Provider = "cpu", device_index: int = 0, 
     options.log_severity_level = 3
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=_chain(provider, device_index))
-    except Exception as error:
-        # ONNX Runtime raises classes of its own for damaged files, all of them plain Exceptions
-        if type(error).__module__.startswith("onnxruntime"):
-            raise DataError(f"{path}: ONNX Runtime cannot load it: {bounded(error)}; export it anew") from error
-        raise
+    except _refusals() as error:
+        raise DataError(f"{path}: ONNX Runtime cannot load it: {bounded(error)}; export it anew") from error
     used = session.get_providers()
     if PROVIDERS[provider] not in used:
         # ONNX Runtime falls back to the CPU where a provider's own libraries do not load
@@ -52,6 +49,14 @@ def open_session(path: Path, provider: Provider = "cpu", device_index: int = 0, 
             f"provider '{provider}': onnxruntime could not start it; install the CUDA libraries it needs"
         )
     return session
+
+
+def _refusals() -> tuple[type[Exception], ...]:
+    """What ONNX Runtime raises for a file: classes of its own, with none in common but ``Exception``."""
+    from onnxruntime.capi import onnxruntime_pybind11_state as state
+
+    found = (value for value in vars(state).values() if isinstance(value, type))
+    return tuple(value for value in found if issubclass(value, Exception))
 
 
 def _chain(provider: Provider, device_index: int) -> list[Any]:
