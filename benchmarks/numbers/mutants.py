@@ -44,6 +44,7 @@ _TRANSFER = ("test_metrics_transfer", "test_metrics_neighbours", *_SCORES)
 _TEXTS = ("test_metrics_queries", "test_metrics_openlex3d")
 _QUESTIONS = ("test_annotation_protocol", "test_retrieval_protocol", "questions/test_reasoning_solver")
 _PROTOCOLS = ("test_protocols", "test_metrics_scoring", "evaluation/test_evaluate")
+_GATE = tuple(f"analysis/gate/test_gate{name}" for name in ("_tolerances", "_references", "", "_answers", "_costs"))
 # Of each module, or of all in a folder, the tests that must notice: the quick ones first. Names without a folder stand
 # in tests/metrics or below.
 GUARDS: dict[str, tuple[str, ...]] = {
@@ -68,8 +69,8 @@ GUARDS: dict[str, tuple[str, ...]] = {
     "analysis/comparison.py": ("analysis/test_compare_pairs", "analysis/test_compare", "analysis/test_planning"),
     "analysis/side_numbers.py": ("analysis/test_compare_pairs", "analysis/test_compare", "analysis/test_planning"),
     "analysis/sides.py": ("analysis/test_compare_pairs", "analysis/test_compare", "analysis/test_planning"),
-    "analysis/gate/": ("analysis/test_gate", "analysis/test_gate_costs"),
-    "analysis/recomputed.py": ("analysis/test_gate", "analysis/test_leaderboard"),
+    "analysis/gate/": _GATE,
+    "analysis/recomputed.py": ("analysis/gate/test_gate", "analysis/test_leaderboard"),
 }  # fmt: skip
 
 

@@ -1,0 +1,137 @@
+"""What the gate says, in every form."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+from gated_runs import edit, in_metrics, lowered, results_in
+
+from su3d_bench.analysis.gate.check import check
+from su3d_bench.analysis.gate.reference import Reference
+from su3d_bench.cli.main import main
+from su3d_bench.reports.gate import Finding, Verdict, github_lines, junit_xml, markdown, plain_lines
+from su3d_bench.runs.finished import read_run
+
+
+@pytest.mark.parametrize(("long", "shown"), [("x" * 40, "x" * 40), ("x" * 41, "x" * 12 + "...")])
+def test_what_has_more_than_forty_characters_is_shown_by_its_first(
+    long: str, shown: str, run: Path, reference: Reference
+) -> None:
+    in_metrics(lambda m: m["results"][0].update(profile=long))(run)
+    (finding,) = check(read_run(run), reference).findings
+    assert finding.text.endswith(f", now {shown}")
+
+
+def test_the_command_fails_with_one_and_writes_what_a_pull_request_needs(
+    run: Path, learnt: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["check", str(run), "--against", str(learnt)]) == 0
+    lowered("metrics", "mAcc")(run)
+    capsys.readouterr()
+    words = ["check", str(run), "--against", str(learnt), "--github"]
+    assert main([*words, "--markdown", str(tmp_path / "c.md"), "--junit", str(tmp_path / "j.xml")]) == 1
+    shown = capsys.readouterr().out
+    assert shown.startswith("failed: 2 differences from") and "::error title=su3d-bench::" in shown
+    assert "| FAIL | collector / rooms-semantic / mAcc |" in (tmp_path / "c.md").read_text()
+    suite = ElementTree.parse(tmp_path / "j.xml").getroot()
+    assert suite.get("failures") == "2" and len(suite.findall("testcase/failure")) == 2
+    assert main([*words, "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["passed"] is False
+
+
+HOSTILE = "<script>|`$(x)`\n::error::\x00" + "é" * 400
+
+
+def test_a_hostile_name_does_no_harm() -> None:
+    verdict = Verdict("run", (Finding("changed", HOSTILE, HOSTILE),), 1, (HOSTILE,))
+    assert "<script>" not in markdown(verdict).replace("\\<script\\>", "")
+    ElementTree.fromstring(junit_xml(verdict))
+    lines = "\n".join(github_lines(verdict)).split("\n")
+    assert len(lines) == 2 and all(line.startswith("::") and " title=su3d-bench::" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    "words", [[], ["a"], ["a", "b", "--against", "r"], ["--learn", "a"], ["a", "--against", "r", "--cost-limit", "2"]]
+)
+def test_a_request_that_is_neither_check_nor_learn_is_one_line(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["check", *words]) == 2
+    assert capsys.readouterr().err.startswith("su3d-bench: check: ")
+
+
+def test_a_check_that_passes_shows_each_number_beside_the_reference_s(
+    run: Path, learnt: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["check", str(run), "--against", str(learnt)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("passed: ")
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| collector")]
+    values = {tuple(row[:2]): row[2:] for row in rows}
+    shown = f"{100 * (results_in(read_run(run)).metrics['mAcc'] or 0):.1f}"
+    assert values["collector / rooms-semantic", "mAcc"] == [shown, shown, "equal"]
+    assert values["collector / cost", "all together"][2:] == ["1.3 times"]
+    monkeypatch.setenv("COLUMNS", "60")
+    assert main(["check", str(run), "--against", str(learnt)]) == 0
+    assert max(map(len, capsys.readouterr().out.splitlines())) <= 60
+
+
+def test_scenes_that_are_missing_come_first_and_what_follows_from_them_is_counted(
+    run: Path, reference: Reference
+) -> None:
+    (gone,) = list(reference.data_digests)[:1]
+    edit(run / "run.json", lambda r: r.update(scenes=[s for s in r["scenes"] if s != gone]))
+    edit(run / "run.json", lambda r: r["data_digests"].pop(gone))
+
+    def without(metrics: Any) -> None:
+        metrics["scenes"].remove(gone)
+        for result in metrics["results"]:
+            result["n_planned"] -= 1
+            result["result"]["scenes"].remove(gone)
+            result["result"]["per_scene"].pop(gone)
+            result["result"]["n_scenes"] -= 1
+            for row in (result["result"]["metrics"], *result["result"]["per_class"].values()):
+                row.update({name: 0.25 for name, value in row.items() if isinstance(value, float)})
+
+    edit(run / "metrics.json", without)
+    verdict = check(read_run(run), reference)
+    lines = plain_lines(verdict)
+    n_explained = sum(one.is_explained for one in verdict.findings)
+    assert f"{n_explained} of them because of other scenes" in lines[0] and n_explained > 20
+    assert lines[1] == f"FAIL {gone}: the run does not have this scene"
+    assert lines[-1] == (
+        f"FAIL over other scenes: {n_explained} differences follow from scenes that the run or the reference alone has"
+    )
+    assert len(lines) < 12
+
+
+def test_many_differences_of_a_kind_are_one_line_with_their_number_and_the_farthest() -> None:
+    findings = tuple(
+        Finding(
+            "regression",
+            f"m / p / class c{n} / AP",
+            "is worse than the reference",
+            0.5,
+            0.4 - n / 100,
+            group="m / p / classes",
+        )
+        for n in range(6)
+    )
+    (line,) = plain_lines(Verdict("run", findings, 1, ()))[1:]
+    assert line == (
+        "FAIL m / p / classes: 6 values, each of which is worse than the reference; the farthest is class c5 / AP "
+        "(50.0 -> 35.0)"
+    )
+    lost = tuple(Finding("missing", f"s{n}", "the run does not have this scene", group="scenes") for n in range(10))
+    (line,) = plain_lines(Verdict("run", lost, 1, ()))[1:]
+    assert line == "FAIL scenes: the run does not have this scene (10: s0, s1, s2, s3, s4, s5, s6, s7 and 2 more)"
+
+
+def test_two_processors_of_one_name_are_not_named_twice(run: Path, reference: Reference) -> None:
+    edit(run / "run.json", lambda r: r.update(processor="other"))
+    (remark,) = [line for line in check(read_run(run), reference).remarks if "processor" in line]
+    assert remark.count(reference.hardware) == 1 and "of the same name" in remark
