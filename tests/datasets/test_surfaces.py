@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from replica_scene import QUADS, TWO_OBJECTS, write_original, write_render
+from rgbd_scene import write_scene
 from scannet_scan import SCAN, grid, write_mesh, write_recording
 from scannet_scan import write_truth as write_scan_truth
-from test_rgbd import write_scene
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.replica.dataset import Replica

@@ -111,8 +111,8 @@ def _scannet_export(form: str) -> Make:
 
 def _rgbd(**changes: Any) -> Make:
     def make(folder: Path) -> Read:
+        from rgbd_scene import write_scene
         from scannet_scan import grid, write_mesh
-        from test_rgbd import write_scene
 
         from su3d_bench.datasets.rgbd.dataset import Rgbd
 

@@ -1,0 +1,253 @@
+"""The adapter of described folders: what rgbd.toml says is what comes out."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+import weakref
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from rgbd_scene import HEIGHT, NUMBERED, WIDTH, depth_values, describe, log_of, open_scene, pose, text_of, write_scene
+
+from su3d_bench.cli.main import main
+from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.datasets.recordings.pose_convention import FLIP
+from su3d_bench.datasets.rgbd.dataset import Rgbd, RgbdOptions
+
+
+def test_frames_hold_what_the_files_hold(tmp_path: Path) -> None:
+    write_scene(tmp_path)
+    rgbd = Rgbd(tmp_path)
+    assert rgbd.scenes() == ("desk",) and rgbd.info("desk", 2).n_frames == 2
+    last = rgbd.frames("desk", 2)[-1]
+    assert (last.index, last.timestamp_s) == (2, 2 / 30)
+    np.testing.assert_array_equal(last.camera_to_world, pose(2))
+    np.testing.assert_array_equal(last.depth_m, (depth_values(2) * 0.001).astype(np.float32))
+    np.testing.assert_array_equal(last.intrinsics, [[6, 0, 5.5], [0, 6.5, 3.5], [0, 0, 1]])
+    assert (last.rgb == (200, 120, 30)).all()
+
+
+def write_depth(folder: Path, index: int, values: np.ndarray) -> None:
+    cv2.imwrite(str(folder / f"data/depth/frame-{index}.png"), values.astype(np.uint16))
+
+
+def test_the_largest_value_is_no_depth_where_it_stands_apart_and_that_is_said_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = write_scene(tmp_path)
+    near = np.linspace(810, 4000, WIDTH * HEIGHT).astype(np.uint16).reshape(HEIGHT, WIDTH)
+    far = np.linspace(60_000, 65_535, WIDTH * HEIGHT).astype(np.uint16).reshape(HEIGHT, WIDTH)
+    lone = near.copy()
+    lone[0] = 65535
+    for index, values in enumerate((lone, far, np.where(near > 2000, 65535, near))):
+        write_depth(folder, index, values)
+    with caplog.at_level(logging.WARNING, "su3d_bench"):
+        apart, among, again = (frame.depth_m for frame in open_scene(tmp_path))
+    assert (apart[0] == 0).all()
+    np.testing.assert_array_equal(apart[1:], (near[1:] * 0.001).astype(np.float32))
+    np.testing.assert_array_equal(among, (far * 0.001).astype(np.float32))
+    assert (again[near > 2000] == 0).all() and again.max() < 2.01
+    (said,) = (record.getMessage() for record in caplog.records)
+    assert said == (
+        "rgbd/desk: depth 65535 (65.54 m) counts as no depth where it stands apart from all other depths of its image"
+    )
+
+
+def test_every_reading_of_a_scene_says_that_and_none_of_them_twice(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Each method of a run has a record of its own."""
+    folder = write_scene(tmp_path)
+    for index in range(3):
+        write_depth(folder, index, np.where(np.arange(WIDTH * HEIGHT).reshape(HEIGHT, WIDTH) < 9, 65535, 900 + index))
+    dataset = Rgbd(tmp_path)
+    for n_readings in (1, 2):
+        with caplog.at_level(logging.WARNING, "su3d_bench"):
+            assert all((frame.depth_m == 0).sum() == 9 for frame in dataset.frames("desk", 1))
+        assert [record.getMessage().count("65535") for record in caplog.records] == [1] * n_readings
+
+
+def test_what_check_and_show_say_of_depth_survives_a_lone_largest_value_and_any_other_is_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_scene(tmp_path)
+    for index in range(3):
+        values = np.full((HEIGHT, WIDTH), 900 + index)
+        values[:2] = 65535
+        write_depth(folder, index, values)
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path))
+    main(["datasets", "check", "rgbd/desk", "--quiet"])
+    said = capsys.readouterr().out
+    assert "0.90 to 0.90 m" in said and said.count("depth 65535 (65.54 m) counts as no depth") == 1
+    assert main(["datasets", "show", "rgbd/desk", "--quiet", "--json", "--out", str(tmp_path / "desk.png")]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["depth_m"] == pytest.approx([0.9, 0.902])
+    values[:2] = 60000
+    write_depth(folder, 1, values)
+    main(["datasets", "check", "rgbd/desk", "--quiet"])
+    assert "in 1 of 3 frames depth reaches 60 m, first frame 1; indoors" in capsys.readouterr().out
+    keys = {**NUMBERED, "check_convention": False, "depth_invalid": [60000]}
+    describe(folder, keys)
+    main(["datasets", "check", "rgbd/desk", "--quiet"])
+    assert "depth reaches" not in capsys.readouterr().out
+
+
+def test_an_unscored_run_says_what_its_labels_are_worth_and_needs_no_truth(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_scene(tmp_path)
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path))
+    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+    words = ["run", "--scenes", "rgbd/desk", "--stride", "1", "--no-pictures", "--jobs", "1"]
+    assert main([*words, "--out", str(tmp_path / "run")]) == 0
+    said = capsys.readouterr()
+    assert "no protocol scores these scenes" in said.out
+    assert "names and labels mean little here" in said.err and "ceiling" not in said.err
+    assert main([*words, "--methods", "oracle", "--out", str(tmp_path / "other")]) == 3
+    assert "rgbd/desk: oracle needs ground truth, the dataset has none" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"intrinsics": None, "intrinsics_file": "camera.json"},
+        {"intrinsics": None, "intrinsics_file": "intrinsics.txt"},
+        {"pose": None, "trajectory": "trajectory.log"},
+        {"pose": None, "trajectory": "lines.tum", "trajectory_format": "tum"},
+        {"pose": None, "trajectory": "lines.kitti", "trajectory_format": "kitti"},
+        {"pose": None, "trajectory": "lines.matrix", "trajectory_format": "matrix"},
+        {"colour": "colour/*.png", "depth": "depth/frame-?.png", "pose": "*.pose.txt"},
+        {"folder": "../desk/data"},
+    ],
+    ids=lambda changes: next(reversed(changes)),
+)
+def test_every_way_to_name_the_same_files_gives_the_same_frames(tmp_path: Path, changes: dict[str, Any]) -> None:
+    folder = write_scene(tmp_path / "plain")
+    expected = open_scene(tmp_path / "plain")
+    folder = write_scene(tmp_path, **changes)
+    kitti = [" ".join(map(repr, pose(k)[:3].reshape(-1).tolist())) for k in range(3)]
+    (folder / "data/lines.kitti").write_text("\n".join(kitti))
+    rows = [" ".join(map(repr, pose(k).reshape(-1).tolist())) for k in range(3)]
+    (folder / "data/lines.matrix").write_text("\n".join(rows))
+    half = [0.05 * k for k in range(3)]
+    tum = [f"{k / 30} {k} {1 / 3} {-k} 0 0 {np.sin(a)} {np.cos(a)}" for k, a in enumerate(half)]
+    (folder / "data/lines.tum").write_text("# time x y z\n" + "\n".join(tum))
+    found = open_scene(tmp_path)
+    assert len(found) == len(expected) == 3
+    for one, other in zip(found, expected, strict=True):
+        assert (one.index, one.timestamp_s) == (other.index, pytest.approx(other.timestamp_s))
+        np.testing.assert_allclose(one.camera_to_world, other.camera_to_world, atol=1e-15)
+        np.testing.assert_array_equal(one.depth_m, other.depth_m)
+        np.testing.assert_array_equal(one.intrinsics, other.intrinsics)
+
+
+def test_globs_pair_up_in_numeric_order(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path, n_frames=12, colour="colour/*.png", depth="depth/*.png", pose="*.pose.txt")
+    assert [frame.camera_to_world[0, 3] for frame in open_scene(tmp_path)] == list(range(12))
+    (folder / "data/depth/frame-5.png").unlink()
+    with pytest.raises(DataError, match=r"12 colour files, 11 depth files and 12 poses match; files pair up in order"):
+        open_scene(tmp_path)
+
+
+def test_rotated_bits_are_turned_back_and_invalid_values_have_no_depth(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path, depth_rotated_bits=3, depth_unit_m=1e-4, depth_invalid=[1, 8191])
+    stored = np.arange(WIDTH * HEIGHT, dtype=np.uint32).reshape(HEIGHT, WIDTH) * 680
+    stored[0, 0] = 8 * 8191
+    cv2.imwrite(str(folder / "data/depth/frame-0.png"), stored.astype(np.uint16))
+    units = ((stored >> 3) | (stored << 13)) & 0xFFFF
+    expected = np.where(units == 8191, 0, units * 1e-4).astype(np.float32)
+    np.testing.assert_array_equal(open_scene(tmp_path)[0].depth_m, expected)
+    assert expected[0, 0] == 0 and (expected > 0).sum() > 90
+
+
+@pytest.mark.parametrize("axes", ["opencv", "opengl"])
+@pytest.mark.parametrize("direction", ["camera_to_world", "world_to_camera"])
+def test_direction_and_axes_are_undone(tmp_path: Path, direction: str, axes: str) -> None:
+    folder = write_scene(tmp_path, pose_direction=direction, camera_axes=axes)
+    for index in range(3):
+        stored = pose(index) @ FLIP if axes == "opengl" else pose(index)
+        stored = np.linalg.inv(stored) if direction == "world_to_camera" else stored
+        (folder / f"data/frame-{index}.pose.txt").write_text(text_of(stored))
+    for index, frame in enumerate(open_scene(tmp_path)):
+        np.testing.assert_allclose(frame.camera_to_world, pose(index), atol=1e-12)
+
+
+def test_frames_that_lack_a_part_are_said_once_and_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    folder = write_scene(tmp_path, n_frames=5)
+    (folder / "data/colour/frame-1.png").unlink()
+    (folder / "data/frame-1.pose.txt").unlink()
+    (folder / "data/depth/frame-3.png").unlink()
+    (folder / "data/frame-4.pose.txt").write_text(text_of(np.full((4, 4), -np.inf)))
+    rgbd = Rgbd(tmp_path)
+    with caplog.at_level(logging.WARNING):
+        assert [frame.index for frame in rgbd.frames("desk", 1)] == [0, 2]
+        assert rgbd.info("desk", 1).n_frames == 2
+    assert [record.getMessage() for record in caplog.records] == [
+        "rgbd/desk: 3 frames lack an image or a usable pose (the first: frame 1, no colour and no pose); left out, "
+        "2 frames are used"
+    ]
+    assert list(rgbd.problems("desk")) == [record.getMessage() for record in caplog.records]
+
+
+def test_a_trajectory_counts_missing_images_or_leaves_them_out(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path, n_frames=4, pose=None, trajectory="trajectory.log")
+    for name in ("colour", "depth"):
+        (folder / f"data/{name}/frame-1.png").unlink()
+    assert [frame.camera_to_world[0, 3] for frame in open_scene(tmp_path)] == [0, 2, 3]
+    (folder / "data/trajectory.log").write_text(log_of(range(3)))
+    assert [(frame.index, frame.camera_to_world[0, 3]) for frame in open_scene(tmp_path)] == [(0, 0), (2, 1), (3, 2)]
+    (folder / "data/trajectory.log").write_text(log_of(range(5)))
+    with pytest.raises(DataError, match=r"trajectory\.log has 5 poses; expected 3, one an image, or 4, one a number"):
+        open_scene(tmp_path)
+
+
+def test_of_many_scenes_one_is_in_memory(tmp_path: Path) -> None:
+    shutil.copytree(write_scene(tmp_path), tmp_path / "rgbd" / "chair")
+    rgbd = Rgbd(tmp_path)
+    first = weakref.ref(rgbd._recording("desk"))
+    assert first() is rgbd._recording("desk")
+    assert rgbd.digest("chair") != rgbd.digest("desk")
+    assert first() is None
+
+
+def test_descriptions_anywhere_can_be_named(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "elsewhere")
+    (folder / "rgbd.toml").rename(folder / "shelf.toml")
+    rgbd = Rgbd(tmp_path, RgbdOptions(files=(folder / "shelf.toml",)))
+    assert rgbd.scenes() == ("shelf",) and len(rgbd.frames("shelf", 1)) == 3
+    assert RgbdOptions.model_validate_json('{"files": "a.toml"}').files == (Path("a.toml"),)
+    (folder / "shelf.toml").rename(folder / "rgbd.toml")
+    assert Rgbd(tmp_path, RgbdOptions(files=(folder,))).scenes() == ("desk",)
+    write_scene(tmp_path)
+    with pytest.raises(DataError, match="rgbd: scene 'desk' is described twice"):
+        Rgbd(tmp_path, RgbdOptions(files=(folder,))).scenes()
+
+
+def test_there_is_no_ground_truth_and_no_scene_without_description(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"rgbd: no scene in .*--set rgbd\.files=path/to/rgbd\.toml"):
+        Rgbd(tmp_path).scenes()
+    write_scene(tmp_path)
+    with pytest.raises(DataError, match="no scene 'dusk'; did you mean 'desk'"):
+        Rgbd(tmp_path).info("dusk", 1)
+    with pytest.raises(GroundTruthMissing):
+        Rgbd(tmp_path).ground_truth("desk", "mesh-vertices")
+    with pytest.raises(GroundTruthMissing):
+        Rgbd(tmp_path).instance_mesh("desk")
+
+
+def test_the_digest_moves_with_every_file_that_is_read(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path, intrinsics=None, intrinsics_file="camera.json")
+    seen = {Rgbd(tmp_path).digest("desk")}
+    unused = {"trajectory.log", "intrinsics.txt"}
+    expected = {path for path in folder.rglob("*") if path.is_file() and path.name not in unused}
+    assert {path.resolve() for path in Rgbd(tmp_path).files("desk")} == expected
+    for path in (folder / "rgbd.toml", folder / "data/camera.json", folder / "data/frame-1.pose.txt"):
+        path.write_text(path.read_text() + "\n")
+        seen.add(Rgbd(tmp_path).digest("desk"))
+    cv2.imwrite(str(folder / "data/depth/frame-2.png"), depth_values(3))
+    assert len(seen | {Rgbd(tmp_path).digest("desk")}) == 5
