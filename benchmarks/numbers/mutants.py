@@ -44,6 +44,7 @@ _TRANSFER = ("test_metrics_transfer", "test_metrics_neighbours", *_SCORES)
 _TEXTS = ("test_metrics_queries", "test_metrics_openlex3d")
 _QUESTIONS = ("test_annotation_protocol", "test_retrieval_protocol", "questions/test_reasoning_solver")
 _PROTOCOLS = ("test_protocols", "test_metrics_scoring", "evaluation/test_evaluate")
+_COMPARE = tuple(f"analysis/test_compare{name}" for name in ("_statistics", "_pairs", ""))
 _GATE = tuple(f"analysis/gate/test_gate{name}" for name in ("_tolerances", "_references", "", "_answers", "_costs"))
 # Of each module, or of all in a folder, the tests that must notice: the quick ones first. Names without a folder stand
 # in tests/metrics or below.
@@ -63,12 +64,11 @@ GUARDS: dict[str, tuple[str, ...]] = {
     "metrics/metric.py": ("test_metrics_undefined", *_SCORES, "analysis/test_compare_pairs"),
     "metrics/scoring.py": ("test_metrics_undefined", *_SCORES),
     "numerics/statistics.py": (
-        "numerics/test_growth", "numerics/test_statistics", "test_metrics_undefined", "analysis/test_compare_pairs",
-        "analysis/test_compare",
+        "numerics/test_growth", "numerics/test_statistics", "test_metrics_undefined", *_COMPARE,
     ),
-    "analysis/comparison.py": ("analysis/test_compare_pairs", "analysis/test_compare", "analysis/test_planning"),
-    "analysis/side_numbers.py": ("analysis/test_compare_pairs", "analysis/test_compare", "analysis/test_planning"),
-    "analysis/sides.py": ("analysis/test_compare_pairs", "analysis/test_compare", "analysis/test_planning"),
+    "analysis/comparison.py": (*_COMPARE, "analysis/test_planning"),
+    "analysis/side_numbers.py": (*_COMPARE, "analysis/test_planning"),
+    "analysis/sides.py": (*_COMPARE, "analysis/test_planning"),
     "analysis/gate/": _GATE,
     "analysis/recomputed.py": ("analysis/gate/test_gate", "analysis/test_leaderboard"),
 }  # fmt: skip
