@@ -19,6 +19,7 @@ MOST_KEPT_BYTES = 4 << 30
 sys.path += sorted({str(file.parent) for file in TESTS.rglob("*.py")} - {*sys.path})
 
 from chat_server import ChatServer, chat_server  # noqa: E402 (it is found by the line above)
+from gated_runs import gate_reference, gate_reference_file, gated, gated_copy  # noqa: E402, F401
 
 # Tables are folded for who says how wide he sees them, as pytest-xdist does to its workers.
 os.environ.pop("COLUMNS", None)

@@ -17,8 +17,8 @@ MAY_SLEEP = {"waiting.py", "painted.py", "office_fill.py", "test_command_runners
 
 
 def test_no_two_files_have_one_name() -> None:
-    # Folders of tests are no packages: each file is a module by its name alone, but those that pytest itself reads.
-    twice = [name for name, n in Counter(file.name for file in FILES).items() if n > 1 and name != "conftest.py"]
+    # Folders of tests are no packages: each file is a module by its name alone.
+    twice = [name for name, n in Counter(file.name for file in FILES).items() if n > 1]
     assert twice == []
 
 

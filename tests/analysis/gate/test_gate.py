@@ -30,15 +30,15 @@ from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run
 
 
-def file_of(run: Path, name: str) -> Path:
-    return run / "scenes/painted.a/collector" / name
+def file_of(gated_copy: Path, name: str) -> Path:
+    return gated_copy / "scenes/painted.a/collector" / name
 
 
 def cut(name: str) -> Callable[[Path], None]:
     """What a disk that was full leaves of a file."""
 
-    def change(run: Path) -> None:
-        file_of(run, name).write_bytes(file_of(run, name).read_bytes()[:-20])
+    def change(gated_copy: Path) -> None:
+        file_of(gated_copy, name).write_bytes(file_of(gated_copy, name).read_bytes()[:-20])
 
     return change
 
@@ -46,22 +46,22 @@ def cut(name: str) -> Callable[[Path], None]:
 def garbage(name: str) -> Callable[[Path], None]:
     """A file that is none, and a seal that says that it is."""
 
-    def change(run: Path) -> None:
-        file_of(run, name).write_bytes(b"no archive")
-        sealed(run)
+    def change(gated_copy: Path) -> None:
+        file_of(gated_copy, name).write_bytes(b"no archive")
+        sealed(gated_copy)
 
     return change
 
 
-def counts_alone(run: Path) -> None:
+def counts_alone(gated_copy: Path) -> None:
     """Other counts than those from which the metrics were formed."""
-    text = (run / "metrics.json").read_text()
-    counted_otherwise(run)
-    (run / "metrics.json").write_text(text)
+    text = (gated_copy / "metrics.json").read_text()
+    counted_otherwise(gated_copy)
+    (gated_copy / "metrics.json").write_text(text)
 
 
 def without(name: str) -> Callable[[Path], None]:
-    return lambda run: file_of(run, name).unlink()
+    return lambda gated_copy: file_of(gated_copy, name).unlink()
 
 
 def results_of(metrics: Any) -> Any:
@@ -150,38 +150,42 @@ NONE_WHATEVER: dict[str, tuple[Callable[[Path], None], str]] = {
 
 
 @pytest.mark.parametrize("name", PLANTED)
-def test_a_planted_regression_is_caught(name: str, run: Path, learnt: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_planted_regression_is_caught(
+    name: str, gated_copy: Path, gate_reference_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     plant, said = PLANTED[name]
-    plant(run)
-    assert main(["check", str(run), "--against", str(learnt)]) == 1
+    plant(gated_copy)
+    assert main(["check", str(gated_copy), "--against", str(gate_reference_file)]) == 1
     assert said in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", NONE_WHATEVER)
 def test_what_no_run_can_have_written_is_refused(
-    name: str, run: Path, learnt: Path, capsys: pytest.CaptureFixture[str]
+    name: str, gated_copy: Path, gate_reference_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plant, said = NONE_WHATEVER[name]
-    plant(run)
-    assert main(["check", str(run), "--against", str(learnt)]) == 2
+    plant(gated_copy)
+    assert main(["check", str(gated_copy), "--against", str(gate_reference_file)]) == 2
     error = capsys.readouterr().err
     assert said in error and error.count("\n") == 1
-    assert main(["check", "--learn", str(run), "--out", str(run / "r.json")]) == 2
+    assert main(["check", "--learn", str(gated_copy), "--out", str(gated_copy / "r.json")]) == 2
 
 
-def test_a_value_that_is_no_number_never_passes(run: Path, learnt: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    in_metrics(lambda m: results_of(m)["metrics"].update(mAcc=float("nan")))(run)
-    assert main(["check", str(run), "--against", str(learnt)]) == 2
+def test_a_value_that_is_no_number_never_passes(
+    gated_copy: Path, gate_reference_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    in_metrics(lambda m: results_of(m)["metrics"].update(mAcc=float("nan")))(gated_copy)
+    assert main(["check", str(gated_copy), "--against", str(gate_reference_file)]) == 2
     assert "metrics.json is not as a run writes it" in capsys.readouterr().err
 
 
-def test_fifty_unchanged_repeats_pass(run: Path, learnt: Path) -> None:
+def test_fifty_unchanged_repeats_pass(gated_copy: Path, gate_reference_file: Path) -> None:
     generator = np.random.default_rng(0)
     for _ in range(50):
         # Time is the one thing that unchanged repeats differ in: by a twentieth, now and then by a tenth.
         noise = np.exp(generator.normal(0, 0.05, 8))
-        timed(run, (40 * noise[:6]).tolist(), 60 * noise[6], start_ms=10 * noise[7])
-        assert main(["check", str(run), "--against", str(learnt)]) == 0
+        timed(gated_copy, (40 * noise[:6]).tolist(), 60 * noise[6], start_ms=10 * noise[7])
+        assert main(["check", str(gated_copy), "--against", str(gate_reference_file)]) == 0
 
 
 def test_real_repeats_with_real_times_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -194,20 +198,20 @@ def test_real_repeats_with_real_times_pass(tmp_path: Path, monkeypatch: pytest.M
 
 @pytest.mark.parametrize("factor", [2.0, 10.0, 1e9])
 def test_a_slowed_calibration_hides_no_tenfold_cost(
-    factor: float, run: Path, learnt: Path, capsys: pytest.CaptureFixture[str]
+    factor: float, gated_copy: Path, gate_reference_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    timed(run, [400.0] * 6, calibration_ms=5.0 * factor)
-    assert main(["check", str(run), "--against", str(learnt)]) == 1
+    timed(gated_copy, [400.0] * 6, calibration_ms=5.0 * factor)
+    assert main(["check", str(gated_copy), "--against", str(gate_reference_file)]) == 1
     shown = capsys.readouterr()
     assert "cost of the updates after 3: costs 5.00 times the reference" in shown.out
     assert "others used the processor, or what is checked slows it" in shown.err
 
 
 def test_a_busy_machine_excuses_a_cost_up_to_twice_and_it_is_said(
-    run: Path, learnt: Path, capsys: pytest.CaptureFixture[str]
+    gated_copy: Path, gate_reference_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    timed(run, [100.0] * 6, 150.0, calibration_ms=15.0)
-    assert main(["check", str(run), "--against", str(learnt)]) == 0
+    timed(gated_copy, [100.0] * 6, 150.0, calibration_ms=15.0)
+    assert main(["check", str(gated_copy), "--against", str(gate_reference_file)]) == 0
     assert "the calibrating work took 15 ms, 3.0 times the reference's" in capsys.readouterr().err
-    timed(run, [106.0] * 6, 150.0, calibration_ms=15.0)
-    assert main(["check", str(run), "--against", str(learnt)]) == 1
+    timed(gated_copy, [106.0] * 6, 150.0, calibration_ms=15.0)
+    assert main(["check", str(gated_copy), "--against", str(gate_reference_file)]) == 1

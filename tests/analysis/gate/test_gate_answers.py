@@ -19,20 +19,20 @@ from su3d_bench.runs.finished import read_run
 
 @pytest.mark.parametrize(("long", "shown"), [("x" * 40, "x" * 40), ("x" * 41, "x" * 12 + "...")])
 def test_what_has_more_than_forty_characters_is_shown_by_its_first(
-    long: str, shown: str, run: Path, reference: Reference
+    long: str, shown: str, gated_copy: Path, gate_reference: Reference
 ) -> None:
-    in_metrics(lambda m: m["results"][0].update(profile=long))(run)
-    (finding,) = check(read_run(run), reference).findings
+    in_metrics(lambda m: m["results"][0].update(profile=long))(gated_copy)
+    (finding,) = check(read_run(gated_copy), gate_reference).findings
     assert finding.text.endswith(f", now {shown}")
 
 
 def test_the_command_fails_with_one_and_writes_what_a_pull_request_needs(
-    run: Path, learnt: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    gated_copy: Path, gate_reference_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["check", str(run), "--against", str(learnt)]) == 0
-    lowered("metrics", "mAcc")(run)
+    assert main(["check", str(gated_copy), "--against", str(gate_reference_file)]) == 0
+    lowered("metrics", "mAcc")(gated_copy)
     capsys.readouterr()
-    words = ["check", str(run), "--against", str(learnt), "--github"]
+    words = ["check", str(gated_copy), "--against", str(gate_reference_file), "--github"]
     assert main([*words, "--markdown", str(tmp_path / "c.md"), "--junit", str(tmp_path / "j.xml")]) == 1
     shown = capsys.readouterr().out
     assert shown.startswith("failed: 2 differences from") and "::error title=su3d-bench::" in shown
@@ -65,27 +65,27 @@ def test_a_request_that_is_neither_check_nor_learn_is_one_line(
 
 
 def test_a_check_that_passes_shows_each_number_beside_the_reference_s(
-    run: Path, learnt: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    gated_copy: Path, gate_reference_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert main(["check", str(run), "--against", str(learnt)]) == 0
+    assert main(["check", str(gated_copy), "--against", str(gate_reference_file)]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("passed: ")
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| collector")]
     values = {tuple(row[:2]): row[2:] for row in rows}
-    shown = f"{100 * (results_in(read_run(run)).metrics['mAcc'] or 0):.1f}"
+    shown = f"{100 * (results_in(read_run(gated_copy)).metrics['mAcc'] or 0):.1f}"
     assert values["collector / rooms-semantic", "mAcc"] == [shown, shown, "equal"]
     assert values["collector / cost", "all together"][2:] == ["1.3 times"]
     monkeypatch.setenv("COLUMNS", "60")
-    assert main(["check", str(run), "--against", str(learnt)]) == 0
+    assert main(["check", str(gated_copy), "--against", str(gate_reference_file)]) == 0
     assert max(map(len, capsys.readouterr().out.splitlines())) <= 60
 
 
 def test_scenes_that_are_missing_come_first_and_what_follows_from_them_is_counted(
-    run: Path, reference: Reference
+    gated_copy: Path, gate_reference: Reference
 ) -> None:
-    (gone,) = list(reference.data_digests)[:1]
-    edit(run / "run.json", lambda r: r.update(scenes=[s for s in r["scenes"] if s != gone]))
-    edit(run / "run.json", lambda r: r["data_digests"].pop(gone))
+    (gone,) = list(gate_reference.data_digests)[:1]
+    edit(gated_copy / "run.json", lambda r: r.update(scenes=[s for s in r["scenes"] if s != gone]))
+    edit(gated_copy / "run.json", lambda r: r["data_digests"].pop(gone))
 
     def without(metrics: Any) -> None:
         metrics["scenes"].remove(gone)
@@ -97,8 +97,8 @@ def test_scenes_that_are_missing_come_first_and_what_follows_from_them_is_counte
             for row in (result["result"]["metrics"], *result["result"]["per_class"].values()):
                 row.update({name: 0.25 for name, value in row.items() if isinstance(value, float)})
 
-    edit(run / "metrics.json", without)
-    verdict = check(read_run(run), reference)
+    edit(gated_copy / "metrics.json", without)
+    verdict = check(read_run(gated_copy), gate_reference)
     lines = plain_lines(verdict)
     n_explained = sum(one.is_explained for one in verdict.findings)
     assert f"{n_explained} of them because of other scenes" in lines[0] and n_explained > 20
@@ -131,7 +131,7 @@ def test_many_differences_of_a_kind_are_one_line_with_their_number_and_the_farth
     assert line == "FAIL scenes: the run does not have this scene (10: s0, s1, s2, s3, s4, s5, s6, s7 and 2 more)"
 
 
-def test_two_processors_of_one_name_are_not_named_twice(run: Path, reference: Reference) -> None:
-    edit(run / "run.json", lambda r: r.update(processor="other"))
-    (remark,) = [line for line in check(read_run(run), reference).remarks if "processor" in line]
-    assert remark.count(reference.hardware) == 1 and "of the same name" in remark
+def test_two_processors_of_one_name_are_not_named_twice(gated_copy: Path, gate_reference: Reference) -> None:
+    edit(gated_copy / "run.json", lambda r: r.update(processor="other"))
+    (remark,) = [line for line in check(read_run(gated_copy), gate_reference).remarks if "processor" in line]
+    assert remark.count(gate_reference.hardware) == 1 and "of the same name" in remark

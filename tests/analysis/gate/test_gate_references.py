@@ -14,45 +14,47 @@ from su3d_bench.core.errors import ConfigError
 from su3d_bench.runs.finished import read_run
 
 
-def test_a_run_without_numbers_teaches_nothing(run: Path, made: Path) -> None:
-    in_metrics(lambda m: m["results"][1].update(result=None))(run)
+def test_a_run_without_numbers_teaches_nothing(gated_copy: Path, gated: Path) -> None:
+    in_metrics(lambda m: m["results"][1].update(result=None))(gated_copy)
     with pytest.raises(ConfigError, match="collector under rooms-instance: was not scored; learn from runs with num"):
-        learn([read_run(made), read_run(run)])
+        learn([read_run(gated), read_run(gated_copy)])
 
 
-def test_a_run_that_timed_nothing_teaches_no_cost(run: Path, made: Path, reference: Reference) -> None:
-    without_calibration(run)
-    taught = learn([read_run(made), read_run(run)])
-    assert taught.costs == reference.costs != {}
-    assert taught.calibration_ms == reference.calibration_ms
+def test_a_run_that_timed_nothing_teaches_no_cost(gated_copy: Path, gated: Path, gate_reference: Reference) -> None:
+    without_calibration(gated_copy)
+    taught = learn([read_run(gated), read_run(gated_copy)])
+    assert taught.costs == gate_reference.costs != {}
+    assert taught.calibration_ms == gate_reference.calibration_ms
 
 
-def test_runs_that_hold_other_results_teach_nothing(run: Path, made: Path) -> None:
-    in_metrics(lambda m: m["results"].pop())(run)
+def test_runs_that_hold_other_results_teach_nothing(gated_copy: Path, gated: Path) -> None:
+    in_metrics(lambda m: m["results"].pop())(gated_copy)
     with pytest.raises(ConfigError, match="the runs hold different methods or protocols"):
-        learn([read_run(made), read_run(run)])
+        learn([read_run(gated), read_run(gated_copy)])
 
 
-def test_runs_of_different_requests_teach_nothing(run: Path, made: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    setting("seed = 0", "seed = 1")(run)
-    assert main(["check", "--learn", str(made), str(run), "--out", str(run / "r.json")]) == 2
+def test_runs_of_different_requests_teach_nothing(
+    gated_copy: Path, gated: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    setting("seed = 0", "seed = 1")(gated_copy)
+    assert main(["check", "--learn", str(gated), str(gated_copy), "--out", str(gated_copy / "r.json")]) == 2
     assert "differs from" in capsys.readouterr().err
-    assert not (run / "r.json").exists()
+    assert not (gated_copy / "r.json").exists()
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"results": []}', "[" * 100_000, '{"hardware": NaN}'])
 def test_a_damaged_reference_is_one_line(
-    text: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    text: str, gated_copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "bad.json").write_text(text)
-    assert main(["check", str(run), "--against", str(tmp_path / "bad.json")]) == 2
+    assert main(["check", str(gated_copy), "--against", str(tmp_path / "bad.json")]) == 2
     error = capsys.readouterr().err
     assert "check --learn" in error and error.count("\n") == 1
 
 
-def test_a_reference_survives_its_file(reference: Reference, tmp_path: Path) -> None:
-    (tmp_path / "r.json").write_text(json.dumps(reference.model_dump(mode="json", exclude_defaults=True)))
-    assert read_reference(tmp_path / "r.json") == reference
+def test_a_reference_survives_its_file(gate_reference: Reference, tmp_path: Path) -> None:
+    (tmp_path / "r.json").write_text(json.dumps(gate_reference.model_dump(mode="json", exclude_defaults=True)))
+    assert read_reference(tmp_path / "r.json") == gate_reference
 
 
 @pytest.mark.parametrize(
@@ -67,11 +69,11 @@ def test_a_reference_survives_its_file(reference: Reference, tmp_path: Path) -> 
     ],
 )  # fmt: skip
 def test_a_reference_outside_its_limits_is_none(
-    key: str, value: object, is_read: bool, reference: Reference, tmp_path: Path
+    key: str, value: object, is_read: bool, gate_reference: Reference, tmp_path: Path
 ) -> None:
-    made = reference.model_dump(mode="json")
-    made["results"] = made["results"][:1]
-    (tmp_path / "r.json").write_text(json.dumps(made | {key: value}))
+    gated = gate_reference.model_dump(mode="json")
+    gated["results"] = gated["results"][:1]
+    (tmp_path / "r.json").write_text(json.dumps(gated | {key: value}))
     if is_read:
         assert getattr(read_reference(tmp_path / "r.json"), key) == value
     else:

@@ -17,62 +17,64 @@ from su3d_bench.reports.gate import Finding, plain_lines
 from su3d_bench.runs.finished import read_run
 
 
-def test_what_is_better_is_said_and_passes(run: Path, made: Path) -> None:
-    verdict = check(read_run(made), learn([read_run(counted_otherwise(run))]))
+def test_what_is_better_is_said_and_passes(gated_copy: Path, gated: Path) -> None:
+    verdict = check(read_run(gated), learn([read_run(counted_otherwise(gated_copy))]))
     assert verdict.is_passed
     assert {one.kind for one in verdict.findings} == {"better"}
     assert f"{len(verdict.findings)} better" in plain_lines(verdict)[0]
 
 
-def test_the_tolerance_is_twice_the_spread_of_the_taught_runs(run: Path, made: Path, tmp_path: Path) -> None:
-    first, second = (read_run(path) for path in (made, counted_otherwise(run, 4)))
+def test_the_tolerance_is_twice_the_spread_of_the_taught_runs(gated_copy: Path, gated: Path, tmp_path: Path) -> None:
+    first, second = (read_run(path) for path in (gated, counted_otherwise(gated_copy, 4)))
     values = [results_in(one).metrics["mAcc"] for one in (first, second)]
     taught = learn([first, second])
-    learnt = taught.results[0].metrics["mAcc"]
-    assert learnt.value == pytest.approx(np.mean(values))
-    assert learnt.tolerance == pytest.approx(2 * (values[0] - values[1]))
+    gate_reference_file = taught.results[0].metrics["mAcc"]
+    assert gate_reference_file.value == pytest.approx(np.mean(values))
+    assert gate_reference_file.tolerance == pytest.approx(2 * (values[0] - values[1]))
     for n_points, is_passed in ((9, True), (11, False)):  # 2 less than the mean of the two, and 8 more at most
-        shutil.copytree(made, tmp_path / str(n_points))
+        shutil.copytree(gated, tmp_path / str(n_points))
         verdict = check(read_run(counted_otherwise(tmp_path / str(n_points), n_points)), taught)
         assert verdict.is_passed == is_passed, verdict.findings
 
 
-def findings_of(run: Path, name: str, measured: float, value: Value, across: float | None = None) -> list[Finding]:
+def findings_of(
+    gated_copy: Path, name: str, measured: float, value: Value, across: float | None = None
+) -> list[Finding]:
     """What is said where a run measured this of a headline value of which no scene and class is known."""
-    numbers = replace(results_in(read_run(run)), metrics={name: measured}, per_scene={}, per_class={})
-    first = learn([read_run(run)]).results[0]
+    numbers = replace(results_in(read_run(gated_copy)), metrics={name: measured}, per_scene={}, per_class={})
+    first = learn([read_run(gated_copy)]).results[0]
     expected = first.model_copy(update={"metrics": {name: value}, "scenes": {}, "classes": {}})
     return list(compared("m / p", expected, numbers, across))
 
 
-def test_a_value_that_differs_by_just_the_tolerance_passes_and_by_a_bit_more_fails(made: Path) -> None:
+def test_a_value_that_differs_by_just_the_tolerance_passes_and_by_a_bit_more_fails(gated: Path) -> None:
     taught = Value(value=0.75, tolerance=0.25)
     for value, n_findings in ((0.5, 0), (1.0, 0), (np.nextafter(0.5, 0), 1)):
-        assert len(findings_of(made, "mAcc", float(value), taught)) == n_findings
+        assert len(findings_of(gated, "mAcc", float(value), taught)) == n_findings
 
 
 @pytest.mark.parametrize(("own", "across"), [(0.25, 0.125), (0.125, 0.25)])
-def test_on_another_processor_the_larger_of_the_two_tolerances_counts(own: float, across: float, made: Path) -> None:
+def test_on_another_processor_the_larger_of_the_two_tolerances_counts(own: float, across: float, gated: Path) -> None:
     taught = Value(value=0.75, tolerance=own)
-    assert findings_of(made, "mAcc", 0.5, taught, across) == []
-    assert len(findings_of(made, "mAcc", 0.4375, taught, across)) == 1
+    assert findings_of(gated, "mAcc", 0.5, taught, across) == []
+    assert len(findings_of(gated, "mAcc", 0.4375, taught, across)) == 1
 
 
 @pytest.mark.parametrize("value", [0.25, 0.75])
-def test_a_value_without_a_better_direction_may_move_in_neither(value: float, made: Path) -> None:
+def test_a_value_without_a_better_direction_may_move_in_neither(value: float, gated: Path) -> None:
     assert "over-merged" not in HIGHER_IS_BETTER
-    found = findings_of(made, "over-merged", value, Value(value=0.5))
+    found = findings_of(gated, "over-merged", value, Value(value=0.5))
     assert [(one.kind, one.text, one.is_failure) for one in found] == [
         ("regression", "differs from the reference", True)
     ]
-    found = findings_of(made, "mAcc", value, Value(value=0.5))
+    found = findings_of(gated, "mAcc", value, Value(value=0.5))
     assert [one.kind for one in found] == ["better" if value > 0.5 else "regression"]
 
 
 @pytest.mark.parametrize("protocol", ["rooms-retrieval", "rooms-reasoning", "rooms-annotation", "rooms-instance"])
-def test_a_headline_value_that_rises_passes_unless_it_is_a_share_of_what_is_wrong(protocol: str, made: Path) -> None:
+def test_a_headline_value_that_rises_passes_unless_it_is_a_share_of_what_is_wrong(protocol: str, gated: Path) -> None:
     for name in load_protocol(protocol).headline:
-        (found,) = findings_of(made, name, 0.75, Value(value=0.5))
+        (found,) = findings_of(gated, name, 0.75, Value(value=0.5))
         assert found.is_failure == (name in {"under-merged", "over-merged"}), name
 
 
@@ -84,24 +86,26 @@ def test_a_headline_value_that_rises_passes_unless_it_is_a_share_of_what_is_wron
     ],
 )  # fmt: skip
 def test_how_a_run_was_asked_for_and_what_moves_no_number_may_differ(
-    old: str, new: str, run: Path, reference: Reference
+    old: str, new: str, gated_copy: Path, gate_reference: Reference
 ) -> None:
-    setting(old, new)(run)
-    assert check(read_run(run), reference).findings == ()
-    assert learn([read_run(run)]).settings == reference.settings
+    setting(old, new)(gated_copy)
+    assert check(read_run(gated_copy), gate_reference).findings == ()
+    assert learn([read_run(gated_copy)]).settings == gate_reference.settings
 
 
-def test_on_another_processor_headline_values_have_a_stated_tolerance(run: Path, reference: Reference) -> None:
-    slower(3.0)(counted_otherwise(run, 4))
-    assert not check(read_run(run), reference).is_passed
-    edit(run / "run.json", lambda r: r.update(processor="other"))
-    verdict = check(read_run(run), reference)
+def test_on_another_processor_headline_values_have_a_stated_tolerance(
+    gated_copy: Path, gate_reference: Reference
+) -> None:
+    slower(3.0)(counted_otherwise(gated_copy, 4))
+    assert not check(read_run(gated_copy), gate_reference).is_passed
+    edit(gated_copy / "run.json", lambda r: r.update(processor="other"))
+    verdict = check(read_run(gated_copy), gate_reference)
     assert verdict.is_passed, verdict.findings
     assert "another processor" in verdict.remarks[0] and "within 2 points" in verdict.remarks[0]
-    counted_otherwise(run, 40)
-    assert not check(read_run(run), reference).is_passed
+    counted_otherwise(gated_copy, 40)
+    assert not check(read_run(gated_copy), gate_reference).is_passed
 
 
-def test_the_headline_values_that_were_compared_are_counted(run: Path, reference: Reference) -> None:
+def test_the_headline_values_that_were_compared_are_counted(gated_copy: Path, gate_reference: Reference) -> None:
     n = sum(len(load_protocol(name).headline) for name in ("rooms-semantic", "rooms-instance"))
-    assert check(read_run(run), reference).n_compared == n
+    assert check(read_run(gated_copy), gate_reference).n_compared == n

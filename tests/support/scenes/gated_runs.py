@@ -4,27 +4,28 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
+from painted import colour_perception
 from places import SCENES
 
+from su3d_bench.analysis.gate.reference import Reference, learn
+from su3d_bench.cli.main import main
 from su3d_bench.core.digests import digest_file
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, pack_scores, unpack_scores
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
+from su3d_bench.runs import scene as scene_run
+from su3d_bench.runs.finished import read_run
 
 PAINTED = f"{SCENES}/painted.py"
-
-
 WORDS = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--methods", f"{PAINTED}:Collector"]
-
-
 WORDS += ["--protocols", "rooms-semantic", "rooms-instance", "--no-pictures", "--jobs", "1"]
-
-
 COSTS = {"calibration_ms": 5.0, "start_ms": 10.0, "close_ms": 0.0}
 
 
@@ -132,3 +133,32 @@ def without_calibration(run: Path) -> None:
 
 def results_in(run: Any) -> Any:
     return run.results["collector", "rooms-semantic"].result
+
+
+@pytest.fixture(scope="module")
+def gated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("gate") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", colour_perception)
+        assert main([*WORDS, "--out", str(folder)]) == 0
+    timed(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def gate_reference(gated: Path) -> Reference:
+    return learn([read_run(gated)])
+
+
+@pytest.fixture(scope="module")
+def gate_reference_file(gated: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The reference as the command writes it."""
+    path = tmp_path_factory.mktemp("gate") / "reference.json"
+    assert main(["check", "--learn", str(gated), "--out", str(path)]) == 0
+    return path
+
+
+@pytest.fixture
+def gated_copy(gated: Path, tmp_path: Path) -> Path:
+    shutil.copytree(gated, tmp_path / "run")
+    return tmp_path / "run"
