@@ -23,7 +23,8 @@ from su3d_bench.core.types import GroundTruth
 from su3d_bench.evaluation.explained import FilesOfTruth
 from su3d_bench.evaluation.scoring import with_confidences_of_files
 from su3d_bench.evaluation.texts import GivenTexts, read_text_features
-from su3d_bench.metrics.attribution.arrays import EXPLAINED, MendedScene
+from su3d_bench.metrics.attribution.arrays import EXPLAINED, LookedAt, MendedScene
+from su3d_bench.metrics.attribution.singles import SingleError
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.metric import Counts
 from su3d_bench.metrics.protocols.model import ProtocolRules
@@ -133,19 +134,36 @@ class Explained:
 
     def mend(self, scene: str, truth_of: TruthOf, encoder: Callable[[], Encoder]) -> MendedJob:
         """The counts of ``scene`` as they are and with its errors mended, by protocol; of those that scored it."""
-        mine = [name for name in self.protocols if scene in self._scores[name]]
-        if not mine:
-            return {}
-        mended: dict[str, MendedScene] = {}
-        for name in mine:
+        return self.mended(scene, self.look_at(scene, truth_of, encoder))
+
+    def look_at(self, scene: str, truth_of: TruthOf, encoder: Callable[[], Encoder]) -> Mapping[str, LookedAt]:
+        """``scene`` as the evaluators of the protocols that scored it see it."""
+        looked_at: dict[str, LookedAt] = {}
+        for name in (name for name in self.protocols if scene in self._scores[name]):
             rules = self._rules(name)
             truth, prediction = self._inputs.of_scene(scene, rules, truth_of)
             if (reason := why_not_scorable(rules, prediction)) is not None:
                 raise PredictionError(f"{scene}: {reason}")
             naming = self._inputs.encoder(rules, prediction, encoder)
-            mended[name] = EXPLAINED[rules.kind][1](rules, truth, prediction, naming)
-            _refuse_other_counts(scene, rules, self._scores[name][scene].counts, mended[name].as_is)
+            looked_at[name] = EXPLAINED[rules.kind][1](rules, truth, prediction, naming)
+        return looked_at
+
+    def mended(self, scene: str, looked_at: Mapping[str, LookedAt]) -> MendedJob:
+        """The counts of ``scene``, which must be those of the run, and those with its errors mended."""
+        mended = {name: one.mended() for name, one in looked_at.items()}
+        for name, counts in mended.items():
+            _refuse_other_counts(scene, self._rules(name), self._scores[name][scene].counts, counts.as_is)
         return mended
+
+    def errors(self, scene: str, protocol: str, looked_at: LookedAt, most: int) -> tuple[int, Sequence[SingleError]]:
+        """How many errors ``scene`` has under ``protocol``, and the ``most`` that cost the run most."""
+        scores = self._scores[protocol]
+        others = [score.counts for name, score in scores.items() if name != scene]
+        return looked_at.errors(self._rules(protocol), scores[scene].counts, others, most)
+
+    def headline(self, protocol: str) -> tuple[str, ...]:
+        """The metrics in which errors under ``protocol`` are told."""
+        return tuple(self._rules(protocol).headline)
 
     def form(self, mended: Mapping[str, MendedJob], other: Side | None = None) -> RunAttribution:
         """What the errors of all scenes cost; ``other`` is the side with perfect 2D masks."""

@@ -6,8 +6,10 @@ the one table of the kinds of protocols whose errors can be told apart.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
@@ -16,13 +18,27 @@ from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.core.types import BoolArray, GroundTruth, Int64Array
 from su3d_bench.metrics.attribution import masks as instances
 from su3d_bench.metrics.attribution import points as semantic
-from su3d_bench.metrics.attribution.overlaps import LabelledMasks, ScoringRules, measure_overlaps, true_instances
+from su3d_bench.metrics.attribution.overlaps import (
+    LabelledMasks,
+    Overlaps,
+    ScoringRules,
+    measure_overlaps,
+    true_instances,
+)
 from su3d_bench.metrics.attribution.points import LabelledPoints
-from su3d_bench.metrics.instance.score import masks_on_truth
+from su3d_bench.metrics.attribution.singles import Pool, SingleError, single_mask_errors, single_point_errors
+from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.instance.average_precision import InstanceCounts
+from su3d_bench.metrics.instance.score import InstanceMetric, masks_on_truth
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import class_index_of_ids
+from su3d_bench.metrics.metric import Counts
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.semantic.score import call_points, transfer_votes
+from su3d_bench.metrics.semantic import confusion
+from su3d_bench.metrics.semantic.confusion import SemanticCounts
+from su3d_bench.metrics.semantic.score import SemanticMetric, call_points, transfer_votes
+
+NO_CLASS = "none"
 
 
 def scored_masks(
@@ -39,9 +55,13 @@ def scored_masks(
 
 @dataclass(frozen=True)
 class ScoredPoints:
-    """The points that a protocol of kind ``semantic`` counts; ``is_counted`` (C,) classes are in its matrix."""
+    """The points that a protocol of kind ``semantic`` counts, at ``positions`` (N, 3) m.
+
+    ``is_counted`` (C,) classes are in its matrix.
+    """
 
     points: LabelledPoints
+    positions: transfer.Points
     is_counted: BoolArray
     has_masks: bool
 
@@ -70,7 +90,7 @@ def scored_points(
         map_distance_m=map_distance_m,
         mask_distance_m=called.distance_m,
     )
-    return ScoredPoints(points, called.is_counted, not isinstance(prediction, DenseFeatures))
+    return ScoredPoints(points, called.targets, called.is_counted, not isinstance(prediction, DenseFeatures))
 
 
 def _object_ids(rules: ProtocolRules, truth: GroundTruth) -> Int64Array:
@@ -80,30 +100,84 @@ def _object_ids(rules: ProtocolRules, truth: GroundTruth) -> Int64Array:
 
 
 MendedScene = instances.Mended | semantic.MendedPoints
-Mend = Callable[[ProtocolRules, GroundTruth, Prediction, Encoder | None], MendedScene]
+Errors = tuple[int, Sequence[SingleError]]
 
 
-def _mended_masks(
-    rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
-) -> MendedScene:
-    assert not isinstance(prediction, DenseFeatures)
-    values, masks, scoring = scored_masks(rules, truth, prediction, encoder)
-    mended = instances.mend_scene(values, masks, scoring)
-    if rules.class_agnostic is not None:
-        return mended
-    relabelled = instances.with_true_labels(measure_overlaps(true_instances(values, scoring), masks, scoring))
-    return replace(mended, with_true_labels=instances.count_masks(values, relabelled, scoring))
+class LookedAt(Protocol):
+    """A scene as a protocol's evaluator sees it.
+
+    ``points`` (N, 3) are those that errors are told of; ``class_name`` says what a class of an error is called.
+    """
+
+    points: transfer.Points
+
+    def mended(self) -> MendedScene: ...
+
+    def errors(self, rules: ProtocolRules, counts: Counts, others: Sequence[Counts], most: int) -> Errors:
+        """How many errors the scene has, and the ``most`` that cost most, the dearest first.
+
+        ``counts`` are its own as they are, ``others`` those of the other scenes.
+        """
+        ...
+
+    def class_name(self, number: int) -> str: ...
 
 
-def _mended_points(
-    rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
-) -> MendedScene:
-    scored = scored_points(rules, truth, prediction, encoder)
-    return semantic.mend_points(scored.points, scored.is_counted, has_masks=scored.has_masks)
+class _SceneOfMasks:
+    def __init__(
+        self, rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
+    ) -> None:
+        assert not isinstance(prediction, DenseFeatures)
+        self.points = truth.points
+        self._values, self._masks, self._scoring = scored_masks(rules, truth, prediction, encoder)
+        self._has_classes = rules.class_agnostic is None
+        self._names = {entry.id: entry.name for entry in rules.classes}
+
+    @cached_property
+    def _overlaps(self) -> Overlaps:
+        return measure_overlaps(true_instances(self._values, self._scoring), self._masks, self._scoring)
+
+    def mended(self) -> MendedScene:
+        mended = instances.mend_scene(self._values, self._masks, self._scoring)
+        if not self._has_classes:
+            return mended
+        relabelled = instances.with_true_labels(self._overlaps)
+        return replace(mended, with_true_labels=instances.count_masks(self._values, relabelled, self._scoring))
+
+    def errors(self, rules: ProtocolRules, counts: Counts, others: Sequence[Counts], most: int) -> Errors:
+        pool = Pool[InstanceCounts](InstanceMetric(rules), counts, others, instance_ap.concatenate)
+        found = single_mask_errors(self._values, self._overlaps, self._scoring, pool)
+        first = rules.headline[0]
+        return len(found), sorted(found, key=lambda error: -error.gains[first])[:most]
+
+    def class_name(self, number: int) -> str:
+        return self._names.get(number, NO_CLASS) if self._has_classes else "object"
 
 
-# Of each kind the causes of its errors, and what mends a scene.
-EXPLAINED: dict[str, tuple[tuple[str, ...], Mend]] = {
-    "instance": (instances.KINDS, _mended_masks),
-    "semantic": (semantic.CAUSES, _mended_points),
+class _SceneOfPoints:
+    def __init__(
+        self, rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
+    ) -> None:
+        self._scored = scored_points(rules, truth, prediction, encoder)
+        self.points = self._scored.positions
+        self._names = [entry.name for entry in rules.classes]
+
+    def mended(self) -> MendedScene:
+        scored = self._scored
+        return semantic.mend_points(scored.points, scored.is_counted, has_masks=scored.has_masks)
+
+    def errors(self, rules: ProtocolRules, counts: Counts, others: Sequence[Counts], most: int) -> Errors:
+        scored = self._scored
+        pool = Pool[SemanticCounts](SemanticMetric(rules), counts, others, confusion.concatenate)
+        return single_point_errors(scored.points, scored.is_counted, pool, has_masks=scored.has_masks, most=most)
+
+    def class_name(self, number: int) -> str:
+        return self._names[number] if number >= 0 else NO_CLASS
+
+
+# Of each kind the causes of its errors, and what looks at a scene.
+Look = Callable[[ProtocolRules, GroundTruth, Prediction, Encoder | None], LookedAt]
+EXPLAINED: dict[str, tuple[tuple[str, ...], Look]] = {
+    "instance": (instances.KINDS, _SceneOfMasks),
+    "semantic": (semantic.CAUSES, _SceneOfPoints),
 }

@@ -36,13 +36,13 @@ higher thresholds.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from su3d_bench.core.maps import Masks
-from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array
+from su3d_bench.core.types import BoolArray, Int32Array, Int64Array
 from su3d_bench.metrics.attribution.overlaps import (
     HALF,
     LabelledMasks,
@@ -54,10 +54,12 @@ from su3d_bench.metrics.attribution.overlaps import (
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 
-__all__ = ["KINDS", "LabelledMasks", "Mended", "ScoringRules", "count_masks", "mend_scene", "with_true_labels"]
+__all__ = [
+    "KINDS", "LabelledMasks", "MaskError", "Mended", "Repair", "ScoringRules", "count_masks", "find_errors",
+    "mend_scene", "repaired", "with_true_labels",
+]  # fmt: skip
 
 KINDS = ("merged", "split", "duplicate", "mislabelled", "background", "missed")
-Mending = tuple[LabelledMasks, int]
 
 
 @dataclass(frozen=True)
@@ -90,12 +92,14 @@ def mend_scene(truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules)
     overlaps = measure_overlaps(instances, predicted, rules)
     as_is = count_masks(truth, predicted, rules)
     alone, n = {}, {}
-    for kind, mend in _MENDINGS.items():
-        mended, n[kind] = mend(overlaps)
-        alone[kind] = count_masks(truth, mended, rules) if n[kind] else as_is
+    for kind, (find, _) in _KINDS.items():
+        errors = find(overlaps)
+        n[kind] = len(errors)
+        alone[kind] = count_masks(truth, repaired(overlaps, errors).labelled(), rules) if errors else as_is
     everything = predicted
-    for mend in _MENDINGS.values():
-        everything, _ = mend(measure_overlaps(instances, everything, rules))
+    for find, _ in _KINDS.values():
+        left = measure_overlaps(instances, everything, rules)
+        everything = repaired(left, find(left)).labelled()
     return Mended(as_is, alone, count_masks(truth, everything, rules), n)
 
 
@@ -127,105 +131,179 @@ def count_masks(truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules
     )
 
 
-def _mend_merged(overlaps: Overlaps) -> Mending:
-    predicted = overlaps.predicted
+@dataclass(frozen=True)
+class MaskError:
+    """One error of a kind: the predicted ``masks`` that make it and the counted ``instances`` that suffer it.
+
+    The mask, or part, and the instance that it is told by come first. A background mask has no instance, a missed
+    instance no mask.
+    """
+
+    kind: str
+    masks: tuple[int, ...]
+    instances: tuple[int, ...]
+
+
+class Repair:
+    """The predictions of a scene while errors are mended in them."""
+
+    def __init__(self, predicted: LabelledMasks) -> None:
+        self._predicted = predicted
+        self.points: dict[int, Int32Array] = {}  # of the masks that have other points now
+        self.class_ids, self.scores = predicted.class_ids.copy(), predicted.scores.copy()
+        self.is_kept = np.ones(len(predicted.masks), bool)
+        self.added: list[tuple[Int32Array, int, float]] = []  # points, class and confidence of masks behind the others
+
+    def mask(self, k: int) -> Int32Array:
+        """The points of mask ``k`` as they are now."""
+        return self.points[k] if k in self.points else self._predicted.masks.mask(k)
+
+    @property
+    def is_touched(self) -> BoolArray:
+        """Which of the masks (K,) count otherwise than before."""
+        touched: BoolArray = ~self.is_kept | (self.class_ids != self._predicted.class_ids)
+        touched |= self.scores != self._predicted.scores
+        touched[list(self.points)] = True
+        return touched
+
+    def labelled(self) -> LabelledMasks:
+        """The mended predictions."""
+        sets = self._predicted.masks.sets()
+        for k, points in self.points.items():
+            sets[k] = points
+        kept = np.flatnonzero(self.is_kept)
+        return LabelledMasks(
+            Masks.of_sets([*(sets[k] for k in kept), *(points for points, _, _ in self.added)]),
+            np.append(self.class_ids[kept], np.array([one for _, one, _ in self.added], np.int64)),
+            np.append(self.scores[kept], np.array([one for _, _, one in self.added], np.float64)),
+        )
+
+
+def find_errors(overlaps: Overlaps) -> list[MaskError]:
+    """All errors of a scene, kind after kind."""
+    return [error for find, _ in _KINDS.values() for error in find(overlaps)]
+
+
+def repaired(overlaps: Overlaps, errors: Sequence[MaskError]) -> Repair:
+    """The predictions with those errors mended, which are of one kind and in the order in which they are found."""
+    repair = Repair(overlaps.predicted)
+    for kind in dict.fromkeys(error.kind for error in errors):
+        _KINDS[kind][1](overlaps, errors, repair)
+    return repair
+
+
+def _find_merged(overlaps: Overlaps) -> list[MaskError]:
     merged = np.flatnonzero(overlaps.is_merged)
-    is_found = [overlaps.is_found(g) for g in range(overlaps.n_instances)]
-    masks, class_ids, scores = predicted.masks.sets(), predicted.class_ids.tolist(), predicted.scores.tolist()
-    is_kept = np.ones(len(masks), bool)
-    for k in merged[np.argsort(-predicted.scores[merged], kind="stable")].tolist():
+    found = []
+    for k in merged[np.argsort(-overlaps.predicted.scores[merged], kind="stable")].tolist():
         home = int(overlaps.shared[k].argmax())
         others = [g for g in np.flatnonzero(overlaps.cover[k] > HALF).tolist() if g != home]
+        found.append(MaskError("merged", (k,), (home, *others)))
+    return found
+
+
+def _mend_merged(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair) -> None:
+    predicted = overlaps.predicted
+    is_found = [overlaps.is_found(g) for g in range(overlaps.n_instances)]
+    for error in errors:
+        (k,), (home, *others) = error.masks, error.instances
         for g in others:
-            masks[k] = np.setdiff1d(masks[k], overlaps.members[g], assume_unique=True)
+            repair.points[k] = np.setdiff1d(repair.mask(k), overlaps.members[g], assume_unique=True)
             if not is_found[g]:
                 is_found[g] = True
-                masks.append(np.intersect1d(predicted.masks.mask(k), overlaps.members[g], assume_unique=True))
-                class_ids.append(int(overlaps.class_of_instance[g]))
-                scores.append(scores[k])
+                piece = np.intersect1d(predicted.masks.mask(k), overlaps.members[g], assume_unique=True)
+                repair.added.append((piece, int(overlaps.class_of_instance[g]), float(predicted.scores[k])))
         if overlaps.finds(k, home):
             continue
-        is_kept[k] = not is_found[home]
-        n_outside = len(masks[k]) - int(overlaps.shared[k, home])
+        repair.is_kept[k] = not is_found[home]
+        n_outside = len(repair.mask(k)) - int(overlaps.shared[k, home])
         if overlaps.shared[k, home] > HALF * (len(overlaps.members[home]) + n_outside):
-            class_ids[k] = int(overlaps.class_of_instance[home])
+            repair.class_ids[k] = int(overlaps.class_of_instance[home])
             is_found[home] = True
-    is_kept = np.concatenate([is_kept, np.ones(len(masks) - len(is_kept), bool)])
-    return _kept(masks, np.array(class_ids, np.int64), np.array(scores, np.float64), is_kept), len(merged)
 
 
-def _mend_split(overlaps: Overlaps) -> Mending:
+def _find_split(overlaps: Overlaps) -> list[MaskError]:
+    split = (g for g in range(overlaps.n_instances) if overlaps.is_split(g))
+    return [MaskError("split", overlaps.parts[g].parts, (g,)) for g in split]
+
+
+def _mend_split(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair) -> None:
     predicted = overlaps.predicted
-    masks, scores, is_kept = predicted.masks.sets(), predicted.scores.copy(), np.ones(len(predicted.masks), bool)
-    class_ids = predicted.class_ids.copy()
-    split = [g for g in range(overlaps.n_instances) if overlaps.is_split(g)]
-    for g in split:
-        members = np.array(overlaps.parts[g].parts)
+    for error in errors:
+        members, (g,) = np.array(error.masks), error.instances
         has_class = predicted.class_ids[members] == overlaps.class_of_instance[g]
         first = int(members[0])
-        masks[first] = np.unique(np.concatenate([predicted.masks.mask(k) for k in members]))
-        scores[first] = predicted.scores[members[has_class]].max()
-        class_ids[first] = overlaps.class_of_instance[g]
-        is_kept[members[1:]] = False
-    return _kept(masks, class_ids, scores, is_kept), len(split)
+        repair.points[first] = np.unique(np.concatenate([predicted.masks.mask(k) for k in members]))
+        repair.scores[first] = predicted.scores[members[has_class]].max()
+        repair.class_ids[first] = overlaps.class_of_instance[g]
+        repair.is_kept[members[1:]] = False
 
 
-def _mend_duplicate(overlaps: Overlaps) -> Mending:
+def _find_duplicate(overlaps: Overlaps) -> list[MaskError]:
+    return [
+        MaskError("duplicate", (k, parts.parts[0]), (g,))
+        for g, parts in enumerate(overlaps.parts)
+        for k in parts.duplicates
+        if overlaps.is_counted[k]
+    ]
+
+
+def _mend_duplicate(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair) -> None:
     predicted = overlaps.predicted
-    scores, is_kept = predicted.scores.copy(), np.ones(len(predicted.masks), bool)
-    for parts in overlaps.parts:
-        for k in parts.duplicates:
-            if not overlaps.is_counted[k]:
-                continue
-            is_kept[k] = False
-            first = parts.parts[0]
-            if predicted.class_ids[k] == predicted.class_ids[first]:
-                scores[first] = max(scores[first], predicted.scores[k])
-    return _kept(predicted.masks.sets(), predicted.class_ids, scores, is_kept), int((~is_kept).sum())
+    for k, first in (error.masks for error in errors):
+        repair.is_kept[k] = False
+        if predicted.class_ids[k] == predicted.class_ids[first]:
+            repair.scores[first] = max(repair.scores[first], predicted.scores[k])
 
 
-def _mend_mislabelled(overlaps: Overlaps) -> Mending:
-    predicted = overlaps.predicted
-    class_ids = predicted.class_ids.copy()
-    for g, parts in enumerate(overlaps.parts):
-        if parts.parts and overlaps.iou[parts.parts[0], g] > HALF and not overlaps.is_found(g):
-            class_ids[parts.parts[0]] = overlaps.class_of_instance[g]
-    return LabelledMasks(predicted.masks, class_ids, predicted.scores), int((class_ids != predicted.class_ids).sum())
+def _find_mislabelled(overlaps: Overlaps) -> list[MaskError]:
+    return [
+        MaskError("mislabelled", parts.parts[:1], (g,))
+        for g, parts in enumerate(overlaps.parts)
+        if parts.parts and overlaps.iou[parts.parts[0], g] > HALF and not overlaps.is_found(g)
+    ]
 
 
-def _mend_background(overlaps: Overlaps) -> Mending:
-    predicted = overlaps.predicted
+def _mend_mislabelled(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair) -> None:
+    for error in errors:
+        repair.class_ids[error.masks[0]] = overlaps.class_of_instance[error.instances[0]]
+
+
+def _find_background(overlaps: Overlaps) -> list[MaskError]:
     belongs = (overlaps.inside > HALF).any(axis=1) | (overlaps.cover > HALF).any(axis=1)
     is_wrong = overlaps.is_counted & ~overlaps.is_ignored & ~belongs
-    return _kept(predicted.masks.sets(), predicted.class_ids, predicted.scores, ~is_wrong), int(is_wrong.sum())
+    return [MaskError("background", (k,), ()) for k in np.flatnonzero(is_wrong).tolist()]
 
 
-def _mend_missed(overlaps: Overlaps) -> Mending:
-    predicted = overlaps.predicted
+def _mend_background(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair) -> None:
+    for error in errors:
+        repair.is_kept[error.masks[0]] = False
+
+
+def _find_missed(overlaps: Overlaps) -> list[MaskError]:
     touches = ((overlaps.inside > HALF) | (overlaps.cover > HALF)) & overlaps.is_large[:, None]
     is_split = np.array([overlaps.is_split(g) for g in range(overlaps.n_instances)], bool)
     missed = np.flatnonzero(~touches.any(axis=0) & ~is_split)
-    best = float(predicted.scores.max()) if len(predicted.scores) else 1.0
-    return (
-        LabelledMasks(
-            Masks.of_sets([*predicted.masks.sets(), *(overlaps.members[g] for g in missed)]),
-            np.concatenate([predicted.class_ids, overlaps.class_of_instance[missed]]),
-            np.concatenate([predicted.scores, np.full(len(missed), best)]),
-        ),
-        len(missed),
-    )
+    return [MaskError("missed", (), (g,)) for g in missed.tolist()]
 
 
-_MENDINGS: dict[str, Callable[[Overlaps], Mending]] = {
-    "merged": _mend_merged,
-    "split": _mend_split,
-    "duplicate": _mend_duplicate,
-    "mislabelled": _mend_mislabelled,
-    "background": _mend_background,
-    "missed": _mend_missed,
+def _mend_missed(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair) -> None:
+    scores = overlaps.predicted.scores
+    best = float(scores.max()) if len(scores) else 1.0
+    for error in errors:
+        (g,) = error.instances
+        repair.added.append((overlaps.members[g], int(overlaps.class_of_instance[g]), best))
+
+
+# Of each kind what finds its errors, in the order in which they are mended, and what mends some of them.
+_KINDS: dict[
+    str,
+    tuple[Callable[[Overlaps], list[MaskError]], Callable[[Overlaps, Sequence[MaskError], Repair], None]],
+] = {
+    "merged": (_find_merged, _mend_merged),
+    "split": (_find_split, _mend_split),
+    "duplicate": (_find_duplicate, _mend_duplicate),
+    "mislabelled": (_find_mislabelled, _mend_mislabelled),
+    "background": (_find_background, _mend_background),
+    "missed": (_find_missed, _mend_missed),
 }
-
-
-def _kept(masks: list[Int32Array], class_ids: Int64Array, scores: Float64Array, is_kept: BoolArray) -> LabelledMasks:
-    kept = np.flatnonzero(is_kept)
-    return LabelledMasks(Masks.of_sets([masks[k] for k in kept]), class_ids[kept], scores[kept])

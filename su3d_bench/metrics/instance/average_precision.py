@@ -183,30 +183,20 @@ def per_scene(
     if any(class_id < 1 for class_id in class_ids):
         raise DataError(f"class ids: {min(class_ids)} cannot be scored; class ids start at 1")
     segment_of_point, segment_value, segment_size = segments_of(ground_truth)
-    segment_label = segment_value // INSTANCES_PER_CLASS
     size = np.diff(indptr)
     is_listed = np.ones((len(class_ids), len(size)), bool)
     if labels is not None:
         is_listed = labels == np.array(class_ids, np.int64)[:, None]
     kept = np.flatnonzero(is_listed.any(axis=0) & (size >= min_region_size))
     intersection = intersections(segment_of_point, len(segment_value), indptr, indices, kept)
-    n_void = intersection[:, ~np.isin(segment_label, class_ids)].sum(axis=1)
 
     parts = []
-    for c, class_id in enumerate(class_ids):
-        columns = np.flatnonzero(segment_label == class_id)  # ascending value, as the original walks them
+    for c in range(len(class_ids)):
         rows = np.flatnonzero(is_listed[c, kept])
-        n_points = size[kept[rows]]
-        shared = intersection[np.ix_(rows, columns)]
-        is_small = segment_size[columns] < min_region_size
+        listed = ListedMasks(intersection[rows], size[kept[rows]], scores[kept[rows]])
         parts.append(
-            count_class(
-                c,
-                iou=shared / (segment_size[columns][None, :] + n_points[:, None] - shared),
-                takes_part=~is_small,
-                scores=scores[kept[rows]],
-                ignored_share=forgives_void * (n_void[rows] + shared[:, is_small].sum(axis=1)) / n_points,
-                thresholds=thresholds,
+            count_class_of_scene(
+                c, listed, segment_value, segment_size, class_ids, min_region_size, thresholds, forgives_void
             )
         )
     return stacked(parts)
@@ -216,6 +206,41 @@ def stacked(parts: Sequence[InstanceCounts]) -> InstanceCounts:
     """The counts of classes one after another."""
     names = InstanceCounts.arrays
     return InstanceCounts(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+
+@dataclass(frozen=True)
+class ListedMasks:
+    """Masks of one class in line order: points ``shared`` (R, S) with each segment, ``size`` and ``scores`` (R,)."""
+
+    shared: Int64Array
+    size: Int64Array
+    scores: Float64Array
+
+
+def count_class_of_scene(
+    class_index: int,
+    listed: ListedMasks,
+    segment_value: Int64Array,
+    segment_size: Int64Array,
+    class_ids: Sequence[int],
+    min_region_size: int,
+    thresholds: Sequence[float],
+    forgives_void: bool,
+) -> InstanceCounts:
+    """The counts of one class of a scene, of masks of at least the minimum size; segments are by ascending value."""
+    segment_label = segment_value // INSTANCES_PER_CLASS
+    columns = np.flatnonzero(segment_label == class_ids[class_index])  # ascending value, as the original walks them
+    shared, n_points = listed.shared[:, columns], listed.size
+    is_small = segment_size[columns] < min_region_size
+    n_void = listed.shared[:, ~np.isin(segment_label, class_ids)].sum(axis=1)
+    return count_class(
+        class_index,
+        iou=shared / (segment_size[columns][None, :] + n_points[:, None] - shared),
+        takes_part=~is_small,
+        scores=listed.scores,
+        ignored_share=forgives_void * (n_void + shared[:, is_small].sum(axis=1)) / n_points,
+        thresholds=thresholds,
+    )
 
 
 def count_class(
@@ -321,19 +346,21 @@ def combine_each(counts: Sequence[InstanceCounts], thresholds: Sequence[float] =
         np.concatenate([c.n_missed.ravel() for c in counts]),
         np.repeat(np.concatenate([c.n_truth > 0 for c in counts]), n_thresholds),
     )
+    return [of_table(table, thresholds) for table in areas.reshape(-1, n_classes, n_thresholds)]
+
+
+def of_table(table: Float64Array, thresholds: Sequence[float]) -> InstanceAP:
+    """The means over a ``table`` (C, T) of areas."""
     columns = ap_columns(thresholds)
     at_50, at_25 = tuple(thresholds).index(0.5), tuple(thresholds).index(0.25)
-    return [
-        InstanceAP(
-            thresholds=tuple(thresholds),
-            table=table[0],
-            # the order in which numpy sums follows the layout that this mixed indexing yields; so does the last bit
-            ap=_nanmean(table[np.zeros((1, 1), int), :, columns[None, :]]),
-            ap50=_nanmean(table[0, :, at_50]),
-            ap25=_nanmean(table[0, :, at_25]),
-        )
-        for table in areas.reshape(-1, 1, n_classes, n_thresholds)
-    ]
+    return InstanceAP(
+        thresholds=tuple(thresholds),
+        table=table,
+        # the order in which numpy sums follows the layout that this mixed indexing yields; so does the last bit
+        ap=_nanmean(table[None][np.zeros((1, 1), int), :, columns[None, :]]),
+        ap50=_nanmean(table[:, at_50]),
+        ap25=_nanmean(table[:, at_25]),
+    )
 
 
 def _check_predictions(
