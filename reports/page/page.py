@@ -18,6 +18,7 @@ SCRIPTS = (  # in the order in which they run
     "scripts/sections.js",
     "scripts/paint.js",
     "scripts/scene.js",
+    "scripts/gallery.js",
     "scripts/errors.js",
     "scripts/timing.js",
     "scripts/compare.js",
@@ -27,8 +28,14 @@ STYLE = "page.css"
 TEMPLATE = "page.html.j2"
 
 
-def page_html(title: str, numbers: Mapping[str, Any], scenes: Sequence[Mapping[str, Any]], maps: Sequence[str]) -> str:
-    """The page. ``numbers`` and ``scenes`` are plain values; ``maps`` are in base64, in the order of ``numbers``."""
+def page_html(
+    title: str,
+    numbers: Mapping[str, Any],
+    scenes: Sequence[Mapping[str, Any]],
+    maps: Sequence[str],
+    galleries: Sequence[Mapping[str, Any]] = (),
+) -> str:
+    """The page. All but ``maps`` are plain values; those are in base64, in the order of ``numbers``."""
     script = "(() => {\n'use strict';\n" + "\n".join(_file(HERE / name) for name in SCRIPTS) + "\n})();\n"
     return rendered(
         HERE,
@@ -37,6 +44,7 @@ def page_html(title: str, numbers: Mapping[str, Any], scenes: Sequence[Mapping[s
         data=embedded_json(numbers),
         scenes=[embedded_json(scene) for scene in scenes],
         maps=maps,
+        galleries=[embedded_json(gallery) for gallery in galleries],
     )
 
 

@@ -278,12 +278,13 @@ CAP_M = 0.05  # a pixel belongs to what owns the map point nearest to it within 
 class BestView:
     """``frame`` is the place in the list of frames, ``seen`` the share of the instance that it shows.
 
-    ``box`` (4,) are the columns and rows x0 y0 x1 y1 of what is seen, in pixels.
+    ``box`` (4,) are the columns and rows x0 y0 x1 y1 of what is seen, in pixels; views are ranked by ``score``.
     """
 
     frame: int
     seen: float
     box: Float64Array
+    score: float
 
 
 def best_view(frames: Sequence[Frame], points: Float32Array) -> BestView | None:
@@ -303,7 +304,7 @@ def best_view(frames: Sequence[Frame], points: Float32Array) -> BestView | None:
         share = float(is_seen.mean())
         score = share**1.5 * min(area / GOOD_AREA, 1.0) ** 0.5
         if score > best_score:
-            best, best_score = BestView(k, share, box), score
+            best, best_score = BestView(k, share, box, score), score
     return best
 
 

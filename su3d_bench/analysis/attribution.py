@@ -161,6 +161,12 @@ class Explained:
         others = [score.counts for name, score in scores.items() if name != scene]
         return looked_at.errors(self._rules(protocol), scores[scene].counts, others, most)
 
+    def instance_ids(self, scene: str) -> Sequence[int]:
+        """How the method numbers its instances; nothing where their places are their numbers."""
+        if self.run.data.truth_files is not None:
+            return ()
+        return getattr(self._inputs.of_map(scene), "ids", np.zeros(0, np.int64)).tolist()
+
     def headline(self, protocol: str) -> tuple[str, ...]:
         """The metrics in which errors under ``protocol`` are told."""
         return tuple(self._rules(protocol).headline)
@@ -192,13 +198,13 @@ class _Inputs:
     def __init__(self, run: FinishedRun, method: str) -> None:
         self._run, self._method = run, method
         self._files = FilesOfTruth(run)
-        self._map = lru_cache(maxsize=1)(self._read_map)
+        self.of_map = lru_cache(maxsize=1)(self._read_map)
 
     def of_scene(self, scene: str, rules: ProtocolRules, truth_of: TruthOf) -> tuple[GroundTruth, Prediction]:
         if self._run.data.truth_files is not None:
             truth = self._files.truth(scene, rules)
             return truth, self._files.prediction(scene, self._method, rules, len(truth.points))
-        return truth_of(rules.ground_truth), self._map(scene)
+        return truth_of(rules.ground_truth), self.of_map(scene)
 
     def _read_map(self, scene: str) -> Prediction:
         return read_prediction(self._run.folder.job(scene, self._method).prediction)

@@ -123,8 +123,8 @@ def test_an_error_is_told_by_its_masks_and_objects() -> None:
     named, missed = single_mask_errors(truth, overlaps, scored, pool)
     assert (named.kind, named.true, named.called, named.masks) == ("mislabelled", (first,), (second,), (0,))
     assert (named.score, named.iou) == (0.8, 0.9)
-    assert named.predicted.tolist() == list(range(90))
-    assert named.truth.tolist() == list(range(100))
+    assert named.predicted[0].tolist() == list(range(90))
+    assert named.truth[0].tolist() == list(range(100))
     assert (missed.kind, missed.true, missed.called, missed.masks) == ("missed", (second,), (), ())
     assert (missed.score, missed.iou, len(missed.predicted)) == (None, 0.0, 0)
     assert missed.gains["AP"] == pytest.approx(0.375)  # its class: recall 1, (1 + precision 1/2) / 2
@@ -155,11 +155,12 @@ def test_the_gain_of_mended_points_is_that_of_the_whole_evaluation(aggregate: st
         cause = causes_of(scenes[0])
         n_told = 0
         for error in found:
-            n_told += len(error.predicted)
-            assert len({*cause[error.predicted]}) == 1
-            assert set(scenes[0].object_id[error.predicted]) == set(scenes[0].object_id[error.truth])
+            (wrong,), (thing,) = error.predicted, error.truth
+            n_told += len(wrong)
+            assert len({*cause[wrong]}) == 1
+            assert set(scenes[0].object_id[wrong]) == set(scenes[0].object_id[thing])
             called = scenes[0].predicted.copy()
-            called[error.predicted] = error.true[0]
+            called[wrong] = error.true[0]
             mended = semantic.per_scene(scenes[0].true_class, called, is_counted)
             after = metric.reported([mended, *counts[1:]])
             gain = {name: after[name] - before[name] for name in rules.headline}

@@ -28,6 +28,8 @@ function confusionSection() {
   });
 }
 
+const wishOf = ({ protocol, run, method }, name, called) => ({ protocol, run, method, name, called });
+
 function confusionTables(one, most) {
   const total = new Map(), cells = new Map();
   for (const [truth, called, n] of one.cells) {
@@ -41,7 +43,9 @@ function confusionTables(one, most) {
     const n = cells.get(`${truth},${called}`) || 0, share = n / total.get(truth);
     const title = `${label(truth)} called ${label(called)}: ${percent(share)} %, ${countText(n)} points`;
     const text = share >= 0.005 ? (100 * share).toFixed(0) : '';
-    const cell = h('td', { class: truth === called ? 'same' : null, title }, text);
+    const wish = wishOf(one, label(truth), label(called));
+    const content = truth === called || !n ? text : toGallery(text, wish, `${title}; the worst errors of this kind`);
+    const cell = h('td', { class: truth === called ? 'same' : null, title }, content);
     if (share > 0) cell.style.backgroundColor = `rgba(var(--heat), ${(0.06 + 0.84 * share).toFixed(3)})`;
     if (share > 0.6) cell.style.color = 'var(--on-accent)';
     return cell;
@@ -53,14 +57,16 @@ function confusionTables(one, most) {
     h('tbody', null, shown.map((truth) => h('tr', null, h('th', { scope: 'row' }, label(truth)),
       columns.map((called) => cellOf(truth, called))))));
   const wrong = one.cells.filter(([truth, called]) => truth !== called)
-    .map(([truth, called, n]) => ({ truth: label(truth), called: label(called), n, share: n / total.get(truth) }))
+    .map(([truth, called, n]) => ({ truth: label(truth), called: label(called), n, share: n / total.get(truth),
+      wish: wishOf(one, label(truth), label(called)) }))
     .sort((a, b) => b.n - a.n);
   return [
     h('div', { class: 'wide', tabindex: '0', role: 'region', 'aria-label': 'Confusion matrix' }, table),
     h('h3', null, 'Largest confusions'),
     dataTable({ caption: 'True class, what it is called instead, and how many points', rows: wrong,
       filter: 'classes', tall: wrong.length > 10, most: MOST_PAIRS,
-      columns: [{ label: 'True class', value: (row) => row.truth }, { label: 'Called', value: (row) => row.called },
+      columns: [{ label: 'True class', value: (row) => row.truth, show: (row) => toGallery(row.truth, row.wish,
+        `The worst errors: ${row.truth} called ${row.called}`) }, { label: 'Called', value: (row) => row.called },
         { label: 'Points', num: true, value: (row) => row.n, show: (row) => countText(row.n) },
         { label: 'Of the class', num: true, value: (row) => row.share, show: (row) => `${percent(row.share)} %` }] }),
   ];
@@ -128,7 +134,9 @@ function errorsTable(all, protocol, name) {
     all.map((one) => h('td', { class: 'num' }, cell(one))));
   const costOf = (one, cause) => {
     const { gains, n } = one.causes[cause];
-    return [signed(gains[name]), bar(gains[name]), h('br'), h('small', null, amount(one, n))];
+    const wish = { protocol, run: one.run, method: one.method, kind: cause, metric: name };
+    const cost = [signed(gains[name]), bar(gains[name])];
+    return [toGallery(cost, wish, `The worst errors: ${cause}, ${nameOf(one)}`), h('br'), h('small', null, amount(one, n))];
   };
   const stages = [...new Set(all.flatMap((one) => Object.keys(one.stages)))];
   return h('table', null,

@@ -62,8 +62,8 @@ function makeInTime() {
 
 headFacts();
 for (const make of [
-  summarySection, mapsSection, scenesSection, classesSection, confusionSection, errorsSection, timingSection,
-  compareSection, provenanceSection,
+  summarySection, mapsSection, scenesSection, classesSection, confusionSection, errorsSection, gallerySection,
+  timingSection, compareSection, provenanceSection,
 ]) make();
 makeInTime();
 followSections();

@@ -265,7 +265,8 @@ function matrixTable(protocol, name, all, head, valuesOf) {
   return dataTable({
     caption: `${protocol}: ${name} in per cent${partial}${marked}`,
     rows, filter: ofScenes ? 'scenes' : 'classes', tall: rows.length > 14,
-    columns: [{ label: head, value: (row) => row.key }, ...all.map((one) => ({
+    columns: [{ label: head, value: (row) => row.key, show: (row) => toGallery(row.key,
+      { protocol, [ofScenes ? 'scene' : 'name']: row.key, metric: name }, `The worst errors of ${row.key}`) }, ...all.map((one) => ({
       label: nameOf(one), num: true, value: (row) => at(one, row.key),
       show: (row) => metricText(name, at(one, row.key)),
       best: (row) => row.best !== null && competes(one) && at(one, row.key) === row.best }))],

@@ -8,13 +8,14 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
 from su3d_bench.analysis.attribution import Explained, MendedJob, explained_of
 from su3d_bench.analysis.page.errors import errors_of, packed, unpacked
-from su3d_bench.analysis.page.kept import Piece, piece, state_of_job, state_of_run
+from su3d_bench.analysis.page.gallery import GalleryOfScene, SceneGallery, photos_of_each
+from su3d_bench.analysis.page.kept import Piece, piece, state_of_counts, state_of_job, state_of_run
 from su3d_bench.analysis.page.maps import MapOfRun, PageMap, PageScene, SharedTruths, Spaces, page_scene, points_of_each
 from su3d_bench.analysis.page.numbers import are_all_read, is_scored, page_numbers, scored_maps
 from su3d_bench.core.errors import DataError, Su3dError, printable
@@ -32,14 +33,17 @@ QUERIES = (
     "a place to store things",
     "something to eat or drink from",
 )
+Kept = TypeVar("Kept")
 Job = tuple[int, str]  # index of the run, method
 _SCENES: TypeAdapter[PageScene] = TypeAdapter(PageScene)
+_GALLERIES: TypeAdapter[SceneGallery] = TypeAdapter(SceneGallery)
 
 
 @dataclass(frozen=True)
 class Wishes:
     """What a page shall hold: ``queries`` are texts that instances are compared with; ``most_bytes`` is about its size.
 
+    There is a gallery of single errors only where errors are explained at all.
     ``jobs`` scenes are made side by side, 0: as many as there are cores.
     """
 
@@ -47,6 +51,7 @@ class Wishes:
     most_bytes: int = 30_000_000
     with_maps: bool = True
     with_errors: bool = True
+    with_gallery: bool = True
     jobs: int = 0
 
 
@@ -61,10 +66,11 @@ class Amount:
 
 @dataclass(frozen=True)
 class Contents:
-    """Plain ``numbers``, and the ``scenes`` with their maps, none of more than ``most_points``."""
+    """Plain ``numbers``, the ``scenes`` with their maps, none of more than ``most_points``, and their ``galleries``."""
 
     numbers: Mapping[str, Any]
     scenes: tuple[PageScene, ...]
+    galleries: tuple[SceneGallery, ...]
     most_points: int
 
     @property
@@ -74,16 +80,24 @@ class Contents:
 
 @dataclass(frozen=True)
 class Asked:
-    """What is needed of one scene and was not kept: the ``errors`` of some jobs, and the scene with its ``maps``."""
+    """What is needed of one scene and was not kept: the ``errors`` of some jobs, the scene with its ``maps``, and the
+    gallery of the errors of the jobs in ``shown``."""
 
     scene: str
-    errors: tuple[tuple[Job, Piece], ...]
+    errors: Mapping[Job, Piece]
     maps: tuple[Job, ...]
     page: Piece | None
+    shown: tuple[Job, ...]
+    gallery: Piece | None
+
+    @property
+    def explained(self) -> list[Job]:
+        """The jobs whose errors are looked at."""
+        return list(dict.fromkeys([*self.errors, *self.shown]))
 
     @property
     def n_steps(self) -> int:
-        return len(self.errors) + len(self.maps)
+        return len(self.explained) + len(self.maps) + bool(self.shown)
 
 
 @dataclass
@@ -93,6 +107,7 @@ class Made:
     scene: str
     errors: dict[Job, MendedJob | str] = field(default_factory=dict)
     page: PageScene | None = None
+    gallery: SceneGallery | None = None
 
 
 @dataclass(frozen=True)
@@ -102,6 +117,7 @@ class Batch:
     folders: tuple[Path, ...]
     queries: tuple[str, ...]
     most_points: int
+    most_photos: int
     scenes: tuple[Asked, ...]
 
 
@@ -122,11 +138,14 @@ def page_contents(
     maps = scored_maps(runs) if wishes.with_maps else []
     most_points = points_of_each(len(maps), wishes.most_bytes)
     explained = _explained(runs) if wishes.with_errors and are_all_read(runs) else {}
-    made, asked = _kept(runs, maps, [job for job, one in explained.items() if isinstance(one, Explained)], wishes)
+    told = [job for job, one in explained.items() if isinstance(one, Explained)]
+    most_photos = photos_of_each(len({scene for index, _ in told for scene in runs[index].scenes}), len(told))
+    made, asked = _kept(runs, maps, told, wishes, most_photos)
     begin(Amount(len(asked), sum(one.n_steps for one in asked), len(made) - len(asked)))
-    for fresh in _all_made(Batch(folders, wishes.queries, most_points, tuple(asked)), wishes.jobs, report):
+    for fresh in _all_made(Batch(folders, wishes.queries, most_points, most_photos, tuple(asked)), wishes.jobs, report):
         made[fresh.scene].errors.update(fresh.errors)
         made[fresh.scene].page = made[fresh.scene].page or fresh.page
+        made[fresh.scene].gallery = made[fresh.scene].gallery or fresh.gallery
     errors = []
     for (index, method), one in explained.items():
         of_scenes = {
@@ -136,7 +155,9 @@ def page_contents(
         }
         errors.append({"run": index, **errors_of(one, method, of_scenes)})
     pages = {scene: made[scene].page for scene in dict.fromkeys(scene for _, _, scene, _ in maps)}
-    return Contents(page_numbers(runs, errors), tuple(page for page in pages.values() if page is not None), most_points)
+    galleries = tuple(one.gallery for one in made.values() if one.gallery is not None and one.gallery.of_methods)
+    shown = tuple(page for page in pages.values() if page is not None)
+    return Contents(page_numbers(runs, errors), shown, galleries, most_points)
 
 
 def _explained(runs: Sequence[FinishedRun]) -> dict[Job, Explained | str]:
@@ -152,7 +173,11 @@ def _explained(runs: Sequence[FinishedRun]) -> dict[Job, Explained | str]:
 
 
 def _kept(
-    runs: Sequence[FinishedRun], maps: Sequence[MapOfRun], explained: Sequence[Job], wishes: Wishes
+    runs: Sequence[FinishedRun],
+    maps: Sequence[MapOfRun],
+    explained: Sequence[Job],
+    wishes: Wishes,
+    most_photos: int,
 ) -> tuple[dict[str, Made], list[Asked]]:
     """What was made of the scenes before, and what is yet to be made."""
     most_points = points_of_each(len(maps), wishes.most_bytes)
@@ -178,11 +203,19 @@ def _kept(
         if of_maps:
             made_from = [[[*job, state(job)] for job in of_maps], list(wishes.queries), most_points]
             place_of_page = piece(runs[of_maps[0][0]], ("maps", scene), made_from)
-            made[scene].page = _read(place_of_page)
-        to_make = tuple((job, place) for job, place in places.items() if job not in made[scene].errors)
-        is_whole = made[scene].page is not None
-        if to_make or (of_maps and not is_whole):
-            asked.append(Asked(scene, to_make, () if is_whole else tuple(of_maps), place_of_page))
+            made[scene].page = _read(_SCENES, place_of_page)
+        told = tuple(places) if wishes.with_gallery else ()
+        place_of_gallery = None
+        if told:
+            # what an error costs depends on the counts of every scene
+            counts = [[*job, state(job), state_of_counts(runs[job[0]], job[1])] for job in told]
+            place_of_gallery = piece(runs[told[0][0]], ("gallery", scene), [counts, most_photos])
+            made[scene].gallery = _read(_GALLERIES, place_of_gallery)
+        to_make = {job: place for job, place in places.items() if job not in made[scene].errors}
+        to_draw = () if made[scene].page is not None else tuple(of_maps)
+        to_show = () if made[scene].gallery is not None else told
+        if to_make or to_draw or to_show:
+            asked.append(Asked(scene, to_make, to_draw, place_of_page, to_show, place_of_gallery))
     return made, asked
 
 
@@ -191,10 +224,10 @@ def _state(runs: Sequence[FinishedRun], scene: str, job: Job) -> list[Any]:
     return [state_of_run(runs[index], scene), state_of_job(runs[index], scene, method)]
 
 
-def _read(place: Piece) -> PageScene | None:
+def _read(form: TypeAdapter[Kept], place: Piece) -> Kept | None:
     content = place.load()
     with suppress(ValidationError):
-        return None if content is None else _SCENES.validate_json(content)
+        return None if content is None else form.validate_json(content)
     return None
 
 
@@ -219,7 +252,7 @@ def _make(batch: Batch, report: Report) -> list[Made]:
     runs = [read_run(folder) for folder in batch.folders]
     spaces = Spaces(batch.queries)
     explained = cache(lambda index, method: explained_of(runs[index], method))
-    return [_make_scene(asked, runs, spaces, explained, batch.most_points, report) for asked in batch.scenes]
+    return [_make_scene(asked, runs, spaces, explained, batch, report) for asked in batch.scenes]
 
 
 def _make_scene(
@@ -227,7 +260,7 @@ def _make_scene(
     runs: Sequence[FinishedRun],
     spaces: Spaces,
     explained: Callable[[int, str], Explained],
-    most_points: int,
+    batch: Batch,
     report: Report,
 ) -> Made:
     made, truths, n_done = Made(asked.scene), SharedTruths(asked.scene), 0
@@ -237,22 +270,38 @@ def _make_scene(
         report(Event(asked.scene, doing, n_done, asked.n_steps))
         n_done += 1
 
-    for (index, method), place in asked.errors:
+    gallery = GalleryOfScene(asked.scene, batch.most_photos)
+    for index, method in asked.explained:
         tell(f"errors of {printable(method, 60)}")
-        run = runs[index]
+        run, of_job = runs[index], explained(index, method)
         try:
-            mended = explained(index, method).mend(
-                asked.scene, partial(truths.of_run, run), partial(spaces.encoder, run)
-            )
+            looked_at = of_job.look_at(asked.scene, partial(truths.of_run, run), partial(spaces.encoder, run))
+            if (index, method) in asked.errors:
+                mended = of_job.mended(asked.scene, looked_at)
+                made.errors[index, method] = mended
+                asked.errors[index, method].save(packed(mended, run.rules))
+            if (index, method) in asked.shown:
+                gallery.add(index, of_job, looked_at)
         except Su3dError as error:
             made.errors[index, method] = str(error)
-            continue
-        made.errors[index, method] = mended
-        place.save(packed(mended, run.rules))
+            gallery.lack()
+    if asked.shown:
+        tell("photos of errors")
+        made.gallery = gallery.finish(_dataset_of(runs[asked.shown[0][0]], asked.scene))
+        if asked.gallery is not None and made.gallery.is_whole:
+            asked.gallery.save(_GALLERIES.dump_json(made.gallery))
     if asked.maps:
         maps = [(index, runs[index], asked.scene, method) for index, method in asked.maps]
-        made.page = page_scene(asked.scene, maps, spaces, truths, most_points, tell)
+        made.page = page_scene(asked.scene, maps, spaces, truths, batch.most_points, tell)
         if asked.page is not None and made.page.is_whole:
             asked.page.save(_SCENES.dump_json(made.page))
     report(Event(asked.scene, SCENE_DONE, asked.n_steps, asked.n_steps))
     return made
+
+
+def _dataset_of(run: FinishedRun, scene: str) -> Any:
+    """The dataset of a run, or why it cannot be had."""
+    try:
+        return run.dataset(scene)
+    except Su3dError as error:
+        return str(error)

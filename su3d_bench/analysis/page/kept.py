@@ -106,6 +106,11 @@ def state_of_job(run: FinishedRun, scene: str, method: str) -> Mapping[str, str 
     return {file.name: _digest(file) for file in files}
 
 
+def state_of_counts(run: FinishedRun, method: str) -> list[str | None]:
+    """The digests of what a method counted in every scene."""
+    return [_digest(run.folder.job(scene, method).counts) for scene in run.scenes]
+
+
 def _digest(file: Path) -> str | None:
     with suppress(OSError):
         return digest_file(file)

@@ -40,7 +40,10 @@ def add_parser(actions: Any) -> None:
         "--queries", nargs="+", metavar="TEXT", help="texts to which instances are compared (default: eight)"
     )
     parser.add_argument("--no-maps", action="store_true", help="leave the maps out")
-    parser.add_argument("--no-errors", action="store_true", help="leave out what each kind of error costs (quicker)")
+    parser.add_argument(
+        "--no-errors", action="store_true", help="leave out what errors cost, and their gallery (quicker)"
+    )
+    parser.add_argument("--no-gallery", action="store_true", help="leave out the single errors and their photos")
     parser.add_argument(
         "--most-megabytes", type=float, default=30.0, metavar="MB", help="maps are thinned for it (default: 30)"
     )
@@ -51,6 +54,7 @@ def add_parser(actions: Any) -> None:
 
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.analysis.page.contents import QUERIES, Wishes, page_contents
+    from su3d_bench.analysis.page.gallery import told_of
     from su3d_bench.reports.page.page import page_html
 
     if not 0 < arguments.most_megabytes <= 1000:
@@ -62,6 +66,7 @@ def call(arguments: argparse.Namespace) -> int:
         most_bytes=round(arguments.most_megabytes * MEGABYTE),
         with_maps=not arguments.no_maps,
         with_errors=not arguments.no_errors,
+        with_gallery=not (arguments.no_gallery or arguments.no_errors),
         jobs=arguments.jobs,
     )
     arguments.takes_up = all(os.access(run, os.W_OK) for run in arguments.runs)  # else nothing is kept
@@ -72,9 +77,14 @@ def call(arguments: argparse.Namespace) -> int:
     maps = contents.maps
     page = page_html(
         printable(title, 200),
-        {**contents.numbers, "maps": [page_map.listed() for page_map in maps]},
+        {
+            **contents.numbers,
+            "maps": [page_map.listed() for page_map in maps],
+            "gallery": told_of(contents.galleries),
+        },
         [scene.listed() for scene in contents.scenes],
         [page_map.content for page_map in maps],
+        [gallery.to_json() for gallery in contents.galleries],
     )
     written(arguments.out, page)
     n_bytes = len(page.encode())

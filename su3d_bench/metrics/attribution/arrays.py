@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -32,7 +32,6 @@ from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.instance.score import InstanceMetric, masks_on_truth
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import class_index_of_ids
-from su3d_bench.metrics.metric import Counts
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic import confusion
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
@@ -113,10 +112,10 @@ class LookedAt(Protocol):
 
     def mended(self) -> MendedScene: ...
 
-    def errors(self, rules: ProtocolRules, counts: Counts, others: Sequence[Counts], most: int) -> Errors:
+    def errors(self, rules: ProtocolRules, counts: Any, others: Sequence[Any], most: int) -> Errors:
         """How many errors the scene has, and the ``most`` that cost most, the dearest first.
 
-        ``counts`` are its own as they are, ``others`` those of the other scenes.
+        ``counts`` of the protocol's kind are its own as they are, ``others`` those of the other scenes.
         """
         ...
 
@@ -128,7 +127,7 @@ class _SceneOfMasks:
         self, rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
     ) -> None:
         assert not isinstance(prediction, DenseFeatures)
-        self.points = truth.points
+        self.points: transfer.Points = truth.points
         self._values, self._masks, self._scoring = scored_masks(rules, truth, prediction, encoder)
         self._has_classes = rules.class_agnostic is None
         self._names = {entry.id: entry.name for entry in rules.classes}
@@ -144,7 +143,7 @@ class _SceneOfMasks:
         relabelled = instances.with_true_labels(self._overlaps)
         return replace(mended, with_true_labels=instances.count_masks(self._values, relabelled, self._scoring))
 
-    def errors(self, rules: ProtocolRules, counts: Counts, others: Sequence[Counts], most: int) -> Errors:
+    def errors(self, rules: ProtocolRules, counts: Any, others: Sequence[Any], most: int) -> Errors:
         pool = Pool[InstanceCounts](InstanceMetric(rules), counts, others, instance_ap.concatenate)
         found = single_mask_errors(self._values, self._overlaps, self._scoring, pool)
         first = rules.headline[0]
@@ -159,14 +158,14 @@ class _SceneOfPoints:
         self, rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
     ) -> None:
         self._scored = scored_points(rules, truth, prediction, encoder)
-        self.points = self._scored.positions
+        self.points: transfer.Points = self._scored.positions
         self._names = [entry.name for entry in rules.classes]
 
     def mended(self) -> MendedScene:
         scored = self._scored
         return semantic.mend_points(scored.points, scored.is_counted, has_masks=scored.has_masks)
 
-    def errors(self, rules: ProtocolRules, counts: Counts, others: Sequence[Counts], most: int) -> Errors:
+    def errors(self, rules: ProtocolRules, counts: Any, others: Sequence[Any], most: int) -> Errors:
         scored = self._scored
         pool = Pool[SemanticCounts](SemanticMetric(rules), counts, others, confusion.concatenate)
         return single_point_errors(scored.points, scored.is_counted, pool, has_masks=scored.has_masks, most=most)

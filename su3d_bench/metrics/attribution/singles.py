@@ -11,9 +11,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Generic
+from typing import Any, Generic
 
 import numpy as np
+from numpy.typing import NDArray
 
 from su3d_bench.core.types import BoolArray, Int64Array
 from su3d_bench.metrics.attribution.masks import MaskError, find_errors, repaired
@@ -24,14 +25,17 @@ from su3d_bench.metrics.instance.average_precision import InstanceCounts, Listed
 from su3d_bench.metrics.metric import C, Metric, Values
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
 
+IntArray = NDArray[np.integer[Any]]
+
+
 @dataclass(frozen=True)
 class SingleError:
     """An error with its ``gains`` in the headline metrics, as fractions.
 
     ``true`` and ``called`` are class ids of masks and class indices of points, each once, the first the one that the
     error is told by; ``masks`` are rows of the prediction. ``score`` is the confidence of the first mask, ``iou`` that
-    of mask and instance, or the highest where one of them is wanting; both are None of points. ``predicted`` and
-    ``truth`` are the points of the masks, or the wrong ones, and those of the instances.
+    of mask and instance, or the highest where one of them is wanting; both are None of points. ``predicted`` are the
+    points of each mask, or the wrong ones, ``truth`` those of each instance.
     """
 
     kind: str
@@ -41,16 +45,14 @@ class SingleError:
     score: float | None
     iou: float | None
     gains: Values
-    predicted: Int64Array
-    truth: Int64Array
+    predicted: tuple[IntArray, ...]
+    truth: tuple[IntArray, ...]
 
 
 class Pool(Generic[C]):
     """The counts of all scenes under a protocol, of which those of one scene are to change."""
 
-    def __init__(
-        self, metric: Metric[C], mine: C, others: Sequence[C], summed: Callable[[Sequence[C]], C]
-    ) -> None:
+    def __init__(self, metric: Metric[C], mine: C, others: Sequence[C], summed: Callable[[Sequence[C]], C]) -> None:
         self.metric, self.mine, self._sum = metric, mine, summed
         self.is_pooled = metric.rules.aggregate == "pooled"
         self._others = others
@@ -140,7 +142,7 @@ class _MendedClasses:
             )
         return answer
 
-    def _shared_by(self, points: np.ndarray) -> Int64Array:
+    def _shared_by(self, points: IntArray) -> Int64Array:
         return np.bincount(self._segment_of_point[points], minlength=len(self._value)).astype(np.int64)
 
 
@@ -172,8 +174,8 @@ def _told(error: MaskError, overlaps: Overlaps, gains: Values) -> SingleError:
     score = None if first is None else float(predicted.scores[first])
     # a split object is told by all its parts, a repeated one by the mask that repeats
     shown = error.masks if error.kind == "split" else error.masks[:1]
-    of_masks = _union([predicted.masks.mask(k) for k in shown])
-    of_truth = _union([overlaps.members[g] for g in error.instances])
+    of_masks = tuple(predicted.masks.mask(k) for k in shown)
+    of_truth = tuple(overlaps.members[g] for g in error.instances)
     if first is not None:
         iou = float(overlaps.iou[first, error.instances[0]] if error.instances else overlaps.iou[first].max(initial=0))
     else:
@@ -181,10 +183,6 @@ def _told(error: MaskError, overlaps: Overlaps, gains: Values) -> SingleError:
     true = dict.fromkeys(int(overlaps.class_of_instance[g]) for g in error.instances)
     called = dict.fromkeys(int(predicted.class_ids[k]) for k in shown)
     return SingleError(error.kind, tuple(true), tuple(called), shown, score, iou, gains, of_masks, of_truth)
-
-
-def _union(sets: Sequence[np.ndarray]) -> Int64Array:
-    return np.unique(np.concatenate([np.zeros(0, np.int64), *sets])).astype(np.int64)
 
 
 def single_point_errors(
@@ -206,7 +204,7 @@ def single_point_errors(
         gains.append(pool.gains(pool.values(SemanticCounts(confusion, pool.mine.is_present))))
     headline = pool.metric.rules.headline
     first = np.array([gain[headline[0]] for gain in gains])
-    order = np.lexsort((np.arange(len(groups)), -n_points, -first))[:most] if len(groups) else []
+    order = np.lexsort((np.arange(len(groups)), -n_points, -first))[:most].tolist()
     answer = []
     for k in order:
         object_id, true, kind, called = groups[k].tolist()
@@ -221,8 +219,8 @@ def single_point_errors(
                 score=None,
                 iou=None,
                 gains=gains[k],
-                predicted=predicted.astype(np.int64),
-                truth=truth.astype(np.int64),
+                predicted=(predicted,),
+                truth=(truth,),
             )
         )
     return len(groups), answer

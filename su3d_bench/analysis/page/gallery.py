@@ -1,0 +1,254 @@
+"""The gallery of a page: of each scene the errors that cost most, with photos of the worst ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.analysis.attribution import Explained
+from su3d_bench.core.errors import Su3dError, printable
+from su3d_bench.core.interfaces import HasSketches
+from su3d_bench.core.types import Float32Array, Frame
+from su3d_bench.metrics.attribution.arrays import LookedAt
+from su3d_bench.metrics.attribution.singles import SingleError
+from su3d_bench.metrics.matching.nearest import Points
+from su3d_bench.reports.page.maps import frame_cover
+from su3d_bench.reports.page.photos import SeenError, error_photo, photo_text
+from su3d_bench.reports.pictures.items import best_view
+from su3d_bench.reports.pictures.scene_look import spread
+
+MOST_ERRORS = 40  # of a scene under a method and a protocol that are told one by one
+MOST_PHOTOS = 64  # of a page, dealt out to its scenes, each of which has at least one for every method
+CANDIDATES = 24  # frames of a scene in which objects are looked for
+MOST_FRAMES = 6  # of a scene from which photos are taken
+AS_GOOD = 0.7  # of the best view of an object: a frame that several share is taken for it
+SKETCH_WIDTH, SHOWN_WIDTH = 160, 320  # of a frame to find a view in, and of one for photos: where that saves time
+MOST_NAMES, MOST_TEXT = 6, 60  # classes that a card names, characters of a name
+NOT_AMONG = "only the worst errors of a scene have one"
+
+
+@dataclass(frozen=True)
+class Card:
+    """One error. ``gains``: by how much each metric rises when it alone is put right, as fractions, None for no number.
+
+    ``true`` and ``called`` are names of classes, ``ids`` the instances as the method numbers them, ``n_points`` and
+    ``n_true`` points of the masks, or wrong ones, and of the true object. ``photo`` is a place in the scene's photos
+    and ``frame`` what it was taken from; ``why`` says why there is none.
+    """
+
+    kind: str
+    true: tuple[str, ...]
+    called: tuple[str, ...]
+    ids: tuple[int, ...]
+    score: float | None
+    iou: float | None
+    n_points: int
+    n_true: int
+    gains: tuple[float | None, ...]
+    photo: int | None = None
+    frame: int | None = None
+    why: str | None = NOT_AMONG
+
+
+@dataclass(frozen=True)
+class Cards:
+    """The ``n`` errors of a scene under a method and a protocol; ``cards`` are the dearest, those that are told."""
+
+    run: int
+    method: str
+    protocol: str
+    kind: str
+    metrics: tuple[str, ...]
+    n: int
+    cards: tuple[Card, ...]
+
+
+@dataclass(frozen=True)
+class SceneGallery:
+    """The errors of one scene; ``photos`` are JPEGs in base64."""
+
+    scene: str
+    of_methods: tuple[Cards, ...]
+    photos: tuple[str, ...]
+    is_whole: bool
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values for a page."""
+        values = asdict(self)
+        del values["is_whole"]
+        return values
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """Where the card of an error stands, and what is to be seen."""
+
+    of: int
+    card: int
+    seen: SeenError
+
+
+def told_of(galleries: Sequence[SceneGallery]) -> list[dict[str, Any]]:
+    """What the galleries hold by method and protocol: how many errors of each scene, which classes, kinds and pairs."""
+    told: dict[tuple[int, str, str], dict[str, Any]] = {}
+    for gallery in galleries:
+        for one in gallery.of_methods:
+            about = {"run": one.run, "method": one.method, "protocol": one.protocol}
+            empty: dict[str, Any] = {"scenes": [], "n": [], "told": [], "kinds": {}, "classes": {}, "pairs": {}}
+            of = told.setdefault((one.run, one.method, one.protocol), about | empty)
+            if one.cards:
+                of["scenes"].append(gallery.scene)
+                of["n"].append(one.n)
+                of["told"].append(len(one.cards))
+            for card in one.cards:
+                of["kinds"][card.kind] = None
+                of["classes"] |= dict.fromkeys((*card.true, *card.called))
+                of["pairs"] |= dict.fromkeys((true, called) for true in card.true for called in card.called)
+    lists = ("kinds", "classes", "pairs")
+    return [{name: list(value) if name in lists else value for name, value in one.items()} for one in told.values()]
+
+
+def photos_of_each(n_scenes: int, n_methods: int) -> int:
+    """How many photos each of some scenes has on a page of so many methods.
+
+    >>> photos_of_each(4, 2), photos_of_each(20, 8)
+    (16, 8)
+    """
+    return max(n_methods, MOST_PHOTOS // max(1, n_scenes))
+
+
+class GalleryOfScene:
+    """Gathers the errors of a scene, method after method, and takes the photos when all are there."""
+
+    def __init__(self, scene: str, most_photos: int) -> None:
+        self._scene, self._most_photos = scene, most_photos
+        self._cards: list[Cards] = []
+        self._shown: list[list[_Shown]] = []
+        self._lacks = False
+
+    def add(self, index: int, explained: Explained, looked_at: Mapping[str, LookedAt]) -> None:
+        """The errors of the method of ``explained``, which is one of run ``index``, under each protocol."""
+        for protocol, scene in looked_at.items():
+            n, errors = explained.errors(self._scene, protocol, scene, MOST_ERRORS)
+            metrics = explained.headline(protocol)
+            ids = explained.instance_ids(self._scene)
+            cards = tuple(_card(error, scene, metrics, ids) for error in errors)
+            kind = explained.run.rules(protocol).kind
+            of = len(self._cards)
+            self._cards.append(Cards(index, printable(explained.method, 200), protocol, kind, metrics, n, cards))
+            points = scene.points
+            self._shown.append(
+                [
+                    _Shown(of, k, SeenError(_places(points, error.predicted), _places(points, error.truth)))
+                    for k, error in enumerate(errors[: self._most_photos])
+                ]
+            )
+
+    def lack(self) -> None:
+        """Say that a method's errors could not be had."""
+        self._lacks = True
+
+    def finish(self, dataset: Any) -> SceneGallery:
+        """The gallery with photos of the worst errors; ``dataset`` is a text where there is none, the reason."""
+        chosen = list(_in_turn(self._shown))[: self._most_photos]
+        cards = [list(one.cards) for one in self._cards]
+        photos: list[str] = []
+        photographer = _Photographer(dataset, self._scene)
+        taken = photographer.take([one.seen for one in chosen])
+        for shown, photo in zip(chosen, taken, strict=True):
+            card = cards[shown.of][shown.card]
+            if isinstance(photo, str):
+                cards[shown.of][shown.card] = replace(card, why=printable(photo, 200))
+            else:
+                cards[shown.of][shown.card] = replace(card, photo=len(photos), frame=photo[0], why=None)
+                photos.append(photo[1])
+        of_methods = tuple(replace(one, cards=tuple(own)) for one, own in zip(self._cards, cards, strict=True))
+        return SceneGallery(
+            printable(self._scene, 200), of_methods, tuple(photos), not (self._lacks or photographer.lacks)
+        )
+
+
+def _card(error: SingleError, scene: LookedAt, metrics: Sequence[str], ids: Sequence[int]) -> Card:
+    def names(classes: Sequence[int]) -> tuple[str, ...]:
+        return tuple(printable(scene.class_name(one), MOST_TEXT) for one in classes[:MOST_NAMES])
+
+    gains = (error.gains[name] for name in metrics)
+    return Card(
+        kind=error.kind,
+        true=names(error.true),
+        called=names(error.called),
+        ids=tuple(ids[k] if k < len(ids) else k for k in error.masks[:MOST_NAMES]),
+        score=None if error.score is None else round(error.score, 4),
+        iou=None if error.iou is None else round(error.iou, 3),
+        n_points=sum(map(len, error.predicted)),
+        n_true=sum(map(len, error.truth)),
+        gains=tuple(round(gain, 6) if np.isfinite(gain) else None for gain in gains),
+    )
+
+
+def _places(points: Points, sets: Sequence[NDArray[np.integer[Any]]]) -> tuple[Float32Array, ...]:
+    return tuple(points[one].astype(np.float32) for one in sets)
+
+
+def _in_turn(lists: Sequence[Sequence[_Shown]]) -> Iterator[_Shown]:
+    """The first of every list, then the second of every list, and so on."""
+    for k in range(max(map(len, lists), default=0)):
+        yield from (one[k] for one in lists if k < len(one))
+
+
+class _Photographer:
+    """Finds the frames of a scene in which things are seen best."""
+
+    def __init__(self, dataset: Any, scene: str) -> None:
+        self._dataset, self._name = dataset, scene.partition("/")[2]
+        self.lacks = isinstance(dataset, str)  # whether frames could not be had, which may be another time
+
+    def take(self, things: Sequence[SeenError]) -> list[tuple[int, str] | str]:
+        """Of each thing the index of a frame and its photo, or why there is none."""
+        if isinstance(self._dataset, str):
+            return [self._dataset] * len(things)
+        if not things:
+            return []
+        try:
+            return self._taken(things)
+        except Su3dError as error:
+            self.lacks = True
+            return [str(error)] * len(things)
+
+    def _taken(self, things: Sequence[SeenError]) -> list[tuple[int, str] | str]:
+        self._sequence: Sequence[Frame] = self._dataset.frames(self._name, 1)
+        places = sorted(spread(len(self._sequence), CANDIDATES))
+        looks = np.zeros((len(things), len(places)))
+        for column, place in enumerate(places):
+            frame = self._frame(place, SKETCH_WIDTH)
+            for row, thing in enumerate(things):
+                view = best_view([frame], thing.points)
+                looks[row, column] = 0.0 if view is None else view.score
+        good = [[places[k] for k in np.flatnonzero((row >= AS_GOOD * row.max()) & (row > 0))] for row in looks]
+        chosen = frame_cover(good, MOST_FRAMES)
+        frames = {place: self._frame(place, SHOWN_WIDTH) for place in chosen}
+        return [self._photo(thing, row, places, frames) for thing, row in zip(things, looks, strict=True)]
+
+    def _photo(
+        self,
+        thing: SeenError,
+        look: np.ndarray,
+        places: Sequence[int],
+        frames: Mapping[int, Frame],
+    ) -> tuple[int, str] | str:
+        for column in np.argsort(-look, kind="stable").tolist():
+            if look[column] > 0 and places[column] in frames:
+                frame = frames[places[column]]
+                photo = error_photo(frame, thing)
+                if photo is not None:
+                    return frame.index, photo_text(photo)
+        return "no frame that was looked at shows it"
+
+    def _frame(self, place: int, width: int) -> Frame:
+        if isinstance(self._dataset, HasSketches):
+            return self._dataset.sketch(self._name, place, width)
+        return self._sequence[place]
