@@ -76,14 +76,14 @@ def noting(made: list[str]) -> Callable[..., PageScene]:
 
 def nothing_is_made(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(contents, "page_scene", refuse)
-    patch.setattr(Explained, "mend", refuse)
+    patch.setattr(Explained, "look_at", refuse)
 
 
 def test_a_second_page_makes_nothing_and_has_the_same_bytes(
     run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     first = page()
-    assert len(pieces(run)) == 4  # of two scenes the map and the errors of one job
+    assert len(pieces(run)) == 6  # of two scenes the map, the errors of one job and the gallery
     assert "painted/b: 2 of 2 scenes" in capsys.readouterr().err
     nothing_is_made(monkeypatch)
     assert page() == first
@@ -196,7 +196,7 @@ def test_processes_side_by_side_give_the_same_bytes(run: Path) -> None:
     command = [sys.executable, str(SCENES / "painted_cli.py"), "report", "html", "run", "--out", "two.html"]
     subprocess.run([*command, "--jobs", "2", *WORDS], check=True, timeout=300)
     assert Path("two.html").read_bytes() == first
-    assert len(pieces(run)) == 4
+    assert len(pieces(run)) == 6
 
 
 def test_counts_come_back_as_they_went(run: Path) -> None:

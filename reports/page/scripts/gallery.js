@@ -46,7 +46,8 @@ function galleryContent(section) {
   const back = h('button', { type: 'button', class: 'plain', hidden: true }, 'Back');
   const clear = h('button', { type: 'button', class: 'plain', onclick: () => { choose({}); draw(); } }, 'Show all');
   const status = h('p', { class: 'count', role: 'status' }), cards = h('ul', { class: 'cards' });
-  const more = h('button', { type: 'button', class: 'plain', onclick: () => { n += CARDS_AT_ONCE; draw(n); } });
+  const more = h('button', { type: 'button', class: 'plain', onclick: () => draw(n + CARDS_AT_ONCE) },
+    'Show more');
   section.append(h('div', { class: 'toolbar' }, back, protocols, metric, Object.values(fields), clear),
     h('ul', { class: 'key' }, h('li', null, h('i', { class: 'sign area' }), 'what the method says'),
       h('li', null, h('i', { class: 'sign line' }), 'what is there')), status, cards, more);
@@ -96,7 +97,6 @@ function galleryContent(section) {
       + (told < there ? `; the ${told} dearest of ${there} stand here one by one` : '');
     cards.replaceChildren(...shown.map((one) => cardOf(one, metric.input.value, photos.get(one.scene))));
     more.hidden = shown.length === found.length;
-    more.textContent = `Show ${Math.min(CARDS_AT_ONCE, found.length - shown.length)} more`;
   }
   section.show = async (wish, from) => {
     const origin = from.closest('section.part'), key = from.dataset.to;

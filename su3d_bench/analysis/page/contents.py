@@ -153,7 +153,7 @@ def page_contents(
             for scene in runs[index].scenes
             if scene in made and (index, method) in made[scene].errors
         }
-        errors.append({"run": index, **errors_of(one, method, of_scenes)})
+        errors.append({**errors_of(one, method, of_scenes), "run": index})  # which has the name of the run
     pages = {scene: made[scene].page for scene in dict.fromkeys(scene for _, _, scene, _ in maps)}
     galleries = tuple(one.gallery for one in made.values() if one.gallery is not None and one.gallery.of_methods)
     shown = tuple(page for page in pages.values() if page is not None)

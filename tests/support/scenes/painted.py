@@ -218,6 +218,30 @@ class Collector:
         )
 
 
+class Mistaken(Collector):
+    """A collector with one error of a kind: in scene a two halves of the chair and a sofa that looks like a table, in
+    scene b no table."""
+
+    name = "mistaken"
+
+    def start(self, scene: SceneInfo) -> None:
+        super().start(scene)
+        self._scene = scene.scene
+
+    def finish(self) -> Prediction:
+        if self._scene != "a":
+            self._points.pop("table", None)
+            return super().finish()
+        if {"chair", "sofa", "table"} <= set(self._points):
+            chair = np.concatenate(self._points["chair"])
+            is_left = chair[:, 0] < np.median(chair[:, 0])
+            self._points |= {"chair": [chair[is_left]], "chair half": [chair[~is_left]]}
+            for values in (self._views, self._features):
+                values["chair half"] = values["chair"]  # type: ignore[index]
+            self._features["sofa"] = self._features["table"]
+        return super().finish()
+
+
 class Delayed(Collector):
     """A collector that takes ``DELAY_S`` longer where the environment says; its name and numbers stay the same.
 
