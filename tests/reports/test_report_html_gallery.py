@@ -59,7 +59,7 @@ def page(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def galleries(text: str) -> list[dict[str, Any]]:
     return [
-        json.loads(one) for one in re.findall(r'<script type="application/json" class="gallery">(.*?)</script>', text)
+        json.loads(one) for one in re.findall(r'<script type="application/json" id="gallery-\d+" class="gallery">(.*?)</script>', text)
     ]
 
 
