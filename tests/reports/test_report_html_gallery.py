@@ -58,9 +58,8 @@ def page(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def galleries(text: str) -> list[dict[str, Any]]:
-    return [
-        json.loads(one) for one in re.findall(r'<script type="application/json" id="gallery-\d+" class="gallery">(.*?)</script>', text)
-    ]
+    pattern = r'<script type="application/json" id="gallery-\d+" class="gallery">(.*?)</script>'
+    return [json.loads(one) for one in re.findall(pattern, text)]
 
 
 def numbers(text: str) -> dict[str, Any]:

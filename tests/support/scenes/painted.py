@@ -236,8 +236,8 @@ class Mistaken(Collector):
             chair = np.concatenate(self._points["chair"])
             is_left = chair[:, 0] < np.median(chair[:, 0])
             self._points |= {"chair": [chair[is_left]], "chair half": [chair[~is_left]]}
-            for values in (self._views, self._features):
-                values["chair half"] = values["chair"]  # type: ignore[index]
+            self._views["chair half"] = self._views["chair"]
+            self._features["chair half"] = self._features["chair"]
             self._features["sofa"] = self._features["table"]
         return super().finish()
 
