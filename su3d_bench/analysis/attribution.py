@@ -98,7 +98,7 @@ def attribute(
     encoder = cache(run.encoder)
     mended = {}
     for scene in run.scenes:
-        truth_of = cache(partial(_truth_of, run, scene))
+        truth_of = cache(partial(truth_of_scene, run, scene))
         mended[scene] = explained.mend(scene, truth_of, encoder)
     return explained.form(mended, other)
 
@@ -139,12 +139,8 @@ class Explained:
     def look_at(self, scene: str, truth_of: TruthOf, encoder: Callable[[], Encoder]) -> Mapping[str, LookedAt]:
         """``scene`` as the evaluators of the protocols that scored it see it."""
         looked_at: dict[str, LookedAt] = {}
-        for name in (name for name in self.protocols if scene in self._scores[name]):
-            rules = self._rules(name)
-            truth, prediction = self._inputs.of_scene(scene, rules, truth_of)
-            if (reason := why_not_scorable(rules, prediction)) is not None:
-                raise PredictionError(f"{scene}: {reason}")
-            naming = self._inputs.encoder(rules, prediction, encoder)
+        for name in self.scored_under(scene):
+            rules, truth, prediction, naming = self.scored(name, scene, truth_of, encoder)
             looked_at[name] = EXPLAINED[rules.kind][1](rules, truth, prediction, naming)
         return looked_at
 
@@ -152,7 +148,7 @@ class Explained:
         """The counts of ``scene``, which must be those of the run, and those with its errors mended."""
         mended = {name: one.mended() for name, one in looked_at.items()}
         for name, counts in mended.items():
-            _refuse_other_counts(scene, self._rules(name), self._scores[name][scene].counts, counts.as_is)
+            self.refuse_other_counts(name, scene, counts.as_is)
         return mended
 
     def errors(self, scene: str, protocol: str, looked_at: LookedAt, most: int) -> tuple[int, Sequence[SingleError]]:
@@ -171,6 +167,32 @@ class Explained:
         """The metrics in which errors under ``protocol`` are told."""
         return tuple(self._rules(protocol).headline)
 
+    def refuse_other_counts(self, protocol: str, scene: str, formed: Counts) -> None:
+        """A ``PredictionError`` where what is explained is not what the run's own number is of."""
+        stored = self._scores[protocol][scene].counts
+        if type(stored) is type(formed) and all(
+            np.array_equal(getattr(stored, each.name), getattr(formed, each.name)) for each in fields(formed)
+        ):
+            return
+        raise PredictionError(
+            f"{printable(scene, 100)}: {protocol}: the counts of the run are not those that its prediction gives here; "
+            "score it again"
+        )
+
+    def scored_under(self, scene: str) -> list[str]:
+        """The protocols that scored ``scene``."""
+        return [name for name in self.protocols if scene in self._scores[name]]
+
+    def scored(
+        self, protocol: str, scene: str, truth_of: TruthOf, encoder: Callable[[], Encoder]
+    ) -> tuple[ProtocolRules, GroundTruth, Prediction, Encoder | None]:
+        """What a scene was scored from under a protocol: the rules, the truth, the map and what named its instances."""
+        rules = self._rules(protocol)
+        truth, prediction = self._inputs.of_scene(scene, rules, truth_of)
+        if (reason := why_not_scorable(rules, prediction)) is not None:
+            raise PredictionError(f"{scene}: {reason}")
+        return rules, truth, prediction, self._inputs.encoder(rules, prediction, encoder)
+
     def form(self, mended: Mapping[str, MendedJob], other: Side | None = None) -> RunAttribution:
         """What the errors of all scenes cost; ``other`` is the side with perfect 2D masks."""
         side = Side(self.run, self.method)
@@ -187,7 +209,8 @@ class Explained:
         return RunAttribution(self.run.name, self.method, (*self.remarks, *_remarks(self.run)), formed)
 
 
-def _truth_of(run: FinishedRun, scene: str, variant: str) -> GroundTruth:
+def truth_of_scene(run: FinishedRun, scene: str, variant: str) -> GroundTruth:
+    """The truth in the data of ``run``, which must be those that it was made from."""
     truth: GroundTruth = run.dataset(scene).ground_truth(scene.partition("/")[2], variant)
     return truth
 
@@ -328,18 +351,6 @@ def _values(rules: ProtocolRules, counts: Sequence[Counts]) -> dict[str, float]:
     """The headline metrics of the scenes, as the protocol reports them."""
     reported = metric_of(rules).reported(counts)
     return {name: reported[name] for name in rules.headline}
-
-
-def _refuse_other_counts(scene: str, rules: ProtocolRules, stored: Counts, formed: Counts) -> None:
-    """The errors that are explained must be those of the run's own number."""
-    if type(stored) is type(formed) and all(
-        np.array_equal(getattr(stored, each.name), getattr(formed, each.name)) for each in fields(formed)
-    ):
-        return
-    raise PredictionError(
-        f"{printable(scene, 100)}: {rules.name}: the counts of the run are not those that its prediction gives here; "
-        "score it again"
-    )
 
 
 def _remarks(run: FinishedRun) -> list[str]:

@@ -8,12 +8,20 @@ from typing import Any
 from su3d_bench.cli.common import add_modules
 from su3d_bench.cli.report import html as report_html
 from su3d_bench.cli.report import leaderboard as report_leaderboard
+from su3d_bench.cli.report import samples as report_samples
 from su3d_bench.cli.report import tables as report_tables
 from su3d_bench.cli.report import timing as report_timing
 from su3d_bench.cli.report import verify as report_verify
 
 # Modules with ``NAME`` and ``add_parser(actions)``, imported for --help too, so with nothing heavy at their top.
-SUB_VERBS: tuple[ModuleType, ...] = (report_tables, report_timing, report_html, report_leaderboard, report_verify)
+SUB_VERBS: tuple[ModuleType, ...] = (
+    report_tables,
+    report_timing,
+    report_html,
+    report_samples,
+    report_leaderboard,
+    report_verify,
+)
 
 
 def add_parser(verbs: Any) -> None:

@@ -55,8 +55,8 @@ from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 
 __all__ = [
-    "KINDS", "LabelledMasks", "MaskError", "Mended", "Repair", "ScoringRules", "count_masks", "find_errors",
-    "mend_scene", "repaired", "with_true_labels",
+    "KINDS", "Errors", "LabelledMasks", "MaskError", "Mended", "Repair", "ScoringRules", "count_masks", "errors_of",
+    "find_errors", "mend_scene", "repaired", "with_true_labels",
 ]  # fmt: skip
 
 KINDS = ("merged", "split", "duplicate", "mislabelled", "background", "missed")
@@ -182,6 +182,29 @@ class Repair:
 def find_errors(overlaps: Overlaps) -> list[MaskError]:
     """All errors of a scene, kind after kind."""
     return [error for find, _ in _KINDS.values() for error in find(overlaps)]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Whose errors they are: ``of_mask`` (K,) and ``of_instance`` (G,) name the kind, empty for none.
+
+    An error is that of a mask, but ``split`` and ``missed`` are those of an instance: there are as many of each kind as
+    ``Mended.n`` counts.
+    """
+
+    of_mask: tuple[str, ...]
+    of_instance: tuple[str, ...]
+
+
+def errors_of(overlaps: Overlaps) -> Errors:
+    """The kind of error of each mask and of each counted instance, before anything is mended."""
+    of_mask, of_instance = [""] * len(overlaps.predicted.masks), [""] * overlaps.n_instances
+    for error in find_errors(overlaps):
+        if error.kind in ("split", "missed"):
+            of_instance[error.instances[0]] = error.kind
+        else:
+            of_mask[error.masks[0]] = error.kind
+    return Errors(tuple(of_mask), tuple(of_instance))
 
 
 def repaired(overlaps: Overlaps, errors: Sequence[MaskError]) -> Repair:

@@ -21,7 +21,7 @@ from su3d_bench.metrics.attribution.masks import MaskError, find_errors, repaire
 from su3d_bench.metrics.attribution.overlaps import LabelledMasks, Overlaps, ScoringRules
 from su3d_bench.metrics.attribution.points import CAUSES, LabelledPoints, causes_of
 from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.instance.average_precision import InstanceCounts, ListedMasks
+from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.metric import C, Metric, Values
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
 
@@ -130,16 +130,11 @@ class _MendedClasses:
         answer = {}
         for index in (index for index, class_id in enumerate(rules.class_ids) if class_id in moved):
             rows = np.flatnonzero(is_large & (mended.class_ids == rules.class_ids[index]))
-            answer[index] = instance_ap.count_class_of_scene(
-                index,
-                ListedMasks(shared[rows], size[rows], mended.scores[rows]),
-                self._value,
-                self._size,
-                rules.class_ids,
+            one = instance_ap.overlaps_of_class(
+                rules.class_ids[index], rows, shared[rows], size[rows], self._value, self._size, rules.class_ids,
                 rules.min_region_size,
-                rules.thresholds,
-                rules.forgives_void,
-            )
+            )  # fmt: skip
+            answer[index] = one.counts(index, mended.scores, rules.thresholds, forgives_void=rules.forgives_void)
         return answer
 
     def _shared_by(self, points: IntArray) -> Int64Array:

@@ -7,7 +7,7 @@ A scene gives a table of counted predictions, tables of scenes are concatenated,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -180,6 +180,49 @@ def per_scene(
     ([2, 2], [True, False, True, False, True, False, True, False])
     """
     _check_predictions(ground_truth, indptr, indices, len(scores) if labels is None else len(labels), scores)
+    classes = class_overlaps(ground_truth, indptr, indices, labels, class_ids, min_region_size)
+    return stacked(
+        [one.counts(index, scores, thresholds, forgives_void=forgives_void) for index, one in enumerate(classes)]
+    )
+
+
+@dataclass(frozen=True)
+class ClassOverlaps:
+    """One class of a scene: its ``predictions`` (R,) of the minimum size, by their place in line, and its instances.
+
+    ``values`` (G,) are those of the instances, ascending; ``iou`` (R, G); ``takes_part`` (G,) marks those of the
+    minimum size; ``ignored_share`` (R,) of a prediction is void or in smaller instances.
+    """
+
+    predictions: Int64Array
+    values: Int64Array
+    iou: Float64Array
+    takes_part: BoolArray
+    ignored_share: Float64Array
+
+    def counts(
+        self, class_index: int, scores: Float64Array, thresholds: Sequence[float], *, forgives_void: bool
+    ) -> InstanceCounts:
+        """The counts of the class; ``scores`` (K,) are those of all masks in line."""
+        return count_class(
+            class_index,
+            iou=self.iou,
+            takes_part=self.takes_part,
+            scores=scores[self.predictions],
+            ignored_share=forgives_void * self.ignored_share,
+            thresholds=thresholds,
+        )
+
+
+def class_overlaps(
+    ground_truth: IntArray,
+    indptr: IntArray,
+    indices: IntArray,
+    labels: IntArray | None,
+    class_ids: Sequence[int],
+    min_region_size: int,
+) -> Iterator[ClassOverlaps]:
+    """The classes of one scene in the order of ``class_ids``; the arrays are those of ``per_scene``."""
     if any(class_id < 1 for class_id in class_ids):
         raise DataError(f"class ids: {min(class_ids)} cannot be scored; class ids start at 1")
     segment_of_point, segment_value, segment_size = segments_of(ground_truth)
@@ -189,58 +232,42 @@ def per_scene(
         is_listed = labels == np.array(class_ids, np.int64)[:, None]
     kept = np.flatnonzero(is_listed.any(axis=0) & (size >= min_region_size))
     intersection = intersections(segment_of_point, len(segment_value), indptr, indices, kept)
-
-    parts = []
-    for c in range(len(class_ids)):
+    for c, class_id in enumerate(class_ids):
         rows = np.flatnonzero(is_listed[c, kept])
-        listed = ListedMasks(intersection[rows], size[kept[rows]], scores[kept[rows]])
-        parts.append(
-            count_class_of_scene(
-                c, listed, segment_value, segment_size, class_ids, min_region_size, thresholds, forgives_void
-            )
-        )
-    return stacked(parts)
+        yield overlaps_of_class(
+            class_id, kept[rows], intersection[rows], size[kept[rows]], segment_value, segment_size, class_ids,
+            min_region_size,
+        )  # fmt: skip
+
+
+def overlaps_of_class(
+    class_id: int,
+    predictions: Int64Array,
+    intersection: Int64Array,
+    n_points: Int64Array,
+    segment_value: Int64Array,
+    segment_size: Int64Array,
+    class_ids: Sequence[int],
+    min_region_size: int,
+) -> ClassOverlaps:
+    """The ``predictions`` (R,) of one class; ``intersection`` (R, S) with all segments, by ascending value."""
+    segment_label = segment_value // INSTANCES_PER_CLASS
+    columns = np.flatnonzero(segment_label == class_id)  # ascending value, as the original walks them
+    n_void = intersection[:, ~np.isin(segment_label, class_ids)].sum(axis=1)
+    shared, is_small = intersection[:, columns], segment_size[columns] < min_region_size
+    return ClassOverlaps(
+        predictions=predictions,
+        values=segment_value[columns],
+        iou=shared / (segment_size[columns][None, :] + n_points[:, None] - shared),
+        takes_part=~is_small,
+        ignored_share=(n_void + shared[:, is_small].sum(axis=1)) / n_points,
+    )
 
 
 def stacked(parts: Sequence[InstanceCounts]) -> InstanceCounts:
     """The counts of classes one after another."""
     names = InstanceCounts.arrays
     return InstanceCounts(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
-
-
-@dataclass(frozen=True)
-class ListedMasks:
-    """Masks of one class in line order: points ``shared`` (R, S) with each segment, ``size`` and ``scores`` (R,)."""
-
-    shared: Int64Array
-    size: Int64Array
-    scores: Float64Array
-
-
-def count_class_of_scene(
-    class_index: int,
-    listed: ListedMasks,
-    segment_value: Int64Array,
-    segment_size: Int64Array,
-    class_ids: Sequence[int],
-    min_region_size: int,
-    thresholds: Sequence[float],
-    forgives_void: bool,
-) -> InstanceCounts:
-    """The counts of one class of a scene, of masks of at least the minimum size; segments are by ascending value."""
-    segment_label = segment_value // INSTANCES_PER_CLASS
-    columns = np.flatnonzero(segment_label == class_ids[class_index])  # ascending value, as the original walks them
-    shared, n_points = listed.shared[:, columns], listed.size
-    is_small = segment_size[columns] < min_region_size
-    n_void = listed.shared[:, ~np.isin(segment_label, class_ids)].sum(axis=1)
-    return count_class(
-        class_index,
-        iou=shared / (segment_size[columns][None, :] + n_points[:, None] - shared),
-        takes_part=~is_small,
-        scores=listed.scores,
-        ignored_share=forgives_void * (n_void + shared[:, is_small].sum(axis=1)) / n_points,
-        thresholds=thresholds,
-    )
 
 
 def count_class(
@@ -286,20 +313,26 @@ def _match(over: BoolArray, takes_part: BoolArray, scores: Float64Array) -> tupl
     """Scores of the true positives and of their duplicates, and how many instances nothing met: greedy, in order."""
     hits: list[float] = []
     duplicates: list[float] = []
-    is_met = takes_part & over.any(axis=0)
-    n_missed = int(takes_part.sum() - is_met.sum())
-    visited = np.zeros(len(scores), bool)
-    for column in np.flatnonzero(is_met):
-        matching = np.flatnonzero(over[:, column] & ~visited)
-        if not len(matching):
-            n_missed += 1
-            continue
-        # only the first in line is used up; the best score of all stays with the true positive
-        visited[matching[0]] = True
+    n_met = 0
+    for _, matching in met_instances(over, takes_part):
+        n_met += 1
         *lower, best = np.sort(scores[matching]).tolist()
         hits.append(best)
         duplicates += lower
-    return hits, duplicates, n_missed
+    return hits, duplicates, int(takes_part.sum()) - n_met
+
+
+def met_instances(over: BoolArray, takes_part: BoolArray) -> Iterator[tuple[int, Int64Array]]:
+    """The instances that are met, and by which predictions; ``over`` (R, G) says who is above the threshold with whom.
+
+    Only the first in line is used up by an instance; the best score of all stays with the true positive.
+    """
+    visited = np.zeros(len(over), bool)
+    for column in np.flatnonzero(takes_part & over.any(axis=0)).tolist():
+        matching = np.flatnonzero(over[:, column] & ~visited)
+        if len(matching):
+            visited[matching[0]] = True
+            yield column, matching
 
 
 def concatenate(counts: Sequence[InstanceCounts]) -> InstanceCounts:

@@ -1,0 +1,204 @@
+"""Runs taken apart to single instances: what each predicted mask met, which instance of the truth nothing met.
+
+A row is what the evaluator itself saw: the masks on the points of the truth, under the names and confidences that
+count. Counts that differ from those of the run are refused, as where errors are explained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+
+import numpy as np
+
+from su3d_bench.analysis.attribution import Explained, explained_of, truth_of_scene
+from su3d_bench.core.errors import ConfigError, counted, printable, suggest
+from su3d_bench.core.maps import DenseFeatures, Instances, Partition
+from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, Int64Array
+from su3d_bench.metrics.attribution.arrays import scored_masks
+from su3d_bench.metrics.attribution.masks import count_masks, errors_of
+from su3d_bench.metrics.attribution.overlaps import LabelledMasks, ScoringRules, measure_overlaps, true_instances
+from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
+from su3d_bench.metrics.instance.hits import hits
+from su3d_bench.metrics.instance.score import OBJECT
+from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.reports.tables.samples import Sample
+from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
+from su3d_bench.runs.finished import FinishedRun, read_run
+
+KIND = "instance"  # of the protocols that tell instances apart by their masks
+MOST_OF_A_NAME = 200  # characters of a text in a cell
+THRESHOLDS = (0.25, 0.5)
+Box = tuple[float | None, float | None, float | None, float | None, float | None, float | None]
+NOWHERE: Box = (None,) * 6
+
+
+@dataclass(frozen=True)
+class Samples:
+    """The rows, and ``remarks``: what has none and why, what must be known of the runs."""
+
+    rows: tuple[Sample, ...]
+    remarks: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """Methods, protocols and scenes by name; all that a run has where none is named."""
+
+    methods: Sequence[str] = ()
+    protocols: Sequence[str] = ()
+    scenes: Sequence[str] = ()
+
+
+def samples(paths: Sequence[Path], chosen: Chosen = Chosen(), report: Report = lambda event: None) -> Samples:
+    """The instances of the runs in the folders ``paths``, scene after scene, under each protocol of kind ``instance``.
+
+    A ``ConfigError`` where nothing has instances, or a name is not one of the run.
+    """
+    rows: list[Sample] = []
+    remarks: list[str] = []
+    for run in map(read_run, paths):
+        of_run = _OfRun(run, chosen)
+        remarks += of_run.remarks
+        for n, scene in enumerate(of_run.scenes, start=1):
+            rows += of_run.rows(scene)
+            report(Event(f"{run.name} {scene}", SCENE_DONE, n, len(of_run.scenes)))
+    if not rows and remarks:
+        raise ConfigError(f"{remarks[0]}; nothing has instances to list")
+    return Samples(tuple(rows), tuple(dict.fromkeys(remarks)))
+
+
+class _OfRun:
+    """The jobs of one run that are listed."""
+
+    def __init__(self, run: FinishedRun, chosen: Chosen) -> None:
+        self._run = run
+        self.remarks = run.elsewhere_lines()
+        for method in chosen.methods:
+            run.check_method(method)
+        for scene in chosen.scenes:
+            if scene not in run.scenes:
+                hint = suggest(scene, run.scenes, "it has")
+                raise ConfigError(f"{run.name}: holds no scene '{printable(scene, 100)}'{hint}")
+        self.scenes = tuple(chosen.scenes) or run.scenes
+        protocols = self._protocols(chosen.protocols)
+        self._jobs = [self._explained(method, protocols) for method in (chosen.methods or run.methods)]
+        self._encoder = cache(run.encoder)
+        if run.record.is_partial:
+            self.remarks.append(f"PARTIAL: {run.name} has only the first {counted(run.limit, 'frame')} of each scene")
+        if run.is_incomplete:
+            self.remarks.append(f"INCOMPLETE: {run.name} lacks scenes that failed")
+
+    def _protocols(self, wanted: Sequence[str]) -> list[str]:
+        for name in wanted:
+            self._run.check_protocol(name)
+        names = []
+        for name in wanted or self._run.protocols:
+            kind = self._run.rules(name).kind
+            if kind == KIND:
+                names.append(name)
+            elif wanted:
+                raise ConfigError(f"protocol '{name}' is of kind '{kind}'; instances are listed under kind '{KIND}'")
+            else:
+                self.remarks.append(f"{name} is of kind {kind}, which matches no masks with instances")
+        return names
+
+    def _explained(self, method: str, protocols: Sequence[str]) -> Explained | None:
+        scored = self._run.scores(method)
+        mine = [name for name in protocols if scored.get(name)]
+        if not mine:
+            self.remarks.append(f"{self._run.name}: {printable(method, 80)} has no score of kind {KIND}")
+            return None
+        return explained_of(self._run, method, mine)
+
+    def rows(self, scene: str) -> Iterator[Sample]:
+        truth_of = cache(partial(truth_of_scene, self._run, scene))
+        for explained in self._jobs:
+            if explained is not None:
+                for protocol in explained.scored_under(scene):
+                    yield from self._of_job(explained, protocol, scene, truth_of)
+
+    def _of_job(
+        self, explained: Explained, protocol: str, scene: str, truth_of: Callable[[str], GroundTruth]
+    ) -> Iterator[Sample]:
+        rules, truth, prediction, naming = explained.scored(protocol, scene, truth_of, self._encoder)
+        assert not isinstance(prediction, DenseFeatures)  # it has no score of this kind
+        seen = scored_masks(rules, truth, prediction, naming)
+        explained.refuse_other_counts(protocol, scene, count_masks(*seen))
+        points = truth.points if self._run.data.truth_files is None else None  # files have no coordinates
+        where = (self._run.name, printable(scene), printable(explained.method), printable(protocol))
+        yield from _rows(where, rules, prediction, seen, points)
+
+
+def _rows(
+    where: tuple[str, str, str, str],
+    rules: ProtocolRules,
+    prediction: Instances | Partition,
+    seen: tuple[Int64Array, LabelledMasks, ScoringRules],
+    points: Float32Array | None,
+) -> Iterator[Sample]:
+    values, masks, scoring = seen
+    instances = true_instances(values, scoring)
+    overlaps = measure_overlaps(instances, masks, scoring)
+    least = scoring.min_region_size
+    at = hits(values, masks.masks, masks.class_ids, masks.scores, scoring.class_ids, least, THRESHOLDS)
+    errors = errors_of(overlaps)
+    value_of = [int(values[members[0]]) for members in instances.members]
+    number_of = [value % INSTANCES_PER_CLASS for value in value_of]
+    ids = _ids(prediction, len(masks.masks))
+    class_of = _class_names(rules)
+    called = [class_of.get(int(one), "") for one in masks.class_ids]
+    true_classes = [class_of[int(one)] for one in instances.class_of_instance]
+    for k, name in enumerate(_names(prediction, len(masks.masks))):
+        met, iou = _best(overlaps.iou[k])
+        yield Sample(
+            *where, "predicted", ids[k], k, called[k], name, float(masks.scores[k]),
+            len(masks.masks.mask(k)), bool(overlaps.is_counted[k]), iou,
+            None if met is None else number_of[met], "" if met is None else true_classes[met],
+            *(bool(one.is_hit[k]) for one in at), errors.of_mask[k], *_box(points, masks.masks.mask(k)),
+        )  # fmt: skip
+    for g, members in enumerate(instances.members):
+        met, iou = _best(overlaps.iou[:, g])
+        yield Sample(
+            *where, "true", number_of[g], None, true_classes[g], "", None,
+            len(members), True, iou, None if met is None else ids[met], "" if met is None else called[met],
+            *(value_of[g] in one.values for one in at), errors.of_instance[g], *_box(points, members),
+        )  # fmt: skip
+
+
+def _class_names(rules: ProtocolRules) -> dict[int, str]:
+    if not rules.names_masks:
+        return {OBJECT: rules.curve_names[0]}
+    return {entry.id: printable(entry.name, MOST_OF_A_NAME) for entry in rules.classes}
+
+
+def _ids(prediction: Instances | Partition, n: int) -> list[int]:
+    ids = prediction.ids if isinstance(prediction, Instances) else ()
+    return [int(one) for one in ids] if len(ids) == n else list(range(n))
+
+
+def _names(prediction: Instances | Partition, n: int) -> list[str]:
+    """What a person reads of each instance: the label that the method decided, else the name that perception gave."""
+    if not isinstance(prediction, Instances):
+        return [""] * n
+    labels = prediction.labels or prediction.names
+    pairs = zip(labels, prediction.names, strict=True)
+    return [printable(label or name, MOST_OF_A_NAME) for label, name in pairs]
+
+
+def _best(iou: Float64Array) -> tuple[int | None, float]:
+    """Where the highest IoU is, the first of equals, and that; nowhere where it is 0."""
+    place = int(iou.argmax()) if len(iou) else 0
+    best = float(iou[place]) if len(iou) else 0.0
+    return (place if best > 0 else None), best
+
+
+def _box(points: Float32Array | None, members: Int32Array) -> Box:
+    if points is None or not len(members):
+        return NOWHERE
+    own = points[members].astype(np.float64)
+    low, high = own.min(axis=0), own.max(axis=0)
+    x, y, z = (float(value) for value in (low + high) / 2)
+    return x, y, z, *(float(value) for value in high - low)  # type: ignore[return-value]
