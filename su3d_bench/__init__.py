@@ -1,7 +1,7 @@
 """Evaluation and benchmarking of open-vocabulary, instance-level 3D scene understanding from RGB-D.
 
-What a dataset, a method or a script of one's own needs is named here and imported at its first use, so that
-``import su3d_bench`` stays instant.
+What a notebook, a script, a dataset or a method of one's own needs is named here and imported at its first use, so
+that ``import su3d_bench`` stays instant.
 """
 
 import os
@@ -9,6 +9,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from su3d_bench.api.lists import list_datasets, list_methods, list_protocols
+    from su3d_bench.api.making import evaluate, run
+    from su3d_bench.api.results import Comparison, Run, Scores, load_run
+    from su3d_bench.core.errors import Su3dError
     from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition
     from su3d_bench.core.system.timing import Timer
     from su3d_bench.core.types import Detections, Frame, GroundTruth, InstanceMesh, LabelSet, PerceptionNeeds, SceneInfo
@@ -19,6 +23,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = [
+    "Comparison",
     "DenseFeatures",
     "Detections",
     "Frame",
@@ -29,25 +34,44 @@ __all__ = [
     "Masks",
     "Partition",
     "PerceptionNeeds",
+    "Run",
     "SceneInfo",
+    "Scores",
+    "Su3dError",
     "Timer",
     "back_project",
     "combine",
+    "evaluate",
+    "list_datasets",
+    "list_methods",
+    "list_protocols",
     "load_protocol",
+    "load_run",
     "read_prediction",
+    "run",
     "score_scene",
 ]
 # Where those names are that are no types of ``core.types``.
 _ELSEWHERE = {
+    "Comparison": "api.results",
     "DenseFeatures": "core.maps",
     "Instances": "core.maps",
     "Masks": "core.maps",
     "Partition": "core.maps",
+    "Run": "api.results",
+    "Scores": "api.results",
+    "Su3dError": "core.errors",
     "Timer": "core.system.timing",
     "back_project": "numerics.geometry",
     "combine": "metrics.scoring",
+    "evaluate": "api.making",
+    "list_datasets": "api.lists",
+    "list_methods": "api.lists",
+    "list_protocols": "api.lists",
     "load_protocol": "metrics.protocols.loading",
+    "load_run": "api.results",
     "read_prediction": "store.predictions",
+    "run": "api.making",
     "score_scene": "metrics.scoring",
 }
 

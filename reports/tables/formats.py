@@ -237,12 +237,16 @@ def meant(cell: str) -> str:
 
 def html_page(parts: Sequence[Table | Prose]) -> str:
     """A page of its own without scripts, for light and dark."""
-    body = "\n".join(_html(part) for part in parts)
     return (
         '<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>su3d-bench tables</title>\n'
-        f"<style>{STYLE}</style>\n{body}\n</html>\n"
+        f"<style>{STYLE}</style>\n{html_tables(parts)}\n</html>\n"
     )
+
+
+def html_tables(parts: Sequence[Table | Prose]) -> str:
+    """The parts alone, to stand in a page or notebook of somebody else's."""
+    return "\n".join(_html(part) for part in parts)
 
 
 def _html(table: Table | Prose) -> str:

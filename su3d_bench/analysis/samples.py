@@ -52,7 +52,11 @@ class Chosen:
     scenes: Sequence[str] = ()
 
 
-def samples(paths: Sequence[Path], chosen: Chosen = Chosen(), report: Report = lambda event: None) -> Samples:
+def samples(
+    paths: Sequence[Path],
+    chosen: Chosen = Chosen(),
+    report: Report = lambda event: None,  # noqa: B008 - it is frozen
+) -> Samples:
     """The instances of the runs in the folders ``paths``, scene after scene, under each protocol of kind ``instance``.
 
     A ``ConfigError`` where nothing has instances, or a name is not one of the run.

@@ -13,7 +13,6 @@ from su3d_bench.core.errors import EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
     from su3d_bench.evaluation.request import Request
-    from su3d_bench.evaluation.result import Evaluation
 
 SCHEMA = 1  # of the JSON file of several methods
 
@@ -92,7 +91,7 @@ def add_parser(verbs: Any) -> None:
 
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.evaluation.as_run import evaluate_methods
-    from su3d_bench.evaluation.evaluate import evaluate
+    from su3d_bench.evaluation.evaluate import evaluate, said_of
     from su3d_bench.reports.tables.evaluation import evaluation_tables, side_by_side_tables
     from su3d_bench.store.records import plain
 
@@ -112,7 +111,8 @@ def call(arguments: argparse.Namespace) -> int:
         tables = side_by_side_tables(plain(run.metrics), documents, per_class=arguments.per_class)
     answer_tables(arguments, document, tables)
     for method, result in results.items():
-        _say(result, f"{method}: " if len(results) > 1 else "", is_quiet=arguments.quiet)
+        for line in said_of(result):
+            remark(f"{method}: {line}" if len(results) > 1 else line, quiet=arguments.quiet)
     if arguments.out is not None:
         _say_next(arguments.out, list(results), was_there=was_there, is_quiet=arguments.quiet)
     return EXIT_DONE
@@ -137,6 +137,8 @@ def _request(paths: Sequence[Path], arguments: argparse.Namespace) -> Request:
 
 def _named(arguments: argparse.Namespace) -> dict[str, list[Path]]:
     """The predictions by the method that they are called."""
+    from su3d_bench.evaluation.request import own_name
+
     if not arguments.predictions and not arguments.name:
         raise ConfigError("evaluate: no predictions were named; give a folder or files, or --name METHOD=PREDICTIONS")
     named: dict[str, list[Path]] = {}
@@ -152,23 +154,7 @@ def _named(arguments: argparse.Namespace) -> dict[str, list[Path]]:
             named[text] = list(arguments.predictions)
     if len(named) == 1 and arguments.out is None:
         raise ConfigError("evaluate: --name calls a method of a run; give --out DIR too, or several methods")
-    own = "predictions" if arguments.out is None else arguments.out.resolve().name
-    return named or {own: list(arguments.predictions)}
-
-
-def _say(result: Evaluation, whose: str, *, is_quiet: bool) -> None:
-    """Remarks on one method's predictions: what they are, and which protocols cannot score them."""
-    from su3d_bench.evaluation.evaluate import NOT_MEANT
-
-    remark(f"{whose}format: {', '.join(result.formats)}; ground truth: {result.ground_truth}", quiet=is_quiet)
-    for line in result.remarks:
-        remark(f"{whose}{line}", quiet=is_quiet)
-    reasons: dict[str, list[str]] = {}
-    for name, reason in result.not_scored.items():
-        reasons.setdefault(reason, []).append(name)
-    for reason, names in reasons.items():
-        if not reason.startswith(NOT_MEANT):
-            remark(f"{whose}not scored under {', '.join(names)}: {reason}", quiet=is_quiet)
+    return named or {own_name(arguments.out): list(arguments.predictions)}
 
 
 def _say_next(out: Path, methods: Sequence[str], *, was_there: bool, is_quiet: bool) -> None:

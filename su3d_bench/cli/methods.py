@@ -32,7 +32,7 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.core import registry
+    from su3d_bench.runs.catalogue import known_methods
 
     if arguments.name == "check":
         return _check(arguments)
@@ -40,7 +40,7 @@ def call(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"methods: unknown argument '{arguments.tried}'; name one method, or: methods check METHOD")
     if arguments.name is not None:
         return _show(arguments)
-    rows = [_about(name, registry.load("method", name)) for name in registry.names("method")]
+    rows = known_methods()
     answer_either(arguments, rows, *[line for row in rows for line in ("", *_lines(row))][1:])
     return EXIT_DONE
 
@@ -59,16 +59,6 @@ def _check(arguments: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-def _about(name: str, method: Any) -> dict[str, Any]:
-    """What a list says of a method; a plug-in need not say more than its first sentence."""
-    row: dict[str, Any] = {"name": name, "summary": _summary(method)}
-    about = getattr(method, "about", None)
-    for field in ("paper", "source", "licence", "status"):
-        row[field] = getattr(about, field, None) or None
-    row["needs"] = list(getattr(about, "needs", ()))
-    return row
-
-
 def _lines(row: dict[str, Any]) -> list[str]:
     lines = [f"{row['name']}  {row['summary']}"]
     for field in ("paper", "source", "licence", "needs", "status"):
@@ -78,18 +68,15 @@ def _lines(row: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _summary(method: Any) -> str:
-    return (method.__doc__ or "").strip().partition("\n")[0]
-
-
 def _show(arguments: argparse.Namespace) -> int:
     from su3d_bench.core import registry
     from su3d_bench.core.config import flatten, write_toml
     from su3d_bench.reports.tables.papers.published import figures_of
+    from su3d_bench.runs.catalogue import about_method
 
     method = registry.load("method", arguments.name)
     defaults = method.Config().model_dump(mode="json")
-    row = _about(method.name, method)
+    row = about_method(method.name, method)
     figures = figures_of(method=method.name)
     presets = {name: dict(settings) for name, settings in _presets_of(method).items()}
     published = [figure.model_dump(mode="json", exclude_none=True) for figure in figures]

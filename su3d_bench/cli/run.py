@@ -20,7 +20,7 @@ from su3d_bench.cli.common import (
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE, counted
 
 if TYPE_CHECKING:
-    from su3d_bench.core.config import KeyPath, Settings
+    from su3d_bench.core.config import Settings
     from su3d_bench.runs.planning.held import Into
     from su3d_bench.runs.planning.plan import Plan
     from su3d_bench.runs.runner import RunResult
@@ -143,16 +143,13 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
 
 def settings_of(arguments: argparse.Namespace) -> Settings:
     """The file's settings, then those of the flags, which win."""
-    from su3d_bench.core.config import RunConfig, Setting, Settings, read_file
+    from su3d_bench.core.config import RunConfig
+    from su3d_bench.runs.planning.asked import asked_settings
 
-    settings = Settings() if arguments.config is None else read_file(arguments.config)
     scenes = [*arguments.scene, *(arguments.scenes or ())] or None
-    flags: list[tuple[KeyPath, Any]] = [
-        ((name,), scenes if name == "scenes" else getattr(arguments, name)) for name in RunConfig.model_fields
-    ]
-    flags.append((("perception", "models", "device"), arguments.device))
-    return settings + Settings(
-        tuple(Setting(key, value, f"--{key[-1].replace('_', '-')}") for key, value in flags if value is not None)
+    values = {name: scenes if name == "scenes" else getattr(arguments, name) for name in RunConfig.model_fields}
+    return asked_settings(
+        values, device=arguments.device, config=arguments.config, source_of=lambda key: f"--{key.replace('_', '-')}"
     )
 
 

@@ -21,7 +21,7 @@ from su3d_bench.predictions.base import Content
 from su3d_bench.predictions.scannet_text import ScannetText
 from su3d_bench.predictions.scenes import Source, open_sources
 
-__all__ = ["NOT_MEANT", "Evaluation", "ProtocolEvaluation", "Request", "evaluate"]
+__all__ = ["Evaluation", "ProtocolEvaluation", "Request", "evaluate", "said_of"]
 
 
 class Keeps(Protocol):
@@ -66,6 +66,16 @@ def evaluate(request: Request, kept: Keeps | None = None) -> Evaluation:
         remarks.append(f"{'every scene' if len(scenes) == n > 1 else which}: {line}")
     formats = tuple(dict.fromkeys(source.reader.name for source in sources))
     return scoring.tally.evaluation(formats, truths.where, remarks)
+
+
+def said_of(result: Evaluation) -> list[str]:
+    """What must be said of an evaluation: formats and truth, remarks on the files, why protocols did not score them."""
+    lines = [f"format: {', '.join(result.formats)}; ground truth: {result.ground_truth}", *result.remarks]
+    reasons: dict[str, list[str]] = {}
+    for name, reason in result.not_scored.items():
+        reasons.setdefault(reason, []).append(name)
+    told = {reason: names for reason, names in reasons.items() if not reason.startswith(NOT_MEANT)}
+    return lines + [f"not scored under {', '.join(names)}: {reason}" for reason, names in told.items()]
 
 
 def _count_file_confidences(request: Request, sources: Sequence[Source]) -> bool:

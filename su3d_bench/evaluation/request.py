@@ -31,3 +31,8 @@ class Request:
     text_features: Path | None = None
     confidences: Confidences | None = None
     queries: Path | None = None
+
+
+def own_name(out: Path | None) -> str:
+    """What predictions are called that nobody named: as the folder of their run, where they become one."""
+    return "predictions" if out is None else out.resolve().name

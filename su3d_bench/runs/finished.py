@@ -61,8 +61,6 @@ from su3d_bench.store.records import (
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 if TYPE_CHECKING:
-    import pandas
-
     from su3d_bench.core.interfaces import Encoder
 
 
@@ -238,24 +236,6 @@ class FinishedRun:
             for protocol, score in of_scene.items():
                 scores.setdefault(protocol, {})[scene] = score
         return scores
-
-    def to_frame(self) -> pandas.DataFrame:
-        """A row a method, protocol and metric, as fractions: value, low and high of its interval, ceiling; scenes.
-
-        NaN where undefined; methods that no protocol scored have no row.
-        """
-        import pandas
-
-        rows = []
-        for (method, protocol), result in self.results.items():
-            numbers, ceiling = result.result, result.ceiling or {}
-            if numbers is None:
-                continue
-            for metric, value in numbers.metrics.items():
-                low, high = numbers.intervals.get(metric) or (None, None)
-                rows.append((method, protocol, metric, value, low, high, ceiling.get(metric), len(numbers.scenes)))
-        columns = ["method", "protocol", "metric", "value", "low", "high", "ceiling", "n_scenes"]
-        return pandas.DataFrame(rows, columns=columns).astype(dict.fromkeys(columns[3:7], "float64"))
 
 
 class _Rules(dict[str, ProtocolRecord]):

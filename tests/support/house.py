@@ -34,7 +34,7 @@ FLOORS = (
     {"baselines", "runs"},
     {"evaluation", "sheets"},
     {"analysis"},
-    {"cli"},
+    {"api", "cli"},
 )
 PURPOSE = {
     "core": "types that go from room to room, interfaces, the registry, settings, errors, digests, devices, timing",
@@ -53,6 +53,7 @@ PURPOSE = {
     "evaluation": "predictions made elsewhere to numbers",
     "sheets": "what people judge: made, answered, scored",
     "analysis": "finished runs compared, gated, ranked, taken apart",
+    "api": "what a program or a notebook calls: runs and predictions to tables of pandas",
     "cli": "a thin module a verb",
 }
 
@@ -112,7 +113,7 @@ def first_calls(call: Callable[[], Any]) -> list[str]:
         name = str(frame.f_globals.get("__name__", ""))
         room, _, module = name.removeprefix("su3d_bench.").partition(".")
         place = f"{room}/{module.replace('.', '/')}"
-        is_met = name.startswith("su3d_bench.") and room in PURPOSE and room not in ("core", "cli")
+        is_met = name.startswith("su3d_bench.") and room in PURPOSE and room not in ("core", "cli", "api")
         if is_met and place not in visited:
             if _is_importing(frame):
                 return

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.cli.common import add_group, add_settings, add_verb, answer_either
-from su3d_bench.core.errors import EXIT_DONE, DataError, ScenesMissing, Su3dError, counted
+from su3d_bench.core.errors import EXIT_DONE
 
 LAYOUTS = ("native", "replica", "scannet", "scannet-python", "scannet-cpp", "tum")
 MAX_LISTED = 40
@@ -123,11 +123,11 @@ def _add_make(actions: Any) -> None:
 
 
 def call_list(arguments: argparse.Namespace) -> int:
-    from su3d_bench.core import registry
+    from su3d_bench.runs.catalogue import known_datasets
 
     root = data_root()
     named = list(dict.fromkeys(arguments.names))
-    rows = [_row(name, registry.load("dataset", name), root) for name in named or registry.names("dataset")]
+    rows = known_datasets(named, root)
     absent = [] if named else [row for row in rows if row["is_missing"]]
     lines = [f"data root: {root}", *(line for row in rows if row not in absent for line in _lines(row))]
     lines += _absent_lines(absent, root)
@@ -138,38 +138,6 @@ def call_list(arguments: argparse.Namespace) -> int:
 def data_root() -> Path:
     """Where a run looks for datasets; said here again because what plans a run takes as long to load as the list."""
     return Path(os.environ.get("SU3D_DATA") or "~/.cache/su3d-bench/data").expanduser()
-
-
-def _row(name: str, dataset_class: Any, root: Path) -> dict[str, Any]:
-    """What is known of a dataset; a dataset may say where it looks (``places``) and how a scene is (``status``)."""
-    from su3d_bench.core.interfaces import HasPlaces
-
-    dataset = dataset_class(root, dataset_class.Options())
-    row: dict[str, Any] = {
-        "name": name,
-        "summary": (dataset_class.__doc__ or "").strip().partition("\n")[0].replace("`", ""),
-        "places": [str(place) for place in (dataset.places() if isinstance(dataset, HasPlaces) else ())],
-        "ground_truth": list(dataset_class.variants),
-        "scenes": [],
-        "error": None,
-        "is_missing": False,
-    }
-    try:
-        row["scenes"] = [{"scene": f"{name}/{scene}", "status": _status(dataset, scene)} for scene in dataset.scenes()]
-    except DataError as error:
-        row |= {"error": str(error), "is_missing": isinstance(error, ScenesMissing)}
-    return row
-
-
-def _status(dataset: Any, scene: str) -> str:
-    from su3d_bench.core.interfaces import HasStatus
-
-    try:
-        if isinstance(dataset, HasStatus):
-            return str(dataset.status(scene))
-        return counted(dataset.info(scene, 1).n_frames, "frame")
-    except Su3dError as error:
-        return str(error)
 
 
 def _absent_lines(rows: Sequence[dict[str, Any]], root: Path) -> list[str]:

@@ -1,0 +1,167 @@
+"""Records of runs as tables of pandas: the columns, what each holds, and how they are filled.
+
+Every number is the one of the record, to the last bit; NaN, or NA in whole numbers, stands where there is none. Texts
+are made printable: they may come from files of others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import astuple
+from typing import TYPE_CHECKING, Any
+
+from su3d_bench.core.errors import printable
+from su3d_bench.reports.tables.samples import COLUMNS, Sample
+
+if TYPE_CHECKING:
+    import pandas
+
+    from su3d_bench.analysis.attribution import RunAttribution
+    from su3d_bench.metrics.costs import UpdateTimes
+    from su3d_bench.store.records import MetricsRecord
+
+TEXT, WHOLE, NUMBER, TRUTH, WHOLE_OR_NONE = "string", "int64", "float64", "bool", "Int64"
+# What the columns hold, by table.
+METRICS = {
+    "method": TEXT,
+    "protocol": TEXT,
+    "metric": TEXT,
+    "is_headline": TRUTH,
+    "value": NUMBER,
+    "low": NUMBER,
+    "high": NUMBER,
+    "ceiling": NUMBER,
+    "n_scenes": WHOLE,
+}
+OF_SCENES = {"method": TEXT, "protocol": TEXT, "scene": TEXT, "metric": TEXT, "value": NUMBER}
+OF_CLASSES = {"method": TEXT, "protocol": TEXT, "class_name": TEXT, "metric": TEXT, "value": NUMBER}
+UPDATES = {"method": TEXT, "scene": TEXT, "update": WHOLE, "frame": WHOLE_OR_NONE}  # all others are numbers
+ERRORS = {
+    "method": TEXT,
+    "protocol": TEXT,
+    "metric": TEXT,
+    "value": NUMBER,
+    "part": TEXT,
+    "kind": TEXT,
+    "n": WHOLE_OR_NONE,
+    "gain": NUMBER,
+}
+DIFFERENCES = {
+    "protocol": TEXT,
+    "left": TEXT,
+    "right": TEXT,
+    "class_name": TEXT,
+    "metric": TEXT,
+    "value_left": NUMBER,
+    "value_right": NUMBER,
+    "difference": NUMBER,
+    "low": NUMBER,
+    "high": NUMBER,
+    "p": NUMBER,
+    "p_of_all": NUMBER,
+    "n_scenes": WHOLE,
+}
+_OF_KIND = {"text": TEXT, "whole number": WHOLE, "number": NUMBER, "yes or no": TRUTH}
+SAMPLES = {
+    one.name: WHOLE_OR_NONE if one.may_lack and one.kind == "whole number" else _OF_KIND[one.kind] for one in COLUMNS
+}
+
+
+def metrics_frame(metrics: MetricsRecord) -> pandas.DataFrame:
+    """A row a method, protocol and metric over all scenes; methods that no protocol scored have none."""
+    rows = []
+    for result in metrics.results:
+        numbers, ceiling = result.result, result.ceiling or {}
+        if numbers is None:
+            continue
+        for metric, value in numbers.metrics.items():
+            low, high = numbers.intervals.get(metric) or (None, None)
+            where = (result.method, result.protocol, metric, metric in result.headline)
+            rows.append((*where, value, low, high, ceiling.get(metric), len(numbers.scenes)))
+    return _frame(METRICS, rows)
+
+
+def scenes_frame(metrics: MetricsRecord) -> pandas.DataFrame:
+    """A row a method, protocol, scene and metric."""
+    return _frame(OF_SCENES, _inner_rows(metrics, "per_scene"))
+
+
+def classes_frame(metrics: MetricsRecord) -> pandas.DataFrame:
+    """A row a method, protocol, class and metric; of the classes that have a value."""
+    return _frame(OF_CLASSES, _inner_rows(metrics, "per_class"))
+
+
+def _inner_rows(metrics: MetricsRecord, name: str) -> list[tuple[Any, ...]]:
+    return [
+        (result.method, result.protocol, inner, metric, value)
+        for result in metrics.results
+        if result.result is not None
+        for inner, values in getattr(result.result, name).items()
+        for metric, value in values.items()
+    ]
+
+
+def updates_frame(times: Iterable[UpdateTimes]) -> pandas.DataFrame:
+    """A row an update, with every column of any ``updates.csv``; NaN where a method has no such column."""
+    import pandas
+
+    tables = [pandas.DataFrame({"method": one.method, "scene": one.scene, **one.columns}) for one in times]
+    names = dict.fromkeys([*UPDATES, *(name for table in tables for name in table.columns)])
+    last = [name for name in ("method_ms", "total_ms") if name in names]
+    order = [*(name for name in names if name not in last), *last]
+    whole = (pandas.concat(tables, ignore_index=True) if tables else pandas.DataFrame()).reindex(columns=order)
+    for name in ("method", "scene"):
+        whole[name] = [printable(str(text)) for text in whole[name]]
+    return whole.astype({name: UPDATES.get(name, NUMBER) for name in order})
+
+
+def samples_frame(samples: Sequence[Sample]) -> pandas.DataFrame:
+    """A row a sample; ``report samples --columns`` says what each column holds."""
+    return _frame(SAMPLES, [astuple(sample) for sample in samples])
+
+
+def errors_frame(attributions: Iterable[RunAttribution]) -> pandas.DataFrame:
+    """A row a method, protocol, metric and kind of error; the value and the gains but those of stages add up to 1."""
+    rows = []
+    for one in attributions:
+        for of_protocol in one.protocols:
+            for metric, value in of_protocol.values.items():
+                where = (one.method, of_protocol.protocol, metric, value)
+                for kind, cause in of_protocol.causes.items():
+                    rows.append((*where, "error", kind, cause.n, cause.gains[metric]))
+                rows.append((*where, "overlap", "", None, of_protocol.overlap[metric]))
+                rows.append((*where, "rest", "", None, of_protocol.rest[metric]))
+                for stage, values in of_protocol.stages.items():
+                    rows.append((*where, "stage", stage, None, values[metric] - value))
+    return _frame(ERRORS, rows)
+
+
+def differences_frame(comparison: Mapping[str, Any]) -> pandas.DataFrame:
+    """A row a protocol and metric, and where classes were compared a row a class too; ``comparison`` is its JSON."""
+    rows = []
+    for protocol in comparison["protocols"]:
+        pairs = [("", metric, value) for metric, value in protocol["metrics"].items()]
+        for name, columns in protocol["classes"].items():
+            pairs += [(name, metric, value) for metric, value in columns.items()]
+        for name, metric, value in pairs:
+            low, high = value["interval"] or (None, None)
+            row = (protocol["protocol"], protocol["left"], protocol["right"], name, metric, value["left"])
+            row += (value["right"], value["difference"], low, high, value["p"], value["p_of_all"])
+            rows.append((*row, len(protocol["scenes"])))
+    return _frame(DIFFERENCES, rows)
+
+
+def listed_frame(columns: Mapping[str, str], rows: Sequence[Sequence[Any]]) -> pandas.DataFrame:
+    """What there is, a row each."""
+    return _frame(columns, rows)
+
+
+def _frame(columns: Mapping[str, str], rows: Sequence[Sequence[Any]]) -> pandas.DataFrame:
+    import pandas
+
+    texts = [place for place, kind in enumerate(columns.values()) if kind == TEXT]
+    plain = [list(row) for row in rows]
+    for row in plain:
+        for place in texts:
+            row[place] = printable(str(row[place]))
+    return pandas.DataFrame(plain, columns=list(columns)).astype(dict(columns))

@@ -1,0 +1,72 @@
+"""What there is to run and to score by, as tables of pandas."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from su3d_bench.api.frames import TEXT, TRUTH, WHOLE, listed_frame
+from su3d_bench.api.results import Names, several
+
+if TYPE_CHECKING:
+    import pandas
+
+
+def list_datasets(names: Names = ()) -> pandas.DataFrame:
+    """The datasets and what of them is here, a row a scene; one of which nothing is here has a row without a scene.
+
+    Columns: ``dataset``, ``scene``, its address as ``run`` takes it, ``state``, how many frames it has or what is wrong,
+    ``summary`` of the dataset (string); ``is_here`` (bool). A ``ConfigError`` for an unknown name.
+
+    >>> import su3d_bench as su3d
+    >>> scenes = su3d.list_datasets("rooms")
+    >>> scenes["scene"][0], bool(scenes["is_here"].all())
+    ('rooms/living0', True)
+    """
+    from su3d_bench.runs.catalogue import known_datasets
+    from su3d_bench.runs.planning.scenes import data_root
+
+    rows: list[tuple[object, ...]] = []
+    for one in known_datasets(several(names), data_root()):
+        rows += [(one["name"], scene["scene"], scene["status"], one["summary"], True) for scene in one["scenes"]]
+        if not one["scenes"]:
+            rows.append((one["name"], "", one["error"] or "has no scene", one["summary"], False))
+    columns = {"dataset": TEXT, "scene": TEXT, "state": TEXT, "summary": TEXT, "is_here": TRUTH}
+    return listed_frame(columns, rows)
+
+
+def list_methods() -> pandas.DataFrame:
+    """The methods that can be run by name: ``name``, ``summary``, ``paper``, ``source``, ``licence``, ``status`` and
+    ``needs``, by commas (string, empty for none).
+
+    >>> import su3d_bench as su3d
+    >>> "opensu3d" in su3d.list_methods()["name"].tolist()
+    True
+    """
+    from su3d_bench.runs.catalogue import known_methods
+
+    columns = dict.fromkeys(("name", "summary", "paper", "source", "licence", "status", "needs"), TEXT)
+    rows = [[", ".join(one[key]) if key == "needs" else one[key] or "" for key in columns] for one in known_methods()]
+    return listed_frame(columns, rows)
+
+
+def list_protocols() -> pandas.DataFrame:
+    """The protocols of the program: ``name``, ``summary``, ``kind``, ``datasets`` and ``headline`` metrics by commas,
+    ``label_space`` (string), ``version`` (int64). ``load_protocol`` has every rule of one.
+
+    >>> import su3d_bench as su3d
+    >>> protocols = su3d.list_protocols().set_index("name")
+    >>> protocols.loc["rooms-instance", "headline"]
+    'AP, AP50, AP25'
+    """
+    from su3d_bench.metrics.protocols.files import protocol_names
+    from su3d_bench.metrics.protocols.loading import load_protocol
+
+    columns = dict.fromkeys(("name", "summary", "kind", "datasets", "headline", "label_space"), TEXT)
+    rows = [
+        (one.name, one.summary, one.kind, ", ".join(one.datasets), ", ".join(one.headline), one.label_space or "")
+        for one in map(load_protocol, protocol_names())
+    ]
+    versions = [load_protocol(name).version for name in protocol_names()]
+    return listed_frame(
+        {**columns, "version": WHOLE}, [(*row, version) for row, version in zip(rows, versions, strict=True)]
+    )
