@@ -72,11 +72,11 @@ $(VENV)/core: pyproject.toml constraints.txt
 	@touch $@
 
 $(VENV)/test: $(VENV)/core
-	$(PIP) -e '.[models,sheets,ray,slurm,stores,test]'
+	$(PIP) -e '.[models,sheets,ray,slurm,stores,parquet,test]'
 	@touch $@
 
 $(VENV)/dev: $(VENV)/test
-	$(PIP) -e '.[models,sheets,ray,slurm,stores,test,dev]'
+	$(PIP) -e '.[models,sheets,ray,slurm,stores,parquet,test,dev]'
 	@touch $@
 
 clean:

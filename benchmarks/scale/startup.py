@@ -1,4 +1,5 @@
-"""How soon the command line answers, beside a Python that does nothing and one that imports numpy and pydantic.
+"""How soon the command line and the package answer, beside a Python that does nothing and one that imports numpy and
+pydantic.
 
 ``python benchmarks startup --json build/measured/startup.json``, one minute. Every command is started in turn, ten
 rounds after one that is not counted; the best of each is what it takes undisturbed. Python's compiled modules are kept
@@ -23,6 +24,7 @@ PYTHON, COMMAND = [sys.executable, "-c"], [sys.executable, "-m", "su3d_bench"]
 COMMANDS = {
     "python -c pass": [*PYTHON, "pass"],
     "python -c 'import numpy, pydantic'": [*PYTHON, "import numpy, pydantic"],
+    "python -c 'import su3d_bench'": [*PYTHON, "import su3d_bench"],
     "su3d-bench --help": [*COMMAND, "--help"],
     "su3d-bench run --help": [*COMMAND, "run", "--help"],
     "su3d-bench datasets list": [*COMMAND, "datasets", "list"],
@@ -62,7 +64,7 @@ def main() -> None:
         command = "python benchmarks startup --json build/measured/startup.json"
         notes = (
             f"Best of {arguments.rounds} rounds, all commands in turn in each; the marks are 100 ms for `--help` and "
-            "400 ms for lists.",
+            "for the package, 400 ms for lists.",
         )
         write_measured(
             arguments.json, "The command line answers", command, ("command", "wall ms", "processor ms"), rows, notes

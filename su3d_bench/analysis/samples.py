@@ -55,7 +55,7 @@ class Chosen:
 def samples(
     paths: Sequence[Path],
     chosen: Chosen = Chosen(),
-    report: Report = lambda event: None,  # noqa: B008 - it is frozen
+    report: Report = lambda event: None,
 ) -> Samples:
     """The instances of the runs in the folders ``paths``, scene after scene, under each protocol of kind ``instance``.
 

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 def list_datasets(names: Names = ()) -> pandas.DataFrame:
     """The datasets and what of them is here, a row a scene; one of which nothing is here has a row without a scene.
 
-    Columns: ``dataset``, ``scene``, its address as ``run`` takes it, ``state``, how many frames it has or what is wrong,
-    ``summary`` of the dataset (string); ``is_here`` (bool). A ``ConfigError`` for an unknown name.
+    Columns: ``dataset``, ``scene``, its address as ``run`` takes it, ``state``, how many frames it has or what is
+    wrong, ``summary`` of the dataset (string); ``is_here`` (bool). A ``ConfigError`` for an unknown name.
 
     >>> import su3d_bench as su3d
     >>> scenes = su3d.list_datasets("rooms")

@@ -41,10 +41,10 @@ def run(
     """Run methods over scenes, score their maps, and give the finished run: what ``su3d-bench run`` does.
 
     The keywords are its flags, None stands for the flag's default: ``scenes`` are addresses or patterns (``rooms/*``),
-    ``settings`` are those of ``--set`` such as ``{"opensu3d.top_m": 10}``, ``more`` any other key of a ``run.toml``, such
-    as ``executor`` or ``anytime``. ``out`` is the folder (default: one in ``runs/`` named after the request): the same
-    call again takes it up, another request is refused, or does ``into`` what ``--extend`` and ``--replace`` do.
-    ``report`` is called with every ``Event``.
+    ``settings`` are those of ``--set`` such as ``{"opensu3d.top_m": 10}``, ``more`` any other key of a ``run.toml``,
+    such as ``executor`` or ``anytime``. ``out`` is the folder (default: one in ``runs/`` named after the request): the
+    same call again takes it up; another request is refused, unless ``into`` says what ``--extend`` or ``--replace``
+    does. ``report`` is called with every ``Event``, by which progress can be shown.
 
     Raises a ``ConfigError`` for a wrong request, before any work; a ``DataError`` or ``ModelMissing`` for what is not
     here; a ``StoreError`` for a folder that holds another run; ``RunIncomplete`` where scenes failed: the folder then
@@ -52,7 +52,8 @@ def run(
 
     >>> import su3d_bench as su3d
     >>> small = {"rooms.n_frames": 8, "rooms.width": 160, "rooms.height": 120}
-    >>> run = su3d.run("rooms/bathroom7", "oracle", settings=small, pictures=False, jobs=1, out="runs/first")
+    >>> more = {"settings": small, "pictures": False, "jobs": 1, "out": "runs/first"}
+    >>> run = su3d.run("rooms/bathroom7", "oracle", protocols="rooms-instance", **more)
     >>> run.metrics.query("metric == 'AP'")["value"].tolist()
     [1.0]
     >>> su3d.run("rooms/bathroom7", "oracel")
@@ -171,9 +172,9 @@ def evaluate(
 ) -> Scores | Run:
     """Score predictions made elsewhere, under every protocol that fits: what ``su3d-bench evaluate`` does.
 
-    ``predictions`` is a folder, a file or several of them, or for several methods side by side a table ``{"mine":
-    folder, "theirs": folder}``. The keywords are the flags. The answer has the numbers; with ``out`` it is written there
-    and is a ``Run``, which also has ``instances``, ``errors`` and ``compare``.
+    ``predictions`` is a folder, a file or several of them, or for several methods side by side a table
+    ``{"mine": folder, "theirs": folder}``. The keywords are the flags. The answer has the numbers; with ``out`` it is
+    written there and is a ``Run``, which also has ``instances``, ``errors`` and ``compare``.
 
     Raises a ``PredictionError`` for predictions that cannot be scored, a ``DataError`` for a truth that is not here, a
     ``ConfigError`` for a wrong request, a ``StoreError`` where ``out`` holds another run.

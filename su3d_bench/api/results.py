@@ -61,7 +61,7 @@ class Scores(Shown):
 
     >>> import su3d_bench as su3d
     >>> scores = su3d.evaluate("predictions", ground_truth="truth", protocols="scannet-instance")
-    >>> scores.metrics.set_index("metric")["value"]["AP50"]
+    >>> float(scores.metrics.set_index("metric")["value"]["AP50"])
     0.5
     >>> scores
     <Scores: predictions under scannet-instance>
@@ -88,7 +88,9 @@ class Scores(Shown):
 
     @property
     def scene_metrics(self) -> pandas.DataFrame:
-        """Every value of each scene alone: ``method``, ``protocol``, ``scene``, ``metric`` (string), ``value`` (float64).
+        """Every value of each scene alone, a row a method, protocol, scene and metric.
+
+        Columns: ``method``, ``protocol``, ``scene``, ``metric`` (string), ``value`` (float64).
 
         >>> import su3d_bench as su3d
         >>> su3d.load_run("runs/demo").scene_metrics["scene"].unique().tolist()
@@ -98,11 +100,13 @@ class Scores(Shown):
 
     @property
     def class_metrics(self) -> pandas.DataFrame:
-        """Every value of each class: ``method``, ``protocol``, ``class_name``, ``metric`` (string), ``value`` (float64).
+        """Every value of each class over all scenes, a row a method, protocol, class and metric.
+
+        Columns: ``method``, ``protocol``, ``class_name``, ``metric`` (string), ``value`` (float64).
 
         >>> import su3d_bench as su3d
         >>> classes = su3d.load_run("runs/demo").class_metrics.query("metric == 'AP' and method == 'oracle'")
-        >>> classes["value"].min()
+        >>> float(classes["value"].min())
         1.0
         """
         return frames.classes_frame(self._record)
@@ -124,8 +128,8 @@ class Scores(Shown):
 class Run(Scores):
     """A finished run: a folder that ``run``, or ``evaluate`` with ``out``, wrote; nothing in it is ever changed here.
 
-    ``path`` is the folder, ``scenes``, ``methods`` and ``protocols`` are their names, ``is_complete`` says that no scene
-    failed. ``print(run)`` shows the tables, a notebook shows them by itself.
+    ``path`` is the folder, ``scenes``, ``methods`` and ``protocols`` are their names, ``is_complete`` says that no
+    scene failed. ``print(run)`` shows the tables, a notebook shows them by itself.
 
     >>> import su3d_bench as su3d
     >>> run = su3d.load_run("runs/demo")
@@ -208,15 +212,16 @@ class Run(Scores):
     def errors(self) -> pandas.DataFrame:
         """What each kind of error costs each method, as ``su3d-bench attribute`` computes it.
 
-        Columns: ``method``, ``protocol``, ``metric`` (string), ``value`` (float64), that of the run; ``part``: ``error``,
-        ``overlap``, ``rest`` or ``stage`` (string); ``kind`` (string), of the error or the stage; ``n`` (Int64), how many
-        of it; ``gain`` (float64), by how much the value rises when it alone is mended. Of each metric the value and the
-        gains but those of stages add up to 1. Protocols of kind ``instance`` and ``semantic`` alone are explained.
+        Columns: ``method``, ``protocol``, ``metric`` (string); ``value`` (float64), that of the run; ``part`` (string):
+        ``error``, ``overlap``, ``rest`` or ``stage``; ``kind`` (string) of the error or the stage; ``n`` (Int64), how
+        many of it; ``gain`` (float64), by how much the value rises when it alone is mended. Of each metric the value
+        and the gains but those of stages add up to 1. Protocols of kind ``instance`` and ``semantic`` alone are
+        explained, and the scenes' data must be here, else a ``DataError``.
 
         >>> import su3d_bench as su3d
         >>> errors = su3d.load_run("runs/demo").errors.query("method == 'opensu3d' and metric == 'AP'")
         >>> gains = errors.query("part != 'stage'")["gain"].sum()
-        >>> round(errors["value"].iloc[0] + gains, 12)
+        >>> round(float(errors["value"].iloc[0] + gains), 12)
         1.0
         """
         return frames.errors_frame(self._attributions)
@@ -309,8 +314,8 @@ class Comparison(Shown):
 
         Columns: ``protocol``, ``left``, ``right``, the methods, ``class_name``, empty for all classes, ``metric``
         (string); ``value_left``, ``value_right``, ``difference``, right - left, ``low`` and ``high`` of its 95 %
-        interval, ``p`` of the exact test over scenes, ``p_of_all`` corrected for all that are compared (float64, NaN for
-        none); ``n_scenes`` in common (int64).
+        interval, ``p`` of the exact test over scenes, ``p_of_all`` corrected for all that are compared (float64, NaN
+        for none); ``n_scenes`` in common (int64).
 
         >>> import su3d_bench as su3d
         >>> run = su3d.load_run("runs/demo")

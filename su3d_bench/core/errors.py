@@ -65,6 +65,13 @@ class Su3dError(Exception):
     """Base of every error that a user can cause.
 
     Its text is one printable line of bounded length, whatever it quotes: it goes to terminals, records and pages.
+
+    >>> import su3d_bench as su3d
+    >>> try:
+    ...     su3d.load_protocol("rooms-instances")
+    ... except su3d.Su3dError as error:
+    ...     print(str(error).partition("; known")[0].partition("? ")[0])
+    unknown protocol 'rooms-instances'; did you mean 'rooms-instance'
     """
 
     exit_code = EXIT_WRONG_INPUT

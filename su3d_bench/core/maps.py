@@ -35,7 +35,8 @@ def starts_of(sizes: Iterable[int]) -> Int64Array:
 class Masks:
     """K sets of points, which may overlap: mask k is ``indices[indptr[k]:indptr[k + 1]]``, ascending.
 
-    >>> masks = Masks.of_sets([np.array([4, 5]), np.array([6])])
+    >>> import numpy as np, su3d_bench as su3d
+    >>> masks = su3d.Masks.of_sets([np.array([4, 5]), np.array([6])])
     >>> masks.indptr.tolist(), masks.mask(1).tolist()
     ([0, 2, 3], [6])
     """
@@ -103,6 +104,12 @@ class Instances(Masks):
     (frame index, row of the file or image that the detection came from), those of instance k at
     ``view_indptr[k]:view_indptr[k + 1]``; where the method keeps them, ``view_names`` and ``view_scores`` (V,) float64
     are the names and prediction scores that perception gave in those views.
+
+    >>> import numpy as np, su3d_bench as su3d
+    >>> points = np.array([[0, 0, 0], [1, 0, 0], [5, 5, 1]], np.float32)
+    >>> instances = su3d.Instances.of(points, [[0, 1], [2]], labels=["chair", "lamp"])
+    >>> len(instances), instances.mask(0).tolist(), instances.boxes[0].tolist()
+    (2, [0, 1], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     """
 
     points: Float32Array
@@ -207,7 +214,13 @@ def _check_masks(masks: Masks, n_points: int) -> None:
 
 @dataclass(frozen=True)
 class Partition:
-    """One instance a point: ``instance`` (M,) int32 rows of ``features`` (K, D), -1 for none."""
+    """One instance a point: ``instance`` (M,) int32 rows of ``features`` (K, D), -1 for none.
+
+    >>> import numpy as np, su3d_bench as su3d
+    >>> points, features = np.zeros((3, 3), np.float32), np.eye(2, 4, dtype=np.float32)
+    >>> su3d.Partition(points, np.array([0, 1, -1], np.int32), features).features.shape
+    (2, 4)
+    """
 
     points: Float32Array
     instance: Int32Array
@@ -216,7 +229,12 @@ class Partition:
 
 @dataclass(frozen=True)
 class DenseFeatures:
-    """One feature a point: ``features`` (M, D) float16, usually memory-mapped; all-zero rows have no feature."""
+    """One feature a point: ``features`` (M, D) float16, usually memory-mapped; all-zero rows have no feature.
+
+    >>> import numpy as np, su3d_bench as su3d
+    >>> su3d.DenseFeatures(np.zeros((3, 3), np.float32), np.ones((3, 4), np.float16)).features.shape
+    (3, 4)
+    """
 
     points: Float32Array
     features: NDArray[np.float16]

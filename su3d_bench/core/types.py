@@ -35,6 +35,15 @@ class Frame:
     ``rgb`` (H, W, 3) uint8; ``depth_m`` (H, W) float32, along the optical axis, 0 where invalid;
     ``camera_to_world`` (4, 4) float64; ``intrinsics`` (3, 3) float64 in pixels.
     ``index`` counts in the sequence at full rate.
+
+    >>> import numpy as np, su3d_bench as su3d
+    >>> camera = np.array([[30.0, 0, 15.5], [0, 30.0, 11.5], [0, 0, 1]])
+    >>> black, two_metres = np.zeros((24, 32, 3), np.uint8), np.full((24, 32), 2.0, np.float32)
+    >>> su3d.Frame(0, 0.0, black, two_metres, np.eye(4), camera).depth_m.shape
+    (24, 32)
+    >>> su3d.Frame(7, 0.0, black, two_metres[1:], np.eye(4), camera)
+    Traceback (most recent call last):
+    su3d_bench.core.errors.DataError: frame 7: depth is 32x23 and colour is 32x24; both must have one size
     """
 
     index: int
@@ -71,7 +80,12 @@ def _size(image: NDArray[Any]) -> str:
 
 @dataclass(frozen=True)
 class SceneInfo:
-    """What a method may know of a scene before its first frame; never ground truth."""
+    """What a method may know of a scene before its first frame; never ground truth.
+
+    >>> import su3d_bench as su3d
+    >>> su3d.SceneInfo("rooms", "living0", n_frames=25, stride=40, image_domain="rendered-rooms").seed
+    0
+    """
 
     dataset: str
     scene: str
@@ -104,7 +118,12 @@ class WorldUp:
 
 @dataclass(frozen=True)
 class LabelSet:
-    """Class ids and their names in a label space, most often named as its dataset; id 0 is never a class."""
+    """Class ids and their names in a label space, most often named as its dataset; id 0 is never a class.
+
+    >>> import su3d_bench as su3d
+    >>> su3d.LabelSet("mine", (3, 7), ("chair", "table")).name_of(7)
+    'table'
+    """
 
     space: str
     ids: tuple[int, ...]
@@ -141,6 +160,13 @@ class GroundTruth:
     ``instance`` (N,) int32 ids unique in the scene, 0 where there is none; ``source`` says how it was made.
     ``evaluation_points`` (P, 3) float32 where a protocol scores points of another cloud than the labelled one.
     ``boxes`` where the objects are known by their boxes alone; the points lie on these.
+
+    >>> import numpy as np, su3d_bench as su3d
+    >>> labels = su3d.LabelSet("mine", (3,), ("chair",))
+    >>> of_points = np.array([3, 3, 0], np.int32), np.array([1, 1, 0], np.int32)
+    >>> truth = su3d.GroundTruth(np.zeros((3, 3), np.float32), *of_points, labels, "mesh-vertices", "by hand")
+    >>> truth.labels.name_of(truth.semantic[0])
+    'chair'
     """
 
     points: Float32Array
@@ -168,6 +194,13 @@ class InstanceMesh:
 
     ``vertices`` (V, 3) float32 m; ``triangles`` (T, 3) int32; ``instance_of_triangle`` (T,) int32, 0 for none;
     ``class_of_instance`` maps an instance id to a class id of ``labels``.
+
+    >>> import numpy as np, su3d_bench as su3d
+    >>> labels = su3d.LabelSet("mine", (3,), ("chair",))
+    >>> corners, triangle = np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32)
+    >>> mesh = su3d.InstanceMesh(corners, triangle, np.array([1], np.int32), {1: 3}, labels)
+    >>> mesh.labels.name_of(mesh.class_of_instance[1])
+    'chair'
     """
 
     vertices: Float32Array
@@ -232,6 +265,13 @@ class Detections:
     the method asked for them. ``score_scale``: ``published`` where scores mean what published thresholds were set for
     (SAM's predicted IoU, a detector's confidence), ``own`` where they only order regions. ``rows`` (K,): which row of
     the file, or of all that was found in the image, each region is, where some were left out.
+
+    >>> import numpy as np, su3d_bench as su3d
+    >>> masks, boxes = np.ones((1, 24, 32), bool), np.array([[0, 0, 32, 24]], np.float32)
+    >>> crops, whole = np.ones((1, 1, 4), np.float32), np.ones(4, np.float32)
+    >>> one = su3d.Detections(0, masks, boxes, np.ones(1, np.float32), ("wall",), ("",), (1.0,), crops, whole)
+    >>> len(one), one.names
+    (1, ('wall',))
     """
 
     frame_index: int
@@ -292,6 +332,10 @@ class PerceptionNeeds:
     makes every number of the method a ceiling. ``automatic`` and ``grounding`` name the settings with which the
     method's own program makes class-agnostic and grounded masks, for profiles that have its models; others pay them no
     heed.
+
+    >>> import su3d_bench as su3d
+    >>> su3d.PerceptionNeeds(masks="class-agnostic", crop_ratios=(1.0, 1.5)).frames
+    True
     """
 
     masks: Literal["grounded", "class-agnostic", "none"] = "grounded"

@@ -72,6 +72,17 @@ def score_scene(rules: ProtocolRules, truth: Truth, prediction: Prediction, enco
 
     ``encoder`` names the features of predictions that bring no labels. Raises ``PredictionError`` for a prediction that
     cannot be scored and ``DataError`` for a truth that does not fit the protocol.
+
+    >>> import numpy as np, su3d_bench as su3d
+    >>> rules = su3d.load_protocol("rooms-instance")
+    >>> chair = rules.scored[0]
+    >>> labels = su3d.LabelSet("replica", (chair.id,), (chair.name,))
+    >>> points, ones = np.random.default_rng(0).random((200, 3)).astype(np.float32), np.ones(200, np.int32)
+    >>> truth = su3d.GroundTruth(points, chair.id * ones, ones, labels, rules.ground_truth, "by hand")
+    >>> half = su3d.Instances.of(points, [np.arange(120)], labels=[chair.name])
+    >>> score = su3d.score_scene(rules, truth, half, None)
+    >>> float(su3d.combine(rules, {"mine/room": score}).metrics["AP50"])  # IoU 0.6
+    1.0
     """
     metric = metric_of(rules)
     base = truth.scene if isinstance(truth, QuestionTruth) else truth
@@ -156,6 +167,13 @@ def combine(rules: ProtocolRules, scores: Mapping[str, SceneScore], *, with_inte
     """The protocol's numbers over the scenes of ``scores``, whose order does not matter.
 
     ``intervals`` are None where they are not wanted.
+
+    A ``DataError`` where no scene is given, or one was scored by other rules. The values are fractions.
+
+    >>> import su3d_bench as su3d
+    >>> su3d.combine(su3d.load_protocol("rooms-instance"), {})
+    Traceback (most recent call last):
+    su3d_bench.core.errors.DataError: rooms-instance: no scene was scored; nothing to combine
     """
     metric, ordered = metric_of(rules), _ordered(rules, scores)
     counts = [score.counts for score in ordered.values()]

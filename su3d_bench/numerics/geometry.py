@@ -22,6 +22,12 @@ def back_project(
     """World points (N, 3) m of the chosen ``pixels`` (H, W) in row-major order: T (D(u,v) K^-1 (u,v,1)).
 
     Integer pixel indices, no half-pixel shift.
+
+    >>> import numpy as np, su3d_bench as su3d
+    >>> camera, is_centre = np.array([[30.0, 0, 1], [0, 30.0, 1], [0, 0, 1]]), np.zeros((3, 3), bool)
+    >>> is_centre[1, 1] = True
+    >>> su3d.back_project(np.full((3, 3), 2.0, np.float32), camera, np.eye(4), is_centre).tolist()
+    [[0.0, 0.0, 2.0]]
     """
     of_row, of_column = ray_parts(intrinsics, camera_to_world, *depth_m.shape)
     z = depth_m[pixels].astype(np.float64)

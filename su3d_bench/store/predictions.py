@@ -143,7 +143,15 @@ def _write_rows(path: Path, table: NDArray[Any]) -> None:
 
 
 def read_prediction(path: Path) -> Prediction:
-    """The prediction that a run stored at ``path``; features of a dense one are memory-mapped."""
+    """The prediction that a run stored at ``path``; features of a dense one are memory-mapped.
+
+    Points are metres, (M, 3) float32. A ``StoreError`` or ``PredictionError`` where the file is damaged or none.
+
+    >>> import su3d_bench as su3d
+    >>> prediction = su3d.read_prediction("runs/demo/scenes/rooms.bathroom7/oracle/prediction.npz")
+    >>> type(prediction).__name__, prediction.points.shape[1]
+    ('Instances', 3)
+    """
     arrays = read_npz(path)
     if str(arrays.get("kind")) == DenseFeatures.__name__ and "features" not in arrays:
         arrays["features"] = _mapped_rows(features_beside(path))

@@ -51,6 +51,8 @@ CASES: dict[str, list[list[str]]] = {
     ],
     "report timing": [["RUN", "--out", "out/timing"], ["RUN", "--format", "markdown"], ["RUN", "--json"]],
     "report html": [["RUN", "--no-maps", "--out", "out/page.html", "--title", HOSTILE]],
+    "report samples": [["RUN"], ["RUN", "--out", "out/samples.csv"], ["RUN", "--json"], ["RUN", "--methods", HOSTILE],
+                       ["--columns"]],
     "report leaderboard": [["."], [".", "--format", "html", "--out", "out/board.html"], [".", "--json"]],
     "report verify": [["out/t.latex"], ["hostile.tex"]],
     "runs list": [["."], [".", "--json"], [HOSTILE]],

@@ -14,6 +14,7 @@ from painted import Painted, colour_perception
 from places import SCENES
 from prediction_files import write_openmask3d, write_scannet_text
 
+from su3d_bench import load_run
 from su3d_bench.cli.main import main
 from su3d_bench.core.digests import digest_file
 from su3d_bench.evaluation.as_run import AGAINST_THE_RULE
@@ -90,7 +91,7 @@ def test_predictions_in_two_formats_go_through_every_verb_with_the_same_numbers(
         assert [result.result.per_scene[f"painted/{name}"][result.headline[0]] for name in "abc"] == [
             known["per_scene"][name][next(iter(known["metrics"]))] for name in "abc"
         ]
-    frame = run.to_frame().set_index(["method", "protocol", "metric"])["value"]
+    frame = load_run(RUN).metrics.set_index(["method", "protocol", "metric"])["value"]
     ap = {method: float(frame[method, "rooms-instance", "AP"]) for method in run.methods}
     assert 0 < ap["theirs"] < ap["mine"] < 1
     before = files_of(RUN)

@@ -23,6 +23,13 @@ class Timer:
     """Collects the milliseconds of each stage of the current update; ``take`` hands them over and starts anew.
 
     Where a GPU is in use, each stage waits for it at both ends, so that work is booked where it was asked for.
+
+    >>> import su3d_bench as su3d
+    >>> timer = su3d.Timer()
+    >>> with timer.stage("match"):
+    ...     pass
+    >>> list(timer.take()), timer.take()
+    (['match'], {})
     """
 
     def __init__(self) -> None:

@@ -31,7 +31,15 @@ def not_comparable_with(rules: ProtocolRules) -> list[str]:
 
 
 def load_protocol(name: str) -> ProtocolRules:
-    """The rules called ``name``, or those in the file ``name`` when it ends in ``.toml``."""
+    """The rules called ``name``, or those in the file ``name`` when it ends in ``.toml``.
+
+    A ``ConfigError`` where there is none of that name, or the file is none.
+
+    >>> import su3d_bench as su3d
+    >>> rules = su3d.load_protocol("rooms-instance")
+    >>> rules.kind, rules.headline, rules.min_region_size
+    ('instance', ('AP', 'AP50', 'AP25'), 100)
+    """
     known = protocol_names()
     if name in known:
         return _built_in(name)

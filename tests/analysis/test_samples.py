@@ -1,0 +1,184 @@
+"""Every instance of a run as a row: what attribute and the evaluator count, the verb, and what stands in its files."""
+
+from __future__ import annotations
+
+import csv
+import doctest
+import io
+import json
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from painted import WordEncoder, colour_perception
+from places import SCENES
+from scored_room import ENCODER, noisy
+
+import su3d_bench.metrics.instance.hits
+import su3d_bench.reports.tables.samples
+from su3d_bench.analysis.attribution import attribute
+from su3d_bench.analysis.samples import Chosen, samples
+from su3d_bench.cli.main import main
+from su3d_bench.core.errors import PredictionError
+from su3d_bench.metrics.attribution.arrays import scored_masks
+from su3d_bench.metrics.attribution.masks import KINDS, count_masks, errors_of, mend_scene
+from su3d_bench.metrics.attribution.overlaps import measure_overlaps, true_instances
+from su3d_bench.metrics.instance.hits import hits
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.reports.tables.samples import COLUMNS, Sample, csv_of
+from su3d_bench.runs import finished as finished_run
+from su3d_bench.runs import scene as scene_run
+
+PAINTED = f"{SCENES}/painted.py"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Two methods over two painted scenes; one loses an object of each."""
+    folder = tmp_path_factory.mktemp("samples") / "run"
+    words = ["run", f"{PAINTED}:Painted/[ab]", "--methods", f"{PAINTED}:Collector", "oracle", "--jobs", "1", "--quiet"]
+    words += ["--protocols", "rooms-semantic", "rooms-instance", "--set", "collector.drop=1", "--no-pictures"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", colour_perception)
+        patch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
+        assert main([*words, "--out", str(folder)]) == 0
+        yield folder
+
+
+def test_the_examples_hold() -> None:
+    assert doctest.testmod(su3d_bench.metrics.instance.hits).failed == 0
+    assert doctest.testmod(su3d_bench.reports.tables.samples).failed == 0
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("name", ["rooms-instance", "replica-openmask3d"])
+def test_hits_and_errors_are_those_that_the_evaluator_and_attribute_count(name: str, seed: int) -> None:
+    rules = load_protocol(name)
+    truth, prediction = noisy(seed)
+    values, masks, scoring = scored_masks(rules, truth, prediction, ENCODER)
+    counts = count_masks(values, masks, scoring)
+    found = hits(
+        values, masks.masks, masks.class_ids, masks.scores, scoring.class_ids, scoring.min_region_size,
+        scoring.thresholds,
+    )  # fmt: skip
+    for t, at in enumerate(found):
+        is_true = counts.is_true & (counts.threshold_index == t)
+        assert len(at.values) == is_true.sum() == (counts.n_truth - counts.n_missed[:, t]).sum()
+        if scoring.thresholds[t] >= 0.5:  # below, a mask may be that of two instances
+            assert sorted(masks.scores[at.is_hit]) == sorted(counts.score[is_true])
+    errors = errors_of(measure_overlaps(true_instances(values, scoring), masks, scoring))
+    named = Counter(errors.of_mask) + Counter(errors.of_instance)
+    mended = mend_scene(values, masks, scoring)
+    assert {kind: named[kind] for kind in KINDS} == dict(mended.n)
+
+
+def test_the_rows_count_what_attribute_counts(run: Path) -> None:
+    rows = samples([run]).rows
+    for method in ("collector", "oracle"):
+        explained = attribute(run, method=method, protocols=["rooms-instance"]).protocols[0]
+        own = [row for row in rows if row.method == method]
+        named = Counter(row.error for row in own)
+        assert {kind: named[kind] for kind in KINDS} == {kind: cause.n for kind, cause in explained.causes.items()}
+    assert {row.error for row in rows if row.method == "collector"} >= {"missed"}
+    perfect = [row for row in rows if row.method == "oracle" and row.is_counted]
+    assert all(row.best_iou == 1 and row.is_hit_25 and row.is_hit_50 and not row.error for row in perfect)
+    assert all(row.class_name == row.matched_class for row in perfect)
+
+
+def test_a_row_says_where_its_instance_is(run: Path) -> None:
+    rows = [row for row in samples([run], Chosen(["oracle"], [], ["painted/a"])).rows if row.is_counted]
+    places = {kind: {} for kind in ("predicted", "true")}  # type: dict[str, dict[int, list[float | None]]]
+    for row in rows:
+        number = row.instance if row.kind == "true" else row.matched
+        assert number is not None
+        places[row.kind][number] = [row.centre_x_m, row.centre_y_m, row.centre_z_m, row.size_x_m]
+    assert places["true"] == places["predicted"] and len(places["true"]) >= 2
+
+
+def test_counts_that_are_not_those_of_the_run_are_refused(run: Path, tmp_path: Path) -> None:
+    import shutil
+
+    other = tmp_path / "other"
+    shutil.copytree(run, other)
+    shutil.copy(other / "scenes/painted.a/oracle/prediction.npz", other / "scenes/painted.a/collector/prediction.npz")
+    with pytest.raises(PredictionError, match="the counts of the run are not those"):
+        samples([other], Chosen(["collector"]))
+
+
+def test_the_verb_writes_one_row_each(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "samples.csv"
+    assert main(["report", "samples", str(run), "--out", str(file), f"--json={tmp_path / 'rows.json'}"]) == 0
+    rows = samples([run]).rows
+    n_predicted = sum(row.kind == "predicted" for row in rows)
+    printed = capsys.readouterr()
+    assert printed.out == f"{file}: {n_predicted} predicted instances, {len(rows) - n_predicted} true\n"
+    assert "rooms-semantic is of kind semantic" in printed.err
+    with file.open(newline="") as stream:
+        written = list(csv.DictReader(stream))
+    assert [row["best_iou"] for row in written] == [repr(row.best_iou) for row in rows]
+    assert json.loads((tmp_path / "rows.json").read_text())[0]["scene"] == "painted/a"
+    assert main(["report", "samples", str(run), "--methods", "oracle", "--scenes", "painted/b"]) == 0
+    told = list(csv.DictReader(io.StringIO(capsys.readouterr().out)))
+    assert {(row["method"], row["scene"]) for row in told} == {("oracle", "painted/b")}
+
+
+def test_parquet_holds_the_same_with_what_each_column_means(run: Path, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="the parquet extra is not installed")
+    file = tmp_path / "samples.parquet"
+    assert main(["report", "samples", str(run), "--out", str(file), "--quiet"]) == 0
+    table = parquet.read_table(file)
+    assert [Sample(**row) for row in table.to_pylist()] == list(samples([run]).rows)
+    assert table.schema.field("best_iou").metadata[b"meaning"].startswith(b"highest IoU")
+
+
+def test_without_pyarrow_one_line_says_what_to_do(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    assert main(["report", "samples", str(run), "--out", str(tmp_path / "samples.parquet")]) == 2
+    line = (
+        "su3d-bench: --format parquet needs the parquet extra: pip install 'su3d-bench[parquet]'; csv needs nothing\n"
+    )
+    assert capsys.readouterr().err == line
+    assert not (tmp_path / "samples.parquet").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ([], "report samples: name the folder of a run"),
+        (["RUN", "--columns"], "--columns speaks of no run"),
+        (["RUN", "--format", "parquet"], "--format parquet: is no text; say where with --out"),
+        (["RUN", "--methods", "none"], "holds no scores of the method 'none'; it has collector, oracle"),
+        (["RUN", "--protocols", "rooms-semantic"], "instances are listed under kind 'instance'"),
+        (["RUN", "--scenes", "painted/c"], "holds no scene 'painted/c'; did you mean"),
+    ],
+)
+def test_a_wrong_request_is_one_line(
+    words: list[str], line: str, run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["report", "samples", *(str(run) if word == "RUN" else word for word in words)]) == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert line in said
+
+
+def test_every_column_is_told_and_no_cell_is_a_formula(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["report", "samples", "--columns"]) == 0
+    printed = capsys.readouterr().out
+    assert all(f"| {column.name} " in printed for column in COLUMNS)
+    values = {column.name: 0 for column in COLUMNS} | {"class_name": "=1+1", "name": "a;=b\n@c", "score": None}
+    (cells,) = csv.DictReader(io.StringIO(csv_of([Sample(**values)])))  # type: ignore[arg-type]
+    assert (cells["class_name"], cells["name"], cells["score"]) == ("'=1+1", "a;'=b @c", "")
+
+
+def test_a_mask_that_two_instances_meet_is_told_once() -> None:
+    """Above IoU 0.25 one mask may be the best of two instances of its class, which the evaluator lets it be."""
+    from su3d_bench.core.maps import Masks
+
+    truth, both = np.repeat([3001, 3002], 200), np.arange(400)
+    masks = Masks.of_sets([np.arange(150), both])
+    (at,) = hits(truth, masks, np.array([3, 3]), np.array([0.5, 0.9]), [3], 100, (0.25,))
+    assert at.is_hit.tolist() == [False, True] and sorted(at.values) == [3001, 3002]

@@ -1,0 +1,267 @@
+"""The public Python API: every example of a docstring, tables that hold what the files hold, errors of one line."""
+
+from __future__ import annotations
+
+import doctest
+import inspect
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from painted import WordEncoder, colour_perception
+from places import ROOT, SCENES
+
+import su3d_bench as su3d
+from su3d_bench.cli.main import main
+from su3d_bench.core.errors import RunIncomplete
+from su3d_bench.runs import finished as finished_run
+from su3d_bench.runs import scene as scene_run
+
+SMALL = {"rooms.n_frames": 80, "rooms.width": 160, "rooms.height": 120}
+PAINTED, COLLECTOR = f"{SCENES}/painted.py:Painted", f"{SCENES}/painted.py:Collector"
+BOTH = ["rooms-semantic", "rooms-instance"]
+
+
+def documented() -> Iterator[tuple[str, Any]]:
+    """Every public name, and what of ours the public classes of results have."""
+    for name in su3d.__all__:
+        value = getattr(su3d, name)
+        yield name, value
+        if inspect.isclass(value) and value.__module__ == "su3d_bench.api.results":
+            for inner, member in vars(value).items():
+                if not inner.startswith("_") and (callable(member) or isinstance(member, property)):
+                    yield f"{name}.{inner}", member
+
+
+DOCUMENTED = dict(documented())
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory, rooms_data: Path) -> Path:
+    """A folder with what the examples speak of: a run of a small room, predictions and their truth."""
+    folder = tmp_path_factory.mktemp("api")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv("SU3D_DATA", str(rooms_data))
+        patch.setenv("SU3D_CACHE", str(folder / "cache"))
+        methods = ["opensu3d", "oracle"]
+        su3d.run("rooms/bathroom7", methods, protocols=BOTH, settings=SMALL, pictures=False, jobs=1, out="runs/demo")
+        truth = np.repeat([5001, 5002], 200)
+        for name in ("truth", "predictions/masks"):
+            Path(name).mkdir(parents=True)
+        np.savetxt("truth/scene0000_00.txt", truth, "%d")
+        np.savetxt("predictions/masks/0.txt", truth == 5001, "%d")
+        Path("predictions/scene0000_00.txt").write_text("masks/0.txt 5 0.9\n")
+    return folder
+
+
+@pytest.fixture
+def here(place: Path, rooms_data: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(place)
+    monkeypatch.setenv("SU3D_DATA", str(rooms_data))
+    monkeypatch.setenv("SU3D_CACHE", str(place / "cache"))
+    return place
+
+
+@pytest.mark.parametrize("name", DOCUMENTED)
+def test_each_public_name_has_an_example_that_runs(name: str, here: Path) -> None:
+    (found,) = doctest.DocTestFinder(recurse=False).find(DOCUMENTED[name], name, globs={})
+    assert found.examples, f"{name}: its docstring has no example"
+    ran = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS).run(found)
+    assert ran.failed == 0
+
+
+def test_the_page_of_python_runs_as_one_script(
+    rooms_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SU3D_DATA", str(rooms_data))
+    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+    blocks = (ROOT / "docs" / "python.md").read_text().split("```python\n")[1:]
+    assert len(blocks) == 3
+    (tmp_path / "page.py").write_text("\n".join(block.partition("```")[0] for block in blocks))
+    done = subprocess.run([sys.executable, "page.py"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "rooms-instance (version" in done.stdout and "missed" in done.stdout
+
+
+# tables
+
+
+@pytest.fixture(scope="module")
+def painted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Two methods over four painted scenes, from the command line; one loses an object of each."""
+    folder = tmp_path_factory.mktemp("painted") / "run"
+    words = ["run", "--scenes", f"{PAINTED}/*", "--methods", COLLECTOR, "oracle", "--protocols", *BOTH]
+    words += ["--set", "collector.drop=1"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", colour_perception)
+        patch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
+        assert main([*words, "--jobs", "1", "--no-pictures", "--quiet", "--out", str(folder)]) == 0
+        yield folder
+
+
+def test_the_tables_of_numbers_hold_what_metrics_json_holds(painted: Path) -> None:
+    run = su3d.load_run(painted)
+    results = json.loads((painted / "metrics.json").read_text())["results"]
+    metrics = run.metrics.set_index(["method", "protocol", "metric"])
+    scenes = run.scene_metrics.set_index(["method", "protocol", "scene", "metric"])["value"]
+    classes = run.class_metrics.set_index(["method", "protocol", "class_name", "metric"])["value"]
+    n = {"metrics": 0, "per_scene": 0, "per_class": 0}
+    for result in results:
+        where, numbers = (result["method"], result["protocol"]), result["result"]
+        for metric, value in numbers["metrics"].items():
+            row = metrics.loc[(*where, metric)]
+            interval = numbers["intervals"].get(metric) or (None, None)
+            known = np.array([value, *interval, result["ceiling"].get(metric)], float)
+            np.testing.assert_array_equal(row[["value", "low", "high", "ceiling"]].astype(float), known)
+            assert row["n_scenes"] == len(numbers["scenes"])
+            assert row["is_headline"] == (metric in result["headline"])
+            n["metrics"] += 1
+        for kind, table in (("per_scene", scenes), ("per_class", classes)):
+            for inner, values in numbers[kind].items():
+                for metric, value in values.items():
+                    np.testing.assert_array_equal(table.loc[(*where, inner, metric)], np.array(value, float))
+                    n[kind] += 1
+    assert (len(metrics), len(scenes), len(classes)) == tuple(n.values())
+    assert min(n.values()) > 0
+
+
+def test_the_table_of_updates_holds_every_updates_csv(painted: Path) -> None:
+    run = su3d.load_run(painted)
+    updates = run.updates
+    for scene in run.scenes:
+        file = painted / "scenes" / scene.replace("/", ".") / "collector" / "updates.csv"
+        names, *lines = (line.split(",") for line in file.read_text().splitlines())
+        own = updates.query("scene == @scene and method == 'collector'")
+        np.testing.assert_array_equal(own[names].to_numpy(float), np.array(lines, float))
+    assert str(updates["update"].dtype) == "int64" and str(updates["total_ms"].dtype) == "float64"
+
+
+def test_the_table_of_errors_is_what_attribute_says(painted: Path, tmp_path: Path) -> None:
+    assert main(["attribute", str(painted), "--method", "collector", f"--json={tmp_path / 'errors.json'}"]) == 0
+    errors = su3d.load_run(painted).errors
+    own = errors[errors["method"] == "collector"].set_index(["protocol", "metric", "part", "kind"]).sort_index()
+    for protocol in json.loads((tmp_path / "errors.json").read_text())["protocols"]:
+        for metric, value in protocol["values"].items():
+            rows = own.loc[(protocol["protocol"], metric)]
+            assert set(rows["value"]) == {value}
+            for kind, cause in protocol["causes"].items():
+                row = rows.loc[("error", kind)]
+                assert (row["n"], row["gain"]) == (cause["n"], cause["gains"][metric])
+            assert value + rows.drop("stage", level="part")["gain"].sum() == pytest.approx(1, abs=1e-12)
+
+
+def test_a_run_that_is_evaluated_has_the_numbers_of_the_evaluation(here: Path) -> None:
+    scores = su3d.evaluate("predictions", ground_truth="truth", protocols="scannet-instance")
+    run = su3d.evaluate("predictions", ground_truth="truth", protocols="scannet-instance", out="runs/again")
+    assert type(scores) is su3d.Scores and isinstance(run, su3d.Run)
+    assert scores.metrics.drop(columns="method").equals(run.metrics.drop(columns="method"))
+    assert any("format: " in line for line in scores.remarks)
+    assert any(line.startswith("again: predictions made elsewhere") for line in run.remarks)
+    found = run.instances
+    assert found[["kind", "error", "is_hit_50"]].values.tolist() == [
+        ["predicted", "", True], ["true", "", True], ["true", "missed", False]
+    ]  # fmt: skip
+    assert found["centre_x_m"].isna().all(), "files of truth say nothing of places"
+
+
+def test_nothing_in_the_folder_changes(painted: Path) -> None:
+    before = {path: path.read_bytes() for path in painted.rglob("*") if path.is_file()}
+    run = su3d.load_run(painted)
+    for name in ("metrics", "scene_metrics", "class_metrics", "updates", "instances", "errors"):
+        assert len(getattr(run, name)) > 0
+    run.compare(run, method="collector", other_method="oracle", per_class=True)
+    run.prediction(run.scenes[0], "oracle")
+    assert before == {path: path.read_bytes() for path in painted.rglob("*") if path.is_file()}
+
+
+# what is shown
+
+
+def test_a_terminal_and_a_notebook_show_the_tables_without_what_would_act_there(painted: Path) -> None:
+    run = su3d.Run(painted, ["<script>alert(1)</script> \x1b[31m"])
+    assert "collector" in str(run) and "\x1b" not in str(run) + repr(run)
+    page = run._repr_html_()
+    assert "<table>" in page and "&lt;script&gt;" in page and "<script>" not in page and "\x1b" not in page
+
+
+def test_a_comparison_of_classes_has_a_row_a_class(painted: Path) -> None:
+    run = su3d.load_run(painted)
+    compared = run.compare(painted, method="collector", other_method="oracle", per_class=True)
+    names = compared.differences["class_name"]
+    assert (names == "").any() and (names == "chair").any()
+    assert "chair" in str(compared) and "<table>" in compared._repr_html_()
+
+
+# making
+
+
+def test_a_script_without_a_guard_starts_workers_and_runs_once(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import su3d_bench as su3d\n"
+        "print('begun')\n"
+        f"run = su3d.run(['{PAINTED}/a', '{PAINTED}/b'], 'oracle', profile='oracle', jobs=2, pictures=False, "
+        "protocols='rooms-instance', out='run')\n"
+        "print(__file__, run.is_complete, len(run.scenes))\n"
+    )
+    done = subprocess.run([sys.executable, str(script)], cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout.splitlines() == ["begun", f"{script} True 2"], done.stderr
+
+
+def test_scenes_that_fail_are_an_error_and_the_others_are_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    events = list[str]()
+    with pytest.raises(RunIncomplete, match=r"1 of 2 scenes failed, the first with: .*frame 2 is missing.*load_run"):
+        su3d.run(
+            [f"{PAINTED}/a", f"{PAINTED}/b"],
+            COLLECTOR,
+            protocols=BOTH,
+            jobs=1,
+            pictures=False,
+            settings={"painted.fault": "missing-frame"},
+            out=tmp_path / "run",
+            report=lambda event: events.append(event.unit),
+        )
+    run = su3d.load_run(tmp_path / "run")
+    assert not run.is_complete and any(line.startswith("INCOMPLETE") for line in run.remarks)
+    assert run.scene_metrics["scene"].unique().tolist() == ["painted/a"]
+    assert {"painted/a", "painted/b"} <= set(events)
+
+
+@pytest.mark.parametrize(
+    ("call", "line"),
+    [
+        (lambda: su3d.run("rooms/none9"), "no scene matches 'rooms/none9'"),
+        (lambda: su3d.run("rooms/living0", strid=3), r"run\(strid=...\): unknown key 'strid'; did you mean 'stride'"),
+        (lambda: su3d.run("rooms/living0", stride=-1), r"run\(stride=...\): stride = -1"),
+        (
+            lambda: su3d.run("rooms/living0", settings={"opensu3d.top_m": object()}),
+            r"run\(settings=...\): no TOML form",
+        ),
+        (lambda: su3d.run("rooms/living0", settings={"opensu3d.topm": 1}), "unknown key 'topm'"),
+        (lambda: su3d.run("rooms/living0", into="other"), "is none of own, extend, replace"),
+        (lambda: su3d.evaluate("nowhere", ground_truth="nowhere"), "nowhere"),
+        (lambda: su3d.evaluate({}, ground_truth="truth"), "no predictions were named"),
+        (lambda: su3d.evaluate("x", ground_truth="t", confidences="files"), r"evaluate\(confidences='files'\)"),
+        (lambda: su3d.load_run("nowhere"), "nowhere: holds no run.json"),
+        (lambda: su3d.list_datasets("room"), "unknown dataset 'room'; did you mean 'rooms'"),
+        (lambda: su3d.load_run("runs/demo").prediction("rooms/bathroom7"), "name one of them"),
+        (lambda: su3d.load_run("runs/demo").prediction("rooms/x", "oracle"), "holds no map of rooms/x"),
+        (lambda: su3d.load_run("runs/demo").samples(methods="sam3d"), "holds no scores of the method 'sam3d'"),
+        (lambda: su3d.load_run("runs/demo").samples(protocols="rooms-semantic"), "is of kind 'semantic'"),
+        (lambda: su3d.load_run("runs/demo").samples(scenes="rooms/x"), "holds no scene 'rooms/x'"),
+        (lambda: su3d.load_run("runs/demo").compare("runs/none"), "there is no such folder"),
+    ],
+)
+def test_what_a_user_can_cause_is_an_error_of_one_line(call: Any, line: str, here: Path) -> None:
+    with pytest.raises(su3d.Su3dError, match=line) as raised:
+        call()
+    assert "\n" not in str(raised.value)
