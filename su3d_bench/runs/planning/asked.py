@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.core.config import Setting, Settings, read_file
+from su3d_bench.core.config import KeyPath, Setting, Settings, read_file
 
 
 def asked_settings(
@@ -17,7 +17,7 @@ def asked_settings(
     ``values`` are by key of a run, ``source_of`` says of a key where it was asked, which begins an error's line.
     """
     settings = Settings() if config is None else read_file(config)
-    given = [((name,), value) for name, value in values.items()]
+    given: list[tuple[KeyPath, Any]] = [((name,), value) for name, value in values.items()]
     given.append((("perception", "models", "device"), device))
     return settings + Settings(
         tuple(Setting(path, value, source_of(path[-1])) for path, value in given if value is not None)
