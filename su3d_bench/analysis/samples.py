@@ -147,7 +147,7 @@ def _rows(
     instances = true_instances(values, scoring)
     overlaps = measure_overlaps(instances, masks, scoring)
     least = scoring.min_region_size
-    at = hits(values, masks.masks, masks.class_ids, masks.scores, scoring.class_ids, least, THRESHOLDS)
+    at_25, at_50 = hits(values, masks.masks, masks.class_ids, masks.scores, scoring.class_ids, least, THRESHOLDS)
     errors = errors_of(overlaps)
     value_of = [int(values[members[0]]) for members in instances.members]
     number_of = [value % INSTANCES_PER_CLASS for value in value_of]
@@ -161,14 +161,14 @@ def _rows(
             *where, "predicted", ids[k], k, called[k], name, float(masks.scores[k]),
             len(masks.masks.mask(k)), bool(overlaps.is_counted[k]), iou,
             None if met is None else number_of[met], "" if met is None else true_classes[met],
-            *(bool(one.is_hit[k]) for one in at), errors.of_mask[k], *_box(points, masks.masks.mask(k)),
+            bool(at_25.is_hit[k]), bool(at_50.is_hit[k]), errors.of_mask[k], *_box(points, masks.masks.mask(k)),
         )  # fmt: skip
     for g, members in enumerate(instances.members):
         met, iou = _best(overlaps.iou[:, g])
         yield Sample(
             *where, "true", number_of[g], None, true_classes[g], "", None,
             len(members), True, iou, None if met is None else ids[met], "" if met is None else called[met],
-            *(value_of[g] in one.values for one in at), errors.of_instance[g], *_box(points, members),
+            value_of[g] in at_25.values, value_of[g] in at_50.values, errors.of_instance[g], *_box(points, members),
         )  # fmt: skip
 
 

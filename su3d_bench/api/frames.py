@@ -122,7 +122,7 @@ def samples_frame(samples: Sequence[Sample]) -> pandas.DataFrame:
 
 def errors_frame(attributions: Iterable[RunAttribution]) -> pandas.DataFrame:
     """A row a method, protocol, metric and kind of error; the value and the gains but those of stages add up to 1."""
-    rows = []
+    rows: list[tuple[Any, ...]] = []
     for one in attributions:
         for of_protocol in one.protocols:
             for metric, value in of_protocol.values.items():
@@ -145,9 +145,9 @@ def differences_frame(comparison: Mapping[str, Any]) -> pandas.DataFrame:
             pairs += [(name, metric, value) for metric, value in columns.items()]
         for name, metric, value in pairs:
             low, high = value["interval"] or (None, None)
-            row = (protocol["protocol"], protocol["left"], protocol["right"], name, metric, value["left"])
-            row += (value["right"], value["difference"], low, high, value["p"], value["p_of_all"])
-            rows.append((*row, len(protocol["scenes"])))
+            where = (protocol["protocol"], protocol["left"], protocol["right"], name, metric)
+            numbers = (value["left"], value["right"], value["difference"], low, high, value["p"], value["p_of_all"])
+            rows.append((*where, *numbers, len(protocol["scenes"])))
     return _frame(DIFFERENCES, rows)
 
 

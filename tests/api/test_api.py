@@ -247,10 +247,10 @@ def test_scenes_that_fail_are_an_error_and_the_others_are_there(
             r"run\(settings=...\): no TOML form",
         ),
         (lambda: su3d.run("rooms/living0", settings={"opensu3d.topm": 1}), "unknown key 'topm'"),
-        (lambda: su3d.run("rooms/living0", into="other"), "is none of own, extend, replace"),
+        (lambda: su3d.run("rooms/living0", into="other"), "is none of own, extend, replace"),  # type: ignore[arg-type]
         (lambda: su3d.evaluate("nowhere", ground_truth="nowhere"), "nowhere"),
         (lambda: su3d.evaluate({}, ground_truth="truth"), "no predictions were named"),
-        (lambda: su3d.evaluate("x", ground_truth="t", confidences="files"), r"evaluate\(confidences='files'\)"),
+        (lambda: su3d.evaluate("x", ground_truth="t", confidences="files"), r"evaluate\(confidences='files'\)"),  # type: ignore[call-overload]
         (lambda: su3d.load_run("nowhere"), "nowhere: holds no run.json"),
         (lambda: su3d.list_datasets("room"), "unknown dataset 'room'; did you mean 'rooms'"),
         (lambda: su3d.load_run("runs/demo").prediction("rooms/bathroom7"), "name one of them"),
