@@ -1,0 +1,146 @@
+"""Texts on their way into the documentation site: made safe for a page, and links as they must be there."""
+
+from __future__ import annotations
+
+import html
+import inspect
+import re
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import PurePosixPath
+from posixpath import normpath, relpath
+
+from su3d_bench.core.printing import escaped
+
+# Files of the repository's root that are pages of the site.
+ROOT_PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+_FENCE = re.compile(r"^ *(```+|~~~+)")
+_SPAN = r"(?P<ticks>`+)(?!`)(?:(?!(?P=ticks)).|\n)*?(?P=ticks)(?!`)"
+_CODE = re.compile(_SPAN)
+# Code, which stays, or a link, whose words may hold code and pictures.
+_CODE_OR_LINK = re.compile(
+    rf"(?P<code>{_SPAN})|(?P<mark>!?)\[(?P<words>(?:`[^`]*`|\[[^\[\]]*\]|[^\[\]`])*)\]\((?P<target>[^()\s]+)\)"
+)
+_ADDRESS = re.compile(r"https?://[^\s;,()<>&\"']+")
+_QUOTED = re.compile(r"``(.+?)``|`(.+?)`", re.DOTALL)
+
+
+def plain(text: object) -> str:
+    """``text`` in one line, such that a page shows its characters and none of them acts.
+
+    >>> plain("a  <b>\\n& c")
+    'a &lt;b&gt; &amp; c'
+    """
+    return html.escape(escaped(" ".join(str(text).split())))
+
+
+def heading(text: object) -> str:
+    """``text`` as ``plain`` has it, for Markdown to leave as it is.
+
+    >>> heading("a_b <i> *c*")
+    'a\\\\_b &lt;i&gt; \\\\*c\\\\*'
+    """
+    return re.sub(r"[\\`*_{}\[\]()#!]", r"\\\g<0>", plain(text))
+
+
+def prose(text: object) -> str:
+    """``text`` as ``plain`` has it, with addresses as links and what stands in backquotes as code.
+
+    >>> prose("``a<b``: https://example.org/x, read")
+    '<code>a&lt;b</code>: <a href="https://example.org/x">https://example.org/x</a>, read'
+    """
+    linked = _ADDRESS.sub(r'<a href="\g<0>">\g<0></a>', plain(text))
+    return _QUOTED.sub(lambda match: f"<code>{match[1] or match[2]}</code>", linked)
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, is_stacked: bool = False) -> str:
+    """A table of cells that are safe already; without a head where ``head`` is empty.
+
+    ``is_stacked``: on a phone, its cells stand one below another.
+    """
+    # a line a cell: the search would take the words of two cells for one
+    heads = ["<thead><tr>", *(f"<th>{cell}</th>" for cell in head), "</tr></thead>"] if head else []
+    lines = [line for row in rows for line in ("<tr>", *(f"<td>{cell}</td>" for cell in row), "</tr>")]
+    whole = "\n".join(["<table>", *heads, "<tbody>", *lines, "</tbody></table>"])
+    return f'<div class="stacked">\n{whole}\n</div>' if is_stacked else whole
+
+
+def for_site(text: str, page: str, is_file: Callable[[str], bool], repository: str | None) -> str:
+    """The Markdown of a page, whose path in the repository is ``page``, as the site wants it.
+
+    A link to a page of the root (README.md) leads to its page of the site; one to any other file outside docs/ leads to
+    the ``repository`` on its code host, and where the project has none yet, it is the file's path as code. What leads
+    nowhere stays as it is, and the build says so.
+    """
+
+    def link(match: re.Match[str]) -> str:
+        words, (target, _, anchor) = match["words"], (match["target"] or "").partition("#")
+        if match["code"] or not target or re.match(r"[a-z]+:", target):
+            return match[0]
+        path = normpath(str(PurePosixPath(page).parent / target))
+        anchor = f"#{anchor}" if anchor else ""
+        if path.startswith("docs/") or path in ROOT_PAGES:
+            here, there = place_of(page), place_of(path)
+            return f"{match['mark']}[{words}]({relpath(there, str(PurePosixPath(here).parent))}{anchor})"
+        if path.startswith("../") or not is_file(path):
+            return match[0]
+        if repository is not None:
+            return f"{match['mark']}[{words}]({repository}/blob/main/{path}{anchor})"
+        return f"`{path}`" if words.strip("`") in path else f"{words} (`{path}`)"
+
+    return outside_fences(text, lambda part: _CODE_OR_LINK.sub(link, _with_bars(part)))
+
+
+def place_of(path: str) -> str:
+    """Where in the site a page of the repository stands.
+
+    >>> place_of("README.md"), place_of("docs/running/gpu.md")
+    ('index.md', 'running/gpu.md')
+    """
+    return ROOT_PAGES.get(path, path.removeprefix("docs/"))
+
+
+def _with_bars(text: str) -> str:
+    r"""``text`` with ``|`` in the code of tables as it is: code hosts want ``\|``, the site shows the backslash."""
+    row = re.compile(r"^\|.*$", re.MULTILINE)
+    return row.sub(lambda line: _CODE.sub(lambda code: code[0].replace("\\|", "|"), line[0]), text)
+
+
+def outside_fences(text: str, change: Callable[[str], str]) -> str:
+    r"""``text`` with ``change`` made to each part that is in no fenced block.
+
+    >>> print(outside_fences("a\n```sh\na\n```\na", str.upper))
+    A
+    ```sh
+    a
+    ```
+    A
+    """
+    parts: list[tuple[bool, str]] = []
+    fence = ""
+    for line in text.splitlines(keepends=True):
+        mark = _FENCE.match(line)
+        is_code = bool(fence or mark)
+        if mark and not fence:
+            fence = mark[1]
+        elif mark and mark[1].startswith(fence) and not line.strip().strip(fence[0]):
+            fence = ""
+        if parts and parts[-1][0] == is_code:
+            parts[-1] = (is_code, parts[-1][1] + line)
+        else:
+            parts.append((is_code, line))
+    return "".join(part if is_code else change(part) for is_code, part in parts)
+
+
+def with_examples(docstring: str) -> str:
+    """A docstring with each of its examples in a fenced block; Markdown would take ``>>>`` for three quotations."""
+    lines: list[str] = []
+    is_example = False
+    for line in inspect.cleandoc(docstring).splitlines():
+        if line.startswith(">>> ") and not is_example:
+            lines += [*([""] if lines and lines[-1] else []), "```pycon"]
+            is_example = True
+        elif is_example and not line.strip():
+            lines.append("```")
+            is_example = False
+        lines.append(line)
+    return "\n".join([*lines, *(["```"] if is_example else [])])
