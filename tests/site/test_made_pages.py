@@ -18,6 +18,7 @@ import yaml
 from made_pages import API, METHODS, PROTOCOLS, protocol_page, told_of
 from places import ROOT
 from site_hooks import filled, repository_of
+from site_text import ROOT_PAGES
 
 import su3d_bench
 from su3d_bench.core import registry
@@ -109,7 +110,7 @@ class _Tags(HTMLParser):
 def test_every_page_has_one_place_in_the_navigation(pages: dict[str, str]) -> None:
     docs = ROOT / "docs"
     there = {str(path.relative_to(docs)) for path in docs.rglob("*.md")} | set(pages)
-    there |= set(site_hooks.ROOT_PAGES.values())
+    there |= set(ROOT_PAGES.values())
     placed = site_hooks._leaves(filled(_settings()["nav"], there))
     assert sorted(placed) == sorted(there)
     assert sorted(site_hooks._leaves(filled(_settings()["nav"], there | {"tutorials/new.md", "new.md"}))) == sorted(
@@ -128,9 +129,12 @@ def test_an_entry_that_names_a_page_comes_before_patterns_and_an_index_first() -
 
 def _settings() -> dict[str, Any]:
     """mkdocs.yml, whose one value for mkdocs alone is left out."""
-    loader = type("Loader", (yaml.SafeLoader,), {})
-    loader.add_multi_constructor("tag:yaml.org,2002:python/", lambda *_: None)
-    settings: dict[str, Any] = yaml.load((ROOT / "mkdocs.yml").read_text(), loader)
+
+    class Loader(yaml.SafeLoader):  # type: ignore[misc]
+        pass
+
+    Loader.add_multi_constructor("tag:yaml.org,2002:python/", lambda *_: None)
+    settings: dict[str, Any] = yaml.load((ROOT / "mkdocs.yml").read_text(), Loader)
     return settings
 
 

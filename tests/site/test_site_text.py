@@ -6,7 +6,7 @@ import doctest
 
 import pytest
 import site_text
-from site_text import for_site, heading, plain, prose, with_examples
+from site_text import ROOT_PAGES, for_site, heading, plain, prose, with_examples
 
 HERE = {"su3d_bench/core/types.py", "action.yml", "benchmarks/README.md"}
 
@@ -23,7 +23,7 @@ def test_the_examples_of_the_texts_hold() -> None:
     ("page", "link", "there"),
     [
         ("docs/running/gpu.md", "[a](clusters.md#x)", "[a](clusters.md#x)"),
-        ("docs/running/gpu.md", "[a](../../README.md)", "[a](../index.md)"),
+        ("docs/running/gpu.md", "[a](../../README.md)", f"[a](../{ROOT_PAGES['README.md']})"),
         ("docs/running/gpu.md", "[a](../../CONTRIBUTING.md#rules)", "[a](../contributing.md#rules)"),
         (
             "README.md",
@@ -58,6 +58,15 @@ def test_code_stays_as_it_is() -> None:
     text = f"`{link}` and\n\n```md\n{link} | `x\\|y`\n```\n~~~~\n```\n{link}\n~~~~\n"
     assert as_site(text) == text
     assert as_site(f"{text}[action.yml](../../action.yml)") == f"{text}`action.yml`"
+
+
+def test_the_first_code_that_names_a_made_page_leads_to_it() -> None:
+    text = "# `made`\n\n[`made`](clusters.md), `other`, `made` and `made`; ``made``"
+    shown = for_site(text, "docs/running/gpu.md", HERE.__contains__, None, {"made": "reference/made.md"})
+    assert shown == text.replace("`other`, `made`", "`other`, [`made`](../reference/made.md)")
+    assert for_site("`made`", "README.md", HERE.__contains__, None, {"made": "reference/made.md"}) == (
+        "[`made`](reference/made.md)"
+    )
 
 
 def test_bars_in_the_code_of_a_table_lose_the_backslash_that_code_hosts_want() -> None:

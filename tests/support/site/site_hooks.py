@@ -7,10 +7,10 @@ from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
-from made_pages import made_pages
-from site_text import ROOT_PAGES, for_site
+from made_pages import PROTOCOLS, made_pages
+from site_text import DOCS, ROOT, ROOT_PAGES, for_site
 
-ROOT = Path(__file__).resolve().parents[3]
+from su3d_bench.metrics.protocols.files import protocol_names
 
 _made: dict[str, str] = {}  # the pages of this build that are no files of docs/
 
@@ -19,8 +19,7 @@ def on_config(config: Any) -> Any:
     """Make the pages, and put each page into its place of the navigation."""
     roots = {place: (ROOT / name).read_text() for name, place in ROOT_PAGES.items()}
     _made.update(made_pages() | roots)
-    docs = ROOT / "docs"
-    on_disk = {str(path.relative_to(docs)) for path in docs.rglob("*.md")}
+    on_disk = {path.relative_to(DOCS).as_posix() for path in DOCS.rglob("*.md")}
     config.nav = filled(config.nav, on_disk | set(_made))
     return config
 
@@ -38,7 +37,9 @@ def on_page_markdown(markdown: str, page: Any, **rest: Any) -> str:
     if place in _made and place not in ROOT_PAGES.values():
         return markdown
     path = next((name for name, root in ROOT_PAGES.items() if root == place), f"docs/{place}")
-    return for_site(markdown, path, lambda name: (ROOT / name).exists(), repository_of(ROOT / "pyproject.toml"))
+    protocols = {name: f"{PROTOCOLS}/{name}.md" for name in protocol_names()}
+    repository = repository_of(ROOT / "pyproject.toml")
+    return for_site(markdown, path, lambda name: (ROOT / name).exists(), repository, protocols)
 
 
 def on_post_template(output: str, template_name: str, **rest: Any) -> str:

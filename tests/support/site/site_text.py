@@ -5,20 +5,26 @@ from __future__ import annotations
 import html
 import inspect
 import re
-from collections.abc import Callable, Iterable, Sequence
-from pathlib import PurePosixPath
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path, PurePosixPath
 from posixpath import normpath, relpath
+from types import MappingProxyType
 
 from su3d_bench.core.printing import escaped
 
-# Files of the repository's root that are pages of the site.
-ROOT_PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+ROOT = Path(__file__).resolve().parents[3]
+DOCS = ROOT / "docs"
+# Files of the repository's root that are pages of the site; README.md is its first where docs/ has no index.md.
+_README = "readme.md" if (DOCS / "index.md").is_file() else "index.md"
+ROOT_PAGES = {"README.md": _README, "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 _FENCE = re.compile(r"^ *(```+|~~~+)")
 _SPAN = r"(?P<ticks>`+)(?!`)(?:(?!(?P=ticks)).|\n)*?(?P=ticks)(?!`)"
 _CODE = re.compile(_SPAN)
-# Code, which stays, or a link, whose words may hold code and pictures.
+# A heading or code, or a link, whose words may hold code and pictures.
 _CODE_OR_LINK = re.compile(
-    rf"(?P<code>{_SPAN})|(?P<mark>!?)\[(?P<words>(?:`[^`]*`|\[[^\[\]]*\]|[^\[\]`])*)\]\((?P<target>[^()\s]+)\)"
+    rf"(?P<heading>^#.*$)|(?P<code>{_SPAN})|"
+    r"(?P<mark>!?)\[(?P<words>(?:`[^`]*`|\[[^\[\]]*\]|[^\[\]`])*)\]\((?P<target>[^()\s]+)\)",
+    re.MULTILINE,
 )
 _ADDRESS = re.compile(r"https?://[^\s;,()<>&\"']+")
 _QUOTED = re.compile(r"``(.+?)``|`(.+?)`", re.DOTALL)
@@ -64,23 +70,34 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], *, is_stacked: boo
     return f'<div class="stacked">\n{whole}\n</div>' if is_stacked else whole
 
 
-def for_site(text: str, page: str, is_file: Callable[[str], bool], repository: str | None) -> str:
+def for_site(
+    text: str,
+    page: str,
+    is_file: Callable[[str], bool],
+    repository: str | None,
+    names: Mapping[str, str] = MappingProxyType({}),
+) -> str:
     """The Markdown of a page, whose path in the repository is ``page``, as the site wants it.
 
     A link to a page of the root (README.md) leads to its page of the site; one to any other file outside docs/ leads to
     the ``repository`` on its code host, and where the project has none yet, it is the file's path as code. What leads
-    nowhere stays as it is, and the build says so.
+    nowhere stays as it is, and the build says so. Of ``names``, whose pages of the site are made and hence unknown to
+    the code host, the first one in code leads to its page.
     """
+    here = str(PurePosixPath(place_of(page)).parent)
+    unnamed = dict(names)
 
     def link(match: re.Match[str]) -> str:
         words, (target, _, anchor) = match["words"], (match["target"] or "").partition("#")
-        if match["code"] or not target or re.match(r"[a-z]+:", target):
+        if match["code"] is not None:
+            there = unnamed.pop(match["code"].strip("`"), None)
+            return match[0] if there is None else f"[{match[0]}]({relpath(there, here)})"
+        if not target or re.match(r"[a-z]+:", target):
             return match[0]
         path = normpath(str(PurePosixPath(page).parent / target))
         anchor = f"#{anchor}" if anchor else ""
         if path.startswith("docs/") or path in ROOT_PAGES:
-            here, there = place_of(page), place_of(path)
-            return f"{match['mark']}[{words}]({relpath(there, str(PurePosixPath(here).parent))}{anchor})"
+            return f"{match['mark']}[{words}]({relpath(place_of(path), here)}{anchor})"
         if path.startswith("../") or not is_file(path):
             return match[0]
         if repository is not None:
@@ -93,8 +110,8 @@ def for_site(text: str, page: str, is_file: Callable[[str], bool], repository: s
 def place_of(path: str) -> str:
     """Where in the site a page of the repository stands.
 
-    >>> place_of("README.md"), place_of("docs/running/gpu.md")
-    ('index.md', 'running/gpu.md')
+    >>> place_of("CHANGELOG.md"), place_of("docs/running/gpu.md")
+    ('changelog.md', 'running/gpu.md')
     """
     return ROOT_PAGES.get(path, path.removeprefix("docs/"))
 
