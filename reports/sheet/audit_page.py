@@ -13,10 +13,10 @@ Shade = tuple[int, int, int]
 Line = tuple[str, Shade]
 Entry = tuple[int, str, str, str, Sequence[Line], str]  # number, scene, kind, text, lines, picture
 STYLE = (
-    "body{font:16px/1.4 system-ui,sans-serif;margin:1rem auto;max-width:82rem;padding:0 1rem;color:#1a1a1a;"
-    "background:#fff}article{border-top:1px solid #ccc;padding:.8rem 0}img{max-width:100%;height:auto;display:block}"
+    ":root{color-scheme:light dark}body{font:16px/1.4 system-ui,sans-serif;margin:1rem auto;max-width:82rem;"
+    "padding:0 1rem}article{border-top:1px solid #8888;padding:.8rem 0}img{max-width:100%;height:auto;display:block}"
     "h1{font-size:1.3rem}h2{font-size:1.1rem;margin:0;overflow-wrap:anywhere}p{margin:.2rem 0;overflow-wrap:anywhere}"
-    ".head{color:#666}"
+    ".line{border-left:.6rem solid;padding-left:.5rem}"
 )
 
 
@@ -26,18 +26,18 @@ def audit_page(entries: Sequence[Entry]) -> str:
         '<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>Questions to look at</title>\n'
-        f"<style>{STYLE}</style>\n<h1>Questions to look at: {len(entries)}</h1>\n"
+        f"<style>{STYLE}</style>\n<main>\n<h1>Questions to look at: {len(entries)}</h1>\n"
         "<p>Green: what answers. Blue: what that was held against. Orange: called so too, and no answer.</p>\n"
         + "\n".join(map(_article, entries))
-        + "\n</html>\n"
+        + "\n</main>\n</html>\n"
     )
 
 
 def _article(entry: Entry) -> str:
     number, scene, kind, text, lines, picture = entry
-    said = "".join(f'<p style="color:rgb{shade}">{safe(line)}</p>' for line, shade in lines)
+    said = "".join(f'<p class="line" style="border-color:rgb{shade}">{safe(line)}</p>' for line, shade in lines)
     return (
-        f'<article id="q{number}"><p class="head">{number} &middot; {safe(scene)} &middot; {safe(kind)}</p>'
+        f'<article id="q{number}"><p>{number} &middot; {safe(scene)} &middot; {safe(kind)}</p>'
         f'<h2 dir="auto">{safe(text)}</h2>{said}'
         f'<img loading="lazy" alt="{safe(text)}" src="{html.escape(quote(picture))}"></article>'
     )

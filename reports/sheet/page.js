@@ -88,6 +88,12 @@
     }
   }
 
+  const isLarge = () => byId("picture").classList.contains("large");
+  function enlarge(isSo) {
+    byId("picture").classList.toggle("large", isSo);
+    byId("image").setAttribute("aria-pressed", String(isSo));
+  }
+
   const cell = (text) => (/[",\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text);
 
   function csv() {
@@ -150,7 +156,7 @@
     if (image.dataset.item !== item.id) {
       image.dataset.item = item.id;
       image.src = `data:image/png;base64,${item.picture}`;
-      byId("picture").classList.remove("large");
+      enlarge(false);
       byId("picture").scrollTo(0, 0);
     }
     image.alt = `picture of ${item.id}`;
@@ -159,6 +165,7 @@
     byId("back").disabled = at === 0;
     byId("next").disabled = at === sheet.items.length - 1;
     byId("undo").disabled = history.length === 0;
+    byId("open").disabled = !sheet.items.some((one, k) => k !== at && openAsk(one));
     byId("export").classList.toggle("ready", done === nTotal);
     const note = byId("note");
     note.classList.toggle("alarm", !canSave);
@@ -172,7 +179,14 @@
   byId("open").addEventListener("click", goToOpen);
   byId("undo").addEventListener("click", undo);
   byId("export").addEventListener("click", exportAnswers);
-  byId("image").addEventListener("click", () => byId("picture").classList.toggle("large"));
+  byId("image").addEventListener("click", () => enlarge(!isLarge()));
+  byId("image").addEventListener("keydown", (event) => {
+    if (event.key === "Enter" || event.key === " ") enlarge(!isLarge());
+    else if (event.key === "Escape" && isLarge()) enlarge(false);
+    else if (!(event.key.startsWith("Arrow") && isLarge())) return;
+    event.stopPropagation(); // the arrows scroll a large picture
+    if (!event.key.startsWith("Arrow")) event.preventDefault();
+  });
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey || event.repeat) return;
     const item = sheet.items[at];

@@ -11,7 +11,8 @@ from su3d_bench.reports.tables.formats import csv_lines, safe
 
 COLUMNS = ("item_id", "question", "reason", "answers", "truth", "scene", "methods", "text", "pictures")
 STYLE = (
-    "body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:60rem;padding:0 1rem;color-scheme:light dark}"
+    ":root{color-scheme:light dark}body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:60rem;"
+    "padding:0 1rem}"
     "article{border-top:1px solid #8888;padding:1rem 0}img{max-width:100%;height:auto;background:#fff}"
     "h1,h2{font-weight:600}h1{font-size:1.4rem}h2{font-size:1.05rem;margin:0;overflow-wrap:anywhere}"
     "p{margin:.3rem 0;overflow-wrap:anywhere}.reason{font-weight:600}"
@@ -36,7 +37,8 @@ def second_looks_page(looks: Sequence[Mapping[str, Any]], pictures: str, sheet_i
         '<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>Second looks</title>\n'
-        f"<style>{STYLE}</style>\n<h1>Second looks at {safe(sheet_id)}: {len(looks)}</h1>\n{body}\n</html>\n"
+        f"<style>{STYLE}</style>\n<main>\n<h1>Second looks at {safe(sheet_id)}: {len(looks)}</h1>\n{body}\n"
+        "</main>\n</html>\n"
     )
 
 

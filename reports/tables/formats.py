@@ -52,9 +52,11 @@ _MARKUP = re.compile(
 _ENTITY = re.compile(r"&(?=#?\w+;)")
 _BLOCK = re.compile(r"^(?:[-+](?=\s)|[#>]|\d{1,9}(?=[.)](?:\s|$)))")
 MOST_OF_A_CELL = 2000
+TITLE = "su3d-bench tables"
 MOST_OF_A_NOTE = 7_000  # characters: it may name every scene of a data set
 STYLE = (
-    "body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:70rem;padding:0 1rem;color-scheme:light dark}"
+    ":root{color-scheme:light dark}body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:70rem;"
+    "padding:0 1rem}h1{font-size:1.3rem}"
     "table{border-collapse:collapse;margin:1rem 0}caption{text-align:left;padding:.3rem 0}"
     "th,td{padding:.2rem .7rem;text-align:right}th:first-child,td:first-child{text-align:left}"
     "thead{border-top:2px solid;border-bottom:1px solid}tbody{border-bottom:1px solid}tbody:last-of-type{border-bottom:"
@@ -239,8 +241,9 @@ def html_page(parts: Sequence[Table | Prose]) -> str:
     """A page of its own without scripts, for light and dark."""
     return (
         '<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>su3d-bench tables</title>\n'
-        f"<style>{STYLE}</style>\n{html_tables(parts)}\n</html>\n"
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f"<title>{TITLE}</title>\n"
+        f"<style>{STYLE}</style>\n<main>\n<h1>{TITLE}</h1>\n{html_tables(parts)}\n</main>\n</html>\n"
     )
 
 
@@ -263,7 +266,8 @@ def _html(table: Table | Prose) -> str:
         bodies.append("<tbody>" + "\n".join(lines) + "</tbody>")
     caption = safe(table.heading + table.caption)
     return (
-        f'<section><div class="wide"><table><caption>{caption}</caption>\n'
+        f'<section><div class="wide" tabindex="0" role="region" aria-label="{caption}">'
+        f"<table><caption>{caption}</caption>\n"
         f"<thead><tr>{head}</tr></thead>\n" + "\n".join(bodies) + f"</table></div>{_list(table.notes)}</section>"
     )
 

@@ -107,10 +107,11 @@ def test_no_text_can_be_html() -> None:
     page = _Page()
     page.feed(html_page([hostile_table()]))
     assert page.tags <= {
-        "html", "meta", "title", "style", "section", "div", "table", "caption", "thead", "tbody", "tr", "th", "td",
-        "strong", "ul", "li",
+        "html", "main", "h1", "meta", "title", "style", "section", "div", "table", "caption", "thead", "tbody", "tr",
+        "th", "td", "strong", "ul", "li",
     }  # fmt: skip
-    assert page.attributes <= {"lang", "charset", "name", "content", "class", "scope"}
+    known = {"lang", "charset", "name", "content", "class", "scope", "tabindex", "role", "aria-label"}
+    assert page.attributes <= known
     assert "<script" not in markdown([hostile_table()])
 
 

@@ -47,7 +47,6 @@ function confusionTables(one, most) {
     const content = truth === called || !n ? text : toGallery(text, wish, `${title}; the worst errors of this kind`);
     const cell = h('td', { class: truth === called ? 'same' : null, title }, content);
     if (share > 0) cell.style.backgroundColor = `rgba(var(--heat), ${(0.06 + 0.84 * share).toFixed(3)})`;
-    if (share > 0.6) cell.style.color = 'var(--on-accent)';
     return cell;
   }
   const table = h('table', { class: 'confusion' },

@@ -22,6 +22,11 @@ FLAGS: tuple[str, ...] = (
     "--remote-debugging-pipe",
 )  # fmt: skip
 WAIT_S = 120.0
+# What a page's own controls know keys by.
+KEY_CODES = {
+    "Tab": 9, "Enter": 13, "Escape": 27, "Space": 32, "End": 35, "Home": 36, "ArrowLeft": 37, "ArrowUp": 38,
+    "ArrowRight": 39, "ArrowDown": 40, "Backspace": 8,
+}  # fmt: skip
 
 
 def find_chromium() -> str | None:
@@ -154,10 +159,15 @@ class Chromium:
         wait_until(lambda: self.run(script), f"it never came true: {script}", WAIT_S)
 
     def press(self, *keys: str) -> None:
-        """Press keys one after another: ``1``, ``u``, ``ArrowLeft``."""
-        for key in keys:
-            self.call("Input.dispatchKeyEvent", {"type": "keyDown", "key": key})
-            self.call("Input.dispatchKeyEvent", {"type": "keyUp", "key": key})
+        """Press keys one after another, as a keyboard does: ``1``, ``u``, ``ArrowLeft``, ``Enter``, ``Shift+Tab``."""
+        for name in keys:
+            *held, key = name.split("+") if len(name) > 1 else [name]
+            text = {"Enter": "\r", "Space": " "}.get(key, key if len(key) == 1 else "")
+            values: dict[str, Any] = {"key": " " if key == "Space" else key, "modifiers": 8 if held == ["Shift"] else 0}
+            if key in KEY_CODES:
+                values |= {"code": key, "windowsVirtualKeyCode": KEY_CODES[key]}
+            self.call("Input.dispatchKeyEvent", {"type": "keyDown", **values, **({"text": text} if text else {})})
+            self.call("Input.dispatchKeyEvent", {"type": "keyUp", **values})
 
     def downloads_to(self, folder: Path) -> None:
         values = {"behavior": "allow", "downloadPath": str(folder)}
@@ -181,4 +191,8 @@ class Chromium:
             elif one.get("method") == "Network.requestWillBeSent":
                 url = str(values["request"]["url"])
                 found += [] if url.startswith(("file:", "data:", "blob:", "about:")) else [url]
+            elif one.get("method") == "Network.webSocketCreated":
+                found.append(str(values["url"]))
+            elif one.get("method") == "Runtime.consoleAPICalled" and values["type"] in ("error", "warning", "assert"):
+                found.append(str([each.get("value", each.get("description")) for each in values["args"]]))
         return found

@@ -1,0 +1,248 @@
+"""The page of runs in a real browser, opened as a file: its numbers and every control."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from chromium import Chromium, find_chromium
+from looks import WHOLE, complaints
+from runs_page import choose, column, open_maps, options, picture, press, text_of, type_into
+
+pytestmark = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
+MIDDLE_SECTIONS = ("Scenes", "Classes", "Confusion", "Errors", "Timing", "Compare")
+
+
+def test_every_section_is_there_and_the_navigation_leads_to_it(browser: Chromium) -> None:
+    names = browser.run("[...document.querySelectorAll('#nav a')].map((one) => one.textContent)")
+    assert names == ["Summary", "Maps", "Scenes", "Classes", "Confusion", "Errors", "Timing", "Compare", "Provenance"]
+    browser.run("document.querySelector('#nav a[href=\"#timing\"]').click()")
+    browser.until("document.querySelector('#nav a[aria-current]')?.textContent === 'Timing'")
+    assert browser.run("Math.abs(document.getElementById('timing').getBoundingClientRect().top) < 120")
+
+
+def test_no_text_of_a_run_becomes_an_element(browser: Chromium) -> None:
+    assert "<img src=x onerror=window.struck=1>" in text_of(browser, "#summary .notes")
+    assert browser.run("window.struck === undefined && !document.querySelector('main img[src=x]')")
+
+
+def test_a_header_sorts_and_turns_by_mouse_and_keyboard(browser: Chromium) -> None:
+    browser.run("document.querySelectorAll('#summary table')[0].querySelectorAll('th button')[1].click()")
+    down = column(browser, "summary", 1)
+    assert (
+        browser.run("document.querySelectorAll('#summary th[aria-sort]')[0].getAttribute('aria-sort')") == "descending"
+    )
+    values = [float(value.split()[0]) for value in down]
+    assert values == sorted(values, reverse=True)
+    assert len(set(values)) > 1
+    press(browser, "#summary th[aria-sort] button")
+    browser.call("Input.dispatchKeyEvent", {"type": "keyDown", "key": "Enter", "text": "\r"})
+    browser.call("Input.dispatchKeyEvent", {"type": "keyUp", "key": "Enter"})
+    assert [float(value.split()[0]) for value in column(browser, "summary", 1)] == sorted(values)
+
+
+def test_a_filter_leaves_the_rows_that_hold_its_text(browser: Chromium) -> None:
+    everything = column(browser, "classes", 0)
+    type_into(browser, "#classes input", "SOFA")
+    assert column(browser, "classes", 0) == ["sofa"]
+    assert text_of(browser, "#classes .count") == f"1 of {len(everything)} rows"
+    type_into(browser, "#classes input", "")
+    assert column(browser, "classes", 0) == everything
+
+
+def test_one_choice_of_protocol_and_its_metric_change_all_tables(browser: Chromium) -> None:
+    assert options(browser, "scenes", "Protocol") == ["rooms-semantic", "rooms-instance"]
+    choose(browser, "scenes", "Protocol", "rooms-instance")
+    assert options(browser, "scenes", "Metric")[:3] == ["AP", "AP50", "AP25"]
+    assert options(browser, "classes", "Column")[:3] == ["AP", "AP50", "AP25"]
+    assert "missed" in text_of(browser, "#errors tbody")
+    before = text_of(browser, "#scenes caption")
+    choose(browser, "scenes", "Metric", "AP25")
+    assert text_of(browser, "#scenes caption") != before
+    choose(browser, "errors", "Metric", "AP50")
+    assert "AP50" in text_of(browser, "#errors caption")
+    choose(browser, "scenes", "Protocol", "rooms-semantic")
+    assert "geometry" in text_of(browser, "#errors tbody")
+
+
+def test_the_confusion_is_of_the_chosen_method(browser: Chromium) -> None:
+    methods = options(browser, "confusion", "Method")
+    assert len(methods) == 3
+    choose(browser, "confusion", "Method", methods[1])
+    noisy = text_of(browser, "#confusion table")
+    choose(browser, "confusion", "Method", methods[0])
+    assert text_of(browser, "#confusion table") != noisy
+    assert text_of(browser, "#confusion .confusion .same") == "100"
+
+
+def test_the_timing_plot_follows_its_three_choices(browser: Chromium) -> None:
+    plot = "document.querySelector('#timing .wide svg')"
+    line = f"{plot}.querySelector('path').getAttribute('d') + {plot}.textContent"
+    seen = [browser.run(line)]
+    for label, text in (("Time of", "the whole update"), ("Against", "points of the map"), ("Scene", "painted/b")):
+        choose(browser, "timing", label, text)
+        seen.append(browser.run(line))
+    assert len(set(seen)) == 4
+    choose(browser, "timing", "Stages of", options(browser, "timing", "Stages of")[1])
+    assert "total" in text_of(browser, "#timing")
+    choose(browser, "timing", "Metric", "F-mIoU")
+    assert "F-mIoU in per cent" in text_of(browser, "#timing")
+
+
+def test_swapping_the_sides_turns_the_sign(browser: Chromium) -> None:
+    sides = options(browser, "compare", "A")
+    choose(browser, "compare", "A", next(one for one in sides if "noise" not in one and "one" in one))
+    choose(browser, "compare", "B", next(one for one in sides if "noise" in one))
+    before = column(browser, "compare", 6)[0].split()[0]
+    browser.run("[...document.querySelectorAll('#compare button')].find((one) => one.textContent === 'Swap').click()")
+    after = column(browser, "compare", 6)[0].split()[0]
+    assert before[0] == "\N{MINUS SIGN}"
+    assert after == "+" + before[1:]
+    choose(browser, "compare", "A", sides[0])
+    choose(browser, "compare", "B", sides[0])
+    assert "Choose two different sides" in text_of(browser, "#compare [role=status]")
+
+
+def test_settings_unfold_and_filter(browser: Chromium) -> None:
+    browser.run("document.querySelectorAll('#provenance details').forEach((one) => { one.open = true; })")
+    assert "rooms-semantic" in text_of(browser, "#provenance details")
+    assert "painted/a" in text_of(browser, "#provenance details")
+
+
+def test_a_table_says_that_its_best_is_bold_where_something_is(browser: Chromium) -> None:
+    tables = "[...document.querySelectorAll('#summary table, #scenes table, #classes table')]"
+    said = browser.run(f"{tables}.map((one) => one.caption.innerText.includes('bold'))")
+    assert said == browser.run(f"{tables}.map((one) => !!one.querySelector('td.best'))")
+    assert True in said
+    assert "bold" not in browser.run(
+        "[...document.querySelectorAll('#summary > p.intro')].map((p) => p.innerText).join()"
+    )
+
+
+def test_all_classes_of_a_confusion_can_be_seen(browser: Chromium) -> None:
+    assert options(browser, "confusion", "Classes") == ["the 18 largest", "all"]
+    choose(browser, "confusion", "Classes", "all")
+    assert "all " in text_of(browser, "#confusion caption")
+
+
+def test_rows_on_other_scenes_have_no_best_and_those_of_one_scene_do(browser: Chromium) -> None:
+    assert browser.run("document.querySelectorAll('#summary td.best').length") == 0
+    assert browser.run("document.querySelectorAll('#scenes td.best').length") > 0
+
+
+def test_every_control_has_a_name_and_the_page_no_sideways_scroll_on_a_phone(
+    browser: Chromium, runs_page: Path, tmp_path: Path
+) -> None:
+    nameless = browser.run(
+        "[...document.querySelectorAll('select, input, button, canvas')].filter((one) => !(one.labels?.length"
+        " || one.getAttribute('aria-label') || one.textContent.trim())).length"
+    )
+    assert nameless == 0
+    with Chromium(tmp_path / "phone", width=390, height=844, is_phone=True) as phone:
+        phone.open(runs_page)
+        phone.until(WHOLE)
+        assert phone.run("document.documentElement.scrollWidth <= innerWidth")
+        assert phone.run("document.querySelectorAll('section.part').length") == 9
+        assert complaints(phone) == []
+
+
+# Every control of the page, by its section, kind and name; column headers and rows of tables apart.
+CONTROLS = {
+    *(("nav", "a", name) for name in (*MIDDLE_SECTIONS, "Summary", "Maps", "Provenance")),
+    ("skip", "a", "Skip to the numbers"),
+    *(("maps", "select", name) for name in ("Scene", "Map", "Colour by", "Text")),
+    *(("maps", "button", name) for name in ("Zoom in", "Zoom out", "Whole map")),
+    ("maps", "input", "Cut above"),
+    ("maps", "input", "Filter instances"),
+    ("maps", "canvas", "3D view"),
+    ("scenes", "select", "Protocol"),
+    ("scenes", "select", "Metric"),
+    ("scenes", "input", "Filter scenes"),
+    ("classes", "select", "Protocol"),
+    ("classes", "select", "Column"),
+    ("classes", "input", "Filter classes"),
+    ("confusion", "select", "Protocol"),
+    ("confusion", "select", "Method"),
+    ("confusion", "select", "Classes"),
+    ("confusion", "input", "Filter classes"),
+    ("errors", "select", "Protocol"),
+    ("errors", "select", "Metric"),
+    *(("timing", "select", name) for name in ("Scene", "Time of", "Against", "Stages of", "Protocol", "Metric")),
+    ("compare", "select", "A"),
+    ("compare", "select", "B"),
+    ("compare", "button", "Swap"),
+    ("summary", "summary", "3 more remarks"),
+    ("summary", "summary", "What the columns mean"),
+    ("provenance", "summary", "Rules and data"),
+    ("provenance", "summary", "Settings"),
+    ("provenance", "input", "Filter settings"),
+}
+# Operates the k-th control of a kind in a section, and says whether it could: a choice of one cannot be changed.
+OPERATE = """(part, kind, k) => {
+  const one = document.querySelectorAll(`${part} ${kind}`)[k];
+  if (kind === 'select') {
+    if (one.options.length < 2) return false;
+    one.selectedIndex = (one.selectedIndex + 1 + (k % (one.options.length - 1))) % one.options.length;
+    one.dispatchEvent(new Event('change'));
+  } else if (kind === 'input') {
+    one.value = one.type === 'range' ? '40' : 'no row has this text';
+    one.dispatchEvent(new Event('input'));
+  } else one.click();
+  return true;
+}"""
+
+
+def names_of_controls(browser: Chromium) -> set[tuple[str, str, str]]:
+    found = browser.run(
+        "[...document.querySelectorAll('a[href], button, select, input, textarea, summary, canvas')]"
+        ".filter((one) => !one.matches('button.sort')).map((one) => [one.closest('section')?.id"
+        " || one.closest('nav')?.id || one.className, one.localName,"
+        " (one.labels?.[0]?.textContent || one.getAttribute('aria-label')"
+        " || one.textContent).trim()])"
+    )
+    return {(part, kind, re.sub(r" \(\d+\)$| of .* by .*", "", name)) for part, kind, name in found}
+
+
+def test_the_list_of_controls_is_whole(browser: Chromium) -> None:
+    open_maps(browser)
+    assert names_of_controls(browser) == CONTROLS
+
+
+@pytest.mark.parametrize("part", ["summary", *(name.lower() for name in MIDDLE_SECTIONS), "provenance", "maps"])
+def test_each_control_of_a_section_changes_what_it_shows(browser: Chromium, part: str) -> None:
+    open_maps(browser)
+    browser.run("document.querySelectorAll('details').forEach((one) => { one.open = false; })")
+    shown = f"document.getElementById('{part}').outerHTML + document.querySelector('#{part} select')?.value"
+    n_operated = 0
+    if part == "confusion":  # the other methods confuse nothing
+        choose(browser, part, "Method", next(one for one in options(browser, part, "Method") if "noise" in one))
+    for kind in ("button.sort", "summary", "input", "select", "button:not(.sort)"):
+        for k in range(browser.run(f"document.querySelectorAll('#{part} {kind}').length")):
+            is_of_view = part == "maps" and kind == "button:not(.sort)"
+            if is_of_view:  # so that the whole map is another picture than this one
+                press(browser, "#maps canvas", "ArrowLeft")
+            before, seen = browser.run(shown), picture(browser) if is_of_view else b""
+            if kind == "select" and browser.run(
+                f"document.querySelectorAll('#{part} select')[{k}].closest('[hidden]')"
+            ):
+                continue
+            if not browser.run(f"({OPERATE})('#{part}', {json.dumps(kind)}, {k})"):
+                continue
+            n_operated += 1
+            if seen:
+                assert picture(browser) != seen, (kind, k)
+            else:
+                browser.until(f"{shown} !== {json.dumps(before)}")
+    assert n_operated > 0
+
+
+def test_each_link_leads_to_its_section(browser: Chromium) -> None:
+    for link in ("#nav a", "a.skip"):
+        for k in range(browser.run(f"document.querySelectorAll('{link}').length")):
+            target = browser.run(f"document.querySelectorAll('{link}')[{k}].hash")
+            browser.run(f"document.querySelectorAll('{link}')[{k}].click()")
+            browser.until(f"location.hash === {json.dumps(target)}")
+            place = f"document.querySelector({json.dumps(target)}).getBoundingClientRect()"
+            assert browser.run(f"{place}.top < innerHeight && {place}.bottom > 0"), target

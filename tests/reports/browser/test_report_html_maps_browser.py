@@ -1,0 +1,164 @@
+"""The maps of the page of runs in a real browser: drawn, turned, coloured, picked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import chromium
+import pytest
+from chromium import Chromium, find_chromium
+from runs_page import SELECT, choose, column, headers, open_maps, options, picture, press, text_of, type_into
+
+pytestmark = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
+
+
+def test_every_colouring_draws_another_picture_and_says_what_it_means(browser: Chromium) -> None:
+    open_maps(browser)
+    kinds = options(browser, "maps", "Colour by")
+    assert kinds == ["colour", "instance", "class", "true class", "error against the truth", "similarity to a text"]
+    seen = {}
+    for kind in kinds:
+        choose(browser, "maps", "Colour by", kind)
+        seen[kind] = picture(browser)
+        assert text_of(browser, "#maps .legend").strip()
+    assert len(set(seen.values())) >= 5  # instances and classes may have the same colours where each is of one class
+    choose(browser, "maps", "Colour by", kinds[4])
+    assert "right class" in text_of(browser, "#maps .legend")
+    choose(browser, "maps", "Colour by", kinds[5])
+    assert options(browser, "maps", "Text") == ["chair", "table"]
+    first = picture(browser)
+    choose(browser, "maps", "Text", "table")
+    assert picture(browser) != first
+    assert column(browser, "maps", 0)[0] == "table"
+    assert headers(browser, "maps") == ["Instance", "Similarity", "Points"]
+    choose(browser, "maps", "Colour by", kinds[0])
+    assert browser.run(f"{SELECT.format(part='maps', label='Text')}.closest('.field').hidden")
+    assert headers(browser, "maps") == ["Instance", "Score", "Points"]
+
+
+def test_keys_turn_move_zoom_and_bring_the_whole_map_back(browser: Chromium) -> None:
+    open_maps(browser)
+    press(browser, "#maps canvas", "Home")
+    whole = picture(browser)
+    seen = [whole]
+    for key in ("ArrowLeft", "ArrowUp", "+", "-", "-"):
+        press(browser, "#maps canvas", key)
+        seen.append(picture(browser))
+    browser.call("Input.dispatchKeyEvent", {"type": "keyDown", "key": "ArrowRight", "modifiers": 8})
+    seen.append(picture(browser))
+    assert len(set(seen)) >= 6  # zooming in and out again gives one picture twice
+    press(browser, "#maps canvas", "Home")
+    assert picture(browser) == whole
+
+
+def pointer(browser: Chromium, kind: str, x: float, y: float, **more: Any) -> None:
+    values = {"type": kind, "x": x, "y": y, "button": "left", "buttons": 1, "clickCount": 1, **more}
+    browser.call("Input.dispatchMouseEvent", values)
+
+
+def middle(browser: Chromium) -> tuple[float, float]:
+    box = browser.run(
+        "(() => { const c = document.querySelector('#maps canvas'); c.scrollIntoView({ block: 'center' });"
+        " const b = c.getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]; })()"
+    )
+    return box[0], box[1]
+
+
+def test_the_mouse_turns_moves_zooms_and_picks(browser: Chromium) -> None:
+    open_maps(browser)
+    x, y = middle(browser)
+    seen = [picture(browser)]
+    for more in ({}, {"modifiers": 8}, {"button": "right", "buttons": 2}):
+        pointer(browser, "mousePressed", x, y, **more)
+        pointer(browser, "mouseMoved", x + 30, y + 20, **more)
+        pointer(browser, "mouseReleased", x + 30, y + 20, **more)
+        seen.append(picture(browser))
+    browser.run("document.querySelector('#maps canvas').focus()")
+    browser.call("Input.dispatchMouseEvent", {"type": "mouseWheel", "x": x, "y": y, "deltaX": 0, "deltaY": -50})
+    seen.append(picture(browser))
+    assert len(set(seen)) == 5
+    press(browser, "#maps canvas", "Escape", "Home")
+    pointer(browser, "mousePressed", x, y)
+    pointer(browser, "mouseReleased", x, y)
+    browser.until("document.querySelector('#maps .detail h3') !== null")
+    assert browser.run("document.querySelectorAll('#maps tr[aria-selected=true]').length") == 1
+
+
+def test_an_instance_shows_its_name_class_scores_and_view(browser: Chromium) -> None:
+    open_maps(browser)
+    press(browser, "#maps canvas", "Escape", "n")
+    first = text_of(browser, "#maps .detail h3")
+    shown = text_of(browser, "#maps .detail")
+    for what in ("Class (rooms-semantic)", "Truth there", "Score", "Points", "Seen in", "Most like", "Frame"):
+        assert what in shown
+    browser.until("document.querySelector('#maps .detail img').naturalWidth > 0")
+    press(browser, "#maps canvas", "n")
+    assert text_of(browser, "#maps .detail h3") != first
+    press(browser, "#maps canvas", "p")
+    assert text_of(browser, "#maps .detail h3") == first
+    press(browser, "#maps canvas", "Escape")
+    assert browser.run("document.querySelector('#maps .detail h3') === null")
+    press(browser, "#maps .side tbody tr", "Enter")
+    assert text_of(browser, "#maps .detail h3") == column(browser, "maps", 0)[0]
+
+
+def test_fingers_turn_and_zoom(browser: Chromium) -> None:
+    open_maps(browser)
+    press(browser, "#maps canvas", "Home")
+    x, y = middle(browser)
+
+    def touch(kind: str, *places: tuple[float, float]) -> None:
+        points = [{"x": place[0], "y": place[1], "id": k} for k, place in enumerate(places)]
+        browser.call("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    seen = [picture(browser)]
+    touch("touchStart", (x, y))
+    touch("touchMove", (x + 40, y + 10))
+    touch("touchEnd")
+    seen.append(picture(browser))
+    touch("touchStart", (x - 20, y), (x + 20, y))
+    touch("touchMove", (x - 60, y), (x + 60, y))
+    touch("touchEnd")
+    seen.append(picture(browser))
+    assert len(set(seen)) == 3
+
+
+def test_the_cut_takes_points_away_and_buttons_zoom(browser: Chromium) -> None:
+    open_maps(browser)
+    press(browser, "#maps canvas", "Escape", "Home")
+    seen = [picture(browser)]
+    type_into(browser, "#maps input[type=range]", "30")
+    seen.append(picture(browser))
+    type_into(browser, "#maps input[type=range]", "100")
+    for title in ("Zoom in", "Zoom out", "Zoom out"):
+        browser.run(f"document.querySelector('#maps button[title=\"{title}\"]').click()")
+        seen.append(picture(browser))
+    assert len(set(seen)) >= 4
+
+
+def test_another_map_and_scene_are_read_when_they_are_chosen(browser: Chromium) -> None:
+    open_maps(browser)
+    first = picture(browser)
+    assert len(options(browser, "maps", "Map")) == 3
+    choose(browser, "maps", "Map", next(one for one in options(browser, "maps", "Map") if "noise" in one))
+    label = "document.querySelector('#maps canvas').getAttribute('aria-label')"
+    browser.until(f"{label}.includes('noise')")
+    assert picture(browser) != first
+    choose(browser, "maps", "Scene", "painted/b")
+    browser.until(f"{label}.includes('painted/b') && {label}.includes('noise')")
+    assert len(options(browser, "maps", "Map")) == 2
+
+
+def test_without_webgl_the_page_says_so_and_keeps_its_numbers(
+    runs_page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(chromium, "FLAGS", (*chromium.FLAGS, "--disable-3d-apis"))
+    with Chromium(tmp_path / "profile") as browser:
+        browser.open(runs_page)
+        browser.run("document.getElementById('maps').scrollIntoView()")
+        browser.until("document.querySelector('#maps .say')?.innerText.includes('no WebGL 2')")
+        browser.until("document.querySelectorAll('#maps .side tbody tr').length > 0")
+        browser.run("document.querySelector('#maps .side tbody tr').click()")
+        assert "Points" in text_of(browser, "#maps .detail")
+        assert browser.run("document.querySelectorAll('#summary table').length") == 2
