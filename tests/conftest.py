@@ -19,6 +19,7 @@ MOST_KEPT_BYTES = 4 << 30
 sys.path += sorted({str(file.parent) for file in TESTS.rglob("*.py")} - {*sys.path})
 
 from chat_server import ChatServer, chat_server  # noqa: E402 (it is found by the line above)
+from chromium import Chromium  # noqa: E402
 from gated_runs import gate_reference, gate_reference_file, gated, gated_copy  # noqa: E402, F401
 
 # Tables are folded for who says how wide he sees them, as pytest-xdist does to its workers.
@@ -73,6 +74,26 @@ def chat(chat_of_module: ChatServer, monkeypatch: pytest.MonkeyPatch) -> ChatSer
     monkeypatch.delenv("OPENAI_BASE_URL", raising=False)
     chat_of_module.forget()
     return chat_of_module
+
+
+@pytest.fixture(scope="session")
+def runs_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of runs, made once."""
+    from made_pages import page_of_runs
+
+    return page_of_runs(tmp_path_factory.mktemp("page"))
+
+
+@pytest.fixture(scope="module")
+def opened_runs(runs_page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
+    """The page of runs in a browser, as the tests before left it."""
+    from looks import WHOLE
+    from made_pages import browser_for_pages
+
+    with browser_for_pages(tmp_path_factory.mktemp("profile")) as found:
+        found.open(runs_page)
+        found.until(WHOLE)
+        yield found
 
 
 @pytest.hookimpl(tryfirst=True)

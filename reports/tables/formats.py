@@ -53,6 +53,7 @@ _ENTITY = re.compile(r"&(?=#?\w+;)")
 _BLOCK = re.compile(r"^(?:[-+](?=\s)|[#>]|\d{1,9}(?=[.)](?:\s|$)))")
 MOST_OF_A_CELL = 2000
 TITLE = "su3d-bench tables"
+MOST_ON_A_LINE = 28  # characters of a cell
 MOST_OF_A_NOTE = 7_000  # characters: it may name every scene of a data set
 STYLE = (
     ":root{color-scheme:light dark}body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:70rem;"
@@ -60,7 +61,9 @@ STYLE = (
     "table{border-collapse:collapse;margin:1rem 0}caption{text-align:left;padding:.3rem 0}"
     "th,td{padding:.2rem .7rem;text-align:right}th:first-child,td:first-child{text-align:left}"
     "thead{border-top:2px solid;border-bottom:1px solid}tbody{border-bottom:1px solid}tbody:last-of-type{border-bottom:"
-    "2px solid}.reported{font-style:italic}.wide{overflow-x:auto}"
+    "2px solid}.reported{font-style:italic}.wide{overflow-x:auto}.short{white-space:nowrap}"
+    "caption span{display:inline-block;position:sticky;left:0;max-width:calc(100vw - 2rem)}"
+    "@media print{.wide{overflow:visible}tr{break-inside:avoid}}"
 )
 
 
@@ -255,21 +258,26 @@ def html_tables(parts: Sequence[Table | Prose]) -> str:
 def _html(table: Table | Prose) -> str:
     if isinstance(table, Prose):
         return _list(table.lines) if table.is_list else "<p>" + "<br>\n".join(map(safe, table.lines)) + "</p>"
-    head = "".join(f'<th scope="col">{safe(name)}</th>' for name in (table.head, *table.columns))
+    head = "".join(f'<th scope="col"{_short(name)}>{safe(name)}</th>' for name in (table.head, *table.columns))
     bodies = []
     for block in blocks_of(table.rows):
         lines = []
         for row in block:
-            cells = "".join(f"<td>{_strong(cell)}</td>" for cell in row.cells)
+            cells = "".join(f"<td{_short(cell.whole)}>{_strong(cell)}</td>" for cell in row.cells)
             kind = ' class="reported"' if row.is_reported else ""
-            lines.append(f'<tr{kind}><th scope="row">{safe(row.title)}</th>{cells}</tr>')
+            lines.append(f'<tr{kind}><th scope="row"{_short(row.title)}>{safe(row.title)}</th>{cells}</tr>')
         bodies.append("<tbody>" + "\n".join(lines) + "</tbody>")
     caption = safe(table.heading + table.caption)
     return (
         f'<section><div class="wide" tabindex="0" role="region" aria-label="{caption}">'
-        f"<table><caption>{caption}</caption>\n"
+        f"<table><caption><span>{caption}</span></caption>\n"
         f"<thead><tr>{head}</tr></thead>\n" + "\n".join(bodies) + f"</table></div>{_list(table.notes)}</section>"
     )
+
+
+def _short(text: str) -> str:
+    """What keeps a number with its interval, or a name, on one line: the box scrolls where the screen is narrow."""
+    return ' class="short"' if len(text) <= MOST_ON_A_LINE else ""
 
 
 def _list(lines: Sequence[str]) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,12 @@ from runs_page import choose, column, open_maps, options, picture, press, text_o
 
 pytestmark = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
 MIDDLE_SECTIONS = ("Scenes", "Classes", "Confusion", "Errors", "Timing", "Compare")
+
+
+@pytest.fixture
+def browser(opened_runs: Chromium) -> Iterator[Chromium]:
+    yield opened_runs
+    assert complaints(opened_runs) == []
 
 
 def test_every_section_is_there_and_the_navigation_leads_to_it(browser: Chromium) -> None:

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import chromium
 import pytest
 from chromium import Chromium, find_chromium
+from looks import complaints
 from runs_page import SELECT, choose, column, headers, open_maps, options, picture, press, text_of, type_into
 
 pytestmark = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
+
+
+@pytest.fixture
+def browser(opened_runs: Chromium) -> Iterator[Chromium]:
+    yield opened_runs
+    assert complaints(opened_runs) == []
 
 
 def test_every_colouring_draws_another_picture_and_says_what_it_means(browser: Chromium) -> None:

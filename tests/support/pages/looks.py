@@ -159,21 +159,21 @@ def on_a_phone(browser: Chromium) -> list[str]:
         browser.run("scrollTo(0, 0)")
         found: list[str] = look(browser, f"sideways({PHONE[0]})")
         found += look(browser, f"smallTargets({LEAST_TARGET})") + look(browser, f"smallTexts({LEAST_TEXT})")
-        return found + look(browser, "cutTexts()")
+        return [*found, *look(browser, "cutTexts()")]
 
 
 def on_a_desktop(browser: Chromium) -> list[str]:
     """The same of a desktop, where texts may be smaller."""
     with seen_as(browser):
         found: list[str] = look(browser, f"sideways({DESKTOP[0]})")
-        return found + look(browser, "cutTexts()")
+        return [*found, *look(browser, "cutTexts()")]
 
 
 def on_paper(browser: Chromium) -> list[str]:
     """What a printed page would leave out, or show too pale."""
     with seen_as(browser, media="print"):
         found: list[str] = look(browser, "unprinted()")
-        return found + look(browser, "paleTexts()")
+        return [*found, *look(browser, "paleTexts()")]
 
 
 def moving(browser: Chromium) -> list[str]:
