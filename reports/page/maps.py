@@ -1,8 +1,10 @@
 """A map in the form in which a page shows it: thinned, quantised, ordered along a curve and deflated.
 
-The content of a map is ``JSON length (uint32, little endian) | JSON | planes``. The JSON names the planes in order; a
-plane of 16 bits is its low bytes and then its high bytes, which deflate far better apart. Positions are differences
-from the point before, modulo 2**16, in steps of ``step`` metres from ``origin``.
+The content of a map is ``JSON length (uint32, little endian) | JSON | tree | planes``. The tree says where the points
+are: level after level a byte a cell, whose bits are the eighths of the cell that hold any (1 the half along x, 2 along
+y, 4 along z), ``depth`` levels down to cells of ``step`` metres from ``origin``, the middle of the first, and a point
+a cell. The JSON names the planes in order; a plane of 16 bits is its low bytes and then its high bytes, which deflate
+far better apart.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ from su3d_bench.reports.pictures.maps import map_cloud
 
 LEAST_SPACING_M = 0.015  # of the drawn points; a finer one shows nothing more on a screen
 COARSER = 1.15  # from one spacing that is tried to the next
-STEPS_A_SPACING = 2  # a point stands at the nearest of these, so the grid itself does not show
+STEPS_A_SPACING = 2  # a point stands in the middle of one of these, so the grid itself does not show
+MOST_CELLS = 1 << 16  # along an axis, in which a page counts
 NO_TRUTH_NEAR, NOT_SCORED = 0xFFFF, 0xFFFE
 NEAR_M = 0.05  # a truth farther than this says nothing of a point of the map
 COLOUR_NEAR_M = 0.06  # frames are sampled every few centimetres
@@ -45,9 +48,11 @@ class Cloud:
 
 def thinned(points: Float32Array, most: int) -> Cloud:
     """At most ``most`` of ``points``, one of each cell, at the least spacing of those that are tried."""
+    extent_m = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    finest_m = max(LEAST_SPACING_M, STEPS_A_SPACING * extent_m / (MOST_CELLS - 2))
 
     def spacing(n_steps: int) -> float:
-        return LEAST_SPACING_M * COARSER**n_steps
+        return finest_m * COARSER**n_steps
 
     n_steps, rows = 0, _first_of_cells(points, spacing(0))
     if len(rows) > most:
@@ -59,7 +64,7 @@ def thinned(points: Float32Array, most: int) -> Cloud:
             rows = _first_of_cells(points, spacing(n_steps))
         while n_steps > 1 and len(finer := _first_of_cells(points, spacing(n_steps - 1))) <= most:
             n_steps, rows = n_steps - 1, finer
-    order = np.argsort(_curve(points[rows], spacing(n_steps)), kind="stable")
+    order = np.argsort(_curve(voxel_coordinates(points[rows], spacing(n_steps) / STEPS_A_SPACING)), kind="stable")
     return Cloud(rows[order], points[rows[order]], spacing(n_steps))
 
 
@@ -69,14 +74,13 @@ def _first_of_cells(points: Float32Array, spacing_m: float) -> Int64Array:
     return np.sort(first_rows(voxel_coordinates(points, spacing_m)))
 
 
-def _curve(points: Float32Array, spacing_m: float) -> Int64Array:
-    """Where each point stands on a Z-order curve, along which neighbours have like values."""
-    cells = voxel_coordinates(points, spacing_m)
+def _curve(cells: Int64Array) -> Int64Array:
+    """Where each cell (n, 3) stands on a Z-order curve, along which neighbours have like values."""
     if not len(cells):
         return np.zeros(0, np.int64)
-    cells = np.minimum(cells - cells.min(axis=0), (1 << 20) - 1)
+    cells = cells - cells.min(axis=0)
     key = np.zeros(len(cells), np.int64)
-    for bit in range(20):
+    for bit in range(int(cells.max()).bit_length()):
         for axis in range(3):
             key |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
     return key
@@ -111,32 +115,38 @@ def nearest_classes(points: Float32Array, truth: Float32Array, classes: Int64Arr
 
 def pack_map(cloud: Cloud, planes: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> str:
     """A map in base64. ``planes`` (n,) or (n, 3) uint8 or uint16 go beside the positions; ``about`` is plain values."""
-    low = cloud.points.min(axis=0).astype(np.float64) if len(cloud.points) else np.zeros(3)
     step = cloud.spacing_m / STEPS_A_SPACING
-    if len(cloud.points):
-        step = max(step, float((cloud.points.max(axis=0) - low).max()) / 0xFFFF)
-    grid = np.rint((cloud.points.astype(np.float64) - low) / step).astype(np.int64)
-    stored: dict[str, NDArray[Any]] = {"position": _differences(grid).astype(np.uint16), **planes}
+    cells = voxel_coordinates(cloud.points, step)
+    levels = _tree(_curve(cells))
+    low = (cells.min(axis=0) + 0.5) * step if len(cells) else np.zeros(3)
     header = {
         "n": len(cloud.points),
         "origin": [round(float(value), 6) for value in low],
         "step": step,
         "spacing": cloud.spacing_m,
+        "depth": len(levels),
         "planes": [
             {"name": name, "bytes": plane.dtype.itemsize, "width": plane.reshape(len(plane), -1).shape[1] or 1}
             if len(plane)
             else {"name": name, "bytes": plane.dtype.itemsize, "width": 1}
-            for name, plane in stored.items()
+            for name, plane in planes.items()
         ],
         **about,
     }
     text = json.dumps(header, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
-    parts = [len(text).to_bytes(4, "little"), text, *(_plane_bytes(plane) for plane in stored.values())]
+    parts = [len(text).to_bytes(4, "little"), text, *levels, *(_plane_bytes(plane) for plane in planes.values())]
     return base64.b64encode(zlib.compress(b"".join(parts), DEFLATE_LEVEL)).decode("ascii")
 
 
-def _differences(grid: Int64Array) -> Int64Array:
-    return np.diff(grid, axis=0, prepend=np.zeros((1, 3), np.int64)) % (1 << 16)
+def _tree(places: Int64Array) -> list[bytes]:
+    """The levels of the tree that holds cells at these ``places`` of the curve, each once and ascending; root first."""
+    levels: list[bytes] = []
+    while len(places) and places[-1] > 0:
+        parents = places >> 3
+        first = np.flatnonzero(np.diff(parents, prepend=-1))
+        levels.append(np.bitwise_or.reduceat(1 << (places & 7), first).astype(np.uint8).tobytes())
+        places = parents[first]
+    return levels[::-1]
 
 
 def _plane_bytes(plane: NDArray[Any]) -> bytes:
@@ -178,6 +188,17 @@ def frame_cover(views: Sequence[Sequence[int]], most: int) -> list[int]:
         chosen.append(best)
         left = [frames for frames in left if best not in frames]
     return chosen
+
+
+def extent_of(points: Float32Array) -> dict[str, list[float]]:
+    """The centre and size in metres of the box around ``points``, as a page has them; nothing of none."""
+    if not len(points):
+        return {}
+    low, high = points.min(axis=0), points.max(axis=0)
+    return {
+        "centre": [round(float(value), 3) for value in (low + high) / 2],
+        "size": [round(float(value), 3) for value in high - low],
+    }
 
 
 def box_in_view(

@@ -14,10 +14,14 @@ from su3d_bench.core.system.files import file_text
 HERE = Path(__file__).parent
 SCRIPTS = (  # in the order in which they run
     "scripts/elements.js",
-    "scripts/map.js",
+    "scripts/maps/shaders.js",
+    "scripts/maps/view.js",
+    "scripts/maps/cloud.js",
     "scripts/sections.js",
-    "scripts/paint.js",
-    "scripts/scene.js",
+    "scripts/maps/paint.js",
+    "scripts/maps/link.js",
+    "scripts/maps/pane.js",
+    "scripts/maps/scene.js",
     "scripts/gallery.js",
     "scripts/errors.js",
     "scripts/timing.js",

@@ -16,10 +16,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from painted import WordEncoder, colour_perception
+from painted import Painted, WordEncoder, colour_perception
 from places import SCENES
 
+from su3d_bench.analysis.page import instances as page_instances
 from su3d_bench.analysis.page import maps as page_maps
+from su3d_bench.analysis.page.instances import MOST_STEPS, Growth
 from su3d_bench.analysis.page.maps import points_of_each
 from su3d_bench.cli.main import main
 from su3d_bench.core.maps import DenseFeatures, Instances
@@ -107,11 +109,17 @@ def data_of(text: str) -> dict[str, Any]:
 
 
 def unpacked(content: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What a browser reads of a packed map: the JSON and the planes, positions in metres."""
+    """What a browser reads of a packed map: the JSON and the planes, among them the places in metres."""
     data = zlib.decompress(base64.b64decode(content))
     length = int.from_bytes(data[:4], "little")
     about, at, planes = json.loads(data[4 : 4 + length]), 4 + length, {}
     n = about["n"]
+    cells = np.zeros((1, 3), np.int64)
+    for _ in range(about["depth"]):
+        is_there = (np.frombuffer(data, np.uint8, len(cells), at)[:, None] >> np.arange(8)) & 1 == 1
+        at += len(cells)
+        of_cell, eighth = np.nonzero(is_there)
+        cells = 2 * cells[of_cell] + np.stack([eighth & 1, eighth >> 1 & 1, eighth >> 2], axis=1)
     for plane in about["planes"]:
         columns = []
         for _ in range(plane["width"]):
@@ -120,8 +128,7 @@ def unpacked(content: str) -> tuple[dict[str, Any], dict[str, Any]]:
             at += n * plane["bytes"]
         planes[plane["name"]] = np.stack(columns, axis=1).squeeze()
     assert at == len(data)
-    steps = np.cumsum(planes["position"].reshape(n, 3), axis=0) % (1 << 16)
-    planes["position"] = np.array(about["origin"]) + steps * about["step"]
+    planes["position"] = np.array(about["origin"]) + (cells if n else cells[:0]) * about["step"]
     return about, planes
 
 
@@ -210,6 +217,7 @@ def test_a_map_reads_back_with_its_instances_colours_and_truth(run: Path, page: 
     stored = read_prediction(run / "scenes" / "painted.a" / "collector" / "prediction.npz")
     assert isinstance(stored, Instances)
     distance = np.linalg.norm(stored.points[None] - planes["position"][:, None], axis=2)
+    assert len(planes["position"]) == about["n"]
     assert distance.min(axis=1).max() < about["step"]  # half a step along each axis
     owner_of = np.full(len(stored.points), -1)
     for k in range(len(stored)):
@@ -225,6 +233,73 @@ def test_a_map_reads_back_with_its_instances_colours_and_truth(run: Path, page: 
     assert 0.2 < is_scored.mean() < 1  # walls are not
     assert (called == planes["truth"])[is_scored].mean() > 0.9
     assert len(planes["colour"]) == about["n"]
+
+
+def test_the_truth_beside_a_map_names_its_objects_and_those_that_the_map_misses(run: Path, tmp_path: Path) -> None:
+    changed = tmp_path / "run"
+    shutil.copytree(run, changed)
+    place = changed / "scenes" / "painted.a" / "collector" / "prediction.npz"
+    stored = read_prediction(place)
+    assert isinstance(stored, Instances)
+    kept = [k for k in range(len(stored)) if stored.names[k] != "chair"]
+    fewer = Instances.of(
+        stored.points, [stored.mask(k) for k in kept], names=[stored.names[k] for k in kept],
+        features=None if stored.features is None else stored.features[kept],
+    )  # fmt: skip
+    write_prediction(place, fewer)
+    found = elements(made(changed, tmp_path / "page.html", "--no-errors"))
+    scene = json.loads(found.content["scene-0"])
+    assert len(scene["truths"]) == 1
+    truth, planes = unpacked(scene["truths"][0])
+    assert [one["name"] for one in truth["instances"]] == ["chair", "sofa", "table", "wall"]
+    assert [truth["classes"][one["class"]] for one in truth["instances"]] == ["chair", "sofa", "table", "wall"]
+    of_dataset = Painted(Path(), Painted.Options()).ground_truth("a", "mesh-vertices")
+    distance = np.linalg.norm(of_dataset.points[None] - planes["position"][:, None], axis=2)
+    assert distance.min(axis=1).max() < truth["step"]
+    nearest_instance = of_dataset.instance[distance.argmin(axis=1)]
+    assert (planes["owner"] == nearest_instance - 1).mean() > 0.99
+    assert np.array_equal(planes["owner"], planes["class"])  # one object a class, in the order of the classes
+    about, _ = unpacked(found.content["map-0"])
+    assert about["beside"] == {"truth": 0, "protocol": "rooms-instance", "counted": [0, 1, 2], "missed": [0]}
+    untouched, _ = unpacked(found.content["map-2"])
+    assert untouched["beside"]["missed"] == []
+
+
+def test_missed_objects_are_as_many_as_the_errors_of_that_name(run: Path, page: str) -> None:
+    errors = {one["method"]: one["protocols"] for one in data_of(page)["errors"]}
+    counted: dict[str, int] = {}
+    for k, listed in enumerate(data_of(page)["maps"]):
+        about, _ = unpacked(elements(page).content[f"map-{k}"])
+        counted[listed["method"]] = counted.get(listed["method"], 0) + len(about["beside"]["missed"])
+    said = {
+        method: next(one["causes"]["missed"]["n"] for one in protocols if one["protocol"] == "rooms-instance")
+        for method, protocols in errors.items()
+    }
+    assert counted == said
+
+
+def test_an_instance_is_born_at_the_update_of_its_first_view(run: Path, page: str) -> None:
+    about, _ = unpacked(elements(page).content["map-0"])
+    stored = read_prediction(run / "scenes" / "painted.a" / "collector" / "prediction.npz")
+    assert isinstance(stored, Instances)
+    assert about["growth"]["frame"] == list(range(6))
+    assert about["growth"]["update"] == list(range(1, 7))
+    assert about["growth"]["held"][-1] == len(stored)
+    first = [stored.views[stored.view_indptr[k] : stored.view_indptr[k + 1], 0].min() for k in range(len(stored))]
+    assert [one["born"] for one in about["instances"]] == first
+
+
+def test_a_growth_of_many_updates_has_few_steps_and_its_last() -> None:
+    frames = [40 * k for k in range(2000)]
+    places = np.unique(np.linspace(0, 1999, MOST_STEPS).round().astype(np.int64))
+    growth = Growth(frames, places, {})
+    assert growth.step_of([40 * 1999]) == len(places) - 1
+    for place in (0, 1, 3, 777):
+        step = growth.step_of([40 * place, 40 * 1999])
+        assert step is not None
+        assert places[step] >= place
+        assert step == 0 or places[step - 1] < place
+    assert growth.step_of([41]) is None
 
 
 def test_similarities_are_those_of_the_asked_texts(run: Path, tmp_path: Path) -> None:
@@ -333,6 +408,16 @@ def test_thinned_points_are_one_a_cell_and_keep_the_order_of_the_curve() -> None
     assert len(thinned(np.zeros((0, 3), np.float32), 5).rows) == 0
 
 
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 300.0])
+def test_places_read_back_within_half_a_step_at_every_size(scale: float) -> None:
+    points = surface(5000, 3) * np.float32(scale) - np.float32(2 * scale)
+    cloud = thinned(points, 2000)
+    about, planes = unpacked(pack_map(cloud, {"owner": index_plane(np.arange(len(cloud.rows)))}, {}))
+    assert planes["owner"].tolist() == list(range(about["n"]))
+    assert np.abs(planes["position"] - cloud.points).max() <= 0.5 * about["step"] * (1 + 1e-4)
+    assert about["depth"] <= 16  # a page counts cells in sixteen bits
+
+
 def test_an_empty_map_packs_and_reads_back() -> None:
     cloud = thinned(np.zeros((0, 3), np.float32), 5)
     about, planes = unpacked(pack_map(cloud, {"owner": index_plane(np.zeros(0, np.int64))}, {"classes": []}))
@@ -381,7 +466,9 @@ def test_a_box_in_a_view_is_where_the_points_project() -> None:
 
 
 @pytest.mark.parametrize(
-    "module", [html_data, html_map, html_page, page_maps, scene_look], ids=lambda module: module.__name__
+    "module",
+    [html_data, html_map, html_page, page_instances, page_maps, scene_look],
+    ids=lambda module: module.__name__,
 )
 def test_the_examples_in_docstrings_hold(module: Any) -> None:
     found: Mapping[str, int] = doctest.testmod(module)._asdict()

@@ -18,6 +18,7 @@ from su3d_bench.analysis.page.gallery import GalleryOfScene, SceneGallery, photo
 from su3d_bench.analysis.page.kept import Piece, piece, state_of_counts, state_of_job, state_of_run
 from su3d_bench.analysis.page.maps import MapOfRun, PageMap, PageScene, SharedTruths, Spaces, page_scene, points_of_each
 from su3d_bench.analysis.page.numbers import are_all_read, is_scored, page_numbers, scored_maps
+from su3d_bench.analysis.page.truths import SharedTruths
 from su3d_bench.core.errors import DataError, Su3dError, printable
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report, run_inline, run_processes
 from su3d_bench.runs.finished import FinishedRun, read_run

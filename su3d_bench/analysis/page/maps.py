@@ -12,10 +12,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from su3d_bench.analysis.page.instances import Growth, fed_frames, frames_of, growth_of, instance_data
+from su3d_bench.analysis.page.truths import Seen, SharedTruths, ShownTruths, judged_objects, why_not_shown
 from su3d_bench.core.errors import ConfigError, Su3dError, printable, printable_json
 from su3d_bench.core.interfaces import Encoder, HasSketches
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
-from su3d_bench.core.types import Float32Array, Frame, GroundTruth, Int64Array, UInt8Array
+from su3d_bench.core.types import Float32Array, Frame, GroundTruth, Int64Array
 from su3d_bench.metrics.matching.labelling import (
     candidate_classes,
     class_index_of_ids,
@@ -30,7 +32,6 @@ from su3d_bench.metrics.semantic.score import has_feature
 from su3d_bench.reports.page.maps import (
     COLOUR_NEAR_M,
     Cloud,
-    box_in_view,
     colour_plane,
     frame_cover,
     index_plane,
@@ -44,7 +45,6 @@ from su3d_bench.reports.pictures.colours import class_colours
 from su3d_bench.reports.pictures.scene_look import SEEN_POINTS, seen_points, spread
 from su3d_bench.runs.finished import FinishedRun, OtherDataError
 from su3d_bench.store.predictions import read_prediction
-from su3d_bench.store.records import read_updates
 
 MOST_POINTS, LEAST_POINTS = 60_000, 3_000  # of one map: what a phone draws at once, what still shows a room
 BYTES_A_POINT = 6.0  # in the page, measured on the rooms: position, colour, owner and truth, deflated, in base64
@@ -55,10 +55,7 @@ GREY_SHARE = 0.01  # of the points may stay without a colour when there are fram
 EVERY = 8  # of the points is asked whether it was seen
 THUMBNAIL_WIDTH, JPEG_QUALITY = 240, 62
 SKETCH_WIDTH, SHOWN_WIDTH = 160, 320  # of a frame for its colours alone, of one that is shown: where that saves time
-MOST_VIEWS = 12  # frames of an instance that are named
-MOST_CAPTION = 240  # characters
 MapOfRun = tuple[int, FinishedRun, str, str]
-Seen = tuple[Float32Array, UInt8Array]  # points (n, 3) m and their colours (n, 3)
 Made = TypeVar("Made")
 
 
@@ -79,11 +76,15 @@ class PageMap:
 
 @dataclass(frozen=True)
 class PageScene:
-    """Thumbnails of a scene: pairs of a frame's index and its JPEG in base64; ``remarks``: what is not known of it."""
+    """Thumbnails of a scene: pairs of a frame's index and its JPEG in base64; ``remarks``: what is not known of it.
+
+    ``truths`` are as maps are; each map names the one that it stands beside by its place here.
+    """
 
     scene: str
     thumbnails: tuple[tuple[int, str], ...]
     maps: tuple[PageMap, ...]
+    truths: tuple[str, ...]
     remarks: tuple[str, ...]
 
     @property
@@ -93,7 +94,8 @@ class PageScene:
 
     def listed(self) -> dict[str, Any]:
         """The scene as the page holds it, its maps aside."""
-        return {"scene": self.scene, "thumbnails": dict(self.thumbnails), "remarks": list(self.remarks)}
+        thumbnails, remarks = dict(self.thumbnails), list(self.remarks)
+        return {"scene": self.scene, "thumbnails": thumbnails, "remarks": remarks, "truths": list(self.truths)}
 
 
 def points_of_each(n_maps: int, most_bytes: int) -> int:
@@ -128,24 +130,6 @@ class Spaces:
         return self._texts[path]
 
 
-class SharedTruths:
-    """The truths of one scene, each made once whoever asks."""
-
-    def __init__(self, scene: str) -> None:
-        self._scene = scene
-        self._truths: dict[tuple[int, str], GroundTruth] = {}
-
-    def of(self, dataset: Any, variant: str) -> GroundTruth:
-        key = id(dataset), variant  # a run keeps its datasets
-        if key not in self._truths:
-            self._truths[key] = dataset.ground_truth(self._scene.partition("/")[2], variant)
-        return self._truths[key]
-
-    def of_run(self, run: FinishedRun, variant: str) -> GroundTruth:
-        """The truth in the data of ``run``, which must be those that it was made from."""
-        return self.of(run.dataset(self._scene), variant)
-
-
 def page_scene(
     scene: str,
     maps: Sequence[MapOfRun],
@@ -171,6 +155,7 @@ class _Scene:
         self._truths = truths
         self._remarks: list[str] = []
         self._frame_of: dict[int, Frame | None] = {}
+        self._shown_truths = ShownTruths()
 
     def page(self, most_points: int, tell: Callable[[str], None]) -> PageScene:
         read = {key[:1] + key[3:]: self._read(key) for key in self._maps}
@@ -185,11 +170,13 @@ class _Scene:
             reason = prediction if isinstance(prediction, str) else None
             content = ""
             if not isinstance(prediction, str):
-                content = self._pack(run, prediction, clouds[index, method], frames, seen)
+                growth = growth_of(run, scene, method)
+                content = self._pack(run, prediction, clouds[index, method], frames, seen, growth)
             made.append(PageMap(index, printable(scene, 200), printable(method, 200), content, reason))
         thumbnails = tuple((index, _jpeg(frame)) for index, frame in frames.items())
         remarks = tuple(printable(line) for line in dict.fromkeys(self._remarks))
-        return PageScene(printable(self._scene, 200), thumbnails, tuple(made), remarks)
+        truths = tuple(self._shown_truths.packed(most_points, seen))
+        return PageScene(printable(self._scene, 200), thumbnails, tuple(made), truths, remarks)
 
     def _read(self, key: MapOfRun) -> Prediction | str:
         _, run, scene, method = key
@@ -239,7 +226,7 @@ class _Scene:
 
     def _seen(self, clouds: Sequence[Float32Array]) -> Seen | None:
         """What the methods saw: in the frames shown, and in as many more as show nearly all of ``clouds``."""
-        fed = sorted({index for _, run, scene, method in self._maps for index in _fed_frames(run, scene, method)})
+        fed = sorted({index for _, run, scene, method in self._maps for index in fed_frames(run, scene, method)})
         fed = fed or list(range(len(self._sequence)))
         unseen = np.concatenate([np.zeros((0, 3), np.float32), *(points[::EVERY] for points in clouds)])
         few = GREY_SHARE * len(unseen)
@@ -255,7 +242,7 @@ class _Scene:
 
     def _chosen_frames(self, maps: Sequence[Instances]) -> Sequence[int]:
         """The frames that are shown: as few as can be that show every instance, from those that the maps name."""
-        return frame_cover([_frames_of(a_map, k) for a_map in maps for k in range(len(a_map))], THUMBNAILS)
+        return frame_cover([frames_of(a_map, k) for a_map in maps for k in range(len(a_map))], THUMBNAILS)
 
     def _rules(self, run: FinishedRun) -> ProtocolRules | None:
         """The rules whose classes the map is shown in: of points before those of instances."""
@@ -265,13 +252,39 @@ class _Scene:
                 fitting += [rules for rules in (run.rules(name),) if rules.vocabulary is not None]
         return min(fitting, key=lambda rules: not rules.takes_dense, default=None)
 
+    def _beside(self, run: FinishedRun, prediction: Prediction) -> dict[str, Any] | None:
+        """The truth that stands beside a map, by its place among those of the scene, and which of it the map misses.
+
+        It is that of the first protocol of instances, else that in whose classes the map is shown.
+        """
+        fitting = (run.rules(name) for name in run.protocols if not why_not_shown(run, name, prediction))
+        judging = next(fitting, None)
+        rules = self._rules(run) if judging is None else judging
+        truth = None if rules is None else self._truth(rules)
+        if rules is None or truth is None or not len(truth.points):
+            return None
+        place = self._shown_truths.place(truth)
+        if judging is None:
+            return {"truth": place}
+        judged = self._had(
+            "no missed objects",
+            lambda: judged_objects(judging, truth, prediction, self._encoder(run, prediction)),
+        )
+        return {"truth": place} if judged is None else {"truth": place, "protocol": judging.name, **judged}
+
     def _truth(self, rules: ProtocolRules) -> GroundTruth | None:
         if self._dataset is None:
             return None
         return self._had("no truth", lambda: self._truths.of(self._dataset, rules.ground_truth))
 
     def _pack(
-        self, run: FinishedRun, prediction: Prediction, cloud: Cloud, frames: Mapping[int, Frame], seen: Seen | None
+        self,
+        run: FinishedRun,
+        prediction: Prediction,
+        cloud: Cloud,
+        frames: Mapping[int, Frame],
+        seen: Seen | None,
+        growth: Growth | None,
     ) -> str:
         rules = self._rules(run)
         truth = None if rules is None else self._truth(rules)
@@ -281,6 +294,7 @@ class _Scene:
             planes["colour"] = colour_plane(colours)
         about: dict[str, Any] = {"protocol": None, "classes": [], "class_colours": [], "instances": [], "queries": []}
         classes: Int64Array | None = None
+        about["beside"] = self._beside(run, prediction)
         if rules is not None:
             names = [entry.name for entry in rules.classes]
             tints = class_colours(names)
@@ -297,8 +311,12 @@ class _Scene:
             similarity = self._similarity(run, prediction)
             about["queries"] = [] if similarity is None else list(self._spaces.queries)
             about["instances"] = [
-                _instance_data(prediction, k, classes, similarity, frames) for k in range(n_predictions(prediction))
+                instance_data(prediction, k, classes, similarity, frames) for k in range(n_predictions(prediction))
             ]
+            if growth is not None and isinstance(prediction, Instances):
+                about["growth"] = growth.steps
+                for k, one in enumerate(about["instances"]):
+                    one["born"] = growth.step_of(frames_of(prediction, k))
         return pack_map(cloud, planes, printable_json(about))
 
     def _classes(
@@ -329,68 +347,10 @@ class _Scene:
         return cosines(features, texts) if texts is not None and texts.shape[1] == features.shape[1] else None
 
 
-def _fed_frames(run: FinishedRun, scene: str, method: str) -> list[int]:
-    """The frames that a method was given, as its table of updates says; none where it says nothing that can be read."""
-    updates = run.folder.job(scene, method).updates
-    with suppress(Su3dError, OSError):
-        return [int(index) for index in read_updates(updates, updates.name).get("frame", ())]
-    return []
-
-
 def _not_near(frames: Sequence[Frame], points: Float32Array) -> Float32Array:
     """Those of ``points`` that none of ``frames`` gives a colour."""
     seen, _ = seen_points(frames, SEEN_POINTS * len(frames) // MORE_FRAMES)
     return points[nearest(seen, points, COLOUR_NEAR_M)[1] < 0]
-
-
-def _frames_of(instances: Instances, k: int) -> list[int]:
-    """The frames in which an instance was seen, each once; none where the method keeps no views."""
-    if not len(instances.views):
-        return []
-    rows = instances.views[instances.view_indptr[k] : instances.view_indptr[k + 1]]
-    return list(dict.fromkeys(int(frame) for frame, _ in rows))
-
-
-def _instance_data(
-    prediction: Prediction, k: int, classes: Int64Array | None, similarity: Any, frames: Mapping[int, Frame]
-) -> dict[str, Any]:
-    """An instance: n points, c class, s similarities in thousandths, and of ``Instances`` its name, score and views."""
-    data: dict[str, Any] = {}
-    if classes is not None:
-        data["class"] = int(classes[k])
-    if similarity is not None:
-        data["similarity"] = [round(1000 * float(value)) for value in similarity[k]]
-    if not isinstance(prediction, Instances):
-        assert not isinstance(prediction, DenseFeatures)
-        return {"id": k, "points": int((prediction.instance == k).sum()), **data}
-    views = _frames_of(prediction, k)
-    own = prediction.points[prediction.mask(k)]
-    data |= {
-        "id": int(prediction.ids[k]) if len(prediction.ids) else k,
-        "name": printable((prediction.labels or prediction.names)[k] or prediction.names[k], 80),
-        "caption": printable(prediction.captions[k], MOST_CAPTION),
-        "score": round(float(prediction.scores[k]), 4),
-        "points": len(own),
-        "n_views": len(views),
-        "views": views[:MOST_VIEWS],
-    }
-    if len(own):
-        low, high = own.min(axis=0), own.max(axis=0)
-        data["centre"] = [round(float(value), 3) for value in (low + high) / 2]
-        data["size"] = [round(float(value), 3) for value in high - low]
-    boxes = {index: _box(own, frames[index]) for index in views if index in frames}
-    seen = {index: box for index, box in boxes.items() if box is not None}
-    if seen:
-        best = max(
-            seen, key=lambda index: ((seen[index][2] - seen[index][0]) * (seen[index][3] - seen[index][1]), -index)
-        )
-        data |= {"view": best, "box": seen[best]}
-    return data
-
-
-def _box(points: Any, frame: Frame) -> list[float] | None:
-    height, width = frame.depth_m.shape
-    return box_in_view(points[:: max(1, len(points) // 2000)], frame.camera_to_world, frame.intrinsics, width, height)
 
 
 def _jpeg(frame: Frame) -> str:

@@ -304,10 +304,7 @@ def _mend_background(overlaps: Overlaps, errors: Sequence[MaskError], repair: Re
 
 
 def _find_missed(overlaps: Overlaps) -> list[MaskError]:
-    touches = ((overlaps.inside > HALF) | (overlaps.cover > HALF)) & overlaps.is_large[:, None]
-    is_split = np.array([overlaps.is_split(g) for g in range(overlaps.n_instances)], bool)
-    missed = np.flatnonzero(~touches.any(axis=0) & ~is_split)
-    return [MaskError("missed", (), (g,)) for g in missed.tolist()]
+    return [MaskError("missed", (), (g,)) for g in overlaps.missed.tolist()]
 
 
 def _mend_missed(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair) -> None:

@@ -82,6 +82,13 @@ class Overlaps:
         """Of each instance, the masks that make it up; merged ones are no part of anything."""
         return tuple(self._parts_of(g) for g in range(self.n_instances))
 
+    @cached_property
+    def missed(self) -> Int64Array:
+        """The instances in which no mask of the minimum size lies, which none holds, and which are not split either."""
+        touches = ((self.inside > HALF) | (self.cover > HALF)) & self.is_large[:, None]
+        is_split = np.array([self.is_split(g) for g in range(self.n_instances)], bool)
+        return np.flatnonzero(~touches.any(axis=0) & ~is_split)
+
     def is_split(self, g: int) -> bool:
         """Whether instance g has several parts that together match it, under its class, and no merged mask finds it."""
         parts = self.parts[g].parts

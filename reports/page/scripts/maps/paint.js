@@ -11,6 +11,10 @@ const ERRORS = [
   ['right class', [59, 140, 226]], ['wrong class', [224, 72, 58]], ['truth not scored', [176, 180, 186]],
   ['no truth within 5 cm', [120, 124, 132]], ['no class', [240, 176, 64]],
 ];
+const JUDGED = [
+  ['missed', [219, 41, 140]], ['not missed', [59, 140, 226]], ['not counted', [176, 180, 186]],
+];
+const MOST_ENTRIES = 300; // of a legend
 const NEAR_NONE = 0xffff, NOT_SCORED = 0xfffe;
 
 function distinct(k) {
@@ -50,8 +54,14 @@ function errorAt(map, k) {
   return called < 0 ? 4 : 1;
 }
 
+function judgedAt(judged, owner) {
+  if (!judged || !judged.counted.includes(owner)) return 2;
+  return judged.missed.includes(owner) ? 0 : 1;
+}
+
 // The colours of all points in one way, and the legend as pairs of a colour (null where there is none) and a text.
-function painted(map, kind, query) {
+// `judged`: of a truth beside a map, which of its objects the protocol counts and the map misses.
+function painted(map, kind, query, judged) {
   const colours = new Uint8Array(3 * map.n), counts = new Map();
   const count = (what) => { counts.set(what, (counts.get(what) || 0) + 1); return what; };
   const share = (n) => `${((100 * n) / Math.max(1, map.n)).toFixed(0)} %`;
@@ -60,38 +70,65 @@ function painted(map, kind, query) {
   const low = Math.min(...values), high = Math.max(...values);
   const owned = (k, rgb) => (map.owner[k] === NEAR_NONE ? NOTHING : rgb(map.owner[k]));
   const nameOfInstance = (own) => (map.instances[own] ? map.instances[own].name : undefined);
+  const colourOfInstance = (own) => PALE[nameOfInstance(own)] || distinct(own);
+  const named = () => map.instances.map((one, own) => [colourOfInstance(own), titleOf(map, one), own, one.points])
+    .sort((a, b) => b[3] - a[3]).slice(0, MOST_ENTRIES);
+  const nJudged = (e) => map.instances.filter((_, own) => judgedAt(judged, own) === e).length;
   const warmth = (own) => heat(high > low ? (values[own] - low) / (high - low) : 0.5);
   const paintOf = {
     colour: (k) => map.colour.subarray(3 * k, 3 * k + 3),
-    instance: (k) => owned(k, (own) => PALE[nameOfInstance(own)] || distinct(own)),
+    instance: (k) => owned(k, colourOfInstance),
     class: (k) => tint(count(classAt(map, k))),
     truth: (k) => tint(count(truthAt(map, k))),
     error: (k) => ERRORS[count(errorAt(map, k))][1],
     similarity: (k) => owned(k, warmth),
+    judged: (k) => JUDGED[count(judgedAt(judged, map.owner[k]))][1],
   }[kind];
   if (paintOf) for (let k = 0; k < map.n; k++) colours.set(paintOf(k), 3 * k);
   const classes = (none) => [...counts].sort((a, b) => b[1] - a[1])
     .map(([c, n]) => [tint(c), `${c < 0 ? none : map.classes[c]} ${share(n)}`]);
   const legendOf = {
     colour: () => [[null, 'as the frames saw it']],
-    instance: () => [[null, plural(map.instances.length, 'instance')]],
+    instance: () => [[null, plural(map.instances.length, 'instance')], ...named()],
     class: () => classes('none'),
     truth: () => classes('not scored or nothing near'),
     error: () => ERRORS.map(([text, rgb], e) => [rgb, `${text} ${share(counts.get(e) || 0)}`])
       .filter((_, e) => counts.get(e)),
+    judged: () => JUDGED.map(([text, rgb], e) => [rgb, `${text} (${nJudged(e)})`]),
     similarity: () => [0, 0.25, 0.5, 0.75, 1].map((t) => [heat(t), ((low + t * (high - low)) / 1000).toFixed(3)]),
   }[kind];
   return { colours, legend: legendOf ? legendOf() : [] };
 }
 
-function legendEntry([rgb, text]) {
-  if (!rgb) return h('li', null, text);
+function swatchOf(rgb) {
   const swatch = h('span', { class: 'swatch' });
   swatch.style.backgroundColor = `rgb(${rgb.join(',')})`;
-  return h('li', null, swatch, text);
+  return swatch;
+}
+function legendEntry([rgb, text, instance]) {
+  if (!rgb) return h('li', null, text);
+  return h('li', { 'data-instance': instance }, swatchOf(rgb), text);
 }
 
 const titleOf = (map, one) => one.name || (one.class >= 0 ? map.classes[one.class] : '') || `instance ${one.id}`;
+
+// What is said of an instance at the pointer: its name, its class where that is another word, its score.
+function wordsOf(map, index) {
+  const one = map.instances[index];
+  if (!one) return null;
+  const title = titleOf(map, one), called = one.class >= 0 ? map.classes[one.class] : '';
+  return [title, called && called !== title ? `class ${called}` : '',
+    isNumber(one.score) ? `score ${one.score.toFixed(2)}` : ''].filter(Boolean);
+}
+
+// What is known of an object of the truth, as pairs of a name and a text.
+function factsOfTruth(truth, index, judged) {
+  const one = truth.instances[index], metres = (values, between) => values.map((v) => v.toFixed(2)).join(between);
+  const facts = [['True class', titleOf(truth, one)], ['Points', countText(one.points)]];
+  if (one.size) facts.push(['Size', `${metres(one.size, ' × ')} m`], ['Centre', `${metres(one.centre, ', ')} m`]);
+  if (judged && judged.counted) facts.push([`In this map (${judged.protocol})`, JUDGED[judgedAt(judged, index)][0]]);
+  return facts;
+}
 
 // The true class that most scored points of an instance have, and their share of them.
 function truthOfInstance(map, index) {

@@ -1,0 +1,119 @@
+"""The truths of a scene for a page: each made once, drawn beside the maps, and which of its objects a map misses."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.core.errors import ConfigError, printable, printable_json
+from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.maps import DenseFeatures, Prediction
+from su3d_bench.core.types import Float32Array, GroundTruth, Int64Array, UInt8Array
+from su3d_bench.metrics.attribution.arrays import scored_masks
+from su3d_bench.metrics.attribution.overlaps import measure_overlaps, true_instances
+from su3d_bench.metrics.fitness import why_not_scorable
+from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.reports.page.maps import colour_plane, extent_of, index_plane, nearest_colours, pack_map, thinned
+from su3d_bench.reports.pictures.colours import class_colours
+from su3d_bench.reports.pictures.maps import truth_owner
+from su3d_bench.runs.finished import FinishedRun
+
+Seen = tuple[Float32Array, UInt8Array]  # points (n, 3) m that frames saw and their colours (n, 3)
+
+
+class SharedTruths:
+    """The truths of one scene, each made once whoever asks."""
+
+    def __init__(self, scene: str) -> None:
+        self._scene = scene
+        self._truths: dict[tuple[int, str], GroundTruth] = {}
+
+    def of(self, dataset: Any, variant: str) -> GroundTruth:
+        key = id(dataset), variant  # a run keeps its datasets
+        if key not in self._truths:
+            self._truths[key] = dataset.ground_truth(self._scene.partition("/")[2], variant)
+        return self._truths[key]
+
+    def of_run(self, run: FinishedRun, variant: str) -> GroundTruth:
+        """The truth in the data of ``run``, which must be those that it was made from."""
+        return self.of(run.dataset(self._scene), variant)
+
+
+class ShownTruths:
+    """The truths of a scene that maps stand beside, each once, in the order in which they were asked for."""
+
+    def __init__(self) -> None:
+        self._truths: list[GroundTruth] = []
+
+    def place(self, truth: GroundTruth) -> int:
+        """Where ``truth`` stands among those that are drawn."""
+        for place, known in enumerate(self._truths):
+            if known is truth:
+                return place
+        self._truths.append(truth)
+        return len(self._truths) - 1
+
+    def packed(self, most_points: int, seen: Seen | None) -> list[str]:
+        """The truths in the form of maps, in base64."""
+        return [_packed(truth, most_points, seen) for truth in self._truths]
+
+
+def why_not_shown(run: FinishedRun, protocol: str, prediction: Prediction) -> str | None:
+    """Why ``protocol`` does not say what a map misses; None where it does."""
+    with suppress(ConfigError):  # another version of it
+        rules = run.rules(protocol)
+        return why_not_scorable(rules, prediction) if rules.kind == "instance" else "counts no objects"
+    return "its rules here are others"
+
+
+def judged_objects(
+    rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
+) -> dict[str, list[int]]:
+    """The places of objects among ``instances_of``: those ``counted`` by ``rules``, and of these those ``missed``.
+
+    They are missed as the kind of error of that name has it.
+    """
+    assert not isinstance(prediction, DenseFeatures)
+    values, masks, scoring = scored_masks(rules, truth, prediction, encoder)
+    overlaps = measure_overlaps(true_instances(values, scoring), masks, scoring)
+    place_of = {int(number): place for place, number in enumerate(instances_of(truth))}
+    counted = [place_of.get(int(truth.instance[members[0]])) for members in overlaps.members]
+    missed = set(overlaps.missed.tolist())
+    return {
+        "counted": [place for place in counted if place is not None],
+        "missed": [place for k, place in enumerate(counted) if k in missed and place is not None],
+    }
+
+
+def instances_of(truth: GroundTruth) -> Int64Array:
+    """The numbers of the instances of a truth, ascending."""
+    return np.unique(truth.instance[truth.instance > 0]).astype(np.int64)
+
+
+def _packed(truth: GroundTruth, most_points: int, seen: Seen | None) -> str:
+    cloud = thinned(truth.points, most_points)
+    numbers, names = instances_of(truth), [printable(name, 80) for name in truth.labels.names]
+    row_of_class = truth_owner(truth)
+    place = np.searchsorted(numbers, truth.instance)
+    owner = np.where(truth.instance > 0, place, -1)
+    planes = {"owner": index_plane(owner[cloud.rows]), "class": index_plane(row_of_class[cloud.rows])}
+    colours = None if seen is None else nearest_colours(cloud.points, *seen)
+    if colours is not None:
+        planes["colour"] = colour_plane(colours)
+    order = np.argsort(owner, kind="stable")
+    starts = np.searchsorted(owner[order], np.arange(len(numbers) + 1))
+    instances = []
+    for k, number in enumerate(numbers.tolist()):
+        rows = order[starts[k] : starts[k + 1]]
+        classes = row_of_class[rows]
+        called = int(np.bincount(classes[classes >= 0]).argmax()) if (classes >= 0).any() else -1
+        one = {"id": number, "class": called, "points": len(rows), **extent_of(truth.points[rows])}
+        instances.append(one | {"name": names[called] if called >= 0 else ""})
+    tints = class_colours(truth.labels.names)
+    about: dict[str, Any] = {
+        "protocol": None, "classes": names, "class_colours": [tints[name] for name in truth.labels.names],
+        "instances": instances, "queries": [],
+    }  # fmt: skip
+    return pack_map(cloud, planes, printable_json(about))
