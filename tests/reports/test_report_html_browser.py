@@ -418,11 +418,12 @@ def test_every_control_has_a_name_and_the_page_no_sideways_scroll_on_a_phone(
 CONTROLS = {
     *(("nav", "a", name) for name in (*MIDDLE_SECTIONS, GALLERY, "Summary", "Maps", "Provenance")),
     ("skip", "a", "Skip to the numbers"),
-    *(("maps", "select", name) for name in ("Scene", "Map", "Colour by", "Text")),
+    *(("maps", "select", name) for name in ("Scene", "Map", "Beside", "Colour by", "Text")),
     *(("maps", "button", name) for name in ("Zoom in", "Zoom out", "Whole map")),
-    ("maps", "input", "Cut above"),
+    *(("maps", "input", name) for name in ("Cut above", "Grown to", "Missed objects", "Near walls fade")),
     ("maps", "input", "Filter instances"),
     ("maps", "canvas", "3D view"),
+    ("maps", "canvas", "3D view of the map"),  # the one beside, before there is any
     ("scenes", "select", "Protocol"),
     ("scenes", "select", "Metric"),
     ("scenes", "input", "Filter scenes"),
@@ -456,7 +457,7 @@ OPERATE = """(part, kind, k) => {
     one.selectedIndex = (one.selectedIndex + 1 + (k % (one.options.length - 1))) % one.options.length;
     one.dispatchEvent(new Event('change'));
   } else if (kind === 'input') {
-    one.value = one.type === 'range' ? '40' : 'no row has this text';
+    one.value = one.type === 'range' ? String(Math.round(0.4 * one.max)) : 'no row has this text';
     one.dispatchEvent(new Event('input'));
   } else one.click();
   return true;

@@ -153,13 +153,13 @@ function mapView(canvas, { eye, onMove, onPick, onHover, onLost }) {
     gl.deleteBuffer(buffer);
     if (mine !== cloud) return null;
     // The pixel itself first, then its surroundings; a ghost before what is behind it.
-    const away = (k) => Math.hypot((k % side) - reach, Math.floor(k / side) - reach);
-    const nearest = [...Array(side * side).keys()].sort((a, b) => away(a) - away(b));
-    const middle = n / 4 + (side * side - 1) / 2;
-    const hit = pixels[4 * middle + 2] ? middle : nearest.find((k) => pixels[4 * k + 2]);
+    const places = side * side;
+    const away = (k) => Math.hypot((k % side) - reach, Math.floor((k % places) / side) - reach);
+    const nearest = [...Array(2 * places).keys()].sort((a, b) => away(a) - away(b) || b - a);
+    const hit = nearest.find((k) => pixels[4 * k + 2]);
     if (hit === undefined) return null;
     const owner = pixels[4 * hit] + 256 * pixels[4 * hit + 1] - 1;
-    return owner === NO_OWNER || owner < 0 ? null : { kind: hit === middle && hit >= n / 4 ? 'ghost' : 'own', owner };
+    return owner === NO_OWNER || owner < 0 ? null : { kind: hit < places ? 'own' : 'ghost', owner };
   }
   async function pickAt(x, y) {
     onPick(await at(x, y), x, y);
