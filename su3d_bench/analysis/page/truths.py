@@ -98,7 +98,7 @@ def _packed(truth: GroundTruth, most_points: int, seen: Seen | None) -> str:
     row_of_class = truth_owner(truth)
     place = np.searchsorted(numbers, truth.instance)
     owner = np.where(truth.instance > 0, place, -1)
-    planes = {"owner": index_plane(owner[cloud.rows]), "class": index_plane(row_of_class[cloud.rows])}
+    planes: dict[str, Any] = {"owner": index_plane(owner[cloud.rows]), "class": index_plane(row_of_class[cloud.rows])}
     colours = None if seen is None else nearest_colours(cloud.points, *seen)
     if colours is not None:
         planes["colour"] = colour_plane(colours)
