@@ -37,7 +37,7 @@ mutants: $(VENV)/test
 bench: $(VENV)/test
 	@mkdir -p build
 	$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-group-by=group --benchmark-columns=min,median,rounds --benchmark-json=build/bench.json
-	$(BIN)/python benchmarks write_performance build/bench.json docs/running/performance.md
+	$(BIN)/python benchmarks write_performance build/bench.json
 
 # All methods on the demo rooms, and along corridors so long that every map reaches 5 million points: on two cores three
 # quarters of an hour for the rooms and half an hour for the corridors.
@@ -48,7 +48,7 @@ bench-methods: $(VENV)/test
 	$(CORRIDOR_RUN) --scenes $(CORRIDOR)/930m --methods opensu3d conceptfusion conceptfusion-sam sam3d@incremental conceptgraphs --out runs/bench-corridor
 	$(CORRIDOR_RUN) --scenes $(CORRIDOR)/310m --methods conceptgraphs-detector --out runs/bench-corridor-detector
 	$(CORRIDOR_RUN) --scenes $(CORRIDOR)/10m $(CORRIDOR)/30m $(CORRIDOR)/100m $(CORRIDOR)/300m $(CORRIDOR)/1000m --limit 20 --set corridor.step_m=0.5 --methods openmask3d openmask3d-segment3d --out runs/bench-corridor-scans
-	$(BIN)/python benchmarks write_performance build/bench.json docs/running/performance.md --rooms runs/bench-rooms --corridors runs/bench-corridor runs/bench-corridor-detector runs/bench-corridor-scans
+	$(BIN)/python benchmarks write_performance build/bench.json --rooms runs/bench-rooms --corridors runs/bench-corridor runs/bench-corridor-detector runs/bench-corridor-scans
 
 # Learns the reference that .ci/run holds the demo run against; commit it with the change that moves the numbers. Wide
 # limits where machines differ: CI runs on whatever there is, beside whatever else runs there.

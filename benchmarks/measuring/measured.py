@@ -1,4 +1,4 @@
-"""What a measuring script found, as a JSON file that ``write_performance.py`` makes a section of the page from."""
+"""What a measuring script found, as a JSON file from which ``write_performance`` makes a table of its notes."""
 
 from __future__ import annotations
 

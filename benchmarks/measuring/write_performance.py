@@ -1,19 +1,21 @@
-"""``docs/running/performance.md``: a table a group of ``make bench``, what scripts measured, then whole runs.
+"""``docs/running/performance.md``, the results, and ``benchmarks/measured.md``, every table that was measured.
 
-``python benchmarks write_performance build/bench.json docs/running/performance.md [--rooms RUN] [--corridors RUN]``:
-the runs are those of ``make bench-methods``; without them their sections stay as the page has them, and so does the
-list of marks, which is written by hand.
+``python benchmarks write_performance [build/bench.json] [--rooms RUN] [--corridors RUN]``: the JSON file is that of
+``make bench``, the runs are those of ``make bench-methods``. What is not given stays as the pages have it, and so do
+the list of marks, which is written by hand, and what a script measured that left no new file.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from folders import BENCHMARKS, ROOT
 
 from su3d_bench.core.system.timing import hardware_line
 from su3d_bench.metrics.costs import (
@@ -32,12 +34,18 @@ from su3d_bench.reports.pictures.timing import draw_update_cost
 from su3d_bench.reports.tables.formats import aligned
 from su3d_bench.runs.finished import read_run, read_update_times
 
-HEAD = """# Performance
-
-Written by `make bench` on one machine: {hardware}.
+PAGE, NOTES = ROOT / "docs/running/performance.md", BENCHMARKS / "measured.md"
+PICTURE = ROOT / "docs/pictures/update-cost.png"
+MACHINE = """Written by `make bench` on one machine: {hardware}.
 Times are medians; only the ratios within a table travel to another machine. No check fails because a machine was slow.
 """
+PAGE_HEAD = f"# Performance\n\n{MACHINE}"
+NOTES_HEAD = f"""# What was measured
+
+{MACHINE}[The results](../docs/running/performance.md) are made of this.
+"""
 MARKS_TITLE = "## Marks"
+MISSED_TITLE = "## What misses its mark, and why"
 ROOMS_TITLE = "## Every method on rooms"
 CORRIDORS_TITLE = "## An update against the map"
 CORRIDORS_TEXT = """
@@ -96,6 +104,16 @@ def measured_sections(folder: Path) -> Iterator[str]:
         yield "\n".join([*lines, *notes])
 
 
+def program_of(section: str) -> str | None:
+    """The measuring program whose table a section holds; None for a group of benchmarks.
+
+    >>> program_of("## A map\\n\\n`python benchmarks big_map --points 5`\\n")
+    'big_map'
+    """
+    found = re.search(r"^`python benchmarks (\w+)", section, re.MULTILINE)
+    return found[1] if found else None
+
+
 def rooms_section(run: Path) -> str:
     """Run time and memory of every method on the scenes of a run."""
     rows = [["method", "updates", "ms an update", "of it the map", "finish, s", "whole scene, s", "peak memory, MiB"]]
@@ -118,11 +136,11 @@ def rooms_section(run: Path) -> str:
     return "\n".join([ROOMS_TITLE, "", text, "", *aligned(rows), ""])
 
 
-def corridors_section(runs: Sequence[Path], picture: Path) -> str:
+def corridors_section(runs: Sequence[Path]) -> str:
     """How the cost of an update grows with each method's map, and its plot."""
     every = [times for run in runs for times in _times(run)]
-    picture.write_bytes(draw_update_cost(every, WARM_UP, "png"))
-    plot = f"![Cost of an update against the points of the map]({picture.parent.name}/{picture.name})"
+    PICTURE.write_bytes(draw_update_cost(every, WARM_UP, "png"))
+    plot = f"![Cost of an update against the points of the map](../{PICTURE.parent.name}/{PICTURE.name})"
     return "\n".join([CORRIDORS_TITLE, CORRIDORS_TEXT, *aligned(growth_table(every)), "", plot, ""])
 
 
@@ -177,29 +195,59 @@ def _stage(summary: MethodSummary, name: str) -> StageSummary:
 
 def section_of(page: str, title: str) -> str:
     """The section of ``page`` below the line ``title``, with it; empty where there is none."""
-    _, found, rest = f"\n{page}".partition(f"\n{title}\n")
-    section, _, _ = f"{found[1:]}{rest}".partition("\n## ")
-    return f"{section.rstrip()}\n" if found else ""
+    return next((one for one in sections_of(page) if one.startswith(f"{title}\n")), "")
+
+
+def sections_of(page: str) -> list[str]:
+    """What stands below each heading of the second order, with it; what stands above the first is left out."""
+    return [f"## {one.rstrip()}\n" for one in f"\n{page}".split("\n## ")[1:]]
+
+
+def head_of(page: str) -> str:
+    """What stands above the first heading of the second order."""
+    return f"{page.partition(chr(10) + '## ')[0].rstrip()}\n"
+
+
+def results_page(before: str, hardware: str | None, rooms: Path | None, corridors: Sequence[Path] | None) -> str:
+    """The page of results; what is None stays as it was ``before``."""
+    sections = [
+        head_of(before) if hardware is None else PAGE_HEAD.format(hardware=hardware),
+        section_of(before, MARKS_TITLE),
+        section_of(before, MISSED_TITLE),
+        section_of(before, ROOMS_TITLE) if rooms is None else rooms_section(rooms),
+        section_of(before, CORRIDORS_TITLE) if corridors is None else corridors_section(corridors),
+    ]
+    return "\n".join(filter(None, sections))
+
+
+def notes_page(before: str, hardware: str | None, groups: Sequence[str] | None, measured: Sequence[str]) -> str:
+    """Every table: the ``groups`` of benchmarks, then what scripts ``measured``, one table a script.
+
+    A script's table takes the place of the one ``before``; groups are new as a whole, or as they were.
+    """
+    known = sections_of(before)
+    if groups is None:
+        groups = [one for one in known if program_of(one) is None]
+    tables = {program_of(one): one for one in (*known, *measured) if program_of(one) is not None}
+    head = head_of(before) if hardware is None else NOTES_HEAD.format(hardware=hardware)
+    return "\n".join([head, *groups, *(tables[name] for name in sorted(filter(None, tables)))])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("benchmarks", type=Path, help="JSON file of pytest-benchmark")
-    parser.add_argument("page", type=Path)
+    parser.add_argument("benchmarks", type=Path, nargs="?", help="JSON file of pytest-benchmark")
     parser.add_argument("--measured", type=Path, default=Path("build/measured"), help="folder of scripts' JSON files")
     parser.add_argument("--rooms", type=Path, metavar="RUN")
     parser.add_argument("--corridors", type=Path, nargs="+", metavar="RUN")
     asked = parser.parse_args()
-    before = asked.page.read_text(encoding="utf-8") if asked.page.exists() else ""
-    sections = [HEAD.format(hardware=hardware_line()), section_of(before, MARKS_TITLE)]
-    sections += benchmark_sections(json.loads(asked.benchmarks.read_text(encoding="utf-8"))["benchmarks"])
-    sections += measured_sections(asked.measured)
-    sections.append(rooms_section(asked.rooms) if asked.rooms else section_of(before, ROOMS_TITLE))
-    picture = asked.page.parent / "pictures" / "update-cost.png"
-    sections.append(
-        corridors_section(asked.corridors, picture) if asked.corridors else section_of(before, CORRIDORS_TITLE)
-    )
-    asked.page.write_text("\n".join(filter(None, sections)), encoding="utf-8")
+    hardware, groups = None, None
+    if asked.benchmarks is not None:
+        hardware = hardware_line()
+        groups = list(benchmark_sections(json.loads(asked.benchmarks.read_text(encoding="utf-8"))["benchmarks"]))
+    page, notes = (file.read_text(encoding="utf-8") for file in (PAGE, NOTES))
+    measured = list(measured_sections(asked.measured))
+    NOTES.write_text(notes_page(notes, hardware, groups, measured), encoding="utf-8")
+    PAGE.write_text(results_page(page, hardware, asked.rooms, asked.corridors), encoding="utf-8")
 
 
 if __name__ == "__main__":

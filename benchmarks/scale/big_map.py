@@ -113,7 +113,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--points", type=int, default=20_000_000)
     parser.add_argument("--instances", type=int, default=5_000)
-    parser.add_argument("--json", type=Path, help="write the table for docs/running/performance.md")
+    parser.add_argument("--json", type=Path, help="write the table for benchmarks/measured.md")
     arguments = parser.parse_args()
     rows: Rows = []
     method = OpenSU3D()

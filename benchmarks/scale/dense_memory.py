@@ -157,7 +157,7 @@ def main() -> None:
     parser.add_argument("--dimensions", type=int, default=1024)
     parser.add_argument("--features-in", nargs="+", default=["disk", "memory"], choices=("disk", "memory"))
     parser.add_argument("--folder", type=Path, help="where the prediction is written; it must exist and is kept")
-    parser.add_argument("--json", type=Path, help="write the table for docs/running/performance.md")
+    parser.add_argument("--json", type=Path, help="write the table for benchmarks/measured.md")
     parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.here:

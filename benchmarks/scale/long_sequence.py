@@ -108,7 +108,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=N_FRAMES)
     parser.add_argument("--features", type=int, default=768)
-    parser.add_argument("--json", type=Path, help="write the table for docs/running/performance.md")
+    parser.add_argument("--json", type=Path, help="write the table for benchmarks/measured.md")
     arguments = parser.parse_args()
     frames = Pacing(arguments.frames)
     method = OpenSU3D()

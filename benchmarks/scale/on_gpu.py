@@ -239,7 +239,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cuda:0", help="cuda:0, another GPU, or cpu: torch on the CPU")
     parser.add_argument("--points", type=int, nargs="+", default=[500_000, 5_000_000, 10_000_000], help="of the maps")
-    parser.add_argument("--json", type=Path, help="write the table for docs/running/performance.md")
+    parser.add_argument("--json", type=Path, help="write the table for benchmarks/measured.md")
     arguments = parser.parse_args()
     try:
         device = device_for(arguments.device, 0)
