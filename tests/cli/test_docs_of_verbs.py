@@ -17,6 +17,8 @@ from su3d_bench.cli.main import build_parser
 ENVIRONMENT = ROOT / "docs" / "running" / "environment.md"
 VARIABLE = re.compile(r"SU3D_[A-Z]+(?:_[A-Z]+)*")
 CODE = ("su3d_bench", "datasets", "baselines", "reports")
+ROADS = ("predictions", "method", "dataset", "ci")  # whoever comes with one has a tutorial
+LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)")
 MADE_UP = {"SU3D_TEST_KEY"}  # by a test, for itself
 
 
@@ -39,10 +41,10 @@ def test_links_of_the_page_lead_somewhere() -> None:
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
-@pytest.mark.parametrize("file", [file for file in PAGES if file.name != "walks.md"], ids=str)  # .ci/walks.py types it
+@pytest.mark.parametrize("file", PAGES, ids=str)
 def test_every_command_of_a_page_is_one_that_the_parser_takes(file: Path) -> None:
     text = file.read_text().replace("\\\n", " ")
-    for line in re.findall(r"^(?:SU3D_\w+=\S+ )?su3d-bench (.*)$", text, re.MULTILINE):
+    for line in re.findall(r"^(?:! |SU3D_\w+=\S+ )?su3d-bench (.*)$", text, re.MULTILINE):
         if not re.search(r"VERB| \.\.\.|\||>", line):
             build_parser().parse_args(shlex.split(line, comments=True))
 
@@ -69,8 +71,8 @@ def test_the_pages_name_no_variable_that_is_not() -> None:
         assert set(VARIABLE.findall(file.read_text())) <= table_of_variables(), file
 
 
-def test_the_readme_explains_five_words_and_shows_five_verbs() -> None:
-    text = (ROOT / "README.md").read_text()
+def test_the_first_page_explains_five_words_and_shows_five_verbs() -> None:
+    text = (ROOT / "docs" / "index.md").read_text()
     words = text.split("## Five words\n")[1].split("\n## ")[0]
     assert re.findall(r"^- \*\*(.+?)\*\*", words, re.MULTILINE) == [
         "scene",
@@ -82,4 +84,19 @@ def test_the_readme_explains_five_words_and_shows_five_verbs() -> None:
     assert text.index("## Five words") < text.index("## What to type")
     lines = re.findall(r"^\| `su3d-bench (.*?)`", text.split("## What to type\n")[1].split("\n## ")[0], re.MULTILINE)
     assert len(lines) == 5
-    assert "docs/verbs.md" in text
+    assert {f"tutorials/{name}.md" for name in ROADS} <= set(LINK.findall(text))
+
+
+def test_the_readme_leads_to_the_four_roads_and_is_short() -> None:
+    text = (ROOT / "README.md").read_text()
+    assert {"docs/index.md", *(f"docs/tutorials/{name}.md" for name in ROADS)} <= set(LINK.findall(text))
+    assert len(text.splitlines()) <= 100
+
+
+@pytest.mark.parametrize("file", PAGES, ids=str)
+def test_a_page_has_one_heading_pictures_with_words_and_links_that_lead_somewhere(file: Path) -> None:
+    text = re.sub(r"^```.*?^```$", "", file.read_text(), flags=re.MULTILINE | re.DOTALL)
+    assert len(re.findall(r"^# ", text, re.MULTILINE)) == 1
+    assert "![](" not in text
+    for target in LINK.findall(text):
+        assert (file.parent / target).is_file(), target

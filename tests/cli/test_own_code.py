@@ -1,6 +1,6 @@
 """What is wrong in somebody's own method or dataset is one line with their file, the line and what is expected.
 
-What README and docs show runs as it stands.
+What docs/own-code.md shows runs as it stands.
 """
 
 from __future__ import annotations
@@ -266,8 +266,8 @@ def blocks(page: str, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", (ROOT / page).read_text(), re.MULTILINE | re.DOTALL)
 
 
-def test_the_method_of_the_readme_runs_as_it_stands(capsys: pytest.CaptureFixture[str]) -> None:
-    (text,) = [block for block in blocks("README.md", "python") if "class " in block]
+def test_the_method_of_the_page_runs_as_it_stands(capsys: pytest.CaptureFixture[str]) -> None:
+    (text,) = [block for block in blocks("docs/own-code.md", "python") if "class " in block]
     Path("my_method.py").write_text(text)
     assert main(["methods", "check", METHOD]) == 0
     assert "instances, with features: nothing found wrong" in capsys.readouterr().out
