@@ -2,7 +2,7 @@
 
 What stands in the ``sh`` blocks of a page of ``docs/tutorials`` is typed, block by block; the first that fails ends the
 tutorial. Of a ``text`` block behind one every line must have been printed, but for its numbers, which may be of another
-processor, and for ``...``, which stands for lines that are left out. ``python .ci/tutorials.py [NAME ...]``, or all.
+processor or code, and for ``...``, which stands for lines that are left out. ``python .ci/tutorials.py [NAME ...]``, or all.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = {page.stem: page for page in sorted((ROOT / "docs" / "tutorials").glob("*.md"))}
 BLOCK = re.compile(r"^```(sh|text)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-NUMBER = re.compile(r"[-+]?\d+(?:[.,]\d+)*")
+NUMBER = re.compile(r"\b[0-9a-f]{16}\b|[-+]?\d+(?:[.,]\d+)*")  # digests of code too
 LEFT_OUT = "..."
 
 
