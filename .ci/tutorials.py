@@ -2,7 +2,9 @@
 
 What stands in the ``sh`` blocks of a page of ``docs/tutorials`` is typed, block by block; the first that fails ends the
 tutorial. Of a ``text`` block behind one every line must have been printed, but for its numbers, which may be of another
-processor or code, and for ``...``, which stands for lines that are left out. ``python .ci/tutorials.py [NAME ...]``, or all.
+processor or code, and for ``...``, which stands for lines that are left out.
+
+``python .ci/tutorials.py [NAME ...]``, or all.
 """
 
 from __future__ import annotations

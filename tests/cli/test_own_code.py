@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import re
-import shlex
 from pathlib import Path
 
 import pytest
@@ -271,11 +270,3 @@ def test_the_method_of_the_page_runs_as_it_stands(capsys: pytest.CaptureFixture[
     Path("my_method.py").write_text(text)
     assert main(["methods", "check", METHOD]) == 0
     assert "instances, with features: nothing found wrong" in capsys.readouterr().out
-
-
-def test_the_commands_of_the_page_run_one_after_another(capsys: pytest.CaptureFixture[str]) -> None:
-    quick = ["--limit", "1", "--no-pictures", "--jobs", "1", "--profile", "oracle"]
-    commands = [shlex.split(line) for block in blocks("docs/own-code.md", "sh") for line in block.splitlines()]
-    assert [command[0] for command in commands] == ["su3d-bench"] * 9
-    for command in commands:
-        assert main([*command[1:], *(quick if command[1] == "run" else [])]) == 0, capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The tutorials are of the form that .ci/tutorials.py types, and what it compares notices what is not printed any more."""
+"""The tutorials have the form that .ci/tutorials.py types, and it notices what is not printed any more."""
 
 from __future__ import annotations
 
