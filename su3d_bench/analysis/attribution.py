@@ -9,20 +9,18 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
-from functools import cache, cached_property, lru_cache, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from su3d_bench.analysis.inputs import Inputs, TruthOf, method_of, truth_of_scene
 from su3d_bench.analysis.sides import Side, refuse_unlike
-from su3d_bench.core.errors import ConfigError, DataError, PredictionError, counted, printable
+from su3d_bench.core.errors import ConfigError, PredictionError, counted, printable
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.types import GroundTruth
-from su3d_bench.evaluation.explained import FilesOfTruth
-from su3d_bench.evaluation.scoring import with_confidences_of_files
-from su3d_bench.evaluation.texts import GivenTexts, read_text_features
 from su3d_bench.metrics.attribution.arrays import EXPLAINED, LookedAt, MendedScene
 from su3d_bench.metrics.attribution.singles import SingleError
 from su3d_bench.metrics.fitness import why_not_scorable
@@ -30,12 +28,10 @@ from su3d_bench.metrics.metric import Counts
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import SceneScore, metric_of, plain_json
 from su3d_bench.runs.finished import FinishedRun, read_run
-from su3d_bench.store.predictions import read_prediction
 
 SCHEMA = 1
 Values = Mapping[str, float]
 MendedJob = Mapping[str, MendedScene]  # of a scene under a method, by protocol
-TruthOf = Callable[[str], GroundTruth]  # by the variant that a protocol asks for
 
 
 @dataclass(frozen=True)
@@ -91,7 +87,7 @@ def attribute(
     ``oracle``: a run of the same method on the same scenes with the profile ``oracle``, for the stage of the 2D masks.
     """
     run = read_run(path)
-    explained = explained_of(run, _method_of(run, method), protocols)
+    explained = explained_of(run, method_of(run, method), protocols)
     other = None if oracle is None else Side(_oracle_run(oracle), explained.method)
     if other is not None:
         other.run.check_method(other.method)
@@ -123,14 +119,11 @@ class Explained:
         return self.run.scores(self.method)
 
     @cached_property
-    def _inputs(self) -> _Inputs:
-        return _Inputs(self.run, self.method)
+    def _inputs(self) -> Inputs:
+        return Inputs(self.run, self.method)
 
     def _rules(self, protocol: str) -> ProtocolRules:
-        """The rules by which the counts were made: of files, their confidences may count where a rule has 1."""
-        rules, elsewhere = self.run.rules(protocol), self.run.made_elsewhere.get(self.method)
-        takes_files = elsewhere is not None and elsewhere.confidences == "file"
-        return with_confidences_of_files(rules) if takes_files else rules
+        return self._inputs.rules(self.run.rules(protocol))
 
     def mend(self, scene: str, truth_of: TruthOf, encoder: Callable[[], Encoder]) -> MendedJob:
         """The counts of ``scene`` as they are and with its errors mended, by protocol; of those that scored it."""
@@ -207,53 +200,6 @@ class Explained:
         if not formed:
             raise ConfigError(f"{side.name}: no scene is scored under {', '.join(self.protocols)}; nothing to explain")
         return RunAttribution(self.run.name, self.method, (*self.remarks, *_remarks(self.run)), formed)
-
-
-def truth_of_scene(run: FinishedRun, scene: str, variant: str) -> GroundTruth:
-    """The truth in the data of ``run``, which must be those that it was made from."""
-    truth: GroundTruth = run.dataset(scene).ground_truth(scene.partition("/")[2], variant)
-    return truth
-
-
-class _Inputs:
-    """The truth, the maps and the encoder of a method of a run, be its predictions made here or elsewhere."""
-
-    def __init__(self, run: FinishedRun, method: str) -> None:
-        self._run, self._method = run, method
-        self._files = FilesOfTruth(run)
-        self.of_map = lru_cache(maxsize=1)(self._read_map)
-
-    def of_scene(self, scene: str, rules: ProtocolRules, truth_of: TruthOf) -> tuple[GroundTruth, Prediction]:
-        if self._run.data.truth_files is not None:
-            truth = self._files.truth(scene, rules)
-            return truth, self._files.prediction(scene, self._method, rules, len(truth.points))
-        return truth_of(rules.ground_truth), self.of_map(scene)
-
-    def _read_map(self, scene: str) -> Prediction:
-        return read_prediction(self._run.folder.job(scene, self._method).prediction)
-
-    def encoder(self, rules: ProtocolRules, prediction: Prediction, own: Callable[[], Encoder]) -> Encoder | None:
-        """What named the instances; None where they have names."""
-        if getattr(prediction, "labels", None) is not None:
-            return None
-        elsewhere = self._run.made_elsewhere.get(self._method)
-        if elsewhere is None or elsewhere.texts is None:
-            return own()
-        path, digest = elsewhere.texts
-        given = read_text_features(Path(path))
-        assert given is not None
-        texts = GivenTexts(given, rules)
-        if texts.digest != digest:
-            raise DataError(f"{printable(path, 200)}: is not the file that {self._run.name} was scored with")
-        return texts
-
-
-def _method_of(run: FinishedRun, method: str | None) -> str:
-    if method is None and len(run.methods) > 1:
-        raise ConfigError(f"{run.name}: holds {', '.join(run.methods)}; choose one with --method")
-    chosen = method or run.methods[0]
-    run.check_method(chosen)
-    return chosen
 
 
 def _protocols_of(run: FinishedRun, wanted: Sequence[str]) -> tuple[list[str], list[str]]:

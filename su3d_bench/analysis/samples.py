@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.analysis.attribution import Explained, explained_of, truth_of_scene
+from su3d_bench.analysis.attribution import Explained, explained_of
+from su3d_bench.analysis.inputs import truth_of_scene
 from su3d_bench.core.errors import ConfigError, counted, printable, suggest
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, Int64Array

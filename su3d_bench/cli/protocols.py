@@ -1,38 +1,53 @@
-"""``su3d-bench protocols``: the evaluations, and every rule of one."""
+"""``su3d-bench protocols``: the evaluations, every rule of one, and in which rules two of them differ."""
 
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, answer_either
+from su3d_bench.cli.common import add_table_format, add_verb, answer_either, answer_tables, progress, remark, show
 from su3d_bench.cli.texts import add_queries
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, suggest
 
 if TYPE_CHECKING:
     from su3d_bench.metrics.protocols.model import ProtocolRules
 
-ACTIONS = ("list", "show")
+ACTIONS = ("list", "show", "diff")
 
 
 def add_parser(verbs: Any) -> None:
     parser = add_verb(
         verbs,
         "protocols",
-        "List the protocols; 'show NAME' prints every rule of one, with --names the texts that are compared.",
-        ("su3d-bench protocols", "su3d-bench protocols show rooms-semantic --names"),
+        "List the protocols; 'show NAME' prints every rule of one, 'diff A B' the rules in which two differ.",
+        (
+            "su3d-bench protocols show rooms-semantic --names",
+            "su3d-bench protocols diff rooms-semantic replica-mesh-ex6 --prediction runs/my-run:opensu3d",
+        ),
         call,
     )
-    parser.add_argument("action", nargs="?", default="list", metavar="list|show")
+    parser.add_argument("action", nargs="?", default="list", metavar="list|show|diff")
     parser.add_argument("name", nargs="?", help="a protocol's name, or a .toml file of the same form")
+    parser.add_argument("other", nargs="?", help="with diff: the one that it is held against")
     parser.add_argument(
         "--names",
         action="store_true",
         help="the texts that features are compared with, one a line, to encode elsewhere",
     )
     add_queries(parser)
+    parser.add_argument(
+        "--prediction",
+        metavar="RUN[:METHOD]",
+        help="with diff: score it under every choice of the rules, and split the difference of its numbers among them",
+    )
+    parser.add_argument("--out", type=Path, metavar="PNG", help="with --prediction: draw the steps to this file")
+    parser.add_argument(
+        "--jobs", type=int, default=0, metavar="N", help="scenes scored side by side (default: the CPU cores)"
+    )
+    add_table_format(parser)
 
 
 def call(arguments: argparse.Namespace) -> int:
@@ -45,6 +60,12 @@ def call(arguments: argparse.Namespace) -> int:
         raise ConfigError("protocols: --names belongs to show NAME")
     if arguments.queries is not None and not arguments.names:
         raise ConfigError("protocols: --queries belongs to show NAME --names")
+    if arguments.action == "diff":
+        return _answer_diff(arguments)
+    if arguments.action == "list" and arguments.name is not None:
+        raise ConfigError(f"protocols list: takes no name; su3d-bench protocols show {arguments.name}")
+    if arguments.other is not None or arguments.prediction is not None or arguments.out is not None:
+        raise ConfigError("protocols: a second protocol, --prediction and --out belong to diff A B")
     if arguments.action == "show":
         if arguments.name is None:
             raise ConfigError(f"protocols show: name one of {', '.join(protocol_names())}")
@@ -59,6 +80,35 @@ def call(arguments: argparse.Namespace) -> int:
     width = max(len(rules.name) for rules in rows)
     lines = [f"{rules.name:<{width}}  {rules.summary}" for rules in rows]
     answer_either(arguments, [rules.model_dump(mode="json", include=fields) for rules in rows], *lines)
+    return EXIT_DONE
+
+
+def _answer_diff(arguments: argparse.Namespace) -> int:
+    from su3d_bench.analysis.rules_walk import Walker, rules_apart
+    from su3d_bench.metrics.protocols.loading import load_protocol
+    from su3d_bench.reports.tables.rules import rules_tables
+
+    if arguments.name is None or arguments.other is None:
+        raise ConfigError("protocols diff: name two protocols; su3d-bench protocols lists them")
+    if arguments.out is not None and arguments.prediction is None:
+        raise ConfigError("protocols diff: --out draws the steps of a --prediction; name one")
+    if arguments.jobs < 0:
+        raise ConfigError(f"--jobs {arguments.jobs}: must be 1 or more; 0 stands for the CPU cores")
+    first, second = load_protocol(arguments.name), load_protocol(arguments.other)
+    apart = rules_apart(first, second)
+    if arguments.prediction is not None:
+        walker = Walker.of(first, second, arguments.prediction)
+        with progress(len(walker.scenes), is_quiet=arguments.quiet) as report:
+            walk = walker.walk(arguments.jobs or os.cpu_count() or 1, report)
+        apart = rules_apart(first, second, walk)
+    value = apart.to_json()
+    answer_tables(arguments, value, rules_tables(value))
+    if arguments.out is not None:
+        from su3d_bench.reports.pictures.rules_walk import draw_walk
+
+        show()  # the plot takes longer than the answer
+        draw_walk(value, arguments.out)
+        remark(f"plot: {arguments.out}", quiet=arguments.quiet)
     return EXIT_DONE
 
 

@@ -1,0 +1,149 @@
+"""In which rules two protocols differ, and the protocols between them: some rules of the one, the others of the other.
+
+Rules that depend on one another move together: those of which one alone makes no protocol, such as a class list and the
+names in ``ignore``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import combinations
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from su3d_bench.core.errors import ConfigError
+from su3d_bench.metrics.fitness import ID_LISTS
+from su3d_bench.metrics.protocols.model import ProtocolRules
+
+# What names a protocol, says where it is used or what of it is shown, and moves no number.
+NAMING = ("name", "version", "summary", "datasets", "by_default", "headline", "not_comparable_with")
+# Says whose features were named; that text tower is the run's own, whatever the rule.
+UNMOVED = ("encoder",)
+
+
+@dataclass(frozen=True)
+class Differing:
+    """A rule, as ``transfer.cap_m``, and its plain value in either protocol."""
+
+    rule: str
+    first: Any
+    second: Any
+
+
+def differing(first: ProtocolRules, second: ProtocolRules) -> list[Differing]:
+    """The rules in which two protocols differ, in the order of the model; ``ConfigError`` for two kinds."""
+    if first.kind != second.kind:
+        raise ConfigError(
+            f"{first.name} is of kind '{first.kind}' and {second.name} of kind '{second.kind}': they share no rules to "
+            "compare; 'protocols show' prints each"
+        )
+    found = []
+    for field in type(first).model_fields:
+        if field in NAMING:
+            continue
+        of_first, of_second = getattr(first, field), getattr(second, field)
+        if isinstance(of_first, BaseModel) and isinstance(of_second, BaseModel):
+            leaves = ((f"{field}.{leaf}", leaf) for leaf in type(of_first).model_fields)
+            values = [(key, getattr(of_first, leaf), getattr(of_second, leaf)) for key, leaf in leaves]
+        else:
+            values = [(field, of_first, of_second)]
+        found += [Differing(key, plain(one), plain(other)) for key, one, other in values if one != other]
+    return found
+
+
+def plain(value: Any) -> Any:
+    """A rule as JSON has it."""
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    return [plain(item) for item in value] if isinstance(value, tuple) else value
+
+
+@dataclass(frozen=True)
+class Mixtures:
+    """The protocols between two of one kind, whose common values can be compared; ``ConfigError`` for any others."""
+
+    first: ProtocolRules
+    second: ProtocolRules
+
+    def __post_init__(self) -> None:
+        differing(self.first, self.second)  # of one kind
+        if self.first.label_space != self.second.label_space:
+            raise ConfigError(
+                f"{self.first.name} scores the labels of '{self.first.label_space}' and {self.second.name} those of "
+                f"'{self.second.label_space}': no truth has both"
+            )
+        if not self.values:
+            raise ConfigError(f"{self.first.name} and {self.second.name} have no value of one name")
+
+    @property
+    def values(self) -> tuple[str, ...]:
+        """The headline values of the first that the second has too."""
+        return tuple(name for name in self.first.headline if name in self.second.value_names)
+
+    @cached_property
+    def groups(self) -> tuple[tuple[str, ...], ...]:
+        """The rules that differ and can move a number, those together that go together.
+
+        Merged until every choice of groups makes a protocol.
+        """
+        rules = [one.rule for one in differing(self.first, self.second) if one.rule not in UNMOVED]
+        groups = [(rule,) for rule in rules]
+        # Ground truths whose class ids are of a list of their own take the classes with them.
+        own_ids = [ID_LISTS.get(one.ground_truth) for one in (self.first, self.second)]
+        if own_ids[0] != own_ids[1]:
+            groups = _merged(groups, [group for group in groups if group[0] in ("classes", "ground_truth")])
+        while (apart := self._inseparable(groups)) is not None:
+            groups = _merged(groups, apart)
+        return tuple(groups)
+
+    def of(self, groups: Collection[int]) -> ProtocolRules:
+        """The first protocol with these ``groups`` of rules, by their numbers, as the second has them."""
+        return self._with([rule for number in sorted(groups) for rule in self.groups[number]])
+
+    def _with(self, moved: Sequence[str]) -> ProtocolRules:
+        values = {field: getattr(self.first, field) for field in type(self.first).model_fields}
+        for rule in moved:
+            field, _, leaf = rule.partition(".")
+            given = getattr(self.second, field)
+            values[field] = values[field].model_copy(update={leaf: getattr(given, leaf)}) if leaf else given
+        said = f"{self.first.name} with {', '.join(moved)} of {self.second.name}" if moved else self.first.name
+        values |= {"name": said, "version": 1, "headline": self.values, "not_comparable_with": ()}
+        return type(self.first).model_validate(values)
+
+    def _inseparable(self, groups: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]] | None:
+        """Two groups of which one alone makes no protocol; None where every choice makes one."""
+        for chosen in _choices(groups):
+            if self._is_protocol(chosen):
+                continue
+            rest = [group for group in groups if group not in chosen]
+            for one in chosen:
+                for other in rest:
+                    without = [group for group in chosen if group != one]
+                    if self._is_protocol(without) and self._is_protocol([*chosen, other]):
+                        return [one, other]
+            return [chosen[0], rest[0]]
+        return None
+
+    def _is_protocol(self, groups: Sequence[tuple[str, ...]]) -> bool:
+        try:
+            self._with([rule for group in groups for rule in group])
+        except ValidationError:
+            return False
+        return True
+
+
+def _choices(groups: Sequence[tuple[str, ...]]) -> Iterator[list[tuple[str, ...]]]:
+    for n in range(1, len(groups)):
+        yield from map(list, combinations(groups, n))
+
+
+def _merged(groups: Sequence[tuple[str, ...]], together: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """``groups`` with those of ``together`` as one, where the first of them stood."""
+    if len(together) < 2:
+        return list(groups)
+    one = tuple(rule for group in groups if group in together for rule in group)
+    place = min(groups.index(group) for group in together)
+    return [*groups[:place], one, *(group for group in groups[place:] if group not in together)]

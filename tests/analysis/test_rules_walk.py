@@ -1,0 +1,124 @@
+"""The way from one protocol to another: its ends are the run's numbers, its steps sum to the difference."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import pytest
+from painted import WordEncoder, colour_perception
+from places import SCENES
+
+from su3d_bench.analysis.rules_walk import Walker, rules_apart
+from su3d_bench.cli.main import main
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.runs import finished
+from su3d_bench.runs import scene as scene_run
+from su3d_bench.runs.finished import read_run
+
+PAINTED = f"{SCENES}/painted.py"
+SEMANTIC = ("rooms-semantic", "replica-mesh-ex6", "replica-openmask3d-semantic")
+INSTANCE = ("rooms-instance", "replica-openmask3d")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of two methods whose maps are not perfect, scored under every protocol that is held against another."""
+    out = tmp_path_factory.mktemp("walk") / "run"
+    words = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--no-pictures", "--jobs", "1"]
+    words += ["--methods", f"{PAINTED}:Collector", f"{PAINTED}:Collector@drop=1", "oracle"]
+    words += ["--protocols", *SEMANTIC, *INSTANCE]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", colour_perception)
+        assert main([*words, "--out", str(out)]) == 0
+    return out
+
+
+@pytest.fixture(autouse=True)
+def _words(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(finished, "encoder_of", lambda run, device: WordEncoder())
+
+
+PAIRS = [(a, b) for names in (SEMANTIC, INSTANCE) for a in names for b in names if a != b]
+
+
+@pytest.mark.parametrize(("first", "second"), PAIRS)
+@pytest.mark.parametrize("method", ["collector", "collector@drop=1"])
+def test_the_steps_lead_from_the_run_s_number_to_its_other(first: str, second: str, method: str, made: Path) -> None:
+    walk = Walker.of(load_protocol(first), load_protocol(second), f"{made}:{method}").walk()
+    results = read_run(made).results
+    for name in walk.start:
+        said = [results[method, protocol].result.metrics[name] for protocol in (first, second)]  # type: ignore[union-attr]
+        assert [walk.start[name], walk.end[name]] == pytest.approx(said, abs=1e-12)
+        total = math.fsum(step.adds[name].share for step in walk.steps)
+        assert total == pytest.approx(walk.end[name] - walk.start[name], abs=1e-12)
+        assert all(step.adds[name].least <= step.adds[name].share <= step.adds[name].most for step in walk.steps)
+
+
+def test_each_rule_gets_what_it_moves_and_the_way_back_is_its_reverse(made: Path, tmp_path: Path) -> None:
+    lines = ['extends = "rooms-semantic"', 'name = "mine"', 'ignore = ["wall", "floor", "ceiling", "chair"]']
+    (tmp_path / "mine.toml").write_text("\n".join([*lines, 'vocabulary = "all"', "[transfer]", "cap_m = 0.001"]))
+    first, second = load_protocol("rooms-semantic"), load_protocol(str(tmp_path / "mine.toml"))
+    there = Walker.of(first, second, f"{made}:collector@drop=1").walk()
+    back = Walker.of(second, first, f"{made}:collector@drop=1").walk()
+    shares = {step.rules: step.adds["mAcc"].share for step in there.steps}
+    assert shares.keys() == {("ignore",), ("vocabulary",), ("transfer.cap_m",)}
+    assert abs(shares["ignore",]) > 0.01
+    assert shares["transfer.cap_m",] == 0.0  # the map is the truth's own points
+    assert {step.rules: -step.adds["mAcc"].share for step in back.steps} == pytest.approx(shares, abs=1e-12)
+
+
+def test_scenes_side_by_side_give_the_same(made: Path) -> None:
+    walker = Walker.of(load_protocol("rooms-instance"), load_protocol("replica-openmask3d"), f"{made}:oracle")
+    assert walker.walk(jobs=2) == walker.walk(jobs=1)
+
+
+def test_protocols_without_a_prediction_are_only_compared() -> None:
+    apart = rules_apart(load_protocol("rooms-semantic"), load_protocol("replica-hovsg"))
+    assert apart.walk is None
+    assert {one.rule for one in apart.differing} >= {"metric", "transfer.neighbours", "aggregate"}
+
+
+def test_the_command_prints_draws_and_answers_in_json(
+    made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["protocols", "diff", "rooms-instance", "replica-openmask3d", "--prediction", f"{made}:collector"]
+    assert main([*words, "--jobs", "1", "--out", str(tmp_path / "walk.png")]) == 0
+    shown = capsys.readouterr().out
+    assert "classes, ignore" in shown and "transfer.evaluation_voxel_m" in shown
+    assert (tmp_path / "walk.png").read_bytes().startswith(b"\x89PNG")
+    assert main([*words, "--jobs", "1", "--json"]) == 0
+    value: Any = json.loads(capsys.readouterr().out)
+    assert (value["first"], value["walk"]["n_orders"]) == ("rooms-instance", None)
+    assert {rule for step in value["walk"]["steps"] for rule in step["rules"]} <= {
+        one["rule"] for one in value["differing"]
+    }
+
+
+REFUSED = [
+    (["rooms-semantic"], "name two protocols"),
+    (["rooms-semantic", "rooms-instance"], "is of kind 'semantic'"),
+    (["rooms-semantic", "replica-mesh-ex6", "--out", "x.png"], "name one"),
+    (["rooms-semantic", "replica-mesh-ex6", "--prediction", "nowhere"], "there is no such folder"),
+    (["rooms-semantic", "replica-mesh-ex6", "--prediction", "{run}"], "choose one with --method"),
+    (["rooms-semantic", "replica-mesh-ex6", "--prediction", "{run}:nobody"], "no scores of the method 'nobody'"),
+    (["rooms-retrieval", "replica-retrieval", "--prediction", "{run}:collector"], "--prediction takes protocols of"),
+    (["rooms-semantic", "replica-mesh-ex6", "--jobs", "-1"], "must be 1 or more"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), REFUSED)
+def test_what_cannot_be_walked_is_one_line(
+    words: list[str], message: str, made: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["protocols", "diff", *(word.format(run=made) for word in words)]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize("words", [["list", "a"], ["show", "rooms-semantic", "rooms-instance"], ["show", "--out", "x"]])
+def test_what_belongs_to_diff_is_refused_elsewhere(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["protocols", *words]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
