@@ -14,7 +14,7 @@ from su3d_bench.numerics.shares import EXACT_STEPS, N_ORDERS, choices, shares
 
 
 def drawn_values(n_steps: int, seed: int = 1) -> list[float]:
-    return np.random.default_rng(seed).random(1 << n_steps).tolist()
+    return list(map(float, np.random.default_rng(seed).random(1 << n_steps)))
 
 
 @pytest.mark.parametrize("n_steps", [1, 2, 3, 5])

@@ -90,7 +90,7 @@ class Mixtures:
         Merged until every choice of groups makes a protocol.
         """
         rules = [one.rule for one in differing(self.first, self.second) if one.rule not in UNMOVED]
-        groups = [(rule,) for rule in rules]
+        groups: list[tuple[str, ...]] = [(rule,) for rule in rules]
         # Ground truths whose class ids are of a list of their own take the classes with them.
         own_ids = [ID_LISTS.get(one.ground_truth) for one in (self.first, self.second)]
         if own_ids[0] != own_ids[1]:
