@@ -16,7 +16,7 @@ from su3d_bench.analysis.attribution import Explained, MendedJob, explained_of
 from su3d_bench.analysis.page.errors import errors_of, packed, unpacked
 from su3d_bench.analysis.page.gallery import GalleryOfScene, SceneGallery, photos_of_each
 from su3d_bench.analysis.page.kept import Piece, piece, state_of_counts, state_of_job, state_of_run
-from su3d_bench.analysis.page.maps import MapOfRun, PageMap, PageScene, SharedTruths, Spaces, page_scene, points_of_each
+from su3d_bench.analysis.page.maps import MapOfRun, PageMap, PageScene, Spaces, page_scene, points_of_each
 from su3d_bench.analysis.page.numbers import are_all_read, is_scored, page_numbers, scored_maps
 from su3d_bench.analysis.page.truths import SharedTruths
 from su3d_bench.core.errors import DataError, Su3dError, printable

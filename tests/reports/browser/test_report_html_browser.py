@@ -14,6 +14,7 @@ from runs_page import choose, column, open_maps, options, picture, press, text_o
 
 pytestmark = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
 MIDDLE_SECTIONS = ("Scenes", "Classes", "Confusion", "Errors", "Timing", "Compare")
+GALLERY = "Worst errors"  # its controls have tests of their own
 
 
 @pytest.fixture
@@ -24,7 +25,8 @@ def browser(opened_runs: Chromium) -> Iterator[Chromium]:
 
 def test_every_section_is_there_and_the_navigation_leads_to_it(browser: Chromium) -> None:
     names = browser.run("[...document.querySelectorAll('#nav a')].map((one) => one.textContent)")
-    assert names == ["Summary", "Maps", "Scenes", "Classes", "Confusion", "Errors", "Timing", "Compare", "Provenance"]
+    before = ["Summary", "Maps", "Scenes", "Classes", "Confusion", "Errors"]
+    assert names == [*before, GALLERY, "Timing", "Compare", "Provenance"]
     browser.run("document.querySelector('#nav a[href=\"#timing\"]').click()")
     browser.until("document.querySelector('#nav a[aria-current]')?.textContent === 'Timing'")
     assert browser.run("Math.abs(document.getElementById('timing').getBoundingClientRect().top) < 120")
@@ -72,6 +74,12 @@ def test_one_choice_of_protocol_and_its_metric_change_all_tables(browser: Chromi
     assert "AP50" in text_of(browser, "#errors caption")
     choose(browser, "scenes", "Protocol", "rooms-semantic")
     assert "geometry" in text_of(browser, "#errors tbody")
+
+
+def test_errors_are_told_of_each_method_of_each_run(browser: Chromium) -> None:
+    heads = browser.run("[...document.querySelectorAll('#errors thead th')].map((one) => one.innerText)")
+    assert heads[1:] == options(browser, "confusion", "Method")
+    assert "undefined" not in "".join(heads)
 
 
 def test_the_confusion_is_of_the_chosen_method(browser: Chromium) -> None:
@@ -151,18 +159,19 @@ def test_every_control_has_a_name_and_the_page_no_sideways_scroll_on_a_phone(
         phone.open(runs_page)
         phone.until(WHOLE)
         assert phone.run("document.documentElement.scrollWidth <= innerWidth")
-        assert phone.run("document.querySelectorAll('section.part').length") == 9
+        assert phone.run("document.querySelectorAll('section.part').length") == 10
         assert complaints(phone) == []
 
 
 # Every control of the page, by its section, kind and name; column headers and rows of tables apart.
 CONTROLS = {
-    *(("nav", "a", name) for name in (*MIDDLE_SECTIONS, "Summary", "Maps", "Provenance")),
+    *(("nav", "a", name) for name in (*MIDDLE_SECTIONS, GALLERY, "Summary", "Maps", "Provenance")),
     ("skip", "a", "Skip to the numbers"),
-    *(("maps", "select", name) for name in ("Scene", "Map", "Colour by", "Text")),
+    *(("maps", "select", name) for name in ("Scene", "Map", "Beside", "Colour by", "Text")),
     *(("maps", "button", name) for name in ("Zoom in", "Zoom out", "Whole map")),
-    ("maps", "input", "Cut above"),
+    *(("maps", "input", name) for name in ("Cut above", "Grown to", "Missed objects", "Near walls fade")),
     ("maps", "input", "Filter instances"),
+    ("maps", "canvas", "3D view of the map"),  # the one beside, before there is any
     ("maps", "canvas", "3D view"),
     ("scenes", "select", "Protocol"),
     ("scenes", "select", "Metric"),
@@ -176,6 +185,9 @@ CONTROLS = {
     ("confusion", "input", "Filter classes"),
     ("errors", "select", "Protocol"),
     ("errors", "select", "Metric"),
+    *(("gallery", "select", name) for name in ("Protocol", "Metric", "Method", "Scene", "Kind", "Called")),
+    ("gallery", "select", "Class, true or called"),
+    *(("gallery", "button", name) for name in ("Back", "Show all", "Show more")),
     *(("timing", "select", name) for name in ("Scene", "Time of", "Against", "Stages of", "Protocol", "Metric")),
     ("compare", "select", "A"),
     ("compare", "select", "B"),
@@ -194,7 +206,7 @@ OPERATE = """(part, kind, k) => {
     one.selectedIndex = (one.selectedIndex + 1 + (k % (one.options.length - 1))) % one.options.length;
     one.dispatchEvent(new Event('change'));
   } else if (kind === 'input') {
-    one.value = one.type === 'range' ? '40' : 'no row has this text';
+    one.value = one.type === 'range' ? String(Math.round(0.4 * one.max)) : 'no row has this text';
     one.dispatchEvent(new Event('input'));
   } else one.click();
   return true;
@@ -204,7 +216,7 @@ OPERATE = """(part, kind, k) => {
 def names_of_controls(browser: Chromium) -> set[tuple[str, str, str]]:
     found = browser.run(
         "[...document.querySelectorAll('a[href], button, select, input, textarea, summary, canvas')]"
-        ".filter((one) => !one.matches('button.sort')).map((one) => [one.closest('section')?.id"
+        ".filter((one) => !one.matches('button.sort, button.to-gallery')).map((one) => [one.closest('section')?.id"
         " || one.closest('nav')?.id || one.className, one.localName,"
         " (one.labels?.[0]?.textContent || one.getAttribute('aria-label')"
         " || one.textContent).trim()])"
@@ -225,9 +237,9 @@ def test_each_control_of_a_section_changes_what_it_shows(browser: Chromium, part
     n_operated = 0
     if part == "confusion":  # the other methods confuse nothing
         choose(browser, part, "Method", next(one for one in options(browser, part, "Method") if "noise" in one))
-    for kind in ("button.sort", "summary", "input", "select", "button:not(.sort)"):
+    for kind in ("button.sort", "summary", "input", "select", "button:not(.sort, .to-gallery)"):
         for k in range(browser.run(f"document.querySelectorAll('#{part} {kind}').length")):
-            is_of_view = part == "maps" and kind == "button:not(.sort)"
+            is_of_view = part == "maps" and kind == "button:not(.sort, .to-gallery)"
             if is_of_view:  # so that the whole map is another picture than this one
                 press(browser, "#maps canvas", "ArrowLeft")
             before, seen = browser.run(shown), picture(browser) if is_of_view else b""
