@@ -53,6 +53,8 @@ CASES: dict[str, list[list[str]]] = {
     "report html": [["RUN", "--no-maps", "--out", "out/page.html", "--title", HOSTILE]],
     "report samples": [["RUN"], ["RUN", "--out", "out/samples.csv"], ["RUN", "--json"], ["RUN", "--methods", HOSTILE],
                        ["--columns"]],
+    "report rerun": [["RUN", "--out", "out/a.rrd"], ["RUN", "--scenes", HOSTILE, "--out", "out/a.rrd"],
+                     ["RUN", "--methods", HOSTILE, "--out", "out/a.rrd"], ["RUN", "--out", f"{HOSTILE}.bin"]],
     "report leaderboard": [["."], [".", "--format", "html", "--out", "out/board.html"], [".", "--json"]],
     "report verify": [["out/t.latex"], ["hostile.tex"]],
     "runs list": [["."], [".", "--json"], [HOSTILE]],

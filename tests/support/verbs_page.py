@@ -44,6 +44,8 @@ MORE = {
     "report tables": "The paper's tables, with the figures as reported beside, in Markdown, LaTeX, CSV or HTML; "
     "`report verify` recomputes every cell.",
     "report html": "One page that works offline: tables that sort, confusion, errors, timing, every map in 3D.",
+    "report rerun": "A recording a scene with frames, masks, maps, truth and the map's growth, for rerun's "
+    "viewer: [running/rerun.md](running/rerun.md).",
     "check": "The gate for CI: [running/ci-gate.md](running/ci-gate.md), `action.yml`.",
     "ask": "By the built-in solver or a language model: [reasoning.md](questions/reasoning.md).",
     "questions": "From the ground truth of any dataset; `--protocols rooms-retrieval` scores maps by such. "

@@ -122,6 +122,11 @@ class Spaces:
             self._encoders[path] = run.encoder()
         return self._encoders[path]
 
+    def naming(self, run: FinishedRun, prediction: Prediction) -> Encoder | None:
+        """What names the instances of a map; None where all of them have names."""
+        labels = getattr(prediction, "labels", None)
+        return None if labels is not None and all(labels) else self.encoder(run)
+
     def texts(self, run: FinishedRun) -> Any:
         """The features (Q, D) of the queries."""
         path = run.folder.path
@@ -244,14 +249,6 @@ class _Scene:
         """The frames that are shown: as few as can be that show every instance, from those that the maps name."""
         return frame_cover([frames_of(a_map, k) for a_map in maps for k in range(len(a_map))], THUMBNAILS)
 
-    def _rules(self, run: FinishedRun) -> ProtocolRules | None:
-        """The rules whose classes the map is shown in: of points before those of instances."""
-        fitting: list[ProtocolRules] = []
-        for name in run.protocols:
-            with suppress(ConfigError):  # those of another version are passed over
-                fitting += [rules for rules in (run.rules(name),) if rules.vocabulary is not None]
-        return min(fitting, key=lambda rules: not rules.takes_dense, default=None)
-
     def _beside(self, run: FinishedRun, prediction: Prediction) -> dict[str, Any] | None:
         """The truth that stands beside a map, by its place among those of the scene, and which of it the map misses.
 
@@ -259,7 +256,7 @@ class _Scene:
         """
         fitting = (run.rules(name) for name in run.protocols if not why_not_shown(run, name, prediction))
         judging = next(fitting, None)
-        rules = self._rules(run) if judging is None else judging
+        rules = shown_rules(run) if judging is None else judging
         truth = None if rules is None else self._truth(rules)
         if rules is None or truth is None or not len(truth.points):
             return None
@@ -268,7 +265,7 @@ class _Scene:
             return {"truth": place}
         judged = self._had(
             "no missed objects",
-            lambda: judged_objects(judging, truth, prediction, self._encoder(run, prediction)),
+            lambda: judged_objects(judging, truth, prediction, self._spaces.naming(run, prediction)),
         )
         return {"truth": place} if judged is None else {"truth": place, "protocol": judging.name, **judged}
 
@@ -286,7 +283,7 @@ class _Scene:
         seen: Seen | None,
         growth: Growth | None,
     ) -> str:
-        rules = self._rules(run)
+        rules = shown_rules(run)
         truth = None if rules is None else self._truth(rules)
         planes: dict[str, Any] = {"owner": index_plane(point_owners(prediction, cloud.rows))}
         colours = None if seen is None else nearest_colours(cloud.points, *seen)
@@ -322,21 +319,7 @@ class _Scene:
     def _classes(
         self, run: FinishedRun, rules: ProtocolRules, prediction: Prediction, truth: Int64Array | None, cloud: Cloud
     ) -> Int64Array | None:
-        """The class of each instance, or of each drawn point of dense features."""
-        if isinstance(prediction, DenseFeatures):
-            prediction = DenseFeatures(cloud.points, np.asarray(prediction.features[cloud.rows]))
-        is_present = scored_classes(rules) if truth is None else present(truth, len(rules.classes))
-
-        def classes() -> Int64Array:
-            candidates = candidate_classes(rules, is_present & scored_classes(rules))
-            called = classes_of_prediction(rules, prediction, self._encoder(run, prediction), candidates)
-            return np.where(has_feature(prediction), called, -1) if isinstance(prediction, DenseFeatures) else called
-
-        return self._had("no classes", classes)
-
-    def _encoder(self, run: FinishedRun, prediction: Prediction) -> Encoder | None:
-        labels = getattr(prediction, "labels", None)
-        return None if labels is not None and all(labels) else self._spaces.encoder(run)
+        return self._had("no classes", lambda: shown_classes(run, rules, prediction, truth, cloud, self._spaces))
 
     def _similarity(self, run: FinishedRun, prediction: Prediction) -> Any:
         """The cosine (K, Q) of each instance with each query; None where the map has no features."""
@@ -347,12 +330,91 @@ class _Scene:
         return cosines(features, texts) if texts is not None and texts.shape[1] == features.shape[1] else None
 
 
+def shown_rules(run: FinishedRun) -> ProtocolRules | None:
+    """The rules whose classes the maps of a run are shown in: of points before those of instances."""
+    fitting: list[ProtocolRules] = []
+    for name in run.protocols:
+        with suppress(ConfigError):  # those of another version are passed over
+            fitting += [rules for rules in (run.rules(name),) if rules.vocabulary is not None]
+    return min(fitting, key=lambda rules: not rules.takes_dense, default=None)
+
+
+def shown_classes(
+    run: FinishedRun,
+    rules: ProtocolRules,
+    prediction: Prediction,
+    truth: Int64Array | None,
+    cloud: Cloud,
+    spaces: Spaces,
+) -> Int64Array:
+    """The class of each instance, or of each drawn point of dense features; ``truth``: that of each point of it."""
+    if isinstance(prediction, DenseFeatures):
+        prediction = DenseFeatures(cloud.points, np.asarray(prediction.features[cloud.rows]))
+    is_present = scored_classes(rules) if truth is None else present(truth, len(rules.classes))
+    candidates = candidate_classes(rules, is_present & scored_classes(rules))
+    called = classes_of_prediction(rules, prediction, spaces.naming(run, prediction), candidates)
+    return np.where(has_feature(prediction), called, -1) if isinstance(prediction, DenseFeatures) else called
+
+
 def _not_near(frames: Sequence[Frame], points: Float32Array) -> Float32Array:
     """Those of ``points`` that none of ``frames`` gives a colour."""
     seen, _ = seen_points(frames, SEEN_POINTS * len(frames) // MORE_FRAMES)
     return points[nearest(seen, points, COLOUR_NEAR_M)[1] < 0]
 
 
+<<<<<<< HEAD
+=======
+def frames_of(instances: Instances, k: int) -> list[int]:
+    """The frames in which an instance was seen, each once; none where the method keeps no views."""
+    if not len(instances.views):
+        return []
+    rows = instances.views[instances.view_indptr[k] : instances.view_indptr[k + 1]]
+    return list(dict.fromkeys(int(frame) for frame, _ in rows))
+
+
+def _instance_data(
+    prediction: Prediction, k: int, classes: Int64Array | None, similarity: Any, frames: Mapping[int, Frame]
+) -> dict[str, Any]:
+    """An instance: n points, c class, s similarities in thousandths, and of ``Instances`` its name, score and views."""
+    data: dict[str, Any] = {}
+    if classes is not None:
+        data["class"] = int(classes[k])
+    if similarity is not None:
+        data["similarity"] = [round(1000 * float(value)) for value in similarity[k]]
+    if not isinstance(prediction, Instances):
+        assert not isinstance(prediction, DenseFeatures)
+        return {"id": k, "points": int((prediction.instance == k).sum()), **data}
+    views = frames_of(prediction, k)
+    own = prediction.points[prediction.mask(k)]
+    data |= {
+        "id": int(prediction.ids[k]) if len(prediction.ids) else k,
+        "name": printable((prediction.labels or prediction.names)[k] or prediction.names[k], 80),
+        "caption": printable(prediction.captions[k], MOST_CAPTION),
+        "score": round(float(prediction.scores[k]), 4),
+        "points": len(own),
+        "n_views": len(views),
+        "views": views[:MOST_VIEWS],
+    }
+    if len(own):
+        low, high = own.min(axis=0), own.max(axis=0)
+        data["centre"] = [round(float(value), 3) for value in (low + high) / 2]
+        data["size"] = [round(float(value), 3) for value in high - low]
+    boxes = {index: _box(own, frames[index]) for index in views if index in frames}
+    seen = {index: box for index, box in boxes.items() if box is not None}
+    if seen:
+        best = max(
+            seen, key=lambda index: ((seen[index][2] - seen[index][0]) * (seen[index][3] - seen[index][1]), -index)
+        )
+        data |= {"view": best, "box": seen[best]}
+    return data
+
+
+def _box(points: Any, frame: Frame) -> list[float] | None:
+    height, width = frame.depth_m.shape
+    return box_in_view(points[:: max(1, len(points) // 2000)], frame.camera_to_world, frame.intrinsics, width, height)
+
+
+>>>>>>> 8c4b705 (report rerun: frames, masks, maps and truth of a run on one timeline for rerun's viewer)
 def _jpeg(frame: Frame) -> str:
     import cv2
 

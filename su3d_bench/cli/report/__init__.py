@@ -8,6 +8,7 @@ from typing import Any
 from su3d_bench.cli.common import add_modules
 from su3d_bench.cli.report import html as report_html
 from su3d_bench.cli.report import leaderboard as report_leaderboard
+from su3d_bench.cli.report import rerun as report_rerun
 from su3d_bench.cli.report import samples as report_samples
 from su3d_bench.cli.report import tables as report_tables
 from su3d_bench.cli.report import timing as report_timing
@@ -19,6 +20,7 @@ SUB_VERBS: tuple[ModuleType, ...] = (
     report_timing,
     report_html,
     report_samples,
+    report_rerun,
     report_leaderboard,
     report_verify,
 )
