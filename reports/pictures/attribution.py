@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.reports.pictures.canvas import Canvas
+from su3d_bench.reports.pictures.canvas import Canvas, drawable
 from su3d_bench.reports.tables.attribution import LEFT, n_text
 from su3d_bench.reports.tables.model import signed
 
@@ -28,7 +28,8 @@ def draw_attribution(attribution: Mapping[str, Any], path: Path) -> None:
     ]
     page = Canvas(1.6 + PANEL_WIDTH * n_columns, sum(heights) + 0.5, per_inch=1)
     figure = page.figure
-    figure.suptitle(f"{attribution['run']}: {attribution['method']}", fontsize=13, fontweight="bold")
+    title = f"What correcting one kind of error alone adds to {attribution['method']} in {attribution['run']}"
+    figure.suptitle(drawable(title), fontsize=13, fontweight="bold", parse_math=False)
     grid = figure.add_gridspec(len(protocols), n_columns, height_ratios=heights)
     for row, protocol in enumerate(protocols):
         for column, name in enumerate(protocol["values"]):
@@ -71,7 +72,11 @@ def _draw_panel(axes: Any, protocol: Mapping[str, Any], metric: str, *, has_name
     axes.set_xticks([tick for tick in axes.get_xticks() if lowest - 0.04 * _span(value) <= tick <= 100])
     axes.set_ylim(len(bars) - 0.4, -0.6)
     axes.set_yticks(list(places), [name for name, *_ in bars] if has_names else [""] * len(bars), fontsize=9.5)
-    axes.set_title(f"{protocol['protocol']}: {metric} {value:.1f}", fontsize=10.5, loc="left")
+    gains = {kind: cause["gains"][metric] or 0.0 for kind, cause in protocol["causes"].items()}
+    worst = max(gains, key=gains.__getitem__, default=None)
+    most = f", the costliest kind: {worst}" if worst is not None and gains[worst] > 0 else ""
+    title = drawable(f"{protocol['protocol']}: {metric} {value:.1f}{most}")
+    axes.set_title(title, fontsize=10.5, loc="left", parse_math=False)
     axes.set_xlabel("value with this alone corrected", fontsize=8.5, color="#444444")
     axes.tick_params(axis="y", length=0)
     axes.tick_params(axis="x", labelsize=8.5)

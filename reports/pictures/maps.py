@@ -89,7 +89,10 @@ def draw_scene(prediction: Prediction, truth: GroundTruth | None, folder: Path, 
     if truth_cloud is not None:
         colours = [palette.get(name, NO_INSTANCE) for name in truth_names]
         rows.append(Row("ground truth", _paint(_views(truth_cloud, cameras), truth_cloud, colours)))
-    _write_picture(classes, f"{title}: classes", rows, {name or "without a name": palette[name] for name in used})
+    legend = {name or "without a name": palette[name] for name in used}
+    if (cloud.owner < 0).any():
+        legend["of no instance"] = NO_INSTANCE
+    _write_picture(classes, f"{title}: classes", rows, legend)
     return [instances, classes]
 
 
@@ -163,13 +166,14 @@ def _write_ranking(page: Canvas, left: float, top: float, similarity: Float64Arr
         is_one = high == low
         colours = np.array(heat_colours(similarity[:1]), np.uint8) if is_one else scale_stops("paper")
         page.axes(left, top + 22, wide, BAR_HEIGHT).imshow(colours[None], aspect="auto")
-        below = top + 26 + BAR_HEIGHT
-        page.text(left, below, f"{low:.3f}", 10)
+        numbers = top + 26 + BAR_HEIGHT
+        page.text(left, numbers, f"{low:.3f}", 10)
         if not is_one:
-            page.text(left + wide / 2, below, f"{(low + high) / 2:.3f}", 10, ha="center")
-            page.text(left + wide, below, f"{high:.3f}", 10, ha="right")
-    first = top + 80
-    room = int((VIEW_HEIGHT - 110) / LEGEND_STEP)
+            page.text(left + wide / 2, numbers, f"{(low + high) / 2:.3f}", 10, ha="center")
+            page.text(left + wide, numbers, f"{high:.3f}", 10, ha="right")
+    page.text(left, top + 62, "grey: of no instance", 9, colour=GREY)
+    first = top + 90
+    room = int((VIEW_HEIGHT - 118) / LEGEND_STEP)
     for k, line in enumerate(lines[:room]):
         weight = "bold" if k == 0 else "normal"
         page.text(left, first + LEGEND_STEP * k, printable(line, 36), 10, fontweight=weight)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,16 +31,13 @@ MAX_DRAWN = 2000  # points a method; more only make the file large
 N_SIZES = 10  # markers a method along the axis of sizes
 PANELS_A_ROW, LEGEND_COLUMNS = 3, 3
 LETTERS_AN_INCH = 15  # of a legend's type
+TITLE_LETTERS_AN_INCH = 12
 DPI = 150
 MIB = 2**20
 TITLE_SIZE = 10
 NARROW = 6  # times from one end of an axis to the other, where 1, 2 and 5 may be too few numbers
 POINTS, UPDATES = "points of the map", "updates so far"
-COST_TITLES = {
-    POINTS: "What an update of the map costs as the map grows",
-    UPDATES: "What an update of the map costs in the course of a scene",
-}
-MEMORY_TITLES = {"map_bytes": "Memory of the map as it grows", "rss_bytes": "Memory of the process, update by update"}
+MOST_TITLE_NAMES = 3  # of methods; more are counted
 
 
 def draw_timing(
@@ -56,7 +54,7 @@ def draw_timing(
         "memory": _memory(times),
         "stages": _stages(times, warm_up),
     }
-    if anytime:
+    if _curves(anytime):
         figures["anytime"] = _anytime(anytime)
     return [_save(figure, folder / f"{name}.{kind}") for name, figure in figures.items() for kind in ("png", "pdf")]
 
@@ -114,6 +112,7 @@ def _update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, against: 
     Each update is a dot; a method's line runs through the medians of the updates of about one size.
     """
     figure, (axes,) = _figure(7.0, 4.0 + 0.16 * len(times))
+    found: dict[str, list[str]] = {}
     for index, (of_method, label) in enumerate(zip(times, _labels(times), strict=True)):
         sized = [(scene, size) for scene in of_method if (size := _sizes(scene, against, warm_up)) is not None]
         sizes = np.concatenate([size for _, size in sized] or [np.zeros(0)])
@@ -123,16 +122,45 @@ def _update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, against: 
             continue
         growth = growth_exponent(sizes, costs)
         if growth is not None:
+            found.setdefault(growth.words, []).append(label)
             label += f": exponent {growth.exponent:z.2f} [{growth.low:z.2f}, {growth.high:z.2f}], {growth.words}"
         _draw_cost(axes, sizes[usable], costs[usable], index, label)
     axes.set(xscale="log", yscale="log", xlabel=against, ylabel="ms per update, without perception")
-    axes.set_title(COST_TITLES[against], loc="left", fontsize=TITLE_SIZE)
+    _entitle(axes, cost_sentence(found, against))
     _number_by_1_2_5(axes.xaxis)
     _number_by_1_2_5(axes.yaxis)
     axes.grid(True, which="major", color="0.85", linewidth=0.6)
     if axes.get_legend_handles_labels()[0]:
         figure.legend(loc="outside lower center", fontsize=8, frameon=False, handlelength=4)
     return figure
+
+
+def cost_sentence(found: Mapping[str, Sequence[str]], against: str) -> str:
+    """What the methods' growth says together; ``found`` has the methods by the words of their growth.
+
+    >>> cost_sentence({"grows": ["a", "b"], "constant per update": ["c"]}, POINTS)
+    'With the points of the map, the cost of an update grows for a and b; stays constant for c'
+    """
+    said = {"grows": "grows for", "constant per update": "stays constant for", "not settled": "is not settled for"}
+    parts = [f"{words} {_listed(found[kind])}" for kind, words in said.items() if kind in found]
+    with_what = "With the points of the map" if against == POINTS else "In the course of a scene"
+    if not parts:
+        return f"{with_what}, nothing can be said of an update's cost: too few, or of too similar size"
+    return f"{with_what}, the cost of an update {'; '.join(parts)}"
+
+
+def _listed(names: Sequence[str]) -> str:
+    """The names as a sentence has them, or how many there are."""
+    if len(names) > MOST_TITLE_NAMES:
+        return f"{len(names)} methods"
+    return " and ".join([*([", ".join(names[:-1])] if len(names) > 1 else []), names[-1]])
+
+
+def _entitle(axes: Axes, sentence: str) -> None:
+    """Write the sentence above the panel, in as many lines as its width asks for."""
+    inches = axes.figure.get_figwidth() * axes.get_position().width
+    lines = textwrap.wrap(sentence, max(30, int(inches * TITLE_LETTERS_AN_INCH)))
+    axes.set_title("\n".join(lines), loc="left", fontsize=TITLE_SIZE)
 
 
 def _number_by_1_2_5(axis: Axis) -> None:
@@ -170,6 +198,7 @@ def _stages(times: Sequence[Sequence[UpdateTimes]], warm_up: int) -> Figure:
     stages = list(dict.fromkeys(stage for of_method in times for scene in of_method for stage in scene.stages))
     left = np.zeros(len(times))
     rows = np.arange(len(times))
+    shares: dict[str, Float64Array] = {}
     for index, stage in enumerate(stages):
         steady = [pooled(of_method, stage, warm_up) for of_method in times]
         widths = np.array([values.mean() if len(values) else 0.0 for values in steady])
@@ -177,12 +206,45 @@ def _stages(times: Sequence[Sequence[UpdateTimes]], warm_up: int) -> Figure:
         style: dict[str, Any] = {"hatch": hatch, "color": COLOURS[index % len(COLOURS)]}
         axes.barh(rows, widths, left=left, edgecolor="white", label=stage, **style)
         left += widths
+        shares[stage] = widths
     axes.set_yticks(rows, _labels(times))
     axes.invert_yaxis()
     axes.set_xlabel("mean ms per update")
-    axes.set_title("Where the time of an update goes", loc="left", fontsize=TITLE_SIZE)
+    _entitle(axes, stages_sentence(_labels(times), shares))
     figure.legend(loc="outside lower center", ncols=min(len(stages), 6), fontsize=8, frameon=False)
     return figure
+
+
+def stages_sentence(labels: Sequence[str], shares: Mapping[str, Float64Array]) -> str:
+    """Where most of the time of an update goes; ``shares`` has the mean ms (N,) of each of N methods by stage.
+
+    >>> stages_sentence(["a"], {"segment": np.array([75.0]), "match": np.array([25.0])})
+    'Most of an update of a is segment: 75 % of 100 ms'
+    """
+    total = np.sum([*shares.values()], axis=0) if shares else np.zeros(0)
+    if not np.any(total):
+        return "No update took a time that was measured"
+    largest = [max(shares, key=lambda stage: shares[stage][row]) for row in range(len(labels))]
+    if len(labels) == 1:
+        share = 100 * shares[largest[0]][0] / total[0]
+        most = "Most" if share > 50 else "The largest part"
+        return f"{most} of an update of {labels[0]} is {largest[0]}: {share:.0f} % of {_rounded(total[0])} ms"
+    slow, fast = int(np.argmax(total)), int(np.argmin(total))
+    slowest, fastest = (
+        f"{_rounded(total[row])} ms with {labels[row]} (most of it {largest[row]})" for row in (slow, fast)
+    )
+    return f"An update takes {fastest}, {slowest}"
+
+
+def _rounded(value: float) -> str:
+    """Three digits, and never a power of ten.
+
+    >>> _rounded(12345.6), _rounded(4.5678), _rounded(0.00001)
+    ('12,346', '4.57', 'under 0.001')
+    """
+    if value >= 100:
+        return f"{value:,.0f}"
+    return f"{value:.3g}" if value >= 0.001 else "under 0.001"
 
 
 def _memory(times: Sequence[Sequence[UpdateTimes]]) -> Figure:
@@ -194,6 +256,7 @@ def _memory(times: Sequence[Sequence[UpdateTimes]]) -> Figure:
     drawn = [("map_bytes", POINTS)] * ("map_bytes" in told) + [("rss_bytes", UPDATES)]
     figure, panels = _figure(4.8, 3.2 + 0.16 * len(times), len(drawn))
     for axes, (column, against) in zip(panels, drawn, strict=True):
+        most: dict[str, float] = {}
         for index, (of_method, label) in enumerate(zip(times, _labels(times), strict=True)):
             counted = [scene for scene in of_method if column in scene.columns]
             sized = [(scene, size) for scene in counted if (size := _sizes(scene, against, 0)) is not None]
@@ -202,17 +265,31 @@ def _memory(times: Sequence[Sequence[UpdateTimes]]) -> Figure:
             if not (sizes > 0).any():
                 continue
             x, y = medians_by_size(sizes[sizes > 0], values[sizes > 0] / MIB)
+            most[label] = float(y.max())
             axes.plot(x, y, linewidth=1.2, markersize=4.5, markerfacecolor="white", label=label, **_style(index))
         what = "the map" if column == "map_bytes" else "the process"
         axes.margins(y=0.12)  # the markers at the top stand whole
         axes.set(xscale="log", xlabel=against, ylabel=f"MiB of {what}")
         axes.set_ylim(bottom=0)
-        axes.set_title(MEMORY_TITLES[column], loc="left", fontsize=TITLE_SIZE)
+        _entitle(axes, memory_sentence(most, what))
         _number_by_1_2_5(axes.xaxis)
         axes.tick_params(axis="x", labelsize=8)
         axes.grid(True, which="major", color="0.85", linewidth=0.6)
     _one_legend(figure, panels)
     return figure
+
+
+def memory_sentence(most: Mapping[str, float], what: str) -> str:
+    """How much memory was held at most; ``most`` has the largest median in MiB by method.
+
+    >>> memory_sentence({"a": 210.4, "b": 95.0}, "the map")
+    'Memory of the map peaks at 210 MiB with a, at 95 MiB with b'
+    """
+    if not most:
+        return f"Memory of {what} was not told by any method"
+    high, low = max(most, key=most.__getitem__), min(most, key=most.__getitem__)
+    text = f"Memory of {what} peaks at {_rounded(most[high])} MiB with {high}"
+    return text if high == low else f"{text}, at {_rounded(most[low])} MiB with {low}"
 
 
 def _one_legend(figure: Figure, panels: Sequence[Axes]) -> None:
@@ -225,20 +302,42 @@ def _one_legend(figure: Figure, panels: Sequence[Axes]) -> None:
     figure.legend([*named.values()], [*named], loc="outside lower center", ncols=ncols, fontsize=8, frameon=False)
 
 
+def _curves(points: Sequence[AnytimePoint]) -> list[tuple[str, str]]:
+    """The protocols and metrics that have a value at any time."""
+    defined = ((point.protocol, name) for point in points for name, value in point.metrics.items() if value is not None)
+    return list(dict.fromkeys(defined))
+
+
 def _anytime(points: Sequence[AnytimePoint]) -> Figure:
     """Each headline metric of each protocol against the seconds until the map was there."""
-    panels = list(dict.fromkeys((point.protocol, name) for point in points for name in point.metrics))
+    panels = _curves(points)
     figure, all_axes = _figure(3.5, 3.4, len(panels))
     several = len({point.run for point in points}) > 1
     for axes, (protocol, name) in zip(all_axes, panels, strict=True):
         curves = dict.fromkeys((point.run, point.method) for point in points)
+        best: dict[str, float] = {}
         for index, (run, method) in enumerate(curves):
             mine = [point for point in points if (point.run, point.method, point.protocol) == (run, method, protocol)]
             values = [100.0 * value if (value := point.metrics.get(name)) is not None else np.nan for point in mine]
             label = _label(method, run, several)
+            if np.isfinite(values).any():
+                best[label] = float(np.asarray(values)[np.isfinite(values)][-1])
             axes.plot([point.seconds for point in mine], values, markersize=4, label=label, **_style(index))
         axes.set(xlabel="seconds until the map was there", ylabel=f"{name} (%)")
-        axes.set_title(f"{protocol}: {name} over time", loc="left", fontsize=TITLE_SIZE)
+        _entitle(axes, anytime_sentence(protocol, name, best))
         axes.grid(True, color="0.85", linewidth=0.6)
     _one_legend(figure, all_axes)
     return figure
+
+
+def anytime_sentence(protocol: str, metric: str, last: Mapping[str, float]) -> str:
+    """Where the curves of a metric end; ``last`` has the last value of each method.
+
+    >>> anytime_sentence("rooms-instance", "AP", {"a": 41.0, "b": 12.5})
+    'rooms-instance: AP ends highest with a, at 41.0 %'
+    """
+    highest = max(last.values())
+    best = _listed([name for name, value in last.items() if value == highest])
+    if len(last) == 1:
+        return f"{protocol}: {metric} of {best} ends at {highest:.1f} %"
+    return f"{protocol}: {metric} ends highest with {best}, at {highest:.1f} %"

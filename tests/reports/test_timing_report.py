@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,8 @@ from su3d_bench.core.system.timing import peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.costs import UpdateTimes, pooled, summarise
 from su3d_bench.numerics.statistics import growth_exponent
-from su3d_bench.reports.pictures.timing import POINTS, UPDATES, _memory, _update_cost
+from su3d_bench.reports.pictures.timing import POINTS, UPDATES, _anytime, _memory, _stages, _update_cost
+from su3d_bench.reports.tables.timing import AnytimePoint
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run, read_update_times
 from su3d_bench.store.records import MapCost
@@ -177,20 +179,64 @@ def test_the_size_of_maps_is_drawn_where_a_method_tells_it(tells: bool) -> None:
     assert all(axes.lines for axes in panels)
 
 
-@pytest.mark.parametrize("cost_ms", [(0.4, 60.0), (14.0, 18.0), (900.0, 40_000.0), (7.0, 7.0)])
-def test_a_plot_has_a_sentence_as_title_plain_numbers_and_room_for_its_line(cost_ms: tuple[float, float]) -> None:
+METHODS = ("opensu3d", "conceptgraphs-detector", "openmask3d-segment3d", "sam3d@incremental", "oracle")
+
+
+def drawn(n_methods: int, cost_ms: tuple[float, float]) -> list[Any]:
+    """The figures of several methods of long names, as wide costs as they may be."""
     sizes = np.linspace(5e4, 3e5, 40)
-    made = times(np.linspace(*cost_ms, 40), n_points=sizes, rss_bytes=np.linspace(1e9, 2e9, 40))
-    for figure in (_update_cost([[made]], 0, POINTS), _update_cost([[made]], 0, UPDATES), _memory([[made]])):
-        figure.canvas.draw()
+    made = []
+    for k, name in enumerate(METHODS[:n_methods]):
+        total = np.linspace(*cost_ms, 40) * (k + 1)
+        one = times(total, n_points=sizes, rss_bytes=np.linspace(1e9, 2e9, 40), map_bytes=sizes * 16, match_ms=total)
+        made.append([replace(one, method=name)])
+    points = [AnytimePoint("r", name, "rooms-instance", share, 9.0 * share, {"AP": share, "AP50": None})
+              for name in METHODS[:n_methods] for share in (0.5, 1.0)]  # fmt: skip
+    figures = [_update_cost(made, 0, POINTS), _update_cost(made, 0, UPDATES), _memory(made), _stages(made, 0)]
+    return [*figures, _anytime(points)]
+
+
+@pytest.mark.parametrize(
+    ("cost_ms", "n_methods"), [((0.4, 60.0), 5), ((14.0, 18.0), 1), ((900.0, 40_000.0), 2), ((7.0, 7.0), 1)]
+)
+def test_a_plot_has_a_sentence_as_title_plain_numbers_and_room_for_its_words(
+    cost_ms: tuple[float, float], n_methods: int
+) -> None:
+    figures = drawn(n_methods, cost_ms)
+    for figure in figures:
+        figure.draw_without_rendering()
+        whole = figure.bbox
         for axes in figure.axes:
-            assert len(axes.get_title(loc="left").split()) > 4
+            title = axes.get_title(loc="left")
+            assert len(title.split()) > 4
             labels = [label.get_text() for axis in (axes.xaxis, axes.yaxis) for label in axis.get_ticklabels()]
-            assert not any("$" in text or "^" in text for text in labels)
+            assert not any("$" in text or "^" in text or re.search(r"\de[+-]?\d", text) for text in [*labels, title])
+            box = axes.get_tightbbox()
+            assert whole.x0 - 1 <= box.x0, "nothing of a panel is cut off"
+            assert box.x1 <= whole.x1 + 1, "nothing of a panel is cut off"
+            assert box.y1 <= whole.y1 + 1, "nothing of a panel is cut off"
+            assert axes.lines or axes.patches, "no panel is empty"
+        boxes = [axes.get_tightbbox() for axes in figure.axes]
+        for k, one in enumerate(boxes):
+            assert not any(one.shrunk(0.98, 0.98).overlaps(other) for other in boxes[:k]), "panels stand apart"
+    for figure in figures[:2]:
+        for axes in figure.axes:
             for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
                 assert sum(low <= place <= high for place in axis.get_ticklocs()) >= 2
-    (axes,) = _memory([[made]]).axes
+
+
+def test_the_markers_of_the_memory_stand_whole() -> None:
+    axes = _memory([[times(np.ones(40), rss_bytes=np.linspace(1e9, 2e9, 40))]]).axes[0]
     assert axes.get_ylim()[1] > 1.01 * np.max(np.asarray(axes.lines[0].get_ydata()))
+
+
+def test_the_title_of_a_plot_says_what_its_lines_show() -> None:
+    sizes = np.linspace(5e4, 3e5, 60)
+    grows = replace(times(sizes / 1e3, n_points=sizes, match_ms=sizes / 1e3), method="one")
+    constant = replace(times(np.full(60, 9.0), n_points=sizes, match_ms=np.full(60, 9.0)), method="two")
+    (axes,) = _update_cost([[grows], [constant]], 0, POINTS).axes
+    title = " ".join(axes.get_title(loc="left").split())
+    assert title == "With the points of the map, the cost of an update grows for one; stays constant for two"
 
 
 def test_the_report_answers_in_json(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
