@@ -126,7 +126,7 @@ def _update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, against: 
             label += f": exponent {growth.exponent:z.2f} [{growth.low:z.2f}, {growth.high:z.2f}], {growth.words}"
         _draw_cost(axes, sizes[usable], costs[usable], index, label)
     axes.set(xscale="log", yscale="log", xlabel=against, ylabel="ms per update, without perception")
-    _entitle(axes, cost_sentence(found, against))
+    _entitle(figure, axes, cost_sentence(found, against))
     _number_by_1_2_5(axes.xaxis)
     _number_by_1_2_5(axes.yaxis)
     axes.grid(True, which="major", color="0.85", linewidth=0.6)
@@ -156,9 +156,9 @@ def _listed(names: Sequence[str]) -> str:
     return " and ".join([*([", ".join(names[:-1])] if len(names) > 1 else []), names[-1]])
 
 
-def _entitle(axes: Axes, sentence: str) -> None:
+def _entitle(figure: Figure, axes: Axes, sentence: str) -> None:
     """Write the sentence above the panel, in as many lines as its width asks for."""
-    inches = axes.figure.get_figwidth() * axes.get_position().width
+    inches = figure.get_figwidth() * axes.get_position().width
     lines = textwrap.wrap(sentence, max(30, int(inches * TITLE_LETTERS_AN_INCH)))
     axes.set_title("\n".join(lines), loc="left", fontsize=TITLE_SIZE)
 
@@ -210,7 +210,7 @@ def _stages(times: Sequence[Sequence[UpdateTimes]], warm_up: int) -> Figure:
     axes.set_yticks(rows, _labels(times))
     axes.invert_yaxis()
     axes.set_xlabel("mean ms per update")
-    _entitle(axes, stages_sentence(_labels(times), shares))
+    _entitle(figure, axes, stages_sentence(_labels(times), shares))
     figure.legend(loc="outside lower center", ncols=min(len(stages), 6), fontsize=8, frameon=False)
     return figure
 
@@ -271,7 +271,7 @@ def _memory(times: Sequence[Sequence[UpdateTimes]]) -> Figure:
         axes.margins(y=0.12)  # the markers at the top stand whole
         axes.set(xscale="log", xlabel=against, ylabel=f"MiB of {what}")
         axes.set_ylim(bottom=0)
-        _entitle(axes, memory_sentence(most, what))
+        _entitle(figure, axes, memory_sentence(most, what))
         _number_by_1_2_5(axes.xaxis)
         axes.tick_params(axis="x", labelsize=8)
         axes.grid(True, which="major", color="0.85", linewidth=0.6)
@@ -324,7 +324,7 @@ def _anytime(points: Sequence[AnytimePoint]) -> Figure:
                 best[label] = float(np.asarray(values)[np.isfinite(values)][-1])
             axes.plot([point.seconds for point in mine], values, markersize=4, label=label, **_style(index))
         axes.set(xlabel="seconds until the map was there", ylabel=f"{name} (%)")
-        _entitle(axes, anytime_sentence(protocol, name, best))
+        _entitle(figure, axes, anytime_sentence(protocol, name, best))
         axes.grid(True, color="0.85", linewidth=0.6)
     _one_legend(figure, all_axes)
     return figure
