@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -276,10 +276,10 @@ class SceneTimeline:
 
     def _maps(self, rules: ProtocolRules | None, truth: GroundTruth | None) -> dict[str, tuple[Owned, Sequence[int]]]:
         """Each method's map, and the first frame in which each of its instances was seen, 0 where nobody knows."""
-        maps = {}
+        maps: dict[str, tuple[Owned, Sequence[int]]] = {}
         for method in self._methods:
             file = self._run.folder.job(self.scene, method).prediction
-            prediction = self._had(f"no map of {printable(method, 80)}", lambda file=file: read_prediction(file))
+            prediction = self._had(f"no map of {printable(method, 80)}", partial(read_prediction, file))
             if prediction is not None:
                 n = 0 if isinstance(prediction, DenseFeatures) else n_predictions(prediction)
                 is_known = isinstance(prediction, Instances)
@@ -291,7 +291,8 @@ class SceneTimeline:
         cloud = thinned(prediction.points, MOST_POINTS)
         instance = point_owners(prediction, cloud.rows).astype(np.int64)
         is_dense = isinstance(prediction, DenseFeatures)
-        label, labels = np.full(len(cloud.rows), -1, np.int64), ()
+        label: Int64Array = np.full(len(cloud.rows), -1, np.int64)
+        labels: tuple[str, ...] = ()
         if rules is not None:
             of_truth = None if truth is None else class_index_of_ids(rules, truth.semantic)
             classes = self._had(
@@ -373,8 +374,8 @@ def smaller(frame: Frame, width: int) -> Frame:
     intrinsics: Float64Array = np.linalg.inv(half) @ scale @ half @ frame.intrinsics
     return replace(
         frame,
-        rgb=cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA),
-        depth_m=cv2.resize(frame.depth_m, size, interpolation=cv2.INTER_NEAREST),
+        rgb=np.asarray(cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA), np.uint8),
+        depth_m=np.asarray(cv2.resize(frame.depth_m, size, interpolation=cv2.INTER_NEAREST), np.float32),
         intrinsics=intrinsics,
     )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -60,10 +61,11 @@ def call(arguments: argparse.Namespace) -> int:
     timelines = [SceneTimeline(run, scene, methods, arguments.stride or 0, spaces) for scene in scenes]
     make_folder(arguments.out.parent)
     with progress(len(timelines), is_quiet=arguments.quiet) as report, replacing(arguments.out) as stream:
-        drawn = (
-            (one.scene, one.records(lambda done, n, one=one: report(Event(one.scene, "frames", done, n))))
-            for one in timelines
-        )
+
+        def tell(scene: str, done: int, total: int) -> None:
+            report(Event(scene, "frames", done, total))
+
+        drawn = ((one.scene, one.records(partial(tell, one.scene))) for one in timelines)
         write_rrd(drawn, methods, stream, sdk)
         refuse_nothing(timelines, run.name)
     for one in timelines:
