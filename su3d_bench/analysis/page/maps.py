@@ -362,59 +362,6 @@ def _not_near(frames: Sequence[Frame], points: Float32Array) -> Float32Array:
     return points[nearest(seen, points, COLOUR_NEAR_M)[1] < 0]
 
 
-<<<<<<< HEAD
-=======
-def frames_of(instances: Instances, k: int) -> list[int]:
-    """The frames in which an instance was seen, each once; none where the method keeps no views."""
-    if not len(instances.views):
-        return []
-    rows = instances.views[instances.view_indptr[k] : instances.view_indptr[k + 1]]
-    return list(dict.fromkeys(int(frame) for frame, _ in rows))
-
-
-def _instance_data(
-    prediction: Prediction, k: int, classes: Int64Array | None, similarity: Any, frames: Mapping[int, Frame]
-) -> dict[str, Any]:
-    """An instance: n points, c class, s similarities in thousandths, and of ``Instances`` its name, score and views."""
-    data: dict[str, Any] = {}
-    if classes is not None:
-        data["class"] = int(classes[k])
-    if similarity is not None:
-        data["similarity"] = [round(1000 * float(value)) for value in similarity[k]]
-    if not isinstance(prediction, Instances):
-        assert not isinstance(prediction, DenseFeatures)
-        return {"id": k, "points": int((prediction.instance == k).sum()), **data}
-    views = frames_of(prediction, k)
-    own = prediction.points[prediction.mask(k)]
-    data |= {
-        "id": int(prediction.ids[k]) if len(prediction.ids) else k,
-        "name": printable((prediction.labels or prediction.names)[k] or prediction.names[k], 80),
-        "caption": printable(prediction.captions[k], MOST_CAPTION),
-        "score": round(float(prediction.scores[k]), 4),
-        "points": len(own),
-        "n_views": len(views),
-        "views": views[:MOST_VIEWS],
-    }
-    if len(own):
-        low, high = own.min(axis=0), own.max(axis=0)
-        data["centre"] = [round(float(value), 3) for value in (low + high) / 2]
-        data["size"] = [round(float(value), 3) for value in high - low]
-    boxes = {index: _box(own, frames[index]) for index in views if index in frames}
-    seen = {index: box for index, box in boxes.items() if box is not None}
-    if seen:
-        best = max(
-            seen, key=lambda index: ((seen[index][2] - seen[index][0]) * (seen[index][3] - seen[index][1]), -index)
-        )
-        data |= {"view": best, "box": seen[best]}
-    return data
-
-
-def _box(points: Any, frame: Frame) -> list[float] | None:
-    height, width = frame.depth_m.shape
-    return box_in_view(points[:: max(1, len(points) // 2000)], frame.camera_to_world, frame.intrinsics, width, height)
-
-
->>>>>>> 8c4b705 (report rerun: frames, masks, maps and truth of a run on one timeline for rerun's viewer)
 def _jpeg(frame: Frame) -> str:
     import cv2
 

@@ -11,11 +11,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import made_pages
+import pages_of_code
 import pytest
 import site_hooks
 import yaml
-from made_pages import API, METHODS, PROTOCOLS, protocol_page, told_of
+from pages_of_code import API, METHODS, PROTOCOLS, protocol_page, told_of
 from places import ROOT
 from site_hooks import filled, repository_of
 from site_text import ROOT_PAGES
@@ -32,7 +32,7 @@ TAGS = {"p", "div", "table", "thead", "tbody", "tr", "th", "td", "code", "a", "d
 
 @pytest.fixture(scope="module")
 def pages() -> dict[str, str]:
-    return made_pages.made_pages()
+    return pages_of_code.made_pages()
 
 
 def words(page: str) -> str:
