@@ -18,6 +18,7 @@ from su3d_bench.core.errors import printable
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, Int64Array, UInt8Array
 from su3d_bench.numerics.geometry import back_project, valid_depth
 from su3d_bench.reports.pictures.canvas import drawable
+from su3d_bench.reports.pictures.render import BACKGROUND
 
 WIDTH, MARGIN, CAPTION = 960, 10, 24
 PHOTO_WIDTH, ZOOM_WIDTH = 560, 370
@@ -29,6 +30,7 @@ INK, GREY, PAPER, PANEL = (26, 26, 26), (96, 96, 96), (255, 255, 255), (244, 244
 ROOM_COLUMNS, ROOM_GAP = 3, 6  # photographs of the room side by side, pixels between them
 ZOOM_GROWTH = 1.7  # sides of the part that is shown, as a multiple of those of the object
 PNG_COLOURS = 160  # of the palette; more make the file larger and the picture no clearer
+PALETTE_WIDTH, COMMON_COLOURS = 160, 96  # pixels of each picture from which a palette is chosen; its frequent colours
 
 
 @dataclass(frozen=True)
@@ -185,17 +187,60 @@ def _draw_ring(shown: UInt8Array, ring: tuple[float, float, float], eye: tuple[f
     cv2.circle(shown, centre, radius, OUTLINE, 3, cv2.LINE_AA)
 
 
-def png_bytes(picture: UInt8Array, *, is_true: bool = False) -> bytes:
+def palette_of(pictures: Sequence[UInt8Array], shades: Sequence[tuple[int, int, int]]) -> UInt8Array:
+    """Colours (n, 3), at most 256, for items whose photographs and views are like ``pictures`` (h, w, 3).
+
+    Beside theirs it has those of what is written and outlined, and ``shades`` from light to dark.
+    """
+    from PIL import Image
+
+    strips = [fitted(picture, (PALETTE_WIDTH, PALETTE_WIDTH)) for picture in pictures]
+    image = Image.fromarray(np.concatenate(strips or [np.full((1, 1, 3), 255, np.uint8)]))
+    common = image.quantize(COMMON_COLOURS, method=Image.Quantize.MEDIANCUT).getpalette()
+    found = _with_rare(np.array(common, np.uint8).reshape(-1, 3)[:COMMON_COLOURS], np.asarray(image).reshape(-1, 3))
+    own = [PANEL, BACKGROUND]
+    own += [mixed(one, PAPER, k / 8) for one in (INK, GREY, OUTLINE, *shades) for k in range(8)]
+    own += [mixed(one, (0, 0, 0), k / 8) for one in shades for k in range(1, 5)]
+    return np.concatenate([found, np.array([PAPER, *own], np.uint8)])
+
+
+def _with_rare(common: UInt8Array, pixels: UInt8Array) -> UInt8Array:
+    """``common`` and the colours of ``pixels`` farthest from all before: few, and asked about."""
+    _, first = np.unique(pixels >> 3, axis=0, return_index=True)
+    left = pixels[first].astype(np.float64)
+    distance = np.min([((left - one) ** 2).sum(axis=1) for one in common.astype(np.float64)], axis=0)
+    found = [*common]
+    for _ in range(PNG_COLOURS - len(common)):
+        rare = left[int(distance.argmax())]
+        found.append(rare.astype(np.uint8))
+        distance = np.minimum(distance, ((left - rare) ** 2).sum(axis=1))
+    return np.array(found, np.uint8)
+
+
+def mixed(one: tuple[int, int, int], other: tuple[int, int, int], share: float) -> tuple[int, int, int]:
+    """The colour between two, ``share`` of the way to the ``other``."""
+    red, green, blue = (round((1 - share) * a + share * b) for a, b in zip(one, other, strict=True))
+    return red, green, blue
+
+
+def png_bytes(picture: UInt8Array, *, is_true: bool = False, palette: UInt8Array | None = None) -> bytes:
     """A PNG of at most ``PNG_COLOURS`` colours: the same bytes for the same picture.
 
-    ``is_true``: larger, with colours that can be judged: 256, and dots of two where none is near enough.
+    ``palette`` (n, 3): of these colours instead, each pixel in the nearest, whatever the others are. ``is_true``:
+    larger, with colours that can be judged: 256, and dots of two where none is near enough.
     """
     from PIL import Image
 
     buffer = io.BytesIO()
     whole = Image.fromarray(picture)
-    n_colours = 256 if is_true else PNG_COLOURS
-    image = whole.quantize(n_colours, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    if palette is not None:
+        of_palette = Image.new("P", (1, 1))
+        of_palette.putpalette(palette.tobytes())
+        image = whole.quantize(palette=of_palette, dither=Image.Dither.NONE)
+    else:
+        image = whole.quantize(
+            256 if is_true else PNG_COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
+        )
     if is_true:
         image = whole.quantize(palette=image, dither=Image.Dither.FLOYDSTEINBERG)
     image.save(buffer, format="PNG", compress_level=6)  # 9: a twentieth smaller in four times the time

@@ -21,7 +21,7 @@ from su3d_bench.reports.sheet.audit_page import audit_page
 from su3d_bench.reports.tables.formats import csv_lines
 from su3d_bench.sheets.judging.answers import MOST_CHARACTERS
 from su3d_bench.sheets.judging.audit_scores import COLUMNS, FILE, read_verdicts
-from su3d_bench.sheets.making.drawing import at_full_size
+from su3d_bench.sheets.making.shown_room import at_full_size
 from su3d_bench.store.atomic import make_folder, remove_file, write_bytes, write_text
 
 PER_SHEET = 12

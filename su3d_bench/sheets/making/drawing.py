@@ -7,38 +7,30 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NoReturn, Protocol
+from typing import NoReturn, Protocol
 
 import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import BoolArray, Float64Array, Frame, UInt8Array
-from su3d_bench.reports.pictures.items import (
-    CAP_M,
-    LOW_HEIGHT,
-    PHOTO_WIDTH,
-    ZOOM_WIDTH,
-    ItemParts,
-    Panel,
-    Tag,
-    best_view,
-    compose,
-    mask_in_frame,
-    png_bytes,
-)
-from su3d_bench.reports.pictures.map_views import MapView, cameras_of, pale, view_of
-from su3d_bench.reports.pictures.maps import thinned_rows
+from su3d_bench.reports.pictures.items import ItemParts, Panel, Tag, compose, png_bytes
+from su3d_bench.reports.pictures.map_views import MapView, pale
 from su3d_bench.reports.pictures.render import colour
-from su3d_bench.reports.pictures.scene_look import seen_points
+from su3d_bench.reports.pictures.scene_look import evenly
 from su3d_bench.runs.executors.local import Event, Report, run_inline, run_processes
 from su3d_bench.sheets.items import SheetKind
 from su3d_bench.sheets.making.drafts import Draft
 from su3d_bench.sheets.making.run_source import mask_digest
+from su3d_bench.sheets.making.shown_room import (
+    ANSWER_COLOUR,
+    OTHER_COLOUR,
+    PLACE_SHARE,
+    ROOM_SHARE,
+    Region,
+    ShownRoom,
+)
 
-ANSWER_COLOUR, OTHER_COLOUR = (222, 74, 22), (32, 98, 196)  # those of reasoning_picture
-SEEN_POINTS = 1_500_000  # of all frames together, before they are thinned: floors are seen at a low angle
-ROOM_SHARE, PLACE_SHARE = 0.75, 0.5  # of the room's colours, so that what is judged stands out
 ROOM_PHOTOS = 6  # of the room, for answers that name nothing
 ROOM_TITLES: Mapping[SheetKind, str] = {
     "retrieval": "the room, what was found in red",
@@ -71,180 +63,116 @@ class Artist:
 
     def __init__(self, source: PictureSource) -> None:
         self._source = source
-        self._maps: dict[bytes, _ShownMap] = {}
+        self._room: ShownRoom | None = None
+        self._regions: dict[bytes, Region] = {}
+        self._photos: dict[bytes, tuple[Frame, BoolArray] | None] = {}
 
     def draw(self, draft: Draft) -> bytes:
         """The PNG of a draft."""
-        return png_bytes(self.picture(draft))
+        return png_bytes(self.picture(draft), palette=self.room(draft.scene).palette)
 
     def picture(self, draft: Draft) -> UInt8Array:
         """The picture (h, 960, 3) of a draft."""
-        shown = self._map(draft.scene, draft.methods[0])
-        room, members = shown.room, shown.members(draft.rows)
-        photo, eye = self._photo(draft, shown)
-        best = max(room.corners, key=lambda view: int(view.shows(members).sum()))
+        return compose(self.parts(draft))
+
+    def parts(self, draft: Draft) -> ItemParts:
+        """What stands in the picture of a draft: of its map the regions of ``rows`` and ``others`` alone."""
+        room = self.room(draft.scene)
+        answer, other = (room.union([self._region(draft, row) for row in rows]) for rows in (draft.rows, draft.others))
+        photo, eye = self._photo(draft, room)
+        best = max(room.corners, key=lambda view: int(view.shows(answer.is_member).sum()))
         room_view = Panel(
             ROOM_TITLES[draft.kind] if draft.rows or draft.others else "the room",
-            colour(best.shown, _coloured(draft, shown, ROOM_SHARE)),
-            best.shows(members),
-            _tags(draft, shown.instances, best),
+            colour(best.shown, _coloured(room, answer, other, ROOM_SHARE)),
+            best.shows(answer.is_member),
+            self._tags(draft, best),
             line=2,
         )
         place = Panel(
             ("its place, from above" if draft.rows else "from above")
             + (" (arrow: from the camera)" if eye is not None and draft.rows else ""),
-            colour(room.above.shown, _coloured(draft, shown, PLACE_SHARE)),
-            tags=_tags(draft, shown.instances, room.above),
-            ring=_ring(draft, shown),
+            colour(room.above.shown, _coloured(room, answer, other, PLACE_SHARE)),
+            tags=self._tags(draft, room.above),
+            ring=_ring(draft, room, answer),
             eye=None if eye is None else _inside(room.above.project(eye[None])[0]),
         )
         photos = self._room_photos(draft) if photo is None else ()
-        return compose(ItemParts(draft.title, photo, room_view, place, photos))
+        return ItemParts(draft.title, photo, room_view, place, photos)
+
+    def room(self, scene: str) -> ShownRoom:
+        """The scene as its frames show it."""
+        if self._room is None or self._room.scene != scene:
+            self._room = ShownRoom(scene, self._source.frames(scene))
+            self._regions.clear()
+            self._photos.clear()
+        return self._room
+
+    def _region(self, draft: Draft, row: int) -> Region:
+        """Where an instance of the draft's map lies; that of another map where it has the same mask."""
+        instances = self._source.instances(draft.scene, draft.methods[0])
+        key = mask_digest(instances, (row,))
+        if key not in self._regions:
+            self._regions[key] = self.room(draft.scene).region(instances.points[instances.mask(row)])
+        return self._regions[key]
 
     def _room_photos(self, draft: Draft) -> tuple[UInt8Array, ...]:
         """Some of the frames, spread over the walk, where an answer names nothing that could be outlined."""
         if draft.rows:
             return ()
         frames = self._source.frames(draft.scene)
-        chosen = np.unique(np.linspace(0, len(frames) - 1, min(ROOM_PHOTOS, len(frames))).astype(np.int64))
-        return tuple(frames[k].rgb for k in chosen)
+        return tuple(frames[k].rgb for k in evenly(len(frames), ROOM_PHOTOS))
 
-    def _photo(self, draft: Draft, shown: _ShownMap) -> tuple[Panel | None, Float64Array | None]:
+    def _photo(self, draft: Draft, room: ShownRoom) -> tuple[Panel | None, Float64Array | None]:
         """The frame that shows the object best, and where its camera was."""
         wanted = draft.rows or draft.others
         if not wanted:
             return None, None
-        photo = shown.photo(wanted, self._source.frames(draft.scene))
-        if photo is None:
-            return None, None
-        title = OUTLINED[draft.kind] if draft.rows else "what the answer was held against"
-        return Panel(f"outlined: {title}", photo.frame.rgb, photo.mask), photo.frame.camera_to_world[:3, 3]
-
-    def _map(self, scene: str, method: str) -> _ShownMap:
-        """What is shown of a map; that of another method where it has the same masks."""
-        instances = self._source.instances(scene, method)
-        key = mask_digest(instances, range(len(instances)))
-        if key not in self._maps:
-            if any(scene != known.room.scene for known in self._maps.values()):
-                self._maps.clear()
-            rooms = [known.room for known in self._maps.values()]
-            self._maps[key] = _ShownMap(rooms[0] if rooms else _Room(scene, self._source.frames(scene)), instances)
-        return self._maps[key]
-
-
-@dataclass(frozen=True)
-class _Photo:
-    """A frame and where it shows what is outlined (h, w)."""
-
-    frame: Frame
-    mask: BoolArray
-
-
-class _Room:
-    """A scene in the colours that its frames saw, from above and from two corners: the same for every method."""
-
-    def __init__(self, scene: str, frames: Sequence[Frame]) -> None:
-        self.scene = scene
-        seen, rgb = seen_points(frames, SEEN_POINTS)
-        rows = thinned_rows(seen)
-        self.points, self.colours = seen[rows], rgb[rows]
-        self.above: MapView = view_of(self.points, cameras_of(self.points, ZOOM_WIDTH, LOW_HEIGHT)[0])
-        corners = cameras_of(self.points, PHOTO_WIDTH, LOW_HEIGHT)[1:]
-        self.corners: tuple[MapView, ...] = tuple(view_of(self.points, camera) for camera in corners)
-
-
-class _ShownMap:
-    """A map within its room, and the tree of its points."""
-
-    def __init__(self, room: _Room, instances: Instances) -> None:
-        from scipy.spatial import KDTree
-
-        self.room, self.instances = room, instances
-        self._tree: Any = KDTree(instances.points, balanced_tree=False, compact_nodes=False)
-        _, self._nearest = self._tree.query(room.points, distance_upper_bound=CAP_M)
-        self._photos: dict[tuple[tuple[int, ...], tuple[int, ...]], _Photo | None] = {}
-
-    def members(self, rows: Sequence[int]) -> BoolArray:
-        """Which points of the room lie at these instances."""
-        is_member = np.zeros(len(self.instances.points) + 1, np.bool_)  # the last: near no point of the map
-        for row in rows:
-            is_member[self.instances.mask(row)] = True
-        members: BoolArray = is_member[self._nearest]
-        return members
-
-    def photo(self, rows: tuple[int, ...], frames: Sequence[Frame]) -> _Photo | None:
-        """The best of ``frames`` to see these instances in, found once; None where none shows them."""
-        key = rows, tuple(frame.index for frame in frames)
+        key = mask_digest(self._source.instances(draft.scene, draft.methods[0]), wanted)
         if key not in self._photos:
-            self._photos[key] = self._best_photo(rows, frames)
-        return self._photos[key]
+            self._photos[key] = room.photo(room.union([self._region(draft, row) for row in wanted]))
+        shown = self._photos[key]
+        if shown is None:
+            return None, None
+        frame, mask = shown
+        title = OUTLINED[draft.kind] if draft.rows else "what the answer was held against"
+        return Panel(f"outlined: {title}", frame.rgb, mask), frame.camera_to_world[:3, 3]
 
-    def _best_photo(self, rows: tuple[int, ...], frames: Sequence[Frame]) -> _Photo | None:
-        is_member = np.zeros(len(self.instances.points), np.bool_)
-        for row in rows:
-            is_member[self.instances.mask(row)] = True
-        points = self.instances.points[is_member]
-        view = best_view(frames, points)
-        if view is None:
-            return None
-        frame = frames[view.frame]
-        bounds = np.stack([points.min(axis=0), points.max(axis=0)]).astype(np.float64)
-        return _Photo(frame, at_full_size(mask_in_frame(frame, self._tree, is_member, bounds), frame.rgb))
+    def _tags(self, draft: Draft, view: MapView) -> tuple[Tag, ...]:
+        """The names of what an answer speaks of, where it is."""
+        if not draft.names:
+            return ()
+        rows = tuple(dict.fromkeys((*draft.rows, *draft.others)))
+        places = np.array([self._region(draft, row).centre for row in rows]).reshape(-1, 3)
+        shades = [ANSWER_COLOUR if row in draft.rows else OTHER_COLOUR for row in rows]
+        return tags_at(places, view, [draft.names[row] for row in rows], shades)
 
 
-def _coloured(draft: Draft, shown: _ShownMap, share: float) -> UInt8Array:
+def _coloured(room: ShownRoom, answer: Region, other: Region, share: float) -> UInt8Array:
     """The colours of the room's points, what is judged and what it was held against in strong ones."""
-    colours = pale(shown.room.colours, share)
-    colours[shown.members(draft.others)] = OTHER_COLOUR
-    colours[shown.members(draft.rows)] = ANSWER_COLOUR
+    colours = pale(room.colours, share)
+    colours[other.is_member] = OTHER_COLOUR
+    colours[answer.is_member] = ANSWER_COLOUR
     return colours
 
 
-def _tags(draft: Draft, instances: Instances, view: MapView) -> tuple[Tag, ...]:
-    """The names of what an answer speaks of, where it is."""
-    if not draft.names:
-        return ()
-    rows = tuple(dict.fromkeys((*draft.rows, *draft.others)))
-    shades = [ANSWER_COLOUR if row in draft.rows else OTHER_COLOUR for row in rows]
-    return tags_of(instances, view, rows, [draft.names[row] for row in rows], shades)
-
-
-def tags_of(
-    instances: Instances,
-    view: MapView,
-    rows: Sequence[int],
-    names: Sequence[str],
-    shades: Sequence[tuple[int, int, int]],
+def tags_at(
+    places: Float64Array, view: MapView, names: Sequence[str], shades: Sequence[tuple[int, int, int]]
 ) -> tuple[Tag, ...]:
-    """A name at the middle of each of ``rows``, as far as it lies before the camera."""
-    places = view.project(instances.centroids[list(rows)].astype(np.float64).reshape(-1, 3))
+    """A name at each of ``places`` (N, 3), as far as it lies before the camera."""
     return tuple(
         Tag(name, float(x), float(y), shade)
-        for name, shade, (x, y) in zip(names, shades, places, strict=True)
+        for name, shade, (x, y) in zip(names, shades, view.project(places), strict=True)
         if np.isfinite([x, y]).all()
     )
 
 
-def _ring(draft: Draft, shown: _ShownMap) -> tuple[float, float, float] | None:
+def _ring(draft: Draft, room: ShownRoom, answer: Region) -> tuple[float, float, float] | None:
     """Around what is outlined, from above; none around several things, which have names."""
-    if len(draft.rows) != 1 or draft.names:
+    if len(draft.rows) != 1 or draft.names or not len(answer.points):
         return None
-    points = shown.instances.points[shown.instances.mask(draft.rows[0])]
-    if not len(points):
-        return None
-    low, high = shown.room.above.project(np.percentile(points, [2, 98], axis=0).astype(np.float64))
+    low, high = room.above.project(np.percentile(answer.points, [2, 98], axis=0).astype(np.float64))
     x, y = (low + high) / 2
     return float(x), float(y), float(0.6 * np.abs(high - low).max())
-
-
-def at_full_size(mask: BoolArray, rgb: UInt8Array, gap: int = 3) -> BoolArray:
-    """The mask at the size of the colour image ``rgb``, gaps of less than ``gap`` of its pixels closed."""
-    import cv2
-
-    closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((gap, gap), np.uint8))
-    height, width = rgb.shape[:2]
-    full: BoolArray = cv2.resize(closed, (width, height), interpolation=cv2.INTER_NEAREST) > 0
-    return full
 
 
 def _inside(place: Float64Array) -> tuple[float, float] | None:

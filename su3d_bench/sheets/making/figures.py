@@ -19,8 +19,9 @@ from su3d_bench.reports.pictures.colours import ROOM_SURFACES, Scale, class_colo
 from su3d_bench.reports.pictures.figures import Cell, GridRow
 from su3d_bench.reports.pictures.items import Tag, seen_in
 from su3d_bench.reports.pictures.map_views import DrawnMap, MapView, drawn_map, pale
-from su3d_bench.sheets.making.drawing import ANSWER_COLOUR, OTHER_COLOUR, tags_of
+from su3d_bench.sheets.making.drawing import tags_at
 from su3d_bench.sheets.making.run_source import RunSource
+from su3d_bench.sheets.making.shown_room import ANSWER_COLOUR, OTHER_COLOUR
 
 CELL_WIDTH, CELL_HEIGHT = 720, 500  # pixels of one picture
 SMALLER = 4  # times, of the views in which the corner is chosen
@@ -156,5 +157,6 @@ def _name_tags(shown: DrawnMap, view: MapView, names: Labels, colours: UInt8Arra
 def _tags_of(
     instances: Instances, view: MapView, rows: Sequence[int], names: Labels, shades: Sequence[tuple[int, int, int]]
 ) -> list[Tag]:
-    tags = tags_of(instances, view, rows, names, shades)
+    places = instances.centroids[list(rows)].astype(np.float64).reshape(-1, 3)
+    tags = tags_at(places, view, names, shades)
     return [tag for tag in tags if 0 < tag.x < 1 and 0 < tag.y < 1]
