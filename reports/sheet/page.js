@@ -144,6 +144,17 @@
     return field;
   }
 
+  function tellHow() {
+    const how = byId("how");
+    how.append(...sheet.guide.map((sentence) => element("p", sentence)));
+    for (const ask of sheet.asks) {
+      how.append(element("h2", ask.text));
+      const list = element("dl");
+      ask.choices.forEach((choice, k) => list.append(element("dt", choice), element("dd", ask.meanings[k] || "")));
+      how.append(list);
+    }
+  }
+
   const currentAsk = (item) => openAsk(item) || item.asks[0];
 
   function show() {
@@ -197,12 +208,15 @@
     else if (event.key === "ArrowRight") go(1);
     else if (event.key === "u" || event.key === "U") undo();
     else if (event.key === "n" || event.key === "N") goToOpen();
+    else if (event.key === "z" || event.key === "Z") enlarge(!isLarge());
+    else if (event.key === "h" || event.key === "H") byId("guide").open = !byId("guide").open;
     else return;
     event.preventDefault();
   });
   window.addEventListener("beforeunload", (event) => {
     if (!canSave && !isExported) event.preventDefault();
   });
+  tellHow();
   restore();
   show();
 })();

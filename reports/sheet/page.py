@@ -18,7 +18,7 @@ HERE = Path(__file__).parent
 
 
 def page_html(title: str, data: Mapping[str, Any]) -> str:
-    """The page of one annotator; ``data``: id, annotator, columns, asks and items, pictures in base 64."""
+    """The page of one annotator; ``data``: id, annotator, columns, guide, asks and items, pictures in base 64."""
     script = file_text(HERE / "page.js")
     names = {"sheet": data["id"], "annotator": data["annotator"]}
     return rendered(HERE, script, title=title, data=json_in_html(data), **names)

@@ -13,6 +13,7 @@ from waiting import wait_until
 
 from su3d_bench.reports.sheet.page import json_in_html
 from su3d_bench.sheets.items import ANSWER_COLUMNS, SheetKind
+from su3d_bench.sheets.making.guide import GUIDE
 from su3d_bench.sheets.making.sets import MadeSheets, write_sheets
 
 needs_browser = pytest.mark.skipif(find_chromium() is None, reason="no browser: install chromium")
@@ -159,3 +160,36 @@ def test_a_phone_needs_no_sideways_scrolling(tmp_path: Path, browser: Chromium) 
         heights = browser.run("[...document.querySelectorAll('.choices button')].map(b => b.offsetHeight)")
         assert min(heights) >= 44
         browser.press("ArrowRight")
+
+
+@needs_browser
+@pytest.mark.parametrize("kind", ["retrieval", "annotation", "reasoning", "questions"])
+def test_the_page_tells_how_to_judge_in_the_words_of_the_workbook(
+    tmp_path: Path, browser: Chromium, kind: SheetKind
+) -> None:
+    openpyxl = pytest.importorskip("openpyxl", reason="needs the sheets extra")
+    both, page = written(tmp_path, kind, TEXTS[:2])
+    guide = openpyxl.load_workbook(page.with_name("sheet.xlsx"))[GUIDE]
+    of_book = [str(value) for row in guide.iter_rows(min_row=2, values_only=True) for value in row if value]
+    browser.open(page)
+    assert browser.run("document.getElementById('guide').open") is False
+    browser.press("h")
+    assert browser.run("document.getElementById('guide').open") is True
+    of_page = browser.run("[...document.querySelectorAll('#how p, #how h2, #how dt, #how dd')].map(e => e.textContent)")
+    assert of_page == of_book and len(of_book) > 4
+    asks = {word for ask in both.sheet.asks for word in (ask.text, *ask.choices, *ask.meanings)}
+    assert asks <= set(of_page)
+
+
+@needs_browser
+def test_the_picture_is_enlarged_by_keyboard(tmp_path: Path, browser: Chromium) -> None:
+    _, page = written(tmp_path, "retrieval", TEXTS)
+    browser.open(page)
+    large = "document.getElementById('image').getAttribute('aria-pressed')"
+    browser.press("z")
+    assert browser.run(large) == "true"
+    browser.run("document.getElementById('image').focus()")
+    browser.press("Enter")
+    assert browser.run(large) == "false"
+    browser.press("z", "ArrowRight")
+    assert browser.run(large) == "false" and browser.faults() == []

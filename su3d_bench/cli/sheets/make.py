@@ -117,7 +117,9 @@ def call(arguments: argparse.Namespace) -> int:
     drawn: dict[SheetKind, list[bytes]] = {}
     of_run = [kind for kind in kinds if kind != QUESTIONS]
     if of_run:
-        source = RunSource(read_run(arguments.run), arguments.methods, arguments.scenes)
+        source = _with_instances(
+            RunSource(read_run(arguments.run), arguments.methods, arguments.scenes), arguments.quiet
+        )
         sources: dict[SheetKind, RunSource] = {kind: _judgeable(source, kind, arguments.quiet) for kind in of_run}
         if arguments.dry_run:
             return _estimate(sources["reasoning"], left_out, arguments)
@@ -168,6 +170,27 @@ def _check(arguments: argparse.Namespace) -> None:
         raise ConfigError(f"{given[0]}: is for --solver llm alone; the built-in solver asks nobody")
 
 
+def _with_instances(source: RunSource, is_quiet: bool) -> RunSource:
+    """The run without the methods whose maps are features alone, in which nothing could be outlined."""
+    scene = source.scenes[0]
+    kept = tuple(method for method in source.methods if source.has_instances(scene, method))
+    if not kept:
+        raise ConfigError(
+            f"{source.run.name}: {', '.join(source.methods)}: no map has instances that people could judge; give the "
+            "run a method that makes them, such as opensu3d"
+        )
+    return _only(source, kept, ("", "which has no instances to judge"), is_quiet)
+
+
+def _only(source: RunSource, kept: tuple[str, ...], why: tuple[str, str], is_quiet: bool) -> RunSource:
+    """The run with these of its methods, where it is said which are left out."""
+    if kept == source.methods:
+        return source
+    left_out = [method for method in source.methods if method not in kept]
+    remark(f"{why[0]}left out {', '.join(left_out)}, {why[1]}", quiet=is_quiet)
+    return source.of_methods(kept)
+
+
 def _judgeable(source: RunSource, kind: SheetKind, is_quiet: bool) -> RunSource:
     """The run without the methods whose maps have no features, where texts are compared with features."""
     if kind != "retrieval":
@@ -179,11 +202,7 @@ def _judgeable(source: RunSource, kind: SheetKind, is_quiet: bool) -> RunSource:
             f"{source.run.name}: {', '.join(source.methods)}: no map has features that a text could be compared with; "
             "give the run a method that makes them, such as opensu3d"
         )
-    if kept == source.methods:
-        return source
-    left_out = [method for method in source.methods if method not in kept]
-    remark(f"retrieval: left out {', '.join(left_out)}, which keeps no features to rank by", quiet=is_quiet)
-    return source.of_methods(kept)
+    return _only(source, kept, ("retrieval: ", "which keeps no features to rank by"), is_quiet)
 
 
 def _truth(arguments: argparse.Namespace) -> TruthSource:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections import deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -40,6 +42,7 @@ from su3d_bench.sheets.making.run_source import RunSource, mask_digest
 MOST_TEXT = 1000  # characters of a query, a label or an answer that a sheet shows
 NO_LABEL = "(no label)"
 NO_ANSWER = "(no answer)"
+HINT = re.compile(r"; did you mean '[^']*'\?")  # for who can ask again
 
 
 @dataclass(frozen=True)
@@ -140,7 +143,7 @@ def retrieval_drafts(source: RunSource, scene: str, questions: Sequence[Question
 def annotation_drafts(source: RunSource, scene: str, n_most: int, random: np.random.Generator) -> list[Draft]:
     """At most ``n_most`` instances a scene, drawn with ``random``, each with its labels n and n' in drawn order.
 
-    What the filter of labels n' leaves out has label n alone.
+    Methods take turns, however many instances each has. What the filter of labels n' leaves out has label n alone.
     """
     rules = source.rules(scene, "annotation")
     truth = source.truth(scene, rules)
@@ -168,8 +171,21 @@ def annotation_drafts(source: RunSource, scene: str, n_most: int, random: np.ran
                     automatic=judge(row, names),
                 )
     drafts = list(draft_of.values())
-    kept = sorted(random.permutation(len(drafts))[:n_most].tolist())
+    kept = sorted(_in_turn(drafts, source.methods, random.permutation(len(drafts)).tolist())[:n_most])
     return [_with_labels_shuffled(drafts[k], random) for k in kept]
+
+
+def _in_turn(drafts: Sequence[Draft], methods: Sequence[str], order: Sequence[int]) -> list[int]:
+    """``order`` so that each method in turn has a part in the next draft, as long as it has one left."""
+    mine = {method: deque(k for k in order if method in drafts[k].methods) for method in methods}
+    taken: dict[int, None] = {}
+    while any(mine.values()):
+        for left in mine.values():
+            while left and left[0] in taken:
+                left.popleft()
+            if left:
+                taken[left.popleft()] = None
+    return list(taken)
 
 
 def _with_labels_shuffled(draft: Draft, random: np.random.Generator) -> Draft:
@@ -296,9 +312,12 @@ def _known(source: RunSource, scene: str, rules: ProtocolRules | None, per_kind:
 
 
 def told(answer: Answer) -> str:
-    """The answer as people see it: why a language model gave none names the model, which they must not see."""
+    """The answer as people see it: why a language model gave none names the model, which they must not see.
+
+    Nor does the word that the map has instead, which is no part of the answer.
+    """
     is_without = answer.solver == "llm" and not answer.is_settled
-    return NO_ANSWER if is_without else answer.text
+    return NO_ANSWER if is_without else HINT.sub("", answer.text)
 
 
 class _Shown:

@@ -43,6 +43,10 @@ def chosen_of(run: FinishedRun, what: str, wanted: Sequence[str], known: tuple[s
     return tuple(dict.fromkeys(wanted)) or known
 
 
+class NoInstancesError(PredictionError):
+    """A map that is features alone."""
+
+
 class RunSource:
     """The maps of a run and the data that they were made from; other data are refused."""
 
@@ -66,6 +70,14 @@ class RunSource:
         other.methods = tuple(methods)
         return other
 
+    def has_instances(self, scene: str, method: str) -> bool:
+        """Whether the map of a scene has instances; features alone are no map that people could judge."""
+        try:
+            self.instances(scene, method)
+        except NoInstancesError:
+            return False
+        return True
+
     def _instances(self, scene: str, method: str) -> Instances:
         """The map of a scene; a ``PredictionError`` where it has no instances."""
         job = self.run.folder.job(scene, method)
@@ -76,7 +88,7 @@ class RunSource:
             )
         prediction = read_prediction(job.prediction)
         if not isinstance(prediction, Instances):
-            raise PredictionError(
+            raise NoInstancesError(
                 f"{printable(str(job.prediction), 200)}: holds no instances that people could judge; leave "
                 f"{printable(method, 80)} out with --methods"
             )

@@ -34,6 +34,7 @@ from su3d_bench.sheets.items import (
     write_sheet,
 )
 from su3d_bench.sheets.making.drafts import Draft
+from su3d_bench.sheets.making.guide import guide_of
 from su3d_bench.sheets.making.workbook import workbook_bytes
 from su3d_bench.store.atomic import is_file, make_folder, write_bytes, write_text
 
@@ -165,7 +166,7 @@ def write_sheets(made: MadeSheets, folder: Path, key_folder: Path) -> list[Path]
     _refuse_other_sheets(made.sheet.id, folder, key_folder, tables)
     for path in (folder, key_folder, folder / PICTURES):
         make_folder(path)
-    for name, content in made.pictures.items():
+    for name, content in sorted(made.pictures.items()):  # in the order of their numbers, which is drawn
         write_bytes(folder / PICTURES / name, content)
     written = []
     for share in made.sheet.annotators:
@@ -211,6 +212,7 @@ def page_data(made: MadeSheets, share: AnnotatorShare) -> dict[str, Any]:
         "id": made.sheet.id,
         "annotator": share.name,
         "columns": list(ANSWER_COLUMNS),
+        "guide": list(guide_of(made.sheet)),
         "asks": [asdict(ask) for ask in made.sheet.asks],
         "items": [
             {

@@ -11,6 +11,7 @@ from typing import Any
 
 from su3d_bench.core.errors import ModelMissing, printable
 from su3d_bench.sheets.items import AnnotatorShare, Sheet
+from su3d_bench.sheets.making.guide import GUIDE, guide_of
 from su3d_bench.store.atomic import ZIP_EPOCH
 
 # The columns of an answers file stand among these; what nobody needs to see is hidden.
@@ -37,7 +38,7 @@ def workbook_bytes(sheet: Sheet, share: AnnotatorShare, pictures: Mapping[str, b
     last = _write_rows(page, sheet, share, pictures)
     _write_head(page, title, last)
     _dress(page, last)
-    _write_guide(book.create_sheet("how to judge"), sheet, title)
+    _write_guide(book.create_sheet(GUIDE), sheet, title)
     buffer = io.BytesIO()
     book.save(buffer)
     return _without_time(buffer.getvalue())
@@ -149,11 +150,15 @@ def _dress(page: Any, last: int) -> None:
 
 
 def _write_guide(page: Any, sheet: Sheet, title: str) -> None:
-    """What each choice means."""
+    """What the pictures show, and what each choice means."""
     from openpyxl.styles import Alignment, Font
 
     text_cell(page, 1, 1, title).font = Font(name=FONT, bold=True, size=15)
     row = 2
+    for sentence in guide_of(sheet):
+        row += 1
+        text_cell(page, row, 1, sentence)
+    row += 1
     for ask in sheet.asks:
         row += 1
         text_cell(page, row, 1, ask.text).font = Font(name=FONT, bold=True)
