@@ -24,6 +24,7 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.truths import RefinedNames
 from su3d_bench.questions.files.files import figure_texts
 from su3d_bench.questions.model import new_question
+from su3d_bench.questions.reasoning.answers import Answer
 from su3d_bench.questions.reasoning.asking import built_in
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
 from su3d_bench.reports.pictures.colours import SCALES, scale_stops, similarity_colours
@@ -52,7 +53,7 @@ from su3d_bench.sheets.items import (
 )
 from su3d_bench.sheets.making import run_source
 from su3d_bench.sheets.making.blinding import without_ids
-from su3d_bench.sheets.making.drafts import annotation_drafts, reasoning_drafts, retrieval_drafts
+from su3d_bench.sheets.making.drafts import _in_turn, annotation_drafts, reasoning_drafts, retrieval_drafts, told
 from su3d_bench.sheets.making.drawing import Artist, SceneDrafts, _lost, draw_all, draw_scene
 from su3d_bench.sheets.making.run_source import RunSource
 from su3d_bench.sheets.making.sets import table_csv, write_sheets
@@ -481,3 +482,17 @@ def test_scenes_drawn_in_processes_give_the_pictures_in_order(source: RunSource,
     assert in_process == {0: drawn[0]}
     with pytest.raises(DataError, match="try --jobs 1"):
         _lost(unit, "died")
+
+
+def test_an_answer_hints_at_no_other_word_of_the_map() -> None:
+    text = "no: the map has no 'cabinet under tissue paper'; did you mean 'paperback'?"
+    assert told(Answer(text)) == "no: the map has no 'cabinet under tissue paper'"
+
+
+def test_methods_take_turns_in_sheets_of_labels_however_many_instances_each_has() -> None:
+    drafts = [replace(one, methods=("many",)) for one in drafts_of("annotation", TEXTS)]
+    drafts[3], drafts[5] = replace(drafts[3], methods=("few",)), replace(drafts[5], methods=("many", "few"))
+    order = np.random.default_rng(0).permutation(len(drafts)).tolist()
+    kept = _in_turn(drafts, ("few", "many"), order)
+    assert sorted(kept) == sorted(order) and {3, 5} <= set(kept[:4])
+    assert _in_turn(drafts_of("annotation", TEXTS), ("opensu3d@scheme1",), order) == order
