@@ -75,8 +75,8 @@ def asked_alike(source: RunSource, encoder: Encoder, kind: SheetKind, per_kind: 
     found: Drafts = {}
     for scene in source.scenes:
         of_scene: Drafts = {}
-        for method in source.methods:
-            for thing, draft in _of_method(source.of_methods((method,)), scene, encoder, kind, per_kind):
+        for thing, draft in _asked(source, scene, encoder, kind, per_kind):
+            for method in draft.methods:
                 of_scene.setdefault((scene, thing), {}).setdefault(method, draft)
         shared = [(thing, drafts) for thing, drafts in of_scene.items() if len(drafts) > 1]
         # What most methods show something for comes first; of equals the first asked.
@@ -85,25 +85,28 @@ def asked_alike(source: RunSource, encoder: Encoder, kind: SheetKind, per_kind: 
     return found
 
 
-def _of_method(
+def _asked(
     source: RunSource, scene: str, encoder: Encoder, kind: SheetKind, per_kind: int
 ) -> Iterable[tuple[str, Draft]]:
-    (method,) = source.methods
+    """The items of a scene, as sheets have them, and what each is of."""
     if kind == "retrieval":
-        if source.instances(scene, method).features is None:
-            return []
-        drafts = retrieval_drafts(source, scene, questions_of(source, scene, None, per_kind), encoder)
+        able = [method for method in source.methods if source.instances(scene, method).features is not None]
+        drafts = retrieval_drafts(source.of_methods(able), scene, questions_of(source, scene, None, per_kind), encoder)
         return [(draft.question_id, draft) for draft in drafts]
     if kind == "reasoning":
         drafts = reasoning_drafts(source, scene, None, per_kind, built_in(encoder))
         return [(draft.question_id, draft) for draft in drafts]
-    instances = source.instances(scene, method)
-    covered = source.covered(scene, source.rules(scene, kind), instances)
-    assert covered is not None
-    drafts = annotation_drafts(source, scene, len(instances), np.random.default_rng(0))
-    drafts.sort(key=lambda draft: -int(covered.n_shared[draft.rows[0]].max(initial=0)))
-    objects = [int(covered.main_object[draft.rows[0]]) for draft in drafts]
-    return [(str(number), draft) for number, draft in zip(objects, drafts, strict=True) if number > 0]
+    maps = {method: source.instances(scene, method) for method in source.methods}
+    rules = source.rules(scene, kind)
+    covered = {method: source.covered(scene, rules, instances) for method, instances in maps.items()}
+    found = []
+    for draft in annotation_drafts(source, scene, sum(map(len, maps.values())), np.random.default_rng(0)):
+        of_map = covered[draft.methods[0]]
+        assert of_map is not None
+        (row,) = draft.rows
+        found.append((int(of_map.n_shared[row].max(initial=0)), int(of_map.main_object[row]), draft))
+    found.sort(key=lambda one: -one[0])
+    return [(str(number), draft) for _, number, draft in found if number > 0]
 
 
 def untitled(parts: ItemParts) -> UInt8Array:
@@ -117,6 +120,7 @@ class Onlooker:
     def __init__(self, artist: Artist) -> None:
         self._artist = artist
         self._plain: dict[object, UInt8Array] = {}
+        self._corners: dict[int, int] = {}
 
     def without_answer(self, draft: Draft, parts: ItemParts) -> UInt8Array:
         """The picture as it would be were there no map: the same frame and corner, the same words above the views."""
@@ -160,9 +164,12 @@ class Onlooker:
 
     def _corner(self, draft: Draft, parts: ItemParts) -> int:
         """From which corner the room is seen."""
-        member = self._members(draft, draft.rows)
-        masks = [view.shows(member) for view in self._artist.room(draft.scene).corners]
-        return next(k for k, mask in enumerate(masks) if np.array_equal(mask, parts.room_view.mask))
+        if id(draft) not in self._corners:
+            member = self._members(draft, draft.rows)
+            masks = [view.shows(member) for view in self._artist.room(draft.scene).corners]
+            found = next(k for k, mask in enumerate(masks) if np.array_equal(mask, parts.room_view.mask))
+            self._corners[id(draft)] = found
+        return self._corners[id(draft)]
 
 
 def _holds(view: MapView, member: BoolArray) -> BoolArray:
@@ -186,11 +193,11 @@ def _put(zone: BoolArray, panel: Panel, mask: BoolArray, at: tuple[int, int], si
             start = (round(panel.eye[0] * inner[0]), round(panel.eye[1] * inner[1]))
             cv2.line(shown, start, middle, 1, 26)
             cv2.circle(shown, start, 9, 1, -1)
-    names = Image.fromarray(np.zeros((*shown.shape, 3), np.uint8))
-    draw_tags(ImageDraw.Draw(names), panel.tags[:MOST_TAGS], (0, 0), inner)
-    shown |= (np.asarray(names).max(axis=2) > 0).astype(np.uint8)
     x, y = at[0] + (size[0] - inner[0]) // 2, at[1] + CAPTION + (size[1] - inner[1]) // 2
     zone[y : y + inner[1], x : x + inner[0]] |= shown > 0
+    names = Image.fromarray(np.zeros((*zone.shape, 3), np.uint8))  # all of it, for their boxes reach over a border
+    draw_tags(ImageDraw.Draw(names), panel.tags[:MOST_TAGS], (x, y), inner)
+    zone |= np.asarray(names).max(axis=2) > 0
 
 
 def look_at(picture: UInt8Array, zone: BoolArray) -> Look:
@@ -271,11 +278,14 @@ def all_looks(
 ) -> Looks:
     """The looks of all drafts; ``check`` sees of each the picture, the one without a map, and the answer's zone."""
     looks: dict[Thing, dict[str, Look]] = {}
+    drawn: dict[int, Look] = {}  # an item of several methods is drawn once
     onlooker = Onlooker(artist)
     for thing, of_method in drafts.items():
         for method, draft in of_method.items():
-            parts = artist.parts(draft)
-            picture, zone = untitled(parts), onlooker.zone_of(draft, parts)
-            check(draft, picture, onlooker.without_answer(draft, parts), zone)
-            looks.setdefault(thing, {})[method] = look_at(picture, zone)
+            if id(draft) not in drawn:
+                parts = artist.parts(draft)
+                picture, zone = untitled(parts), onlooker.zone_of(draft, parts)
+                check(draft, picture, onlooker.without_answer(draft, parts), zone)
+                drawn[id(draft)] = look_at(picture, zone)
+            looks.setdefault(thing, {})[method] = drawn[id(draft)]
     return looks
