@@ -166,8 +166,10 @@ class Onlooker:
         """From which corner the room is seen."""
         if id(draft) not in self._corners:
             member = self._members(draft, draft.rows)
+            wanted = parts.room_view.mask
+            assert wanted is not None
             masks = [view.shows(member) for view in self._artist.room(draft.scene).corners]
-            found = next(k for k, mask in enumerate(masks) if np.array_equal(mask, parts.room_view.mask))
+            found = next(k for k, mask in enumerate(masks) if np.array_equal(mask, wanted))
             self._corners[id(draft)] = found
         return self._corners[id(draft)]
 
@@ -176,7 +178,10 @@ def _holds(view: MapView, member: BoolArray) -> BoolArray:
     """Which pixels (h, w) of a view have anything of ``member``, be it a quarter of one."""
     fine = np.append(member, False)[view.shown.point]
     height, width = (side // OVERSAMPLING for side in fine.shape)
-    return fine[: 2 * height, : 2 * width].reshape(height, OVERSAMPLING, width, OVERSAMPLING).any(axis=(1, 3))
+    held: BoolArray = (
+        fine[: 2 * height, : 2 * width].reshape(height, OVERSAMPLING, width, OVERSAMPLING).any(axis=(1, 3))
+    )
+    return held
 
 
 def _put(zone: BoolArray, panel: Panel, mask: BoolArray, at: tuple[int, int], size: tuple[int, int]) -> None:
@@ -184,7 +189,7 @@ def _put(zone: BoolArray, panel: Panel, mask: BoolArray, at: tuple[int, int], si
     height, width = panel.picture.shape[:2]
     scale = min(size[0] / width, size[1] / height)
     inner = max(1, round(width * scale)), max(1, round(height * scale))
-    shown = (cv2.resize(mask.astype(np.float32), inner, interpolation=cv2.INTER_LINEAR) > 0).astype(np.uint8)
+    shown: Any = (cv2.resize(mask.astype(np.float32), inner, interpolation=cv2.INTER_LINEAR) > 0).astype(np.uint8)
     shown = cv2.dilate(shown, np.ones((2 * LINE + 1, 2 * LINE + 1), np.uint8))
     if panel.ring is not None:
         middle = (round(panel.ring[0] * inner[0]), round(panel.ring[1] * inner[1]))
@@ -205,7 +210,7 @@ def look_at(picture: UInt8Array, zone: BoolArray) -> Look:
     size = picture.shape[1] // SMALLER, picture.shape[0] // SMALLER
     cut = tuple(slice(SMALLER * side) for side in size[::-1])
     small: Any = cv2.resize(picture[cut], size, interpolation=cv2.INTER_AREA)
-    blocks = zone[cut].reshape(size[1], SMALLER, size[0], SMALLER)
+    blocks: Any = zone[cut].reshape(size[1], SMALLER, size[0], SMALLER)
     return Look(small, blocks.any(axis=(1, 3)))
 
 
@@ -237,7 +242,7 @@ def p_of_telling(pairs: Sequence[tuple[str, Look, Look]]) -> float | None:
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
 
-    shown = [(scene, *(features_of(look, a.zone | b.zone) for look in (a, b))) for scene, a, b in pairs]
+    shown = [(scene, features_of(a, a.zone | b.zone), features_of(b, a.zone | b.zone)) for scene, a, b in pairs]
     scenes, found = sorted({scene for scene, *_ in shown}), []
     for held_out in scenes:
         train = [(a, b) for scene, a, b in shown if scene != held_out]
