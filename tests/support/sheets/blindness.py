@@ -181,7 +181,7 @@ def _holds(view: MapView, member: BoolArray) -> BoolArray:
     held: BoolArray = (
         fine[: 2 * height, : 2 * width].reshape(height, OVERSAMPLING, width, OVERSAMPLING).any(axis=(1, 3))
     )
-    return held
+    return np.asarray(held, np.bool_)
 
 
 def _put(zone: BoolArray, panel: Panel, mask: BoolArray, at: tuple[int, int], size: tuple[int, int]) -> None:
