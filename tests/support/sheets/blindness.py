@@ -178,9 +178,7 @@ def _holds(view: MapView, member: BoolArray) -> BoolArray:
     """Which pixels (h, w) of a view have anything of ``member``, be it a quarter of one."""
     fine = np.append(member, False)[view.shown.point]
     height, width = (side // OVERSAMPLING for side in fine.shape)
-    held: BoolArray = (
-        fine[: 2 * height, : 2 * width].reshape(height, OVERSAMPLING, width, OVERSAMPLING).any(axis=(1, 3))
-    )
+    held: Any = fine[: 2 * height, : 2 * width].reshape(height, OVERSAMPLING, width, OVERSAMPLING).any(axis=(1, 3))
     return np.asarray(held, np.bool_)
 
 
