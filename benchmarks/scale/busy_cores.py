@@ -36,7 +36,7 @@ COMMAND = """
 import json, sys
 from contextlib import contextmanager
 from su3d_bench.cli import main
-from su3d_bench.cli import common as progress
+from su3d_bench.cli.shared import bars as progress
 @contextmanager
 def lines(*_, **__):
     yield lambda one: print(json.dumps([one.unit, one.label, one.done, one.total]), file=sys.stderr, flush=True)

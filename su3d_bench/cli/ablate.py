@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from su3d_bench.cli.common import add_verb, remark
 from su3d_bench.cli.run import add_run_flags, carry_out, plan_of, show_plan
+from su3d_bench.cli.shared.answers import remark
+from su3d_bench.cli.shared.flags import add_verb
 from su3d_bench.core.errors import EXIT_DONE
 
 

@@ -6,21 +6,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import (
-    add_language_flags,
-    add_verb,
-    add_whose_map,
-    answer,
-    answer_estimate,
-    answer_json,
-    answer_nothing_to_pay,
-    chat_client,
-    check_scene_first,
-    file_name_of,
-    remark,
-    remark_unseen,
-    show,
-)
+from su3d_bench.cli.shared.answers import answer, answer_json, file_name_of, remark, remark_unseen, show
+from su3d_bench.cli.shared.flags import add_verb, add_whose_map, check_scene_first
+from su3d_bench.cli.shared.language import add_language_flags, answer_estimate, answer_nothing_to_pay, chat_client
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, StoreError
 
 if TYPE_CHECKING:

@@ -8,7 +8,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_group, add_verb, answer_either, remark
+from su3d_bench.cli.shared.answers import answer_either, remark
+from su3d_bench.cli.shared.flags import add_group, add_verb
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, counted, shown
 
 if TYPE_CHECKING:

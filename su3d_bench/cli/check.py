@@ -7,15 +7,8 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import (
-    add_verb,
-    answer_commands,
-    answer_document,
-    answer_either,
-    answer_json,
-    remark,
-    written,
-)
+from su3d_bench.cli.shared.answers import answer_commands, answer_document, answer_either, answer_json, remark, written
+from su3d_bench.cli.shared.flags import add_verb
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:

@@ -8,7 +8,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from su3d_bench.cli.common import add_verb, answer_either
+from su3d_bench.cli.shared.answers import answer_either
+from su3d_bench.cli.shared.flags import add_verb
 from su3d_bench.core.errors import EXIT_DONE
 
 SHELLS = ("bash", "zsh", "fish")

@@ -8,7 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_protocols, add_table_format, add_verb, answer_tables, remark
+from su3d_bench.cli.shared.answers import answer_tables, remark
+from su3d_bench.cli.shared.flags import add_protocols, add_table_format, add_verb
 from su3d_bench.core.errors import EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:

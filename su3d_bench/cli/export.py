@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, answer, answer_json, remark
+from su3d_bench.cli.shared.answers import answer, answer_json, remark
+from su3d_bench.cli.shared.flags import add_verb
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, counted, printable, suggest
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from importlib import import_module
 from pathlib import Path
 
 from su3d_bench import __version__
-from su3d_bench.cli.common import remark
 from su3d_bench.cli.parser import Parser
+from su3d_bench.cli.shared.answers import remark
 from su3d_bench.core.errors import (
     EXIT_DONE,
     EXIT_INTERNAL,

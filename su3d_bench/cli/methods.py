@@ -9,7 +9,8 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, answer, answer_document, answer_either, answer_json
+from su3d_bench.cli.shared.answers import answer, answer_document, answer_either, answer_json
+from su3d_bench.cli.shared.flags import add_verb
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, counted
 from su3d_bench.core.printing import one_line
 

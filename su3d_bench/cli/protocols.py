@@ -8,7 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_table_format, add_verb, answer_either, answer_tables, progress, remark, show
+from su3d_bench.cli.shared.answers import answer_either, answer_tables, remark, show
+from su3d_bench.cli.shared.bars import progress
+from su3d_bench.cli.shared.flags import add_table_format, add_verb
 from su3d_bench.cli.texts import add_queries
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, suggest
 

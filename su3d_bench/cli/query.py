@@ -6,17 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import (
-    add_verb,
-    add_whose_map,
-    answer,
-    answer_json,
-    check_scene_first,
-    file_name_of,
-    remark,
-    remark_unseen,
-    show,
-)
+from su3d_bench.cli.shared.answers import answer, answer_json, file_name_of, remark, remark_unseen, show
+from su3d_bench.cli.shared.flags import add_verb, add_whose_map, check_scene_first
 from su3d_bench.core.errors import ConfigError, PredictionError
 
 if TYPE_CHECKING:

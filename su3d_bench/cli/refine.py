@@ -8,16 +8,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import (
-    add_language_flags,
-    add_verb,
-    answer,
-    answer_estimate,
-    answer_json,
-    answer_nothing_to_pay,
-    chat_client,
-    remark,
-)
+from su3d_bench.cli.shared.answers import answer, answer_json, remark
+from su3d_bench.cli.shared.flags import add_verb
+from su3d_bench.cli.shared.language import add_language_flags, answer_estimate, answer_nothing_to_pay, chat_client
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, StoreError, counted, suggest
 
 if TYPE_CHECKING:

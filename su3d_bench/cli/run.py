@@ -7,16 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import (
-    add_settings,
-    add_table_format,
-    add_verb,
-    answer,
-    answer_document,
-    answer_json,
-    formatted,
-    remark,
-)
+from su3d_bench.cli.shared.answers import answer, answer_document, answer_json, formatted, remark
+from su3d_bench.cli.shared.flags import add_settings, add_table_format, add_verb
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE, counted
 
 if TYPE_CHECKING:
@@ -154,7 +146,7 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
 
 
 def carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
-    from su3d_bench.cli.common import progress
+    from su3d_bench.cli.shared.bars import progress
     from su3d_bench.runs.planning.scenes import cache_root
     from su3d_bench.runs.runner import run_plan
     from su3d_bench.store.caches import why_large, why_slow

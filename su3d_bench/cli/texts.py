@@ -7,7 +7,8 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_group, add_settings, add_verb, answer_either, remark
+from su3d_bench.cli.shared.answers import answer_either, remark
+from su3d_bench.cli.shared.flags import add_group, add_settings, add_verb
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, shown, suggest
 
 SUFFIX = ".npz"

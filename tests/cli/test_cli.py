@@ -14,8 +14,8 @@ from fuzz_words import verbs as every_verb
 from painted import colour_perception
 from places import SCENES
 
-from su3d_bench.cli.common import file_name_of, file_name_of_scene
 from su3d_bench.cli.main import EXIT_INTERRUPTED, build_parser, main
+from su3d_bench.cli.shared.answers import file_name_of, file_name_of_scene
 from su3d_bench.core.errors import EXIT_INTERNAL
 from su3d_bench.reports.pictures import maps
 from su3d_bench.reports.tables.formats import FORMATS

@@ -10,9 +10,10 @@ from typing import Any
 import pytest
 from fuzz_words import verbs
 
-from su3d_bench.cli.common import add_verb, answer_either
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.cli.parser import OTHER_SPELLING, SPELLINGS, Parser
+from su3d_bench.cli.shared.answers import answer_either
+from su3d_bench.cli.shared.flags import add_verb
 from su3d_bench.core.errors import ConfigError
 
 EVERY = [pytest.param(parser, id=" ".join(words)) for words, parser in verbs()]

@@ -9,7 +9,8 @@ from dataclasses import asdict
 from itertools import groupby
 from typing import Any
 
-from su3d_bench.cli.common import answer, answer_either, progress, remark
+from su3d_bench.cli.shared.answers import answer, answer_either, remark
+from su3d_bench.cli.shared.bars import progress
 from su3d_bench.core import registry
 from su3d_bench.core.config import read_assignments
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable, printable_json

@@ -9,7 +9,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_group, add_settings, add_verb, answer_either
+from su3d_bench.cli.shared.answers import answer_either
+from su3d_bench.cli.shared.flags import add_group, add_settings, add_verb
 from su3d_bench.core.errors import EXIT_DONE
 
 LAYOUTS = ("native", "replica", "scannet", "scannet-python", "scannet-cpp", "tum")

@@ -12,7 +12,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NoReturn
 
-from su3d_bench.cli.common import answer_either, drawn_bars, remark
+from su3d_bench.cli.shared.answers import answer_either, remark
+from su3d_bench.cli.shared.bars import drawn_bars
 from su3d_bench.core import registry
 from su3d_bench.core.config import read_assignments
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, nearest

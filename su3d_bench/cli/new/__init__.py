@@ -7,7 +7,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_verb, answer_either
+from su3d_bench.cli.shared.answers import answer_either
+from su3d_bench.cli.shared.flags import add_verb
 from su3d_bench.core.errors import EXIT_DONE, ConfigError
 
 SUFFIX = {"method": ".py", "dataset": ".py", "protocol": ".toml"}
@@ -32,7 +33,7 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.cli.common import written
+    from su3d_bench.cli.shared.answers import written
     from su3d_bench.core.system.files import file_text
 
     what, file = arguments.what, arguments.file

@@ -5,7 +5,6 @@ from __future__ import annotations
 from types import ModuleType
 from typing import Any
 
-from su3d_bench.cli.common import add_modules
 from su3d_bench.cli.report import html as report_html
 from su3d_bench.cli.report import leaderboard as report_leaderboard
 from su3d_bench.cli.report import rerun as report_rerun
@@ -13,6 +12,7 @@ from su3d_bench.cli.report import samples as report_samples
 from su3d_bench.cli.report import tables as report_tables
 from su3d_bench.cli.report import timing as report_timing
 from su3d_bench.cli.report import verify as report_verify
+from su3d_bench.cli.shared.flags import add_modules
 
 # Modules with ``NAME`` and ``add_parser(actions)``, imported for --help too, so with nothing heavy at their top.
 SUB_VERBS: tuple[ModuleType, ...] = (

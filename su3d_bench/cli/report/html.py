@@ -8,7 +8,9 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, answer_either, drawn_bars, remark, written
+from su3d_bench.cli.shared.answers import answer_either, remark, written
+from su3d_bench.cli.shared.bars import drawn_bars
+from su3d_bench.cli.shared.flags import add_verb
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, counted, printable
 
 if TYPE_CHECKING:

@@ -8,7 +8,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_verb, answer_either, progress, remark
+from su3d_bench.cli.shared.answers import answer_either, remark
+from su3d_bench.cli.shared.bars import progress
+from su3d_bench.cli.shared.flags import add_verb
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, counted, printable
 
 NAME = "rerun"

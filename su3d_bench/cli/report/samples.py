@@ -7,17 +7,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import (
-    add_protocols,
-    add_table_format,
-    add_verb,
-    answer,
-    answer_document,
-    answer_json,
-    answer_tables,
-    progress,
-    remark,
-)
+from su3d_bench.cli.shared.answers import answer, answer_document, answer_json, answer_tables, remark
+from su3d_bench.cli.shared.bars import progress
+from su3d_bench.cli.shared.flags import add_protocols, add_table_format, add_verb
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, counted
 
 NAME = "samples"

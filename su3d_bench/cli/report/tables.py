@@ -7,7 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_table_format, add_verb, answer_or_write
+from su3d_bench.cli.shared.answers import answer_or_write
+from su3d_bench.cli.shared.flags import add_table_format, add_verb
 from su3d_bench.core.errors import EXIT_DONE
 
 if TYPE_CHECKING:

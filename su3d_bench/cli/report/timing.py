@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_table_format, add_verb, answer_tables, remark, show
+from su3d_bench.cli.shared.answers import answer_tables, remark, show
+from su3d_bench.cli.shared.flags import add_table_format, add_verb
 
 if TYPE_CHECKING:
     from su3d_bench.metrics.costs import UpdateTimes

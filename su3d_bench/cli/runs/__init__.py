@@ -5,10 +5,10 @@ from __future__ import annotations
 from types import ModuleType
 from typing import Any
 
-from su3d_bench.cli.common import add_modules
 from su3d_bench.cli.runs import list as runs_list
 from su3d_bench.cli.runs import remove as runs_remove
 from su3d_bench.cli.runs import show as runs_show
+from su3d_bench.cli.shared.flags import add_modules
 
 # Modules with ``NAME`` and ``add_parser(actions)``, imported for --help too, so with nothing heavy at their top.
 SUB_VERBS: tuple[ModuleType, ...] = (runs_list, runs_show, runs_remove)

@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_table_format, add_verb, answer_tables, remark
+from su3d_bench.cli.shared.answers import answer_tables, remark
+from su3d_bench.cli.shared.flags import add_table_format, add_verb
 from su3d_bench.core.errors import EXIT_DONE, ConfigError
 
 NAME = "list"

@@ -7,7 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_verb, answer_either
+from su3d_bench.cli.shared.answers import answer_either
+from su3d_bench.cli.shared.flags import add_verb
 from su3d_bench.core.errors import EXIT_DONE, ConfigError
 
 NAME = "remove"
@@ -46,7 +47,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 def _is_agreed(lines: list[str]) -> bool:
     """Whether whoever sits at the terminal wants the runs of ``lines`` gone."""
-    from su3d_bench.cli.common import remark
+    from su3d_bench.cli.shared.answers import remark
 
     if not sys.stdin.isatty():
         raise ConfigError("runs remove: nobody is there to be asked; add --yes to remove without a question")

@@ -9,7 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_verb, answer_either
+from su3d_bench.cli.shared.answers import answer_either
+from su3d_bench.cli.shared.flags import add_verb
 from su3d_bench.core.errors import EXIT_DONE
 
 NAME = "show"

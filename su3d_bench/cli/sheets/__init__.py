@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import ModuleType
 from typing import Any
 
-from su3d_bench.cli.common import add_modules
+from su3d_bench.cli.shared.flags import add_modules
 from su3d_bench.cli.sheets import make as sheets_make
 from su3d_bench.cli.sheets import pictures as sheets_pictures
 from su3d_bench.cli.sheets import score as sheets_score

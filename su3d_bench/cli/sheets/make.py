@@ -7,15 +7,9 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from su3d_bench.cli.common import (
-    add_language_flags,
-    add_verb,
-    answer,
-    answer_estimate,
-    answer_json,
-    chat_client,
-    remark,
-)
+from su3d_bench.cli.shared.answers import answer, answer_json, remark
+from su3d_bench.cli.shared.flags import add_verb
+from su3d_bench.cli.shared.language import add_language_flags, answer_estimate, chat_client
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, counted
 
 if TYPE_CHECKING:
@@ -313,7 +307,7 @@ def _drawn(
     source: PictureSource, name: str, drafts: Mapping[SheetKind, Sequence[Draft]], arguments: argparse.Namespace
 ) -> dict[SheetKind, list[bytes]]:
     """The pictures of all drafts."""
-    from su3d_bench.cli.common import progress
+    from su3d_bench.cli.shared.bars import progress
     from su3d_bench.runs.executors.local import Event
     from su3d_bench.sheets.making.drawing import draw_all
 

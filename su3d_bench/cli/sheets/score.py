@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_table_format, add_verb, answer_json, answer_tables, remark, written
+from su3d_bench.cli.shared.answers import answer_json, answer_tables, remark, written
+from su3d_bench.cli.shared.flags import add_table_format, add_verb
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, counted
 
 if TYPE_CHECKING:
