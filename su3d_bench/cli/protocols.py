@@ -27,7 +27,7 @@ def add_parser(verbs: Any) -> None:
         "List the protocols; 'show NAME' prints every rule of one, 'diff A B' the rules in which two differ.",
         (
             "su3d-bench protocols show rooms-semantic --names",
-            "su3d-bench protocols diff rooms-semantic replica-mesh-ex6 --prediction runs/my-run:opensu3d",
+            "su3d-bench protocols diff rooms-semantic replica-mesh-ex6",
         ),
         call,
     )

@@ -217,7 +217,7 @@ def test_text_truth_makes_a_run_whose_errors_are_told_and_whose_verbs_say_what_i
     query = answered(capsys, "query", "scannet/scene0001_00", "chair", "--run", "runs/mine", "--method", "mine", code=2)
     assert "is over the points of ground-truth files, which have no coordinates" in query
     sheets = answered(capsys, "sheets", "make", "runs/mine", "--kind", "annotation", "--out", "sheets", code=2)
-    assert sheets.count("\n") == 1 and "gt" in sheets
+    assert sheets.count("\n") == 1 and "is over the points of ground-truth files" in sheets
     answered(capsys, "export", "runs/mine", "--to", "scannet", "--out", "exported")
     assert main([*TEXTS[:1], "exported", *TEXTS[2:-2], "--json", "again.json", "--quiet"]) == 0
     again = json.loads(Path("again.json").read_text())["protocols"]["scannet-instance"]["metrics"]

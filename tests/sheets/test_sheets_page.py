@@ -191,5 +191,6 @@ def test_the_picture_is_enlarged_by_keyboard(tmp_path: Path, browser: Chromium) 
     browser.run("document.getElementById('image').focus()")
     browser.press("Enter")
     assert browser.run(large) == "false"
+    browser.run("document.getElementById('image').blur()")  # where it is focused the arrows scroll it
     browser.press("z", "ArrowRight")
     assert browser.run(large) == "false" and browser.faults() == []

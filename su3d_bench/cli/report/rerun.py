@@ -37,7 +37,7 @@ def add_parser(actions: Any) -> None:
         metavar="N",
         help="every Nth of the frames that the methods were given (default: at most 60 of a scene)",
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE.rrd", help="the file, read by rerun's viewer")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the .rrd file, read by rerun's viewer")
 
 
 def call(arguments: argparse.Namespace) -> int:
