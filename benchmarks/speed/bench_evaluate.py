@@ -29,9 +29,8 @@ from su3d_bench.metrics.instance.average_precision import (
     InstanceAP,
     InstanceCounts,
     combine,
-    count_class,
-    per_scene,
 )
+from su3d_bench.metrics.instance.scene_counts import count_class, per_scene
 from su3d_bench.metrics.protocols.loading import load_protocol
 
 N_SCENES, N_POINTS, N_MASKS, N_INSTANCES = 8, 200_000, 150, 90

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from su3d_bench.metrics.instance.average_precision import per_scene
+from su3d_bench.metrics.instance.scene_counts import per_scene
 
 N_POINTS, N_PREDICTIONS, N_CLASSES, N_INSTANCES = 200_000, 150, 20, 80  # a furnished room of Replica
 CLASS_IDS = tuple(range(1, N_CLASSES + 1))

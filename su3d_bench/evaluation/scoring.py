@@ -24,6 +24,7 @@ from su3d_bench.metrics.fitness import (
     why_not_numbers,
 )
 from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.score import (
     OBJECT,
     encode_without_classes,
@@ -264,7 +265,7 @@ def _semantic_score(rules: ProtocolRules, labels: Int64Array, class_ids: np.ndar
 def _instance_score(
     rules: ProtocolRules, values: Int64Array, masks: Masks, scores: Float64Array, ids: Int64Array
 ) -> SceneScore:
-    _, distinct, n_points = instance_ap.segments_of(values)
+    _, distinct, n_points = scene_counts.segments_of(values)
     n_scored = int(n_points[np.isin(distinct // instance_ap.INSTANCES_PER_CLASS, _class_ids(rules))].sum())
     return _score(rules, _instance_counts(rules, values, masks, scores, ids), len(masks), n_scored)
 
@@ -275,7 +276,7 @@ def _instance_counts(
     """The counts of masks with class ids (K,), or without any of each mask under every class."""
     assert rules.min_region_size is not None
     used = np.ones(len(masks)) if rules.confidence == "ones" else scores
-    return instance_ap.per_scene(
+    return scene_counts.per_scene(
         values,
         masks.indptr,
         masks.indices,
@@ -318,7 +319,7 @@ def _ids_of_masks(
 
 def _instance_ceiling(rules: ProtocolRules, truth: VertexTruth, values: Int64Array) -> SceneScore:
     """What the annotated objects themselves score."""
-    row, distinct, _ = instance_ap.segments_of(truth.values)
+    row, distinct, _ = scene_counts.segments_of(truth.values)
     is_object = distinct >= instance_ap.INSTANCES_PER_CLASS
     n_void = int((~is_object).sum())
     masks = transfer.masks_of_partition(row - n_void, len(distinct) - n_void)

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import metric_of
 from su3d_bench.metrics.semantic import confusion as semantic
@@ -79,7 +80,7 @@ def test_values_over_drawn_scenes_are_those_of_the_scenes_together() -> None:
         indptr = np.concatenate([[0], np.cumsum([len(mask) for mask in masks])])
         labels, scores = rng.choice(ids, 10), rng.integers(1, 4, 10) / 4
         scored = [entry.id for entry in rules.scored]
-        counts.append(instance_ap.per_scene(truth, indptr, np.concatenate(masks), labels, scores, scored))
+        counts.append(scene_counts.per_scene(truth, indptr, np.concatenate(masks), labels, scores, scored))
     weights = np.concatenate(
         [np.ones((1, 4), np.int64), np.eye(4, dtype=np.int64), rng.multinomial(4, [0.25] * 4, size=6)]
     )

@@ -23,9 +23,9 @@ from su3d_bench.metrics.instance.average_precision import (
     concatenate,
     encode_ground_truth,
     last_line_of_each_mask_file,
-    per_scene,
 )
 from su3d_bench.metrics.instance.precision_recall import dots
+from su3d_bench.metrics.instance.scene_counts import per_scene
 from su3d_bench.metrics.instance.score import NO_OBJECT, covered_objects
 from su3d_bench.metrics.protocols.loading import load_protocol
 

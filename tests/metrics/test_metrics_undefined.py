@@ -12,7 +12,7 @@ import pytest
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array, Int64Array
-from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.instance.resampling import resampled_ap
 from su3d_bench.metrics.metric import Arrays, Counts, SceneScore, Values, present, scene_mean
@@ -57,7 +57,9 @@ def masks(*classes: tuple[int, bool]) -> InstanceCounts:
     indices = np.concatenate([np.arange(0), *(np.arange(100 * k, 100 * k + 100) for k in found)])
     labels = np.array([ids[k] for k in found], np.int64)
     every_id = [entry.id for entry in INSTANCE.scored]
-    return instance_ap.per_scene(truth, np.arange(len(found) + 1) * 100, indices, labels, np.ones(len(found)), every_id)
+    return scene_counts.per_scene(
+        truth, np.arange(len(found) + 1) * 100, indices, labels, np.ones(len(found)), every_id
+    )
 
 
 # ---- means

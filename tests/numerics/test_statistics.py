@@ -12,7 +12,7 @@ import scipy.stats
 import su3d_bench.numerics.statistics
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.instance import resampling
+from su3d_bench.metrics.instance import resampling, scene_counts
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.numerics.statistics import (
     DIFFERENCE,
@@ -172,7 +172,7 @@ def random_scene(rng: np.random.Generator) -> instance_ap.InstanceCounts:
         masks.append(np.arange(start, start + rng.integers(100, 200)))
     indptr = np.concatenate([[0], np.cumsum([len(m) for m in masks])])
     labels, scores = rng.integers(1, 4, len(masks)), rng.integers(1, 6, len(masks)) / 5
-    return instance_ap.per_scene(truth, indptr, np.concatenate(masks), labels, scores, [1, 2, 3])
+    return scene_counts.per_scene(truth, indptr, np.concatenate(masks), labels, scores, [1, 2, 3])
 
 
 def test_the_counts_of_a_class_alone_are_its_rows_as_the_first_class() -> None:

@@ -51,7 +51,7 @@ from su3d_bench.metrics.attribution.overlaps import (
     measure_overlaps,
     true_instances,
 )
-from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 
 __all__ = [
@@ -80,10 +80,11 @@ class Mended:
 def mend_scene(truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules) -> Mended:
     """The counts of one scene with its errors mended; ``truth`` (N,) is label * 1000 + instance, 0 where void.
 
+    >>> from su3d_bench.metrics.instance.average_precision import combine
     >>> truth = np.repeat([3001, 3002], 200)
     >>> both = LabelledMasks(Masks.of_sets([np.arange(400)]), np.array([3]), np.ones(1))
     >>> mended = mend_scene(truth, both, ScoringRules((3,)))
-    >>> [instance_ap.combine([counts]).ap50 for counts in (mended.as_is, mended.alone["merged"], mended.all)]
+    >>> [combine([counts]).ap50 for counts in (mended.as_is, mended.alone["merged"], mended.all)]
     [0.0, 1.0, 1.0]
     >>> mended.n["merged"], mended.n["missed"]
     (1, 0)
@@ -118,7 +119,7 @@ def with_true_labels(overlaps: Overlaps) -> LabelledMasks:
 
 def count_masks(truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules) -> InstanceCounts:
     """The additive counts of one scene, as the evaluator has them."""
-    return instance_ap.per_scene(
+    return scene_counts.per_scene(
         truth,
         predicted.masks.indptr,
         predicted.masks.indices,

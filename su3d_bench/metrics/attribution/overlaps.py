@@ -10,6 +10,7 @@ import numpy as np
 from su3d_bench.core.maps import Masks
 from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array
 from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
 
 HALF = 0.5  # of a mask or an instance; also the IoU above which a mask can match one instance only
@@ -149,7 +150,7 @@ class TrueInstances:
 
 def true_instances(truth: Int64Array, rules: ScoringRules) -> TrueInstances:
     """The instances of one scene; ``truth`` (N,) is label * 1000 + instance, 0 where void."""
-    segment_of_point, values, sizes = instance_ap.segments_of(truth)
+    segment_of_point, values, sizes = scene_counts.segments_of(truth)
     is_instance = np.isin(values // INSTANCES_PER_CLASS, rules.class_ids) & (sizes >= rules.min_region_size)
     order = np.argsort(segment_of_point, kind="stable").astype(np.int32)
     starts = np.concatenate([[0], np.cumsum(sizes)])
@@ -166,7 +167,7 @@ def measure_overlaps(instances: TrueInstances, predicted: LabelledMasks, rules: 
     """The overlaps of the masks of one scene with the instances that are there."""
     masks, size = predicted.masks, predicted.masks.sizes
     n_segments, every = len(instances.is_instance), np.arange(len(size))
-    shared = instance_ap.intersections(instances.segment_of_point, n_segments, masks.indptr, masks.indices, every)
+    shared = scene_counts.intersections(instances.segment_of_point, n_segments, masks.indptr, masks.indices, every)
     n_ignored = shared[:, ~instances.is_instance].sum(axis=1)
     shared = shared[:, instances.is_instance]
     size_of_instance, class_of_instance = instances.size[None, :], instances.class_of_instance

@@ -21,6 +21,7 @@ from su3d_bench.metrics.attribution.masks import MaskError, find_errors, repaire
 from su3d_bench.metrics.attribution.overlaps import LabelledMasks, Overlaps, ScoringRules
 from su3d_bench.metrics.attribution.points import CAUSES, LabelledPoints, causes_of
 from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.metric import C, Metric, Values
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
@@ -98,9 +99,9 @@ class _MendedClasses:
 
     def __init__(self, truth: Int64Array, overlaps: Overlaps, rules: ScoringRules) -> None:
         self._overlaps, self._rules = overlaps, rules
-        self._segment_of_point, self._value, self._size = instance_ap.segments_of(truth)
+        self._segment_of_point, self._value, self._size = scene_counts.segments_of(truth)
         masks = overlaps.predicted.masks
-        self._shared = instance_ap.intersections(
+        self._shared = scene_counts.intersections(
             self._segment_of_point, len(self._value), masks.indptr, masks.indices, np.arange(len(masks))
         )
 
@@ -130,7 +131,7 @@ class _MendedClasses:
         answer = {}
         for index in (index for index, class_id in enumerate(rules.class_ids) if class_id in moved):
             rows = np.flatnonzero(is_large & (mended.class_ids == rules.class_ids[index]))
-            one = instance_ap.overlaps_of_class(
+            one = scene_counts.overlaps_of_class(
                 rules.class_ids[index], rows, shared[rows], size[rows], self._value, self._size, rules.class_ids,
                 rules.min_region_size,
             )  # fmt: skip

@@ -9,7 +9,7 @@ import numpy as np
 
 from su3d_bench.core.maps import Masks
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
-from su3d_bench.metrics.instance.average_precision import class_overlaps, met_instances
+from su3d_bench.metrics.instance.scene_counts import class_overlaps, met_instances
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ def hits(
     min_region_size: int,
     thresholds: Sequence[float],
 ) -> list[Hits]:
-    """The hits at each of ``thresholds``; the arrays are those of ``average_precision.per_scene``.
+    """The hits at each of ``thresholds``; the arrays are those of ``scene_counts.per_scene``.
 
     >>> truth, masks = np.repeat([3001, 3002], 200), Masks.of_sets([np.arange(120), np.arange(200), np.arange(90)])
     >>> at_50, at_25 = hits(truth, masks, np.array([3, 3, 3]), np.array([0.5, 0.9, 1.0]), [3], 100, (0.5, 0.25))

@@ -23,7 +23,7 @@ def resampled_ap(
 ) -> dict[str, Float64Array]:
     """AP, AP50 and AP25 (R,) of the scenes drawn ``weights`` (R, S) times, equal to ``combine`` up to rounding.
 
-    >>> from su3d_bench.metrics.instance.average_precision import per_scene
+    >>> from su3d_bench.metrics.instance.scene_counts import per_scene
     >>> hit = per_scene(np.full(120, 7004), np.array([0, 120]), np.arange(120), np.array([7]), np.ones(1), [7])
     >>> miss = per_scene(np.full(120, 7009), np.array([0]), np.arange(0), np.zeros(0, int), np.ones(0), [7])
     >>> resampled_ap([hit, miss], np.array([[2, 0], [1, 1], [0, 2]]))["AP"].tolist()

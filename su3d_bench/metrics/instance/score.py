@@ -14,6 +14,7 @@ from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Masks, Partition
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array
 from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.average_precision import InstanceAP, InstanceCounts
 from su3d_bench.metrics.instance.resampling import resampled_ap
 from su3d_bench.metrics.matching import nearest as transfer
@@ -105,7 +106,7 @@ class InstanceMetric(CurveMetric):
         if truth.evaluation_points is not None:
             raise DataError(f"{rules.name}: the truth '{truth.variant}' has no instances on its evaluation points")
         scored = masks_on_truth(rules, truth, prediction, encoder)
-        counts = instance_ap.per_scene(
+        counts = scene_counts.per_scene(
             scored.values,
             scored.masks.indptr,
             scored.masks.indices,
@@ -271,6 +272,6 @@ def covered_objects(rules: TransferRules, truth: GroundTruth, prediction: Instan
     masks = transfer.masks_of(prediction)
     moved = transfer.transfer_masks(prediction.points, masks, truth.points, rules.cap_m, rules.evaluation_voxel_m)
     ids, column = np.unique(np.maximum(truth.instance, 0), return_inverse=True)
-    shared = instance_ap.intersections(column, len(ids), moved.indptr, moved.indices, np.arange(len(masks)))
+    shared = scene_counts.intersections(column, len(ids), moved.indptr, moved.indices, np.arange(len(masks)))
     is_object = ids > 0
     return Covered(ids[is_object].astype(np.int64), shared[:, is_object])

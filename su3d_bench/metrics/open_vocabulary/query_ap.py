@@ -15,6 +15,7 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.maps import Masks
 from su3d_bench.core.types import Float32Array, Float64Array, Int64Array
 from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 
 SPACE = "queries"
@@ -97,7 +98,7 @@ def per_scene(
     ids, segment_of_point, size_of_object = np.unique(object_of_point, return_inverse=True, return_counts=True)
     n_masks = len(masks)
     size = masks.sizes
-    shared = instance_ap.intersections(segment_of_point, len(ids), masks.indptr, masks.indices, np.arange(n_masks))
+    shared = scene_counts.intersections(segment_of_point, len(ids), masks.indptr, masks.indices, np.arange(n_masks))
     iou = shared / (size_of_object[None, :] + size[:, None] - shared)
     column_of = {int(object_id): column for column, object_id in enumerate(ids) if object_id >= 0}
     order = np.argsort(-confidence, axis=0, kind="stable")[:top_k]
@@ -106,7 +107,7 @@ def per_scene(
         columns = [column_of[object_id] for object_id in query.object_ids if object_id in column_of]
         takes_part = size_of_object[columns] >= min_region_size
         rows = order[size[order[:, q]] >= min_region_size, q]
-        of_query = instance_ap.count_class(
+        of_query = scene_counts.count_class(
             0,
             iou=iou[np.ix_(rows, np.array(columns, np.int64)[takes_part])],
             takes_part=np.ones(int(takes_part.sum()), bool),
@@ -120,4 +121,4 @@ def per_scene(
 
 def _no_counts(thresholds: Sequence[float]) -> InstanceCounts:
     none = np.zeros(0)
-    return instance_ap.count_class(0, np.zeros((0, 0)), none.astype(bool), none, none, thresholds)
+    return scene_counts.count_class(0, np.zeros((0, 0)), none.astype(bool), none, none, thresholds)

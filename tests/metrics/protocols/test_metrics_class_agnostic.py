@@ -15,7 +15,7 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition
 from su3d_bench.core.types import GroundTruth, LabelSet
 from su3d_bench.metrics.instance.average_precision import combine as combine_counts
-from su3d_bench.metrics.instance.average_precision import per_scene
+from su3d_bench.metrics.instance.scene_counts import per_scene
 from su3d_bench.metrics.instance.score import encode_without_classes
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
