@@ -20,6 +20,7 @@ from su3d_bench.analysis.page.maps import MapOfRun, PageMap, PageScene, Spaces, 
 from su3d_bench.analysis.page.numbers import are_all_read, is_scored, page_numbers, scored_maps
 from su3d_bench.analysis.page.truths import SharedTruths
 from su3d_bench.core.errors import DataError, Su3dError, printable
+from su3d_bench.metrics.attribution.arrays import LookedAt
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report, run_inline, run_processes
 from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.store.atomic import is_file
@@ -272,11 +273,13 @@ def _make_scene(
         n_done += 1
 
     gallery = GalleryOfScene(asked.scene, batch.most_photos)
+    seen: dict[Job, Mapping[str, LookedAt]] = {}
     for index, method in asked.explained:
         tell(f"errors of {printable(method, 60)}")
         run, of_job = runs[index], explained(index, method)
         try:
             looked_at = of_job.look_at(asked.scene, partial(truths.of_run, run), partial(spaces.encoder, run))
+            seen[index, method] = looked_at
             if (index, method) in asked.errors:
                 mended = of_job.mended(asked.scene, looked_at)
                 made.errors[index, method] = mended
@@ -293,7 +296,7 @@ def _make_scene(
             asked.gallery.save(_GALLERIES.dump_json(made.gallery))
     if asked.maps:
         maps = [(index, runs[index], asked.scene, method) for index, method in asked.maps]
-        made.page = page_scene(asked.scene, maps, spaces, truths, batch.most_points, tell)
+        made.page = page_scene(asked.scene, maps, spaces, truths, batch.most_points, tell, seen)
         if asked.page is not None and made.page.is_whole:
             asked.page.save(_SCENES.dump_json(made.page))
     report(Event(asked.scene, SCENE_DONE, asked.n_steps, asked.n_steps))

@@ -6,18 +6,21 @@ import base64
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
 
+from su3d_bench.analysis.inputs import Inputs
 from su3d_bench.analysis.page.instances import Growth, fed_frames, frames_of, growth_of, instance_data
 from su3d_bench.analysis.page.truths import Seen, SharedTruths, ShownTruths, judged_objects, why_not_shown
 from su3d_bench.core.errors import ConfigError, Su3dError, printable, printable_json
 from su3d_bench.core.interfaces import Encoder, HasSketches
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
 from su3d_bench.core.types import Float32Array, Frame, GroundTruth, Int64Array
+from su3d_bench.metrics.attribution.arrays import LookedAt, SceneOfMasks
 from su3d_bench.metrics.matching.labelling import (
     candidate_classes,
     class_index_of_ids,
@@ -142,18 +145,27 @@ def page_scene(
     truths: SharedTruths,
     most_points: int,
     tell: Callable[[str], None] = lambda doing: None,
+    looked_at: Mapping[tuple[int, str], Mapping[str, LookedAt]] = MappingProxyType({}),
 ) -> PageScene:
     """A scene with its ``maps``. What fails of a map is a reason on the page, never a page without it.
 
-    ``tell`` hears of each map before it is made.
+    ``tell`` hears of each map before it is made; ``looked_at`` holds what evaluators saw of it already, by protocol.
     """
-    return _Scene(scene, maps, spaces, truths).page(most_points, tell)
+    return _Scene(scene, maps, spaces, truths, looked_at).page(most_points, tell)
 
 
 class _Scene:
     """One scene under all methods of all runs."""
 
-    def __init__(self, scene: str, maps: Sequence[MapOfRun], spaces: Spaces, truths: SharedTruths) -> None:
+    def __init__(
+        self,
+        scene: str,
+        maps: Sequence[MapOfRun],
+        spaces: Spaces,
+        truths: SharedTruths,
+        looked_at: Mapping[tuple[int, str], Mapping[str, LookedAt]],
+    ) -> None:
+        self._looked_at = looked_at
         self._scene = scene
         self._maps = maps
         self._spaces = spaces
@@ -176,7 +188,7 @@ class _Scene:
             content = ""
             if not isinstance(prediction, str):
                 growth = growth_of(run, scene, method)
-                content = self._pack(run, prediction, clouds[index, method], frames, seen, growth)
+                content = self._pack((index, method), run, prediction, clouds[index, method], frames, seen, growth)
             made.append(PageMap(index, printable(scene, 200), printable(method, 200), content, reason))
         thumbnails = tuple((index, _jpeg(frame)) for index, frame in frames.items())
         remarks = tuple(printable(line) for line in dict.fromkeys(self._remarks))
@@ -249,7 +261,7 @@ class _Scene:
         """The frames that are shown: as few as can be that show every instance, from those that the maps name."""
         return frame_cover([frames_of(a_map, k) for a_map in maps for k in range(len(a_map))], THUMBNAILS)
 
-    def _beside(self, run: FinishedRun, prediction: Prediction) -> dict[str, Any] | None:
+    def _beside(self, job: tuple[int, str], run: FinishedRun, prediction: Prediction) -> dict[str, Any] | None:
         """The truth that stands beside a map, by its place among those of the scene, and which of it the map misses.
 
         It is that of the first protocol of instances, else that in whose classes the map is shown.
@@ -263,10 +275,15 @@ class _Scene:
         place = self._shown_truths.place(truth)
         if judging is None:
             return {"truth": place}
-        judged = self._had(
-            "no missed objects",
-            lambda: judged_objects(judging, truth, prediction, self._spaces.naming(run, prediction)),
-        )
+
+        def judged_by(rules: ProtocolRules) -> dict[str, list[int]]:
+            seen = self._looked_at.get(job, {}).get(rules.name)
+            if not isinstance(seen, SceneOfMasks):
+                rules = Inputs(run, job[1]).rules(rules)
+                seen = SceneOfMasks(rules, truth, prediction, self._spaces.naming(run, prediction))
+            return judged_objects(truth, seen.overlaps)
+
+        judged = self._had("no missed objects", partial(judged_by, judging))
         return {"truth": place} if judged is None else {"truth": place, "protocol": judging.name, **judged}
 
     def _truth(self, rules: ProtocolRules) -> GroundTruth | None:
@@ -276,6 +293,7 @@ class _Scene:
 
     def _pack(
         self,
+        job: tuple[int, str],
         run: FinishedRun,
         prediction: Prediction,
         cloud: Cloud,
@@ -291,7 +309,7 @@ class _Scene:
             planes["colour"] = colour_plane(colours)
         about: dict[str, Any] = {"protocol": None, "classes": [], "class_colours": [], "instances": [], "queries": []}
         classes: Int64Array | None = None
-        about["beside"] = self._beside(run, prediction)
+        about["beside"] = self._beside(job, run, prediction)
         if rules is not None:
             names = [entry.name for entry in rules.classes]
             tints = class_colours(names)

@@ -8,13 +8,10 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import ConfigError, printable, printable_json
-from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.maps import DenseFeatures, Prediction
+from su3d_bench.core.maps import Prediction
 from su3d_bench.core.types import Float32Array, GroundTruth, Int64Array, UInt8Array
-from su3d_bench.metrics.attribution.arrays import scored_masks
-from su3d_bench.metrics.attribution.overlaps import measure_overlaps, true_instances
+from su3d_bench.metrics.attribution.overlaps import Overlaps
 from su3d_bench.metrics.fitness import why_not_scorable
-from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.reports.page.maps import colour_plane, extent_of, index_plane, nearest_colours, pack_map, thinned
 from su3d_bench.reports.pictures.colours import class_colours
 from su3d_bench.reports.pictures.maps import truth_owner
@@ -68,16 +65,11 @@ def why_not_shown(run: FinishedRun, protocol: str, prediction: Prediction) -> st
     return "its rules here are others"
 
 
-def judged_objects(
-    rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
-) -> dict[str, list[int]]:
-    """The places of objects among ``instances_of``: those ``counted`` by ``rules``, and of these those ``missed``.
+def judged_objects(truth: GroundTruth, overlaps: Overlaps) -> dict[str, list[int]]:
+    """The places of objects among ``instances_of``: those ``counted``, and of these those ``missed``.
 
     They are missed as the kind of error of that name has it.
     """
-    assert not isinstance(prediction, DenseFeatures)
-    values, masks, scoring = scored_masks(rules, truth, prediction, encoder)
-    overlaps = measure_overlaps(true_instances(values, scoring), masks, scoring)
     place_of = {int(number): place for place, number in enumerate(instances_of(truth))}
     counted = [place_of.get(int(truth.instance[members[0]])) for members in overlaps.members]
     missed = set(overlaps.missed.tolist())

@@ -122,7 +122,9 @@ class LookedAt(Protocol):
     def class_name(self, number: int) -> str: ...
 
 
-class _SceneOfMasks:
+class SceneOfMasks:
+    """A scene as an evaluator of masks sees it."""
+
     def __init__(
         self, rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
     ) -> None:
@@ -133,19 +135,19 @@ class _SceneOfMasks:
         self._names = {entry.id: entry.name for entry in rules.classes}
 
     @cached_property
-    def _overlaps(self) -> Overlaps:
+    def overlaps(self) -> Overlaps:
         return measure_overlaps(true_instances(self._values, self._scoring), self._masks, self._scoring)
 
     def mended(self) -> MendedScene:
-        mended = instances.mend_scene(self._values, self._masks, self._scoring)
+        mended = instances.mend_scene(self._values, self._masks, self._scoring, self.overlaps)
         if not self._has_classes:
             return mended
-        relabelled = instances.with_true_labels(self._overlaps)
+        relabelled = instances.with_true_labels(self.overlaps)
         return replace(mended, with_true_labels=instances.count_masks(self._values, relabelled, self._scoring))
 
     def errors(self, rules: ProtocolRules, counts: Any, others: Sequence[Any], most: int) -> Errors:
         pool = Pool[InstanceCounts](InstanceMetric(rules), counts, others, instance_ap.concatenate)
-        found = single_mask_errors(self._values, self._overlaps, self._scoring, pool)
+        found = single_mask_errors(self._values, self.overlaps, self._scoring, pool)
         first = rules.headline[0]
         return len(found), sorted(found, key=lambda error: -error.gains[first])[:most]
 
@@ -177,6 +179,6 @@ class _SceneOfPoints:
 # Of each kind the causes of its errors, and what looks at a scene.
 Look = Callable[[ProtocolRules, GroundTruth, Prediction, Encoder | None], LookedAt]
 EXPLAINED: dict[str, tuple[tuple[str, ...], Look]] = {
-    "instance": (instances.KINDS, _SceneOfMasks),
+    "instance": (instances.KINDS, SceneOfMasks),
     "semantic": (semantic.CAUSES, _SceneOfPoints),
 }

@@ -77,8 +77,12 @@ class Mended:
     n_scored: int | None = None
 
 
-def mend_scene(truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules) -> Mended:
+def mend_scene(
+    truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules, overlaps: Overlaps | None = None
+) -> Mended:
     """The counts of one scene with its errors mended; ``truth`` (N,) is label * 1000 + instance, 0 where void.
+
+    ``overlaps`` of the predictions with it, where they were measured before.
 
     >>> from su3d_bench.metrics.instance.average_precision import combine
     >>> truth = np.repeat([3001, 3002], 200)
@@ -90,7 +94,7 @@ def mend_scene(truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules)
     (1, 0)
     """
     instances = true_instances(truth, rules)
-    overlaps = measure_overlaps(instances, predicted, rules)
+    overlaps = overlaps or measure_overlaps(instances, predicted, rules)
     as_is = count_masks(truth, predicted, rules)
     alone, n = {}, {}
     for kind, (find, _) in _KINDS.items():
@@ -99,7 +103,7 @@ def mend_scene(truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules)
         alone[kind] = count_masks(truth, repaired(overlaps, errors).labelled(), rules) if errors else as_is
     everything = predicted
     for find, _ in _KINDS.values():
-        left = measure_overlaps(instances, everything, rules)
+        left = overlaps if everything is predicted else measure_overlaps(instances, everything, rules)
         everything = repaired(left, find(left)).labelled()
     return Mended(as_is, alone, count_masks(truth, everything, rules), n)
 
