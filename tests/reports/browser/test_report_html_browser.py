@@ -262,7 +262,17 @@ def test_each_link_leads_to_its_section(browser: Chromium) -> None:
         for k in range(browser.run(f"document.querySelectorAll('{link}').length")):
             target = browser.run(f"document.querySelectorAll('{link}')[{k}].hash")
             browser.run(f"document.querySelectorAll('{link}')[{k}].click()")
-            # what is shown of the maps stands behind their name
-            browser.until(f"location.hash.split('?')[0] === {json.dumps(target)}")
+            browser.until(f"location.hash === {json.dumps(target)}")
             place = f"document.querySelector({json.dumps(target)}).getBoundingClientRect()"
             assert browser.run(f"{place}.top < innerHeight && {place}.bottom > 0"), target
+
+
+def test_the_maps_do_not_take_the_address_back_from_where_somebody_went(browser: Chromium) -> None:
+    open_maps(browser)
+    browser.run("history.replaceState(null, '', location.pathname)")
+    choose(browser, "maps", "Colour by", options(browser, "maps", "Colour by")[-1])
+    browser.until("location.hash.startsWith('#maps?')")
+    choose(browser, "maps", "Colour by", options(browser, "maps", "Colour by")[0])
+    browser.run("document.querySelector('#nav a[href=\"#errors\"]').click()")
+    browser.run("new Promise((done) => setTimeout(done, 600))")  # longer than the address waits for a pause
+    assert browser.run("location.hash") == "#errors"

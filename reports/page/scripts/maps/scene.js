@@ -70,7 +70,7 @@ function mapsContent(section) {
     h('div', { class: 'viewer' }, h('div', null, panes, growthNote, keys), h('div', { class: 'side' }, detail, list)));
 
   let map = null, truth = null, current = null, picked = -1, rows = [], listedBy = null, loads = 0, asides = 0;
-  let asked = null, isTouched = false, isWriting = null;
+  let asked = null, address = null, isWriting = null; // the address when somebody last changed something here
   const judged = () => (map && map.beside && map.beside.counted ? map.beside : null);
 
   function listMaps() {
@@ -324,11 +324,13 @@ function mapsContent(section) {
     else if (event.key === 'Escape') pick(-1);
   });
 
-  // The address follows what somebody changes here, once they pause; it adds nothing to the history.
+  // The address follows what somebody changes here, once they pause, unless they have gone on to another one since; it
+  // adds nothing to the history.
   function keepLink() {
-    if (!isTouched || !map || asked) return;
+    if (address === null || !map || asked) return;
     clearTimeout(isWriting);
     isWriting = setTimeout(() => {
+      if (location.hash !== address) return;
       const { growth } = map || {}, aside = besideField.input.value, last = growth ? growth.frame.length - 1 : 0;
       const yes = (field) => (field.input.checked ? 'yes' : 'no');
       const state = {
@@ -340,10 +342,11 @@ function mapsContent(section) {
         instance: picked >= 0 ? picked : null,
       };
       try { history.replaceState(null, '', linkText(state, eye)); } catch (error) { /* forbidden of files somewhere */ }
+      address = location.hash;
     }, 300);
   }
   for (const what of ['pointerdown', 'keydown', 'wheel', 'change', 'input', 'click']) {
-    section.addEventListener(what, () => { isTouched = true; }, { capture: true, passive: true });
+    section.addEventListener(what, () => { address = location.hash; }, { capture: true, passive: true });
   }
   function followLink() {
     const link = readLink(location.hash);
