@@ -47,23 +47,30 @@ class Cloud:
 
 
 def thinned(points: Float32Array, most: int) -> Cloud:
-    """At most ``most`` of ``points``, one of each cell, at the least spacing of those that are tried."""
+    """At most ``most`` of ``points``, one of each cell, at the least spacing of those that are tried.
+
+    Coarser grids are laid over what the finest has left.
+    """
     extent_m = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
     finest_m = max(LEAST_SPACING_M, STEPS_A_SPACING * extent_m / (MOST_CELLS - 2))
 
     def spacing(n_steps: int) -> float:
         return finest_m * COARSER**n_steps
 
-    n_steps, rows = 0, _first_of_cells(points, spacing(0))
+    finest = _first_of_cells(points, spacing(0))
+    left = points[finest]
+    n_steps, rows = 0, np.arange(len(finest))
     if len(rows) > most:
         # Points lie on surfaces: their cells are as the inverse square of the spacing.
         n_steps = max(1, round(math.log(len(rows) / most) / (2 * math.log(COARSER))))
-        rows = _first_of_cells(points, spacing(n_steps))
+        rows = _first_of_cells(left, spacing(n_steps))
+        is_above = len(rows) > most  # then the last that is tried is the first that is few enough
         while len(rows) > most:
             n_steps += 1
-            rows = _first_of_cells(points, spacing(n_steps))
-        while n_steps > 1 and len(finer := _first_of_cells(points, spacing(n_steps - 1))) <= most:
+            rows = _first_of_cells(left, spacing(n_steps))
+        while not is_above and n_steps > 1 and len(finer := _first_of_cells(left, spacing(n_steps - 1))) <= most:
             n_steps, rows = n_steps - 1, finer
+    rows = finest[rows]
     order = np.argsort(_curve(voxel_coordinates(points[rows], spacing(n_steps) / STEPS_A_SPACING)), kind="stable")
     return Cloud(rows[order], points[rows[order]], spacing(n_steps))
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from su3d_bench.analysis.page.instances import fed_frames, frames_of
 from su3d_bench.analysis.page.maps import Spaces, shown_classes, shown_rules
-from su3d_bench.analysis.page.truths import SharedTruths
+from su3d_bench.analysis.page.scene_data import SceneData
 from su3d_bench.core.errors import StoreError, Su3dError, counted, printable
 from su3d_bench.core.interfaces import HasSketches
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
@@ -187,7 +187,7 @@ class SceneTimeline:
     def __init__(self, run: FinishedRun, scene: str, methods: Sequence[str], stride: int, spaces: Spaces) -> None:
         self._run, self.scene, self._methods, self._stride = run, scene, methods, stride
         self._spaces = spaces
-        self._truths = SharedTruths(scene)
+        self._data = SceneData(scene)
         self.remarks: list[str] = []
         self.n_frames = self.n_maps = 0
 
@@ -247,7 +247,7 @@ class SceneTimeline:
     def _sequence(self) -> Sequence[Frame]:
         if self._dataset is None:
             return ()
-        return self._had("no frames", lambda: self._dataset.frames(self.scene.partition("/")[2], 1)) or ()
+        return self._had("no frames", lambda: self._data.sequence(self._dataset)) or ()
 
     def _frames(self) -> list[int]:
         """The frames that are shown: of those that the methods were given, else of all."""
@@ -271,7 +271,7 @@ class SceneTimeline:
     def _truth(self, rules: ProtocolRules) -> GroundTruth | None:
         if self._dataset is None:
             return None
-        truth: GroundTruth | None = self._had("no truth", lambda: self._truths.of(self._dataset, rules.ground_truth))
+        truth: GroundTruth | None = self._had("no truth", lambda: self._data.truth(self._dataset, rules.ground_truth))
         return truth
 
     def _maps(self, rules: ProtocolRules | None, truth: GroundTruth | None) -> dict[str, tuple[Owned, Sequence[int]]]:

@@ -19,7 +19,7 @@ from su3d_bench.analysis.page import contents
 from su3d_bench.analysis.page.errors import packed, unpacked
 from su3d_bench.analysis.page.kept import FOLDER, MOST_OF_EACH
 from su3d_bench.analysis.page.maps import PageScene, page_scene
-from su3d_bench.analysis.page.truths import SharedTruths
+from su3d_bench.analysis.page.scene_data import SceneData
 from su3d_bench.cli.main import EXIT_INTERRUPTED, main
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import PredictionError
@@ -203,8 +203,8 @@ def test_processes_side_by_side_give_the_same_bytes(run: Path) -> None:
 def test_counts_come_back_as_they_went(run: Path) -> None:
     finished = read_run(run)
     explained = explained_of(finished, "collector")
-    truths = SharedTruths("painted/a")
-    mended = explained.mend("painted/a", lambda variant: truths.of_run(finished, variant), WordEncoder)
+    data = SceneData("painted/a")
+    mended = explained.mend("painted/a", lambda variant: data.truth_of_run(finished, variant), WordEncoder)
     back = unpacked(packed(mended, finished.rules), finished.rules)
     assert back is not None
     assert explained.form({"painted/a": back}).to_json() == explained.form({"painted/a": mended}).to_json()

@@ -18,7 +18,7 @@ from su3d_bench.analysis.page.gallery import GalleryOfScene, SceneGallery, photo
 from su3d_bench.analysis.page.kept import Piece, piece, state_of_counts, state_of_job, state_of_run
 from su3d_bench.analysis.page.maps import MapOfRun, PageMap, PageScene, Spaces, page_scene, points_of_each
 from su3d_bench.analysis.page.numbers import are_all_read, is_scored, page_numbers, scored_maps
-from su3d_bench.analysis.page.truths import SharedTruths
+from su3d_bench.analysis.page.scene_data import SceneData
 from su3d_bench.core.errors import DataError, Su3dError, printable
 from su3d_bench.metrics.attribution.arrays import LookedAt
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report, run_inline, run_processes
@@ -265,7 +265,7 @@ def _make_scene(
     batch: Batch,
     report: Report,
 ) -> Made:
-    made, truths, n_done = Made(asked.scene), SharedTruths(asked.scene), 0
+    made, data, n_done = Made(asked.scene), SceneData(asked.scene), 0
 
     def tell(doing: str) -> None:
         nonlocal n_done
@@ -278,7 +278,7 @@ def _make_scene(
         tell(f"errors of {printable(method, 60)}")
         run, of_job = runs[index], explained(index, method)
         try:
-            looked_at = of_job.look_at(asked.scene, partial(truths.of_run, run), partial(spaces.encoder, run))
+            looked_at = of_job.look_at(asked.scene, partial(data.truth_of_run, run), partial(spaces.encoder, run))
             seen[index, method] = looked_at
             if (index, method) in asked.errors:
                 mended = of_job.mended(asked.scene, looked_at)
@@ -291,12 +291,12 @@ def _make_scene(
             gallery.lack()
     if asked.shown:
         tell("photos of errors")
-        made.gallery = gallery.finish(_dataset_of(runs[asked.shown[0][0]], asked.scene))
+        made.gallery = gallery.finish(_dataset_of(runs[asked.shown[0][0]], asked.scene), data)
         if asked.gallery is not None and made.gallery.is_whole:
             asked.gallery.save(_GALLERIES.dump_json(made.gallery))
     if asked.maps:
         maps = [(index, runs[index], asked.scene, method) for index, method in asked.maps]
-        made.page = page_scene(asked.scene, maps, spaces, truths, batch.most_points, tell, seen)
+        made.page = page_scene(asked.scene, maps, spaces, data, batch.most_points, tell, seen)
         if asked.page is not None and made.page.is_whole:
             asked.page.save(_SCENES.dump_json(made.page))
     report(Event(asked.scene, SCENE_DONE, asked.n_steps, asked.n_steps))

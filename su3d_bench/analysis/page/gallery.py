@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.analysis.attribution import Explained
+from su3d_bench.analysis.page.instances import fed_frames
+from su3d_bench.analysis.page.scene_data import SHOWN_WIDTH, SKETCH_WIDTH, SceneData
 from su3d_bench.core.errors import Su3dError, printable
-from su3d_bench.core.interfaces import HasSketches
 from su3d_bench.core.types import Float32Array, Frame
 from su3d_bench.metrics.attribution.arrays import LookedAt
 from su3d_bench.metrics.attribution.singles import SingleError
@@ -19,14 +20,12 @@ from su3d_bench.metrics.matching.nearest import Points
 from su3d_bench.reports.page.maps import frame_cover
 from su3d_bench.reports.page.photos import SeenError, error_photo, photo_text
 from su3d_bench.reports.pictures.items import best_view
-from su3d_bench.reports.pictures.scene_look import spread
 
 MOST_ERRORS = 40  # of a scene under a method and a protocol that are told one by one
 MOST_PHOTOS = 64  # of a page, dealt out to its scenes, each of which has at least one for every method
 CANDIDATES = 24  # frames of a scene in which objects are looked for
 MOST_FRAMES = 6  # of a scene from which photos are taken
 AS_GOOD = 0.7  # of the best view of an object: a frame that several share is taken for it
-SKETCH_WIDTH, SHOWN_WIDTH = 160, 320  # of a frame to find a view in, and of one for photos: where that saves time
 MOST_NAMES, MOST_TEXT = 6, 60  # classes that a card names, characters of a name
 NOT_AMONG = "only the worst errors of a scene have one"
 
@@ -128,10 +127,12 @@ class GalleryOfScene:
         self._scene, self._most_photos = scene, most_photos
         self._cards: list[Cards] = []
         self._shown: list[list[_Shown]] = []
+        self._fed: list[int] = []
         self._lacks = False
 
     def add(self, index: int, explained: Explained, looked_at: Mapping[str, LookedAt]) -> None:
         """The errors of the method of ``explained``, which is one of run ``index``, under each protocol."""
+        self._fed += fed_frames(explained.run, self._scene, explained.method)
         for protocol, scene in looked_at.items():
             n, errors = explained.errors(self._scene, protocol, scene, MOST_ERRORS)
             metrics = explained.headline(protocol)
@@ -152,12 +153,12 @@ class GalleryOfScene:
         """Say that a method's errors could not be had."""
         self._lacks = True
 
-    def finish(self, dataset: Any) -> SceneGallery:
+    def finish(self, dataset: Any, data: SceneData) -> SceneGallery:
         """The gallery with photos of the worst errors; ``dataset`` is a text where there is none, the reason."""
         chosen = list(_in_turn(self._shown))[: self._most_photos]
         cards = [list(one.cards) for one in self._cards]
         photos: list[str] = []
-        photographer = _Photographer(dataset, self._scene)
+        photographer = _Photographer(dataset, data, self._fed)
         taken = photographer.take([one.seen for one in chosen])
         for shown, photo in zip(chosen, taken, strict=True):
             card = cards[shown.of][shown.card]
@@ -203,8 +204,8 @@ def _in_turn(lists: Sequence[Sequence[_Shown]]) -> Iterator[_Shown]:
 class _Photographer:
     """Finds the frames of a scene in which things are seen best."""
 
-    def __init__(self, dataset: Any, scene: str) -> None:
-        self._dataset, self._name = dataset, scene.partition("/")[2]
+    def __init__(self, dataset: Any, data: SceneData, fed: Sequence[int]) -> None:
+        self._dataset, self._data, self._fed = dataset, data, fed
         self.lacks = isinstance(dataset, str)  # whether frames could not be had, which may be another time
 
     def take(self, things: Sequence[SeenError]) -> list[tuple[int, str] | str]:
@@ -220,17 +221,16 @@ class _Photographer:
             return [str(error)] * len(things)
 
     def _taken(self, things: Sequence[SeenError]) -> list[tuple[int, str] | str]:
-        self._sequence: Sequence[Frame] = self._dataset.frames(self._name, 1)
-        places = sorted(spread(len(self._sequence), CANDIDATES))
+        places = sorted(self._data.in_turn(self._dataset, self._fed)[:CANDIDATES])
         looks = np.zeros((len(things), len(places)))
         for column, place in enumerate(places):
-            frame = self._frame(place, SKETCH_WIDTH)
+            frame = self._data.frame(self._dataset, place, SKETCH_WIDTH)
             for row, thing in enumerate(things):
                 view = best_view([frame], thing.points)
                 looks[row, column] = 0.0 if view is None else view.score
         good = [[places[k] for k in np.flatnonzero((row >= AS_GOOD * row.max()) & (row > 0))] for row in looks]
         chosen = frame_cover(good, MOST_FRAMES)
-        frames = {place: self._frame(place, SHOWN_WIDTH) for place in chosen}
+        frames = {place: self._data.frame(self._dataset, place, SHOWN_WIDTH) for place in chosen}
         return [self._photo(thing, row, places, frames) for thing, row in zip(things, looks, strict=True)]
 
     def _photo(
@@ -247,8 +247,3 @@ class _Photographer:
                 if photo is not None:
                     return frame.index, photo_text(photo)
         return "no frame that was looked at shows it"
-
-    def _frame(self, place: int, width: int) -> Frame:
-        if isinstance(self._dataset, HasSketches):
-            return self._dataset.sketch(self._name, place, width)
-        return self._sequence[place]

@@ -15,9 +15,10 @@ import numpy as np
 
 from su3d_bench.analysis.inputs import Inputs
 from su3d_bench.analysis.page.instances import Growth, fed_frames, frames_of, growth_of, instance_data
-from su3d_bench.analysis.page.truths import Seen, SharedTruths, ShownTruths, judged_objects, why_not_shown
+from su3d_bench.analysis.page.scene_data import MOST_LOOKED_AT, SHOWN_WIDTH, SKETCH_WIDTH, SceneData
+from su3d_bench.analysis.page.truths import Seen, ShownTruths, judged_objects, why_not_shown
 from su3d_bench.core.errors import ConfigError, Su3dError, printable, printable_json
-from su3d_bench.core.interfaces import Encoder, HasSketches
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
 from su3d_bench.core.types import Float32Array, Frame, GroundTruth, Int64Array
 from su3d_bench.metrics.attribution.arrays import LookedAt, SceneOfMasks
@@ -45,7 +46,7 @@ from su3d_bench.reports.page.maps import (
     thinned,
 )
 from su3d_bench.reports.pictures.colours import class_colours
-from su3d_bench.reports.pictures.scene_look import SEEN_POINTS, seen_points, spread
+from su3d_bench.reports.pictures.scene_look import SEEN_POINTS, seen_points
 from su3d_bench.runs.finished import FinishedRun, OtherDataError
 from su3d_bench.store.predictions import read_prediction
 
@@ -53,11 +54,10 @@ MOST_POINTS, LEAST_POINTS = 60_000, 3_000  # of one map: what a phone draws at o
 BYTES_A_POINT = 6.0  # in the page, measured on the rooms: position, colour, owner and truth, deflated, in base64
 SHARE_OF_POINTS = 0.6  # of the page; the rest is for instances, pictures and tables
 THUMBNAILS = 14  # frames of a scene that are shown
-MORE_FRAMES, FRAMES_AT_ONCE = 48, 6  # that are read at most for the colours of the map, and before it is looked again
+FRAMES_AT_ONCE = 6  # that are read for the colours of the map before it is looked again
 GREY_SHARE = 0.01  # of the points may stay without a colour when there are frames left
 EVERY = 8  # of the points is asked whether it was seen
 THUMBNAIL_WIDTH, JPEG_QUALITY = 240, 62
-SKETCH_WIDTH, SHOWN_WIDTH = 160, 320  # of a frame for its colours alone, of one that is shown: where that saves time
 MapOfRun = tuple[int, FinishedRun, str, str]
 Made = TypeVar("Made")
 
@@ -142,7 +142,7 @@ def page_scene(
     scene: str,
     maps: Sequence[MapOfRun],
     spaces: Spaces,
-    truths: SharedTruths,
+    data: SceneData,
     most_points: int,
     tell: Callable[[str], None] = lambda doing: None,
     looked_at: Mapping[tuple[int, str], Mapping[str, LookedAt]] = MappingProxyType({}),
@@ -151,7 +151,7 @@ def page_scene(
 
     ``tell`` hears of each map before it is made; ``looked_at`` holds what evaluators saw of it already, by protocol.
     """
-    return _Scene(scene, maps, spaces, truths, looked_at).page(most_points, tell)
+    return _Scene(scene, maps, spaces, data, looked_at).page(most_points, tell)
 
 
 class _Scene:
@@ -162,14 +162,14 @@ class _Scene:
         scene: str,
         maps: Sequence[MapOfRun],
         spaces: Spaces,
-        truths: SharedTruths,
+        data: SceneData,
         looked_at: Mapping[tuple[int, str], Mapping[str, LookedAt]],
     ) -> None:
         self._looked_at = looked_at
         self._scene = scene
         self._maps = maps
         self._spaces = spaces
-        self._truths = truths
+        self._data = data
         self._remarks: list[str] = []
         self._frame_of: dict[int, Frame | None] = {}
         self._shown_truths = ShownTruths()
@@ -225,34 +225,28 @@ class _Scene:
     def _sequence(self) -> Sequence[Frame]:
         frames = None
         if self._dataset is not None:
-            frames = self._had("no views", lambda: self._dataset.frames(self._scene.partition("/")[2], 1))
+            frames = self._had("no views", lambda: self._data.sequence(self._dataset))
         return () if frames is None else frames
 
     def _frame(self, index: int, width: int) -> Frame | None:
         """Frame ``index`` of the full sequence, read once; None where it is not there. ``width`` pixels are enough."""
         if index not in self._frame_of:
             is_there = 0 <= index < len(self._sequence)
-            frame = self._had("no views", lambda: self._read_frame(index, width)) if is_there else None
+            frame = self._had("no views", lambda: self._data.frame(self._dataset, index, width)) if is_there else None
             self._frame_of[index] = frame if frame is not None and frame.index == index else None
         return self._frame_of[index]
 
-    def _read_frame(self, index: int, width: int) -> Frame:
-        if isinstance(self._dataset, HasSketches):
-            return self._dataset.sketch(self._scene.partition("/")[2], index, width)
-        return self._sequence[index]
-
     def _seen(self, clouds: Sequence[Float32Array]) -> Seen | None:
         """What the methods saw: in the frames shown, and in as many more as show nearly all of ``clouds``."""
-        fed = sorted({index for _, run, scene, method in self._maps for index in fed_frames(run, scene, method)})
-        fed = fed or list(range(len(self._sequence)))
+        fed = [index for _, run, scene, method in self._maps for index in fed_frames(run, scene, method)]
+        places = self._data.in_turn(self._dataset, fed) if len(self._sequence) else []
         unseen = np.concatenate([np.zeros((0, 3), np.float32), *(points[::EVERY] for points in clouds)])
         few = GREY_SHARE * len(unseen)
         unseen = _not_near([frame for frame in self._frame_of.values() if frame is not None], unseen)
-        places = spread(len(fed), MORE_FRAMES)
         for start in range(0, len(places), FRAMES_AT_ONCE):
             if len(unseen) <= few:
                 break
-            more = (self._frame(fed[place], SKETCH_WIDTH) for place in places[start : start + FRAMES_AT_ONCE])
+            more = (self._frame(index, SKETCH_WIDTH) for index in places[start : start + FRAMES_AT_ONCE])
             unseen = _not_near([frame for frame in more if frame is not None], unseen)
         read = [frame for frame in self._frame_of.values() if frame is not None]
         return seen_points(read, SEEN_POINTS) if read else None
@@ -289,7 +283,7 @@ class _Scene:
     def _truth(self, rules: ProtocolRules) -> GroundTruth | None:
         if self._dataset is None:
             return None
-        return self._had("no truth", lambda: self._truths.of(self._dataset, rules.ground_truth))
+        return self._had("no truth", lambda: self._data.truth(self._dataset, rules.ground_truth))
 
     def _pack(
         self,
@@ -376,7 +370,7 @@ def shown_classes(
 
 def _not_near(frames: Sequence[Frame], points: Float32Array) -> Float32Array:
     """Those of ``points`` that none of ``frames`` gives a colour."""
-    seen, _ = seen_points(frames, SEEN_POINTS * len(frames) // MORE_FRAMES)
+    seen, _ = seen_points(frames, SEEN_POINTS * len(frames) // MOST_LOOKED_AT)
     return points[nearest(seen, points, COLOUR_NEAR_M)[1] < 0]
 
 

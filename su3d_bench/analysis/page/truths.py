@@ -20,24 +20,6 @@ from su3d_bench.runs.finished import FinishedRun
 Seen = tuple[Float32Array, UInt8Array]  # points (n, 3) m that frames saw and their colours (n, 3)
 
 
-class SharedTruths:
-    """The truths of one scene, each made once whoever asks."""
-
-    def __init__(self, scene: str) -> None:
-        self._scene = scene
-        self._truths: dict[tuple[int, str], GroundTruth] = {}
-
-    def of(self, dataset: Any, variant: str) -> GroundTruth:
-        key = id(dataset), variant  # a run keeps its datasets
-        if key not in self._truths:
-            self._truths[key] = dataset.ground_truth(self._scene.partition("/")[2], variant)
-        return self._truths[key]
-
-    def of_run(self, run: FinishedRun, variant: str) -> GroundTruth:
-        """The truth in the data of ``run``, which must be those that it was made from."""
-        return self.of(run.dataset(self._scene), variant)
-
-
 class ShownTruths:
     """The truths of a scene that maps stand beside, each once, in the order in which they were asked for."""
 

@@ -126,13 +126,14 @@ def _packed(rows: Int64Array | Float64Array) -> Int64Array | None:
     """One number a row of whole numbers, ordered as the rows from their last column on; None where 63 bits are few."""
     if not len(rows) or rows.dtype.kind not in "iu":
         return None
-    low = rows.min(axis=0)
-    spans = [int(high) - int(least) + 1 for high, least in zip(rows.max(axis=0), low, strict=True)]
+    lows = [int(column.min()) for column in rows.T]  # column by column: numpy is slow along short rows
+    spans = [int(column.max()) - low + 1 for column, low in zip(rows.T, lows, strict=True)]
     if math.prod(spans) >= 1 << 63:
         return None
     keys = np.zeros(len(rows), np.int64)
-    for column in reversed(range(rows.shape[1])):
-        keys = keys * spans[column] + (rows[:, column] - low[column])
+    for column, low, span in reversed(list(zip(rows.T, lows, spans, strict=True))):
+        keys *= span
+        keys += column - low
     return keys
 
 
@@ -143,7 +144,15 @@ def first_rows(rows: Int64Array) -> Int64Array:
     [1, 0, 3]
     """
     keys = _packed(rows)
-    return np.unique(row_ids(rows) if keys is None else keys, return_index=True)[1]
+    keys = row_ids(rows) if keys is None else keys
+    n_bits = len(keys).bit_length()
+    if int(keys.max(initial=0)).bit_length() + n_bits > 63:
+        return np.unique(keys, return_index=True)[1]
+    # a key and its place in one number: plain numbers are sorted in half the time of an order
+    held = np.sort((keys << n_bits) | np.arange(len(keys)))
+    is_first = np.ones(len(held), bool)
+    np.not_equal(held[1:] >> n_bits, held[:-1] >> n_bits, out=is_first[1:])
+    return held[is_first] & ((1 << n_bits) - 1)
 
 
 def transfer_masks(

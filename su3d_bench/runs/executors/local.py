@@ -7,6 +7,7 @@ held to one thread everywhere, so that no result depends on how many units run s
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import signal
@@ -215,6 +216,7 @@ def _worker(work: Work[Unit, Outcome], unit: Unit, connection: Connection) -> No
             threading.Thread(target=_end_with_parent, daemon=True).start()
             connection.send(answer_of(work, unit, lambda event: connection.send(("event", event))))
             connection.close()
+        gc.freeze()  # all that is left goes with the process: nobody need search it for cycles
     except Ended as end:  # all is let go of; the parent is told how it came
         signal.signal(end.number, signal.SIG_DFL)
         os.kill(os.getpid(), end.number)
