@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.maps import DenseFeatures, Prediction
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array, UInt8Array
-from su3d_bench.metrics.matching.nearest import first_rows, nearest
+from su3d_bench.metrics.matching.nearest import Candidates, first_rows
 from su3d_bench.numerics.geometry import voxel_coordinates
 from su3d_bench.reports.pictures.maps import map_cloud
 
@@ -103,17 +103,17 @@ def point_owners(prediction: Prediction, rows: Int64Array) -> Int32Array:
     return map_cloud(prediction).owner[rows]
 
 
-def nearest_colours(points: Float32Array, seen: Float32Array, seen_rgb: UInt8Array) -> UInt8Array | None:
+def nearest_colours(points: Float32Array, seen: Candidates, seen_rgb: UInt8Array) -> UInt8Array | None:
     """The colour (n, 3) of what frames saw nearest to each point, grey where nothing is near; None without frames."""
     if not len(seen) or not len(points):
         return None
-    _, nearest_row = nearest(seen, points, COLOUR_NEAR_M)
+    _, nearest_row = seen.nearest(points, COLOUR_NEAR_M)
     return np.where(nearest_row[:, None] >= 0, seen_rgb[nearest_row], np.uint8(128))
 
 
-def nearest_classes(points: Float32Array, truth: Float32Array, classes: Int64Array) -> Int64Array:
+def nearest_classes(points: Float32Array, truth: Candidates, classes: Int64Array) -> Int64Array:
     """The true class (n,) near each point; ``NOT_SCORED`` where the truth there has none, ``NO_TRUTH_NEAR``."""
-    _, nearest_row = nearest(truth, points, NEAR_M)
+    _, nearest_row = truth.nearest(points, NEAR_M)
     if not len(truth):
         return np.full(len(points), NO_TRUTH_NEAR)
     classes = np.where(classes >= 0, classes, NOT_SCORED)

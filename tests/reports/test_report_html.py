@@ -25,6 +25,7 @@ from su3d_bench.analysis.page.instances import MOST_STEPS, Growth
 from su3d_bench.analysis.page.maps import points_of_each
 from su3d_bench.cli.main import main
 from su3d_bench.core.maps import DenseFeatures, Instances
+from su3d_bench.metrics.matching.nearest import Candidates
 from su3d_bench.reports.page import maps as html_map
 from su3d_bench.reports.page import numbers as html_data
 from su3d_bench.reports.page import page as html_page
@@ -446,16 +447,16 @@ def test_of_masks_that_overlap_the_smaller_one_is_seen() -> None:
 def test_the_truth_of_a_point_is_the_nearest_within_five_centimetres() -> None:
     truth = np.array([[0, 0, 0], [1, 0, 0]], np.float32)
     points = np.array([[0.04, 0, 0], [0.06, 0, 0], [1, 0, 0]], np.float32)
-    assert nearest_classes(points, truth, np.array([7, -1])).tolist() == [7, NO_TRUTH_NEAR, NOT_SCORED]
-    assert nearest_classes(points, truth[:0], np.zeros(0, np.int64)).tolist() == [NO_TRUTH_NEAR] * 3
+    assert nearest_classes(points, Candidates(truth), np.array([7, -1])).tolist() == [7, NO_TRUTH_NEAR, NOT_SCORED]
+    assert nearest_classes(points, Candidates(truth[:0]), np.zeros(0, np.int64)).tolist() == [NO_TRUTH_NEAR] * 3
 
 
 def test_a_point_that_no_frame_saw_is_grey() -> None:
     seen, colours = np.zeros((1, 3), np.float32), np.array([[10, 20, 30]], np.uint8)
-    found = nearest_colours(np.array([[0.05, 0, 0], [0.07, 0, 0]], np.float32), seen, colours)
+    found = nearest_colours(np.array([[0.05, 0, 0], [0.07, 0, 0]], np.float32), Candidates(seen), colours)
     assert found is not None
     assert found.tolist() == [[10, 20, 30], [128, 128, 128]]
-    assert nearest_colours(seen, seen[:0], colours[:0]) is None
+    assert nearest_colours(seen, Candidates(seen[:0]), colours[:0]) is None
 
 
 def test_a_box_in_a_view_is_where_the_points_project() -> None:

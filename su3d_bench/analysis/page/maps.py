@@ -29,7 +29,7 @@ from su3d_bench.metrics.matching.labelling import (
     cosines,
     scored_classes,
 )
-from su3d_bench.metrics.matching.nearest import nearest
+from su3d_bench.metrics.matching.nearest import Candidates, nearest
 from su3d_bench.metrics.metric import n_predictions, present
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.score import has_feature
@@ -249,7 +249,10 @@ class _Scene:
             more = (self._frame(index, SKETCH_WIDTH) for index in places[start : start + FRAMES_AT_ONCE])
             unseen = _not_near([frame for frame in more if frame is not None], unseen)
         read = [frame for frame in self._frame_of.values() if frame is not None]
-        return seen_points(read, SEEN_POINTS) if read else None
+        if not read:
+            return None
+        points, colours = seen_points(read, SEEN_POINTS)
+        return Candidates(points), colours
 
     def _chosen_frames(self, maps: Sequence[Instances]) -> Sequence[int]:
         """The frames that are shown: as few as can be that show every instance, from those that the maps name."""
@@ -311,7 +314,9 @@ class _Scene:
             of_truth = None if truth is None else class_index_of_ids(rules, truth.semantic)
             if truth is not None and of_truth is not None:
                 of_truth = np.where((of_truth >= 0) & scored_classes(rules)[of_truth], of_truth, -1)
-                planes["truth"] = nearest_classes(cloud.points, truth.points, of_truth).astype(np.uint16)
+                planes["truth"] = nearest_classes(cloud.points, self._data.candidates(truth), of_truth).astype(
+                    np.uint16
+                )
             classes = self._classes(run, rules, prediction, of_truth, cloud)
         if isinstance(prediction, DenseFeatures):
             if classes is not None:

@@ -7,6 +7,7 @@ from typing import Any
 
 from su3d_bench.core.interfaces import HasSketches
 from su3d_bench.core.types import Frame, GroundTruth
+from su3d_bench.metrics.matching.nearest import Candidates
 from su3d_bench.reports.pictures.scene_look import spread
 from su3d_bench.runs.finished import FinishedRun
 
@@ -21,6 +22,7 @@ class SceneData:
         self._name = scene.partition("/")[2]
         self._scene = scene
         self._truths: dict[tuple[int, str], GroundTruth] = {}
+        self._candidates: dict[int, Candidates] = {}  # of truths that are kept above
         self._sequences: dict[int, Sequence[Frame]] = {}
         self._frames: dict[tuple[int, int, int], Frame] = {}
 
@@ -29,6 +31,12 @@ class SceneData:
         if key not in self._truths:
             self._truths[key] = dataset.ground_truth(self._name, variant)
         return self._truths[key]
+
+    def candidates(self, truth: GroundTruth) -> Candidates:
+        """The points of a truth, to be asked for what is nearest."""
+        if id(truth) not in self._candidates:
+            self._candidates[id(truth)] = Candidates(truth.points)
+        return self._candidates[id(truth)]
 
     def truth_of_run(self, run: FinishedRun, variant: str) -> GroundTruth:
         """The truth in the data of ``run``, which must be those that it was made from."""

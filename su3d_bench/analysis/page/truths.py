@@ -9,15 +9,16 @@ import numpy as np
 
 from su3d_bench.core.errors import ConfigError, printable, printable_json
 from su3d_bench.core.maps import Prediction
-from su3d_bench.core.types import Float32Array, GroundTruth, Int64Array, UInt8Array
+from su3d_bench.core.types import GroundTruth, Int64Array, UInt8Array
 from su3d_bench.metrics.attribution.overlaps import Overlaps
 from su3d_bench.metrics.fitness import why_not_scorable
+from su3d_bench.metrics.matching.nearest import Candidates
 from su3d_bench.reports.page.maps import colour_plane, extent_of, index_plane, nearest_colours, pack_map, thinned
 from su3d_bench.reports.pictures.colours import class_colours
 from su3d_bench.reports.pictures.maps import truth_owner
 from su3d_bench.runs.finished import FinishedRun
 
-Seen = tuple[Float32Array, UInt8Array]  # points (n, 3) m that frames saw and their colours (n, 3)
+Seen = tuple[Candidates, UInt8Array]  # points (n, 3) m that frames saw and their colours (n, 3)
 
 
 class ShownTruths:

@@ -15,7 +15,61 @@ Points = Float32Array | Float64Array
 
 COVERAGE_RADII_M = (0.025, 0.05, 0.1)
 _MAX_NEIGHBOURS = 4_000_000  # candidates held at once while ties are broken
-WORTH_ORDERING = 100_000  # points, below which sorting takes longer than it saves
+WORTH_ORDERING = 50_000  # candidates, below which sorting takes longer than it saves
+
+
+class Candidates:
+    """Points (N, 3) m, arranged once so that what is nearest can be asked of them again and again."""
+
+    def __init__(self, points: Points) -> None:
+        self._n = len(points)
+        self._is_ordered = self._n >= WORTH_ORDERING
+        if not self._n:
+            return
+        from scipy.spatial import cKDTree
+
+        if self._is_ordered:
+            self._low = points.min(axis=0)
+            self._cells_a_metre = 32.0 / max(float((points.max(axis=0) - self._low).max()), 1e-9)
+        self._order = self._along_curve(points)
+        self._held = np.asarray(points, np.float64)[self._order]
+        self._tree = cKDTree(self._held, balanced_tree=False, compact_nodes=False)
+
+    def __len__(self) -> int:
+        return self._n
+
+    def nearest(self, queries: Points, cap_m: float = np.inf) -> tuple[Float64Array, Int64Array]:
+        """``nearest`` of these points."""
+        if not self._n or not len(queries):
+            return np.full(len(queries), np.inf), np.full(len(queries), -1, np.int64)
+        asking_order = self._along_curve(queries)
+        ordered_queries = np.asarray(queries, np.float64)[asking_order]
+        # the tree takes only neighbours nearer than its bound; the cap itself still counts
+        bound = np.nextafter(cap_m, np.inf)
+        distances, indices = self._tree.query(ordered_queries, k=2, distance_upper_bound=bound, workers=1)
+        # the tree says n, and infinity, where it found none
+        nearest_index = self._order.take(indices[:, 0], mode="clip")
+        tied = np.flatnonzero((distances[:, 0] == distances[:, 1]) & np.isfinite(distances[:, 0]))
+        nearest_index[tied] = _lowest_of_equals(self._tree, self._held, ordered_queries[tied], self._order)
+        distance, index = np.empty(len(ordered_queries)), np.empty(len(ordered_queries), np.int64)
+        distance[asking_order], index[asking_order] = distances[:, 0], nearest_index
+        too_far = ~np.isfinite(distance) | (distance > cap_m)
+        distance[too_far], index[too_far] = np.inf, -1
+        return distance, index
+
+    def _along_curve(self, points: Points) -> Int64Array:
+        """An order in which points that are near in space are near in memory, so that a search finds them in the cache.
+
+        It follows a Z-order curve through 32 x 32 x 32 cells of a cube around the candidates; few are left as they are.
+        """
+        if not self._is_ordered:
+            return np.arange(len(points))
+        cell = np.clip((points - self._low) * self._cells_a_metre, 0, 31).astype(np.uint16)
+        key = np.zeros(len(points), np.uint16)  # numpy sorts 16 bits in linear time
+        for bit in range(5):
+            for axis in range(3):
+                key |= ((cell[:, axis] >> bit) & 1) << (3 * bit + axis)
+        return np.argsort(key, kind="stable")
 
 
 def nearest(candidates: Points, queries: Points, cap_m: float = np.inf) -> tuple[Float64Array, Int64Array]:
@@ -28,44 +82,7 @@ def nearest(candidates: Points, queries: Points, cap_m: float = np.inf) -> tuple
     >>> distance.tolist(), index.tolist()
     ([1.0, 1.0], [0, 1])
     """
-    if not len(candidates) or not len(queries):
-        return np.full(len(queries), np.inf), np.full(len(queries), -1, np.int64)
-    from scipy.spatial import cKDTree
-
-    order, asking_order = _along_curve(candidates, queries)
-    held, ordered_queries = np.asarray(candidates, np.float64)[order], np.asarray(queries, np.float64)[asking_order]
-    tree = cKDTree(held, balanced_tree=False, compact_nodes=False)
-    # the tree takes only neighbours nearer than its bound; the cap itself still counts
-    bound = np.nextafter(cap_m, np.inf)
-    distances, indices = tree.query(ordered_queries, k=2, distance_upper_bound=bound, workers=1)
-    nearest_index = order.take(indices[:, 0], mode="clip")  # the tree says n, and infinity, where it found none
-    tied = np.flatnonzero((distances[:, 0] == distances[:, 1]) & np.isfinite(distances[:, 0]))
-    nearest_index[tied] = _lowest_of_equals(tree, held, ordered_queries[tied], order)
-    distance, index = np.empty(len(ordered_queries)), np.empty(len(ordered_queries), np.int64)
-    distance[asking_order], index[asking_order] = distances[:, 0], nearest_index
-    too_far = ~np.isfinite(distance) | (distance > cap_m)
-    distance[too_far], index[too_far] = np.inf, -1
-    return distance, index
-
-
-def _along_curve(candidates: Points, queries: Points) -> tuple[Int64Array, Int64Array]:
-    """Orders in which points that are near in space are near in memory, so that a search finds them in the cache.
-
-    Both follow a Z-order curve through 32 x 32 x 32 cells of a cube around the candidates; few points stay as is.
-    """
-    if len(candidates) + len(queries) < WORTH_ORDERING:
-        return np.arange(len(candidates)), np.arange(len(queries))
-    low = candidates.min(axis=0)
-    cells_a_metre = 32.0 / max(float((candidates.max(axis=0) - low).max()), 1e-9)
-    orders = []
-    for points in (candidates, queries):
-        cell = np.clip((points - low) * cells_a_metre, 0, 31).astype(np.uint16)
-        key = np.zeros(len(points), np.uint16)  # numpy sorts 16 bits in linear time
-        for bit in range(5):
-            for axis in range(3):
-                key |= ((cell[:, axis] >> bit) & 1) << (3 * bit + axis)
-        orders.append(np.argsort(key, kind="stable"))
-    return orders[0], orders[1]
+    return Candidates(candidates).nearest(queries, cap_m)
 
 
 def _lowest_of_equals(tree: Any, candidates: Float64Array, queries: Float64Array, order: Int64Array) -> Int64Array:
