@@ -51,7 +51,7 @@ def thinned(points: Float32Array, most: int) -> Cloud:
 
     Coarser grids are laid over what the finest has left.
     """
-    extent_m = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    extent_m = max((float(np.ptp(column)) for column in points.T), default=0.0) if len(points) else 0.0
     finest_m = max(LEAST_SPACING_M, STEPS_A_SPACING * extent_m / (MOST_CELLS - 2))
 
     def spacing(n_steps: int) -> float:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core import registry
-from su3d_bench.core.config import Settings, flatten, resolve
+from su3d_bench.core.config import flatten
 from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_json, package_versions, source_digest
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.interfaces import HasCaveat, HasInputs, HasOwnPerception, Method, ReadsMadeRooms
@@ -18,7 +18,8 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.perception.profiles import Perception, PerceptionConfig
 from su3d_bench.questions.reasoning.language_solver import answers_digest
 from su3d_bench.questions.refined_names import refined_digest
-from su3d_bench.runs.own.watch import checked_dataset, checked_method, made, settings_model, told
+from su3d_bench.runs.own.watch import told
+from su3d_bench.runs.parts import Part
 from su3d_bench.store.records import SealRecord
 from su3d_bench.store.run_folder import JobFolder
 
@@ -26,15 +27,6 @@ from su3d_bench.store.run_folder import JobFolder
 NOT_IN_KEY = ("perception.cache", "perception.models.folder", "perception.models.paths", "perception.language.")
 INSTEAD = "--replace puts this one in its place, or choose another folder with --out"
 FIELDS_KNOWN_LATER = ("data", "profile", "perception", "packages.torch", "packages.transformers")
-
-
-@dataclass(frozen=True)
-class Part:
-    """A dataset or method of the run: its registry target, its own name, its resolved options as JSON."""
-
-    target: str
-    name: str
-    options: str
 
 
 @dataclass(frozen=True)
@@ -133,29 +125,6 @@ def refuse_other_run(folder: JobFolder, key: Mapping[str, str], known_later: Seq
     """A ``StoreError`` where ``folder`` was sealed under another key, fields in ``known_later`` aside."""
     if changed := folder.changed_field("predict", key, known_later=known_later):
         raise StoreError(f"{folder.path}: holds another run ({changed}); {INSTEAD}")
-
-
-def options_model(kind: str, target: str) -> Any:
-    """The model of the options of a dataset, or of the settings of a method."""
-    return settings_model(registry.load(kind, target), "Config" if kind == "method" else "Options")
-
-
-def part_of(kind: str, target: str, settings: Settings) -> Part:
-    """The dataset or method at ``target`` with what ``settings`` say of it."""
-    name = str(registry.load(kind, target).name)
-    return Part(target, name, resolve(settings, (kind, name), options_model(kind, target)).model_dump_json())
-
-
-def build_dataset(part: Part, data_root: Path) -> Any:
-    """The dataset of ``part``, reading below ``data_root``."""
-    dataset_class = registry.load("dataset", part.target)
-    return checked_dataset(made(dataset_class, data_root, dataset_class.Options.model_validate_json(part.options)))
-
-
-def build_method(part: Part) -> Any:
-    """A fresh method of ``part``."""
-    method_class = registry.load("method", part.target)
-    return checked_method(made(method_class, method_class.Config.model_validate_json(part.options)))
 
 
 TRUE_PROPOSALS_CAVEAT = "proposals from the ground truth; a ceiling, not a result"

@@ -55,17 +55,8 @@ from su3d_bench.runs.feeding import (
     true_proposals,
     warm_up,
 )
-from su3d_bench.runs.job import (
-    JobInputs,
-    MethodOutcome,
-    Part,
-    SceneJob,
-    build_dataset,
-    build_method,
-    config_key,
-    refuse_other_run,
-    stride_of,
-)
+from su3d_bench.runs.job import JobInputs, MethodOutcome, SceneJob, config_key, refuse_other_run, stride_of
+from su3d_bench.runs.parts import Part, build_dataset, build_method
 from su3d_bench.runs.planning.poses import REMARK, PosesContradicted, judged
 from su3d_bench.store.atomic import write_bytes, write_text
 from su3d_bench.store.predictions import read_prediction

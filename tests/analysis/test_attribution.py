@@ -279,14 +279,14 @@ def test_an_instance_is_split_where_its_parts_match_it_together_under_its_class(
     parts, is_split = SPLITS[name]
     masks = [points(0, share, start) for share, start, _ in parts]
     predicted = labelled(masks, [class_id for *_, class_id in parts], [0.9] * len(parts))
-    assert overlaps_of(truth(), predicted, RULES).is_split(0) == is_split
+    assert (0 in overlaps_of(truth(), predicted, RULES).split) == is_split
 
 
 def test_an_instance_that_a_merged_mask_finds_is_not_split() -> None:
     halves, merged = [points(0, 0.5), points(0, 0.5, 0.5)], np.concatenate([points(0), points(1, 0.6)])
     for masks, is_split in ((halves, True), ([*halves, merged], False)):
         n = len(masks)
-        assert overlaps_of(truth(), labelled(masks, [3] * n, [0.9] * n), RULES).is_split(0) == is_split
+        assert (0 in overlaps_of(truth(), labelled(masks, [3] * n, [0.9] * n), RULES).split) == is_split
 
 
 def test_what_leaves_the_iou_as_it_is_is_no_part() -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.analysis.attribution import Explained
 from su3d_bench.analysis.page.instances import fed_frames
-from su3d_bench.analysis.page.scene_data import SHOWN_WIDTH, SKETCH_WIDTH, SceneData
+from su3d_bench.analysis.page.scene_data import SKETCH_WIDTH, SceneData
 from su3d_bench.core.errors import Su3dError, printable
 from su3d_bench.core.types import Float32Array, Frame
 from su3d_bench.metrics.attribution.arrays import LookedAt
@@ -25,6 +25,7 @@ MOST_ERRORS = 40  # of a scene under a method and a protocol that are told one b
 MOST_PHOTOS = 64  # of a page, dealt out to its scenes, each of which has at least one for every method
 CANDIDATES = 24  # frames of a scene in which objects are looked for
 MOST_FRAMES = 6  # of a scene from which photos are taken
+PHOTO_WIDTH = 320  # of a frame for photos, where that saves time
 AS_GOOD = 0.7  # of the best view of an object: a frame that several share is taken for it
 MOST_NAMES, MOST_TEXT = 6, 60  # classes that a card names, characters of a name
 NOT_AMONG = "only the worst errors of a scene have one"
@@ -230,7 +231,7 @@ class _Photographer:
                 looks[row, column] = 0.0 if view is None else view.score
         good = [[places[k] for k in np.flatnonzero((row >= AS_GOOD * row.max()) & (row > 0))] for row in looks]
         chosen = frame_cover(good, MOST_FRAMES)
-        frames = {place: self._data.frame(self._dataset, place, SHOWN_WIDTH) for place in chosen}
+        frames = {place: self._data.frame(self._dataset, place, PHOTO_WIDTH) for place in chosen}
         return [self._photo(thing, row, places, frames) for thing, row in zip(things, looks, strict=True)]
 
     def _photo(

@@ -15,7 +15,7 @@ import numpy as np
 
 from su3d_bench.analysis.inputs import Inputs
 from su3d_bench.analysis.page.instances import Growth, fed_frames, frames_of, growth_of, instance_data
-from su3d_bench.analysis.page.scene_data import MOST_LOOKED_AT, SHOWN_WIDTH, SKETCH_WIDTH, SceneData
+from su3d_bench.analysis.page.scene_data import MOST_LOOKED_AT, SKETCH_WIDTH, SceneData
 from su3d_bench.analysis.page.truths import Seen, ShownTruths, judged_objects, why_not_shown
 from su3d_bench.core.errors import ConfigError, Su3dError, printable, printable_json
 from su3d_bench.core.interfaces import Encoder
@@ -177,7 +177,9 @@ class _Scene:
     def page(self, most_points: int, tell: Callable[[str], None]) -> PageScene:
         read = {key[:1] + key[3:]: self._read(key) for key in self._maps}
         chosen = self._chosen_frames([a_map for a_map in read.values() if isinstance(a_map, Instances)])
-        frames = {index: frame for index in sorted(chosen) if (frame := self._frame(index, SHOWN_WIDTH)) is not None}
+        frames = {
+            index: frame for index in sorted(chosen) if (frame := self._frame(index, THUMBNAIL_WIDTH)) is not None
+        }
         clouds = {key: thinned(one.points, most_points) for key, one in read.items() if not isinstance(one, str)}
         seen = self._seen([cloud.points for cloud in clouds.values()])
         made = []

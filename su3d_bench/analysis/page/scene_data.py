@@ -12,7 +12,7 @@ from su3d_bench.reports.pictures.scene_look import spread
 from su3d_bench.runs.finished import FinishedRun
 
 MOST_LOOKED_AT = 48  # frames of a scene
-SKETCH_WIDTH, SHOWN_WIDTH = 160, 320  # of a frame to look at, and of one that is shown: where that saves time
+SKETCH_WIDTH = 160  # of a frame to look at, where that saves time
 
 
 class SceneData:

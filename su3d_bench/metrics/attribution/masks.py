@@ -251,8 +251,7 @@ def _mend_merged(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair
 
 
 def _find_split(overlaps: Overlaps) -> list[MaskError]:
-    split = (g for g in range(overlaps.n_instances) if overlaps.is_split(g))
-    return [MaskError("split", overlaps.parts[g].parts, (g,)) for g in split]
+    return [MaskError("split", overlaps.parts[g].parts, (g,)) for g in overlaps.split.tolist()]
 
 
 def _mend_split(overlaps: Overlaps, errors: Sequence[MaskError], repair: Repair) -> None:

@@ -87,11 +87,14 @@ class Overlaps:
     def missed(self) -> Int64Array:
         """The instances in which no mask of the minimum size lies, which none holds, and which are not split either."""
         touches = ((self.inside > HALF) | (self.cover > HALF)) & self.is_large[:, None]
-        is_split = np.array([self.is_split(g) for g in range(self.n_instances)], bool)
-        return np.flatnonzero(~touches.any(axis=0) & ~is_split)
+        return np.setdiff1d(np.flatnonzero(~touches.any(axis=0)), self.split)
 
-    def is_split(self, g: int) -> bool:
-        """Whether instance g has several parts that together match it, under its class, and no merged mask finds it."""
+    @cached_property
+    def split(self) -> Int64Array:
+        """The instances with several parts that together match them, under their class, which no merged mask finds."""
+        return np.array([g for g in range(self.n_instances) if self._is_split(g)], np.int64)
+
+    def _is_split(self, g: int) -> bool:
         parts = self.parts[g].parts
         if len(parts) < 2 or (self.is_found(g) and not self.finds(parts[0], g)):
             return False

@@ -172,6 +172,13 @@ def encoder_warning(rules: ProtocolRules, prediction: Prediction, encoder: Encod
 def class_index_of_ids(rules: ProtocolRules, ids: Sequence[int] | np.ndarray) -> Int64Array:
     """The class index of each class id, -1 for ids that are none of the protocol's classes."""
     values = np.asarray(ids, np.int64)
+    low, high = int(values.min(initial=0)), int(values.max(initial=0))
+    if high - low < len(values):  # a table of all ids between them is smaller than the answer
+        index_of = np.full(high - low + 1, -1, np.int64)
+        for index, entry in enumerate(rules.classes):
+            if low <= entry.id <= high:
+                index_of[entry.id - low] = index
+        return index_of[values - low]
     known = np.array([*(entry.id for entry in rules.classes), np.iinfo(np.int64).max], np.int64)
     order = np.argsort(known)
     place = order[np.searchsorted(known, values, sorter=order)]

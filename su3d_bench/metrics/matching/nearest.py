@@ -29,8 +29,9 @@ class Candidates:
         from scipy.spatial import cKDTree
 
         if self._is_ordered:
-            self._low = points.min(axis=0)
-            self._cells_a_metre = 32.0 / max(float((points.max(axis=0) - self._low).max()), 1e-9)
+            self._low = np.array([column.min() for column in points.T])  # numpy is slow along short rows
+            side_m = max(float(np.ptp(column)) for column in points.T)
+            self._cells_a_metre = 32.0 / max(side_m, 1e-9)
         self._order = self._along_curve(points)
         self._held = np.asarray(points, np.float64)[self._order]
         self._tree = cKDTree(self._held, balanced_tree=False, compact_nodes=False)

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.runs.job import Part, SceneJob, build_dataset, build_method, stride_of
+from su3d_bench.runs.job import SceneJob, stride_of
+from su3d_bench.runs.parts import Part, build_dataset, build_method
 from su3d_bench.runs.planning.held import kept_jobs
 from su3d_bench.runs.planning.plan import Plan
 from su3d_bench.store.records import read_updates

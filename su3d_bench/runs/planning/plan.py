@@ -35,17 +35,8 @@ from su3d_bench.metrics.protocols.files import protocol_names
 from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
 from su3d_bench.runs.executors.choose import ELSEWHERE, check_execution
-from su3d_bench.runs.job import (
-    FIELDS_KNOWN_LATER,
-    Part,
-    SceneJob,
-    build_method,
-    config_key,
-    options_model,
-    own_code,
-    part_of,
-    refuse_other_run,
-)
+from su3d_bench.runs.job import FIELDS_KNOWN_LATER, SceneJob, config_key, own_code, refuse_other_run
+from su3d_bench.runs.parts import Part, build_method, options_model, part_of
 from su3d_bench.runs.planning.held import (
     HeldRun,
     Into,

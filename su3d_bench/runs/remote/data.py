@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.runs.job import Part, build_dataset
+from su3d_bench.runs.parts import Part, build_dataset
 from su3d_bench.runs.remote.folder import RemoteFolder
 from su3d_bench.store.atomic import make_folder
 from su3d_bench.store.scratch import TemporaryFolder

@@ -17,6 +17,7 @@ from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.errors import StoreError
 from su3d_bench.runs.executors.local import Report
 from su3d_bench.runs.job import MethodOutcome, SceneJob
+from su3d_bench.runs.planning.scenes import cache_root as own_cache_root
 from su3d_bench.runs.remote.folder import RemoteFolder
 from su3d_bench.runs.scene import failed_outcomes, run_scene
 from su3d_bench.store.atomic import make_folder, write_bytes
@@ -24,7 +25,6 @@ from su3d_bench.store.run_folder import JOBS, RECORDS, RunFolder
 from su3d_bench.store.scratch import TemporaryFolder
 from su3d_bench.store.unfinished import is_unfinished
 
-CACHE_ROOT = "~/.cache/su3d-bench/cache"
 SEAL = "done.json"
 REPLIES = "language"  # of language models, which the scenes of a run share
 LARGE = ("prediction.npz", ".features.npy", ".png")  # ends of names that no table or comparison reads
@@ -50,7 +50,7 @@ def run_distant_scene(distant: DistantJob, report: Report) -> tuple[MethodOutcom
     """What ``run_scene`` gives, its files sent to the store."""
     if distant.here.is_dir():
         os.chdir(distant.here)  # relative paths in the configuration are meant from there
-    cache_root = distant.cache_root or Path(os.environ.get("SU3D_CACHE") or CACHE_ROOT).expanduser()
+    cache_root = distant.cache_root or own_cache_root()
     with TemporaryFolder("su3d-scene-") as scratch:
         job = replace(distant.job, cache_root=cache_root)
         if distant.data is not None:
