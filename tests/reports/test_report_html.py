@@ -1,4 +1,4 @@
-"""The page of runs: what it holds, that nothing of a run is markup, how maps are packed, what it says of gaps."""
+"""The page of runs: what it holds, that nothing of a run is markup, what it says of gaps."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import hashlib
 import json
 import re
 import shutil
-import zlib
 from collections.abc import Mapping
 from html.parser import HTMLParser
 from pathlib import Path
@@ -16,29 +15,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+from packed_maps import unpacked
 from painted import Painted, WordEncoder, colour_perception
 from places import SCENES
 
 from su3d_bench.analysis.page import instances as page_instances
 from su3d_bench.analysis.page import maps as page_maps
 from su3d_bench.analysis.page.instances import MOST_STEPS, Growth
-from su3d_bench.analysis.page.maps import points_of_each
 from su3d_bench.cli.main import main
 from su3d_bench.core.maps import DenseFeatures, Instances
-from su3d_bench.metrics.matching.nearest import Candidates
 from su3d_bench.reports.page import maps as html_map
 from su3d_bench.reports.page import numbers as html_data
 from su3d_bench.reports.page import page as html_page
 from su3d_bench.reports.page.maps import (
     NO_TRUTH_NEAR,
     NOT_SCORED,
-    box_in_view,
-    index_plane,
-    nearest_classes,
-    nearest_colours,
-    pack_map,
-    point_owners,
-    thinned,
 )
 from su3d_bench.reports.page.page import page_html
 from su3d_bench.reports.pictures import scene_look
@@ -107,30 +98,6 @@ def elements(text: str) -> Elements:
 def data_of(text: str) -> dict[str, Any]:
     found: dict[str, Any] = json.loads(elements(text).content["data"])
     return found
-
-
-def unpacked(content: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """What a browser reads of a packed map: the JSON and the planes, among them the places in metres."""
-    data = zlib.decompress(base64.b64decode(content))
-    length = int.from_bytes(data[:4], "little")
-    about, at, planes = json.loads(data[4 : 4 + length]), 4 + length, {}
-    n = about["n"]
-    cells = np.zeros((1, 3), np.int64)
-    for _ in range(about["depth"]):
-        is_there = (np.frombuffer(data, np.uint8, len(cells), at)[:, None] >> np.arange(8)) & 1 == 1
-        at += len(cells)
-        of_cell, eighth = np.nonzero(is_there)
-        cells = 2 * cells[of_cell] + np.stack([eighth & 1, eighth >> 1 & 1, eighth >> 2], axis=1)
-    for plane in about["planes"]:
-        columns = []
-        for _ in range(plane["width"]):
-            part = np.frombuffer(data, np.uint8, n * plane["bytes"], at).reshape(plane["bytes"], n).astype(np.int64)
-            columns.append(part[0] + (256 * part[1] if plane["bytes"] == 2 else 0))
-            at += n * plane["bytes"]
-        planes[plane["name"]] = np.stack(columns, axis=1).squeeze()
-    assert at == len(data)
-    planes["position"] = np.array(about["origin"]) + (cells if n else cells[:0]) * about["step"]
-    return about, planes
 
 
 def test_the_page_holds_the_numbers_of_the_record(run: Path, page: str) -> None:
@@ -375,95 +342,6 @@ def test_a_page_answers_in_json(run: Path, tmp_path: Path, capsys: pytest.Captur
     assert told["n_bytes"] == len(text.encode())
     assert told["n_maps"] == 4
     assert elements(text).content["title"] == "A <b> title"
-
-
-def surface(n: int, seed: int) -> Any:
-    """Random points (n, 3) on the walls of a room of 6 x 5 x 3 m."""
-    rng = np.random.default_rng(seed)
-    points = rng.random((n, 3)) * [6.0, 5.0, 3.0]
-    axis = rng.integers(0, 3, n)
-    points[np.arange(n), axis] = np.where(rng.random(n) < 0.5, 0.0, np.array([6.0, 5.0, 3.0])[axis])
-    return points.astype(np.float32)
-
-
-def test_twenty_scenes_under_eight_methods_stay_below_thirty_megabytes() -> None:
-    most = points_of_each(160, 30_000_000)
-    cloud = thinned(surface(150_000, 0), most)
-    assert 0.6 * most < len(cloud.points) <= most
-    rng = np.random.default_rng(1)
-    cells = np.floor(cloud.points / 0.4).astype(np.int64) @ [1, 20, 400]
-    planes: dict[str, Any] = {
-        "owner": index_plane(cells % 150),
-        "colour": html_map.colour_plane(rng.integers(0, 256, (len(cells), 3), np.uint8)),  # noise: the worst case
-        "truth": index_plane(cells % 60),
-    }
-    assert 160 * len(pack_map(cloud, planes, {})) < 30_000_000
-
-
-def test_thinned_points_are_one_a_cell_and_keep_the_order_of_the_curve() -> None:
-    points = np.array([[0, 0, 0], [0.001, 0, 0], [1, 0, 0], [1, 1, 1], [0.02, 0, 0]], np.float32)
-    cloud = thinned(points, 10)
-    assert sorted(cloud.rows.tolist()) == [0, 2, 3, 4]
-    assert cloud.rows[0] == 0
-    assert len(thinned(points, 2).rows) <= 2
-    assert len(thinned(np.zeros((0, 3), np.float32), 5).rows) == 0
-
-
-@pytest.mark.parametrize("scale", [1e-3, 1.0, 300.0])
-def test_places_read_back_within_half_a_step_at_every_size(scale: float) -> None:
-    points = surface(5000, 3) * np.float32(scale) - np.float32(2 * scale)
-    cloud = thinned(points, 2000)
-    about, planes = unpacked(pack_map(cloud, {"owner": index_plane(np.arange(len(cloud.rows)))}, {}))
-    assert planes["owner"].tolist() == list(range(about["n"]))
-    assert np.abs(planes["position"] - cloud.points).max() <= 0.5 * about["step"] * (1 + 1e-4)
-    assert about["depth"] <= 16  # a page counts cells in sixteen bits
-
-
-def test_an_empty_map_packs_and_reads_back() -> None:
-    cloud = thinned(np.zeros((0, 3), np.float32), 5)
-    about, planes = unpacked(pack_map(cloud, {"owner": index_plane(np.zeros(0, np.int64))}, {"classes": []}))
-    assert about["n"] == 0
-    assert planes["owner"].size == 0
-
-
-def test_of_masks_that_overlap_the_smaller_one_is_seen() -> None:
-    prediction = Instances(
-        points=np.zeros((4, 3), np.float32),
-        indptr=np.array([0, 3, 4]),
-        indices=np.array([0, 1, 2, 1], np.int32),
-        scores=np.ones(2),
-        features=None,
-        labels=None,
-        names=("large", "small"),
-        captions=("", ""),
-        boxes=np.zeros((2, 2, 3), np.float32),
-        centroids=np.zeros((2, 3), np.float32),
-        view_indptr=np.zeros(3, np.int64),
-        views=np.zeros((0, 2), np.int32),
-    )
-    assert point_owners(prediction, np.arange(4)).tolist() == [0, 1, 0, -1]
-
-
-def test_the_truth_of_a_point_is_the_nearest_within_five_centimetres() -> None:
-    truth = np.array([[0, 0, 0], [1, 0, 0]], np.float32)
-    points = np.array([[0.04, 0, 0], [0.06, 0, 0], [1, 0, 0]], np.float32)
-    assert nearest_classes(points, Candidates(truth), np.array([7, -1])).tolist() == [7, NO_TRUTH_NEAR, NOT_SCORED]
-    assert nearest_classes(points, Candidates(truth[:0]), np.zeros(0, np.int64)).tolist() == [NO_TRUTH_NEAR] * 3
-
-
-def test_a_point_that_no_frame_saw_is_grey() -> None:
-    seen, colours = np.zeros((1, 3), np.float32), np.array([[10, 20, 30]], np.uint8)
-    found = nearest_colours(np.array([[0.05, 0, 0], [0.07, 0, 0]], np.float32), Candidates(seen), colours)
-    assert found is not None
-    assert found.tolist() == [[10, 20, 30], [128, 128, 128]]
-    assert nearest_colours(seen, Candidates(seen[:0]), colours[:0]) is None
-
-
-def test_a_box_in_a_view_is_where_the_points_project() -> None:
-    intrinsics = np.array([[100.0, 0, 50], [0, 100.0, 40], [0, 0, 1]])
-    points = np.array([[0, 0, 2], [0.5, 0.4, 2], [0, 0, -1], [9, 0, 2]], np.float32)
-    assert box_in_view(points, np.eye(4), intrinsics, 100, 80) == [0.5, 0.5, 0.75, 0.75]
-    assert box_in_view(points[2:], np.eye(4), intrinsics, 100, 80) is None
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,124 @@
+"""The points of a map on a page: thinned, packed, read back, coloured by what is near."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from packed_maps import unpacked
+
+from su3d_bench.analysis.page.maps import points_of_each
+from su3d_bench.core.maps import Instances
+from su3d_bench.metrics.matching.nearest import Candidates
+from su3d_bench.reports.page import maps as html_map
+from su3d_bench.reports.page.maps import (
+    NO_TRUTH_NEAR,
+    NOT_SCORED,
+    box_in_view,
+    index_plane,
+    nearest_classes,
+    nearest_colours,
+    pack_map,
+    point_owners,
+    thinned,
+)
+
+
+def surface(n: int, seed: int) -> Any:
+    """Random points (n, 3) on the walls of a room of 6 x 5 x 3 m."""
+    rng = np.random.default_rng(seed)
+    points = rng.random((n, 3)) * [6.0, 5.0, 3.0]
+    axis = rng.integers(0, 3, n)
+    points[np.arange(n), axis] = np.where(rng.random(n) < 0.5, 0.0, np.array([6.0, 5.0, 3.0])[axis])
+    return points.astype(np.float32)
+
+
+def test_twenty_scenes_under_eight_methods_stay_below_thirty_megabytes() -> None:
+    most = points_of_each(160, 30_000_000)
+    cloud = thinned(surface(150_000, 0), most)
+    assert 0.6 * most < len(cloud.points) <= most
+    rng = np.random.default_rng(1)
+    cells = np.floor(cloud.points / 0.4).astype(np.int64) @ [1, 20, 400]
+    planes: dict[str, Any] = {
+        "owner": index_plane(cells % 150),
+        "colour": html_map.colour_plane(rng.integers(0, 256, (len(cells), 3), np.uint8)),  # noise: the worst case
+        "truth": index_plane(cells % 60),
+    }
+    assert 160 * len(pack_map(cloud, planes, {})) < 30_000_000
+
+
+def test_thinned_points_are_one_a_cell_and_keep_the_order_of_the_curve() -> None:
+    points = np.array([[0, 0, 0], [0.001, 0, 0], [1, 0, 0], [1, 1, 1], [0.02, 0, 0]], np.float32)
+    cloud = thinned(points, 10)
+    assert sorted(cloud.rows.tolist()) == [0, 2, 3, 4]
+    assert cloud.rows[0] == 0
+    assert len(thinned(points, 2).rows) <= 2
+    assert len(thinned(np.zeros((0, 3), np.float32), 5).rows) == 0
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 300.0])
+def test_places_read_back_within_half_a_step_at_every_size(scale: float) -> None:
+    points = surface(5000, 3) * np.float32(scale) - np.float32(2 * scale)
+    cloud = thinned(points, 2000)
+    about, planes = unpacked(pack_map(cloud, {"owner": index_plane(np.arange(len(cloud.rows)))}, {}))
+    assert planes["owner"].tolist() == list(range(about["n"]))
+    assert np.abs(planes["position"] - cloud.points).max() <= 0.5 * about["step"] * (1 + 1e-4)
+    assert about["depth"] <= 16  # a page counts cells in sixteen bits
+
+
+def test_an_empty_map_packs_and_reads_back() -> None:
+    cloud = thinned(np.zeros((0, 3), np.float32), 5)
+    about, planes = unpacked(pack_map(cloud, {"owner": index_plane(np.zeros(0, np.int64))}, {"classes": []}))
+    assert about["n"] == 0
+    assert planes["owner"].size == 0
+
+
+def test_of_masks_that_overlap_the_smaller_one_is_seen() -> None:
+    prediction = Instances(
+        points=np.zeros((4, 3), np.float32),
+        indptr=np.array([0, 3, 4]),
+        indices=np.array([0, 1, 2, 1], np.int32),
+        scores=np.ones(2),
+        features=None,
+        labels=None,
+        names=("large", "small"),
+        captions=("", ""),
+        boxes=np.zeros((2, 2, 3), np.float32),
+        centroids=np.zeros((2, 3), np.float32),
+        view_indptr=np.zeros(3, np.int64),
+        views=np.zeros((0, 2), np.int32),
+    )
+    assert point_owners(prediction, np.arange(4)).tolist() == [0, 1, 0, -1]
+
+
+def test_the_truth_of_a_point_is_the_nearest_within_five_centimetres() -> None:
+    truth = np.array([[0, 0, 0], [1, 0, 0]], np.float32)
+    points = np.array([[0.04, 0, 0], [0.06, 0, 0], [1, 0, 0]], np.float32)
+    assert nearest_classes(points, Candidates(truth), np.array([7, -1])).tolist() == [7, NO_TRUTH_NEAR, NOT_SCORED]
+    assert nearest_classes(points, Candidates(truth[:0]), np.zeros(0, np.int64)).tolist() == [NO_TRUTH_NEAR] * 3
+
+
+def test_a_point_that_no_frame_saw_is_grey() -> None:
+    seen, colours = np.zeros((1, 3), np.float32), np.array([[10, 20, 30]], np.uint8)
+    found = nearest_colours(np.array([[0.05, 0, 0], [0.07, 0, 0]], np.float32), Candidates(seen), colours)
+    assert found is not None
+    assert found.tolist() == [[10, 20, 30], [128, 128, 128]]
+    assert nearest_colours(seen, Candidates(seen[:0]), colours[:0]) is None
+
+
+def test_a_box_in_a_view_is_where_the_points_project() -> None:
+    intrinsics = np.array([[100.0, 0, 50], [0, 100.0, 40], [0, 0, 1]])
+    points = np.array([[0, 0, 2], [0.5, 0.4, 2], [0, 0, -1], [9, 0, 2]], np.float32)
+    assert box_in_view(points, np.eye(4), intrinsics, 100, 80) == [0.5, 0.5, 0.75, 0.75]
+    assert box_in_view(points[2:], np.eye(4), intrinsics, 100, 80) is None
+
+
+def test_the_grid_is_the_finest_that_leaves_few_enough_points() -> None:
+    line = np.zeros((40_000, 3), np.float32)
+    line[:, 0] = np.linspace(0, 400, len(line))  # unlike a surface, so that the first guess of a spacing is far off
+    for points, most in ((line, 900), (surface(60_000, 4), 5_000)):
+        cloud = thinned(points, most)
+        assert len(cloud.rows) <= most
+        finer = np.unique(np.floor(points / np.float64(cloud.spacing_m / html_map.COARSER)), axis=0)
+        assert len(finer) > most
