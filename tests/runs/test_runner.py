@@ -1,33 +1,24 @@
+"""What a run makes of its scenes, and what it leaves in its folder."""
+
 from __future__ import annotations
 
 import csv
 import json
 import os
-import random
-import shutil
-import signal
 import subprocess
-import sys
-import time
 import tomllib
-from contextlib import suppress
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 from painted import ColourPerception, colour_perception
+from painted_runs import PAINTED, in_process, job, metrics, run, words
 from places import SCENES
-from waiting import wait_until
 
 from su3d_bench.cli.main import main
 from su3d_bench.runs import feeding as scene_feeding
 from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import scene as scene_run
-
-PAINTED = f"{SCENES}/painted.py:Painted"
-COLLECTOR = f"{SCENES}/painted.py:Collector"
-PROTOCOLS = ["--protocols", "rooms-semantic", "rooms-instance"]
 
 
 @pytest.fixture(autouse=True)
@@ -35,28 +26,6 @@ def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for module in (scene_run, finished_scenes):
         monkeypatch.setattr(module, "build_perception", colour_perception)
     monkeypatch.chdir(tmp_path)
-
-
-def words(*more: str, scenes: str = "*", out: str = "out") -> list[str]:
-    base = ["run", "--scenes", f"{PAINTED}/{scenes}", "--methods", COLLECTOR, *PROTOCOLS, "--no-pictures"]
-    return [*base, "--jobs", "1", "--out", out, *more]
-
-
-def run(*more: str, scenes: str = "*", out: str = "out") -> int:
-    return main(words(*more, scenes=scenes, out=out))
-
-
-def in_process(*more: str, out: str = "out") -> list[str]:
-    return [sys.executable, str(SCENES / "painted_cli.py"), *words(*more, out=out)]
-
-
-def metrics(out: str = "out") -> dict[str, Any]:
-    loaded: dict[str, Any] = json.loads(Path(out, "metrics.json").read_text())
-    return loaded
-
-
-def job(scene: str = "a", method: str = "collector", out: str = "out") -> Path:
-    return Path(out, "scenes", f"painted.{scene}", method)
 
 
 def test_a_run_leaves_the_folder_that_the_design_promises() -> None:
@@ -143,43 +112,6 @@ def test_a_damaged_file_is_made_again(name: str) -> None:
     assert (job() / "counts.npz").read_bytes() == counts
 
 
-@pytest.mark.parametrize(
-    ("more", "field"),
-    [
-        (["--set", "collector.drop=1"], "method.collector.drop was 0, now 1"),
-        (["--set", "painted.n_frames=4"], "dataset.painted.n_frames was 6, now 4"),
-        (["--stride", "3"], "stride was 1, now 3"),
-        (["--limit", "2"], "limit was none, now 2"),
-        (["--seed", "5"], "seed was 0, now 5"),
-        (["--set", "perception.naming.temperature=0.5"], "perception.naming.temperature was 0.05, now 0.5"),
-    ],
-)
-def test_another_key_in_the_same_folder_is_refused_by_name(
-    more: list[str], field: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(scenes="a") == 0
-    before = Path("out/metrics.json").read_bytes()
-    capsys.readouterr()
-    assert run(*more, scenes="a") == 2
-    line = (
-        f"out: holds another run ({field}); --replace puts this one in its place, or choose another folder with --out"
-    )
-    assert capsys.readouterr().err == f"su3d-bench: {line}\n"
-    assert Path("out/metrics.json").read_bytes() == before
-
-
-def test_changed_perception_is_refused_by_name(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(scenes="a") == 0
-    other = colour_perception()
-    other.digest = "colours-2"
-    for module in (scene_run, finished_scenes):
-        monkeypatch.setattr(module, "build_perception", lambda *_, **__: other)
-    assert run(scenes="a") == 2
-    assert "perception was colours-1, now colours-2" in capsys.readouterr().err
-
-
 def test_other_protocols_score_the_same_predictions_again(monkeypatch: pytest.MonkeyPatch) -> None:
     assert run(scenes="a") == 0
     made = (job() / "prediction.npz").stat().st_mtime_ns
@@ -189,7 +121,11 @@ def test_other_protocols_score_the_same_predictions_again(monkeypatch: pytest.Mo
 
 
 PLUG_IN = (SCENES / "painted.py").read_text().splitlines()
+
+
 MADE = 1 + next(k for k, line in enumerate(PLUG_IN) if "return Frame(" in line)
+
+
 CRASHES = 1 + next(k for k, line in enumerate(PLUG_IN) if "a mistake in a plug-in" in line)
 
 
@@ -283,99 +219,6 @@ def test_pictures_are_drawn_and_vouched_for() -> None:
     assert (job() / "pictures" / "classes.png").is_file()
 
 
-def test_a_read_only_folder_is_one_line(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    # Root may write anywhere, so the refusal is made here instead of by permissions.
-    def refuse(self: Path, *_: Any, **__: Any) -> None:
-        raise PermissionError(13, "Permission denied", str(self))
-
-    monkeypatch.setattr(Path, "mkdir", refuse)
-    assert run() == 2
-    line = "su3d-bench: cannot write out: the folder is read-only; choose another with --out"
-    assert capsys.readouterr().err.splitlines()[-1] == line
-
-
-def test_a_full_disk_is_one_line_and_the_run_resumes(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert run(out="whole") == 0
-    n_writes = 0
-    write = os.fsync
-
-    def full_after_twelve(descriptor: int) -> None:
-        nonlocal n_writes
-        n_writes += 1
-        if n_writes > 12:
-            raise OSError(28, "No space left on device")
-        write(descriptor)
-
-    capsys.readouterr()
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full_after_twelve)
-        assert run() == 2
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1
-    assert ": the disk is full; free some space and run the same command again" in error
-    assert run() == 0
-    assert Path("out/metrics.json").read_bytes() == Path("whole/metrics.json").read_bytes()
-
-
-def test_worker_processes_give_the_same_bytes_as_one() -> None:
-    noise = ("--set", "collector.noise_m=0.02")
-    for jobs in ("1", "2"):
-        finish(in_process(*noise, "--jobs", jobs, out=f"jobs{jobs}"))
-    assert Path("jobs1/metrics.json").read_bytes() == Path("jobs2/metrics.json").read_bytes()
-    for scene in "abcd":
-        one, two = ((job(scene, out=f"jobs{n}") / "prediction.npz").read_bytes() for n in (1, 2))
-        assert one == two
-
-
-def test_a_killed_worker_fails_its_scene_alone() -> None:
-    done = subprocess.run(in_process("--jobs", "2", "--set", "painted.fault=kill"), capture_output=True, text=True)
-    assert done.returncode == 3
-    assert "painted/b: the worker was killed (signal 9), most often for want of memory; try fewer --jobs" in done.stderr
-    assert metrics()["results"][0]["result"]["scenes"] == ["painted/a", "painted/c", "painted/d"]
-
-
-def test_an_interrupt_ends_cleanly_and_the_run_resumes() -> None:
-    command = in_process("--jobs", "2", "--set", "painted.frame_ms=500")
-    # a shell ignores interrupts for what it runs in the background, and children inherit that
-    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=heard)
-    wait_until(job("a").exists)
-    os.killpg(process.pid, signal.SIGINT)
-    _, error = process.communicate(timeout=20)
-    assert process.returncode == 130
-    assert error == "su3d-bench: interrupted; the same command takes it up again\n"
-    assert json.loads(Path("out/run.json").read_text())["status"] == "interrupted"
-
-
-def test_killed_at_any_moment_and_taken_up_again_it_gives_the_same_bytes() -> None:
-    slow = ("--set", "painted.frame_ms=20", "--set", "collector.noise_m=0.01")
-    started = time.monotonic()
-    finish(in_process(*slow, out="whole"))
-    whole_s = time.monotonic() - started
-    expected = Path("whole/metrics.json").read_bytes()
-    moments = random.Random(0)
-    for k in range(10):
-        command = in_process(*slow, "--jobs", "2" if k % 3 == 0 else "1")
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        with suppress(subprocess.TimeoutExpired):
-            process.wait(moments.uniform(0.1, 0.9) * whole_s)
-        process.kill()
-        process.wait()
-        if moments.random() < 0.5:
-            shutil.rmtree("out/scenes/painted.a", ignore_errors=True)
-    finish(in_process(*slow))
-    assert Path("out/metrics.json").read_bytes() == expected
-    assert not list(Path("out").rglob("*.unfinished"))
-
-
-def finish(command: list[str]) -> None:
-    """Run ``command`` to its end, which must be a good one."""
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-
 def test_progress_shows_scenes_and_frames_on_a_terminal_only() -> None:
     ours, theirs = os.openpty()
     slow = in_process("--set", "painted.frame_ms=60", "--jobs", "2", out="tty")
@@ -403,35 +246,6 @@ def read_some(descriptor: int) -> bytes:
         return b""
 
 
-def test_the_second_of_two_runs_on_one_folder_is_refused() -> None:
-    process = subprocess.Popen(in_process("--set", "painted.frame_ms=200"), stdout=subprocess.DEVNULL)
-    wait_until(Path("out/run.json").exists)
-    assert run("--set", "painted.frame_ms=200") == 2
-    process.kill()
-    process.wait()
-
-
-def test_a_folder_of_somebody_else_is_refused_and_left_alone(capsys: pytest.CaptureFixture[str]) -> None:
-    Path("out").mkdir()
-    Path("out/.notes.tmp").write_text("theirs")
-    assert run() == 2
-    assert capsys.readouterr().err == (
-        "su3d-bench: out: holds '.notes.tmp' and is no folder of a run; choose a new folder with --out\n"
-    )
-    assert [path.name for path in Path("out").iterdir()] == [".notes.tmp"]
-
-
-def test_a_run_takes_an_empty_folder_and_its_own_and_deletes_nothing_that_is_not_its(tmp_path: Path) -> None:
-    Path("out").mkdir()
-    Path("out/.run.toml.0123456789ab.unfinished").write_text("killed before its first file")
-    assert run(scenes="a") == 0
-    Path("out/.notes.tmp").write_text("theirs")
-    Path("out/scenes/painted.a/collector/.notes.tmp").write_text("theirs")
-    assert run(scenes="a") == 0
-    assert {path.name for path in Path("out").rglob(".*")} == {".notes.tmp"}
-    assert len(list(Path("out").rglob(".notes.tmp"))) == 2
-
-
 def test_scenes_whose_names_differ_in_a_slash_have_a_map_each(capsys: pytest.CaptureFixture[str]) -> None:
     twins = ["run", "--scenes", f"{SCENES}/twins.py:Twins/*", *words()[3:]]
     assert main(twins) == 0
@@ -452,30 +266,6 @@ def test_a_scene_is_exported_under_its_own_name(capsys: pytest.CaptureFixture[st
     capsys.readouterr()
     assert main(["export", "out", "--to", "openlex3d", "--method", "collector", "--out", "x"]) == 0
     assert [path.name for path in Path("x/twins").iterdir()] == ["a_b"]
-
-
-@pytest.mark.parametrize(
-    ("more", "line"),
-    [
-        (["--methods", f"{SCENES}/twins.py:SlashCollector"], "'../elsewhere' cannot be the name of a folder"),
-        (["--methods", COLLECTOR, f"{SCENES}/./painted.py:Collector"], "different ones are called 'collector'"),
-        (
-            ["--scenes", f"{PAINTED}/a", f"{SCENES}/./painted.py:Painted/b"],
-            "two different ones are called 'pai",
-        ),
-        (["--protocols", "one/mine.toml", "two/mine.toml"], "two different ones are called 'mine'"),
-    ],
-)
-def test_two_things_of_one_name_are_refused_before_any_work(
-    more: list[str], line: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for folder, voxel in (("one", "0.05"), ("two", "0.06")):
-        Path(folder).mkdir()
-        text = f'extends = "rooms-semantic"\nname = "mine"\n[transfer]\nevaluation_voxel_m = {voxel}\n'
-        Path(folder, "mine.toml").write_text(text)
-    assert main([*words(), *more]) == 2
-    assert line in capsys.readouterr().err
-    assert not Path("out").exists()
 
 
 def test_a_protocol_named_twice_counts_once() -> None:
