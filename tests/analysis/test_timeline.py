@@ -14,8 +14,8 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
-from painted import WordEncoder, colour_perception
-from places import SCENES
+from painted import WordEncoder
+from painted_runs import painted_run
 
 from su3d_bench.analysis.page.maps import Spaces
 from su3d_bench.analysis.timeline import MOST_POINTS, SEEN_M, SceneTimeline, ids_of, in_view, owned_of_truth, smaller
@@ -27,24 +27,16 @@ from su3d_bench.reports.timeline import records as kinds
 from su3d_bench.reports.timeline.records import Moment, Record
 from su3d_bench.reports.timeline.rrd import rerun_sdk, write_rrd
 from su3d_bench.runs import finished as finished_run
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run
 from su3d_bench.store.records import read_updates
 
-PAINTED = f"{SCENES}/painted.py"
 SCENE = "painted/a"
 HOSTILE = "\x1b[31m/red <b>\n::stop-commands::x\u202e"
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("timeline") / "run"
-    words = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--jobs", "1", "--no-pictures"]
-    words += ["--methods", f"{PAINTED}:Collector", "--protocols", "rooms-semantic", "rooms-instance"]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
-        assert main([*words, "--out", str(folder)]) == 0
-    return folder
+    return painted_run(tmp_path_factory.mktemp("timeline") / "run")
 
 
 @pytest.fixture

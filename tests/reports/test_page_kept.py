@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from painted import WordEncoder, colour_perception
+from painted import WordEncoder
+from painted_runs import painted_run
 from places import SCENES
 
 from su3d_bench.analysis.attribution import Explained, explained_of
@@ -24,23 +25,15 @@ from su3d_bench.cli.main import EXIT_INTERRUPTED, main
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.runs import finished as finished_run
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run
 from su3d_bench.store.predictions import read_prediction, write_prediction
 
-PAINTED = f"{SCENES}/painted.py"
 WORDS = ["--queries", "chair", "table"]
 
 
 @pytest.fixture(scope="module")
 def made_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("kept") / "run"
-    words = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--jobs", "1", "--no-pictures"]
-    words += ["--methods", f"{PAINTED}:Collector", "--protocols", "rooms-semantic", "rooms-instance"]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
-        assert main([*words, "--out", str(folder)]) == 0
-    return folder
+    return painted_run(tmp_path_factory.mktemp("kept") / "run")
 
 
 @pytest.fixture

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import pytest
 from packed_maps import unpacked
-from painted import Painted, WordEncoder, colour_perception
-from places import SCENES
+from painted import Painted, WordEncoder
+from painted_runs import COLLECTOR, painted_page, painted_run
 
 from su3d_bench.analysis.page import instances as page_instances
 from su3d_bench.analysis.page import maps as page_maps
@@ -33,37 +33,20 @@ from su3d_bench.reports.page.maps import (
 )
 from su3d_bench.reports.page.page import page_html
 from su3d_bench.reports.pictures import scene_look
-from su3d_bench.runs import finished as finished_run
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.predictions import read_prediction, write_prediction
 
-PAINTED = f"{SCENES}/painted.py"
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(1)>&\"'<!--"
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("page") / "run"
-    words = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--jobs", "1", "--no-pictures"]
-    words += ["--methods", f"{PAINTED}:Collector", f"{PAINTED}:Collector@noise_m=0.3", "--anytime", "0.5"]
-    words += ["--protocols", "rooms-semantic", "rooms-instance", "--out", str(folder)]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
-        assert main(words) == 0
-    return folder
-
-
-def made(run: Path, page: Path, *words: str) -> str:
-    """The page of a run, made with the encoder of painted scenes."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
-        assert main(["report", "html", str(run), "--out", str(page), "--quiet", "--jobs", "1", *words]) == 0
-    return page.read_text(encoding="utf-8")
+    methods = (COLLECTOR, f"{COLLECTOR}@noise_m=0.3")
+    return painted_run(tmp_path_factory.mktemp("page") / "run", "--anytime", "0.5", methods=methods)
 
 
 @pytest.fixture(scope="module")
 def page(run: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
-    return made(run, tmp_path_factory.mktemp("page") / "page.html")
+    return painted_page(run, tmp_path_factory.mktemp("page") / "page.html")
 
 
 class Elements(HTMLParser):
@@ -139,7 +122,7 @@ def test_the_confusion_of_the_page_gives_the_mean_accuracy_of_the_record(page: s
 
 
 def test_the_same_run_gives_the_same_bytes(run: Path, page: str, tmp_path: Path) -> None:
-    assert made(run, tmp_path / "again.html") == page
+    assert painted_page(run, tmp_path / "again.html") == page
 
 
 def test_nothing_may_run_or_be_loaded_but_what_stands_in_the_page(page: str) -> None:
@@ -171,7 +154,7 @@ def test_control_characters_of_a_record_do_not_reach_the_page(run: Path, tmp_pat
     metrics = json.loads((changed / "metrics.json").read_text())
     metrics["results"][0]["caveat"] = f"{HOSTILE}\x1b[31m\u202e"
     (changed / "metrics.json").write_text(json.dumps(metrics))
-    text = made(changed, tmp_path / "page.html", "--no-maps", "--no-errors")
+    text = painted_page(changed, tmp_path / "page.html", "--no-maps", "--no-errors")
     assert data_of(text)["results"][0]["caveat"] == f"{HOSTILE}\\x1b[31m\\u202e"
     assert "\x1b" not in text
     assert "\u202e" not in text
@@ -215,7 +198,7 @@ def test_the_truth_beside_a_map_names_its_objects_and_those_that_the_map_misses(
         features=None if stored.features is None else stored.features[kept],
     )  # fmt: skip
     write_prediction(place, fewer)
-    found = elements(made(changed, tmp_path / "page.html", "--no-errors"))
+    found = elements(painted_page(changed, tmp_path / "page.html", "--no-errors"))
     scene = json.loads(found.content["scene-0"])
     assert len(scene["truths"]) == 1
     truth, planes = unpacked(scene["truths"][0])
@@ -271,7 +254,7 @@ def test_a_growth_of_many_updates_has_few_steps_and_its_last() -> None:
 
 
 def test_similarities_are_those_of_the_asked_texts(run: Path, tmp_path: Path) -> None:
-    text = made(run, tmp_path / "page.html", "--queries", "chair", "table", "--no-errors")
+    text = painted_page(run, tmp_path / "page.html", "--queries", "chair", "table", "--no-errors")
     about, _ = unpacked(elements(text).content["map-0"])
     assert about["queries"] == ["chair", "table"]
     stored = read_prediction(run / "scenes" / "painted.a" / "collector" / "prediction.npz")
@@ -288,7 +271,7 @@ def test_dense_features_have_a_class_a_point_and_no_instance(run: Path, tmp_path
     rows = WordEncoder().encode_texts(["sofa", "table", "sofa", "sofa"]).astype(np.float16)
     rows[3] = 0
     write_prediction(changed / "scenes" / "painted.a" / "collector" / "prediction.npz", DenseFeatures(points, rows))
-    about, planes = unpacked(elements(made(changed, tmp_path / "page.html", "--no-errors")).content["map-0"])
+    about, planes = unpacked(elements(painted_page(changed, tmp_path / "page.html", "--no-errors")).content["map-0"])
     order = np.argmin(np.linalg.norm(points[None] - planes["position"][:, None], axis=2), axis=1)
     called = ["none" if c == 0xFFFF else about["classes"][c] for c in planes["class"]]
     assert called == [("sofa", "table", "sofa", "none")[k] for k in order]
@@ -304,7 +287,7 @@ def test_what_cannot_be_shown_is_a_reason_on_the_page(run: Path, tmp_path: Path)
     record = json.loads((changed / "run.json").read_text())
     record["data_digests"]["painted/a"] = "0" * 64
     (changed / "run.json").write_text(json.dumps(record))
-    text = made(changed, tmp_path / "page.html")
+    text = painted_page(changed, tmp_path / "page.html")
     found = data_of(text)
     assert ["damaged" in str(one["reason"]) or "not a readable" in str(one["reason"]) for one in found["maps"]] == [
         *(False, False),
@@ -337,7 +320,7 @@ def test_a_wrong_request_is_one_line(
 
 
 def test_a_page_answers_in_json(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = made(run, tmp_path / "page.html", "--json", "--no-errors", "--title", "A <b> title")
+    text = painted_page(run, tmp_path / "page.html", "--json", "--no-errors", "--title", "A <b> title")
     told = json.loads(capsys.readouterr().out)
     assert told["n_bytes"] == len(text.encode())
     assert told["n_maps"] == 4

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import pytest
+from painted import WordEncoder, colour_perception
 from places import SCENES
 
 from su3d_bench.cli.main import main
+from su3d_bench.runs import finished as finished_run
+from su3d_bench.runs import scene as scene_run
 
 PAINTED = f"{SCENES}/painted.py:Painted"
-
-
 COLLECTOR = f"{SCENES}/painted.py:Collector"
-
-
 PROTOCOLS = ["--protocols", "rooms-semantic", "rooms-instance"]
 
 
@@ -40,3 +41,20 @@ def metrics(out: str = "out") -> dict[str, Any]:
 
 def job(scene: str = "a", method: str = "collector", out: str = "out") -> Path:
     return Path(out, "scenes", f"painted.{scene}", method)
+
+
+def painted_run(folder: Path, *more: str, methods: Sequence[str] = (COLLECTOR,)) -> Path:
+    """A finished run of two scenes, made in this process."""
+    named = ["run", f"{PAINTED}/a", f"{PAINTED}/b", "--methods", *methods, *PROTOCOLS, "--no-pictures"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", colour_perception)
+        assert main([*named, "--jobs", "1", "--out", str(folder), *more]) == 0
+    return folder
+
+
+def painted_page(run: Path, page: Path, *more: str) -> str:
+    """The page of a run, made with the encoder of painted scenes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
+        assert main(["report", "html", str(run), "--out", str(page), "--quiet", "--jobs", "1", *more]) == 0
+    return page.read_text(encoding="utf-8")
