@@ -160,6 +160,9 @@ class GroundTruth:
     ``instance`` (N,) int32 ids unique in the scene, 0 where there is none; ``source`` says how it was made.
     ``evaluation_points`` (P, 3) float32 where a protocol scores points of another cloud than the labelled one.
     ``boxes`` where the objects are known by their boxes alone; the points lie on these.
+    ``every_semantic`` (N, K) int32 where points may have several classes: all of them in the order of the annotation,
+    then 0; ``semantic`` and ``instance`` are of the one object that stands for the point. ``semantic`` -1 marks points
+    that evaluations leave out, in the truth and in predictions; only truths whose protocols ask for it have such.
 
     >>> import numpy as np, su3d_bench as su3d
     >>> labels = su3d.LabelSet("mine", (3,), ("chair",))
@@ -177,6 +180,7 @@ class GroundTruth:
     source: str
     evaluation_points: Float32Array | None = None
     boxes: ObjectBoxes | None = None
+    every_semantic: Int32Array | None = None
 
     def __post_init__(self) -> None:
         check_arrays(self, f"ground truth '{self.variant}'", ("points", "semantic", "instance"), DataError)
@@ -186,6 +190,13 @@ class GroundTruth:
                 f"ground truth '{self.variant}': points {self.points.shape}, semantic {self.semantic.shape} and "
                 f"instance {self.instance.shape} do not agree"
             )
+        if self.every_semantic is not None:
+            check_arrays(self, f"ground truth '{self.variant}'", ("every_semantic",), DataError)
+            if self.every_semantic.ndim != 2 or len(self.every_semantic) != n:
+                raise DataError(
+                    f"ground truth '{self.variant}': every_semantic {self.every_semantic.shape} has no row for each of "
+                    f"{n} points"
+                )
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ FORMS: dict[str, type] = {
     **dict.fromkeys(("points", "features", "boxes", "centroids", "vertices", "evaluation_points"), np.float32),
     **dict.fromkeys(("scores", "view_scores"), np.float64),
     **dict.fromkeys(("indptr", "view_indptr", "ids"), np.int64),
-    **dict.fromkeys(("indices", "views", "instance", "semantic"), np.int32),
+    **dict.fromkeys(("indices", "views", "instance", "semantic", "every_semantic"), np.int32),
     **dict.fromkeys(("triangles", "instance_of_triangle", "segments"), np.int32),
 }
 ELEMENTS: dict[str, type] = {"scenes": str, "files": Path, "places": Path, "problems": str}
