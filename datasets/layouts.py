@@ -7,8 +7,16 @@ from collections.abc import Mapping
 from su3d_bench.datasets.replica.writing import ReplicaLayout
 from su3d_bench.datasets.scannet.writing.exports import CppExportLayout, PythonExportLayout
 from su3d_bench.datasets.scannet.writing.layout import SensLayout
+from su3d_bench.datasets.scannetpp.writing.layout import ScannetppLayout
 from su3d_bench.datasets.tum.writing import TumLayout
 from su3d_bench.datasets.writing import Layout
 
-_ALL: tuple[Layout, ...] = (ReplicaLayout(), SensLayout(), PythonExportLayout(), CppExportLayout(), TumLayout())
+_ALL: tuple[Layout, ...] = (
+    ReplicaLayout(),
+    SensLayout(),
+    PythonExportLayout(),
+    CppExportLayout(),
+    ScannetppLayout(),
+    TumLayout(),
+)
 LAYOUTS: Mapping[str, Layout] = {layout.name: layout for layout in _ALL}

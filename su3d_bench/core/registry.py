@@ -24,6 +24,7 @@ DATASETS = {
     "rooms": "su3d_bench.datasets.rooms.dataset:Rooms",
     "replica": "su3d_bench.datasets.replica.dataset:Replica",
     "scannet": "su3d_bench.datasets.scannet.dataset:ScanNet",
+    "scannetpp": "su3d_bench.datasets.scannetpp.dataset:ScanNetPP",
     "tum": "su3d_bench.datasets.tum.dataset:Tum",
     "rgbd": "su3d_bench.datasets.rgbd.dataset:Rgbd",
 }

@@ -115,10 +115,16 @@ def _fault_of_truth(truth: GroundTruth) -> str | None:
         return fault
     if not np.isfinite(truth.points).all():
         return "points holds values that are not finite"
-    if (fault := _fault_of_range("instance", truth.instance)) or (fault := _fault_of_range("semantic", truth.semantic)):
+    if fault := _fault_of_range("instance", truth.instance):
         return fault
-    unknown = np.setdiff1d(truth.semantic, (0, *truth.labels.ids))
-    return f"semantic holds the class id {int(unknown[0])}, which its labels do not have" if len(unknown) else None
+    every = truth.every_semantic
+    if every is not None and every.dtype.kind != "i":
+        return f"every_semantic is {every.dtype}; whole numbers are expected"
+    for name, ids, no_class in (("semantic", truth.semantic, (-1, 0)), ("every_semantic", every, (0,))):
+        unknown = np.setdiff1d(() if ids is None else ids, (*no_class, *truth.labels.ids))
+        if len(unknown):
+            return f"{name} holds the class id {int(unknown[0])}, which its labels do not have"
+    return None
 
 
 def _fault_of_mesh(mesh: InstanceMesh) -> str | None:

@@ -1,0 +1,224 @@
+"""Posed RGB-D frames of the iPhone: which there are, where their images are, and both brought to one camera.
+
+Colour comes from ``rgb/`` or else ``rgb.mkv``, depth from ``depth/`` or else ``depth.bin``. Both images show the same
+view in other sizes, so that they differ in scale alone. Frames have at most so many columns as is asked for: colour is
+averaged, of depth the nearest value is taken, as the toolkit's authors advise (scannetpp/scannetpp, issue 140).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import Float32Array, Float64Array, Frame, UInt8Array
+from su3d_bench.datasets.recordings.exported_frames import list_folder, read_size
+from su3d_bench.datasets.recordings.recorded_frames import StoredDepth, depth_m_of_values
+from su3d_bench.datasets.scannetpp.iphone.depth_file import DEPTH_NAME, DEPTH_SIZE, UNITS_PER_METRE, DepthFile
+from su3d_bench.datasets.scannetpp.iphone.poses import (
+    COLMAP,
+    FRAME_NAME,
+    IMAGES_NAME,
+    TRACKING_NAME,
+    PosedFrames,
+    read_colmap,
+    read_tracking,
+)
+from su3d_bench.datasets.scannetpp.iphone.video import VIDEO_NAME, VideoFile, video_size
+from su3d_bench.formats.images import Size, UInt16Array, decode_colour, decode_depth, read_bytes, sized
+
+PoseSource = Literal["auto", "colmap", "tracking"]
+COLOUR_FOLDER, DEPTH_FOLDER = "rgb", "depth"
+COLOUR_ENDINGS, DEPTH_ENDINGS = (".jpg", ".png"), (".png",)
+FRAMES_PER_SECOND = 60.0  # of the iPhone's video
+EXTRACT_AGAIN = "extract the frames again with the official toolkit"
+DEPTH_M_OF_VALUE = depth_m_of_values(UNITS_PER_METRE)
+DEPTH_SIZE_REASON = "the size of the iPhone's depth"
+
+
+def pose_source(folder: Path, kind: PoseSource) -> PoseSource:
+    """Which poses are read of the iPhone's ``folder``; those of COLMAP where both are there."""
+    if kind != "auto":
+        return kind
+    return "colmap" if (folder / COLMAP / IMAGES_NAME).exists() or not (folder / TRACKING_NAME).exists() else "tracking"
+
+
+@dataclass(frozen=True, eq=False)
+class IphoneRecording:
+    """A recording with its poses; ``colour_of`` and ``depth_of`` are the extracted files by their frame, None where
+    images come out of the video and ``depth.bin``."""
+
+    folder: Path
+    where: str
+    posed: PosedFrames
+    colour_of: Mapping[int, str] | None
+    depth_of: Mapping[int, str] | None
+
+    @cached_property
+    def usable(self) -> list[int]:
+        """The rows of ``posed`` that have a pose."""
+        return np.flatnonzero(np.isfinite(self.posed.poses).all(axis=(1, 2))).tolist()
+
+    def every(self, stride: int) -> list[int]:
+        """Usable rows among every ``stride``-th; one without a pose is not replaced."""
+        return [row for row in self.usable if row % stride == 0]
+
+    def say_what_is_lost(self) -> str | None:
+        """A line that counts the frames without a pose."""
+        n, n_usable = len(self.posed.numbers), len(self.usable)
+        return None if n == n_usable else f"{self.where}: frames without a pose, left out: {n - n_usable} of {n}"
+
+    def files(self) -> list[Path]:
+        numbers = [int(self.posed.numbers[row]) for row in self.usable]
+        paths = list(self.posed.files)
+        for name, file_of in ((VIDEO_NAME, self.colour_of), (DEPTH_NAME, self.depth_of)):
+            paths += [self.folder / name] if file_of is None else [self.folder / file_of[n] for n in numbers]
+        return paths
+
+
+def open_recording(folder: Path, where: str, kind: PoseSource = "auto") -> IphoneRecording:
+    """The recording in the ``iphone`` folder of a scene."""
+    if not folder.is_dir():
+        raise DataError(
+            f"{where}: no iphone/ folder; the iPhone's frames are read, the DSLR's have no depth and are left out"
+        )
+    colour_of = _extracted(folder, COLOUR_FOLDER, COLOUR_ENDINGS, VIDEO_NAME, where)
+    depth_of = _extracted(folder, DEPTH_FOLDER, DEPTH_ENDINGS, DEPTH_NAME, where)
+    if pose_source(folder, kind) == "colmap":
+        posed = read_colmap(folder / COLMAP, where)
+    else:
+        posed = read_tracking(folder / TRACKING_NAME, where, _colour_size(folder, colour_of, where))
+    recording = IphoneRecording(folder, where, posed, colour_of, depth_of)
+    numbers = [int(posed.numbers[row]) for row in recording.usable]
+    for name, ending, file_of in (
+        (COLOUR_FOLDER, COLOUR_ENDINGS[0], colour_of),
+        (DEPTH_FOLDER, DEPTH_ENDINGS[0], depth_of),
+    ):
+        missing = [] if file_of is None else [number for number in numbers if number not in file_of]
+        if missing:
+            more = f", and {len(missing) - 1} more" if len(missing) > 1 else ""
+            raise DataError(f"{where}: {name}/frame_{missing[0]:06d}{ending} is missing{more}; {EXTRACT_AGAIN}")
+    return recording
+
+
+def _colour_size(folder: Path, colour_of: Mapping[int, str] | None, where: str) -> Size:
+    """The size of the colour images, told from the first of them."""
+    if colour_of is None:
+        return video_size(folder / VIDEO_NAME, where)
+    if not colour_of:
+        raise DataError(f"{where}: {COLOUR_FOLDER}/ holds no frame; {EXTRACT_AGAIN}")
+    return read_size(folder, colour_of[min(colour_of)], where)
+
+
+def _extracted(folder: Path, name: str, endings: Sequence[str], packed: str, where: str) -> Mapping[int, str] | None:
+    """The extracted files by their frame; None where the ``packed`` file is to be read."""
+    if not (folder / name).is_dir():
+        if not os.path.lexists(folder / packed):
+            raise DataError(f"{where}: neither {name}/ nor {packed} is in {folder}; copy one of them there")
+        return None
+    file_of: dict[int, str] = {}
+    for file in list_folder(folder, name, where):
+        match = FRAME_NAME.fullmatch(file)
+        if match is not None and file.endswith(tuple(endings)):
+            file_of.setdefault(int(match[1]), f"{name}/{file}")
+    return file_of
+
+
+class IphoneFrames(Sequence[Frame]):
+    """The frames of ``rows``, of at most ``width`` columns, each read when it is asked for."""
+
+    def __init__(self, recording: IphoneRecording, rows: Sequence[int], width: int) -> None:
+        self._recording, self._rows = recording, rows
+        full_width, full_height = recording.posed.size
+        self.size: Size = min(width, full_width), max(1, round(full_height * min(width, full_width) / full_width))
+        self._depth = StoredDepth(recording.where, DEPTH_M_OF_VALUE)
+        wanted = frozenset(int(recording.posed.numbers[row]) for row in rows)
+        self._colour_values = self._colour_reader(wanted)
+        self._depth_values = self._depth_reader(wanted)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, position: int) -> Frame:  # type: ignore[override]
+        row, posed = self._rows[position], self._recording.posed
+        number = int(posed.numbers[row])
+        return Frame(
+            index=number,
+            timestamp_s=number / FRAMES_PER_SECOND,
+            rgb=self._colour_values(number),
+            depth_m=self._at_size(self._depth.depth_m(self._depth_values(number))),
+            camera_to_world=posed.poses[row],
+            intrinsics=self.intrinsics(row),
+        )
+
+    def intrinsics(self, row: int) -> Float64Array:
+        """The camera (3, 3) of the frames' size, where the middle of the first pixel is at 0."""
+        full = self._recording.posed
+        matrix = full.intrinsics[row].copy()
+        matrix[:2] *= np.array(self.size)[:, None] / np.array(full.size)[:, None]
+        matrix[:2, 2] -= 0.5
+        return matrix
+
+    def _colour_reader(self, wanted: frozenset[int]) -> Callable[[int], UInt8Array]:
+        recording, size = self._recording, self._recording.posed.size
+        if (file_of := recording.colour_of) is None:
+            return VideoFile(recording.folder / VIDEO_NAME, recording.where, size, wanted, self._colour_at_size).image
+
+        def read(number: int) -> UInt8Array:
+            where = f"{recording.where}: {file_of[number]}"
+            content = read_bytes(recording.folder / file_of[number], where, EXTRACT_AGAIN)
+            return self._colour_at_size(sized(decode_colour, content, size, where, "as the camera says"))
+
+        return read
+
+    def _depth_reader(self, wanted: frozenset[int]) -> Callable[[int], UInt16Array]:
+        recording = self._recording
+        if (file_of := recording.depth_of) is None:
+            return DepthFile(recording.folder / DEPTH_NAME, recording.where, wanted).values
+
+        def read(number: int) -> UInt16Array:
+            where = f"{recording.where}: {file_of[number]}"
+            content = read_bytes(recording.folder / file_of[number], where, EXTRACT_AGAIN)
+            return sized(decode_depth, content, DEPTH_SIZE, where, DEPTH_SIZE_REASON)
+
+        return read
+
+    @cached_property
+    def _straightening(self) -> tuple[Float32Array, Float32Array] | None:
+        """Column and row of the image, as the lens bent it, that each pixel (H, W) sees; None where it bends nothing.
+
+        COLMAP gives all frames one camera where it gives a distortion.
+        """
+        distortion = self._recording.posed.distortion
+        if not distortion.any():
+            return None
+        import cv2
+
+        matrix = self.intrinsics(0)
+        maps = cv2.initUndistortRectifyMap(matrix, distortion, np.eye(3), matrix, self.size, cv2.CV_32FC1)
+        return np.asarray(maps[0], np.float32), np.asarray(maps[1], np.float32)
+
+    def _colour_at_size(self, colour: UInt8Array) -> UInt8Array:
+        import cv2
+
+        if (colour.shape[1], colour.shape[0]) != self.size:
+            colour = np.asarray(cv2.resize(colour, self.size, interpolation=cv2.INTER_AREA), np.uint8)
+        if self._straightening is None:
+            return colour
+        border = cv2.BORDER_REPLICATE
+        return np.asarray(cv2.remap(colour, *self._straightening, cv2.INTER_LINEAR, borderMode=border), np.uint8)
+
+    def _at_size(self, depth_m: Float32Array) -> Float32Array:
+        import cv2
+
+        if (depth_m.shape[1], depth_m.shape[0]) != self.size:
+            depth_m = np.asarray(cv2.resize(depth_m, self.size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
+        if self._straightening is None:
+            return depth_m
+        return np.asarray(cv2.remap(depth_m, *self._straightening, cv2.INTER_NEAREST), np.float32)

@@ -1,0 +1,206 @@
+"""Cameras and poses of ScanNet++'s iPhone, in the coordinates of the aligned mesh, metres.
+
+- ``colmap/cameras.txt`` and ``images.txt``: what the official toolkit reads; a part of the video's frames, one camera
+  with distortion. Poses are world-to-camera, quaternions w x y z.
+- ``pose_intrinsic_imu.json``: every frame of the video as the phone's own tracking has it, ``aligned_pose`` turned into
+  the world of the mesh, camera-to-world; intrinsics a frame, without distortion.
+
+Both have OpenCV's camera axes. In both files the corner of an image is at 0, in ``Frame`` the middle of its first
+pixel.
+
+Source: scannetpp/scannetpp at commit f3b4712, common/utils/colmap.py, common/scene_release.py.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import Float64Array, Int64Array
+from su3d_bench.datasets.recordings.recorded_frames import numbers, parsed_json, pinhole, read_text
+from su3d_bench.formats.images import MAX_PIXELS, Size, read_bytes
+from su3d_bench.numerics.geometry import are_rigid
+
+COLMAP, CAMERAS_NAME, IMAGES_NAME = "colmap", "cameras.txt", "images.txt"
+TRACKING_NAME = "pose_intrinsic_imu.json"
+OFF_CENTRE = 0.1  # of the image; an iPhone's principal point is within 0.02 of the middle
+FRAME_NAME = re.compile(r"frame_([0-9]{1,9})(?:\.[A-Za-z]{1,4})?")
+# Where each model of COLMAP keeps fx fy cx cy and k1 k2 p1 p2: src/colmap/sensor/models.h.
+MODELS = {
+    "SIMPLE_PINHOLE": ((0, 0, 1, 2), ()),
+    "PINHOLE": ((0, 1, 2, 3), ()),
+    "SIMPLE_RADIAL": ((0, 0, 1, 2), (3,)),
+    "RADIAL": ((0, 0, 1, 2), (3, 4)),
+    "OPENCV": ((0, 1, 2, 3), (4, 5, 6, 7)),
+}
+N_PARAMETERS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
+MOST_DISTORTION = 10.0  # an iPhone has 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class PosedFrames:
+    """Frames of the video by their ``numbers`` (n,), rising, each with its camera-to-world pose (n, 4, 4), not finite
+    where it was lost, and its intrinsics (n, 3, 3) for images of ``size``, the corner at 0.
+
+    ``distortion``: k1 k2 p1 p2 of all frames, zeros for none. ``files``: what they were read from.
+    """
+
+    numbers: Int64Array
+    poses: Float64Array
+    intrinsics: Float64Array
+    size: Size
+    distortion: Float64Array
+    files: tuple[Path, ...]
+
+
+def read_colmap(folder: Path, where: str) -> PosedFrames:
+    """The frames that COLMAP registered; ``folder`` holds ``cameras.txt`` and ``images.txt``."""
+    cameras, images = folder / CAMERAS_NAME, folder / IMAGES_NAME
+    intrinsics, size, distortion = _read_camera(cameras, f"{where}: {COLMAP}/{CAMERAS_NAME}")
+    pose_of = _read_images(images, f"{where}: {COLMAP}/{IMAGES_NAME}")
+    order = sorted(pose_of)
+    return PosedFrames(
+        np.array(order, np.int64),
+        np.array([pose_of[number] for number in order]),
+        np.broadcast_to(intrinsics, (len(order), 3, 3)),
+        size,
+        distortion,
+        (cameras, images),
+    )
+
+
+def _read_camera(path: Path, where: str) -> tuple[Float64Array, Size, Float64Array]:
+    lines = [line.split() for line in read_text(path, where).splitlines() if line.strip() and line.strip()[0] != "#"]
+    if len(lines) != 1:
+        raise DataError(f"{where}: has {len(lines)} cameras; expected one, as of an iPhone")
+    words = lines[0]
+    model = words[1] if len(words) > 1 else ""
+    if model not in MODELS:
+        raise DataError(f"{where}: the camera's model is {model[:40]!a}; expected {', '.join(MODELS)}")
+    if len(words) != 4 + N_PARAMETERS[model] or not all(re.fullmatch(r"[0-9]{1,6}", word) for word in words[2:4]):
+        raise DataError(f"{where}: expected one line 'id {model} width height' and {N_PARAMETERS[model]} numbers")
+    values = numbers(words[4:], where)
+    (fx, fy, cx, cy), bent = MODELS[model]
+    distortion = np.array([*(values[i] for i in bent), *[0.0] * (4 - len(bent))])
+    if not (np.isfinite(distortion).all() and np.abs(distortion).max() < MOST_DISTORTION):
+        raise DataError(f"{where}: the distortion is {' '.join(f'{v:g}' for v in distortion)}; copy the file again")
+    return pinhole(values[fx], values[fy], values[cx], values[cy], where), _size(words[2:4], where), distortion
+
+
+def _size(words: Sequence[str], where: str) -> Size:
+    width, height = int(words[0]), int(words[1])
+    if width < 1 or height < 1 or width * height > MAX_PIXELS:
+        raise DataError(f"{where}: images of {width}x{height}; expected 1 to {MAX_PIXELS} pixels")
+    return width, height
+
+
+def _read_images(path: Path, where: str) -> dict[int, Float64Array]:
+    """Camera-to-world pose of each frame. Every second line lists points, and may be empty."""
+    lines = read_text(path, where).splitlines()
+    pose_of: dict[int, Float64Array] = {}
+    at = 0
+    while at < len(lines):
+        line = lines[at].strip()
+        at += 1
+        if not line or line.startswith("#"):
+            continue
+        words, place = line.split(), f"{where} line {at}"
+        if len(words) != 10:
+            raise DataError(f"{place}: has {len(words)} words; expected 'id qw qx qy qz tx ty tz camera name'")
+        number = frame_number(words[9].rpartition("/")[2], place)
+        if number in pose_of:
+            raise DataError(f"{place}: frame {number} stands there twice; copy the file again")
+        pose_of[number] = _inverse_pose(numbers(words[1:8], place), place)
+        at += 1  # the line of the points
+    if not pose_of:
+        raise DataError(f"{where}: lists no frame; copy the file again")
+    return pose_of
+
+
+def frame_number(name: str, where: str) -> int:
+    """The number in a name such as ``frame_000010.jpg``."""
+    match = FRAME_NAME.fullmatch(name)
+    if match is None:
+        raise DataError(f"{where}: {name[:40]!a} is no frame of the iPhone; expected a name such as frame_000010")
+    return int(match[1])
+
+
+def _inverse_pose(values: Sequence[float], where: str) -> Float64Array:
+    length = math.hypot(*values[:4])
+    if not all(math.isfinite(value) and abs(value) < 1e9 for value in values) or abs(length - 1) > 1e-2:
+        raise DataError(f"{where}: expected a unit quaternion qw qx qy qz and a shift in metres; copy the file again")
+    w, x, y, z = (value / length for value in values[:4])
+    to_camera = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    pose = np.eye(4)
+    pose[:3, :3] = to_camera.T
+    pose[:3, 3] = -to_camera.T @ np.array(values[4:7])
+    return pose
+
+
+def read_tracking(path: Path, where: str, size: Size) -> PosedFrames:
+    """Every frame of the video, whose images have that ``size``, with its ``aligned_pose``."""
+    where = f"{where}: {path.name}"
+    content = parsed_json(read_bytes(path, where), where)
+    if not isinstance(content, dict) or not content:
+        raise DataError(f"{where}: is no JSON object with a key a frame; copy the file again")
+    entry_of: dict[int, Any] = {}
+    for name, entry in content.items():
+        number = frame_number(name, where)
+        if not isinstance(entry, dict) or number in entry_of:
+            raise DataError(f"{where}: frame {number} stands there twice or is no JSON object; copy the file again")
+        entry_of[number] = entry
+    order = sorted(entry_of)
+    poses = np.array(
+        [_matrix(entry_of[n].get("aligned_pose"), 4, f"{where}: frame {n}: 'aligned_pose'") for n in order]
+    )
+    cameras = [_matrix(entry_of[n].get("intrinsic"), 3, f"{where}: frame {n}: 'intrinsic'") for n in order]
+    intrinsics = np.array(
+        [
+            pinhole(k[0, 0], k[1, 1], k[0, 2], k[1, 2], f"{where}: frame {n}: 'intrinsic'")
+            for n, k in zip(order, cameras, strict=True)
+        ]
+    )
+    is_elsewhere = np.abs(intrinsics[:, :2, 2] / np.array(size) - 0.5).max(axis=1) > OFF_CENTRE
+    if is_elsewhere.any():
+        row = int(is_elsewhere.argmax())
+        raise DataError(
+            f"{where}: frame {order[row]}: 'intrinsic' has its principal point at ({intrinsics[row, 0, 2]:g}, "
+            f"{intrinsics[row, 1, 2]:g}), the images have {size[0]}x{size[1]}; it belongs to images of another size"
+        )
+    is_finite = np.isfinite(poses).all(axis=(1, 2))
+    is_faulty = is_finite.copy()
+    is_faulty[is_finite] = ~are_rigid(poses[is_finite])
+    if is_faulty.any():
+        raise DataError(
+            f"{where}: frame {order[int(is_faulty.argmax())]}: 'aligned_pose' is not a rigid motion; copy the file "
+            "again"
+        )
+    if not is_finite.any():
+        raise DataError(f"{where}: none of the {len(order)} frames has a pose; leave the scene out")
+    return PosedFrames(np.array(order, np.int64), poses, intrinsics, size, np.zeros(4), (path,))
+
+
+def _matrix(value: Any, side: int, where: str) -> Float64Array:
+    """A square matrix as nested lists; its numbers may be not finite."""
+    rows = value if isinstance(value, list) and len(value) == side else []
+    is_matrix = all(isinstance(row, list) and len(row) == side for row in rows) and bool(rows)
+    entries = [entry for row in rows for entry in row] if is_matrix else []
+    if not entries or not all(isinstance(entry, int | float) and not isinstance(entry, bool) for entry in entries):
+        raise DataError(f"{where} is no matrix of {side}x{side} numbers; copy the file again")
+    try:
+        return np.array([float(entry) for entry in entries]).reshape(side, side)
+    except OverflowError:
+        raise DataError(f"{where} holds a number beyond all measure; copy the file again") from None
