@@ -372,7 +372,7 @@ def _look_at_truth(
             rows.append(TruthVariant(variant, printable(str(error).removeprefix(f"{findings.scene}: "))))
             continue
         known = truth if known is None else known
-        n_objects, n_classes = (len(np.unique(ids[ids != 0])) for ids in (truth.instance, truth.semantic))
+        n_objects, n_classes = (len(np.unique(ids[ids > 0])) for ids in (truth.instance, truth.semantic))
         rows.append(TruthVariant(variant, None, len(truth.points), n_objects, n_classes))
     if known is not None:
         findings.attempt("truth", lambda: _instance_mesh(dataset, scene))

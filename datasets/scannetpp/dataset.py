@@ -123,7 +123,9 @@ class ScanNetPP:
         return IphoneFrames(recording, recording.every(stride), self.options.width)
 
     def files(self, scene: str) -> Sequence[Path]:
-        return (*self._recording(scene).files(), *self._small_files(scene))
+        # A list of masked vertices may be empty: it is listed where it is not, because an empty file is else a fault.
+        small = [path for path in self._small_files(scene) if path.name != MASK_NAME or path.stat().st_size]
+        return (*self._recording(scene).files(), *small)
 
     def digest(self, scene: str) -> str:
         """A key of the content of the truth, the benchmark's lists, the poses and the first and last images, and of the

@@ -37,8 +37,8 @@ class SceneFolders:
 
     @property
     def releases(self) -> list[Path]:
-        """The folders that hold ``data/``, ``metadata/`` and ``splits/``."""
-        return [place.parent for place in self.places]
+        """The folders that hold ``data/``, ``metadata/`` and ``splits/``; a ``data/`` that is a link has two."""
+        return list(dict.fromkeys(path.parent for place in self.places for path in (place, place.resolve())))
 
     def benchmark_folder(self, scene: str) -> Path | None:
         """Where the lists of the benchmark lie, beside the scene first; None where none has all of them."""

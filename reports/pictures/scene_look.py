@@ -45,7 +45,7 @@ class SceneLook:
         """Points, objects and classes of the truth; nothing where there is none."""
         if self.truth is None:
             return {}
-        n_objects, n_classes = (len(np.unique(ids[ids != 0])) for ids in (self.truth.instance, self.truth.semantic))
+        n_objects, n_classes = (len(np.unique(ids[ids > 0])) for ids in (self.truth.instance, self.truth.semantic))
         return {"n_points": len(self.truth.points), "n_objects": n_objects, "n_classes": n_classes}
 
 

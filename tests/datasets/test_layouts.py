@@ -25,12 +25,17 @@ from su3d_bench.datasets.scannet.recordings import open_cpp_export, open_python_
 from su3d_bench.datasets.scannet.sens.read import SensFile
 from su3d_bench.datasets.scannet.writing.categories import categories, room_of, scan_name
 from su3d_bench.datasets.scannet.writing.truth import segment_of_vertex
+from su3d_bench.datasets.scannetpp.dataset import ScanNetPP
+from su3d_bench.datasets.scannetpp.writing import categories as scannetpp_categories
+from su3d_bench.datasets.scannetpp.writing.categories import benchmark_names
 from su3d_bench.formats.ply import read_ply
 
 ROOM, SCAN, N_FRAMES, SIZE = "bathroom0", "scene9400_00", 12, (80, 60)
 SCANNET = ("scannet", "scannet-python", "scannet-cpp")
-ADDRESS = dict.fromkeys(SCANNET, SCAN) | {"replica": ROOM, "tum": ROOM}
-UNITS_PER_METRE = dict.fromkeys(SCANNET, 1000.0) | {"replica": 6553.5, "tum": 5000.0}
+SCANNETPP_SCENE = "0000000400"
+ADDRESS = dict.fromkeys(SCANNET, SCAN) | {"replica": ROOM, "tum": ROOM, "scannetpp": SCANNETPP_SCENE}
+UNITS_PER_METRE = dict.fromkeys((*SCANNET, "scannetpp"), 1000.0) | {"replica": 6553.5, "tum": 5000.0}
+FRAMES_PER_SECOND = dict.fromkeys(LAYOUTS, 30) | {"scannetpp": 60}  # the iPhone's video
 
 
 @pytest.fixture(scope="module")
@@ -113,14 +118,21 @@ def test_colour_is_equal_where_the_codec_loses_nothing_and_near_elsewhere(made: 
 @pytest.mark.parametrize(
     ("name", "tolerance"),
     # float32; six decimals of a float32; six digits of a value below 10; nine decimals of a quaternion
-    [("replica", 0.0), ("scannet", 5e-7), ("scannet-python", 1e-6), ("scannet-cpp", 6e-6), ("tum", 5e-9)],
+    [
+        ("replica", 0.0),
+        ("scannet", 5e-7),
+        ("scannet-python", 1e-6),
+        ("scannet-cpp", 6e-6),
+        ("scannetpp", 1e-12),
+        ("tum", 5e-9),
+    ],
 )
 def test_poses_times_and_camera_are_within_what_the_format_prints(
     made: dict[str, Path], rooms: Rooms, name: str, tolerance: float
 ) -> None:
     for ours, theirs in zip(rooms.frames(ROOM, 1), frames(made, name), strict=True):
         assert ours.index == theirs.index
-        assert abs(ours.timestamp_s - theirs.timestamp_s) < 1e-6
+        assert abs(ours.timestamp_s - theirs.timestamp_s * FRAMES_PER_SECOND[name] / 30) < 1e-6
         np.testing.assert_allclose(theirs.camera_to_world, ours.camera_to_world, rtol=0, atol=tolerance)
         np.testing.assert_allclose(theirs.intrinsics, ours.intrinsics, rtol=1e-5)
 
@@ -157,6 +169,71 @@ def test_segments_cut_objects_into_pieces_and_never_cross_one(made: dict[str, Pa
     floor = next(one.id for one in rooms.objects(ROOM) if one.class_name == "floor")
     sizes = np.unique(segments[owner == floor], return_counts=True)[1]
     assert sizes.max() > 0.5 * sizes.sum()  # a plane stays in one piece
+
+
+def test_truth_of_a_scene_of_scannetpp_is_that_of_the_room_in_the_benchmarks_classes(
+    made: dict[str, Path], rooms: Rooms
+) -> None:
+    ours = rooms.ground_truth(ROOM, "mesh-vertices")
+    theirs = reader(made, "scannetpp").ground_truth(SCANNETPP_SCENE, "scannetpp")
+    np.testing.assert_array_equal(theirs.points, ours.points)
+    row_of = {name: row for row, name in enumerate(benchmark_names(), 1)}
+    rows = [line.split(",") for line in scannetpp_categories.list_texts()["map_benchmark.csv"].splitlines()[1:]]
+    class_of_word = {word: row_of.get(target or word, 0) for word, _, target, _ in rows}
+    class_of = {0: 0} | {known.id: class_of_word[scannetpp_categories.words()[known.name]] for known in CLASSES}
+    expected = np.array([class_of[i] for i in ours.semantic.tolist()])
+    assert theirs.semantic.tolist() == expected.tolist() and len(set(expected.tolist())) > 8
+    assert theirs.every_semantic is not None and not theirs.every_semantic[:, 1:].any()
+    without = [0, *(row_of[name] for name in scannetpp_categories.without_instances())]
+    np.testing.assert_array_equal(theirs.instance > 0, ~np.isin(expected, without) & (ours.instance > 0))
+    pairs = {(a, b) for a, b in zip(theirs.instance.tolist(), ours.instance.tolist(), strict=True) if a > 0}
+    assert len(pairs) == len({a for a, _ in pairs}) == len({b for _, b in pairs}) > 5
+
+
+def test_the_lists_of_scannetpp_have_100_and_84_classes_and_a_row_a_word_of_the_rooms() -> None:
+    texts = scannetpp_categories.list_texts()
+    names, instances = (texts[name].splitlines() for name in ("top100.txt", "top100_instance.txt"))
+    assert (len(names), len(instances)) == (100, 84) and set(instances) < set(names)
+    header, *rows = (line.split(",") for line in texts["map_benchmark.csv"].splitlines())
+    assert header == ["class", "count", "semantic_map_to", "instance_map_to"]
+    assert {row[0] for row in rows} == set(scannetpp_categories.words().values()) and len(rows) == len(
+        set(map(str, rows))
+    )
+    assert all((row[2] or row[0]) in {*names, "None"} for row in rows)
+    assert set(scannetpp_categories.words()) == {known.name for known in CLASSES}
+
+
+def test_a_scene_of_scannetpp_has_the_files_and_keys_of_the_release(made: dict[str, Path]) -> None:
+    folder = made["scannetpp"] / "data" / SCANNETPP_SCENE
+    files = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file() and path.suffix != ".jpg"}
+    assert files == {
+        "iphone/colmap/cameras.txt", "iphone/colmap/images.txt", "iphone/depth.bin", "iphone/pose_intrinsic_imu.json",
+        "scans/mesh_aligned_0.05.ply", "scans/mesh_aligned_0.05_mask.txt", "scans/segments.json",
+        "scans/segments_anno.json",
+    }  # fmt: skip
+    tracked = json.loads((folder / "iphone/pose_intrinsic_imu.json").read_text())
+    assert list(tracked)[:2] == ["frame_000000", "frame_000001"]
+    assert {"pose", "aligned_pose", "intrinsic", "timestamp"} == set(tracked["frame_000000"])
+    group = json.loads((folder / "scans/segments_anno.json").read_text())["segGroups"][1]
+    assert set(group) == {"id", "objectId", "index", "label", "segments", "obb"}
+    assert set(group["obb"]) == {"centroid", "axesLengths", "normalizedAxes"}
+    colmap, tracking = (
+        ScanNetPP(made["scannetpp"], ScanNetPP.Options(poses=kind)).frames(SCANNETPP_SCENE, 1)
+        for kind in ("colmap", "tracking")
+    )
+    for ours, theirs in zip(colmap, tracking, strict=True):
+        np.testing.assert_allclose(ours.camera_to_world, theirs.camera_to_world, atol=1e-12)
+        np.testing.assert_array_equal(ours.intrinsics, theirs.intrinsics)
+
+
+def test_every_room_has_a_scene_name_of_scannetpp_of_its_own() -> None:
+    kinds = ("living", "bedroom", "kitchen", "office", "bathroom", "studio")
+    names = {scannetpp_categories.scene_name(f"{k}{n}"): f"{k}{n}" for k in kinds for n in range(100)}
+    assert len(names) == 600 and all(len(name) == 10 for name in names)
+    assert all(scannetpp_categories.room_of(name) == room for name, room in names.items())
+    assert scannetpp_categories.room_of("036bce3393") is None
+    with pytest.raises(DataError, match=r"^rooms/living100: has no scene name"):
+        scannetpp_categories.scene_name("living100")
 
 
 def test_a_room_of_tum_is_not_scored(made: dict[str, Path]) -> None:

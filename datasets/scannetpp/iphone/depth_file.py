@@ -20,7 +20,7 @@ import numpy as np
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import Float32Array
-from su3d_bench.datasets.recordings.recorded_frames import reading
+from su3d_bench.datasets.recordings.recorded_frames import N_DEPTH_VALUES, reading
 from su3d_bench.datasets.scannetpp.iphone.forward import ForwardReader
 from su3d_bench.datasets.scannetpp.iphone.lz4 import NotLz4, unpacked_block
 from su3d_bench.formats.images import UInt16Array
@@ -116,7 +116,7 @@ def millimetres(depth_m: Float32Array) -> UInt16Array:
     """Whole millimetres of metres, what is less cut off; 0 for what 16 bits do not hold."""
     with np.errstate(invalid="ignore", over="ignore"):
         values = depth_m * np.float32(UNITS_PER_METRE)
-        return np.where((values >= 0) & (values <= np.iinfo(np.uint16).max), values, 0).astype(np.uint16)
+        return np.where((values >= 0) & (values < N_DEPTH_VALUES), values, 0).astype(np.uint16)
 
 
 def packed_metres(values: UInt16Array) -> bytes:
@@ -132,7 +132,7 @@ def packed_metres(values: UInt16Array) -> bytes:
 
 def _index(path: Path) -> list[Packed] | None:
     """Where the images are in a file whose lengths lead from one to the next up to its end; None for one stream."""
-    index = []
+    index: list[Packed] = []
     with opened(path) as stream:
         n_bytes = stream.seek(0, 2)
         at = 0

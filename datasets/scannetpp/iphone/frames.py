@@ -160,7 +160,7 @@ class IphoneFrames(Sequence[Frame]):
     def intrinsics(self, row: int) -> Float64Array:
         """The camera (3, 3) of the frames' size, where the middle of the first pixel is at 0."""
         full = self._recording.posed
-        matrix = full.intrinsics[row].copy()
+        matrix: Float64Array = full.intrinsics[row].copy()
         matrix[:2] *= np.array(self.size)[:, None] / np.array(full.size)[:, None]
         matrix[:2, 2] -= 0.5
         return matrix

@@ -109,6 +109,43 @@ def _scannet_export(form: str) -> Make:
     return make
 
 
+def _scannetpp(poses: str, *, packed: bool = False) -> Make:
+    def make(folder: Path) -> Read:
+        from scannetpp_scene import SCENE, write_scene
+
+        from su3d_bench.datasets.scannetpp.dataset import ScanNetPP
+
+        write_scene(folder, packed=packed, spacing_m=0.5)
+        options = ScanNetPP.Options(poses=poses)
+        return _whole_dataset(lambda: ScanNetPP(folder, options), SCENE)
+
+    return make
+
+
+def _depth_stream(folder: Path) -> Read:
+    import zlib
+
+    from scannetpp_scene import depth_values
+
+    from su3d_bench.datasets.scannetpp.iphone.depth_file import DepthFile
+
+    pack, path = zlib.compressobj(wbits=-zlib.MAX_WBITS), folder / "depth.bin"
+    metres = b"".join((depth_values(k) / np.float32(1000)).astype("<f4").tobytes() for k in range(2))
+    path.write_bytes(pack.compress(metres) + pack.flush())
+    return lambda: DepthFile(path, "here", frozenset((0, 1))).values(1)
+
+
+def _depth_blocks(folder: Path) -> Read:
+    import base64
+    import json
+
+    from su3d_bench.datasets.scannetpp.iphone.depth_file import DepthFile
+
+    block = base64.b64decode(json.loads((CASES / "scannetpp_lz4.json").read_text())["image"][0])
+    (folder / "depth.bin").write_bytes(len(block).to_bytes(4, "little") + block)
+    return lambda: DepthFile(folder / "depth.bin", "here", frozenset((0,))).values(0)
+
+
 def _rgbd(**changes: Any) -> Make:
     def make(folder: Path) -> Read:
         from rgbd_scene import write_scene
@@ -284,6 +321,16 @@ TARGETS = (
     Target("sens raw", _sens("sens02_toy_raw.sens"), ("a.sens",)),
     Target("scannet python export", _scannet_export("python"), (f"{SCAN}/*/*",), 0.15),
     Target("scannet c++ export", _scannet_export("c++"), (f"{SCAN}/frame*", f"{SCAN}/_info.txt"), 0.15),
+    Target("scannetpp colmap", _scannetpp("colmap"), ("data/*/iphone/colmap/*",), 0.15),
+    Target("scannetpp tracking", _scannetpp("tracking"), ("data/*/iphone/*.json",), 0.15),
+    Target("scannetpp images", _scannetpp("colmap"), ("data/*/iphone/rgb/*", "data/*/iphone/depth/*"), 0.15),
+    Target("scannetpp video", _scannetpp("tracking", packed=True), ("data/*/iphone/rgb.mkv",), 0.15),
+    Target("scannetpp depth", _scannetpp("colmap", packed=True), ("data/*/iphone/depth.bin",), 0.15),
+    Target("scannetpp depth stream", _depth_stream, ("depth.bin",), 0.15),
+    Target("scannetpp depth blocks", _depth_blocks, ("depth.bin",), 0.15),
+    Target("scannetpp mesh", _scannetpp("colmap"), ("data/*/scans/*.ply",), 0.15),
+    Target("scannetpp annotation", _scannetpp("colmap"), ("data/*/scans/*.json", "data/*/scans/*.txt"), 0.15),
+    Target("scannetpp lists", _scannetpp("colmap"), ("metadata/*/*", "splits/*"), 0.15),
     Target("rgbd description", _rgbd(camera_axes="opengl", depth_invalid=[3]), ("rgbd/desk/rgbd.toml",)),
     Target("rgbd frames", _rgbd(), ("rgbd/desk/data/colour/*", "rgbd/desk/data/depth/*")),
     Target("rgbd poses", _rgbd(), ("rgbd/desk/data/*.pose.txt",)),

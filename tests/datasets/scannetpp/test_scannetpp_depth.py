@@ -1,0 +1,107 @@
+"""``depth.bin`` of ScanNet++ in its three forms, and LZ4 blocks as the package of that name makes them."""
+
+from __future__ import annotations
+
+import base64
+import json
+import zlib
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from places import CASES
+
+from su3d_bench.core.errors import DataError
+from su3d_bench.datasets.scannetpp.iphone.depth_file import DepthFile, millimetres, packed_metres
+from su3d_bench.datasets.scannetpp.iphone.forward import N_KEPT, ForwardReader
+from su3d_bench.datasets.scannetpp.iphone.lz4 import NotLz4, unpacked_block
+
+CASE = json.loads((CASES / "scannetpp_lz4.json").read_text())
+SHAPE = (192, 256)
+
+
+def image(number: int) -> np.ndarray:
+    values = np.arange(SHAPE[0] * SHAPE[1], dtype=np.uint16).reshape(SHAPE) % np.uint16(5000)
+    return values + np.uint16(number)
+
+
+def raw(content: bytes) -> bytes:
+    pack = zlib.compressobj(wbits=-15)
+    return pack.compress(content) + pack.flush()
+
+
+def opened(path: Path, content: bytes, n: int = 4) -> DepthFile:
+    path.write_bytes(content)
+    return DepthFile(path, "here", frozenset(range(n)))
+
+
+@pytest.mark.parametrize("case", [*CASE["blocks"], CASE["image"]])
+def test_lz4_blocks_are_unpacked_as_the_package_packed_them(case: tuple[str, int, int]) -> None:
+    block, n_bytes, checksum = base64.b64decode(case[0]), case[1], case[2]
+    assert zlib.crc32(unpacked_block(block, n_bytes)) == checksum
+    for wrong in (n_bytes - 1, n_bytes + 1):
+        with pytest.raises(NotLz4):
+            unpacked_block(block, wrong)
+
+
+@pytest.mark.parametrize("block", [b"", b"\xf0", b"\x10", b"\x04a\x00\x00", b"\x14a\x02\x00", b"\xff" * 40])
+def test_a_block_that_cannot_be_is_refused(block: bytes) -> None:
+    with pytest.raises(NotLz4):
+        unpacked_block(block, 100)
+
+
+def test_an_image_of_the_release_is_read(tmp_path: Path) -> None:
+    block = base64.b64decode(CASE["image"][0])
+    values = opened(tmp_path / "depth.bin", 2 * (len(block).to_bytes(4, "little") + block)).values(1)
+    assert values.shape == SHAPE and zlib.crc32(values.astype("<u2").tobytes()) == CASE["image"][2]
+
+
+def test_all_images_in_one_stream_are_read_in_any_order(tmp_path: Path) -> None:
+    metres = b"".join((image(k).astype(np.float32) / np.float32(1000)).astype("<f4").tobytes() for k in range(4))
+    depth = opened(tmp_path / "depth.bin", raw(metres))
+    for number in (0, 3, 1, 2, 0):
+        expected = millimetres(image(number).astype(np.float32) / np.float32(1000))
+        np.testing.assert_array_equal(depth.values(number), expected)
+    with pytest.raises(DataError, match=r"^here: depth.bin: has fewer images, frame 4 is not among them"):
+        depth.values(4)
+
+
+def test_what_is_packed_is_unpacked_to_the_same_millimetres() -> None:
+    every = np.arange(65536, dtype=np.uint16)
+    for values in (np.resize(every[:49152], SHAPE), np.resize(every[16384:], SHAPE)):
+        packed = packed_metres(values)
+        assert int.from_bytes(packed[:4], "little") == len(packed) - 4
+        depth_m = np.frombuffer(zlib.decompress(packed[4:], wbits=-15), np.float32)
+        np.testing.assert_array_equal((depth_m * 1000).astype(np.uint16), values.reshape(-1))  # as the toolkit does
+
+
+def test_metres_are_cut_off_and_what_is_no_depth_is_none() -> None:
+    depth_m = np.array([0.0, 1.9999, 65.535, 65.5361, -1.0, np.nan, np.inf], np.float32)
+    assert millimetres(depth_m).tolist() == [0, 1999, 65535, 0, 0, 0, 0]
+
+
+@pytest.mark.parametrize("content", [b"nothing of the kind", raw(b"\0" * 1000), raw(b"\0" * 4 * 49152)[:-3]])
+def test_a_file_of_no_form_is_one_line(tmp_path: Path, content: bytes) -> None:
+    with pytest.raises(DataError, match=r"^here: depth.bin: (is none of the forms|ends within an image)"):
+        opened(tmp_path / "depth.bin", content).values(1)
+
+
+def test_a_forward_reader_begins_anew_only_for_what_it_has_not_kept() -> None:
+    begun, unpacked = [], []
+
+    def begin() -> Iterator[Callable[[], int]]:
+        begun.append(1)
+        return iter([partial(unpack, k) for k in range(100)])
+
+    def unpack(k: int) -> int:
+        unpacked.append(k)
+        return k * k
+
+    reader = ForwardReader(begin, frozenset(range(0, 100, 5)))
+    assert [reader.at(k) for k in (10, 5, 0, 15)] == [100, 25, 0, 225]
+    assert len(begun) == 1 and unpacked == [0, 5, 10, 15]
+    assert reader.at(5 * (N_KEPT + 3)) == (5 * (N_KEPT + 3)) ** 2
+    assert reader.at(0) == 0 and len(begun) == 2
+    assert reader.at(100) is None

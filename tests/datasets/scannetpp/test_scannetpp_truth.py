@@ -1,0 +1,139 @@
+"""The truth of ScanNet++ against what the official toolkit answered, and what is wrong with the files of a scan."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from places import CASES
+from scannet_scan import grid
+from scannetpp_scene import MAP, NAMES, write_lists, write_scans
+
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import GroundTruth
+from su3d_bench.datasets.scannetpp.labels import read_benchmark_classes
+from su3d_bench.datasets.scannetpp.truth import TRUTH_NAMES, instance_mesh, read_annotated_scan, vertex_truth
+
+CASE = json.loads((CASES / "scannetpp_truth.json").read_text())
+NO_LABEL = -100
+
+
+def truth_of(folder: Path, lists: Path) -> GroundTruth:
+    files = {name: folder / name for name in TRUTH_NAMES}
+    return vertex_truth(read_annotated_scan(files, read_benchmark_classes(lists, "here"), "here"))
+
+
+def written(root: Path, segments: Any, groups: Any, masked: Any = (), mesh: Any = None) -> GroundTruth:
+    write_lists(root)
+    write_scans(root / "scans", segments, groups, masked, mesh)
+    return truth_of(root / "scans", root / "metadata/semantic_benchmark")
+
+
+def row_of_points(n: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.arange(3 * n, dtype=np.float32).reshape(n, 3), np.array([[0, 1, 2]], np.int32)
+
+
+@pytest.mark.parametrize("problem", CASE["problems"])
+def test_the_truth_is_what_the_official_toolkit_makes_of_the_same_files(
+    tmp_path: Path, problem: dict[str, Any]
+) -> None:
+    for name, text in (
+        ("top100.txt", "\n".join(problem["names"])),
+        ("top100_instance.txt", "\n".join(problem["inst"])),
+        ("map_benchmark.csv", problem["csv"]),
+    ):
+        (tmp_path / name).write_text(text)
+    mesh = row_of_points(len(problem["segs"]))
+    write_scans(tmp_path / "scans", problem["segs"], problem["groups"], problem["mask"], mesh)
+    truth = truth_of(tmp_path / "scans", tmp_path)
+    assert truth.every_semantic is not None
+    official = {name: np.array(answer) for name, answer in problem["answer"].items()}
+    is_kept = np.ones(len(problem["segs"]), bool)
+    is_kept[problem["mask"]] = False
+    for ours, theirs in ((truth.semantic, official["single"]), (truth.every_semantic, official["multi"])):
+        np.testing.assert_array_equal(ours[is_kept], np.where(theirs == NO_LABEL, 0, theirs + 1)[is_kept])
+    instance = official["single_instance"]  # prepare_semantic_gt.py: 0 and below are none
+    np.testing.assert_array_equal(truth.instance[is_kept], np.where(instance <= 0, 0, instance + 1)[is_kept])
+    assert (truth.semantic[~is_kept] == -1).all() and not truth.instance[~is_kept].any()
+
+
+def test_a_vertex_keeps_three_classes_and_the_smallest_object_stands_for_it(tmp_path: Path) -> None:
+    groups = [("floor", (1, 2, 3)), ("couch", (1, 2)), ("chair", (1,)), ("rug", (1, 3))]
+    truth = written(tmp_path, [1, 2, 2, 3, 9], groups, masked=[2], mesh=row_of_points(5))
+    floor, chair, sofa, mat = (NAMES.index(name) + 1 for name in ("floor", "chair", "sofa", "mat"))
+    assert truth.every_semantic is not None
+    # The rug finds no room on the first vertex, and so covers one less.
+    assert truth.every_semantic.tolist() == [[floor, sofa, chair], [floor, sofa, 0], [0] * 3, [floor, mat, 0], [0] * 3]
+    assert truth.semantic.tolist() == [chair, sofa, -1, mat, 0]
+    assert truth.instance.tolist() == [3, 2, 0, 4, 0]
+
+
+def test_the_first_object_of_a_file_is_never_an_instance(tmp_path: Path) -> None:
+    truth = written(tmp_path, [1, 2, 2], [("chair", (1,)), ("chair", (2,))], mesh=row_of_points(3))
+    assert truth.semantic.tolist() == [3, 3, 3] and truth.instance.tolist() == [0, 2, 2]
+
+
+def test_words_that_the_benchmark_does_not_have_lie_on_no_vertex(tmp_path: Path) -> None:
+    groups = [("odd", (1,)), ("chair", (1,)), ("Chair", (2,)), ("sofa", (2,))]  # no row has "sofa": the map knows couch
+    truth = written(tmp_path, [1, 2, 2], groups, mesh=row_of_points(3))
+    assert truth.semantic.tolist() == [3, 0, 0] and truth.instance.tolist() == [2, 0, 0]
+
+
+def test_the_surface_of_an_object_is_that_of_most_corners(tmp_path: Path) -> None:
+    points, triangles = grid(3, 2)
+    write_lists(tmp_path)
+    write_scans(tmp_path, [1, 1, 2, 1, 1, 2], [("floor", (1,)), ("couch", (2,))], mesh=(points, triangles))
+    classes = read_benchmark_classes(tmp_path / "metadata/semantic_benchmark", "here")
+    mesh = instance_mesh(read_annotated_scan({name: tmp_path / name for name in TRUTH_NAMES}, classes, "here"))
+    assert mesh.instance_of_triangle.tolist() == [1, 1, 1, 2]
+    assert mesh.class_of_instance == {1: 2, 2: 4}
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "line"),
+    [
+        ("segments.json", "[1, 2]", "segments.json: is no JSON object"),
+        ("segments.json", '{"segIndices": [1, 2, -1]}', r"'segIndices'\[2\] is -1; expected a segment id"),
+        ("segments.json", '{"segIndices": [1, 2]}', "has 2 vertices, mesh_aligned_0.05.ply has 3; they belong to two"),
+        ("segments_anno.json", '{"segGroups": [{"segments": [1]}]}', "group 0: 'label' is None; expected a word"),
+        ("segments_anno.json", '{"segGroups": [{"label": "x"}]}', "group 0: has no list 'segments'"),
+        ("segments_anno.json", "{}", "has no list 'segGroups'"),
+        ("mesh_aligned_0.05_mask.txt", "3\n", "'3' is no vertex of mesh_aligned_0.05.ply, which has 3"),
+        ("mesh_aligned_0.05_mask.txt", "-1\n", "'-1' is no vertex"),
+    ],
+)
+def test_what_is_wrong_with_a_scan_is_one_line(tmp_path: Path, name: str, text: str, line: str) -> None:
+    written(tmp_path, [1, 2, 2], [("chair", (1,))], mesh=row_of_points(3))
+    (tmp_path / "scans" / name).write_text(text)
+    with pytest.raises(DataError, match=f"^here: .*{line}"):
+        truth_of(tmp_path / "scans", tmp_path / "metadata/semantic_benchmark")
+
+
+def test_more_objects_than_ids_can_tell_apart_are_refused(tmp_path: Path) -> None:
+    groups = [*[("floor", (1,))] * 999, ("chair", (2,))]
+    assert written(tmp_path, [1, 2, 2], groups, mesh=row_of_points(3)).instance.tolist() == [0, 1000, 1000]
+    with pytest.raises(DataError, match="cannot tell more than 1000 apart"):
+        written(tmp_path, [1, 2, 2], [*groups, ("chair", (2,))], mesh=row_of_points(3))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "line"),
+    [
+        ("top100.txt", "wall\nwall\n", "top100.txt: has 'wall' twice"),
+        ("top100.txt", "wall\n\nfloor\n", "line 2: '' is no name"),
+        ("top100.txt", "", "has 0 lines"),
+        ("top100_instance.txt", "piano\n", "top100_instance.txt has 'piano', which top100.txt has not"),
+        ("map_benchmark.csv", "class,count\n", "has no column 'semantic_map_to'"),
+        ("map_benchmark.csv", f"{MAP}sofa\n", "row 7: has 1 cells of 4"),
+        ("map_benchmark.csv", f"{MAP}sofa,many,,\n", "'count': 'many' is no number"),
+    ],
+)
+def test_what_is_wrong_with_the_lists_is_one_line(tmp_path: Path, name: str, text: str, line: str) -> None:
+    write_lists(tmp_path)
+    folder = tmp_path / "metadata/semantic_benchmark"
+    (folder / name).write_text(text)
+    with pytest.raises(DataError, match=f"^here: .*{line}"):
+        read_benchmark_classes(folder, "here")
