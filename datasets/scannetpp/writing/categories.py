@@ -49,7 +49,7 @@ def room_of(scene: str) -> str | None:
 @cache
 def benchmark_names() -> tuple[str, ...]:
     """The 100 classes of the benchmark in the order of its list."""
-    return tuple(str(name) for _, name in parse_toml(file_text(RULES / "classes.scannetpp-100.toml"))["classes"])
+    return tuple(str(row[1]) for row in parse_toml(file_text(RULES / "classes.scannetpp-100.toml"))["classes"])
 
 
 def without_instances() -> frozenset[str]:
