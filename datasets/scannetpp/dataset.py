@@ -13,7 +13,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.core.digests import digest_file
-from su3d_bench.core.errors import DataError, GroundTruthMissing, counted, suggest
+from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
 from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo, Surface
 from su3d_bench.datasets.recordings.recorded_frames import reading
@@ -27,7 +27,13 @@ from su3d_bench.datasets.scannetpp.folders import (
     find_scenes,
     no_scenes,
 )
-from su3d_bench.datasets.scannetpp.iphone.frames import IphoneFrames, IphoneRecording, PoseSource, open_recording
+from su3d_bench.datasets.scannetpp.iphone.frames import (
+    IphoneFrames,
+    IphoneRecording,
+    PoseSource,
+    describe_recording,
+    open_recording,
+)
 from su3d_bench.datasets.scannetpp.labels import (
     BENCHMARK_FOLDER,
     LABEL_SPACE,
@@ -100,8 +106,9 @@ class ScanNetPP:
         return find_scenes(self.root).places or [self.root / name for name in PLACES[:2]]
 
     def status(self, scene: str) -> str:
-        """A word on the scene from a quick look: frames with a pose, and ground truth."""
-        words = counted(len(self._recording(scene).usable), "frame")
+        """A word on the scene from a quick look: frames, and ground truth."""
+        with reading(self._where(scene)):
+            words = describe_recording(self._folder(scene) / IPHONE, self.options.poses)
         try:
             self._truth_files(scene)
             self._benchmark_folder(scene)

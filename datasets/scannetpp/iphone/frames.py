@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from su3d_bench.core.errors import DataError
+from su3d_bench.core.errors import DataError, counted
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, UInt8Array
 from su3d_bench.datasets.recordings.exported_frames import list_folder, read_size
 from su3d_bench.datasets.recordings.recorded_frames import StoredDepth, depth_m_of_values
@@ -27,6 +27,7 @@ from su3d_bench.datasets.scannetpp.iphone.poses import (
     IMAGES_NAME,
     TRACKING_NAME,
     PosedFrames,
+    n_registered,
     read_colmap,
     read_tracking,
 )
@@ -47,6 +48,18 @@ def pose_source(folder: Path, kind: PoseSource) -> PoseSource:
     if kind != "auto":
         return kind
     return "colmap" if (folder / COLMAP / IMAGES_NAME).exists() or not (folder / TRACKING_NAME).exists() else "tracking"
+
+
+def describe_recording(folder: Path, kind: PoseSource) -> str:
+    """A word on the frames from a quick look at the iPhone's ``folder``."""
+    source = pose_source(folder, kind)
+    path = folder / COLMAP / IMAGES_NAME if source == "colmap" else folder / TRACKING_NAME
+    if not path.is_file():
+        return "no frames of the iPhone"
+    if source == "tracking":
+        return "frames with the poses of the phone"
+    n = n_registered(path)
+    return "frames with the poses of COLMAP" if n is None else counted(n, "frame")
 
 
 @dataclass(frozen=True, eq=False)

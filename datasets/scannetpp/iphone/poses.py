@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,8 +23,9 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import Float64Array, Int64Array
-from su3d_bench.datasets.recordings.recorded_frames import numbers, parsed_json, pinhole, read_text
+from su3d_bench.datasets.recordings.recorded_frames import numbers, parsed_json, pinhole, read_text, reading
 from su3d_bench.formats.images import MAX_PIXELS, Size, read_bytes
 from su3d_bench.numerics.geometry import are_rigid
 
@@ -42,6 +43,8 @@ MODELS = {
 }
 N_PARAMETERS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8}
 MOST_DISTORTION = 10.0  # an iPhone has 0.2
+MOST_LINE_BYTES = 16 << 20  # of the points of one image, which are some thousands
+HEAD_BYTES = 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,25 +106,39 @@ def _size(words: Sequence[str], where: str) -> Size:
 
 def _read_images(path: Path, where: str) -> dict[int, Float64Array]:
     """Camera-to-world pose of each frame. Every second line lists points, and may be empty."""
-    lines = read_text(path, where).splitlines()
     pose_of: dict[int, Float64Array] = {}
-    at = 0
-    while at < len(lines):
-        line = lines[at].strip()
-        at += 1
-        if not line or line.startswith("#"):
+    is_of_points = False
+    for at, line in enumerate(_lines(path, where), 1):
+        if is_of_points or not line.strip() or line.startswith(b"#"):
+            is_of_points = False
             continue
-        words, place = line.split(), f"{where} line {at}"
+        is_of_points = True
+        words, place = line.decode("ascii", "replace").split(), f"{where} line {at}"
         if len(words) != 10:
             raise DataError(f"{place}: has {len(words)} words; expected 'id qw qx qy qz tx ty tz camera name'")
         number = frame_number(words[9].rpartition("/")[2], place)
         if number in pose_of:
             raise DataError(f"{place}: frame {number} stands there twice; copy the file again")
         pose_of[number] = _inverse_pose(numbers(words[1:8], place), place)
-        at += 1  # the line of the points
     if not pose_of:
         raise DataError(f"{where}: lists no frame; copy the file again")
     return pose_of
+
+
+def _lines(path: Path, where: str) -> Iterator[bytes]:
+    """The lines of a file that may have hundreds of megabytes, for it lists every point of every image."""
+    with reading(where), opened(path) as stream:
+        while line := stream.readline(MOST_LINE_BYTES):
+            if len(line) == MOST_LINE_BYTES:
+                raise DataError(f"{where}: a line has more than {MOST_LINE_BYTES >> 20} MiB; copy the file again")
+            yield line
+
+
+def n_registered(path: Path) -> int | None:
+    """How many images the head of ``images.txt`` says it lists; None where it says nothing."""
+    with opened(path) as stream:
+        match = re.search(rb"^# Number of images: ([0-9]{1,7})\b", stream.read(HEAD_BYTES), re.MULTILINE)
+    return None if match is None else int(match[1])
 
 
 def frame_number(name: str, where: str) -> int:

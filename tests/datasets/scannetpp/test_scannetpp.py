@@ -26,6 +26,8 @@ from su3d_bench.core.errors import DataError, GroundTruthMissing, ScenesMissing
 from su3d_bench.datasets.checks import inspect
 from su3d_bench.datasets.scannetpp.dataset import ScanNetPP
 
+# The files count from the corner of the image, frames from the middle of the first pixel.
+CAMERA = np.array([[64.0, 0.0, 31.5], [0.0, 64.0, 23.5], [0.0, 0.0, 1.0]])
 LISTS = "metadata/semantic_benchmark"
 
 
@@ -40,8 +42,7 @@ def test_poses_of_both_kinds_are_camera_to_world_in_the_world_of_the_mesh(tmp_pa
     assert [frame.index for frame in frames] == list(NUMBERS)
     for frame, expected in zip(frames, poses(), strict=True):
         np.testing.assert_allclose(frame.camera_to_world, expected, atol=1e-12)
-        # Both files count from the corner of the image, frames from the middle of the first pixel.
-        np.testing.assert_allclose(frame.intrinsics, [[64, 0, 31.5], [0, 64, 23.5], [0, 0, 1]])
+        np.testing.assert_allclose(frame.intrinsics, CAMERA)
 
 
 def test_colmap_is_taken_where_both_are_there_and_tracking_where_it_is_not(tmp_path: Path) -> None:
@@ -82,7 +83,8 @@ def test_frames_have_at_most_the_columns_asked_for_and_the_same_rays(tmp_path: P
     small = dataset(tmp_path, width=32).frames(SCENE, 1)[0]
     assert small.rgb.shape == (24, 32, 3) and small.depth_m.shape == (24, 32)
     corners = np.array([[-0.5, -0.5, 1], [31.5, 23.5, 1]])
-    np.testing.assert_allclose(corners @ np.linalg.inv(small.intrinsics).T, [[-0.5, -0.375, 1], [0.5, 0.375, 1]])
+    rays = np.array([[-0.5, -0.375, 1], [0.5, 0.375, 1]])
+    np.testing.assert_allclose(corners @ np.linalg.inv(small.intrinsics).T, rays)
     whole = dataset(tmp_path, width=4096).frames(SCENE, 1)[0]
     assert whole.rgb.shape[:2] == COLOUR_SIZE[::-1]
 
@@ -112,7 +114,7 @@ def test_other_models_of_colmap_are_read_by_their_own_order(
     else:
         write_colmap(folder / "iphone/colmap", numbers, model)
     intrinsics = dataset(tmp_path).frames(SCENE, 1)[0].intrinsics
-    np.testing.assert_allclose(intrinsics, [[64, 0, 31.5], [0, 64, 23.5], [0, 0, 1]])
+    np.testing.assert_allclose(intrinsics, CAMERA)
 
 
 def test_every_way_to_ask_is_answered_and_the_check_finds_nothing(tmp_path: Path) -> None:
@@ -120,6 +122,7 @@ def test_every_way_to_ask_is_answered_and_the_check_finds_nothing(tmp_path: Path
     data = dataset(tmp_path)
     assert list(data.scenes()) == [SCENE] and data.groups() == {"nvs_sem_val": (SCENE,)}
     assert data.status(SCENE) == "3 frames, ground truth"
+    assert dataset(tmp_path, poses="tracking").status(SCENE) == "frames with the poses of the phone, ground truth"
     found = inspect(data, SCENE)
     assert [finding for finding in found.findings if finding.severity == "error"] == []
     assert found.truth[0].variant == "scannetpp" and found.truth[0].n_classes == 3

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from fuzzing import Make, Read, Target, every_one_of
@@ -109,7 +109,7 @@ def _scannet_export(form: str) -> Make:
     return make
 
 
-def _scannetpp(poses: str, *, packed: bool = False) -> Make:
+def _scannetpp(poses: Literal["colmap", "tracking"], *, packed: bool = False) -> Make:
     def make(folder: Path) -> Read:
         from scannetpp_scene import SCENE, write_scene
 

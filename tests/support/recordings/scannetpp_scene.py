@@ -40,7 +40,7 @@ def write_colmap(folder: Path, distortion: Sequence[float] = (0, 0, 0, 0), model
     width, height = COLOUR_SIZE
     camera = f"1 {model} {width} {height} {width} {width} {width / 2} {height / 2} {' '.join(map(str, distortion))}"
     (folder / "cameras.txt").write_text(f"# Camera list\n{camera}\n")
-    lines = ["# Image list"]
+    lines = ["# Image list with two lines of data per image:", "# Number of images: 3, mean observations per image: 1"]
     for k, (number, matrix) in enumerate(zip(NUMBERS, poses(), strict=True), 1):
         shift = " ".join(repr(float(value)) for value in np.linalg.inv(matrix)[:3, 3])
         lines += [f"{k} 0.0 1.0 0.0 0.0 {shift} 1 frame_{number:06d}.jpg", "1.5 2.5 -1" if k == 1 else ""]
