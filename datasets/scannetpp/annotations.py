@@ -79,7 +79,10 @@ class _Members:
 
     def of(self, segments: Int64Array) -> Int64Array:
         """The vertices in any of ``segments``; those that no vertex has are passed over."""
-        rows = np.flatnonzero(np.isin(self.ids, segments))
+        places = np.searchsorted(self.ids, segments)
+        is_known = places < len(self.ids)
+        is_known[is_known] = self.ids[places[is_known]] == segments[is_known]
+        rows = np.unique(places[is_known])
         lengths = self.starts[rows + 1] - self.starts[rows]
         within = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
         members: Int64Array = self.vertices[np.repeat(self.starts[rows], lengths) + within]

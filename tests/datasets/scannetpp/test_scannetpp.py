@@ -217,6 +217,28 @@ def test_poses_that_cannot_be_right_are_named(tmp_path: Path, name: str, text: s
         list(dataset(tmp_path).frames(SCENE, 1))
 
 
+def test_points_of_images_are_passed_over_and_a_line_without_end_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_scene(tmp_path)
+    path = folder / "iphone/colmap/images.txt"
+    head, pose, _, *rest = path.read_text().splitlines()[1:]
+    path.write_text("\n".join([head, pose, "1 2 3 " * 40, *rest]) + "\n")
+    assert len(dataset(tmp_path).frames(SCENE, 1)) == 3
+    monkeypatch.setattr("su3d_bench.datasets.scannetpp.iphone.poses.MOST_LINE_BYTES", 200)
+    with pytest.raises(DataError, match=rf"^{WHERE}: colmap/images.txt: a line has more than"):
+        dataset(tmp_path).frames(SCENE, 1)
+
+
+def test_faults_of_recording_and_truth_are_named_side_by_side(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path)
+    (folder / "iphone/colmap/cameras.txt").write_text("")
+    (folder / "scans/segments.json").write_text("{")
+    first, second = dataset(tmp_path).problems(SCENE)
+    assert first.startswith(f"{WHERE}: colmap/cameras.txt: has 0 cameras")
+    assert second.startswith(f"{WHERE}: segments.json: not JSON")
+
+
 @pytest.mark.parametrize(
     ("changes", "line"),
     [
