@@ -160,6 +160,26 @@ DATASETS = {
         "[0, 7, 8, 9]",
         "ground_truth: semantic holds the class id 7, which its labels",
     ),
+    "a class below those that are left out": (
+        "[0, *LABELS.ids]",
+        "[0, -2, -2, -2]",
+        "ground_truth: semantic holds the class id -2, which its labels",
+    ),
+    "several unknown classes": (
+        'variant, "painted")',
+        'variant, "painted", every_semantic=np.full((len(points), 2), 7, np.int32))',
+        "ground_truth: every_semantic holds the class id 7, which its labels",
+    ),
+    "several shares of classes": (
+        'variant, "painted")',
+        'variant, "painted", every_semantic=np.zeros((len(points), 2)))',
+        "every_semantic is float64; whole numbers are expected",
+    ),
+    "several classes of other points": (
+        'variant, "painted")',
+        'variant, "painted", every_semantic=np.zeros((3, 2), np.int32))',
+        "every_semantic (3, 2) has no row for each of",
+    ),
     "shares of classes": (
         "[0, *LABELS.ids], np.int32",
         "[0, *LABELS.ids], np.float32",

@@ -115,7 +115,8 @@ def _fault_of_truth(truth: GroundTruth) -> str | None:
         return fault
     if not np.isfinite(truth.points).all():
         return "points holds values that are not finite"
-    if fault := _fault_of_range("instance", truth.instance):
+    known = np.maximum(truth.semantic, 0)  # below it is -1 alone, for points that are left out
+    if (fault := _fault_of_range("instance", truth.instance)) or (fault := _fault_of_range("semantic", known)):
         return fault
     every = truth.every_semantic
     if every is not None and every.dtype.kind != "i":
