@@ -256,7 +256,7 @@ def _scene_warnings(kept: SceneOutcomes) -> list[str]:
 
 def _confidence_warnings(rules: ProtocolRules, evaluation: ProtocolEvaluation, file_confidences: bool) -> list[str]:
     confidences = evaluation.confidences
-    if not rules.needs_instances or confidences is None:
+    if not rules.needs_instances or not rules.confidences or confidences is None:
         return []
     if evaluation.with_ones is not None:
         shown = ", ".join(f"{name} {100 * evaluation.with_ones[name]:.1f}" for name in rules.headline)

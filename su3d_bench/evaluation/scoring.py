@@ -53,6 +53,8 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import QuestionTruth, metric_of, score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
+from su3d_bench.metrics.semantic.panoptic_quality import PanopticCounts
+from su3d_bench.metrics.semantic.panoptic_score import count_segments
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
 from su3d_bench.predictions.own_runs import OwnRuns
 
@@ -233,10 +235,11 @@ def score_on_vertices(
         *_melted(scene, rules, truth.values),
         *named,
     ]
+    has_bound = rules.names_masks and bool(rules.confidences)
     return SceneOutcome(
         _instance_score(rules, values, content, content.scores, ids),
         _instance_ceiling(rules, truth, values),
-        None if rules.class_agnostic else _instance_counts(rules, values, content, content.scores, None),
+        _instance_counts(rules, values, content, content.scores, None) if has_bound else None,
         facts,
         tuple(warnings),
     )
@@ -267,7 +270,16 @@ def _instance_score(
 ) -> SceneScore:
     _, distinct, n_points = scene_counts.segments_of(values)
     n_scored = int(n_points[np.isin(distinct // instance_ap.INSTANCES_PER_CLASS, _class_ids(rules))].sum())
-    return _score(rules, _instance_counts(rules, values, masks, scores, ids), len(masks), n_scored)
+    count = _instance_counts if rules.confidences else _segment_counts
+    return _score(rules, count(rules, values, masks, scores, ids), len(masks), n_scored)
+
+
+def _segment_counts(
+    rules: ProtocolRules, values: Int64Array, masks: Masks, scores: Float64Array, ids: Int64Array
+) -> PanopticCounts:
+    """The counts of masks with class ids (K,) where every point is in one segment."""
+    semantic, instance = np.divmod(values, instance_ap.INSTANCES_PER_CLASS)
+    return count_segments(rules, semantic, instance, masks, scores, ids)
 
 
 def _instance_counts(
@@ -291,7 +303,7 @@ def _instance_counts(
 
 def _score(
     rules: ProtocolRules,
-    counts: instance_ap.InstanceCounts | semantic.SemanticCounts,
+    counts: instance_ap.InstanceCounts | semantic.SemanticCounts | PanopticCounts,
     n_predictions: int,
     n_scored: int,
 ) -> SceneScore:
@@ -345,7 +357,7 @@ def score_on_truth(
         if not isinstance(content, VertexLabels):
             facts = mask_facts(masks, scores, len(prediction.points))
             warnings += empty_warnings(scene, facts, masks, getattr(prediction, "names", ()))
-        if rules.names_masks:
+        if rules.names_masks and rules.confidences:
             cap_m, voxel_m = rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
             moved = transfer.transfer_masks(prediction.points, masks, truth.points, cap_m, voxel_m)
             values = instance_ap.encode_ground_truth(truth.semantic, truth.instance)

@@ -29,8 +29,10 @@ from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
 from su3d_bench.metrics.open_vocabulary.score import CategoriesMetric, QueryMetric
 from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.questions.presence import PresenceMetric
 from su3d_bench.metrics.questions.score import AnnotationMetric, ReasoningMetric, RetrievalMetric
-from su3d_bench.metrics.questions.truths import AnnotationTruth, ReasoningTruth, RetrievalTruth
+from su3d_bench.metrics.questions.truths import AnnotationTruth, PresenceTruth, ReasoningTruth, RetrievalTruth
+from su3d_bench.metrics.semantic.panoptic_score import PanopticMetric
 from su3d_bench.metrics.semantic.score import SemanticMetric
 from su3d_bench.numerics.statistics import jackknife_interval, leave_one_out
 from su3d_bench.store.atomic import read_arrays
@@ -47,15 +49,17 @@ __all__ = [
 ]
 
 EVERY_SCENE = "every scene"  # stands before a warning that all scenes share, where else the name of one stands
-QuestionTruth = RetrievalTruth | AnnotationTruth | ReasoningTruth
+QuestionTruth = RetrievalTruth | PresenceTruth | AnnotationTruth | ReasoningTruth
 Truth = GroundTruth | OpenLexTruth | QueryTruth | QuestionTruth
 METRICS: dict[str, type[Metric[Any]]] = {
     "semantic": SemanticMetric,
     "instance": InstanceMetric,
+    "panoptic": PanopticMetric,
     "boxes": BoxMetric,
     "queries": QueryMetric,
     "categories": CategoriesMetric,
     "retrieval": RetrievalMetric,
+    "presence": PresenceMetric,
     "annotation": AnnotationMetric,
     "reasoning": ReasoningMetric,
 }

@@ -15,6 +15,7 @@ from su3d_bench.metrics.questions.truths import (
     AnnotationTruth,
     AskedText,
     GivenAnswer,
+    PresenceTruth,
     ReasoningTruth,
     RefinedNames,
     RetrievalTruth,
@@ -24,6 +25,7 @@ from su3d_bench.metrics.scoring import QuestionTruth
 from su3d_bench.questions.generator import chosen, generate, right_by_name
 from su3d_bench.questions.known_objects import is_called, known_objects
 from su3d_bench.questions.model import Question, new_question
+from su3d_bench.questions.presence import counted_rooms, presence_questions
 from su3d_bench.questions.reasoning.asking import BUILT_IN, MapSolver, built_in, given_answer
 from su3d_bench.questions.reasoning.generated import generate_questions
 from su3d_bench.questions.reasoning.scene_map import SceneMap, map_of
@@ -72,6 +74,10 @@ def question_truth(
     if rules.kind == "annotation":
         return _annotation_truth(rules.min_region_size, truth, refine or voted_names)
     objects = scene_objects(dataset, scene, truth, rules.min_region_size)
+    if rules.presence is not None:
+        rooms = counted_rooms()
+        asked = presence_questions(f"{dataset.name}/{scene}", truth, objects, rules.per_kind or len(objects), rooms)
+        return PresenceTruth(truth, asked, f"popular and adversarial by what stands in {len(rooms)} built-in rooms")
     if rules.kind == "reasoning":
         return _reasoning_truth(rules, truth, objects, refine or voted_names, solver)
     if rules.questions == "dataset":

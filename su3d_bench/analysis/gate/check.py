@@ -19,6 +19,7 @@ from su3d_bench.analysis.gate.reference import (
 )
 from su3d_bench.core.english import plural
 from su3d_bench.core.errors import printable
+from su3d_bench.metrics.protocols.model import PanopticRules, PresenceQuestionRules
 from su3d_bench.reports.gate import SCENES, Compared, Finding, Verdict
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.records import NumbersRecord
@@ -28,9 +29,15 @@ _OF_QUESTIONS = ("instance", "affordance", "property", "relative", "all", "answe
 _OF_BOXES = ("centroid", "class", "recall25", "recall50", "precision25", "precision50")
 _OF_LABELS = ("label n", "label n'", "well-merged", "well-merged n'")
 _JUDGED = (*_OF_QUESTIONS, *_OF_LABELS)
+_OF_SEGMENTS = PanopticRules.values_of_metric["panopticapi"]
+# whether yes is said too often or too seldom depends on where one stands
+_OF_PRESENCE = tuple(name for name in PresenceQuestionRules.values_of_metric["pope"] if "yes-rate" not in name)
 HIGHER_IS_BETTER = frozenset(
-    {"AP", "AP50", "AP25", "mAcc", "mIoU", "F-mIoU", "synonyms", "overall", *_SHARES, *_OF_BOXES, *_JUDGED}
-)
+    {
+        *("AP", "AP50", "AP25", "mAcc", "mIoU", "F-mIoU", "synonyms", "overall"),
+        *_SHARES, *_OF_BOXES, *_JUDGED, *_OF_SEGMENTS, *_OF_PRESENCE,
+    }
+)  # fmt: skip
 
 
 def check(run: FinishedRun, reference: Reference) -> Verdict:

@@ -15,13 +15,14 @@ CATEGORIES = ("synonyms", "depictions", "vis_sim", "clutter", "missing", "incorr
 AP_NAMES = ("AP", "AP50", "AP25")
 BOX_AXES = Literal["truth", "world"]
 _CURVE_FIELDS = ("min_region_size", "thresholds", "confidence")
-_NEEDS_QUESTIONS = "questions: kinds 'retrieval' and 'reasoning' need them, and min_region_size"
+_NEEDS_QUESTIONS = "questions: kinds 'retrieval', 'reasoning' and 'presence' need them, and min_region_size"
 _ONLY_CURVES = "min_region_size, thresholds and confidence belong to kind 'instance', 'boxes' or 'queries'"
 # The fields that not every kind has, and what is said where one is missing or out of place.
 _OWN_FIELDS = {
-    "classes": "classes: needed where labels count, that is under kinds 'semantic', 'instance' and 'boxes'",
+    "classes": "classes: needed where labels count, that is under kinds 'semantic', 'instance', 'panoptic' and 'boxes'",
     "class_agnostic": "class_agnostic: belongs to kind 'instance'",
     "void": "void: belongs to kind 'instance'",
+    "stuff": "stuff: kind 'panoptic' needs the classes that are no things, others take none",
     "vocabulary": "vocabulary: belongs to protocols that choose among classes, and these need it",
     "min_region_size": _ONLY_CURVES,
     "thresholds": _ONLY_CURVES,
@@ -33,6 +34,7 @@ _OWN_FIELDS = {
     "merging": "merging: kind 'annotation' needs it, others take none",
     "answers": "answers: kind 'reasoning' needs it, others take none",
     "box_axes": "box_axes: kind 'boxes' needs it, others take none",
+    "presence": "presence: kind 'presence' needs it, others take none",
 }
 
 
@@ -86,15 +88,33 @@ class AnswerRules(_Strict):
     distance_share: Annotated[float, Field(ge=0)]
 
 
-SECTIONS: dict[str, type[BaseModel]] = {"transfer": TransferRules, "merging": MergeRules, "answers": AnswerRules}
+class PresenceRules(_Strict):
+    """When a text is said to have something in the map, and over which rooms it is counted what stands in rooms.
+
+    The relevancy of an instance to a text is, of all ``canonical`` phrases, the least share that the text has in the
+    softmax of its cosine and that of the phrase, both times ``sharpness``; something is there where that of an instance
+    is above ``relevancy``. ``counted_over``: the rooms by which absent things are frequent ones, or ones that stand
+    with what is there.
+    """
+
+    canonical: Annotated[tuple[str, ...], Field(min_length=1)]
+    sharpness: Annotated[float, Field(gt=0)]
+    relevancy: Annotated[float, Field(gt=0, lt=1)]
+    counted_over: Literal["rooms"]
+
+
+SECTIONS: dict[str, type[BaseModel]] = {
+    "transfer": TransferRules, "merging": MergeRules, "answers": AnswerRules, "presence": PresenceRules
+}  # fmt: skip
 
 
 class ProtocolRules(_Strict):
     """One evaluation, complete: the same rules and the same prediction give the same number.
 
-    ``kind``: ``semantic`` (a class a point), ``instance`` (masks with a class), ``queries`` (masks ranked for each
-    text), ``boxes`` (with a class), ``categories`` (how near a point's label comes to those of its object), or what
-    people are asked otherwise: ``retrieval`` (the first mask of each text), ``annotation`` (names and shapes of masks),
+    ``kind``: ``semantic`` (a class a point), ``instance`` (masks with a class), ``panoptic`` (every point in a segment
+    of a thing or of ``stuff``), ``queries`` (masks ranked for each text), ``boxes`` (with a class), ``categories`` (how
+    near a point's label comes to those of its object), or what people are asked otherwise: ``retrieval`` (the first
+    mask of each text), ``presence`` (is there such a thing at all?), ``annotation`` (names and shapes of masks),
     ``reasoning`` (questions that boxes settle). ``questions`` are those of the ``dataset`` itself or ``generated`` from
     the truth, ``per_kind`` of each kind at most; ``synonyms`` names the table of other names of classes. Protocols that
     are not ``by_default`` run where they are named. ``classes`` is the label set in the order of the original;
@@ -115,7 +135,10 @@ class ProtocolRules(_Strict):
     name: str
     version: Annotated[int, Field(ge=1)]
     summary: str
-    kind: Literal["semantic", "instance", "boxes", "queries", "categories", "retrieval", "annotation", "reasoning"]
+    kind: Literal[
+        "semantic", "instance", "panoptic", "boxes", "queries", "categories",
+        "retrieval", "presence", "annotation", "reasoning",
+    ]  # fmt: skip
     metric: Literal[
         "conceptgraphs",
         "scannet",
@@ -124,7 +147,10 @@ class ProtocolRules(_Strict):
         "query-ap",
         "openlex3d-topn",
         "openlex3d-ranking",
+        "panopticapi",
+        "semantic-kitti",
         "retrieval",
+        "pope",
         "annotation",
         "reasoning",
     ]
@@ -135,6 +161,7 @@ class ProtocolRules(_Strict):
     classes: tuple[ClassEntry, ...] = ()
     class_agnostic: Literal["scored", "annotated", "numbered", "everything"] | None = None
     void: Literal["false-positives"] | None = None
+    stuff: tuple[str, ...] = ()
     ignore: tuple[str, ...] = ()
     ignore_rule: Literal["exact", "substring"] = "exact"
     vocabulary: Literal["all", "scored", "scene"] | None = None
@@ -153,6 +180,7 @@ class ProtocolRules(_Strict):
     merging: MergeRules | None = None
     answers: AnswerRules | None = None
     box_axes: BOX_AXES | None = None
+    presence: PresenceRules | None = None
     aggregate: Literal["pooled", "scene-mean"] = "pooled"
     headline: Annotated[tuple[str, ...], Field(min_length=1)]
     not_comparable_with: tuple[str, ...] = ()
@@ -238,8 +266,6 @@ class ProtocolRules(_Strict):
             raise ValueError("transfer.neighbours: belongs to kind 'semantic'")
         if transfer.neighbours > 1 and transfer.evaluation_voxel_m > 0:
             raise ValueError("transfer.evaluation_voxel_m: of neighbours that vote nothing is left out; set it to 0")
-        if self.is_judged and transfer.cap_m is None:
-            raise ValueError(f"transfer.cap_m: kind '{self.kind}' needs one")
 
     @property
     def value_names(self) -> tuple[str, ...]:
@@ -313,6 +339,27 @@ class InstanceRules(ProtocolRules):
         return ("classes",) if self.class_agnostic == "scored" else ()
 
 
+class PanopticRules(ProtocolRules):
+    """Every point in one segment of a thing or of stuff."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = dict.fromkeys(
+        ("panopticapi", "semantic-kitti"),
+        tuple(f"{quality}{part}" for part in ("", " things", " stuff") for quality in ("PQ", "SQ", "RQ")),
+    )
+    needs_instances = True
+    needs = ("classes", "vocabulary", "stuff")
+
+    def _needed(self) -> tuple[str, ...]:
+        return (*self.needs, "min_region_size") if self.metric == "semantic-kitti" else self.needs
+
+    def _check_metric(self) -> None:
+        super()._check_metric()
+        scored = [entry.name for entry in self.scored]
+        for name in self.stuff:
+            if name not in scored:
+                raise ValueError(f"stuff: '{name}' is no scored class{suggest(name, scored)}")
+
+
 class BoxRules(ProtocolRules):
     """Boxes with a class."""
 
@@ -370,6 +417,11 @@ class _JudgedRules(ProtocolRules):
     is_judged = True
     needs_own_points = True
 
+    def _check_transfer(self) -> None:
+        super()._check_transfer()
+        if self.transfer.cap_m is None:
+            raise ValueError(f"transfer.cap_m: kind '{self.kind}' needs one")
+
 
 class RetrievalRules(_JudgedRules):
     """The first mask of each text."""
@@ -383,6 +435,32 @@ class RetrievalRules(_JudgedRules):
 
     def _needed(self) -> tuple[str, ...]:
         return (*self.needs, "synonyms") if self.questions == "generated" else self.needs
+
+
+class PresenceQuestionRules(ProtocolRules):
+    """Is there such a thing at all?"""
+
+    is_judged = True
+    needs_own_points = True
+    values_of_metric: ClassVar[ValuesOfMetric] = {
+        "pope": tuple(
+            f"{measure} {sampling}"
+            for sampling in ("random", "popular", "adversarial")
+            for measure in ("precision", "recall", "F1", "accuracy", "yes-rate", "AUROC")
+        )
+    }
+    text_metrics = ("pope",)
+    needs = ("questions", "min_region_size", "synonyms", "per_kind", "presence")
+
+    def _needed(self) -> tuple[str, ...]:
+        if self.questions == "dataset":
+            raise ValueError("questions: kind 'presence' takes 'generated'")
+        return self.needs
+
+    def _check_transfer(self) -> None:
+        super()._check_transfer()
+        if self.transfer.cap_m is not None or self.transfer.evaluation_voxel_m > 0:
+            raise ValueError("transfer.cap_m: kind 'presence' transfers nothing; no cap_m, no evaluation_voxel_m")
 
 
 class AnnotationRules(_JudgedRules):
@@ -415,10 +493,12 @@ class ReasoningRules(_JudgedRules):
 RULES_OF_KIND: dict[str, type[ProtocolRules]] = {
     "semantic": SemanticRules,
     "instance": InstanceRules,
+    "panoptic": PanopticRules,
     "boxes": BoxRules,
     "queries": QueryRules,
     "categories": CategoryRules,
     "retrieval": RetrievalRules,
+    "presence": PresenceQuestionRules,
     "annotation": AnnotationRules,
     "reasoning": ReasoningRules,
 }

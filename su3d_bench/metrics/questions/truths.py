@@ -35,6 +35,25 @@ class RetrievalTruth:
 
 
 @dataclass(frozen=True)
+class AskedThing:
+    """What a map is asked for that the scene has or has not; ``sampling``: the way by which absent things are drawn."""
+
+    text: str
+    sampling: str
+    is_there: bool
+
+
+@dataclass(frozen=True)
+class PresenceTruth:
+    """The objects of a scene and things that it has or has not; ``source`` says over what it is counted which things
+    are frequent, and which stand together."""
+
+    scene: GroundTruth
+    asked: tuple[AskedThing, ...]
+    source: str
+
+
+@dataclass(frozen=True)
 class RefinedNames:
     """Labels n' of a map, one an instance, and who chose them.
 
