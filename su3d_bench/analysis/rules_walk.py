@@ -22,7 +22,7 @@ from su3d_bench.runs.finished import FinishedRun, read_run
 
 SCHEMA = 1
 # Of these the truth of a dataset is all that is needed, and a prediction is scored without a question.
-KINDS = ("semantic", "instance")
+KINDS = ("semantic", "instance", "panoptic")
 
 
 @dataclass(frozen=True)

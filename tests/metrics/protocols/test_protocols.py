@@ -43,7 +43,9 @@ NAMES = {
     "replica-ovo51", "rooms-instance", "rooms-semantic", "scannet-instance",
     "scannet-semantic", "scannet200-instance", "scannet200-semantic", "rooms-retrieval", "replica-retrieval",
     "scannet-retrieval", "rooms-annotation", "replica-annotation", "scannet-annotation", "rooms-reasoning",
-    "replica-reasoning", "scannet-reasoning", "replica-boxes",
+    "replica-reasoning", "scannet-reasoning", "replica-boxes", "rooms-presence", "replica-presence",
+    "scannet-presence", "rooms-panoptic", "replica-panoptic", "scannet-panoptic", "scannet-panoptic-oneformer3d",
+    "scannet200-panoptic",
 }  # fmt: skip
 
 
@@ -106,7 +108,7 @@ def test_instance_protocols_use_the_original_thresholds_and_size(name: str) -> N
         n_points = MIN_REGION_SIZE if rules.kind == "instance" and name != "opensun3d-challenge" else 1
         assert (rules.thresholds, rules.min_region_size) == (THRESHOLDS, n_points)
     else:
-        n_vertices = MIN_REGION_SIZE if rules.is_judged else None
+        n_vertices = MIN_REGION_SIZE if rules.is_judged else 1 if rules.metric == "semantic-kitti" else None
         assert (rules.thresholds, rules.min_region_size, rules.confidence) == ((), n_vertices, None)
 
 
@@ -188,20 +190,22 @@ def test_a_rule_that_a_file_leaves_out_asks_for_nothing() -> None:
         "candidates": "object-points", "neighbours": 1, "cap_m": None, "evaluation_voxel_m": 0.0,
     }  # fmt: skip
     assert {key: value for key, value in rules.items() if key not in said} == {
-        "by_default": True, "class_agnostic": None, "void": None, "ignore": (), "ignore_rule": "exact", "prompts": (),
-        "prompt_names": {}, "encoder": None, "min_region_size": None, "thresholds": (), "confidence": None,
+        "by_default": True, "class_agnostic": None, "void": None, "stuff": (), "ignore": (), "ignore_rule": "exact",
+        "prompts": (), "prompt_names": {}, "encoder": None, "min_region_size": None, "thresholds": (), "confidence": None,
         "top_k": None, "questions": None, "per_kind": None, "synonyms": None, "merging": None, "answers": None,
-        "box_axes": None, "aggregate": "pooled", "not_comparable_with": (),
+        "box_axes": None, "presence": None, "aggregate": "pooled", "not_comparable_with": (),
     }  # fmt: skip
 
 
 KINDS = {
     "semantic": {"takes_dense", "names_points", "takes_votes", "ignores_classes"},
     "instance": {"needs_instances", "ignores_classes"},
+    "panoptic": {"needs_instances", "ignores_classes"},
     "boxes": {"needs_own_points", "needs_boxes", "ignores_classes"},
     "queries": {"needs_own_points", "ignores_classes"},
     "categories": {"takes_dense", "needs_own_points"},
     "retrieval": {"is_judged", "needs_own_points", "ignores_classes"},
+    "presence": {"is_judged", "needs_own_points", "ignores_classes"},
     "annotation": {"is_judged", "needs_own_points", "goes_by_names", "ignores_classes"},
     "reasoning": {"is_judged", "needs_own_points", "goes_by_names", "ignores_classes"},
 }
@@ -374,7 +378,7 @@ FAULTS = (
     ("instance", "[transfer]", "[transfer]\nneighbours = 2", "transfer.neighbours: belongs to kind 'semantic'"),
     ("annotation", "version = 1", 'version = 1\nprompt = "{}"', "it takes no prompt and no encoder"),
     ("annotation", "version = 1", 'version = 1\nencoder = "x"', "it takes no prompt and no encoder"),
-    ("retrieval", "min_region_size = 100", "", "questions: kinds 'retrieval' and 'reasoning' need them"),
+    ("retrieval", "min_region_size = 100", "", "questions: kinds 'retrieval', 'reasoning' and 'presence' need them"),
     ("retrieval", "version = 1", 'version = 1\nconfidence = "ones"', "confidence belong to kind 'instance'"),
     ("instance", 'name = "mine"', 'name = "rooms-instance"', "the protocol name 'rooms-instance' is built in"),
 )
@@ -441,7 +445,7 @@ def test_show_prints_every_rule_with_what_its_file_says_of_it(name: str, capsys:
     assert main(["protocols", "show", name]) == 0
     text = capsys.readouterr().out
     rules = load_protocol(name)
-    for key in rules.model_dump(exclude={"transfer", "prompt_names", "classes", "merging", "answers"}):
+    for key in rules.model_dump(exclude={"transfer", "prompt_names", "classes", "merging", "answers", "presence"}):
         assert f"\n{key} " in text
     for line in (RULES / f"{name}.toml").read_text().splitlines():
         comment = line.partition("  # ")[2] or line.partition("# ")[2] * line.startswith("#")

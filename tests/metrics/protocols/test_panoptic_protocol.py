@@ -1,0 +1,252 @@
+"""Panoptic quality: the original evaluators' answers to the last bit, hand-worked segments, and what a map is scored by."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from places import CASES
+from scored_room import ENCODER, ID, instances, noisy, noisy_scores, nothing, room, truth_as_prediction
+
+from su3d_bench.cli.main import main
+from su3d_bench.core.errors import ConfigError, DataError
+from su3d_bench.core.maps import Masks
+from su3d_bench.metrics.protocols.loading import load_protocol, read_protocol
+from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, score_scene, unpack_scores
+from su3d_bench.metrics.semantic import panoptic_quality as panoptic
+from su3d_bench.metrics.semantic.panoptic_quality import PanopticCounts, Rule, Segments
+from su3d_bench.metrics.semantic.panoptic_score import count_segments
+
+RULES = load_protocol("rooms-panoptic")
+KITTI = load_protocol("scannet-panoptic-oneformer3d")
+ORIGINALS: dict[str, Rule] = {"panoptic01_panopticapi": "panopticapi", "panoptic02_semantic_kitti": "semantic-kitti"}
+PROBLEMS = {name: json.loads((CASES / f"{name}.json").read_text())["problems"] for name in ORIGINALS}
+ONE_THING, THING_AND_STUFF = np.array([True]), np.array([True, False])
+
+
+def segments(classes: Sequence[int], numbers: Sequence[int]) -> Segments:
+    return Segments(np.array(classes, np.int64), np.array(numbers, np.int64))
+
+
+@pytest.mark.parametrize(("name", "index"), [(name, k) for name in ORIGINALS for k in range(len(PROBLEMS[name]))])
+def test_the_answer_of_the_original_holds_to_the_last_bit(name: str, index: int) -> None:
+    rule, problem = ORIGINALS[name], PROBLEMS[name][index]
+    with np.load(CASES / f"{name}.npz") as archive:
+        is_thing, ends, points = (archive[f"{index}/{key}"] for key in ("is_thing", "ends", "points"))
+    scenes = np.split(points.astype(np.int64), ends[:-1], axis=1)
+    size = problem.get("min_region_size", 1)
+    counts = [
+        panoptic.per_scene(Segments(*one[:2]), Segments(*one[2:]), is_thing, rule, size) for one in scenes
+    ]
+    answer: dict[str, Any] = problem["answer"]
+    qualities = panoptic.class_qualities(panoptic.combine(counts), rule)
+    means = panoptic.means({key: values[None] for key, values in qualities.items()}, is_thing, rule)
+    for key, values in qualities.items():
+        assert np.nan_to_num(values).tolist() == answer["classes"][key]  # of what is nowhere the original prints 0
+    assert {key: float(value[0]) for key, value in means.items()} == {key: answer[key] for key in means}
+
+
+def test_there_are_thirty_problems_of_each_original() -> None:
+    assert [len(problems) for problems in PROBLEMS.values()] == [30, 30]
+
+
+def test_an_iou_of_one_half_is_no_match() -> None:
+    truth = segments([0] * 4, [1] * 4)
+    half = panoptic.per_scene(truth, segments([0, 0, -1, -1], [5, 5, 0, 0]), ONE_THING)
+    more = panoptic.per_scene(truth, segments([0, 0, 0, -1], [5, 5, 5, 0]), ONE_THING)
+    assert (half.n_matched[0], half.n_false[0], half.n_missed[0]) == (0, 1, 1)
+    assert (more.n_matched[0], more.iou[0]) == (1, 0.75)
+
+
+def test_stuff_is_one_segment_whatever_its_numbers() -> None:
+    truth = segments([1] * 6, [4, 4, 4, 9, 9, 9])
+    found = segments([1] * 6, [1, 2, 3, 4, 5, 6])
+    assert panoptic.per_scene(truth, found, THING_AND_STUFF).iou.tolist() == [0.0, 1.0]
+
+
+def test_void_is_taken_off_the_union_and_excuses_what_is_mostly_in_it() -> None:
+    truth = segments([0, 0, -1, -1, -1, -1], [1, 1, 0, 0, 0, 0])
+    found = segments([0] * 6, [1, 1, 1, 2, 2, 2])
+    counts = panoptic.per_scene(truth, found, ONE_THING)
+    assert (counts.n_matched[0], counts.iou[0], counts.n_false[0]) == (1, 1.0, 0)
+    half_void = panoptic.per_scene(segments([1, -1], [0, 0]), segments([0, 0], [1, 1]), THING_AND_STUFF)
+    assert half_void.n_false.tolist() == [1, 0]  # more than a half is ignored, a half is not
+
+
+def test_points_of_a_thing_that_no_instance_has_are_a_crowd() -> None:
+    crowd = segments([0] * 5, [0] * 5)
+    counts = panoptic.per_scene(crowd, segments([0, 0, 0, -1, -1], [1, 1, 1, 0, 0]), ONE_THING)
+    assert (counts.n_matched[0], counts.n_false[0], counts.n_missed[0]) == (0, 0, 0)
+    other = panoptic.per_scene(crowd, segments([1] * 5, [0] * 5), THING_AND_STUFF)
+    assert other.n_false.tolist() == [0, 1]  # a crowd excuses its own class alone
+    as_kitti = panoptic.per_scene(crowd, segments([0] * 5, [1] * 5), ONE_THING, "semantic-kitti")
+    assert as_kitti.iou.tolist() == [1.0]
+
+
+def test_small_segments_are_neither_missed_nor_wrong_where_there_is_a_least_size() -> None:
+    truth, found = segments([0, 0, 1, 1], [1, 1, 0, 0]), segments([1, 1, 0, 0], [0, 0, 8, 8])
+    for size, expected in ((2, [1, 1]), (3, [0, 0])):
+        counts = panoptic.per_scene(truth, found, THING_AND_STUFF, "semantic-kitti", size)
+        assert (counts.n_false.tolist(), counts.n_missed.tolist()) == (expected, expected)
+
+
+def test_the_truth_scores_one_and_nothing_scores_zero() -> None:
+    truth = room()
+    for prediction, expected in ((truth_as_prediction(truth, with_labels=True), 1.0), (nothing(truth), 0.0)):
+        result = combine(RULES, {"room": score_scene(RULES, truth, prediction, ENCODER)})
+        assert {result.metrics[name] for name in RULES.headline} == {expected}
+    assert result.metrics["n_classes"] == 7
+    assert result.per_class["wall"] == {"PQ": 0.0, "SQ": 0.0, "RQ": 0.0}
+    assert np.isnan(result.per_class["bed"]["PQ"])
+
+
+def test_the_order_of_masks_and_the_numbers_of_objects_change_nothing() -> None:
+    truth, prediction = noisy(3)
+    order = np.random.default_rng(0).permutation(len(prediction))
+    assert prediction.labels is not None
+    mixed = instances(
+        truth.points,
+        [prediction.mask(k) for k in order],
+        [prediction.labels[k] for k in order],
+        scores=prediction.scores[order].tolist(),
+    )
+    other = replace(truth, instance=np.where(truth.instance > 0, 9 - truth.instance, 0).astype(np.int32))
+    one = score_scene(RULES, truth, prediction, None).counts
+    for counts in (score_scene(RULES, truth, mixed, None).counts, score_scene(RULES, other, prediction, None).counts):
+        assert isinstance(one, PanopticCounts) and isinstance(counts, PanopticCounts)
+        for name in PanopticCounts.arrays:
+            np.testing.assert_allclose(getattr(counts, name), getattr(one, name), rtol=1e-15)
+
+
+def test_a_point_in_several_masks_is_that_of_the_greatest_confidence_and_the_first_of_equals() -> None:
+    masks = Masks.of_sets([np.arange(4), np.arange(4), np.arange(4)])
+    semantic, instance = np.full(4, ID["chair"]), np.ones(4, np.int64)
+    ids = np.array([ID["lamp"], ID["chair"], ID["table"]])
+    place = {entry.name: k for k, entry in enumerate(RULES.scored)}
+    for scores, best in (((0.1, 0.9, 0.5), "chair"), ((0.5, 0.5, 0.5), "lamp"), ((0.1, 0.2, 0.5), "table")):
+        counts = count_segments(RULES, semantic, instance, masks, np.array(scores), ids)
+        found = np.flatnonzero(counts.n_matched + counts.n_false)
+        assert found.tolist() == [place[best]]
+    without = count_segments(RULES, semantic, instance, masks, np.array([0.1, 0.2, 0.9]), np.array([1, ID["chair"], 0]))
+    assert without.n_matched[place["chair"]] == 1  # a mask without a class hides nothing
+
+
+def test_a_reader_is_told_how_many_points_several_masks_claim() -> None:
+    truth = room()
+    twice = np.flatnonzero(truth.instance == 2)
+    prediction = instances(truth.points, [twice, twice[:75]], ["chair", "chair"], scores=[0.5, 0.5])
+    assert score_scene(RULES, truth, prediction, None).warnings == (
+        "50.0 % of the points that masks cover are in several; each counts for that of equal confidence the first",
+    )
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(2, 5), st.integers(0, 1000))
+def test_parts_combine_to_the_whole_and_weights_of_ones_are_it(n_scenes: int, seed: int) -> None:
+    scores = {f"rooms/{k}": score_scene(RULES, *noisy(seed + k), None) for k in range(n_scenes)}
+    metric, counts = metric_of(RULES), [score.counts for score in scores.values()]
+    whole = metric.combine(counts)
+    in_parts = metric.combine([panoptic.combine(counts[:1]), panoptic.combine(counts[1:])])  # type: ignore[arg-type]
+    assert whole == pytest.approx(in_parts, rel=1e-14, nan_ok=True)
+    once = metric.resampled(counts, np.ones((1, n_scenes), np.int64))
+    assert {name: float(value[0]) for name, value in once.items()} == pytest.approx(
+        {name: whole[name] for name in once}, rel=1e-14, nan_ok=True
+    )
+    alone = metric.resampled(counts, np.eye(n_scenes, dtype=np.int64))
+    for k, row in enumerate(metric.combine_each(counts)):
+        assert {name: float(value[k]) for name, value in alone.items()} == pytest.approx(
+            {name: row[name] for name in alone}, rel=1e-14, nan_ok=True
+        )
+
+
+def test_each_class_is_resampled_as_it_is_scored() -> None:
+    scores = noisy_scores(RULES.name, 4)
+    result, counts = combine(RULES, scores), [score.counts for score in scores.values()]
+    classes = metric_of(RULES).resampled_classes(counts, np.ones((1, 4), np.int64))
+    assert set(classes) == {"wall", "chair", "table", "lamp", "cushion", "book", "backpack"}
+    for name, values in classes.items():
+        assert {key: float(value[0]) for key, value in values.items()} == pytest.approx(result.per_class[name])
+    assert result.intervals["PQ"] is not None
+
+
+def test_groups_of_classes_have_means_of_their_own() -> None:
+    rules = load_protocol("scannet200-panoptic")
+    nothing_there = PanopticCounts(*(np.zeros(200, np.int64) for _ in range(3)), np.zeros(200))
+    whole = metric_of(rules).pooled([replace(nothing_there, n_missed=np.ones(200, np.int64))])
+    assert whole.groups == {name: {"PQ": 0.0, "SQ": 0.0, "RQ": 0.0} for name in ("head", "common", "tail")}
+
+
+def test_counts_survive_their_file_and_impossible_ones_are_refused() -> None:
+    score = noisy_scores(RULES.name, 1)["rooms/0"]
+    kept = unpack_scores(pack_scores({RULES.name: score}))[RULES.name]
+    assert combine(RULES, {"a": kept}).metrics == combine(RULES, {"a": score}).metrics
+    counts = score.counts
+    assert isinstance(counts, PanopticCounts)
+    arrays = {name: getattr(counts, name) for name in PanopticCounts.arrays}
+    for iou in (np.full_like(counts.iou, 9.0), np.full_like(counts.iou, np.nan)):
+        with pytest.raises(DataError, match="'iou' of class 0"):
+            PanopticCounts.checked(arrays | {"iou": iou})
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ('stuff = ["walls"]', "stuff: 'walls' is no scored class; did you mean 'wall'?"),
+        ("stuff = []", "stuff: kind 'panoptic' needs the classes that are no things"),
+        ("min_region_size = 5", "min_region_size, thresholds and confidence belong to kind"),
+        ('metric = "scannet"', "kind 'panoptic' needs metric 'panopticapi' or 'semantic-kitti'"),
+        ('headline = ["AP"]', "headline: a protocol of kind 'panoptic' has PQ, SQ, RQ, PQ things"),
+    ],
+)
+def test_wrong_rules_are_told_in_one_line(line: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(f'extends = "rooms-panoptic"\nname = "mine"\n{line}\n')
+    with pytest.raises(ConfigError) as caught:
+        read_protocol(path)
+    assert message in str(caught.value)
+
+
+def test_the_splits_are_those_that_are_named() -> None:
+    splits = {
+        name: (sum(entry.name not in rules.stuff for entry in rules.scored), rules.stuff)
+        for name in ("rooms", "replica", "scannet", "scannet200")
+        for rules in (load_protocol(f"{name}-panoptic"),)
+    }
+    surfaces = ("wall", "floor", "ceiling")
+    assert splits == {
+        "rooms": (66, surfaces), "replica": (48, surfaces), "scannet": (18, surfaces[:2]),
+        "scannet200": (198, surfaces[:2]),
+    }  # fmt: skip
+    assert (KITTI.metric, KITTI.min_region_size) == ("semantic-kitti", 1)
+
+
+def test_text_files_of_masks_are_scored_against_text_files_of_truth(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    values = np.repeat([1001, 5001, 5002, 0], 200)  # a wall, two chairs, void
+    for folder in ("truth", "pred/masks"):
+        Path(folder).mkdir(parents=True)
+    Path("truth/scene0000_00.txt").write_text("\n".join(map(str, values)))
+    lines = []
+    for k, (label, rows) in enumerate({(1, (0, 200)): 0, (5, (200, 400)): 0, (5, (400, 550)): 0}):
+        mask = (np.arange(800) >= rows[0]) & (np.arange(800) < rows[1])
+        Path(f"pred/masks/{k}.txt").write_text("\n".join(map(str, mask.astype(int))))
+        lines.append(f"masks/{k}.txt {label} 0.9\n")
+    Path("pred/scene0000_00.txt").write_text("".join(lines))
+    names = ["scannet-panoptic", "scannet-panoptic-oneformer3d"]
+    words = ["evaluate", "pred", "--ground-truth", "truth", "--protocols", *names, "--json", "a.json", "--quiet"]
+    assert main(words) == 0
+    scored = json.loads(Path("a.json").read_text())["protocols"]
+    api, kitti = (scored[name]["metrics"] for name in names)
+    assert (api["pq"], api["pq stuff"], api["sq things"]) == ((1 + 0.875) / 2, 1.0, 0.875)
+    assert kitti["pq"] == pytest.approx((1 + 0.875) / 20)
+    assert {scored[name]["ceiling"]["pq"] for name in names} == {1.0, 2 / 20}
+    capsys.readouterr()

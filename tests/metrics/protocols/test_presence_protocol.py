@@ -1,0 +1,242 @@
+"""Things that are there and things that are not: POPE's answers to the last bit, hand-worked similarities, what is asked."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from places import CASES
+from scored_room import ENCODER, LABELS, instances, nothing, room, truth_as_prediction
+
+from su3d_bench.core.errors import ConfigError, DataError, PredictionError
+from su3d_bench.core.types import Float32Array, UInt8Array
+from su3d_bench.datasets.rooms.dataset import Rooms
+from su3d_bench.metrics.protocols.loading import load_protocol, read_protocol
+from su3d_bench.metrics.questions.presence import relevancies
+from su3d_bench.metrics.questions.presence_counts import MEASURES, SAMPLINGS, PresenceCounts, measured
+from su3d_bench.metrics.questions.truths import AskedThing, PresenceTruth
+from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, plain_json, score_scene, unpack_scores
+from su3d_bench.questions.known_objects import is_called, known_objects, plain_name
+from su3d_bench.questions.presence import absent_names, counted_rooms, drawn, presence_questions
+from su3d_bench.questions.reasoning.scene_map import is_room_surface
+
+RULES = load_protocol("rooms-presence")
+POPE = json.loads((CASES / "presence01_pope.json").read_text())
+TRUTH = room()
+PERFECT = truth_as_prediction(TRUTH, with_labels=False)
+ASKED = (
+    AskedThing("chair", "random", is_there=True),
+    AskedThing("bed", "random", is_there=False),
+    AskedThing("lamp", "random", is_there=True),
+    AskedThing("sofa", "random", is_there=False),
+)
+QUESTIONS = PresenceTruth(TRUTH, ASKED, "made for a test")
+
+
+def counts_of(
+    there: Sequence[int], yes: Sequence[int], similarity: Sequence[float] | None = None, sampling: int = 0
+) -> PresenceCounts:
+    return PresenceCounts(
+        np.full(len(there), sampling, np.int64),
+        np.array(there, bool),
+        np.array(yes, bool),
+        np.zeros(len(there)) if similarity is None else np.array(similarity, np.float64),
+    )
+
+
+def once(counts: Sequence[PresenceCounts]) -> dict[str, float]:
+    return {name: float(value[0]) for name, value in measured(counts, np.ones((1, len(counts)), np.int64)).items()}
+
+
+@pytest.mark.parametrize("index", range(len(POPE["numbers"])))
+def test_the_numbers_of_popes_script_hold_to_the_last_bit(index: int) -> None:
+    problem = POPE["numbers"][index]
+    ends = np.cumsum(problem["sizes"])[:-1]
+    parts = zip(np.split(np.array(problem["there"]), ends), np.split(np.array(problem["yes"]), ends), strict=True)
+    values = once([counts_of(there.tolist(), yes.tolist()) for there, yes in parts])
+    assert {name: values[f"{name} random"] for name in problem["answer"]} == problem["answer"]
+
+
+@pytest.mark.parametrize("index", range(len(POPE["negatives"])))
+def test_what_is_absent_is_drawn_as_pope_draws_it(index: int) -> None:
+    problem = POPE["negatives"][index]
+    rooms, mine = problem["rooms"], problem["rooms"][problem["scene"]]
+    absent = [name for name in dict.fromkeys(name for one in rooms for name in one) if name not in mine]
+    for sampling, expected in problem["answer"].items():
+        found = drawn("rooms/a", sampling, mine[: problem["n_things"]], absent, rooms)
+        assert [other for _, other in found] == expected
+
+
+def test_there_are_thirty_problems_of_each() -> None:
+    assert [len(POPE[name]) for name in ("numbers", "negatives")] == [30, 30]
+
+
+def test_auroc_is_the_share_of_pairs_in_the_right_order_equal_ones_by_half() -> None:
+    values = once([counts_of([1, 1, 0, 0], [0] * 4, [0.9, 0.4, 0.4, 0.1])])
+    assert values["AUROC random"] == (1 + 1 + 0.5 + 1) / 4
+    assert np.isnan(values["AUROC popular"])
+
+
+def test_a_map_that_never_says_yes_has_no_precision_and_an_f1_of_zero() -> None:
+    values = once([counts_of([1, 0], [0, 0])])
+    assert np.isnan(values["precision random"])
+    assert (values["recall random"], values["F1 random"], values["accuracy random"]) == (0.0, 0.0, 0.5)
+    nothing_there = once([counts_of([0, 0], [0, 1])])
+    assert np.isnan(nothing_there["F1 random"])
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(1, 5), st.integers(0, 10_000))
+def test_scenes_drawn_several_times_count_so_often(n_scenes: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scenes = []
+    for _ in range(n_scenes):
+        n = int(rng.integers(0, 8))
+        there, yes, similarity = rng.random(n) < 0.5, rng.random(n) < 0.5, np.round(rng.random(n), 1)
+        scenes.append(PresenceCounts(rng.integers(0, 3, n), there, yes, similarity))
+    weights = rng.integers(0, 3, (6, n_scenes))
+    found = measured(scenes, weights)
+    for r, row in enumerate(weights):
+        repeated = [scene for scene, n in zip(scenes, row, strict=True) for _ in range(n)] or [counts_of([], [])]
+        assert {name: float(value[r]) for name, value in found.items()} == pytest.approx(once(repeated), nan_ok=True)
+
+
+def test_a_perfect_map_says_yes_to_what_is_there_and_no_to_what_is_not() -> None:
+    values = metric_of(RULES).combine([score_scene(RULES, QUESTIONS, PERFECT, ENCODER).counts])
+    assert [values[f"{name} random"] for name in MEASURES] == [1.0, 1.0, 1.0, 1.0, 0.5, 1.0]
+    assert (values["n_random"], values["n_popular"]) == (4, 0)
+
+
+def test_an_empty_map_says_no_to_everything() -> None:
+    score = score_scene(RULES, QUESTIONS, nothing(TRUTH), ENCODER)
+    values = plain_json(metric_of(RULES).combine([score.counts]))
+    assert [values[f"{name} random"] for name in MEASURES] == [None, 0.0, 0.0, 0.5, 0.0, 0.5]
+    assert score.counts.similarity.tolist() == [-1.0] * 4  # type: ignore[attr-defined]
+
+
+def test_order_of_instances_and_of_questions_changes_nothing() -> None:
+    order = np.random.default_rng(0).permutation(len(PERFECT))
+    assert PERFECT.features is not None
+    mixed = instances(TRUTH.points, [PERFECT.mask(k) for k in order], None, PERFECT.features[order])
+    turned = PresenceTruth(TRUTH, ASKED[::-1], "made for a test")
+    metric = metric_of(RULES)
+    one = metric.combine([score_scene(RULES, QUESTIONS, PERFECT, ENCODER).counts])
+    other = metric.combine([score_scene(RULES, turned, mixed, ENCODER).counts])
+    assert plain_json(one) == plain_json(other)
+
+
+class Plane:
+    """Texts on a circle: "one" at 0 degrees, "object" at 40, all other canonical phrases at 90."""
+
+    name, digest, dim = "plane", "plane", 2
+
+    def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:
+        raise AssertionError("scoring looks at no image")
+
+    def encode_texts(self, texts: Sequence[str]) -> Float32Array:
+        degrees = np.radians([{"one": 0.0, "object": 40.0}.get(text, 90.0) for text in texts])
+        return np.stack([np.cos(degrees), np.sin(degrees)], axis=1).astype(np.float32)
+
+
+@pytest.mark.parametrize(("degrees", "says_yes"), [((19.0, 60.0), True), ((21.0, 60.0), False)])
+def test_yes_needs_an_instance_that_is_nearer_to_the_text_than_to_every_canonical_phrase(
+    degrees: tuple[float, ...], says_yes: bool
+) -> None:
+    at = np.radians(degrees)
+    features = np.stack([np.cos(at), np.sin(at)], axis=1).astype(np.float32)
+    masks = [np.arange(10), np.arange(10, 20)]
+    asked = PresenceTruth(TRUTH, (AskedThing("one", "popular", is_there=True),), "")
+    counts = score_scene(RULES, asked, instances(TRUTH.points, masks, None, features), Plane()).counts
+    assert isinstance(counts, PresenceCounts)
+    assert counts.says_yes.tolist() == [says_yes]
+    assert counts.similarity[0] == pytest.approx(np.cos(at[0]), abs=1e-6)
+    assert counts.sampling.tolist() == [1]
+
+
+def test_relevancy_is_that_of_lerf() -> None:
+    assert RULES.presence is not None
+    cosine, canonical = np.array([[0.31, 0.2]]), np.array([[0.1, 0.25, 0.2, 0.0]])
+    shares = np.exp(10 * cosine[..., None]) / (np.exp(10 * cosine[..., None]) + np.exp(10 * canonical[:, None, :]))
+    np.testing.assert_allclose(relevancies(cosine, canonical, RULES.presence), shares.min(axis=2), rtol=1e-14)
+
+
+def test_a_map_without_features_is_told_what_it_lacks() -> None:
+    with pytest.raises(PredictionError, match="needs features"):
+        score_scene(RULES, QUESTIONS, truth_as_prediction(TRUTH, with_labels=True), ENCODER)
+
+
+def test_a_room_is_asked_for_what_it_has_and_for_as_much_that_it_has_not() -> None:
+    objects = known_objects(TRUTH, 100)
+    asked = presence_questions("rooms/a", TRUTH, objects, 4, counted_rooms())
+    names = {plain_name(name) for name in LABELS.names}
+    for sampling in SAMPLINGS:
+        mine = [thing for thing in asked if thing.sampling == sampling]
+        there = [thing.text for thing in mine if thing.is_there]
+        absent = [thing.text for thing in mine if not thing.is_there]
+        assert (len(there), len(absent), len(set(absent))) == (4, 4, 4)
+        assert set(there) <= {"chair", "table", "lamp", "cushion", "book", "backpack"}
+        assert set(absent) <= names - {"chair", "table", "lamp", "cushion", "book", "backpack", "wall", "floor"}
+    assert asked == presence_questions("rooms/a", TRUTH, objects, 4, counted_rooms())
+    assert asked != presence_questions("rooms/b", TRUTH, objects, 4, counted_rooms())
+
+
+def test_what_may_be_called_like_something_that_is_there_is_not_absent() -> None:
+    small = TRUTH.semantic.copy()
+    small[-1] = LABELS.ids[LABELS.names.index("sofa")]  # one vertex that belongs to no object
+    absent = absent_names(replace(TRUTH, semantic=small), known_objects(TRUTH, 100))
+    there = ("chair", "table", "lamp", "cushion", "book", "backpack", "sofa")
+    assert not [name for name in absent for known in there if is_called(name, known) or is_called(known, name)]
+    assert not [name for name in absent if is_room_surface(name)]
+    assert {"bed", "toilet"} <= set(absent)
+
+
+def test_where_nothing_absent_is_left_less_is_asked() -> None:
+    assert list(drawn("a/b", "popular", ["bed", "lamp"], ["sink"], [["sink"]])) == [("bed", "sink"), ("lamp", None)]
+    assert list(drawn("a/b", "adversarial", ["bed"], ["sink"], [["bed"]])) == [("bed", "sink")]  # by chance
+
+
+@pytest.mark.parametrize("scene", ["bedroom3", "bathroom0"])
+def test_the_rooms_over_which_it_is_counted_are_those_of_the_generator(scene: str, tmp_path: Path) -> None:
+    names = [plain_name(LABELS.name_of(thing.class_id)) for thing in Rooms(tmp_path).objects(scene)]
+    rooms = counted_rooms()
+    assert tuple(dict.fromkeys(name for name in names if not is_room_surface(name))) in rooms
+    assert len(rooms) == 48
+
+
+def test_counts_survive_their_file_and_impossible_ones_are_refused() -> None:
+    score = score_scene(RULES, QUESTIONS, PERFECT, ENCODER)
+    kept = unpack_scores(pack_scores({RULES.name: score}))[RULES.name]
+    assert plain_json(combine(RULES, {"a": kept}).metrics) == plain_json(combine(RULES, {"a": score}).metrics)
+    arrays = {name: getattr(score.counts, name) for name in PresenceCounts.arrays}
+    for name, value, message in (
+        ("sampling", np.full(4, 3, np.int64), "counts beyond the 3 samplings"),
+        ("similarity", np.full(4, np.nan), "no cosines"),
+        ("similarity", np.full(4, 1.1), "no cosines"),
+    ):
+        with pytest.raises(DataError, match=message):
+            PresenceCounts.checked(arrays | {name: value})
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ('questions = "dataset"', "questions: kind 'presence' takes 'generated'"),
+        ("[presence]\nrelevancy = 1.5", "presence.relevancy: input should be less than 1, not 1.5"),
+        ("[presence]\ncanonical = []", "presence.canonical"),
+        ("[presence]\ncanonicals = []", "unknown key 'presence.canonicals'; did you mean 'canonical'?"),
+        ("[transfer]\ncap_m = 0.05", "transfer.cap_m: kind 'presence' transfers nothing"),
+        ('stuff = ["wall"]', "stuff: kind 'panoptic' needs the classes"),
+    ],
+)
+def test_wrong_rules_are_told_in_one_line(lines: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(f'extends = "rooms-presence"\nname = "mine"\n{lines}\n')
+    with pytest.raises(ConfigError) as caught:
+        read_protocol(path)
+    assert message in str(caught.value)
