@@ -1,4 +1,4 @@
-"""Panoptic quality: the original evaluators' answers to the last bit, hand-worked segments, and what a map is scored by."""
+"""Panoptic quality: the originals' answers to the last bit, hand-worked segments, and what a map is scored by."""
 
 from __future__ import annotations
 
@@ -42,9 +42,7 @@ def test_the_answer_of_the_original_holds_to_the_last_bit(name: str, index: int)
         is_thing, ends, points = (archive[f"{index}/{key}"] for key in ("is_thing", "ends", "points"))
     scenes = np.split(points.astype(np.int64), ends[:-1], axis=1)
     size = problem.get("min_region_size", 1)
-    counts = [
-        panoptic.per_scene(Segments(*one[:2]), Segments(*one[2:]), is_thing, rule, size) for one in scenes
-    ]
+    counts = [panoptic.per_scene(Segments(*one[:2]), Segments(*one[2:]), is_thing, rule, size) for one in scenes]
     answer: dict[str, Any] = problem["answer"]
     qualities = panoptic.class_qualities(panoptic.combine(counts), rule)
     means = panoptic.means({key: values[None] for key, values in qualities.items()}, is_thing, rule)

@@ -1,4 +1,4 @@
-"""Things that are there and things that are not: POPE's answers to the last bit, hand-worked similarities, what is asked."""
+"""Things that are there and things that are not: POPE's answers to the last bit, hand-worked ones, what is asked."""
 
 from __future__ import annotations
 

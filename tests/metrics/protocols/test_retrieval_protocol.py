@@ -198,7 +198,7 @@ def test_questions_that_a_dataset_knows_itself_are_asked(tmp_path: Path, all_is_
 @pytest.mark.parametrize(
     ("name", "old", "new", "line"),
     [
-        ("rooms-retrieval", 'questions = "generated"', "", "questions: kinds 'retrieval', 'reasoning' and 'presence' need them"),
+        ("rooms-retrieval", 'questions = "generated"', "", "questions: kinds 'retrieval', 'reasoning' and"),
         ("replica-retrieval", 'synonyms = "lexicon"', "", "synonyms: kind 'annotation' and generated questions need"),
         ("rooms-retrieval", DRAWN, 'questions = "dataset"\nper_kind = 3', "per_kind: belongs to generated questions"),
         ("rooms-annotation", "[merging]", "[answers]", "answers"),
