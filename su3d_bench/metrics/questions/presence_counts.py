@@ -63,7 +63,7 @@ def measured(counts: Sequence[PresenceCounts], weights: Int64Array) -> dict[str,
     >>> values["F1 random"].tolist(), values["AUROC random"].tolist(), values["yes-rate popular"].tolist()
     ([0.5], [0.0], [nan])
     """
-    answer = {}
+    answer: dict[str, Float64Array] = {}
     for place, sampling in enumerate(SAMPLINGS):
         rows = [_of_sampling(of_scene, place) for of_scene in counts]
         values = _shares(rows, weights) | {"AUROC": _auroc(rows, weights)}
@@ -118,4 +118,5 @@ def _auroc(rows: Sequence[PresenceCounts], weights: Int64Array) -> Float64Array:
 
 
 def _ratio(part: Float64Array, whole: Float64Array) -> Float64Array:
-    return np.divide(part, whole, out=np.full(part.shape, np.nan), where=whole > 0)
+    answer: Float64Array = np.divide(part, whole, out=np.full(part.shape, np.nan), where=whole > 0)
+    return answer
