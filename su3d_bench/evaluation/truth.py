@@ -44,6 +44,7 @@ from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth
 from su3d_bench.predictions.base import scene_files
 from su3d_bench.predictions.scenes import Match, Source, match_scenes, planned_scenes
+from su3d_bench.questions.files.datasets import is_foreign, read_foreign_queries
 from su3d_bench.questions.files.queries import VARIANT as QUERY_OBJECTS
 from su3d_bench.questions.files.queries import query_truth, read_query_file
 from su3d_bench.runs.planning.scenes import data_root
@@ -163,7 +164,7 @@ class DatasetTruths(SceneTruths):
     def take_queries(self, path: Path) -> None:
         if not self._dataset.variants:
             super().take_queries(path)
-        self._queries = read_query_file(path)
+        self._queries = read_foreign_queries(path) if is_foreign(path) else read_query_file(path)
         self._queries_digest = digest_file(path)
 
     def why_not(self, rules: ProtocolRules, *, is_named: bool) -> str | None:

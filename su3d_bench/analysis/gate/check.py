@@ -19,7 +19,7 @@ from su3d_bench.analysis.gate.reference import (
 )
 from su3d_bench.core.english import plural
 from su3d_bench.core.errors import printable
-from su3d_bench.metrics.protocols.model import PanopticRules, PresenceQuestionRules
+from su3d_bench.metrics.protocols.model import GroundingRules, PanopticRules, PresenceQuestionRules
 from su3d_bench.reports.gate import SCENES, Compared, Finding, Verdict
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.records import NumbersRecord
@@ -35,7 +35,7 @@ _OF_PRESENCE = tuple(name for name in PresenceQuestionRules.values_of_metric["po
 HIGHER_IS_BETTER = frozenset(
     {
         *("AP", "AP50", "AP25", "mAcc", "mIoU", "F-mIoU", "synonyms", "overall"),
-        *_SHARES, *_OF_BOXES, *_JUDGED, *_OF_SEGMENTS, *_OF_PRESENCE,
+        *GroundingRules.values_of_metric["scanrefer"], *_SHARES, *_OF_BOXES, *_JUDGED, *_OF_SEGMENTS, *_OF_PRESENCE,
     }
 )  # fmt: skip
 

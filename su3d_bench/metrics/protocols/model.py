@@ -33,7 +33,7 @@ _OWN_FIELDS = {
     "synonyms": "synonyms: kind 'annotation' and generated questions need a table, others take none",
     "merging": "merging: kind 'annotation' needs it, others take none",
     "answers": "answers: kind 'reasoning' needs it, others take none",
-    "box_axes": "box_axes: kind 'boxes' needs it, others take none",
+    "box_axes": "box_axes: kinds 'boxes' and 'grounding' need it, others take none",
     "presence": "presence: kind 'presence' needs it, others take none",
 }
 
@@ -113,9 +113,10 @@ class ProtocolRules(_Strict):
 
     ``kind``: ``semantic`` (a class a point), ``instance`` (masks with a class), ``panoptic`` (every point in a segment
     of a thing or of ``stuff``), ``queries`` (masks ranked for each text), ``boxes`` (with a class), ``categories`` (how
-    near a point's label comes to those of its object), or what people are asked otherwise: ``retrieval`` (the first
-    mask of each text), ``presence`` (is there such a thing at all?), ``annotation`` (names and shapes of masks),
-    ``reasoning`` (questions that boxes settle). ``questions`` are those of the ``dataset`` itself or ``generated`` from
+    near a point's label comes to those of its object), ``grounding`` (the box of the first mask of each text), or what
+    people are asked otherwise: ``retrieval`` (the first mask of each text), ``presence`` (is there such a thing at
+    all?), ``annotation`` (names and shapes of masks), ``reasoning`` (questions that boxes settle). ``questions`` are
+    those of the ``dataset`` itself or ``generated`` from
     the truth, ``per_kind`` of each kind at most; ``synonyms`` names the table of other names of classes. Protocols that
     are not ``by_default`` run where they are named. ``classes`` is the label set in the order of the original;
     ``ignore`` names classes that are known but not scored, and for ``categories`` labels
@@ -137,7 +138,7 @@ class ProtocolRules(_Strict):
     summary: str
     kind: Literal[
         "semantic", "instance", "panoptic", "boxes", "queries", "categories",
-        "retrieval", "presence", "annotation", "reasoning",
+        "grounding", "retrieval", "presence", "annotation", "reasoning",
     ]  # fmt: skip
     metric: Literal[
         "conceptgraphs",
@@ -149,6 +150,7 @@ class ProtocolRules(_Strict):
         "openlex3d-ranking",
         "panopticapi",
         "semantic-kitti",
+        "scanrefer",
         "retrieval",
         "pope",
         "annotation",
@@ -411,6 +413,22 @@ class CategoryRules(ProtocolRules):
         return ("top_k",) if self.metric == "openlex3d-topn" else ()
 
 
+class GroundingRules(ProtocolRules):
+    """The box of the first mask of each text."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = {"scanrefer": ("Acc@0.25", "Acc@0.5")}
+    needs_own_points = True
+    text_metrics = ("scanrefer",)
+    needs = ("box_axes",)
+
+    def _check_transfer(self) -> None:
+        super()._check_transfer()
+        if self.box_axes != "world":
+            raise ValueError("box_axes: kind 'grounding' takes 'world'")
+        if self.transfer.cap_m is not None or self.transfer.evaluation_voxel_m > 0:
+            raise ValueError("transfer.cap_m: kind 'grounding' transfers nothing; no cap_m, no evaluation_voxel_m")
+
+
 class _JudgedRules(ProtocolRules):
     """What people are asked otherwise."""
 
@@ -497,6 +515,7 @@ RULES_OF_KIND: dict[str, type[ProtocolRules]] = {
     "boxes": BoxRules,
     "queries": QueryRules,
     "categories": CategoryRules,
+    "grounding": GroundingRules,
     "retrieval": RetrievalRules,
     "presence": PresenceQuestionRules,
     "annotation": AnnotationRules,

@@ -21,6 +21,7 @@ from typing import Any
 
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.system.files import file_bytes, opened
+from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
 from su3d_bench.questions.files.queries import MOST_OBJECTS_ID, is_text
 from su3d_bench.questions.model import REASONING, Question, new_question
 
@@ -77,6 +78,19 @@ def read_foreign(path: Path) -> tuple[Question, ...]:
     if isinstance(content, dict) and isinstance(content.get("questions"), list):
         return tuple(_situated(content["questions"], _replies(path), where))
     raise DataError(f"{where}: is neither a list of descriptions (ScanRefer) nor has it 'questions' (SQA3D)")
+
+
+def read_foreign_queries(path: Path) -> dict[str, tuple[TextQuery, ...]]:
+    """The sentences of each scene that name an object, each as often as the file has it."""
+    queries_of_scene: dict[str, list[TextQuery]] = {}
+    for question in read_foreign(path):
+        if not question.is_known:
+            raise DataError(
+                f"{printable(str(path), 200)}: {question.source} names no objects; nothing can be scored by it"
+            )
+        scene = question.scene.rpartition("/")[2]
+        queries_of_scene.setdefault(scene, []).append(TextQuery(question.text, question.answers or ()))
+    return {scene: tuple(queries) for scene, queries in queries_of_scene.items()}
 
 
 def _refuse_others(content: Any, where: str) -> None:

@@ -45,7 +45,7 @@ NAMES = {
     "scannet-retrieval", "rooms-annotation", "replica-annotation", "scannet-annotation", "rooms-reasoning",
     "replica-reasoning", "scannet-reasoning", "replica-boxes", "rooms-presence", "replica-presence",
     "scannet-presence", "rooms-panoptic", "replica-panoptic", "scannet-panoptic", "scannet-panoptic-oneformer3d",
-    "scannet200-panoptic",
+    "scannet200-panoptic", "grounding",
 }  # fmt: skip
 
 
@@ -204,6 +204,7 @@ KINDS = {
     "boxes": {"needs_own_points", "needs_boxes", "ignores_classes"},
     "queries": {"needs_own_points", "ignores_classes"},
     "categories": {"takes_dense", "needs_own_points"},
+    "grounding": {"needs_own_points", "ignores_classes"},
     "retrieval": {"is_judged", "needs_own_points", "ignores_classes"},
     "presence": {"is_judged", "needs_own_points", "ignores_classes"},
     "annotation": {"is_judged", "needs_own_points", "goes_by_names", "ignores_classes"},
