@@ -84,7 +84,8 @@ def add_parser(verbs: Any) -> None:
         "--queries",
         type=Path,
         metavar="FILE",
-        help="texts and the objects that they speak of, for query-ap: TOML or CSV with scene, text and objects",
+        help="texts and the objects that they speak of, for query-ap and grounding: TOML or CSV with scene, text and "
+        "objects, ScanRefer's JSON, Nr3D's CSV",
     )
     parser.add_argument("--per-class", action="store_true", help="print the table of every class too")
     add_table_format(parser, "--table-format")

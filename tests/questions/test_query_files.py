@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,7 @@ from replica_scene import QUADS, TWO_OBJECTS, write_original, write_render
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, DataError
+from su3d_bench.core.types import GroundTruth
 from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.evaluation.evaluate import Request, evaluate
 from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
@@ -137,3 +140,36 @@ def test_the_command_line_takes_a_file_of_queries(
     files = ["--queries", str(tmp_path / "q.csv"), "--text-features", str(tmp_path / "texts.npz")]
     assert main([*words, *files]) == 0
     assert "100.0" in capsys.readouterr().out
+
+
+def test_sentences_of_scanrefer_and_nr3d_are_held_against_boxes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flat = Replica.ground_truth
+
+    def tilted(dataset: Replica, scene: str, variant: str) -> GroundTruth:
+        truth = flat(dataset, scene, variant)
+        return replace(truth, points=truth.points + truth.points[:, 1:2] * np.array([[0.1, 0, 1]], np.float32))
+
+    monkeypatch.setattr(Replica, "ground_truth", tilted)  # what is flat has no volume, and no overlap in ScanRefer
+    write_map(tmp_path, monkeypatch)
+    rows = [
+        ("a place to sit", 0),
+        ("something to eat at", 5),
+        ("something to eat at", 0),
+    ]  # ids from 0; the last is not
+    ref = [{"scene_id": "room0", "object_id": str(number), "description": text} for text, number in rows]
+    (tmp_path / "ScanRefer_filtered_val.json").write_text(json.dumps(ref))
+    lines = "".join(f"room0,{number},{text}\n" for text, number in rows)
+    (tmp_path / "nr3d.csv").write_text(f"scan_id,target_id,utterance\n{lines}")
+    for name in ("ScanRefer_filtered_val.json", "nr3d.csv"):
+        words = ["evaluate", str(tmp_path / "maps"), "--dataset", "replica", "--queries", str(tmp_path / name)]
+        files = ["--text-features", str(tmp_path / "texts.npz"), "--protocols", "grounding", "--json", "--quiet"]
+        assert main([*words, *files]) == 0
+        scored = json.loads(capsys.readouterr().out)["protocols"]["grounding"]
+        assert set(scored["metrics"].values()) == {2 / 3}
+    (tmp_path / "broken.json").write_text('[{"scene_id": "room0"}]')
+    words = ["evaluate", str(tmp_path / "maps"), "--dataset", "replica", "--queries", str(tmp_path / "broken.json")]
+    assert main(words) == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and "has no 'description'" in told
