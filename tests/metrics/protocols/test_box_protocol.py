@@ -419,5 +419,5 @@ def test_rules_that_boxes_do_not_have_are_refused(tmp_path: Path, line: str, mes
         read_protocol(path)
     assert message in str(caught.value)
     path.write_text('extends = "replica-openmask3d"\nname = "mine"\nbox_axes = "truth"\n')
-    with pytest.raises(ConfigError, match="box_axes: kind 'boxes' needs it, others take none"):
+    with pytest.raises(ConfigError, match="box_axes: kinds 'boxes' and 'grounding' need it"):
         read_protocol(path)
