@@ -151,3 +151,11 @@ def without_nonfinite(features: Float32Array, what: str) -> tuple[Float32Array, 
         features[is_bad] = 0
     n = int((~features.any(axis=1)).sum())
     return features, (f"{n} {what} have no feature (a row of zeros or NaN)",) if n else ()
+
+
+def half_rows(table: NDArray[np.floating[Any]]) -> NDArray[np.float16]:
+    """``table`` (N, D) in float16, rows of zeros in place of those that hold what it cannot."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        rows = table.astype(np.float16)
+    rows[~np.isfinite(rows).all(axis=1)] = 0
+    return rows

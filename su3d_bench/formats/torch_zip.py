@@ -36,8 +36,10 @@ Kind = Literal["tensor", "sparse", "array", "dict", "tuple", "other"]
 ZIP_START = b"PK\x03\x04"
 PICKLE_NAME = "data.pkl"
 SPARSE = "torch.sparse_coo"
-# NumPy codes of torch's storages and dtypes; those that NumPy lacks (bfloat16, quantised ones) are refused by name.
+# NumPy codes of torch's storages and dtypes; those that NumPy lacks (quantised ones) are refused by name.
+BFLOAT16 = "BFloat16"  # the upper halves of float32, which is what they become
 CODES = {
+    BFLOAT16: "u2",
     "Bool": "b1",
     "Byte": "u1",
     "Char": "i1",
@@ -80,6 +82,46 @@ class Storage:
     content: bytes
     code: str | None
     order: str
+
+
+@dataclass(frozen=True)
+class StorageReference:
+    """What a pickle says of a storage that stands outside of it: ``n`` values of a ``kind`` such as ``Float``."""
+
+    name: str
+    kind: str
+    n: int
+
+    @classmethod
+    def of(cls, key: object) -> StorageReference:
+        """That of ("storage", type, name, place, number of values)."""
+        if (
+            not isinstance(key, tuple)
+            or len(key) < 5
+            or not is_word(key[0], "storage")
+            or not isinstance(key[1], Named)
+            or any(value is not None for value in key[5:])  # views of torch before 0.4
+        ):
+            raise RefusedError("a reference that is no storage")
+        name, n = key[2], key[4]
+        if not isinstance(name, str) or re.fullmatch(r"\d{1,20}", name) is None or type(n) is not int:
+            raise RefusedError("a reference without a valid name or size")
+        return cls(name, key[1].name.removesuffix("Storage"), n)
+
+    @property
+    def width(self) -> int:
+        """Bytes of a value; 1 where the storage does not say."""
+        return int(CODES.get(self.kind, "u1")[-1])
+
+    def storage(self, content: bytes, order: str) -> Storage:
+        """The storage with this content, in the byte order "<" or ">"."""
+        code = CODES.get(self.kind)
+        if code is not None and self.n * self.width != len(content):
+            raise RefusedError(f"storage {self.name} of {self.n} values has {len(content)} bytes")
+        if self.kind == BFLOAT16:
+            upper = np.frombuffer(content, f"{order}u2").astype("<u4")
+            return Storage((upper << 16).tobytes(), "f4", "<")
+        return Storage(content, code, order)
 
 
 def torch_kind(path: Path) -> Kind | None:
@@ -158,6 +200,7 @@ class _Storages:
     def __init__(self, archive: zipfile.ZipFile, prefix: str, path: Path, allowance: Allowance) -> None:
         self._archive, self._prefix, self._path, self._allowance = archive, prefix, path, allowance
         self._contents: dict[str, bytes] = {}
+        self._storages: dict[StorageReference, Storage] = {}
         self._n_left = path.stat().st_size
         self._order = "<"
         if f"{prefix}byteorder" in archive.namelist():
@@ -167,24 +210,13 @@ class _Storages:
             self._order = "<" if order == b"little" else ">"
 
     def find(self, key: object) -> object:
-        """The storage of a reference ("storage", type, name, place, number of values)."""
-        if (
-            not isinstance(key, tuple)
-            or len(key) < 5
-            or not is_word(key[0], "storage")
-            or not isinstance(key[1], Named)
-        ):
-            raise RefusedError("a reference that is no storage")
-        name, n = key[2], key[4]
-        if not isinstance(name, str) or re.fullmatch(r"\d{1,9}", name) is None or type(n) is not int:
-            raise RefusedError("a reference without a valid name or size")
-        if name not in self._contents:
-            self._contents[name] = self._read(f"{self._prefix}data/{name}")
-        code = CODES.get(key[1].name.removesuffix("Storage"))
-        content = self._contents[name]
-        if code is not None and n * int(code[-1]) != len(content):
-            raise RefusedError(f"storage {name} of {n} values has {len(content)} bytes")
-        return Storage(content, code, self._order)
+        """The storage of a reference."""
+        reference = StorageReference.of(key)
+        if reference.name not in self._contents:
+            self._contents[reference.name] = self._read(f"{self._prefix}data/{reference.name}")
+        if reference not in self._storages:
+            self._storages[reference] = reference.storage(self._contents[reference.name], self._order)
+        return self._storages[reference]
 
     def _read(self, member: str) -> bytes:
         info = self._archive.NameToInfo.get(member)

@@ -10,6 +10,10 @@ from su3d_bench.predictions.conceptgraphs import ConceptGraphs
 from su3d_bench.predictions.gradslam import Gradslam
 from su3d_bench.predictions.hovsg import HovSg
 from su3d_bench.predictions.mask_archives import MaskClustering, Open3dis, OpenIns3d, OpenYolo3d
+from su3d_bench.predictions.online.esam import Esam
+from su3d_bench.predictions.online.onlineanyseg import OnlineAnySeg
+from su3d_bench.predictions.online.ovo import Ovo
+from su3d_bench.predictions.online.rayfronts import RayFronts
 from su3d_bench.predictions.openlex3d import OpenLex3d
 from su3d_bench.predictions.openmask3d import OpenMask3d
 from su3d_bench.predictions.own_runs import OwnRuns
@@ -32,6 +36,10 @@ _ALL: tuple[Reader, ...] = (
     Gradslam(),
     HovSg(),
     OpenLex3d(),
+    Ovo(),
+    RayFronts(),
+    Esam(),
+    OnlineAnySeg(),
 )
 READERS: dict[str, Reader] = {reader.name: reader for reader in _ALL}
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import DataError, PredictionError, StoreError, converted, shown
 from su3d_bench.core.maps import DenseFeatures
 from su3d_bench.core.types import Float32Array
-from su3d_bench.formats.arrays import checked_points
+from su3d_bench.formats.arrays import checked_points, half_rows
 from su3d_bench.formats.hdf5 import n_columns_of, read_rows, row_blocks
 from su3d_bench.formats.poses import moved, read_first_pose
 from su3d_bench.predictions.base import SceneFolders, ScenePrediction
@@ -77,7 +77,7 @@ def _features(file: Path, n_points: int) -> tuple[NDArray[np.float16], int]:
             n_rows += len(block)
             if n_rows > n_points:
                 break
-            rows = _half(block)
+            rows = half_rows(block)
             n_without += int((~rows.any(axis=1)).sum())
             stored.append(rows)
             n_held += rows.nbytes
@@ -90,13 +90,6 @@ def _features(file: Path, n_points: int) -> tuple[NDArray[np.float16], int]:
             return np.concatenate([np.zeros((0, n_columns), np.float16), *stored]), n_without
         _spill(spill, stored)
         return np.memmap(spill, np.float16, "r", shape=(n_points, n_columns)), n_without
-
-
-def _half(block: NDArray[np.floating[Any]]) -> NDArray[np.float16]:
-    with np.errstate(over="ignore", invalid="ignore"):
-        rows = block.astype(np.float16)
-    rows[~np.isfinite(rows).all(axis=1)] = 0
-    return rows
 
 
 def _spill(file: Any, stored: list[NDArray[np.float16]]) -> None:

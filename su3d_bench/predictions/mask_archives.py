@@ -24,6 +24,7 @@ from su3d_bench.formats.arrays import (
 from su3d_bench.formats.numpy_files import npz_names, read_npz
 from su3d_bench.formats.torch_zip import Kind, SparseTensor, read_torch, torch_kind
 from su3d_bench.predictions.base import NO_SCORES, SceneFiles, ScenePrediction, VertexMasks, vertex_masks
+from su3d_bench.predictions.online.onlineanyseg import MASKS as ONLINE_MASKS
 
 
 class TorchFiles(SceneFiles):
@@ -45,7 +46,9 @@ class MaskClustering(SceneFiles):
 
     def recognise(self, path: Path) -> str | None:
         first = self.first(path, ".npz")
-        return "its .npz files hold 'pred_masks'" if first is not None and "pred_masks" in npz_names(first) else None
+        if first is None or first.name == ONLINE_MASKS:  # over points of its own
+            return None
+        return "its .npz files hold 'pred_masks'" if "pred_masks" in npz_names(first) else None
 
     def read_scene(self, place: Path, scene: str) -> ScenePrediction:
         where = shown(place)

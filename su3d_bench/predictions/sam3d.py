@@ -21,6 +21,7 @@ from su3d_bench.formats.ply import first_rows, read_ply
 from su3d_bench.formats.torch_zip import read_torch
 from su3d_bench.predictions.base import NO_SCORES, SceneFiles, ScenePrediction, VertexMasks, vertex_masks
 from su3d_bench.predictions.mask_archives import TorchFiles
+from su3d_bench.predictions.online.onlineanyseg import MASKS as ONLINE_MASKS
 
 REMARKS = (NO_SCORES, "groups without classes")
 CHANNELS = ("red", "green", "blue")
@@ -49,7 +50,7 @@ class Sam3d(TorchFiles):
             raise PredictionError(f"{where}: holds {kind_of(groups)}; expected one group number a point")
         if len(groups) > MOST_POINTS:
             raise PredictionError(f"{where}: holds {kind_of(groups)}; is it damaged?")
-        return ScenePrediction(scene, self.name, place, _masks(groups, "group", where), REMARKS)
+        return ScenePrediction(scene, self.name, place, masks_of_groups(groups, "group", where), REMARKS)
 
 
 class Sam3dColours(SceneFiles):
@@ -59,7 +60,7 @@ class Sam3dColours(SceneFiles):
 
     def recognise(self, path: Path) -> str | None:
         first = self.first(path, ".ply")
-        if first is None:
+        if first is None or (first.parent / ONLINE_MASKS).is_file():  # the cloud that those masks are over
             return None
         try:
             with reading(shown(first)):
@@ -82,10 +83,10 @@ class Sam3dColours(SceneFiles):
                 f"{where}: {len(np.unique(groups))} colours; expected one a group: is it the cloud of a photograph?"
             )
         remark = "a colour is a group: two groups of one colour are one here"
-        return ScenePrediction(scene, self.name, place, _masks(groups, "colour", where), (*REMARKS, remark))
+        return ScenePrediction(scene, self.name, place, masks_of_groups(groups, "colour", where), (*REMARKS, remark))
 
 
-def _masks(groups: NDArray[np.integer[Any]], noun: str, where: str) -> VertexMasks:
+def masks_of_groups(groups: NDArray[np.integer[Any]], noun: str, where: str) -> VertexMasks:
     """A mask for each value from 0 up, in ascending order."""
     order = np.argsort(groups, kind="stable").astype(np.int32)
     order = order[np.count_nonzero(groups < 0) :]

@@ -22,7 +22,10 @@ from cloud_files import (
     write_hovsg,
     write_map,
     write_object,
+    write_onlineanyseg,
     write_openlex,
+    write_ovo,
+    write_rayfronts,
     write_small,
     write_tensor,
 )
@@ -71,7 +74,7 @@ def test_a_scene_that_is_not_there_is_one_line(tmp_path: Path, format: str) -> N
     assert "of scene 'x'" in refused(tmp_path / "nothing", "x", format)
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", [name for name in FORMATS if name != "esam"])  # which names nothing
 def test_the_truth_in_each_format_is_scored_as_perfect(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, format: str
 ) -> None:
@@ -89,6 +92,12 @@ def test_the_truth_in_each_format_is_scored_as_perfect(
         write_gradslam(scene / "saved-map/pointclouds", truth.points, features[row])
     elif format == "hovsg":
         write_hovsg(scene, {k: truth.points[row == k] for k in range(4)}, features)
+    elif format == "ovo":
+        write_ovo(scene, truth.points, row + 3, {k + 3: features[k] for k in range(4)})
+    elif format == "rayfronts":
+        write_rayfronts(scene / "map.pt", {"feats_xyz": truth.points, "feats_feats": features[row]})
+    elif format == "onlineanyseg":
+        write_onlineanyseg(scene, truth.points, [row == k for k in range(4)], list(features))
     else:
         write_openlex(scene, truth.points, row, features)
     np.savez(tmp_path / "texts.npz", names=np.array(names), features=encoder.encode_texts(names))

@@ -231,7 +231,7 @@ def test_other_members_are_left_alone(tmp_path: Path) -> None:
         (tensor((10**9, 10**9), (0, 0)), "lies beyond"),
         (tensor((6,), (1,), n=10**12), "storage 0 of 1000000000000 values has 24 bytes"),
         (tensor((6,), (1,), n=5), "storage 0 of 5 values has 24 bytes"),
-        (tensor((6,), (1,), kind="BFloat16Storage"), "asks for 'torch.BFloat16Storage'"),
+        (tensor((6,), (1,), kind="QInt8Storage"), "asks for 'torch.QInt8Storage'"),
         (tensor((1,) * 9, (1,) * 9), "without a valid shape"),
         (b"\x80\x02" + storage(6, key="../../x") + b".", "a reference without a valid name"),
         (b"\x80\x02" + storage(6, key="7") + b".", "'a/data/7' is not in the archive"),

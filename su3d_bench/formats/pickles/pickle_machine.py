@@ -46,9 +46,11 @@ class PickleMachine:
         constructors: Constructors,
         persistent: Callable[[object], object] | None,
         forget: frozenset[str],
+        is_last: bool = True,
     ) -> None:
         self._stream, self._n_bytes, self.n_read = stream, n_bytes, 0
         self._constructors, self._persistent, self._forget = constructors, persistent, forget
+        self._is_last = is_last  # nothing may stand behind it
         self._stack: list[object] = []
         self._frames: list[list[object]] = []  # what lies below each mark
         self._memo: dict[int, object] = {}
@@ -74,7 +76,7 @@ class PickleMachine:
     def _end(self) -> object:
         if len(self._stack) != 1 or self._frames:
             raise RefusedError("it does not end with one value")
-        if self._stream.read(1):
+        if self._is_last and self._stream.read(1):
             raise RefusedError("more bytes stand after its end")
         return self._stack[0]
 

@@ -49,15 +49,16 @@ def read_pickle(
     constructors: Constructors = CONSTRUCTORS,
     persistent: Callable[[object], object] | None = None,
     forget: Iterable[str] = (),
+    is_last: bool = True,
 ) -> object:
     """The value of the pickle that ``stream`` holds from here to its end, at most ``n_bytes`` away.
 
     ``n_packed``: how many bytes the file has where the stream is compressed, which bound what is kept of it.
     ``constructors`` is the whole of what the pickle may name; ``persistent`` answers references to what is stored
-    outside of it, which are refused without it.
+    outside of it, which are refused without it. Where it is not the last, the stream stands behind it afterwards.
     """
     n_packed = n_bytes if n_packed is None else n_packed
-    machine = PickleMachine(stream, n_bytes, n_packed, constructors, persistent, frozenset(forget))
+    machine = PickleMachine(stream, n_bytes, n_packed, constructors, persistent, frozenset(forget), is_last)
     try:
         return machine.run()
     except (RefusedError, UnpackingError) as error:

@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 import pytest
 from ply_files import write_ply_as
-from prediction_files import TorchFile
+from prediction_files import TorchFile, torch_text
 
 from su3d_bench.formats.pcd import write_pcd_points
 from su3d_bench.formats.ply import PlyElement
@@ -122,6 +122,49 @@ def write_openlex(folder: Path, points: Any, index: Any, features: Any, cloud: s
     np.save(folder / "embeddings.npy", features)
 
 
+def write_ovo(folder: Path, points: Any, ids: Any, features: dict[int, Any], *, is_stream: bool = True) -> None:
+    """A checkpoint of OVO: the points of its SLAM with the object of each in a column, a feature an object."""
+    folder.mkdir(parents=True, exist_ok=True)
+    file = TorchFile(is_stream=is_stream)
+    cloud = {
+        "xyz": np.asarray(points, np.float32),
+        "obj_ids": np.asarray(ids, np.int32)[:, np.newaxis],
+        "ids": np.arange(len(points), dtype=np.int32)[:, np.newaxis],
+        "max_id": len(points),
+    }
+    numbers = torch_text("ins_3d_ids") + file.array(np.array(list(features), np.int64))
+    for number, feature in features.items():
+        numbers += torch_text(f"ins3d_{number}_clip_feature") + file.value(feature)
+        numbers += torch_text(f"ins3d_{number}_clip_feature_kf") + file.value(None)
+    objects = b"}(" + numbers + b"u"
+    both = torch_text("map_params") + file.value(cloud) + torch_text("ovo_map_params") + objects
+    file.write(folder / "ovo_map.ckpt", b"}(" + both + b"u")
+
+
+def write_rayfronts(path: Path, value: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    file = TorchFile()
+    file.write(path, file.value(value))
+
+
+def write_esam(folder: Path, points: Any, groups: Any) -> None:
+    """What ESAM's stream demo leaves: the points (frames, points, 3) and one of its 256 colours each, 200 for none."""
+    folder.mkdir(parents=True, exist_ok=True)
+    palette = (np.random.default_rng(0).random((256, 3)) * 255).astype(int)
+    palette[-1] = 200
+    np.save(folder / "points.npy", np.asarray(points, np.float32))
+    np.save(folder / "points_color.npy", palette[np.asarray(groups)].reshape(np.shape(points)))
+
+
+def write_onlineanyseg(folder: Path, points: Any, masks: Any, features: Any = None) -> None:
+    """Masks over the rebuilt points, class 0 and score 1 for each, its features in columns; and these points."""
+    write_object(folder / "final.ply", points)
+    arrays = {"pred_masks": np.stack(masks, 1), "pred_score": np.ones(len(masks))}
+    arrays |= {"pred_classes": np.zeros(len(masks), np.int32)}
+    arrays |= {} if features is None else {"pred_sem_features": np.stack(features, 1)}
+    np.savez(folder / "ckpt_final.npz", **arrays)
+
+
 def write_small(folder: Path, format: str) -> Path:
     """The scene room0 in ``format``, small; the folder that holds the scene's folder."""
     scene = folder / "room0"
@@ -132,9 +175,18 @@ def write_small(folder: Path, format: str) -> Path:
         write_gradslam(scene / "saved-map/pointclouds", points, RNG.normal(size=(6, 8)).astype(np.float16))
     elif format == "hovsg":
         write_hovsg(scene, {0: points[:4], 1: points[4:]}, RNG.normal(size=(2, 8)).astype(np.float32))
+    elif format == "ovo":
+        write_ovo(scene, points, [5, -1, 5, 0, 0, 5], {5: np.ones(8, np.float32), 0: np.ones((1, 8), np.float32)})
+    elif format == "rayfronts":
+        write_rayfronts(scene / "map.pt", {"feats_xyz": points, "feats_feats": np.ones((6, 8), np.float32)})
+    elif format == "esam":
+        write_esam(scene, points.reshape(3, 2, 3), [0, 0, 1, -1, 1, 0])
+    elif format == "onlineanyseg":
+        masks = [np.arange(6) < 3, np.arange(6) > 2]
+        write_onlineanyseg(scene, points, masks, list(np.ones((2, 8), np.float32)))
     else:
         write_openlex(scene, points, np.array([0, 0, 1, 1, 0, 1]), RNG.normal(size=(2, 8)))
     return folder
 
 
-FORMATS = ("conceptgraphs", "gradslam", "hovsg", "openlex3d")
+FORMATS = ("conceptgraphs", "gradslam", "hovsg", "openlex3d", "ovo", "rayfronts", "esam", "onlineanyseg")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import struct
 import zipfile
 from collections.abc import Callable, Sequence
@@ -93,19 +94,25 @@ STORAGES = {"bool": "Bool", "float16": "Half", "float32": "Float", "float64": "D
 
 
 class TorchFile:
-    """What torch.save writes, without torch: tensors become storages beside a pickle in torch's words."""
+    """What torch.save writes, without torch: tensors become storages beside a pickle in torch's words.
 
-    def __init__(self) -> None:
+    ``is_stream``: in the form before 1.6, which ``_use_new_zipfile_serialization=False`` still asks for.
+    """
+
+    def __init__(self, *, is_stream: bool = False) -> None:
+        self._is_stream = is_stream
         self._storages: list[bytes] = []
+        self._sizes: list[int] = []
 
     def tensor(self, array: Any) -> bytes:
         """The pickle of a contiguous tensor, whose values go into a storage."""
         array = np.ascontiguousarray(array) if array.ndim else array
         key = str(len(self._storages))
         self._storages.append(array.tobytes())
+        self._sizes.append(array.size)
         kind = STORAGES[array.dtype.name].encode()
         reference = torch_text("storage") + b"ctorch\n" + kind + b"Storage\n" + torch_text(key) + torch_text("cpu")
-        size = b"\x8a\x08" + struct.pack("<q", array.size)
+        size = b"\x8a\x08" + struct.pack("<q", array.size) + b"N" * self._is_stream
         strides = [stride // array.itemsize for stride in array.strides]
         return (
             b"ctorch._utils\n_rebuild_tensor_v2\n((" + reference + size + b"tQK\x00" + torch_numbers(array.shape)
@@ -124,13 +131,36 @@ class TorchFile:
             + b"\x86Rtb"
         )  # fmt: skip
 
+    def value(self, value: Any) -> bytes:
+        """The pickle of dicts, lists, texts, integers, None and tensors."""
+        if isinstance(value, dict):
+            return b"}(" + b"".join(torch_text(key) + self.value(one) for key, one in value.items()) + b"u"
+        if isinstance(value, list):
+            return b"](" + b"".join(map(self.value, value)) + b"e"
+        if isinstance(value, np.ndarray):
+            return self.tensor(value)
+        if isinstance(value, int):
+            return b"\x8a\x08" + struct.pack("<q", value)
+        return b"N" if value is None else torch_text(value)
+
     def write(self, path: Path, pickled: bytes) -> None:
+        if self._is_stream:
+            path.write_bytes(self._stream(pickled))
+            return
         with zipfile.ZipFile(path, "w") as archive:
             archive.writestr(f"{path.stem}/data.pkl", b"\x80\x02" + pickled + b".")
             archive.writestr(f"{path.stem}/byteorder", b"little")
             for key, content in enumerate(self._storages):
                 archive.writestr(f"{path.stem}/data/{key}", content)
             archive.writestr(f"{path.stem}/version", b"3\n")
+
+    def _stream(self, pickled: bytes) -> bytes:
+        """A magic number, a version, facts of the machine, the value, the names of the storages, and these."""
+        facts = {"protocol_version": 1001, "little_endian": True, "type_sizes": {"short": 2, "int": 4, "long": 4}}
+        names = [str(key) for key in range(len(self._storages))]
+        first = b"".join(pickle.dumps(value, 2) for value in (0x1950A86A20F9469CFC6C, 1001, facts))
+        storages = [struct.pack("<q", n) + content for n, content in zip(self._sizes, self._storages, strict=True)]
+        return first + b"\x80\x02" + pickled + b"." + pickle.dumps(names, 2) + b"".join(storages)
 
 
 def write_openmask3d(folder: Path, scene: dict[str, Any], features: Any) -> None:

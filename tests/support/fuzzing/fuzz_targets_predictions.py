@@ -212,9 +212,10 @@ OVER_VERTICES = (
     *("scannet-text", "scannet-semantic-text", "openmask3d", "maskclustering", "open3dis", "openyolo3d", "openins3d"),
     *("sam3d", "su3d-bench"),
 )
+WITH_OWN_POINTS = ("conceptgraphs", "hovsg", "openlex3d", "ovo", "rayfronts", "esam", "onlineanyseg")
 TARGETS = (
     *(Target(f"prediction {name}", _format(name), ("**/*",)) for name in OVER_VERTICES),
-    *(Target(f"prediction {name}", _cloud_format(name), ("**/*",)) for name in ("conceptgraphs", "hovsg", "openlex3d")),
+    *(Target(f"prediction {name}", _cloud_format(name), ("**/*",)) for name in WITH_OWN_POINTS),
     Target("prediction gradslam", _cloud_format("gradslam"), ("**/pc_points.h5", "**/pc_embeddings.h5")),
     Target("prediction conceptgraphs inside", _conceptgraphs_inside, ("plain.pkl",)),
     Target("prediction scannet++", _scannetpp, ("**/*",)),

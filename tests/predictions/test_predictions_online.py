@@ -1,0 +1,241 @@
+"""Maps of OVO, RayFronts, ESAM and OnlineAnySeg: what their own lines saved is read to the last value.
+
+``tests/cases/online_maps`` was saved by the originals' own functions on made inputs: OVO at cf3b68e (``VanillaMapper``,
+``Instance3D``, ``save_dict_to_ckpt``; features in float32, float16 and bfloat16), RayFronts at cfa0e6a (``save`` of
+three maps), ESAM at 188fc6d (``mask_to_color``), OnlineAnySeg at 152466e (``export_instance_mask``); torch 2.13.0.
+"""
+
+from __future__ import annotations
+
+import pickle
+import shutil
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from cloud_files import write_esam, write_object, write_onlineanyseg, write_ovo, write_rayfronts
+from places import CASES
+from prediction_files import TorchFile, refused
+from same_values import assert_same
+
+from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.maps import DenseFeatures, Instances, Partition
+from su3d_bench.formats.torch_stream import read_torch_of_either_form
+from su3d_bench.predictions.formats import READERS, recognise
+
+FILES = CASES / "online_maps"
+POINTS = np.random.default_rng(1).normal(size=(6, 3)).astype(np.float32)
+ROW = np.ones(4, np.float32)
+
+
+def expected() -> dict[str, Any]:
+    with np.load(FILES / "expected.npz") as archive:
+        return {name: archive[name] for name in archive.files}
+
+
+def copied(tmp_path: Path, **names: str) -> Path:
+    """A folder ``room0`` with the saved files under the names that they have in a result."""
+    folder = tmp_path / "room0"
+    folder.mkdir()
+    for name in names.values():
+        shutil.copy(FILES / name, folder / name)
+    return folder
+
+
+def read(path: Path, scene: str = "room0") -> Any:
+    return recognise(path).read(path, scene).content
+
+
+# ---- what the originals wrote
+
+
+def test_a_map_of_ovo_has_the_object_of_each_point_and_its_feature(tmp_path: Path) -> None:
+    content, known = read(copied(tmp_path, map="ovo_map.ckpt")), expected()
+    assert isinstance(content, Partition)
+    np.testing.assert_array_equal(content.points, known["ovo_xyz"])
+    np.testing.assert_array_equal(content.features, known["ovo_features"])
+    numbers = np.append(known["ovo_numbers"], -1)
+    np.testing.assert_array_equal(numbers[content.instance], known["ovo_ids"])
+
+
+@pytest.mark.parametrize(("file", "name"), [("semantic_voxel_map.pt", "voxels"), ("semantic_point_cloud.pt", "points")])
+def test_both_maps_of_rayfronts_that_can_be_saved_are_features_of_places(tmp_path: Path, file: str, name: str) -> None:
+    shutil.copy(FILES / file, tmp_path / "room0.pt")
+    content, known = read(tmp_path), expected()
+    assert isinstance(content, DenseFeatures)
+    np.testing.assert_array_equal(content.points, known[f"{name}_xyz"])
+    np.testing.assert_array_equal(content.features, known[f"{name}_feat"].astype(np.float16))
+
+
+def test_occupied_voxels_alone_say_what_is_missing(tmp_path: Path) -> None:
+    shutil.copy(FILES / "occ_voxel_map.pt", tmp_path / "room0.pt")
+    assert "which voxels are occupied and no features" in refused(tmp_path, "room0", "rayfronts")
+
+
+def test_masks_of_onlineanyseg_lie_on_its_own_points_with_a_feature_each(tmp_path: Path) -> None:
+    folder, known = copied(tmp_path, masks="ckpt_final.npz"), expected()
+    points = np.random.default_rng(0).normal(size=(30, 3))
+    write_object(folder / "final.ply", points)
+    content = read(folder)
+    assert isinstance(content, Instances) and content.labels is None
+    np.testing.assert_array_equal(content.points, points.astype(np.float32))
+    np.testing.assert_array_equal(content.features, known["onlineanyseg_features"])
+    for mask, members in zip(known["onlineanyseg_masks"], content.sets(), strict=True):
+        np.testing.assert_array_equal(members, np.flatnonzero(mask))
+
+
+def test_colours_of_esam_are_masks_and_grey_is_none(tmp_path: Path) -> None:
+    content = read(copied(tmp_path, points="points.npy", colours="points_color.npy"))
+    assert isinstance(content, Instances)
+    masks = expected()["esam_masks"]
+    first = np.where(masks.any(0), masks.argmax(0), -1)  # of masks that share a point the original draws the first
+    np.testing.assert_array_equal(content.points, np.load(FILES / "points.npy").reshape(-1, 3))
+    found = {tuple(members.tolist()) for members in content.sets()}
+    assert found == {tuple(np.flatnonzero(first == k).tolist()) for k in range(len(masks)) if (first == k).any()}
+
+
+# ---- forms and faults
+
+
+def test_caches_of_an_evaluation_are_read_by_the_folder_of_the_scene(tmp_path: Path) -> None:
+    value = {"feats_xyz": POINTS, "feats_feats": np.ones((6, 4), np.float32)}
+    for scene in ("office0", "room0"):
+        write_rayfronts(tmp_path / "SemSegReplica" / scene / "map.pt", value)
+        write_rayfronts(tmp_path / "SemSegReplica" / scene / "text_embeds.pt", {"text_embeds": np.ones((2, 4))})
+    for path in (tmp_path, tmp_path / "SemSegReplica"):
+        assert list(recognise(path).scenes(path)) == ["office0", "room0"]
+        assert len(read(path).points) == 6
+
+
+def test_a_map_of_ovo_as_an_archive_or_with_gaussians_is_read_too(tmp_path: Path) -> None:
+    write_ovo(tmp_path / "room0", POINTS, [2, 2, 7, -1, 7, 7], {7: ROW, 2: 2 * ROW}, is_stream=False)
+    content = read(tmp_path)
+    np.testing.assert_array_equal(content.instance, [1, 1, 0, -1, 0, 0])
+    file = TorchFile(is_stream=True)
+    cloud = {"xyz": POINTS, "obj_ids": np.full((6, 1), -1, np.int32)}
+    value = {"gaussian_params": cloud, "ovo_map_params": {"ins_3d_ids": np.zeros(0, np.int64)}}
+    file.write(tmp_path / "room0/ovo_map.ckpt", file.value(value))
+    content = read(tmp_path)
+    assert (content.instance == -1).all() and len(content.features) == 0
+
+
+def test_objects_of_ovo_without_points_or_features_are_told(tmp_path: Path) -> None:
+    write_ovo(tmp_path / "room0", POINTS, [0] * 6, {0: ROW, 3: None})
+    prediction = recognise(tmp_path).read(tmp_path, "room0")
+    assert prediction.remarks == (
+        "1 objects have no feature (a row of zeros or NaN)",
+        "1 of 2 objects have no point left",
+    )
+
+
+@pytest.mark.parametrize(
+    ("ids", "features", "message"),
+    [
+        ([9] * 6, {0: ROW}, "point 0 is of object 9, which the map does not have"),
+        ([0] * 5, {0: ROW}, "'obj_ids' is an array of shape (5, 1) int32; expected an object for each of 6 points"),
+        ([0] * 6, {0: ROW, 1: np.ones(3, np.float32)}, "the feature of object 1 is an array of shape (3,) float32"),
+        ([0] * 6, {0: np.ones((2, 2), np.float32)}, "the feature of object 0 is an array of shape (2, 2) float32"),
+    ],
+)
+def test_each_fault_of_a_map_of_ovo_is_one_line(
+    tmp_path: Path, ids: list[int], features: dict[int, Any], message: str
+) -> None:
+    write_ovo(tmp_path / "room0", POINTS, ids, features)
+    assert message in refused(tmp_path, "room0", "ovo")
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ({"feats_xyz": POINTS}, "holds feats_xyz; expected a map of RayFronts, such as map.pt"),
+        ({"feats_xyz": None, "feats_feats": None}, "the points are a NoneType"),
+        ({"feats_xyz": POINTS, "feats_feats": np.ones((5, 4), np.float32)}, "6 places, but the features are"),
+        ({"global_vox_xyz": POINTS, "global_vox_rgb_feat_conf": np.ones((6, 4), np.float32)}, "(6, 0) float32; expect"),
+        ({"global_xyz_pc": [], "global_feat_pc": []}, "holds no cloud"),
+        ({"global_xyz_pc": [POINTS], "global_feat_pc": [POINTS[:, :2], POINTS]}, "expected tables of one width"),
+    ],
+)
+def test_each_fault_of_a_map_of_rayfronts_is_one_line(tmp_path: Path, value: dict[str, Any], message: str) -> None:
+    write_rayfronts(tmp_path / "room0.pt", value)
+    assert message in refused(tmp_path, "room0", "rayfronts")
+
+
+def test_each_fault_of_results_of_esam_and_onlineanyseg_is_one_line(tmp_path: Path) -> None:
+    write_esam(tmp_path / "room0", POINTS, [0, 1, 0, 1, -1, 0])
+    colours = np.load(tmp_path / "room0/points_color.npy")
+    for wrong, message in (
+        (colours[:5], "expected a colour for each of points.npy, (6, 3)"),
+        (colours + 200, "expected 0 to 255"),
+        (colours / 255, "float64; expected a colour"),
+    ):
+        np.save(tmp_path / "room0/points_color.npy", wrong)
+        assert message in refused(tmp_path, "room0", "esam")
+    n = 300
+    np.save(tmp_path / "room0/points.npy", np.zeros((n, 3)))
+    np.save(
+        tmp_path / "room0/points_color.npy",
+        np.stack([np.arange(n) % 256, np.arange(n) // 256, np.zeros(n)], 1).astype(int),
+    )
+    assert "has 300 colours, ESAM's palette 256" in refused(tmp_path, "room0", "esam")
+    folder = tmp_path / "online"
+    write_onlineanyseg(folder / "room0", POINTS, [np.arange(5) < 2])
+    assert "the masks are of 5 points, final.ply has 6" in refused(folder, "room0", "onlineanyseg")
+    write_onlineanyseg(folder / "room0", POINTS, [np.arange(6) < 2], [ROW, ROW])
+    assert "1 masks, but the features are" in refused(folder, "room0", "onlineanyseg")
+    write_onlineanyseg(folder / "room0", POINTS, [np.arange(6) < 2])
+    assert "class-agnostic" in recognise(folder).read(folder, "room0").remarks[0]
+    assert READERS["maskclustering"].recognise(folder / "room0") is None
+
+
+# ---- the older form of torch.save
+
+
+def test_what_torch_writes_in_its_older_form_is_read_to_the_last_value(tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch", reason="torch is not installed: the committed file alone proves the layout")
+    whole = torch.arange(12).reshape(3, 4)
+    value = {"a": whole, "part": whole[1:, ::2], "n": 3, "list": [whole.half(), np.arange(3.0)], "none": None}
+    value |= {"brain": whole.to(torch.bfloat16) / 3, "empty": torch.zeros(0, 4)}
+    torch.save(value, tmp_path / "x", _use_new_zipfile_serialization=False)
+    found: Any = read_torch_of_either_form(tmp_path / "x")
+    table = np.arange(12).reshape(3, 4)
+    assert_same(found["part"], table[1:, ::2])
+    assert_same(found["list"], [table.astype(np.float16), np.arange(3.0)])
+    assert_same(found["brain"], value["brain"].float().numpy())
+    assert found["empty"].shape == (0, 4) and found["none"] is None and found["n"] == 3
+    torch.save(value["brain"], tmp_path / "y")
+    assert_same(read_torch_of_either_form(tmp_path / "y"), value["brain"].float().numpy())
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (struct.pack("<q", 6), struct.pack("<q", 7), "has 7 values in storage"),
+        (struct.pack("<q", 6), struct.pack("<q", -1), "has -1 values in storage"),
+        (pickle.dumps(1001, 2), pickle.dumps(1002, 2), "a form of torch.save that is not known"),
+        (pickle.dumps(["0"], 2), pickle.dumps(["1"], 2), "does not name each storage once"),
+        (pickle.dumps(["0"], 2), pickle.dumps([], 2), "does not name each storage once"),
+        (b"ctorch\nFloat", b"cposix\nsystem\nctorch\nFloat", "asks for 'posix.system'"),
+    ],
+)
+def test_each_fault_of_the_older_form_is_one_line(tmp_path: Path, old: bytes, new: bytes, message: str) -> None:
+    file = TorchFile(is_stream=True)
+    file.write(tmp_path / "x", file.value(np.arange(6, dtype=np.float32)))
+    content = (tmp_path / "x").read_bytes()
+    head, found, tail = content.rpartition(old)
+    assert found
+    (tmp_path / "x").write_bytes(head + new + tail)
+    with pytest.raises(PredictionError) as caught:
+        read_torch_of_either_form(tmp_path / "x")
+    assert message in str(caught.value) and str(caught.value).startswith(f"{tmp_path}/x: ")
+
+
+def test_bytes_behind_the_last_storage_and_other_files_are_refused(tmp_path: Path) -> None:
+    file = TorchFile(is_stream=True)
+    file.write(tmp_path / "x", file.value(np.arange(6, dtype=np.float32)))
+    (tmp_path / "y").write_bytes((tmp_path / "x").read_bytes() + b"\0")
+    (tmp_path / "z").write_bytes(b"")
+    for name, message in (("y", "has more bytes behind its end"), ("z", "no file of torch.save")):
+        with pytest.raises(PredictionError, match=message):
+            read_torch_of_either_form(tmp_path / name)
