@@ -77,6 +77,8 @@ def _context(scored: Mapping[str, Any]) -> Iterable[str]:
             f"predictions a scene: {sum(counts) / len(counts):.1f}{spread}; near-duplicate pairs {twice['near']}, "
             f"identical ones {twice['identical']}; confidences {_confidences(scored)}"
         )
+    if scored["labels"] is not None:
+        yield f"labels: {scored['labels']}"
     if scored["contested_points"] is not None:
         yield f"points that several masks claim: {percent(scored['contested_points'])} % of those in masks"
     if scored["coverage"] is None:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
+from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.numerics.statistics import FEW_SCENES, Interval, SignFlipTest
 
 NOT_MEASURED = "-"
@@ -182,6 +183,25 @@ def confidence_notes(confidences: Mapping[str, str | None]) -> list[str]:
     return [f"MIXED CONFIDENCES: {told}: these average precisions do not compare"]
 
 
+def is_ceiling(method: str, caveat: str | None) -> bool:
+    """Whether a row was told the truth, and competes with none."""
+    return method == CEILING_METHOD or "a ceiling, not a result" in (caveat or "")
+
+
+def label_count_notes(labels: Mapping[str, str | None]) -> list[str]:
+    """That rows are of other numbers of labels a mask or point, which do not compare; nothing where all are of one.
+
+    >>> label_count_notes({"a": "one label", "b": "the top 5 labels", "c": None})
+    ['MIXED LABELS: one label (a); the top 5 labels (b): these numbers do not compare']
+    """
+    whose: dict[str, list[str]] = {}
+    for row, what in labels.items():
+        if what is not None:
+            whose.setdefault(what, []).append(row)
+    told = "; ".join(f"{what} ({', '.join(rows)})" for what, rows in whose.items())
+    return [f"MIXED LABELS: {told}: these numbers do not compare"] if len(whose) > 1 else []
+
+
 @dataclass(frozen=True, kw_only=True)
 class Measured:
     """The numbers of ``metrics.json`` for one method and protocol, as fractions, None where undefined.
@@ -241,4 +261,4 @@ class Measured:
     @property
     def is_ceiling(self) -> bool:
         """Whether the method was told the truth, or where to look for it, so that it competes with none."""
-        return self.method == "oracle" or "a ceiling, not a result" in (self.caveat or "")
+        return is_ceiling(self.method, self.caveat)

@@ -14,6 +14,8 @@ from su3d_bench.reports.tables.model import (
     Table,
     confidence_notes,
     few_scenes,
+    is_ceiling,
+    label_count_notes,
     label_notes,
     percent,
     text_table,
@@ -69,10 +71,15 @@ def _protocol_table(rows: Sequence[Mapping[str, Any]], metrics: Mapping[str, Any
     body += _cheap_rows(rows, names, len(header))
     notes = [line for row in rows for line in _notes(row)]
     notes += confidence_notes({str(row["method"]): row.get("confidences") for row in rows})
+    notes += label_count_notes({str(row["method"]): row.get("labels") for row in rows if not _is_ceiling(row)})
     n_scenes = [row["result"]["n_scenes"] for row in rows if row["result"] and any(row["result"]["intervals"].values())]
     notes += label_notes(names)
     notes += [line for line in (few_scenes(min(n_scenes, default=0)),) if line]
     return text_table(str(first["protocol"]), [header, *body], heading=title, notes=notes)
+
+
+def _is_ceiling(row: Mapping[str, Any]) -> bool:
+    return is_ceiling(str(row["method"]), row["caveat"])
 
 
 def _cheap_rows(rows: Sequence[Mapping[str, Any]], names: Sequence[str], n_columns: int) -> list[list[str]]:

@@ -1,7 +1,8 @@
 """Runs of many people as one ranking, after it is known that their numbers answer the same question.
 
 A number enters where its run is whole, its protocol is the one installed here, to the digest, every scene's data have
-the digest that most runs have, and it follows from the run's own counts. Everything else is named with the reason.
+the digest that most runs have, it follows from the run's own counts, and it is of as many labels a mask or point as
+most are. Everything else is named with the reason.
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ import numpy as np
 
 from su3d_bench.analysis.recomputed import rules_of_run, why_not_counted
 from su3d_bench.core.errors import ConfigError, Su3dError, counted, printable, some
-from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.protocols.files import protocol_names
 from su3d_bench.metrics.scoring import combine
 from su3d_bench.numerics.statistics import Interval, rank_intervals
@@ -29,6 +29,7 @@ from su3d_bench.reports.tables.model import (
     bracketed,
     confidence_notes,
     few_scenes,
+    is_ceiling,
     percent,
 )
 from su3d_bench.runs.finished import FinishedRun, read_run
@@ -60,6 +61,7 @@ class Entry:
     data: tuple[tuple[str, str], ...]
     profile: str
     confidences: str | None
+    labels: str | None
     is_ceiling: bool
     ranks: tuple[int, int] | None = None
 
@@ -111,6 +113,8 @@ def leaderboard(folder: Path, protocols: Sequence[str] = (), *, with_ranks: bool
     for key in dict.fromkeys((entry.protocol, entry.digest, entry.scenes) for entry in entries):
         ranked_together = [entry for entry in entries if (entry.protocol, entry.digest, entry.scenes) == key]
         alike, others = _of_same_data(ranked_together)
+        alike, unlike = _of_as_many_labels(alike)
+        others += unlike
         board = tuple(sorted(alike, key=_rank))
         boards.append(ranked(board) if with_ranks else board)
         refused += others
@@ -170,7 +174,8 @@ def _entries(name: str, run: FinishedRun, protocols: Sequence[str]) -> Iterator[
             data=tuple((scene, run.record.data_digests[scene]) for scene in sorted(result.scenes)),
             profile=ELSEWHERE if method in run.made_elsewhere else printable(run.record.profile or "", 40),
             confidences=None if record.confidences is None else printable(record.confidences, 80),
-            is_ceiling="a ceiling, not a result" in (record.caveat or "") or method == CEILING_METHOD,
+            labels=run.labels(method, protocol, rules),
+            is_ceiling=is_ceiling(method, record.caveat),
         )
 
 
@@ -195,6 +200,24 @@ def _of_same_data(entries: Sequence[Entry]) -> tuple[list[Entry], list[Refused]]
             reason = f"other data of {printable(scene, 80)} than {len(alike)} of {len(entries)} entries have"
             others.append(Refused(entry.run, f"{entry.method} / {entry.protocol}", reason))
     return alike, others
+
+
+def _of_as_many_labels(entries: Sequence[Entry]) -> tuple[list[Entry], list[Refused]]:
+    """The entries that give as many labels as most do, the first seen of equals, with the ceilings, and the others."""
+    rivals = [entry for entry in entries if not entry.is_ceiling]
+    if not rivals:
+        return list(entries), []
+    (common, n), *_ = Counter(entry.labels for entry in rivals).most_common(1)
+    others = [
+        Refused(
+            entry.run,
+            f"{entry.method} / {entry.protocol}",
+            f"is of {printable(str(entry.labels), 80)}, {n} of {len(rivals)} entries are of {common}",
+        )
+        for entry in rivals
+        if entry.labels != common
+    ]
+    return [entry for entry in entries if entry.is_ceiling or entry.labels == common], others
 
 
 def _rank(entry: Entry) -> tuple[bool, float, str, str]:
@@ -252,6 +275,7 @@ def _table(board: Sequence[Entry], index: int, intervals: bool) -> Table:
     if any(entry.is_ceiling for entry in board):
         notes.append("Rows that were told the truth stand last and compete with none.")
     notes += confidence_notes({f"{entry.method} of {entry.run}": entry.confidences for entry in rivals})
+    notes += [f"Labels: {said}." for said in {entry.labels: None for entry in rivals if entry.labels}]
     if has_ranks:
         notes.append(
             f"Rank: from which to which it may go by {first.headline[0]}, with 95 % for all rows together: sign-flip "

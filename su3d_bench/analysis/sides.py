@@ -8,6 +8,7 @@ from pathlib import Path
 
 from su3d_bench.core.config import MOVES_NO_NUMBER
 from su3d_bench.core.errors import ConfigError, printable
+from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import SceneScore, metric_of
 from su3d_bench.questions.files.queries import VARIANT as QUERY_OBJECTS
@@ -187,6 +188,12 @@ def refuse_unlike(left: Side, right: Side, protocol: str, scenes: Sequence[str])
     queries = [None if truth is None else truth.queries for truth in truths]
     if queries[0] != queries[1] and left.run.rules(protocol).ground_truth == QUERY_OBJECTS:
         raise ConfigError(f"{where}: their queries are of different files; evaluate both with the same --queries")
+    if CEILING_METHOD not in (left.method, right.method):
+        given = [side.run.labels(side.method, protocol, left.run.rules(protocol)) for side in (left, right)]
+        if None not in given and given[0] != given[1]:
+            raise ConfigError(
+                f"{where}: {protocol} is of {given[0]} and of {given[1]}; give both predictions as many labels"
+            )
     records = [side.run.results.get((side.method, protocol)) for side in (left, right)]
     named = [record for record in records if record is not None and record.encoder is not None]
     are_elsewhere = left.method in left.run.made_elsewhere or right.method in right.run.made_elsewhere

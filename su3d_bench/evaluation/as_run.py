@@ -260,6 +260,7 @@ def _result(kept: _Kept, evaluation: Evaluation, rules: ProtocolRules) -> Result
         ceiling=None if found is None or found.ceiling is None else plain_json(found.ceiling),
         result=None if found is None else _numbers(kept, found),
         confidences=None if found is None else _confidences(kept, found),
+        labels=None if found is None else found.labels,
     )
 
 

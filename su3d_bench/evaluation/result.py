@@ -11,6 +11,7 @@ import numpy as np
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
+from su3d_bench.metrics.labels import LEAST_SEVERAL, labels_counted
 from su3d_bench.metrics.matching.checks import MaskFacts
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
@@ -49,6 +50,9 @@ class SceneOutcomes:
     unscored: dict[str, str] = field(default_factory=dict)
     has_coverage: bool = False
     encoder: tuple[str, str] | None = None
+    labels: str | None = None
+    n_masks: int = 0
+    n_several: int = 0
 
     def add(self, scene: str, outcome: SceneOutcome) -> None:
         self.scores[scene] = outcome.score
@@ -69,7 +73,7 @@ class ProtocolEvaluation:
     ``missed`` scenes have no prediction and count as missed, ``skipped`` ones are left out as the original does.
     ``scores`` and ``ceilings`` are by scene, ``unscored`` has a reason for each of the others; ``encoder``: name and
     digest of what named the features. ``coverage``: by radius in metres the share of scored points with a predicted
-    point that near, None without coordinates.
+    point that near, None without coordinates. ``labels``: how many of a mask or point count, None where none does.
     """
 
     rules: ProtocolRules
@@ -86,6 +90,7 @@ class ProtocolEvaluation:
     ceilings: Mapping[str, SceneScore]
     unscored: Mapping[str, str]
     encoder: tuple[str, str] | None = None
+    labels: str | None = None
 
     @property
     def n_duplicates(self) -> tuple[int, int]:
@@ -127,6 +132,7 @@ class ProtocolEvaluation:
             "coverage": None if self.coverage is None else plain_json(self.coverage),
             "n_predictions": dict(result.n_predictions),
             "duplicates": {"near": near, "identical": identical},
+            "labels": self.labels,
             "confidences": None
             if confidences is None
             else {"min": confidences[0], "max": confidences[1], "constant": confidences[0] == confidences[1]},
@@ -217,6 +223,11 @@ def _form(rules: ProtocolRules, kept: SceneOutcomes, file_confidences: bool) -> 
         ceilings=ceilings,
         unscored=kept.unscored,
         encoder=kept.encoder,
+        labels=labels_counted(
+            rules,
+            by_features=kept.encoder is not None,
+            are_several=kept.n_masks > 0 and kept.n_several >= LEAST_SEVERAL * kept.n_masks,
+        ),
     )
     lines = [*_scene_warnings(kept), *_confidence_warnings(rules, evaluation, file_confidences), *kept.warnings]
     # of kind 'instance' said above, for all scenes at once

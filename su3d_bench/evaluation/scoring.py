@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -31,6 +32,7 @@ from su3d_bench.metrics.instance.score import (
     masks_and_scores,
     named_classes,
 )
+from su3d_bench.metrics.labels import labels_counted, under_several_labels
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.checks import (
     check_cloud,
@@ -87,7 +89,10 @@ class Scoring:
 
     def add(self, scene: str, prediction: ScenePrediction, where: str) -> None:
         """Score one scene; at the first that is not empty, protocols that do not fit go out or, when named, raise."""
-        outcomes = {name: self._score(rules, scene, prediction) for name, rules in self.tally.rules.items()}
+        facts = facts_of(prediction.content)
+        if any(rules.names_masks for rules in self.tally.rules.values()):
+            facts = replace(facts, n_several=_n_under_several_labels(prediction.content))
+        outcomes = {name: self._score(rules, scene, prediction, facts) for name, rules in self.tally.rules.items()}
         reasons = {name: reason for name, reason in outcomes.items() if reason is not None}
         for name, reason in reasons.items():
             if self._named or self._first is not None:
@@ -124,9 +129,9 @@ class Scoring:
                     kept.missed.append(scene)
         return nothing
 
-    def _score(self, rules: ProtocolRules, scene: str, prediction: ScenePrediction) -> str | None:
+    def _score(self, rules: ProtocolRules, scene: str, prediction: ScenePrediction, facts: ContentFacts) -> str | None:
         """The reason why a scene cannot be scored under the protocol; None where it was."""
-        facts, has_points = facts_of(prediction.content), self._truths.has_points
+        has_points, kept = self._truths.has_points, self.tally.outcomes[rules.name]
         reason = why_not_content(rules, facts, has_points=has_points)
         if reason is None and has_points and not self._named and self._first is None:
             reason = why_not_numbers(rules, facts)
@@ -138,7 +143,14 @@ class Scoring:
         if isinstance(encoder, str):
             return encoder
         if encoder is not None:
-            self.tally.outcomes[rules.name].encoder = encoder.name, encoder.digest
+            kept.encoder = encoder.name, encoder.digest
+        if facts.n and (rules.n_labels or 0) > 1:
+            given = labels_counted(rules, by_features=encoder is not None)
+            if kept.labels not in (None, given):
+                return f"gives {given} of a point, and {kept.labels} in the scenes before; give all scenes alike"
+            kept.labels = given
+        kept.n_masks += facts.n
+        kept.n_several += facts.n_several
         return self._score_content(rules, scene, prediction.content, encoder)
 
     def _score_content(self, rules: ProtocolRules, scene: str, content: Content, encoder: Encoder | None) -> str | None:
@@ -186,6 +198,14 @@ def skips_missing_scenes(rules: ProtocolRules) -> bool:
     if rules.metric != "scannet" or rules.name not in protocol_names() or rules.class_agnostic == "numbered":
         return False
     return not any(getattr(registry.load("dataset", name), "renders_frames", False) for name in rules.datasets)
+
+
+def _n_under_several_labels(content: Content) -> int:
+    """How many masks stand there under another label too; 0 where no label is given."""
+    labels = content.class_numbers if isinstance(content, VertexMasks) else getattr(content, "labels", None)
+    if labels is None or not isinstance(content, Masks):
+        return 0
+    return int(under_several_labels(content, [*labels]).sum())
 
 
 def facts_of(content: Content) -> ContentFacts:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.maps import Instances, Partition, Prediction
+from su3d_bench.metrics.labels import LEAST_SEVERAL
 from su3d_bench.metrics.matching.labelling import has_every_label
 from su3d_bench.metrics.open_vocabulary.score import NEEDS_FEATURES
 from su3d_bench.metrics.protocols.model import ProtocolRules
@@ -53,7 +54,8 @@ class ContentFacts:
     ``form``: ``vertex-masks`` and ``vertex-labels`` (one class a point) lie over the points of the truth, the others
     bring their own. ``n``: how many masks or rows of features. ``n_dimensions`` of the features, None without any.
     ``has_names``: some instance has a name or label. ``class_ids``: classes given as ids of the label space.
-    ``n_points``: over how many points of the truth it lies, None where it has its own or says no number.
+    ``n_points``: over how many points of the truth it lies, None where it has its own or says no number. ``n_several``:
+    how many of its masks stand there under another label too.
     """
 
     form: Form
@@ -64,6 +66,12 @@ class ContentFacts:
     has_names: bool = False
     class_ids: NDArray[np.integer[Any]] | None = None
     n_points: int | None = None
+    n_several: int = 0
+
+    @property
+    def are_several(self) -> bool:
+        """Whether its masks stand there under several labels each."""
+        return self.n > 0 and self.n_several >= LEAST_SEVERAL * self.n
 
     @classmethod
     def of(cls, prediction: Prediction) -> ContentFacts:
@@ -146,6 +154,9 @@ def _why_not_named(rules: ProtocolRules, content: ContentFacts) -> str | None:
     """Why masks cannot get the classes that a protocol of classes asks for."""
     if rules.class_agnostic is not None or (rules.needs_own_points and not rules.vocabulary) or not content.n:
         return None
+    if rules.labels is not None and content.are_several != (rules.labels == "top-k"):
+        given = "the same masks stand there under several" if content.are_several else "each mask has one"
+        return f"takes {'one label' if rules.labels == 'one' else 'the top labels'} of a mask, and {given}"
     if not content.has_labels and content.n_dimensions is None:
         is_map = content.has_own_points
         what = "the instances have neither labels" if is_map else "the masks have neither classes"

@@ -30,6 +30,7 @@ from su3d_bench.core.maps import Prediction
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.metrics.costs import UpdateTimes
+from su3d_bench.metrics.labels import labels_counted
 from su3d_bench.metrics.protocols.files import protocol_names
 from su3d_bench.metrics.protocols.loading import load_protocol, read_rules
 from su3d_bench.metrics.protocols.model import ProtocolRules
@@ -171,6 +172,11 @@ class FinishedRun:
         """A line a method whose predictions were made elsewhere."""
         of_methods = self.made_elsewhere.items()
         return [f"{printable(method, 80)}: {made_elsewhere(record.formats)}" for method, record in of_methods]
+
+    def labels(self, method: str, protocol: str, rules: ProtocolRules) -> str | None:
+        """How many labels of a mask or point a result is of, see ``labels_counted``; None where no label counts."""
+        record = self.results[method, protocol]
+        return record.labels or labels_counted(rules, by_features=record.encoder is not None)
 
     def rules(self, protocol: str, *, to_the_letter: bool = False) -> ProtocolRules:
         """The rules that scored the run: the program's own, else those that ``run.json`` keeps.

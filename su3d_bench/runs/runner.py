@@ -22,6 +22,7 @@ from su3d_bench.core.registry import CEILING_METHOD, DATASETS
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.system.timing import hardware_line, processor_digest
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
+from su3d_bench.metrics.labels import labels_counted
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import EVERY_SCENE, SceneScore, combine, combined_metrics, plain_json, unpack_scores
@@ -358,6 +359,7 @@ def _result(
     numbers = NumbersRecord(**combine(rules, scored).to_json()) if scored else None
     if numbers is not None:
         numbers = replace(numbers, warnings=(*numbers.warnings, *doubts))
+    encoder = _join(outcome.encoder for outcome in mine.values() if outcome.profile is not None)
     midway = [(share, _metrics_over(scenes, rules, counts)) for share, counts in early.items()]
     return ResultRecord(
         method=method,
@@ -367,7 +369,7 @@ def _result(
         headline=rules.headline,
         profile=_join(outcome.profile for outcome in mine.values()),
         caveat=_join((outcome.caveat for outcome in mine.values()), "; "),
-        encoder=_join(outcome.encoder for outcome in mine.values() if outcome.profile is not None),
+        encoder=encoder,
         encoder_digest=_join(outcome.encoder_digest for outcome in mine.values()),
         n_planned=len(planned),
         failed=tuple(failed),
@@ -376,6 +378,7 @@ def _result(
         result=numbers,
         anytime=tuple(MidwayRecord(share, metrics) for share, metrics in midway if metrics) if early else None,
         confidences=None if numbers is None else confidences_of(rules, numbers),
+        labels=None if numbers is None else labels_counted(rules, by_features=encoder is not None),
     )
 
 

@@ -202,7 +202,8 @@ class ResultRecord:
     """One method under one protocol; ``encoder`` is null where the method named its instances itself.
 
     ``result`` is null where no scene was scored; ``anytime`` is missing where no map midway was asked for;
-    ``confidences``: what ranked the predictions of an average precision, null where none was formed.
+    ``confidences``: what ranked the predictions of an average precision, null where none was formed. ``labels``: how
+    many labels of a mask or point count, null where none does, or where an older run does not say.
     """
 
     method: str
@@ -221,6 +222,7 @@ class ResultRecord:
     result: NumbersRecord | None
     anytime: tuple[MidwayRecord, ...] | None = None
     confidences: str | None = None
+    labels: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

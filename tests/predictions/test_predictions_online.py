@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from cloud_files import write_esam, write_object, write_onlineanyseg, write_ovo, write_rayfronts
 from places import CASES
-from prediction_files import TorchFile, refused
+from prediction_files import TorchFile, refused, torch_text
 from same_values import assert_same
 
 from su3d_bench.core.errors import PredictionError
@@ -160,6 +160,26 @@ def test_each_fault_of_a_map_of_ovo_is_one_line(
 def test_each_fault_of_a_map_of_rayfronts_is_one_line(tmp_path: Path, value: dict[str, Any], message: str) -> None:
     write_rayfronts(tmp_path / "room0.pt", value)
     assert message in refused(tmp_path, "room0", "rayfronts")
+
+
+def test_objects_and_clouds_that_share_one_table_are_refused(tmp_path: Path) -> None:
+    """A reference costs a few bytes of the file, what it stands for memory each time."""
+    n, wide = 5_000, np.ones(100_000, np.float16)
+    keep, again = b"r\x05\x00\x00\x00", b"j\x05\x00\x00\x00"
+    file = TorchFile(is_stream=True)
+    cloud = file.value({"xyz": POINTS, "obj_ids": np.zeros((6, 1), np.int32)})
+    objects = torch_text("ins_3d_ids") + file.array(np.arange(n))
+    objects += torch_text("ins3d_0_clip_feature") + file.tensor(wide) + keep
+    objects += b"".join(torch_text(f"ins3d_{k}_clip_feature") + again for k in range(1, n))
+    (tmp_path / "room0").mkdir()
+    both = torch_text("map_params") + cloud + torch_text("ovo_map_params") + b"}(" + objects + b"u"
+    file.write(tmp_path / "room0/ovo_map.ckpt", b"}(" + both + b"u")
+    assert "unpacks to more than" in refused(tmp_path, "room0", "ovo")
+    file = TorchFile()
+    clouds = b"](" + file.tensor(np.ones((100_000, 3), np.float32)) + keep + again * n + b"e"
+    shared = torch_text("global_xyz_pc") + clouds + torch_text("global_feat_pc") + again
+    file.write(tmp_path / "room0.pt", b"}(" + shared + b"u")
+    assert "unpacks to more than" in refused(tmp_path / "room0.pt", "room0", "rayfronts")
 
 
 def test_each_fault_of_results_of_esam_and_onlineanyseg_is_one_line(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ _OWN_FIELDS = {
     "class_agnostic": "class_agnostic: belongs to kind 'instance'",
     "void": "void: belongs to kind 'instance'",
     "stuff": "stuff: kind 'panoptic' needs the classes that are no things, others take none",
+    "labels": "labels: belongs to kind 'instance', where masks have classes",
     "vocabulary": "vocabulary: belongs to protocols that choose among classes, and these need it",
     "min_region_size": _ONLY_CURVES,
     "thresholds": _ONLY_CURVES,
@@ -129,8 +130,9 @@ class ProtocolRules(_Strict):
     rest is void), all ``annotated`` ones, ``numbered``, where a number alone tells an object, whatever its class, or
     ``everything``, with the points that nobody annotated as one more. ``void``: masks on it are ``false-positives``;
     where absent, they are dropped at every threshold that their share of void is above, as in ScanNet's script.
-    ``box_axes``: the box of an instance is the smallest around its points along the axes of the ``truth``'s box that it
-    is held against, or along those of the ``world``.
+    ``labels``: whether the same mask may stand there under several labels (``top-k``) or under ``one`` alone; where
+    absent, either is scored, and no ranking has both. ``box_axes``: the box of an instance is the smallest around its
+    points along the axes of the ``truth``'s box that it is held against, or along those of the ``world``.
     """
 
     name: str
@@ -164,6 +166,7 @@ class ProtocolRules(_Strict):
     class_agnostic: Literal["scored", "annotated", "numbered", "everything"] | None = None
     void: Literal["false-positives"] | None = None
     stuff: tuple[str, ...] = ()
+    labels: Literal["one", "top-k"] | None = None
     ignore: tuple[str, ...] = ()
     ignore_rule: Literal["exact", "substring"] = "exact"
     vocabulary: Literal["all", "scored", "scene"] | None = None
@@ -294,6 +297,11 @@ class ProtocolRules(_Strict):
         return self.needs_instances and self.class_agnostic is None
 
     @property
+    def n_labels(self) -> int | None:
+        """How many labels of a mask or point count, if it has so many; None where its label is not asked for."""
+        return (self.top_k or 1) if self.vocabulary is not None and self.class_agnostic is None else None
+
+    @property
     def compares_texts(self) -> bool:
         """Whether features are compared with texts whatever labels there are."""
         return self.metric in self.text_metrics
@@ -333,7 +341,12 @@ class InstanceRules(ProtocolRules):
     values_of_metric: ClassVar[ValuesOfMetric] = {"scannet": AP_NAMES}
     needs_instances = True
     confidences = ("ones", "prediction")
-    takes = ("class_agnostic", "void", *_CURVE_FIELDS)
+    takes = ("class_agnostic", "void", "labels", *_CURVE_FIELDS)
+
+    def _check_texts(self) -> None:
+        super()._check_texts()
+        if self.class_agnostic is not None and self.labels is not None:
+            raise ValueError(_OWN_FIELDS["labels"])
 
     def _needed(self) -> tuple[str, ...]:
         if self.class_agnostic is None:
@@ -408,6 +421,10 @@ class CategoryRules(ProtocolRules):
     needs_own_points = True
     ignores_classes = False
     text_metrics = ("openlex3d-ranking",)
+
+    @property
+    def n_labels(self) -> int | None:
+        return self.top_k
 
     def _needed(self) -> tuple[str, ...]:
         return ("top_k",) if self.metric == "openlex3d-topn" else ()

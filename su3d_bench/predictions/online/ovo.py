@@ -18,6 +18,7 @@ from su3d_bench.core.types import Float32Array, Int32Array, Int64Array
 from su3d_bench.formats.arrays import MOST_MASKS, checked_points, kind_of, without_nonfinite
 from su3d_bench.formats.torch_stream import read_torch_of_either_form
 from su3d_bench.predictions.base import SceneFolders, ScenePrediction
+from su3d_bench.store.unpacking import Allowance, UnpackingError
 
 MAP = "ovo_map.ckpt"
 POINTS = ("map_params", "gaussian_params")  # the second in maps of before; its own loader takes both
@@ -47,7 +48,7 @@ class Ovo(SceneFolders):
             )
         points = checked_points(cloud.get("xyz"), where)
         ids = _ids(objects.get("ins_3d_ids"), where)
-        features, remarks = without_nonfinite(_features(objects, ids, where), "objects")
+        features, remarks = without_nonfinite(_features(objects, ids, Allowance(file.stat().st_size), where), "objects")
         instance = _rows(cloud.get("obj_ids"), len(points), ids, where)
         n_lost = len(ids) - len(np.unique(instance[instance >= 0]))
         if n_lost:
@@ -66,27 +67,32 @@ def _ids(value: object, where: str) -> Int64Array:
     return ids
 
 
-def _features(objects: Mapping[object, object], ids: Int64Array, where: str) -> Float32Array:
+def _features(objects: Mapping[object, object], ids: Int64Array, allowance: Allowance, where: str) -> Float32Array:
     """A row (K, D) for each object, of zeros for those that were never described."""
-    found: dict[int, Float32Array] = {}
-    n_dimensions = 0
+    features: Float32Array | None = None
     for row, number in enumerate(ids.tolist()):
         value = objects.get(f"ins3d_{number}_clip_feature")
         if value is None:
             continue
         is_row = isinstance(value, np.ndarray) and value.dtype.kind == "f" and value.shape in _row_shapes(value.size)
-        if not isinstance(value, np.ndarray) or not is_row or n_dimensions not in {0, value.size}:
-            beside = f" of {n_dimensions}" if n_dimensions else ""
+        if (
+            not isinstance(value, np.ndarray)
+            or not is_row
+            or (features is not None and value.size != features.shape[1])
+        ):
+            beside = "" if features is None else f" of {features.shape[1]}"
             raise PredictionError(
                 f"{where}: the feature of object {number} is {kind_of(value)}; expected a row{beside}"
             )
-        n_dimensions = value.size
+        if features is None:
+            try:
+                allowance.spend(4 * len(ids) * value.size)  # objects may share one row
+            except UnpackingError as error:
+                raise PredictionError(f"{where}: {error}") from error
+            features = np.zeros((len(ids), value.size), np.float32)
         with np.errstate(over="ignore", invalid="ignore"):
-            found[row] = value.reshape(-1).astype(np.float32)
-    features = np.zeros((len(ids), max(n_dimensions, 1)), np.float32)
-    for row, feature in found.items():
-        features[row] = feature
-    return features
+            features[row] = value.reshape(-1)
+    return np.zeros((len(ids), 1), np.float32) if features is None else features
 
 
 def _row_shapes(n: int) -> tuple[tuple[int, ...], ...]:

@@ -19,6 +19,7 @@ from su3d_bench.formats.arrays import checked_points, half_rows, kind_of
 from su3d_bench.formats.torch_zip import read_torch
 from su3d_bench.predictions.base import ScenePrediction, first_found, named_once
 from su3d_bench.predictions.mask_archives import TorchFiles
+from su3d_bench.store.unpacking import Allowance, UnpackingError
 
 MAP = "map.pt"
 N_COLOURS, N_COUNTS = 3, 1  # columns before and behind the features of a voxel
@@ -36,6 +37,8 @@ class RayFronts(TorchFiles):
         return f"it holds {MAP}" if _kept(path) else super().recognise(path)
 
     def scenes(self, path: Path) -> dict[str, Path]:
+        if not path.exists():
+            return {}
         kept = _kept(path)
         return dict(named_once([(file.absolute().parent.name, file) for file in kept], path)) or super().scenes(path)
 
@@ -43,7 +46,10 @@ class RayFronts(TorchFiles):
         where, value = shown(place), read_torch(place)
         if not isinstance(value, dict):
             raise PredictionError(f"{where}: holds {kind_of(value)}; expected a dict of RayFronts")
-        points, table = _columns(value, where)
+        try:
+            points, table = _columns(value, Allowance(place.stat().st_size), where)
+        except UnpackingError as error:
+            raise PredictionError(f"{where}: {error}") from error
         places = checked_points(points, where)
         if not isinstance(table, np.ndarray) or table.ndim != 2 or table.dtype.kind != "f" or not table.shape[1]:
             raise PredictionError(f"{where}: the features are {kind_of(table)}; expected a row a voxel or point")
@@ -64,7 +70,7 @@ def _kept(path: Path) -> list[Path]:
     return [file for file in first_found(path, [MAP, f"*/{MAP}", f"*/*/{MAP}"]) if file.is_file()]
 
 
-def _columns(value: Mapping[object, object], where: str) -> tuple[object, object]:
+def _columns(value: Mapping[object, object], allowance: Allowance, where: str) -> tuple[object, object]:
     """Places and features of a map in any of the three forms."""
     if "feats_feats" in value:
         return value.get("feats_xyz"), value["feats_feats"]
@@ -73,7 +79,8 @@ def _columns(value: Mapping[object, object], where: str) -> tuple[object, object
         has_columns = isinstance(table, np.ndarray) and table.ndim == 2
         return value.get("global_vox_xyz"), table[:, N_COLOURS:-N_COUNTS] if has_columns else table  # type: ignore[index]
     if "global_feat_pc" in value:
-        return _joined(value.get("global_xyz_pc"), where), _joined(value["global_feat_pc"], where)
+        places, features = value.get("global_xyz_pc"), value["global_feat_pc"]
+        return _joined(places, allowance, where), _joined(features, allowance, where)
     if "global_vox_occ" in value:
         raise PredictionError(f"{where}: holds which voxels are occupied and no features; save a semantic map")
     names = sorted(name for name in value if isinstance(name, str))
@@ -82,14 +89,15 @@ def _columns(value: Mapping[object, object], where: str) -> tuple[object, object
     )
 
 
-def _joined(value: object, where: str) -> NDArray[np.generic]:
+def _joined(value: object, allowance: Allowance, where: str) -> NDArray[np.generic]:
     """The clouds of a list as one."""
     clouds = value if isinstance(value, list | tuple) else []
     first = clouds[0] if clouds else None
     for cloud in clouds:
-        is_table = isinstance(cloud, np.ndarray) and cloud.ndim == 2 and isinstance(first, np.ndarray)
-        if not is_table or cloud.shape[1] != first.shape[1] or cloud.dtype.kind not in "fiu":
+        is_table = isinstance(cloud, np.ndarray) and cloud.ndim == 2 and cloud.dtype.kind in "fiu"
+        if not is_table or not isinstance(first, np.ndarray) or cloud.shape[1:] != first.shape[1:]:
             raise PredictionError(f"{where}: a cloud of the list is {kind_of(cloud)}; expected tables of one width")
     if not clouds:
         raise PredictionError(f"{where}: holds no cloud; expected a list of them")
+    allowance.spend(sum(cloud.nbytes for cloud in clouds))  # clouds may share what they hold
     return np.concatenate(clouds)

@@ -159,7 +159,7 @@ def write_esam(folder: Path, points: Any, groups: Any) -> None:
 def write_onlineanyseg(folder: Path, points: Any, masks: Any, features: Any = None) -> None:
     """Masks over the rebuilt points, class 0 and score 1 for each, its features in columns; and these points."""
     write_object(folder / "final.ply", points)
-    arrays = {"pred_masks": np.stack(masks, 1), "pred_score": np.ones(len(masks))}
+    arrays: dict[str, Any] = {"pred_masks": np.stack(masks, 1), "pred_score": np.ones(len(masks))}
     arrays |= {"pred_classes": np.zeros(len(masks), np.int32)}
     arrays |= {} if features is None else {"pred_sem_features": np.stack(features, 1)}
     np.savez(folder / "ckpt_final.npz", **arrays)

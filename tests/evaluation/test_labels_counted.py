@@ -1,0 +1,163 @@
+"""One label a mask or point, or the likeliest of several: told from the prediction, said of a number, never mixed."""
+
+from __future__ import annotations
+
+import doctest
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluated_text import CHAIR, TABLE, document, numbers, scene, write_truth
+from prediction_files import write_maskclustering, write_scannet_text
+
+from su3d_bench.analysis.leaderboard import leaderboard
+from su3d_bench.cli.main import main
+from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.maps import Instances, Masks
+from su3d_bench.metrics import labels
+from su3d_bench.metrics.fitness import ContentFacts, why_not_content
+from su3d_bench.metrics.labels import labels_counted, under_several_labels
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.reports.tables.model import label_count_notes
+
+ONE = scene([CHAIR, TABLE], [5, 7])
+PAIRS = scene([CHAIR, CHAIR, TABLE, TABLE], [5, 6, 7, 4], [0.9, 0.4, 0.8, 0.3])
+INSTANCE = load_protocol("scannet-instance")
+
+
+def evaluated(folder: Path, name: str, written: dict[str, Any], *more: str) -> None:
+    """A run ``name`` below ``folder`` of masks over the small scene."""
+    write_truth(folder / "gt")
+    write_scannet_text(folder / f"pred-{name}", written)
+    words = ["evaluate", str(folder / f"pred-{name}"), "--ground-truth", str(folder / "gt"), "--quiet"]
+    words += ["--protocols", *(more or ("scannet-instance",)), "--out", str(folder / "runs" / name), "--name", name]
+    assert main(words) == 0
+
+
+def test_examples_are_true() -> None:
+    assert doctest.testmod(labels).attempted >= 3 and doctest.testmod(labels).failed == 0
+
+
+def test_a_mask_counts_as_under_several_labels_only_with_another_label() -> None:
+    masks = Masks.of_sets([np.array(one) for one in ([0, 1], [0, 1], [0, 1, 2], [], [], [3], [3])])
+    found = under_several_labels(masks, [5, 6, 5, 1, 2, 8, 8])
+    assert found.tolist() == [True, True, False, False, False, False, False]
+
+
+@pytest.mark.parametrize(
+    ("name", "by_features", "are_several", "said"),
+    [
+        ("scannet-instance", False, False, "one label"),
+        ("scannet-instance", False, True, "the top labels of a mask"),
+        ("scannet-semantic", True, True, "one label"),
+        ("openlex3d-topn", True, False, "the top 5 labels"),
+        ("openlex3d-topn", False, False, "one label"),
+        ("openlex3d-ranking", True, False, None),
+        ("class-agnostic-open3dis", False, True, None),
+        ("query-ap", True, False, None),
+        ("rooms-retrieval", True, False, None),
+    ],
+)
+def test_each_kind_of_protocol_says_of_how_many_labels_its_number_is(
+    name: str, by_features: bool, are_several: bool, said: str | None
+) -> None:
+    assert labels_counted(load_protocol(name), by_features=by_features, are_several=are_several) == said
+
+
+def test_masks_under_several_labels_are_told_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_truth(tmp_path / "gt")
+    for written, expected in ((ONE, "one label"), (PAIRS, "the top labels of a mask")):
+        write_scannet_text(tmp_path / "pred", written)
+        assert numbers(tmp_path)["labels"] == expected
+        assert main(["evaluate", str(tmp_path / "pred"), "--ground-truth", str(tmp_path / "gt"), "--quiet"]) == 0
+        assert f"labels: {expected}" in capsys.readouterr().out
+    assert numbers(tmp_path, "class-agnostic-open3dis")["labels"] is None
+
+
+def test_a_mask_that_is_there_twice_by_chance_makes_no_top_labels(tmp_path: Path) -> None:
+    write_truth(tmp_path / "gt")
+    masks = [CHAIR, CHAIR, TABLE, np.arange(400, 500), np.arange(450, 600)]
+    write_scannet_text(tmp_path / "pred", scene(masks, [5, 6, 7, 5, 5]))
+    assert numbers(tmp_path)["labels"] == "one label"
+
+
+def test_a_ranking_has_numbers_of_as_many_labels_and_names_the_others(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, written in (("a", ONE), ("b", PAIRS), ("c", ONE)):
+        evaluated(tmp_path, name, written)
+    found = leaderboard(tmp_path / "runs")
+    assert [[one.run for one in board] for board in found.boards] == [["a", "c"]]
+    assert {one.labels for one in found.boards[0]} == {"one label"}
+    (refused,) = found.refused
+    assert (refused.run, refused.what) == ("b", "b / scannet-instance")
+    assert refused.reason == "is of the top labels of a mask, 2 of 3 entries are of one label"
+    capsys.readouterr()
+    assert main(["report", "leaderboard", str(tmp_path / "runs")]) == 0
+    shown = capsys.readouterr().out
+    assert "Labels: one label." in shown and "Left out: b, b / scannet-instance: is of the top labels" in shown
+
+
+def test_a_comparison_of_one_label_with_several_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, written in (("a", ONE), ("b", PAIRS)):
+        evaluated(tmp_path, name, written, "scannet-instance", "class-agnostic-open3dis")
+    capsys.readouterr()
+    runs = [str(tmp_path / "runs/a:a"), str(tmp_path / "runs/b:b")]
+    assert main(["compare", *runs, "--protocols", "scannet-instance"]) == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1
+    assert "scannet-instance is of one label and of the top labels of a mask; give both" in line
+    assert main(["compare", *runs, "--protocols", "class-agnostic-open3dis"]) == 0
+
+
+def test_a_run_that_does_not_say_is_told_by_its_rules_and_its_encoder(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        evaluated(tmp_path, name, ONE)
+    metrics = tmp_path / "runs/a/metrics.json"
+    value = json.loads(metrics.read_text())
+    for result in value["results"]:
+        del result["labels"]
+    metrics.write_text(json.dumps(value))
+    assert [[one.labels for one in board] for board in leaderboard(tmp_path / "runs").boards] == [["one label"] * 2]
+
+
+@pytest.mark.parametrize(("labels", "fits", "fails"), [("one", ONE, PAIRS), ("top-k", PAIRS, ONE)])
+def test_own_rules_may_take_one_of_the_two_alone(
+    tmp_path: Path, labels: str, fits: dict[str, Any], fails: dict[str, Any]
+) -> None:
+    rules = tmp_path / "mine.toml"
+    rules.write_text(f'extends = "scannet-instance"\nname = "mine"\nlabels = "{labels}"\n')
+    write_truth(tmp_path / "gt")
+    write_scannet_text(tmp_path / "pred", fits)
+    assert document(tmp_path, str(rules))["protocols"]["mine"]["metrics"]["ap"] is not None
+    write_scannet_text(tmp_path / "pred", fails)
+    with pytest.raises(PredictionError, match=r"mine: takes .* of a mask, and (the same masks|each mask)"):
+        document(tmp_path, str(rules))
+
+
+def test_labels_belong_to_masks_with_classes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for parent in ("scannet-semantic", "class-agnostic-open3dis"):
+        rules = tmp_path / "mine.toml"
+        rules.write_text(f'extends = "{parent}"\nname = "mine"\nlabels = "one"\n')
+        assert main(["protocols", "show", str(rules)]) == 2
+        assert "labels: belongs to kind 'instance', where masks have classes" in capsys.readouterr().err
+
+
+def test_archives_of_pairs_are_told_too(tmp_path: Path) -> None:
+    write_truth(tmp_path / "gt")
+    write_maskclustering(tmp_path / "pred", PAIRS)
+    assert numbers(tmp_path)["labels"] == "the top labels of a mask"
+
+
+def test_a_map_with_features_alone_gives_as_many_labels_as_are_asked() -> None:
+    points = np.zeros((4, 3), np.float32)
+    facts = ContentFacts.of(Instances.of(points, [[0, 1], [2]], features=np.ones((2, 4))))
+    assert not facts.are_several and why_not_content(INSTANCE, facts) is None
+
+
+def test_rows_of_other_numbers_of_labels_are_marked() -> None:
+    assert label_count_notes({"a": "one label", "b": "one label", "c": None}) == []
+    (line,) = label_count_notes({"a": "one label", "b": "the top 5 labels"})
+    assert line == "MIXED LABELS: one label (a); the top 5 labels (b): these numbers do not compare"
