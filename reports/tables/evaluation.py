@@ -78,7 +78,7 @@ def _context(scored: Mapping[str, Any]) -> Iterable[str]:
             f"identical ones {twice['identical']}; confidences {_confidences(scored)}"
         )
     if scored["labels"] is not None:
-        yield f"labels: {scored['labels']}"
+        yield f"of each mask or point counts: {scored['labels']}"
     if scored["contested_points"] is not None:
         yield f"points that several masks claim: {percent(scored['contested_points'])} % of those in masks"
     if scored["coverage"] is None:

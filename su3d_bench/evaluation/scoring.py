@@ -147,7 +147,7 @@ class Scoring:
         if facts.n and (rules.n_labels or 0) > 1:
             given = labels_counted(rules, by_features=encoder is not None)
             if kept.labels not in (None, given):
-                return f"gives {given} of a point, and {kept.labels} in the scenes before; give all scenes alike"
+                return f"gives {given} of a point, and {kept.labels} in the scenes before; give all alike"
             kept.labels = given
         kept.n_masks += facts.n
         kept.n_several += facts.n_several

@@ -1,4 +1,9 @@
-"""Masks over the scene's points in one archive a scene: MaskClustering, Mask3D, Open3DIS, Open-YOLO 3D, OpenIns3D."""
+"""Masks over the scene's points in one archive a scene: MaskClustering, Mask3D, Open3DIS, Open-YOLO 3D, OpenIns3D.
+
+Sources: PKU-EPIC/MaskClustering at commit eb2d41c, utils/post_process.py and semantics/open-voc_query.py;
+VinAIResearch/Open3DIS at 4b05043, generate_3d_inst.py and maskwise_vocab.py of tools; aminebdj/OpenYOLO3D at 24f344d,
+``predict`` of utils/__init__.py and the files of ``--path_to_3d_masks``.
+"""
 
 from __future__ import annotations
 
@@ -25,6 +30,8 @@ from su3d_bench.formats.numpy_files import npz_names, read_npz
 from su3d_bench.formats.torch_zip import Kind, SparseTensor, read_torch, torch_kind
 from su3d_bench.predictions.base import NO_SCORES, SceneFiles, ScenePrediction, VertexMasks, vertex_masks
 from su3d_bench.predictions.online.onlineanyseg import MASKS as ONLINE_MASKS
+
+ALL_ONES = "Open-YOLO 3D's own evaluator puts 1 for every score"
 
 
 class TorchFiles(SceneFiles):
@@ -85,7 +92,7 @@ class Open3dis(TorchFiles):
         where, value = shown(place), read_torch(place)
         if not isinstance(value, dict) or "ins" not in value:
             raise PredictionError(f"{where}: holds {kind_of(value)} without 'ins'; expected a dict of Open3DIS")
-        scores, classes = value.get("conf"), value.get("final_class")
+        scores, classes = _scores_of_classes(value.get("conf"), value.get("final_class")), value.get("final_class")
         n_known = next(
             (len(column) for column in (classes, scores) if isinstance(column, np.ndarray) and column.ndim == 1), None
         )
@@ -102,6 +109,20 @@ class Open3dis(TorchFiles):
             numbering="index",
         )
         return ScenePrediction(scene, self.name, place, masks, tuple(remarks))
+
+
+def _scores_of_classes(scores: object, classes: object) -> object:
+    """The score of the class of each mask, where maskwise_vocab.py has those of all classes, mask after mask."""
+    are_lists = all(isinstance(column, np.ndarray) and column.ndim == 1 for column in (scores, classes))
+    if not are_lists or not isinstance(scores, np.ndarray) or not isinstance(classes, np.ndarray) or not len(classes):
+        return scores
+    n_classes, rest = divmod(len(scores), len(classes))
+    is_place = classes.dtype.kind in "iu" and 0 <= int(classes.min()) <= int(classes.max()) < n_classes
+    return (
+        scores.reshape(-1, n_classes)[np.arange(len(classes)), classes]
+        if not rest and n_classes > 1 and is_place
+        else scores
+    )
 
 
 def _instances(value: object, n_known: int | None, where: str) -> tuple[list[Int32Array], int | None]:
@@ -135,20 +156,24 @@ def _masks_in_columns(matrix: NDArray[Any], n_known: int | None, where: str) -> 
 
 class OpenYolo3d(TorchFiles):
     name = "openyolo3d"
-    summary = "Open-YOLO 3D's proposals <scene>.pt: a pair of masks (points, masks) and scores, without classes"
+    summary = "Open-YOLO 3D's <scene>.pt: proposals, masks (points, masks) and scores, or masks, classes and scores"
     suffixes = (".pt",)
     kinds = ("tuple",)
     content = "a tuple"
 
     def read_scene(self, place: Path, scene: str) -> ScenePrediction:
         where, value = shown(place), read_torch(place)
-        if not isinstance(value, tuple | list) or len(value) != 2:
-            raise PredictionError(f"{where}: holds {kind_of(value)}; expected a pair of masks and scores")
+        if not isinstance(value, tuple | list) or len(value) not in (2, 3):
+            raise PredictionError(
+                f"{where}: holds {kind_of(value)}; expected masks and scores, or masks, classes and scores"
+            )
         matrix = matrix_of(value[0], where)
-        scores = scores_of(value[1], matrix.shape[1], where)
-        masks = vertex_masks(where, column_members(matrix, where), len(matrix), scores=scores)
-        remarks = ("proposals without classes", "Open-YOLO 3D's own evaluator puts 1 for every score")
-        return ScenePrediction(scene, self.name, place, masks, remarks)
+        scores = scores_of(value[-1], matrix.shape[1], where)
+        classes = classes_of(value[1], matrix.shape[1], where) if len(value) == 3 else None
+        members = column_members(matrix, where)
+        masks = vertex_masks(where, members, len(matrix), scores=scores, class_numbers=classes, numbering="index")
+        remarks = () if classes is not None else ("proposals without classes",)
+        return ScenePrediction(scene, self.name, place, masks, (*remarks, ALL_ONES))
 
 
 class OpenIns3d(TorchFiles):

@@ -5,22 +5,31 @@ from __future__ import annotations
 import doctest
 import json
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pytest
 from evaluated_text import CHAIR, TABLE, document, numbers, scene, write_truth
+from painted import WordEncoder
 from prediction_files import write_maskclustering, write_scannet_text
 
+import su3d_bench.evaluation.scoring
 from su3d_bench.analysis.leaderboard import leaderboard
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import Instances, Masks
+from su3d_bench.evaluation.request import Request
+from su3d_bench.evaluation.scoring import Scoring
 from su3d_bench.metrics import labels
 from su3d_bench.metrics.fitness import ContentFacts, why_not_content
 from su3d_bench.metrics.labels import labels_counted, under_several_labels
 from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.predictions.base import ScenePrediction
 from su3d_bench.reports.tables.model import label_count_notes
+
+if TYPE_CHECKING:
+    from su3d_bench.evaluation.truth import SceneTruths
 
 ONE = scene([CHAIR, TABLE], [5, 7])
 PAIRS = scene([CHAIR, CHAIR, TABLE, TABLE], [5, 6, 7, 4], [0.9, 0.4, 0.8, 0.3])
@@ -72,7 +81,7 @@ def test_masks_under_several_labels_are_told_and_said(tmp_path: Path, capsys: py
         write_scannet_text(tmp_path / "pred", written)
         assert numbers(tmp_path)["labels"] == expected
         assert main(["evaluate", str(tmp_path / "pred"), "--ground-truth", str(tmp_path / "gt"), "--quiet"]) == 0
-        assert f"labels: {expected}" in capsys.readouterr().out
+        assert f"of each mask or point counts: {expected}" in capsys.readouterr().out
     assert numbers(tmp_path, "class-agnostic-open3dis")["labels"] is None
 
 
@@ -149,6 +158,24 @@ def test_archives_of_pairs_are_told_too(tmp_path: Path) -> None:
     write_truth(tmp_path / "gt")
     write_maskclustering(tmp_path / "pred", PAIRS)
     assert numbers(tmp_path)["labels"] == "the top labels of a mask"
+
+
+def test_scenes_with_one_label_beside_scenes_with_five_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    rules = load_protocol("openlex3d-topn")
+    scoring = Scoring(Request(()))
+    scoring._truths = cast("SceneTruths", SimpleNamespace(has_points=True))
+    scoring.tally.enter(rules)
+    monkeypatch.setattr(scoring, "_score_content", lambda *_: None)
+    monkeypatch.setattr(su3d_bench.evaluation.scoring, "encoder_for", lambda *_, **__: WordEncoder())
+    points = np.zeros((4, 3), np.float32)
+    ranked = Instances.of(points, [[0, 1], [2]], features=np.ones((2, 4)))
+    named = Instances.of(points, [[0, 1], [2]], labels=["chair", "lamp"], features=np.ones((2, 4)))
+
+    def scored(name: str, content: Instances) -> str | None:
+        return scoring._score(rules, name, ScenePrediction(name, "x", Path("x"), content), ContentFacts.of(content))
+
+    assert [scored("a", ranked), scored("b", ranked)] == [None, None]
+    assert scored("c", named) == "gives one label of a point, and the top 5 labels in the scenes before; give all alike"
 
 
 def test_a_map_with_features_alone_gives_as_many_labels_as_are_asked() -> None:

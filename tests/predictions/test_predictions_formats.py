@@ -26,6 +26,7 @@ from prediction_files import (
     write_openins3d,
     write_openmask3d,
     write_openyolo3d,
+    write_openyolo3d_labelled,
     write_sam3d,
     write_sam3d_colours,
     write_scannet_text,
@@ -209,6 +210,21 @@ def test_open3dis_tensors_have_masks_in_rows_unless_the_scores_say_otherwise(tmp
         tmp_path / "alone.pth", b"}(" + torch_text("ins") + alone.tensor(TOY["masks"]) + torch_text("conf") + b"Nu"
     )
     assert_masks(masks_of(read(tmp_path, "alone")), TOY["masks"])
+
+
+def test_labelled_masks_of_openyolo3d_are_told_from_its_proposals(tmp_path: Path) -> None:
+    write_openyolo3d_labelled(tmp_path, TOY)
+    prediction = read(tmp_path, TOY["name"])
+    assert prediction.format == "openyolo3d" and masks_of(prediction).numbering == "index"
+    assert_masks(masks_of(prediction), TOY["masks"], TOY["labels"], TOY["scores"].astype(np.float32))
+    assert prediction.remarks == ("Open-YOLO 3D's own evaluator puts 1 for every score",)
+
+
+def test_scores_of_all_classes_that_open3dis_leaves_are_those_of_the_masks_own(tmp_path: Path) -> None:
+    table = np.random.default_rng(2).random((3, 50))
+    write_open3dis(tmp_path, TOY | {"scores": table.ravel()})
+    own = table[np.arange(3), TOY["labels"]]
+    assert_masks(masks_of(read(tmp_path, TOY["name"])), TOY["masks"], TOY["labels"], own)
 
 
 @pytest.mark.parametrize("form", ["text", "list", "array"])

@@ -74,13 +74,10 @@ def _features(objects: Mapping[object, object], ids: Int64Array, allowance: Allo
         value = objects.get(f"ins3d_{number}_clip_feature")
         if value is None:
             continue
+        n = None if features is None else features.shape[1]
         is_row = isinstance(value, np.ndarray) and value.dtype.kind == "f" and value.shape in _row_shapes(value.size)
-        if (
-            not isinstance(value, np.ndarray)
-            or not is_row
-            or (features is not None and value.size != features.shape[1])
-        ):
-            beside = "" if features is None else f" of {features.shape[1]}"
+        if not isinstance(value, np.ndarray) or not is_row or n not in (None, value.size):
+            beside = "" if n is None else f" of {n}"
             raise PredictionError(
                 f"{where}: the feature of object {number} is {kind_of(value)}; expected a row{beside}"
             )

@@ -190,8 +190,8 @@ def test_a_rule_that_a_file_leaves_out_asks_for_nothing() -> None:
         "candidates": "object-points", "neighbours": 1, "cap_m": None, "evaluation_voxel_m": 0.0,
     }  # fmt: skip
     assert {key: value for key, value in rules.items() if key not in said} == {
-        "by_default": True, "class_agnostic": None, "void": None, "labels": None, "stuff": (), "ignore": (), "ignore_rule": "exact",
-        "prompts": (), "prompt_names": {}, "encoder": None, "min_region_size": None, "thresholds": (),
+        "by_default": True, "class_agnostic": None, "void": None, "labels": None, "stuff": (), "ignore": (),
+        "ignore_rule": "exact", "prompts": (), "prompt_names": {}, "encoder": None, "min_region_size": None, "thresholds": (),
         "confidence": None, "top_k": None, "questions": None, "per_kind": None, "synonyms": None, "merging": None,
         "answers": None, "box_axes": None, "presence": None, "aggregate": "pooled", "not_comparable_with": (),
     }  # fmt: skip

@@ -178,6 +178,14 @@ def write_openyolo3d(folder: Path, scene: dict[str, Any]) -> None:
     file.write(folder / f"{scene['name']}.pt", pickled)
 
 
+def write_openyolo3d_labelled(folder: Path, scene: dict[str, Any]) -> None:
+    """What predict of Open-YOLO 3D gives of a scene: masks, positions of their classes and scores."""
+    folder.mkdir(parents=True, exist_ok=True)
+    file = TorchFile()
+    columns = (scene["masks"].T, scene["labels"].astype(np.int64), scene["scores"].astype(np.float32))
+    file.write(folder / f"{scene['name']}.pt", b"".join(map(file.tensor, columns)) + b"\x87")
+
+
 def write_openins3d(folder: Path, scene: dict[str, Any]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     file = TorchFile()
