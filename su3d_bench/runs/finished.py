@@ -175,7 +175,9 @@ class FinishedRun:
 
     def labels(self, method: str, protocol: str, rules: ProtocolRules) -> str | None:
         """How many labels of a mask or point a result is of, see ``labels_counted``; None where no label counts."""
-        record = self.results[method, protocol]
+        record = self.results.get((method, protocol))
+        if record is None:
+            return None
         return record.labels or labels_counted(rules, by_features=record.encoder is not None)
 
     def rules(self, protocol: str, *, to_the_letter: bool = False) -> ProtocolRules:

@@ -174,7 +174,7 @@ def pickled(kind: str) -> bytes:
         ("open3dis", "overlap", "run of 1 points from 3 on"),
         ("open3dis", "huge", "the runs are no numbers"),
         ("openyolo3d", "pair", "the masks are 1; expected a matrix"),
-        ("openyolo3d", "many", "holds a tuple; expected a pair"),
+        ("openyolo3d", "many", "holds a tuple; expected masks and scores, or"),
         ("openins3d", "text", "expected a sparse tensor"),
         ("openmask3d", "text", "the masks are a str; expected a matrix"),
         ("sam3d", "text", "expected one group number a point"),
