@@ -5,14 +5,14 @@ Each ``why_not_...`` gives the reason as a clause without the protocol's name, N
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.maps import Instances, Partition, Prediction
-from su3d_bench.metrics.labels import LEAST_SEVERAL
+from su3d_bench.metrics.labels import LEAST_SEVERAL, under_several_labels
 from su3d_bench.metrics.matching.labelling import has_every_label
 from su3d_bench.metrics.open_vocabulary.score import NEEDS_FEATURES
 from su3d_bench.metrics.protocols.model import ProtocolRules
@@ -135,7 +135,10 @@ def why_not_content(rules: ProtocolRules, content: ContentFacts, *, has_points: 
 
 def why_not_scorable(rules: ProtocolRules, prediction: Prediction) -> str | None:
     """A sentence where this kind of prediction cannot be scored under the protocol at all."""
-    reason = why_not_map(rules, ContentFacts.of(prediction))
+    facts = ContentFacts.of(prediction)
+    if rules.labels is not None and isinstance(prediction, Instances) and prediction.labels is not None:
+        facts = replace(facts, n_several=int(under_several_labels(prediction, prediction.labels).sum()))
+    reason = why_not_map(rules, facts)
     return f"{rules.name}: {reason}" if reason else None
 
 
@@ -143,6 +146,8 @@ def why_not_map(rules: ProtocolRules, content: ContentFacts) -> str | None:
     """Why a map with points of its own cannot be scored under a protocol at all."""
     if not rules.takes_dense and content.form == "dense":
         return "needs instances, and the method gives one feature a point"
+    if (reason := _why_not_labels(rules, content)) is not None:
+        return reason
     if rules.goes_by_names:
         if content.form != "instances":
             return "needs instances with names, and the method gives a partition"
@@ -150,13 +155,20 @@ def why_not_map(rules: ProtocolRules, content: ContentFacts) -> str | None:
     return NEEDS_FEATURES if rules.compares_texts and content.n_dimensions is None and content.n else None
 
 
+def _why_not_labels(rules: ProtocolRules, content: ContentFacts) -> str | None:
+    """Why masks with one label or several cannot be scored where a protocol takes the other alone."""
+    if rules.labels is None or not content.n or content.are_several == (rules.labels == "top-k"):
+        return None
+    given = "the same masks stand there under several" if content.are_several else "each mask has one"
+    return f"takes {'one label' if rules.labels == 'one' else 'the top labels'} of a mask, and {given}"
+
+
 def _why_not_named(rules: ProtocolRules, content: ContentFacts) -> str | None:
     """Why masks cannot get the classes that a protocol of classes asks for."""
     if rules.class_agnostic is not None or (rules.needs_own_points and not rules.vocabulary) or not content.n:
         return None
-    if rules.labels is not None and content.are_several != (rules.labels == "top-k"):
-        given = "the same masks stand there under several" if content.are_several else "each mask has one"
-        return f"takes {'one label' if rules.labels == 'one' else 'the top labels'} of a mask, and {given}"
+    if content.form == "vertex-masks" and (reason := _why_not_labels(rules, content)) is not None:
+        return reason
     if not content.has_labels and content.n_dimensions is None:
         is_map = content.has_own_points
         what = "the instances have neither labels" if is_map else "the masks have neither classes"

@@ -22,7 +22,7 @@ from su3d_bench.core.maps import Instances, Masks
 from su3d_bench.evaluation.request import Request
 from su3d_bench.evaluation.scoring import Scoring
 from su3d_bench.metrics import labels
-from su3d_bench.metrics.fitness import ContentFacts, why_not_content
+from su3d_bench.metrics.fitness import ContentFacts, why_not_content, why_not_scorable
 from su3d_bench.metrics.labels import labels_counted, under_several_labels
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.predictions.base import ScenePrediction
@@ -182,6 +182,18 @@ def test_a_map_with_features_alone_gives_as_many_labels_as_are_asked() -> None:
     points = np.zeros((4, 3), np.float32)
     facts = ContentFacts.of(Instances.of(points, [[0, 1], [2]], features=np.ones((2, 4))))
     assert not facts.are_several and why_not_content(INSTANCE, facts) is None
+
+
+def test_maps_of_runs_are_held_against_rules_that_take_one_of_the_two() -> None:
+    masks, points = [[0, 1], [0, 1], [2]], np.zeros((4, 3), np.float32)
+    one = Instances.of(points, masks, labels=["chair", "chair", "lamp"])
+    several = Instances.of(points, masks[:2], labels=["chair", "stool"])
+    nothing = Instances.of(points, [], labels=[])
+    takes = {labels: INSTANCE.model_copy(update={"labels": labels}) for labels in ("one", "top-k")}
+    for rules, fits, fails in ((takes["one"], one, several), (takes["top-k"], several, one)):
+        assert why_not_scorable(rules, fits) is None and why_not_scorable(rules, nothing) is None
+        assert str(why_not_scorable(rules, fails)).startswith("scannet-instance: takes ")
+    assert why_not_scorable(INSTANCE, one) is None and why_not_scorable(INSTANCE, several) is None
 
 
 def test_rows_of_other_numbers_of_labels_are_marked() -> None:
