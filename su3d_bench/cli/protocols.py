@@ -53,6 +53,7 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
+    from su3d_bench.metrics.labels import labels_taken
     from su3d_bench.metrics.protocols.files import protocol_names, rules_files
     from su3d_bench.metrics.protocols.loading import load_protocol
 
@@ -74,7 +75,7 @@ def call(arguments: argparse.Namespace) -> int:
         rules = load_protocol(arguments.name)
         if arguments.names:
             return _answer_names(arguments, rules)
-        value = rules.model_dump(mode="json") | {"digest": rules.digest}
+        value = rules.model_dump(mode="json") | {"digest": rules.digest, "labels_taken": labels_taken(rules)}
         answer_either(arguments, value, *_rules_lines(rules, rules_files(arguments.name)))
         return EXIT_DONE
     rows = [load_protocol(name) for name in protocol_names()]
@@ -127,6 +128,7 @@ def _answer_names(arguments: argparse.Namespace, rules: ProtocolRules) -> int:
 def _rules_lines(rules: ProtocolRules, files: Sequence[Path]) -> list[str]:
     """Every rule as a line, beneath it what the file that sets it says of it: its source, or that it is ours."""
     from su3d_bench.core.config import flatten, toml_value
+    from su3d_bench.metrics.labels import labels_taken
     from su3d_bench.metrics.protocols.files import HEADING, remarks_of
     from su3d_bench.metrics.protocols.loading import not_comparable_with
 
@@ -138,6 +140,7 @@ def _rules_lines(rules: ProtocolRules, files: Sequence[Path]) -> list[str]:
         lines.append(f"{key:<28} {'none' if value is None else toml_value(value)}")
         lines += [f"    {remark}" for remark in remarks.pop(key, [])]
     lines += [f"    {remark}" for key in remarks if key != "classes" for remark in remarks[key]]
+    lines.append(f"{'labels taken':<28} {labels_taken(rules)}")
     lines.append(f"{'digest':<28} {rules.digest}")
     if rules.classes:
         lines += ["", f"{len(rules.scored)} of {len(rules.classes)} classes are scored (id, name, group):"]

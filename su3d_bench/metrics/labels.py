@@ -38,6 +38,25 @@ def labels_counted(rules: ProtocolRules, *, by_features: bool, are_several: bool
     return SEVERAL if are_several and rules.names_masks else ONE
 
 
+def labels_taken(rules: ProtocolRules) -> str:
+    """Which of the two a protocol takes, as a clause.
+
+    >>> from su3d_bench.metrics.protocols.loading import load_protocol
+    >>> labels_taken(load_protocol("scannet-instance"))
+    'one label of a mask, or the top ones; never both in a ranking'
+    """
+    if rules.n_labels is None:
+        return "no label counts"
+    if rules.n_labels > 1:
+        return (
+            f"the top {rules.n_labels} labels of features, or one label each; never both in a prediction or a ranking"
+        )
+    if not rules.names_masks:
+        return "one label"
+    only = {"one": "one label of a mask", "top-k": "the top labels of a mask"}
+    return only[rules.labels] if rules.labels else "one label of a mask, or the top ones; never both in a ranking"
+
+
 def under_several_labels(masks: Masks, labels: Sequence[str | int]) -> BoolArray:
     """Whether the same points stand there under another label too, of each mask; empty masks do not.
 

@@ -75,6 +75,22 @@ def test_each_kind_of_protocol_says_of_how_many_labels_its_number_is(
     assert labels_counted(load_protocol(name), by_features=by_features, are_several=are_several) == said
 
 
+@pytest.mark.parametrize(
+    ("name", "taken"),
+    [
+        ("scannet-instance", "one label of a mask, or the top ones; never both in a ranking"),
+        ("openlex3d-topn", "the top 5 labels of features, or one label each; never both in a prediction or a ranking"),
+        ("scannet-semantic", "one label"),
+        ("class-agnostic-open3dis", "no label counts"),
+    ],
+)
+def test_a_protocol_says_which_it_takes(name: str, taken: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["protocols", "show", name]) == 0
+    assert f"labels taken                 {taken}\n" in capsys.readouterr().out
+    assert main(["protocols", "show", name, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["labels_taken"] == taken
+
+
 def test_masks_under_several_labels_are_told_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_truth(tmp_path / "gt")
     for written, expected in ((ONE, "one label"), (PAIRS, "the top labels of a mask")):
