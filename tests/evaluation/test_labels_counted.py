@@ -135,6 +135,19 @@ def test_a_comparison_of_one_label_with_several_is_refused(tmp_path: Path, capsy
     assert line.count("\n") == 1
     assert "scannet-instance is of one label and of the top labels of a mask; give both" in line
     assert main(["compare", *runs, "--protocols", "class-agnostic-open3dis"]) == 0
+    capsys.readouterr()
+    assert main(["report", "tables", str(tmp_path / "runs/a"), str(tmp_path / "runs/b")]) == 2
+    assert "is of one label and of the top labels of a mask" in capsys.readouterr().err
+
+
+def test_methods_of_one_run_that_differ_are_marked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_truth(tmp_path / "gt")
+    for name, written in (("a", ONE), ("b", PAIRS)):
+        write_scannet_text(tmp_path / name, written)
+    words = ["evaluate", "--name", *(f"{name}={tmp_path / name}" for name in "ab"), "--quiet"]
+    assert main([*words, "--ground-truth", str(tmp_path / "gt"), "--protocols", "scannet-instance"]) == 0
+    shown = capsys.readouterr().out
+    assert "MIXED LABELS: one label (a); the top labels of a mask (b): these numbers do not compare" in shown
 
 
 def test_a_run_that_does_not_say_is_told_by_its_rules_and_its_encoder(tmp_path: Path) -> None:
