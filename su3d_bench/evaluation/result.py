@@ -223,7 +223,8 @@ def _form(rules: ProtocolRules, kept: SceneOutcomes, file_confidences: bool) -> 
         ceilings=ceilings,
         unscored=kept.unscored,
         encoder=kept.encoder,
-        labels=labels_counted(
+        labels=kept.labels
+        or labels_counted(
             rules,
             by_features=kept.encoder is not None,
             are_several=kept.n_masks > 0 and kept.n_several >= LEAST_SEVERAL * kept.n_masks,
