@@ -22,8 +22,10 @@ from painted_runs import COLLECTOR, painted_page, painted_run
 from su3d_bench.analysis.page import instances as page_instances
 from su3d_bench.analysis.page import maps as page_maps
 from su3d_bench.analysis.page.instances import MOST_STEPS, Growth
+from su3d_bench.analysis.page.truths import same_objects
 from su3d_bench.cli.main import main
-from su3d_bench.core.maps import DenseFeatures, Instances
+from su3d_bench.core.maps import DenseFeatures, Instances, Masks
+from su3d_bench.core.types import GroundTruth, LabelSet
 from su3d_bench.reports.page import maps as html_map
 from su3d_bench.reports.page import numbers as html_data
 from su3d_bench.reports.page import page as html_page
@@ -211,9 +213,33 @@ def test_the_truth_beside_a_map_names_its_objects_and_those_that_the_map_misses(
     assert (planes["owner"] == nearest_instance - 1).mean() > 0.99
     assert np.array_equal(planes["owner"], planes["class"])  # one object a class, in the order of the classes
     about, _ = unpacked(found.content["map-0"])
-    assert about["beside"] == {"truth": 0, "protocol": "rooms-instance", "counted": [0, 1, 2], "missed": [0]}
+    assert about["beside"] == {
+        "truth": 0, "objects": 4, "protocol": "rooms-instance", "counted": [0, 1, 2], "missed": [0],
+    }  # fmt: skip
+    named = {one["name"]: one["object"] for one in about["instances"]}
+    assert named == {name: {"place": k, "name": name} for k, name in ((1, "sofa"), (2, "table"), (3, "wall"))}
     untouched, _ = unpacked(found.content["map-2"])
     assert untouched["beside"]["missed"] == []
+
+
+def test_a_mask_is_an_object_of_the_truth_where_they_share_more_than_half() -> None:
+    labels = LabelSet("painted", (5, 9), ("chair", "lamp"))
+    instance = np.repeat([0, 40, 7], 10).astype(np.int32)
+    semantic = np.repeat([0, 9, 5], 10).astype(np.int32)
+    truth = GroundTruth(np.zeros((30, 3), np.float32), semantic, instance, labels, "mesh-vertices", "by hand")
+    lump, half, most, twice, nothing = (np.arange(a, b) for a, b in ((10, 30), (10, 15), (9, 20), (20, 26), (0, 0)))
+    found = same_objects(truth, Masks.of_sets([lump, half, most, twice, np.arange(20, 30), nothing]))
+    lamp, chair = {"place": 1, "name": "lamp"}, {"place": 0, "name": "chair"}
+    assert found == {2: lamp, 3: chair, 4: chair}  # half is not more than half
+
+
+def test_a_run_without_masks_to_score_knows_the_objects_of_its_truth_too(tmp_path: Path) -> None:
+    run = painted_run(tmp_path / "run", "--protocols", "rooms-semantic")
+    about, _ = unpacked(elements(painted_page(run, tmp_path / "page.html", "--no-errors")).content["map-0"])
+    assert about["beside"] == {"truth": 0, "objects": 4}
+    assert {one["name"]: one["object"]["place"] for one in about["instances"]} == {
+        "chair": 0, "sofa": 1, "table": 2, "wall": 3,
+    }  # fmt: skip
 
 
 def test_missed_objects_are_as_many_as_the_errors_of_that_name(run: Path, page: str) -> None:

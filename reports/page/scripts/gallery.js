@@ -128,7 +128,7 @@ function galleryContent(section) {
       photos.set(one.scene, one.photos);
       for (const { cards: own, ...of } of one.of_methods) {
         all.push(...own.map((card) => ({ ...card, scene: one.scene, run: of.run, method: of.method,
-          protocol: of.protocol, metrics: of.metrics, family: of.kind })));
+          protocol: of.protocol, metrics: of.metrics, family: of.kind, truth: of.truth })));
       }
     }
     chosen.listeners.push(refresh);
@@ -156,12 +156,14 @@ function cardOf(one, metric, photos) {
   }
   if (one.ids.length) fact(one.ids.length > 1 ? 'Instances' : 'Instance', one.ids.join(', '));
   fact('Costs', one.metrics.map((name, k) => `${name} ${costText(one.gains[k])}`).join(', '));
-  const alt = `Frame ${one.frame} of ${one.scene}: ${cardTitle(one)}`;
+  const alt = `Frame ${one.frame} of ${one.scene}: ${cardTitle(one)}`, link = linkToError(one);
   const photo = one.photo === null ? h('p', { class: 'no-photo' }, `No photo: ${one.why}`)
     : h('figure', null, h('img', { src: `data:image/jpeg;base64,${photos[one.photo]}`, alt, width: 256, height: 192 }),
       h('figcaption', null, `frame ${one.frame}`));
   return h('li', { class: 'card' }, photo,
     h('p', { class: 'cost' }, h('b', null, costText(one.cost)), ` ${metric}`,
       h('span', { class: 'mark', title: about }, one.kind)),
-    h('h3', null, cardTitle(one)), h('dl', null, facts));
+    h('h3', null, cardTitle(one)), h('dl', null, facts), link
+      ? h('a', { class: 'to-map', href: link, 'aria-label': `See it in the map: ${cardTitle(one)}` }, 'See it in the map')
+      : null);
 }

@@ -35,15 +35,18 @@ NOT_AMONG = "only the worst errors of a scene have one"
 class Card:
     """One error. ``gains``: by how much each metric rises when it alone is put right, as fractions, None for no number.
 
-    ``true`` and ``called`` are names of classes, ``ids`` the instances as the method numbers them, ``n_points`` and
-    ``n_true`` points of the masks, or wrong ones, and of the true object. ``photo`` is a place in the scene's photos
-    and ``frame`` what it was taken from; ``why`` says why there is none.
+    ``true`` and ``called`` are names of classes, ``ids`` the instances as the method numbers them, ``rows`` where they
+    stand in its map, ``objects`` the truth's instances by their numbers, ``n_points`` and ``n_true`` points of the
+    masks, or wrong ones, and of the true object. ``photo`` is a place in the scene's photos and ``frame`` what it was
+    taken from; ``why`` says why there is none.
     """
 
     kind: str
     true: tuple[str, ...]
     called: tuple[str, ...]
     ids: tuple[int, ...]
+    rows: tuple[int, ...]
+    objects: tuple[int, ...]
     score: float | None
     iou: float | None
     n_points: int
@@ -56,12 +59,16 @@ class Card:
 
 @dataclass(frozen=True)
 class Cards:
-    """The ``n`` errors of a scene under a method and a protocol; ``cards`` are the dearest, those that are told."""
+    """The ``n`` errors of a scene under a method and a protocol; ``cards`` are the dearest, those that are told.
+
+    ``truth``: which of the scene's truths numbers the objects.
+    """
 
     run: int
     method: str
     protocol: str
     kind: str
+    truth: str
     metrics: tuple[str, ...]
     n: int
     cards: tuple[Card, ...]
@@ -139,9 +146,9 @@ class GalleryOfScene:
             metrics = explained.headline(protocol)
             ids = explained.instance_ids(self._scene)
             cards = tuple(_card(error, scene, metrics, ids) for error in errors)
-            kind = explained.run.rules(protocol).kind
+            rules, method = explained.run.rules(protocol), printable(explained.method, 200)
             of = len(self._cards)
-            self._cards.append(Cards(index, printable(explained.method, 200), protocol, kind, metrics, n, cards))
+            self._cards.append(Cards(index, method, protocol, rules.kind, rules.ground_truth, metrics, n, cards))
             points = scene.points
             self._shown.append(
                 [
@@ -179,11 +186,14 @@ def _card(error: SingleError, scene: LookedAt, metrics: Sequence[str], ids: Sequ
         return tuple(printable(scene.class_name(one), MOST_TEXT) for one in classes[:MOST_NAMES])
 
     gains = (error.gains[name] for name in metrics)
+    numbers = (int(scene.instance[points[0]]) for points in error.truth[:MOST_NAMES] if len(points))
     return Card(
         kind=error.kind,
         true=names(error.true),
         called=names(error.called),
         ids=tuple(ids[k] if k < len(ids) else k for k in error.masks[:MOST_NAMES]),
+        rows=tuple(error.masks[:MOST_NAMES]),
+        objects=tuple(number for number in numbers if number > 0),
         score=None if error.score is None else round(error.score, 4),
         iou=None if error.iou is None else round(error.iou, 3),
         n_points=sum(map(len, error.predicted)),

@@ -35,7 +35,7 @@ from su3d_bench.store.unfinished import is_unfinished
 FOLDER = Path(".cache", "page")
 MOST_BYTES = 1 << 28  # of a piece; one of a scene under fifty methods has a tenth of it
 MOST_OF_EACH = 3  # of one scene's pieces made from different things, such as other --queries
-FORMAT = 2  # moves every key: raise it when the form of a piece changes
+FORMAT = 3  # moves every key: raise it when the form of a piece changes
 
 
 @dataclass(frozen=True)

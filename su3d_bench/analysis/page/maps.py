@@ -16,7 +16,15 @@ import numpy as np
 from su3d_bench.analysis.inputs import Inputs
 from su3d_bench.analysis.page.instances import Growth, fed_frames, frames_of, growth_of, instance_data
 from su3d_bench.analysis.page.scene_data import MOST_LOOKED_AT, SKETCH_WIDTH, SceneData
-from su3d_bench.analysis.page.truths import Seen, ShownTruths, judged_objects, why_not_shown
+from su3d_bench.analysis.page.truths import (
+    Beside,
+    Seen,
+    ShownTruths,
+    instances_of,
+    judged_objects,
+    same_objects,
+    why_not_shown,
+)
 from su3d_bench.core.errors import ConfigError, Su3dError, printable, printable_json
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
@@ -29,7 +37,7 @@ from su3d_bench.metrics.matching.labelling import (
     cosines,
     scored_classes,
 )
-from su3d_bench.metrics.matching.nearest import Candidates, nearest
+from su3d_bench.metrics.matching.nearest import Candidates, masks_of, nearest, transfer_masks
 from su3d_bench.metrics.metric import n_predictions, present
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.score import has_feature
@@ -64,17 +72,22 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True)
 class PageMap:
-    """A map as the page holds it; ``content`` is empty and ``reason`` says why where it cannot be shown."""
+    """A map as the page holds it; ``content`` is empty and ``reason`` says why where it cannot be shown.
+
+    ``truth``: which of the scene's truths stands beside it, None where none does.
+    """
 
     run: int
     scene: str
     method: str
     content: str
     reason: str | None
+    truth: str | None = None
 
     def listed(self) -> dict[str, Any]:
         """What the page's list of maps says of it."""
-        return {"run": self.run, "scene": self.scene, "method": self.method, "reason": self.reason}
+        about = {"run": self.run, "scene": self.scene, "method": self.method, "reason": self.reason}
+        return about | {"truth": self.truth}
 
 
 @dataclass(frozen=True)
@@ -187,11 +200,13 @@ class _Scene:
             tell(f"map of {printable(method, 60)}")
             prediction = read[index, method]
             reason = prediction if isinstance(prediction, str) else None
-            content = ""
+            content, truth = "", None
             if not isinstance(prediction, str):
                 growth = growth_of(run, scene, method)
-                content = self._pack((index, method), run, prediction, clouds[index, method], frames, seen, growth)
-            made.append(PageMap(index, printable(scene, 200), printable(method, 200), content, reason))
+                beside = self._beside((index, method), run, prediction)
+                truth = None if beside is None else beside.variant
+                content = self._pack(run, prediction, clouds[index, method], frames, seen, growth, beside)
+            made.append(PageMap(index, printable(scene, 200), printable(method, 200), content, reason, truth))
         thumbnails = tuple((index, _jpeg(frame)) for index, frame in frames.items())
         remarks = tuple(printable(line) for line in dict.fromkeys(self._remarks))
         truths = tuple(self._shown_truths.packed(most_points, seen))
@@ -260,8 +275,8 @@ class _Scene:
         """The frames that are shown: as few as can be that show every instance, from those that the maps name."""
         return frame_cover([frames_of(a_map, k) for a_map in maps for k in range(len(a_map))], THUMBNAILS)
 
-    def _beside(self, job: tuple[int, str], run: FinishedRun, prediction: Prediction) -> dict[str, Any] | None:
-        """The truth that stands beside a map, by its place among those of the scene, and which of it the map misses.
+    def _beside(self, job: tuple[int, str], run: FinishedRun, prediction: Prediction) -> Beside | None:
+        """The truth that stands beside a map, and which of it the map misses.
 
         It is that of the first protocol of instances, else that in whose classes the map is shown.
         """
@@ -271,19 +286,25 @@ class _Scene:
         truth = None if rules is None else self._truth(rules)
         if rules is None or truth is None or not len(truth.points):
             return None
-        place = self._shown_truths.place(truth)
+        about = {"truth": self._shown_truths.place(truth), "objects": len(instances_of(truth))}
+        variant = rules.ground_truth
         if judging is None:
-            return {"truth": place}
+            if isinstance(prediction, DenseFeatures):
+                return Beside(variant, about, {})
+            cap_m, voxel_m = rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
+            moved = transfer_masks(prediction.points, masks_of(prediction), truth.points, cap_m, voxel_m)
+            return Beside(variant, about, same_objects(truth, moved))
 
-        def judged_by(rules: ProtocolRules) -> dict[str, list[int]]:
+        def judged_by(rules: ProtocolRules) -> tuple[dict[str, Any], Mapping[int, Mapping[str, Any]]]:
             seen = self._looked_at.get(job, {}).get(rules.name)
             if not isinstance(seen, SceneOfMasks):
                 rules = Inputs(run, job[1]).rules(rules)
                 seen = SceneOfMasks(rules, truth, prediction, self._spaces.naming(run, prediction))
-            return judged_objects(truth, seen.overlaps)
+            same = same_objects(truth, seen.overlaps.predicted.masks)
+            return {"protocol": rules.name, **judged_objects(truth, seen.overlaps)}, same
 
-        judged = self._had("no missed objects", partial(judged_by, judging))
-        return {"truth": place} if judged is None else {"truth": place, "protocol": judging.name, **judged}
+        judged, same = self._had("no missed objects", partial(judged_by, judging)) or ({}, {})
+        return Beside(variant, about | judged, same)
 
     def _truth(self, rules: ProtocolRules) -> GroundTruth | None:
         if self._dataset is None:
@@ -292,13 +313,13 @@ class _Scene:
 
     def _pack(
         self,
-        job: tuple[int, str],
         run: FinishedRun,
         prediction: Prediction,
         cloud: Cloud,
         frames: Mapping[int, Frame],
         seen: Seen | None,
         growth: Growth | None,
+        beside: Beside | None,
     ) -> str:
         rules = shown_rules(run)
         truth = None if rules is None else self._truth(rules)
@@ -308,7 +329,7 @@ class _Scene:
             planes["colour"] = colour_plane(colours)
         about: dict[str, Any] = {"protocol": None, "classes": [], "class_colours": [], "instances": [], "queries": []}
         classes: Int64Array | None = None
-        about["beside"] = self._beside(job, run, prediction)
+        about["beside"] = None if beside is None else beside.about
         if rules is not None:
             names = [entry.name for entry in rules.classes]
             tints = class_colours(names)
@@ -329,6 +350,8 @@ class _Scene:
             about["instances"] = [
                 instance_data(prediction, k, classes, similarity, frames) for k in range(n_predictions(prediction))
             ]
+            for k, of_truth_object in () if beside is None else beside.same.items():
+                about["instances"][k]["object"] = of_truth_object
             if growth is not None and isinstance(prediction, Instances):
                 about["growth"] = growth.steps
                 for k, one in enumerate(about["instances"]):

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from su3d_bench.core.errors import ConfigError, printable, printable_json
-from su3d_bench.core.maps import Prediction
-from su3d_bench.core.types import GroundTruth, Int64Array, UInt8Array
+from su3d_bench.core.maps import Masks, Prediction
+from su3d_bench.core.types import GroundTruth, Int32Array, Int64Array, UInt8Array
 from su3d_bench.metrics.attribution.overlaps import Overlaps
 from su3d_bench.metrics.fitness import why_not_scorable
+from su3d_bench.metrics.instance.scene_counts import intersections
 from su3d_bench.metrics.matching.nearest import Candidates
 from su3d_bench.reports.page.maps import colour_plane, extent_of, index_plane, nearest_colours, pack_map, thinned
 from su3d_bench.reports.pictures.colours import class_colours
@@ -19,6 +22,18 @@ from su3d_bench.reports.pictures.maps import truth_owner
 from su3d_bench.runs.finished import FinishedRun
 
 Seen = tuple[Candidates, UInt8Array]  # points (n, 3) m that frames saw and their colours (n, 3)
+
+
+@dataclass(frozen=True)
+class Beside:
+    """The truth beside a map: which ``variant`` of it, and what the page's map says ``about`` it.
+
+    ``same``: by the place of each instance that is an object of this truth, which object.
+    """
+
+    variant: str
+    about: Mapping[str, Any]
+    same: Mapping[int, Mapping[str, Any]]
 
 
 class ShownTruths:
@@ -62,6 +77,29 @@ def judged_objects(truth: GroundTruth, overlaps: Overlaps) -> dict[str, list[int
     }
 
 
+def same_objects(truth: GroundTruth, masks: Masks) -> dict[int, dict[str, Any]]:
+    """Of each of ``masks`` on the points of the truth that is one of its objects, above IoU 0.5: its place and name.
+
+    The place is that among ``instances_of``; parts and lumps are no object of the truth.
+    """
+    numbers = instances_of(truth)
+    column = np.where(truth.instance > 0, np.searchsorted(numbers, truth.instance), len(numbers))
+    shared = intersections(column, len(numbers) + 1, masks.indptr, masks.indices, np.arange(len(masks)))[:, :-1]
+    union = masks.sizes[:, None] + np.bincount(column, minlength=len(numbers) + 1)[:-1] - shared
+    row_of_class = truth_owner(truth)
+    found: dict[int, dict[str, Any]] = {}
+    for row, place in np.argwhere(2 * shared > union).tolist():  # objects share no point: of a mask at most one
+        called = _most(row_of_class[truth.instance == numbers[place]])
+        found[row] = {"place": place, "name": printable(truth.labels.names[called], 80) if called >= 0 else ""}
+    return found
+
+
+def _most(classes: Int32Array) -> int:
+    """The row of the labels that most points have, -1 where none has any."""
+    known = classes[classes >= 0]
+    return int(np.bincount(known).argmax()) if len(known) else -1
+
+
 def instances_of(truth: GroundTruth) -> Int64Array:
     """The numbers of the instances of a truth, ascending."""
     return np.unique(truth.instance[truth.instance > 0]).astype(np.int64)
@@ -82,8 +120,7 @@ def _packed(truth: GroundTruth, most_points: int, seen: Seen | None) -> str:
     instances = []
     for k, number in enumerate(numbers.tolist()):
         rows = order[starts[k] : starts[k + 1]]
-        classes = row_of_class[rows]
-        called = int(np.bincount(classes[classes >= 0]).argmax()) if (classes >= 0).any() else -1
+        called = _most(row_of_class[rows])
         one = {"id": number, "class": called, "points": len(rows), **extent_of(truth.points[rows])}
         instances.append(one | {"name": names[called] if called >= 0 else ""})
     tints = class_colours(truth.labels.names)

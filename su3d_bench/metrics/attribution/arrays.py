@@ -105,10 +105,12 @@ Errors = tuple[int, Sequence[SingleError]]
 class LookedAt(Protocol):
     """A scene as a protocol's evaluator sees it.
 
-    ``points`` (N, 3) are those that errors are told of; ``class_name`` says what a class of an error is called.
+    ``points`` (N, 3) are those that errors are told of, ``instance`` (N,) the truth's at each, 0 for none;
+    ``class_name`` says what a class of an error is called.
     """
 
     points: transfer.Points
+    instance: Int64Array
 
     def mended(self) -> MendedScene: ...
 
@@ -130,6 +132,7 @@ class SceneOfMasks:
     ) -> None:
         assert not isinstance(prediction, DenseFeatures)
         self.points: transfer.Points = truth.points
+        self.instance = truth.instance.astype(np.int64)
         self._values, self._masks, self._scoring = scored_masks(rules, truth, prediction, encoder)
         self._has_classes = rules.class_agnostic is None
         self._names = {entry.id: entry.name for entry in rules.classes}
@@ -161,6 +164,8 @@ class _SceneOfPoints:
     ) -> None:
         self._scored = scored_points(rules, truth, prediction, encoder)
         self.points: transfer.Points = self._scored.positions
+        number = self._scored.points.object_id
+        self.instance = np.where(number <= truth.instance.max(initial=0), number, 0)
         self._names = [entry.name for entry in rules.classes]
 
     def mended(self) -> MendedScene:

@@ -252,13 +252,43 @@ def test_the_legend_names_instances_and_marks_the_chosen_one(browser: Chromium) 
     opened(browser)
     choose(browser, "Colour by", "instance")
     entries = browser.run("[...document.querySelector('#maps .legend').children].map((one) => one.innerText)")
-    assert entries[0] == "3 instances"
+    assert entries[0] == "3 instances; 3 of them are objects of the truth, in its colour"
     assert sorted(entries[1:]) == ["sofa", "table", "wall"]
     press(browser, "n")
     chosen = browser.run("document.querySelector('#maps .legend [aria-current]').innerText")
     assert chosen == browser.run("document.querySelector('#maps .detail h3').innerText")
     press(browser, "Escape")
     assert browser.run("document.querySelector('#maps .legend [aria-current]') === null")
+
+
+def test_an_object_has_one_colour_in_the_map_and_in_the_truth(browser: Chromium) -> None:
+    opened(browser)
+    choose(browser, "Beside", "truth")
+    choose(browser, "Colour by", "instance")
+    browser.until("document.querySelectorAll('#maps .legend')[1].innerText.includes('chair')")
+    entries = "[...document.querySelectorAll('#maps .legend')[{k}].querySelectorAll('[data-instance]')]"
+    tint = "[one.innerText, one.querySelector('.swatch').style.backgroundColor]"
+    found = [
+        dict(browser.run(f"{entries.format(k=k)}.map((one) => {tint})")) for k in range(2)
+    ]  # by name, which are all different here
+    same = sorted(name for name in found[0] if name in found[1] and found[0][name] == found[1][name])
+    assert same == ["sofa", "table", "wall"]  # the wall is pale whatever it is
+    assert found[1]["chair"] not in found[0].values()  # it is missed: no other object has its colour
+
+
+def test_the_number_of_an_object_in_an_address_is_that_of_the_truth(browser: Chromium) -> None:
+    opened(browser)
+    values = {"scene": "painted/a", "map": "collector", "beside": "truth", "colour": "instance"}
+    asked_for(browser, **values, object="1")
+    heading = "document.querySelector('#maps .detail h3')"
+    browser.until(f"{heading} !== null")
+    assert browser.run(f"{heading}.innerText") == "Truth: chair"
+    chosen = "document.querySelectorAll('#maps .legend')[1].querySelector('[aria-current]')"
+    assert browser.run(f"{chosen}.innerText") == "chair"
+    browser.until("location.hash.includes('object=1')")
+    asked_for(browser, **values, object="77")
+    browser.until(f"{heading} === null")
+    assert browser.run(chosen) is None
 
 
 def test_missed_objects_are_ghosts_that_can_be_taken_away(browser: Chromium) -> None:

@@ -30,6 +30,8 @@ needs_browser = pytest.mark.skipif(find_chromium() is None, reason="needs Chromi
 WHOLE = "!document.querySelector('#main[aria-busy]')"
 FIELD = "[...document.querySelectorAll('#gallery select')].find((one) => one.labels[0].textContent === '{label}')"
 
+MAPS_FIELD = FIELD.replace("#gallery", "#maps")
+
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -337,6 +339,47 @@ def test_a_row_a_cell_and_a_bar_lead_to_their_errors_and_back(anew: Chromium, pa
     assert anew.run("document.activeElement.dataset.to && JSON.parse(document.activeElement.dataset.to)") == wish
     assert anew.run(f"document.activeElement.closest('section').id === {json.dumps(part)}")
     assert is_hidden(anew, "Back")
+
+
+@needs_browser
+@pytest.mark.parametrize("kind", ["missed", "mislabelled", "label"])
+def test_a_card_leads_to_what_it_is_about_in_the_map_and_back(anew: Chromium, page: Path, kind: str) -> None:
+    choose(anew, "Protocol", "rooms-semantic" if kind == "label" else "rooms-instance")
+    choose(anew, "Kind", kind)
+    told = next(card for card in cards(page.read_text()) if card["kind"] == kind)
+    anew.run("document.querySelector('#gallery .card .to-map').scrollIntoView({ block: 'center' })")
+    before = anew.run("scrollY")
+    anew.run("document.querySelector('#gallery .card .to-map').focus()")
+    anew.press("Enter")
+    heading = "document.querySelector('#maps .detail h3')"
+    anew.until(f"{heading} !== null && !document.querySelector('#maps .panes[aria-busy]')")
+    assert abs(anew.run("document.getElementById('maps').getBoundingClientRect().top")) < 200
+    shown = {
+        name: anew.run(f"{MAPS_FIELD.format(label=name)}.selectedOptions[0].text")
+        for name in ("Scene", "Map", "Beside")
+    }
+    assert shown == {"Scene": told["scene"], "Map": told["method"], "Beside": "truth"}
+    colour = anew.run(f"{MAPS_FIELD.format(label='Colour by')}.value")
+    assert colour == ("class" if kind == "label" else "instance")
+    told_there = anew.run("document.querySelector('#maps .detail').innerText")
+    assert told["true"][0] in told_there
+    if told["rows"]:
+        chosen = anew.run("document.querySelector('#maps .side tr[aria-selected=true]').innerText")
+        assert chosen.split()[0] == anew.run(f"{heading}.innerText")
+    else:
+        assert anew.run(f"{heading}.innerText") == f"Truth: {told['true'][0]}"
+    anew.run("history.back()")
+    anew.until("!location.hash.startsWith('#maps')")
+    anew.until(f"Math.abs(scrollY - {before}) < 5")
+
+
+@needs_browser
+def test_a_page_without_maps_has_no_way_to_them(run: Path, tmp_path: Path) -> None:
+    made(run, tmp_path / "page.html", "--no-maps")
+    with Chromium(tmp_path / "profile") as browser:
+        browser.open(tmp_path / "page.html")
+        browser.until("document.querySelectorAll('#gallery .card').length > 0")
+        assert browser.run("document.querySelector('#gallery .to-map')") is None
 
 
 @needs_browser

@@ -1,6 +1,6 @@
 // What the view of the maps shows as the end of the page's address, and back. Nothing in an address is believed.
 
-const LINK = '#maps?', MOST_LINK = 2000, MOST_FRAME = 1e9;
+const LINK = '#maps?', MOST_LINK = 2000, MOST_FRAME = 1e9, MOST_OBJECT = 2 ** 31;
 const mapKey = (one) => (RUNS.length > 1 ? `${one.run + 1}:${one.method}` : one.method);
 const mapIndex = (scene, key) => DATA.maps.findIndex((one) => one.scene === scene && mapKey(one) === key);
 
@@ -21,7 +21,7 @@ function linkText(state, eye) {
   for (const [name, value] of Object.entries(state)) {
     if (value !== null && value !== undefined && value !== '') said.set(name, String(value));
   }
-  said.set('camera', cameraText(eye));
+  if (eye) said.set('camera', cameraText(eye));
   return LINK + said.toString();
 }
 // What an address asks for, of what there is; null where it asks for no map of this page.
@@ -38,5 +38,13 @@ function readLink(hash) {
   const colour = COLOURINGS.some(([kind]) => kind === text('colour')) ? text('colour') : null;
   return { scene, index, beside, colour, text: whole('text', 1000), cut: whole('cut', 100),
     frame: whole('frame', MOST_FRAME), missed: yes('missed'), walls: yes('walls'), instance: whole('instance', 0xffff),
-    camera: cameraOf(text('camera')) };
+    object: whole('object', MOST_OBJECT), camera: cameraOf(text('camera')) };
+}
+// The address of what a single error is about: its instance, and the object of the truth beside; null without a map.
+function linkToError(one) {
+  const shown = DATA.maps.find((each) => each.run === one.run && each.scene === one.scene && each.method === one.method);
+  if (!shown || shown.reason) return null;
+  const [object] = shown.truth === one.truth ? one.objects : [], [instance] = one.rows;
+  return linkText({ scene: one.scene, map: mapKey(shown), colour: one.family === 'semantic' ? 'class' : 'instance',
+    beside: shown.truth === null ? null : 'truth', instance, object }, null);
 }

@@ -69,8 +69,13 @@ function painted(map, kind, query, judged) {
   const values = kind === 'similarity' ? map.instances.map((one) => one.similarity[query]) : [];
   const low = Math.min(...values), high = Math.max(...values);
   const owned = (k, rgb) => (map.owner[k] === NEAR_NONE ? NOTHING : rgb(map.owner[k]));
-  const nameOfInstance = (own) => (map.instances[own] ? map.instances[own].name : undefined);
-  const colourOfInstance = (own) => PALE[nameOfInstance(own)] || distinct(own);
+  // One object, one colour: an instance that is an object of the truth has that object's, all others none of these.
+  const nObjects = map.beside ? map.beside.objects : 0;
+  const same = map.instances.filter((one) => one.object).length;
+  function colourOfInstance(own) {
+    const one = map.instances[own] || {}, of = one.object;
+    return PALE[of ? of.name : one.name] || distinct(of ? of.place : nObjects + own);
+  }
   const named = () => map.instances.map((one, own) => [colourOfInstance(own), titleOf(map, one), own, one.points])
     .sort((a, b) => b[3] - a[3]).slice(0, MOST_ENTRIES);
   const nJudged = (e) => map.instances.filter((_, own) => judgedAt(judged, own) === e).length;
@@ -89,7 +94,9 @@ function painted(map, kind, query, judged) {
     .map(([c, n]) => [tint(c), `${c < 0 ? none : map.classes[c]} ${share(n)}`]);
   const legendOf = {
     colour: () => [[null, 'as the frames saw it']],
-    instance: () => [[null, plural(map.instances.length, 'instance')], ...named()],
+    instance: () => [[null, plural(map.instances.length, 'instance')
+      + (same ? `; ${same} of them ${same > 1 ? 'are objects' : 'is an object'} of the truth, in its colour` : '')],
+    ...named()],
     class: () => classes('none'),
     truth: () => classes('not scored or nothing near'),
     error: () => ERRORS.map(([text, rgb], e) => [rgb, `${text} ${share(counts.get(e) || 0)}`])

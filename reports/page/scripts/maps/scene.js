@@ -69,7 +69,7 @@ function mapsContent(section) {
       wallsField),
     h('div', { class: 'viewer' }, h('div', null, panes, growthNote, keys), h('div', { class: 'side' }, detail, list)));
 
-  let map = null, truth = null, current = null, picked = -1, rows = [], listedBy = null, loads = 0, asides = 0;
+  let map = null, truth = null, current = null, picked = -1, object = -1, rows = [], listedBy = null, loads = 0, asides = 0;
   let asked = null, address = null, isWriting = null; // the address when somebody last changed something here
   const judged = () => (map && map.beside && map.beside.counted ? map.beside : null);
 
@@ -114,7 +114,7 @@ function mapsContent(section) {
     if (mine !== loads) return;
     const isOther = !current || current.scene.scene !== one.scene;
     current = { index, scene: sceneOf(one.scene) };
-    picked = -1;
+    picked = object = -1;
     detail.replaceChildren();
     const next = one.reason || typeof DecompressionStream === 'undefined' ? null : await mapAt(index);
     if (mine !== loads) return;
@@ -143,6 +143,7 @@ function mapsContent(section) {
     if (link && link.instance !== null) pick(link.instance, !link.camera);
     await Promise.all([showBeside(), showGhosts()]);
     if (mine !== loads) return;
+    if (link && link.object !== null && link.beside === 'truth' && other.map) pickObject(link);
     if (link) follow(link);
     panes.removeAttribute('aria-busy');
   }
@@ -162,6 +163,7 @@ function mapsContent(section) {
     const next = wanted === 'truth' ? await truthBeside() : wanted ? await mapAt(Number(wanted)) : null;
     if (mine !== asides) return;
     const before = pane.view ? pane.view.narrowness() : 1;
+    object = -1;
     other.node.hidden = !next;
     panes.classList.toggle('two', !!next);
     if (pane.view) pane.view.zoom(before / pane.view.narrowness());
@@ -279,17 +281,27 @@ function mapsContent(section) {
   }
   function pickBeside(found) {
     const isTruth = besideField.input.value === 'truth', owner = found ? found.owner : -1;
+    object = isTruth ? owner : -1;
     other.choose(owner);
+    keepLink();
     if (owner < 0 || !other.map) showDetail();
     else if (isTruth) showTruth(other.map, owner);
     else showFacts(other.map, owner);
+  }
+  const flyTo = (one) => { if (pane.view && one && one.centre) pane.view.lookAt(one.centre, Math.hypot(...one.size)); };
+  // The object of the truth beside that an address asks for, by its number.
+  function pickObject({ object: number, instance, camera }) {
+    object = other.map.instances.findIndex((one) => one.id === number);
+    other.choose(object);
+    if (object < 0) return;
+    if (!camera) flyTo(other.map.instances[object]);
+    if (instance === null) showTruth(other.map, object);
   }
   function pick(index, fly) {
     if (!map) return;
     picked = index >= 0 && index < map.instances.length ? index : -1;
     pane.choose(picked);
-    const one = map.instances[picked];
-    if (pane.view && fly && one && one.centre) pane.view.lookAt(one.centre, Math.hypot(...one.size));
+    if (fly) flyTo(map.instances[picked]);
     for (const row of rows) {
       row.selected = row.index === picked;
       if (row.node) row.node.setAttribute('aria-selected', String(row.selected));
@@ -340,6 +352,7 @@ function mapsContent(section) {
         frame: growth && Number(grow.value) < last ? growth.frame[Number(grow.value)] : null,
         missed: missedField.input.disabled ? null : yes(missedField), walls: yes(wallsField),
         instance: picked >= 0 ? picked : null,
+        object: object >= 0 && aside === 'truth' && other.map ? other.map.instances[object].id : null,
       };
       try { history.replaceState(null, '', linkText(state, eye)); } catch (error) { /* forbidden of files somewhere */ }
       address = location.hash;
