@@ -33,29 +33,42 @@ class Sample:
     run: str = _column("folder of the run")
     scene: str = _column("address of the scene, such as rooms/living0")
     method: str = _column("whose map")
-    protocol: str = _column("under whose rules; of kind instance")
-    kind: str = _column("predicted: a mask of the map; true: an instance of the truth that takes part in the score")
-    instance: int = _column(
-        "predicted: the number by which query and the page call it; true: its number among those of its class and scene"
+    protocol: str = _column("under whose rules; of kind instance or semantic")
+    kind: str = _column(
+        "predicted: a mask of the map, under kind semantic what it calls by one name; true: an instance of the truth "
+        "that takes part in the score"
+    )
+    instance: int | None = _column(
+        "predicted: the number by which query and the page call it; true: its number among those of its class and "
+        "scene; none under kind semantic for all points of a class that belong to no instance"
     )
     row: int | None = _column("predicted: its place in the prediction, from 0; true: none")
     class_name: str = _column(
         "the class that it is called or has; empty for none of the protocol's; object where the protocol has no classes"
     )
     name: str = _column("predicted: what the method or perception calls it; true: empty")
-    score: float | None = _column("predicted: the confidence that counts under the protocol; true: none")
-    n_points: int = _column("points of the truth that it has")
-    is_counted: bool = _column("whether it takes part: of a scored class and of the protocol's minimum size")
+    score: float | None = _column("predicted: the confidence that counts under kind instance; true: none")
+    n_points: int = _column(
+        "points of the truth that it has; under kind semantic of those that are counted, predicted those that it names"
+    )
+    n_right: int | None = _column("of these points those that are called their class, under kind semantic; else none")
+    is_counted: bool = _column(
+        "whether it takes part: of a scored class and, under kind instance, of the protocol's minimum size"
+    )
     best_iou: float = _column(
         "highest IoU with any of the other kind, whatever its class, 0 to 1; of the truth those that take part"
     )
-    matched: int | None = _column("the instance of the other kind with that IoU; none where it is 0")
+    matched: int | None = _column("the instance of the other kind with that IoU; none where it is 0 or has no number")
     matched_class: str = _column("the class of that one; empty where there is none")
-    is_hit_25: bool = _column("predicted: a true positive above IoU 0.25; true: met by one")
-    is_hit_50: bool = _column("predicted: a true positive above IoU 0.5; true: met by one")
+    is_hit_25: bool = _column(
+        "predicted: a true positive above IoU 0.25, under kind semantic of the class of what it has that IoU with; "
+        "true: met by one"
+    )
+    is_hit_50: bool = _column("the same above IoU 0.5")
     error: str = _column(
         "the kind of its error as attribute counts it, empty for none: of a mask merged, duplicate, mislabelled or "
-        "background, of an instance of the truth split or missed"
+        "background, of an instance of the truth split or missed; under kind semantic the cause of most of its wrong "
+        "points: geometry, background, association or label"
     )
     centre_x_m: float | None = _column("centre of the box along the axes around its points, m; none without places")
     centre_y_m: float | None = _column("the same, y")

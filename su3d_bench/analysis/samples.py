@@ -1,7 +1,8 @@
 """Runs taken apart to single instances: what each predicted mask met, which instance of the truth nothing met.
 
 A row is what the evaluator itself saw: the masks on the points of the truth, under the names and confidences that
-count. Counts that differ from those of the run are refused, as where errors are explained.
+count; of points, those that it counts, by the object that they are of and by the mask that names them. Counts that
+differ from those of the run are refused, as where errors are explained.
 """
 
 from __future__ import annotations
@@ -17,19 +18,24 @@ from su3d_bench.analysis.attribution import Explained, explained_of
 from su3d_bench.analysis.inputs import truth_of_scene
 from su3d_bench.core.errors import ConfigError, counted, printable, suggest
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
-from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, Int64Array
-from su3d_bench.metrics.attribution.arrays import scored_masks
+from su3d_bench.core.types import Float64Array, GroundTruth, Int32Array, Int64Array
+from su3d_bench.metrics.attribution.arrays import ScoredPoints, scored_masks, scored_points
 from su3d_bench.metrics.attribution.masks import count_masks, errors_of
 from su3d_bench.metrics.attribution.overlaps import LabelledMasks, ScoringRules, measure_overlaps, true_instances
+from su3d_bench.metrics.attribution.points import CAUSES, causes_of
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
 from su3d_bench.metrics.instance.hits import hits
 from su3d_bench.metrics.instance.score import OBJECT
+from su3d_bench.metrics.matching.labelling import scored_classes
+from su3d_bench.metrics.matching.nearest import Points
+from su3d_bench.metrics.metric import n_predictions
 from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.semantic import confusion
 from su3d_bench.reports.tables.samples import Sample
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
 from su3d_bench.runs.finished import FinishedRun, read_run
 
-KIND = "instance"  # of the protocols that tell instances apart by their masks
+KINDS = ("instance", "semantic")  # of the protocols that say what became of single instances
 MOST_OF_A_NAME = 200  # characters of a text in a cell
 THRESHOLDS = (0.25, 0.5)
 Box = tuple[float | None, float | None, float | None, float | None, float | None, float | None]
@@ -58,7 +64,7 @@ def samples(
     chosen: Chosen = Chosen(),
     report: Report = lambda event: None,
 ) -> Samples:
-    """The instances of the runs in the folders ``paths``, scene after scene, under each protocol of kind ``instance``.
+    """The instances of the runs in the folders ``paths``, scene after scene, under each protocol of ``KINDS``.
 
     A ``ConfigError`` where nothing has instances, or a name is not one of the run.
     """
@@ -102,19 +108,21 @@ class _OfRun:
         names = []
         for name in wanted or self._run.protocols:
             kind = self._run.rules(name).kind
-            if kind == KIND:
+            if kind in KINDS:
                 names.append(name)
             elif wanted:
-                raise ConfigError(f"protocol '{name}' is of kind '{kind}'; instances are listed under kind '{KIND}'")
+                raise ConfigError(
+                    f"protocol '{name}' is of kind '{kind}'; instances are listed under kind {' and '.join(KINDS)}"
+                )
             else:
-                self.remarks.append(f"{name} is of kind {kind}, which matches no masks with instances")
+                self.remarks.append(f"{name} is of kind {kind}, which tells no instances apart")
         return names
 
     def _explained(self, method: str, protocols: Sequence[str]) -> Explained | None:
         scored = self._run.scores(method)
         mine = [name for name in protocols if scored.get(name)]
         if not mine:
-            self.remarks.append(f"{self._run.name}: {printable(method, 80)} has no score of kind {KIND}")
+            self.remarks.append(f"{self._run.name}: {printable(method, 80)} has no score of kind {' or '.join(KINDS)}")
             return None
         return explained_of(self._run, method, mine)
 
@@ -129,12 +137,20 @@ class _OfRun:
         self, explained: Explained, protocol: str, scene: str, truth_of: Callable[[str], GroundTruth]
     ) -> Iterator[Sample]:
         rules, truth, prediction, naming = explained.scored(protocol, scene, truth_of, self._encoder)
+        has_places = self._run.data.truth_files is None  # files have no coordinates
+        where = (self._run.name, printable(scene), printable(explained.method), printable(protocol))
+        if rules.kind == "semantic":
+            of_points = scored_points(rules, truth, prediction, naming)
+            named = of_points.points
+            counts = confusion.per_scene(named.true_class, named.predicted, of_points.is_counted)
+            explained.refuse_other_counts(protocol, scene, counts)
+            n_instances = int(truth.instance.max(initial=0))
+            yield from _OfPoints(rules, prediction, of_points, n_instances, has_places=has_places).rows(where)
+            return
         assert not isinstance(prediction, DenseFeatures)  # it has no score of this kind
         seen = scored_masks(rules, truth, prediction, naming)
         explained.refuse_other_counts(protocol, scene, count_masks(*seen))
-        points = truth.points if self._run.data.truth_files is None else None  # files have no coordinates
-        where = (self._run.name, printable(scene), printable(explained.method), printable(protocol))
-        yield from _rows(where, rules, prediction, seen, points)
+        yield from _rows(where, rules, prediction, seen, truth.points if has_places else None)
 
 
 def _rows(
@@ -142,7 +158,7 @@ def _rows(
     rules: ProtocolRules,
     prediction: Instances | Partition,
     seen: tuple[Int64Array, LabelledMasks, ScoringRules],
-    points: Float32Array | None,
+    points: Points | None,
 ) -> Iterator[Sample]:
     values, masks, scoring = seen
     instances = true_instances(values, scoring)
@@ -160,7 +176,7 @@ def _rows(
         met, iou = _best(overlaps.iou[k])
         yield Sample(
             *where, "predicted", ids[k], k, called[k], name, float(masks.scores[k]),
-            len(masks.masks.mask(k)), bool(overlaps.is_counted[k]), iou,
+            len(masks.masks.mask(k)), None, bool(overlaps.is_counted[k]), iou,
             None if met is None else number_of[met], "" if met is None else true_classes[met],
             bool(at_25.is_hit[k]), bool(at_50.is_hit[k]), errors.of_mask[k], *_box(points, masks.masks.mask(k)),
         )  # fmt: skip
@@ -168,9 +184,105 @@ def _rows(
         met, iou = _best(overlaps.iou[:, g])
         yield Sample(
             *where, "true", number_of[g], None, true_classes[g], "", None,
-            len(members), True, iou, None if met is None else ids[met], "" if met is None else called[met],
+            len(members), None, True, iou, None if met is None else ids[met], "" if met is None else called[met],
             value_of[g] in at_25.values, value_of[g] in at_50.values, errors.of_instance[g], *_box(points, members),
         )  # fmt: skip
+
+
+class _OfPoints:
+    """The counted points of a scene by what they are of, and by what named them.
+
+    An object is an instance of one class, or all points of a class that belong to none; a naming is all that one mask
+    names one class, or without masks all that is named so. Both are rows of ``_distinct``.
+    """
+
+    def __init__(
+        self,
+        rules: ProtocolRules,
+        prediction: Instances | Partition | DenseFeatures,
+        scored: ScoredPoints,
+        n_instances: int,
+        *,
+        has_places: bool,
+    ) -> None:
+        points = scored.points
+        self._rows = np.flatnonzero((points.true_class >= 0) & scored.is_counted[points.true_class])
+        true, self._called = points.true_class[self._rows], points.predicted[self._rows]
+        mask = points.mask[self._rows] if scored.has_masks else np.full(len(self._rows), -1)
+        is_instance = points.object_id[self._rows] <= n_instances
+        number = np.where(is_instance, points.object_id[self._rows], -1)
+        self._is_right = true == self._called
+        self._cause = causes_of(points, has_masks=scored.has_masks)[self._rows]
+        is_named = self._called >= 0
+        self._objects, self._object_of = _distinct(true, number)
+        self._namings, naming = _distinct(self._called[is_named], mask[is_named])
+        self._naming_of = np.full(len(self._rows), -1)
+        self._naming_of[is_named] = naming
+        self._positions = scored.positions if has_places else None
+        self._classes = [printable(entry.name, MOST_OF_A_NAME) for entry in rules.classes]
+        self._takes_part = scored_classes(rules)
+        self._ids: list[int] = []
+        self._names: list[str] = []
+        if not isinstance(prediction, DenseFeatures):
+            self._ids = _ids(prediction, n_predictions(prediction))
+            self._names = _names(prediction, n_predictions(prediction))
+
+    def rows(self, where: tuple[str, str, str, str]) -> Iterator[Sample]:
+        """What is named, and then what is there."""
+        names, iou = self._classes, self._overlaps()
+        called_as = np.array([called for called, _ in self._namings], np.int64)
+        true_class = np.array([true for true, _ in self._objects], np.int64)
+        counted = self._takes_part[true_class]
+        hits_of = np.where((called_as[:, None] == true_class) & counted, iou, 0.0)
+        for k, (called, mask) in enumerate(self._namings):
+            met, best = _best(np.where(counted, iou[k], 0.0))
+            of = None if met is None else self._objects[met]
+            members, hit = np.flatnonzero(self._naming_of == k), hits_of[k].max(initial=0)
+            yield Sample(
+                *where, "predicted", self._ids[mask] if mask >= 0 else None, mask if mask >= 0 else None, names[called],
+                self._names[mask] if mask >= 0 else "", None, len(members), self._n_right(members),
+                bool(self._takes_part[called]), best, None if of is None or of[1] < 0 else of[1],
+                "" if of is None else names[of[0]], bool(hit > 0.25), bool(hit > 0.5),
+                self._error(members), *self._box(members),
+            )  # fmt: skip
+        for g, (true, number) in enumerate(self._objects):
+            met, best = _best(iou[:, g])
+            of = None if met is None else self._namings[met]
+            members, hit = np.flatnonzero(self._object_of == g), hits_of[:, g].max(initial=0)
+            yield Sample(
+                *where, "true", number if number >= 0 else None, None, names[true], "", None, len(members),
+                self._n_right(members), bool(self._takes_part[true]), best,
+                None if of is None or of[1] < 0 else self._ids[of[1]],
+                "" if of is None else names[of[0]], bool(hit > 0.25), bool(hit > 0.5), self._error(members),
+                *self._box(members),
+            )  # fmt: skip
+
+    def _overlaps(self) -> Float64Array:
+        """The IoU (K, G) of each naming and object over the counted points."""
+        n, m = len(self._namings), len(self._objects)
+        is_named = self._naming_of >= 0
+        shared = np.bincount(self._naming_of[is_named] * m + self._object_of[is_named], minlength=n * m).reshape(n, m)
+        of_naming = np.bincount(self._naming_of[is_named], minlength=n)
+        of_object = np.bincount(self._object_of, minlength=m)
+        return np.asarray(shared / np.maximum(of_naming[:, None] + of_object - shared, 1), np.float64)
+
+    def _n_right(self, members: Int64Array) -> int:
+        return int(self._is_right[members].sum())
+
+    def _error(self, members: Int64Array) -> str:
+        """The cause of most of the wrong points; of as many of two the first that is looked for."""
+        causes = self._cause[members]
+        n = np.bincount(causes[causes >= 0], minlength=len(CAUSES))
+        return CAUSES[int(n.argmax())] if n.any() else ""
+
+    def _box(self, members: Int64Array) -> Box:
+        return _box(self._positions, self._rows[members])
+
+
+def _distinct(classes: Int64Array, numbers: Int64Array) -> tuple[list[tuple[int, int]], Int64Array]:
+    """The pairs that there are, ascending by number and then class, and which of them each point has."""
+    pairs, place = np.unique(np.stack([numbers, classes], axis=1), axis=0, return_inverse=True)
+    return [(int(one), int(number)) for number, one in pairs], place.reshape(-1)
 
 
 def _class_names(rules: ProtocolRules) -> dict[int, str]:
@@ -200,7 +312,7 @@ def _best(iou: Float64Array) -> tuple[int | None, float]:
     return (place if best > 0 else None), best
 
 
-def _box(points: Float32Array | None, members: Int32Array) -> Box:
+def _box(points: Points | None, members: Int32Array | Int64Array) -> Box:
     if points is None or not len(members):
         return NOWHERE
     own = points[members].astype(np.float64)

@@ -175,11 +175,12 @@ class Run(Scores):
 
     @property
     def instances(self) -> pandas.DataFrame:
-        """Every instance, predicted and true, under each protocol of kind ``instance``; ``samples`` with no choice.
+        """Every instance, predicted and true, under each protocol of masks or points; ``samples`` with no choice.
 
         >>> import su3d_bench as su3d
         >>> instances = su3d.load_run("runs/demo").instances
-        >>> predicted = instances.query("method == 'oracle' and kind == 'predicted' and is_counted")
+        >>> masks = instances.query("protocol == 'rooms-instance'")
+        >>> predicted = masks.query("method == 'oracle' and kind == 'predicted' and is_counted")
         >>> bool((predicted["best_iou"] == 1).all())
         True
         """

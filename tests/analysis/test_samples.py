@@ -10,6 +10,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,12 +21,14 @@ from scored_room import ENCODER, noisy
 import su3d_bench.metrics.instance.hits
 import su3d_bench.reports.tables.samples
 from su3d_bench.analysis.attribution import attribute
-from su3d_bench.analysis.samples import Chosen, samples
+from su3d_bench.analysis.samples import Chosen, _OfPoints, samples
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.metrics.attribution.arrays import scored_masks
+from su3d_bench.core.maps import DenseFeatures, Instances
+from su3d_bench.metrics.attribution.arrays import ScoredPoints, scored_masks
 from su3d_bench.metrics.attribution.masks import KINDS, count_masks, errors_of, mend_scene
 from su3d_bench.metrics.attribution.overlaps import measure_overlaps, true_instances
+from su3d_bench.metrics.attribution.points import LabelledPoints
 from su3d_bench.metrics.instance.hits import hits
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.reports.tables.samples import COLUMNS, Sample, csv_of
@@ -75,8 +78,99 @@ def test_hits_and_errors_are_those_that_the_evaluator_and_attribute_count(name: 
     assert {kind: named[kind] for kind in KINDS} == dict(mended.n)
 
 
+def test_the_rows_of_points_add_up_to_the_matrix_and_the_causes_of_the_run(run: Path) -> None:
+    """By true class its points and those that are right, by what they are called those that are called so."""
+    rows = [row for row in samples([run]).rows if row.protocol == "rooms-semantic"]
+    finished = finished_run.read_run(run)
+    names = [entry.name for entry in finished.rules("rooms-semantic").classes]
+    for method in finished.methods:
+        for scene, score in finished.scores(method)["rooms-semantic"].items():
+            own = [row for row in rows if (row.method, row.scene) == (method, scene)]
+            matrix = score.counts.confusion  # type: ignore[union-attr]
+            found = np.zeros((3, len(names)), np.int64)
+            for row in own:
+                assert row.n_right is not None
+                place = names.index(row.class_name)
+                found[0 if row.kind == "true" else 1, place] += row.n_points
+                found[2, place] += row.n_right if row.kind == "true" else 0
+            assert found[0].tolist() == matrix.sum(axis=1).tolist()
+            assert found[1].tolist() == matrix[:, :-1].sum(axis=0).tolist()
+            assert found[2].tolist() == np.diag(matrix[:, :-1]).tolist()
+        explained = attribute(run, method=method, protocols=["rooms-semantic"]).protocols[0]
+        true = [row for row in rows if (row.method, row.kind) == (method, "true")]
+        n_wrong = sum(row.n_points - (row.n_right or 0) for row in true)
+        assert n_wrong == sum(cause.n for cause in explained.causes.values())
+        assert {row.error for row in true} - {""} <= {cause for cause, told in explained.causes.items() if told.n}
+    lost = [row for row in rows if row.method == "collector" and row.kind == "true" and not row.n_right]
+    assert lost and all(row.error and not row.is_hit_25 for row in lost)
+    perfect = [row for row in rows if row.method == "oracle"]
+    assert perfect and all(row.best_iou == 1 and row.is_hit_50 and row.n_right == row.n_points for row in perfect)
+    assert {(row.instance, row.class_name) for row in perfect if row.kind == "true"} == {
+        (row.matched, row.matched_class) for row in perfect if row.kind == "predicted"
+    }
+
+
+def scored_by_hand(mask: list[int], *, has_masks: bool = True) -> list[Sample]:
+    """Ten points: a chair of six of instance 4, two lamps' points without an instance, two points of no class."""
+    rules = load_protocol("rooms-semantic")
+    chair, lamp = ([entry.name for entry in rules.classes].index(name) for name in ("chair", "lamp"))
+    points = LabelledPoints(
+        true_class=np.array([chair] * 6 + [lamp] * 2 + [-1] * 2),
+        predicted=np.array([chair] * 4 + [lamp] * 2 + [lamp, -1] + [chair] * 2),
+        is_scored=np.array([True] * 8 + [False] * 2),
+        object_id=np.array([4] * 6 + [9] * 4),
+        mask=np.array(mask),
+        map_distance_m=np.zeros(10),
+        mask_distance_m=np.zeros(10),
+    )
+    positions = np.stack([np.arange(10.0), np.zeros(10), np.zeros(10)], axis=1)
+    is_counted = np.isin(np.arange(len(rules.classes)), [chair, lamp])
+    scored = ScoredPoints(points, positions, is_counted, has_masks)
+    cloud = positions.astype(np.float32)
+    a_map: Any = Instances.of(cloud, [np.arange(5), np.arange(5, 10)], names=["a", "b"], ids=[70, 80])
+    if not has_masks:
+        a_map = DenseFeatures(cloud, np.ones((10, 2), np.float16))
+    made = _OfPoints(rules, a_map, scored, 4, has_places=True)
+    return list(made.rows(("run", "scene", "method", "rooms-semantic")))
+
+
+def test_points_are_told_by_what_names_them_and_by_what_they_are() -> None:
+    rows = scored_by_hand([0] * 4 + [0, 1, 1, -1, 0, 0])
+    told = [
+        (
+            row.kind,
+            row.instance,
+            row.row,
+            row.class_name,
+            row.name,
+            row.n_points,
+            row.n_right,
+            row.matched,
+            row.is_hit_50,
+        )
+        for row in rows
+    ]
+    assert told == [
+        ("predicted", 70, 0, "chair", "a", 4, 4, 4, True),
+        ("predicted", 70, 0, "lamp", "a", 1, 0, 4, False),
+        ("predicted", 80, 1, "lamp", "b", 2, 1, None, False),  # a third with the lamps, which have no number
+        ("true", None, None, "lamp", "", 2, 1, 80, False),
+        ("true", 4, None, "chair", "", 6, 4, 70, True),
+    ]
+    assert [row.best_iou for row in rows] == pytest.approx([4 / 6, 1 / 6, 1 / 3, 1 / 3, 4 / 6])
+    assert [row.error for row in rows] == ["", "label", "label", "background", "label"]
+    assert (rows[0].centre_x_m, rows[0].size_x_m) == (1.5, 3.0)
+
+
+def test_points_of_a_map_without_instances_are_told_by_class() -> None:
+    rows = scored_by_hand([0] * 10, has_masks=False)
+    told = [(row.kind, row.instance, row.row, row.class_name, row.n_points, row.n_right) for row in rows]
+    assert told[:2] == [("predicted", None, None, "chair", 4, 4), ("predicted", None, None, "lamp", 3, 1)]
+    assert rows[0].is_hit_50 and rows[0].matched == 4 and rows[-1].matched is None and rows[-1].matched_class == "chair"
+
+
 def test_the_rows_count_what_attribute_counts(run: Path) -> None:
-    rows = samples([run]).rows
+    rows = samples([run], Chosen([], ["rooms-instance"])).rows
     for method in ("collector", "oracle"):
         explained = attribute(run, method=method, protocols=["rooms-instance"]).protocols[0]
         own = [row for row in rows if row.method == method]
@@ -89,7 +183,8 @@ def test_the_rows_count_what_attribute_counts(run: Path) -> None:
 
 
 def test_a_row_says_where_its_instance_is(run: Path) -> None:
-    rows = [row for row in samples([run], Chosen(["oracle"], [], ["painted/a"])).rows if row.is_counted]
+    chosen = Chosen(["oracle"], ["rooms-instance"], ["painted/a"])
+    rows = [row for row in samples([run], chosen).rows if row.is_counted]
     places = {kind: {} for kind in ("predicted", "true")}  # type: dict[str, dict[int, list[float | None]]]
     for row in rows:
         number = row.instance if row.kind == "true" else row.matched
@@ -115,7 +210,9 @@ def test_the_verb_writes_one_row_each(run: Path, tmp_path: Path, capsys: pytest.
     n_predicted = sum(row.kind == "predicted" for row in rows)
     printed = capsys.readouterr()
     assert printed.out == f"{file}: {n_predicted} predicted instances, {len(rows) - n_predicted} true\n"
-    assert "rooms-semantic is of kind semantic" in printed.err
+    assert {row["protocol"] for row in json.loads((tmp_path / "rows.json").read_text())} == {
+        "rooms-instance", "rooms-semantic",
+    }  # fmt: skip
     with file.open(newline="") as stream:
         written = list(csv.DictReader(stream))
     assert [row["best_iou"] for row in written] == [repr(row.best_iou) for row in rows]
@@ -153,7 +250,7 @@ def test_without_pyarrow_one_line_says_what_to_do(
         (["RUN", "--columns"], "--columns speaks of no run"),
         (["RUN", "--format", "parquet"], "--format parquet: is no text; say where with --out"),
         (["RUN", "--methods", "none"], "holds no scores of the method 'none'; it has collector, oracle"),
-        (["RUN", "--protocols", "rooms-semantic"], "instances are listed under kind 'instance'"),
+        (["RUN", "--protocols", "rooms-retrieval"], "was not scored under 'rooms-retrieval'"),
         (["RUN", "--scenes", "painted/c"], "holds no scene 'painted/c'; did you mean"),
     ],
 )

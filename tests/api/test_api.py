@@ -256,7 +256,7 @@ def test_scenes_that_fail_are_an_error_and_the_others_are_there(
         (lambda: su3d.load_run("runs/demo").prediction("rooms/bathroom7"), "name one of them"),
         (lambda: su3d.load_run("runs/demo").prediction("rooms/x", "oracle"), "holds no map of rooms/x"),
         (lambda: su3d.load_run("runs/demo").samples(methods="sam3d"), "holds no scores of the method 'sam3d'"),
-        (lambda: su3d.load_run("runs/demo").samples(protocols="rooms-semantic"), "is of kind 'semantic'"),
+        (lambda: su3d.load_run("runs/demo").samples(protocols="rooms-retrieval"), "was not scored under"),
         (lambda: su3d.load_run("runs/demo").samples(scenes="rooms/x"), "holds no scene 'rooms/x'"),
         (lambda: su3d.load_run("runs/demo").compare("runs/none"), "there is no such folder"),
     ],

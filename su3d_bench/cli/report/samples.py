@@ -29,7 +29,7 @@ def add_parser(actions: Any) -> None:
     )
     parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="folders of finished runs")
     parser.add_argument("--methods", nargs="+", default=[], metavar="METHOD", help="only these (default: all)")
-    add_protocols(parser, "under these alone (default: all of kind instance)", "PROTOCOL")
+    add_protocols(parser, "under these alone (default: all of kind instance and semantic)", "PROTOCOL")
     parser.add_argument("--scenes", nargs="+", default=[], metavar="SCENE", help="only these (default: all)")
     parser.add_argument(
         "--format", choices=FORMATS, help="of the rows (default: parquet where --out ends so, else csv)"
