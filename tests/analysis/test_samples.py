@@ -31,6 +31,7 @@ from su3d_bench.metrics.attribution.overlaps import measure_overlaps, true_insta
 from su3d_bench.metrics.attribution.points import LabelledPoints
 from su3d_bench.metrics.instance.hits import hits
 from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.semantic.confusion import SemanticCounts
 from su3d_bench.reports.tables.samples import COLUMNS, Sample, csv_of
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
@@ -86,7 +87,8 @@ def test_the_rows_of_points_add_up_to_the_matrix_and_the_causes_of_the_run(run: 
     for method in finished.methods:
         for scene, score in finished.scores(method)["rooms-semantic"].items():
             own = [row for row in rows if (row.method, row.scene) == (method, scene)]
-            matrix = score.counts.confusion  # type: ignore[union-attr]
+            assert isinstance(score.counts, SemanticCounts)
+            matrix = score.counts.confusion
             found = np.zeros((3, len(names)), np.int64)
             for row in own:
                 assert row.n_right is not None
