@@ -14,7 +14,8 @@ import numpy as np
 from su3d_bench.numerics.relations import RELATIONS, Relation, Relations, is_between, may_be_between
 
 SIDE, TOP = (0, 2), (0, 1)  # the axes that a panel shows
-GREEN, RED, ORANGE, GREY = "#2a8a4a", "#c0392b", "#e08a1e", "#d9d9d9"
+GREEN, RED, ORANGE, GREY, BLUE = "#2a8a4a", "#c0392b", "#b86a00", "#d9d9d9", "#4a6fa5"
+NARROW = 0.3  # m: a box that no word fits into
 Box = tuple[float, float, float, float, float, float]  # lowest corner and sizes, metres
 
 
@@ -43,7 +44,7 @@ PANELS = (
     Panel("on", "an inner board of\nno shelf and no seat",
           SIDE, (0.2, 0.05, 0.2, 0.2, 0.2, 0.2), (0, 0, 0, 1, 0.3, 0.6), (), ("a", "stand")),
     Panel("in", "a container may be\nstuck out of",
-          SIDE, (0.2, 0.1, 0.1, 0.2, 0.2, 0.8), (0, 0, 0, 0.6, 0.5, 0.6), (), ("a", "basket")),
+          SIDE, (0.36, 0.1, 0.1, 0.2, 0.2, 0.8), (0, 0, 0, 0.6, 0.5, 0.6), (), ("a", "basket")),
     Panel("under", "bears it", SIDE, TABLE, (0.4, 0.4, 0.7, 0.2, 0.2, 0.2)),
     Panel("under", "not through a slab",
           SIDE, (0, 0, 0, 1, 1, 0.6), (0.4, 0.4, 0.7, 0.2, 0.2, 0.2), ((-0.2, 0, 0.6, 1.4, 1, 0.1),)),
@@ -90,6 +91,22 @@ def answer(panel: Panel) -> str:
     return "is" if relations.of(relation)[0, 1] else "is not"
 
 
+def place_of_name(panel: Panel, box: Box, name: str) -> tuple[tuple[float, float], dict[str, str]]:
+    """Where a name stands so that nothing lies over it, and how it is aligned there.
+
+    In the middle of its box; above one that is narrower than the name; in the corner of one that the other lies in.
+    """
+    x, y = panel.view
+    low, high = bounds(box)
+    middle = (low + high) / 2
+    if len(name) > 1 and high[x] - low[x] < NARROW:
+        return (middle[x], high[y] + 0.03), {"ha": "center", "va": "bottom"}
+    first = bounds(panel.subject)
+    if box == panel.other and (np.minimum(high, first[1]) - np.maximum(low, first[0]))[[x, y]].min() > 0.01:
+        return (low[x] + 0.03, high[y] - 0.03), {"ha": "left", "va": "top"}
+    return (middle[x], middle[y]), {"ha": "center", "va": "center"}
+
+
 def draw(path: Path) -> None:
     from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle
@@ -100,20 +117,20 @@ def draw(path: Path) -> None:
     for panel, axes in zip(PANELS, figure.subplots(rows, columns).flat, strict=True):
         word = answer(panel)
         colour = {"is": GREEN, "is not": RED, "may be": ORANGE}[word]
-        drawn = [(panel.subject, colour, panel.names[0]), (panel.other, "#4a6fa5", panel.names[1])]
-        for box, colour, name in [*((box, GREY, "") for box in panel.others), *reversed(drawn)]:
+        drawn = [(panel.subject, colour, panel.names[0]), (panel.other, BLUE, panel.names[1])]
+        for box, shade, name in [*((box, GREY, "") for box in panel.others), *reversed(drawn)]:
             low, high = bounds(box)
             x, y = panel.view
             size = high - low
-            axes.add_patch(Rectangle((low[x], low[y]), size[x], max(size[y], 0.02), facecolor=colour, alpha=0.75))
-            axes.text(low[x] + size[x] / 2, low[y] + size[y] / 2, name, ha="center", va="center", fontsize=8)
+            axes.add_patch(Rectangle((low[x], low[y]), size[x], max(size[y], 0.02), facecolor=shade, alpha=0.75))
+            place, ways = place_of_name(panel, box, name)
+            axes.text(*place, name, fontsize=8, **ways)
         if panel.view == SIDE:
             axes.axhline(0, color="#555555", linewidth=1)
-        axes.set_title(f"{word} {panel.relation}", fontsize=9)
+        axes.set_title(f"{word} {panel.relation}", fontsize=9, color=colour, fontweight="bold")
         axes.set_xlabel(f"{panel.text}\n({'side' if panel.view == SIDE else 'from above'})", fontsize=7.5)
-        axes.set_aspect("equal")
-        axes.autoscale_view()
-        axes.margins(0.12)
+        axes.margins(0.16)
+        axes.set_aspect("equal", adjustable="datalim")  # so that all panels are of one size
         axes.set_xticks([])
         axes.set_yticks([])
     figure.savefig(path, dpi=110)

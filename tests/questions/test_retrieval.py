@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.maps import Instances
+from su3d_bench.core.maps import DenseFeatures, Instances
 from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
-from su3d_bench.questions.retrieval import rank, rank_all
+from su3d_bench.questions import retrieval
+from su3d_bench.questions.retrieval import points_found, rank, rank_all
 
 
 class TwoWords:
@@ -62,3 +63,39 @@ def test_retrieval_without_comparable_features_is_refused() -> None:
         rank(instances_with(None), "east", TwoWords())
     with pytest.raises(PredictionError, match="3 dimensions and encoder 'two-words' gives 2"):
         rank(instances_with(np.ones((1, 3))), "east", TwoWords())
+
+
+def as_the_program_of_conceptfusion_shows(similarity: Float64Array) -> list[int]:
+    """What its examples/demo_text_query.py leaves of the similarities: relative to their range, from 0.6 on."""
+    similarity = (similarity + 1.0) / 2.0
+    relative = (similarity - similarity.min()) / (similarity.max() - similarity.min() + 1e-12)
+    return np.flatnonzero(relative >= 0.6).tolist()
+
+
+@pytest.mark.parametrize("rows_at_once", [7, 65536])
+def test_of_features_alone_the_points_are_found_that_their_own_program_shows(
+    rows_at_once: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(retrieval, "BLOCK_ROWS", rows_at_once)
+    random = np.random.default_rng(3)
+    features = random.normal(size=(60, 2)).astype(np.float16)
+    features[::9] = 0  # no feature, no part
+    dense = DenseFeatures(random.normal(size=(60, 3)).astype(np.float32), features)
+    has = np.flatnonzero(features.any(axis=1))
+    found = points_found(dense, ["east", "north"], TwoWords())
+    for k in range(2):
+        similarity = features[has, k].astype(np.float64) / np.linalg.norm(features[has].astype(np.float64), axis=1)
+        assert found.mask(k).tolist() == has[as_the_program_of_conceptfusion_shows(similarity)].tolist()
+    assert np.array_equal(found.points, dense.points)
+
+
+def test_where_every_point_is_equally_similar_none_is_found() -> None:
+    for n, features in ((0, np.zeros((0, 2))), (3, np.zeros((3, 2))), (3, np.ones((3, 2)))):
+        dense = DenseFeatures(np.zeros((n, 3), np.float32), features.astype(np.float16))
+        assert points_found(dense, ["east"], TwoWords()).sizes.tolist() == [0]
+
+
+def test_features_of_other_dimensions_than_the_encoders_are_refused() -> None:
+    dense = DenseFeatures(np.zeros((1, 3), np.float32), np.ones((1, 5), np.float16))
+    with pytest.raises(PredictionError, match="5 dimensions and encoder 'two-words' gives 2"):
+        points_found(dense, ["east"], TwoWords())

@@ -111,9 +111,7 @@ def call(arguments: argparse.Namespace) -> int:
     drawn: dict[SheetKind, list[bytes]] = {}
     of_run = [kind for kind in kinds if kind != QUESTIONS]
     if of_run:
-        source = _with_instances(
-            RunSource(read_run(arguments.run), arguments.methods, arguments.scenes), arguments.quiet
-        )
+        source = RunSource(read_run(arguments.run), arguments.methods, arguments.scenes)
         sources: dict[SheetKind, RunSource] = {kind: _judgeable(source, kind, arguments.quiet) for kind in of_run}
         if arguments.dry_run:
             return _estimate(sources["reasoning"], left_out, arguments)
@@ -164,39 +162,26 @@ def _check(arguments: argparse.Namespace) -> None:
         raise ConfigError(f"{given[0]}: is for --solver llm alone; the built-in solver asks nobody")
 
 
-def _with_instances(source: RunSource, is_quiet: bool) -> RunSource:
-    """The run without the methods whose maps are features alone, in which nothing could be outlined."""
-    scene = source.scenes[0]
-    kept = tuple(method for method in source.methods if source.has_instances(scene, method))
+def _judgeable(source: RunSource, kind: SheetKind, is_quiet: bool) -> RunSource:
+    """The run without the methods whose maps hold nothing that sheets of a kind judge; it is said which.
+
+    Texts are compared with features, of instances or of points; labels, masks and answers are of instances.
+    """
+    is_able, lacks, wanted = source.has_instances, "has no instances to judge", "instances that people could judge"
+    if kind == "retrieval":
+        is_able, lacks = source.has_features, "keeps no features to rank by"
+        wanted = "features that a text could be compared with"
+    kept = tuple(method for method in source.methods if is_able(source.scenes[0], method))
     if not kept:
         raise ConfigError(
-            f"{source.run.name}: {', '.join(source.methods)}: no map has instances that people could judge; give the "
-            "run a method that makes them, such as opensu3d"
+            f"{source.run.name}: {', '.join(source.methods)}: no map has {wanted}; give the run a method that makes "
+            "them, such as opensu3d"
         )
-    return _only(source, kept, ("", "which has no instances to judge"), is_quiet)
-
-
-def _only(source: RunSource, kept: tuple[str, ...], why: tuple[str, str], is_quiet: bool) -> RunSource:
-    """The run with these of its methods, where it is said which are left out."""
     if kept == source.methods:
         return source
     left_out = [method for method in source.methods if method not in kept]
-    remark(f"{why[0]}left out {', '.join(left_out)}, {why[1]}", quiet=is_quiet)
+    remark(f"{kind}: left out {', '.join(left_out)}, which {lacks}", quiet=is_quiet)
     return source.of_methods(kept)
-
-
-def _judgeable(source: RunSource, kind: SheetKind, is_quiet: bool) -> RunSource:
-    """The run without the methods whose maps have no features, where texts are compared with features."""
-    if kind != "retrieval":
-        return source
-    scene = source.scenes[0]
-    kept = tuple(method for method in source.methods if source.instances(scene, method).features is not None)
-    if not kept:
-        raise ConfigError(
-            f"{source.run.name}: {', '.join(source.methods)}: no map has features that a text could be compared with; "
-            "give the run a method that makes them, such as opensu3d"
-        )
-    return _only(source, kept, ("retrieval: ", "which keeps no features to rank by"), is_quiet)
 
 
 def _truth(arguments: argparse.Namespace) -> TruthSource:

@@ -12,8 +12,8 @@ import numpy as np
 
 from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.maps import Instances
-from su3d_bench.core.types import GroundTruth
+from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
+from su3d_bench.core.types import Float32Array, GroundTruth
 from su3d_bench.metrics.instance.score import Covered
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.score import (
@@ -33,7 +33,7 @@ from su3d_bench.questions.reasoning.answers import Answer, unsettled
 from su3d_bench.questions.reasoning.asking import AskMap, given_answer
 from su3d_bench.questions.reasoning.language_solver import LanguageSolver
 from su3d_bench.questions.reasoning.scene_map import SceneMap
-from su3d_bench.questions.retrieval import rank_all
+from su3d_bench.questions.retrieval import points_found, rank_all
 from su3d_bench.questions.truths import own_questions, question_truth, scene_objects
 from su3d_bench.sheets.items import RIGHT, WRONG, SheetKind
 from su3d_bench.sheets.making.blinding import without_ids
@@ -50,7 +50,8 @@ class Draft:
     """An item without number and picture. ``rows`` of the map of ``methods[0]`` are outlined, ``others`` drawn too.
 
     ``title``: lines of the picture; ``text``: what the sheet shows; ``names`` (K) of the map's instances as the answer
-    calls them, '' of those that it does not speak of.
+    calls them, '' of those that it does not speak of. ``points`` (M, 3) m are what was found in a map that has no
+    instances, and then row 0.
     """
 
     kind: SheetKind
@@ -67,6 +68,7 @@ class Draft:
     automatic: Mapping[str, str] = field(default_factory=dict)
     others: tuple[int, ...] = ()
     names: tuple[str, ...] = ()
+    points: Float32Array | None = field(default=None, compare=False)
 
 
 def judged(is_right: bool) -> str:
@@ -103,20 +105,23 @@ def questions_of(
 
 
 def retrieval_drafts(source: RunSource, scene: str, questions: Sequence[Question], encoder: Encoder) -> list[Draft]:
-    """For each question one draft for every instance that some method ranks first, with all methods that do."""
+    """For each question one draft for everything that some method finds first, with all methods that do.
+
+    Of instances that is the most similar one, of features alone the points that ``points_found`` says.
+    """
     rules = source.rules(scene, "retrieval")
     texts = [question.text for question in questions]
-    maps = {method: source.instances(scene, method) for method in source.methods}
-    rankings = {method: rank_all(instances, texts, encoder) for method, instances in maps.items() if len(instances)}
-    objects = {method: source.covered(scene, rules, maps[method]) for method in rankings}
+    every = {method: _firsts(source.prediction(scene, method), texts, encoder) for method in source.methods}
+    firsts = {method: found for method, found in every.items() if found is not None}
+    objects = {method: source.covered(scene, rules, found.a_map) for method, found in firsts.items()}
     drafts = []
     for place, question in enumerate(questions):
         groups: dict[bytes, list[str]] = {}
-        for method, ranked in rankings.items():
-            groups.setdefault(mask_digest(maps[method], [int(ranked[place].order[0])]), []).append(method)
+        for method, found in firsts.items():
+            groups.setdefault(mask_digest(found.a_map, [found.rows[place]]), []).append(method)
         for methods in groups.values():
-            first = rankings[methods[0]][place]
-            row, covered = int(first.order[0]), objects[methods[0]]
+            first, covered = firsts[methods[0]], objects[methods[0]]
+            row = first.rows[place]
             automatic = {}
             if covered is not None and question.is_known:
                 query = AskedText(question.kind, question.text, question.answers or ())
@@ -127,17 +132,44 @@ def retrieval_drafts(source: RunSource, scene: str, questions: Sequence[Question
                     kind="retrieval",
                     scene=scene,
                     methods=tuple(methods),
-                    instance_ids=tuple(id_of(maps[name], int(rankings[name][place].order[0])) for name in methods),
-                    rows=(row,),
+                    instance_ids=tuple(firsts[name].id_at(place) for name in methods),
+                    rows=(0,) if first.is_of_points else (row,),
                     title=(f"Is this: {question.text}?",),
                     text=printable(question.text, MOST_TEXT),
                     asks=("retrieval",),
                     question_id=question.id,
                     question_kind=question.kind,
                     automatic=automatic,
+                    points=first.a_map.points[first.a_map.mask(row)] if first.is_of_points else None,
                 )
             )
     return drafts
+
+
+@dataclass(frozen=True)
+class _Firsts:
+    """What a map gives for some questions: the row of ``a_map`` for each; of features alone that is what is found."""
+
+    a_map: Instances
+    rows: tuple[int, ...]
+    is_of_points: bool
+
+    def id_at(self, place: int) -> int:
+        """The number of the instance that answers a question; -1 of points, which are none."""
+        return -1 if self.is_of_points else id_of(self.a_map, self.rows[place])
+
+
+def _firsts(prediction: Prediction, texts: Sequence[str], encoder: Encoder) -> _Firsts | None:
+    """What a map gives for each text; None of an empty one."""
+    if not len(prediction.points):
+        return None
+    if isinstance(prediction, DenseFeatures):
+        return _Firsts(points_found(prediction, texts, encoder), tuple(range(len(texts))), True)
+    assert isinstance(prediction, Instances)
+    if not len(prediction):
+        return None
+    ranked = rank_all(prediction, texts, encoder)
+    return _Firsts(prediction, tuple(int(ranking.order[0]) for ranking in ranked), False)
 
 
 def annotation_drafts(source: RunSource, scene: str, n_most: int, random: np.random.Generator) -> list[Draft]:

@@ -109,11 +109,17 @@ class Artist:
 
     def _region(self, draft: Draft, row: int) -> Region:
         """Where an instance of the draft's map lies; that of another map where it has the same mask."""
-        instances = self._source.instances(draft.scene, draft.methods[0])
+        instances = self._map(draft)
         key = mask_digest(instances, (row,))
         if key not in self._regions:
             self._regions[key] = self.room(draft.scene).region(instances.points[instances.mask(row)])
         return self._regions[key]
+
+    def _map(self, draft: Draft) -> Instances:
+        """The map whose rows a draft names."""
+        if draft.points is not None:
+            return Instances.of(draft.points, [np.arange(len(draft.points))])
+        return self._source.instances(draft.scene, draft.methods[0])
 
     def _room_photos(self, draft: Draft) -> tuple[UInt8Array, ...]:
         """Some of the frames, spread over the walk, where an answer names nothing that could be outlined."""
@@ -127,7 +133,7 @@ class Artist:
         wanted = draft.rows or draft.others
         if not wanted:
             return None, None
-        key = mask_digest(self._source.instances(draft.scene, draft.methods[0]), wanted)
+        key = mask_digest(self._map(draft), wanted)
         if key not in self._photos:
             self._photos[key] = room.photo(room.union([self._region(draft, row) for row in wanted]))
         shown = self._photos[key]

@@ -18,7 +18,7 @@ from su3d_bench.core.errors import (
     printable,
     suggest,
 )
-from su3d_bench.core.maps import Instances
+from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
 from su3d_bench.core.types import Frame, GroundTruth
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.instance.score import Covered, covered_objects
@@ -43,10 +43,6 @@ def chosen_of(run: FinishedRun, what: str, wanted: Sequence[str], known: tuple[s
     return tuple(dict.fromkeys(wanted)) or known
 
 
-class NoInstancesError(PredictionError):
-    """A map that is features alone."""
-
-
 class RunSource:
     """The maps of a run and the data that they were made from; other data are refused."""
 
@@ -54,7 +50,7 @@ class RunSource:
         self.run = run
         self.methods = chosen_of(run, "method", methods, run.methods)
         self.scenes = chosen_of(run, "scene", scenes, run.scenes)
-        self.instances = lru_cache(maxsize=len(self.methods))(self._instances)
+        self.prediction = lru_cache(maxsize=len(self.methods))(self._prediction)
         self._covered: dict[tuple[str, str, bytes], Covered] = {}
         self._truths = lru_cache(maxsize=2)(self._read_truth)
         self._frames_at = lru_cache(maxsize=len(self.methods))(self._read_frames)
@@ -71,28 +67,34 @@ class RunSource:
         return other
 
     def has_instances(self, scene: str, method: str) -> bool:
-        """Whether the map of a scene has instances; features alone are no map that people could judge."""
-        try:
-            self.instances(scene, method)
-        except NoInstancesError:
-            return False
-        return True
+        """Whether the map of a scene has instances, of which labels, masks and answers about them can be judged."""
+        return isinstance(self.prediction(scene, method), Instances)
 
-    def _instances(self, scene: str, method: str) -> Instances:
+    def has_features(self, scene: str, method: str) -> bool:
+        """Whether the map of a scene can be asked for what a text says: it has features of instances or of points."""
+        prediction = self.prediction(scene, method)
+        if isinstance(prediction, Instances):
+            return prediction.features is not None
+        return isinstance(prediction, DenseFeatures)
+
+    def instances(self, scene: str, method: str) -> Instances:
         """The map of a scene; a ``PredictionError`` where it has no instances."""
+        prediction = self.prediction(scene, method)
+        if not isinstance(prediction, Instances):
+            raise PredictionError(
+                f"{printable(str(self.run.folder.job(scene, method).prediction), 200)}: holds no instances that people "
+                f"could judge; leave {printable(method, 80)} out with --methods"
+            )
+        return prediction
+
+    def _prediction(self, scene: str, method: str) -> Prediction:
         job = self.run.folder.job(scene, method)
         if not job.prediction.is_file():
             raise StoreError(
                 f"{self.run.name}: holds no map of {printable(scene, 100)} by {printable(method, 80)}; run it, or "
                 "leave it out with --methods or --scenes"
             )
-        prediction = read_prediction(job.prediction)
-        if not isinstance(prediction, Instances):
-            raise NoInstancesError(
-                f"{printable(str(job.prediction), 200)}: holds no instances that people could judge; leave "
-                f"{printable(method, 80)} out with --methods"
-            )
-        return prediction
+        return read_prediction(job.prediction)
 
     def refined(self, scene: str, method: str) -> RefinedNames | None:
         """Labels n' of the map's instances; None where nobody made them."""
@@ -105,7 +107,9 @@ class RunSource:
     def frames(self, scene: str) -> tuple[Frame, ...]:
         """Some of the frames from which the maps were made, spread over the scene: the same whatever the method."""
         n = len(self.run.dataset(scene).frames(scene.partition("/")[2], 1))
-        of_views = np.unique(np.concatenate([self.instances(scene, method).views[:, 0] for method in self.methods]))
+        maps = (self.prediction(scene, method) for method in self.methods)
+        views = [a_map.views[:, 0] for a_map in maps if isinstance(a_map, Instances)]
+        of_views = np.unique(np.concatenate([np.zeros(0, np.int32), *views]))
         indices = of_views[(of_views >= 0) & (of_views < n)] if len(of_views) else np.arange(n)
         chosen = np.unique(np.linspace(0, len(indices) - 1, min(MOST_FRAMES, len(indices))).astype(np.int64))
         return self._frames_at(scene, tuple(int(indices[k]) for k in chosen))
