@@ -32,7 +32,6 @@ def main() -> int:
     parser.add_argument("--per-kind", type=int, default=10, help="questions of each kind of query")
     arguments = parser.parse_args()
     source = RunSource(read_run(arguments.run))
-    source = source.of_methods([one for one in source.methods if source.has_instances(source.scenes[0], one)])
     artist, encoder = Artist(source), source.run.encoder("cpu")
     astray: list[Draft] = []
 
@@ -44,7 +43,7 @@ def main() -> int:
     for kind in KINDS:
         per_kind = 1 if kind == "reasoning" else arguments.per_kind
         looks[kind] = all_looks(artist, asked_alike(source, encoder, kind, per_kind, arguments.most), check)
-    found = told_apart(looks, source.methods)
+    found = told_apart(looks)
     print("| kind | things | pictures | pairs | told apart | least p |\n|---|---|---|---|---|---|")
     for kind in KINDS:
         values = [p for (of_kind, *_), p in found.items() if of_kind == kind and p is not None]

@@ -23,7 +23,8 @@ from su3d_bench.reports.pictures.render import BACKGROUND
 WIDTH, MARGIN, CAPTION = 960, 10, 24
 PHOTO_WIDTH, ZOOM_WIDTH = 560, 370
 TOP_HEIGHT, LOW_HEIGHT = 420, 320
-TITLE_SIZE, TITLE_LINE, MOST_TITLE_LINES = 25, 33, 3
+TITLE_SIZE, TITLE_LINE, MOST_TITLE_LINES = 25, 33, 4  # two lines each of a question and its answer
+FIRST_WIDE, REST_WIDE = 60, 88  # characters of a line of the title
 MOST_TAGS, MOST_TAG_TEXT, TAG_LINE = 8, 28, 19
 OUTLINE, HALO = (255, 64, 200), (255, 255, 255)  # a pink that no heat scale has, on white
 INK, GREY, PAPER, PANEL = (26, 26, 26), (96, 96, 96), (255, 255, 255), (244, 244, 242)
@@ -79,13 +80,14 @@ def compose(parts: ItemParts) -> UInt8Array:
     """The picture (h, 960, 3) of an item."""
     from PIL import Image, ImageDraw
 
-    lines = _title_lines(parts.title)
+    lines = title_lines(parts.title)
     top = MARGIN + TITLE_LINE * len(lines) + 6
     low = top + CAPTION + TOP_HEIGHT + MARGIN
     page = Image.new("RGB", (WIDTH, low + CAPTION + LOW_HEIGHT + MARGIN), PAPER)
     draw = ImageDraw.Draw(page)
-    for k, (text, size) in enumerate(lines):
-        write_line(draw, (MARGIN, MARGIN + TITLE_LINE * k), text, size, INK if k == 0 else GREY, is_bold=k == 0)
+    for k, (text, is_first) in enumerate(lines):
+        size, shade = (TITLE_SIZE, INK) if is_first else (TITLE_SIZE - 6, GREY)
+        write_line(draw, (MARGIN, MARGIN + TITLE_LINE * k), text, size, shade, is_bold=is_first)
     right = MARGIN + PHOTO_WIDTH + MARGIN
     if parts.photo is not None:
         _place(page, draw, parts.photo, (MARGIN, top), (PHOTO_WIDTH, TOP_HEIGHT))
@@ -281,18 +283,19 @@ def draw_tags(draw: Any, tags: tuple[Tag, ...], at: tuple[int, int], size: tuple
         write_line(draw, place, text, 13, tag.colour)
 
 
-def _title_lines(title: tuple[str, ...]) -> list[tuple[str, int]]:
-    """Lines and their sizes; what does not fit ends in dots."""
+def title_lines(title: tuple[str, ...]) -> list[tuple[str, bool]]:
+    """Lines, and whether each is of the first of ``title``, which is large; what does not fit ends in dots."""
     import textwrap
 
-    lines: list[tuple[str, int]] = []
+    lines: list[tuple[str, bool]] = []
     for k, text in enumerate(title):
-        size = TITLE_SIZE if k == 0 else TITLE_SIZE - 6
-        wide = 60 if k == 0 else 88
-        wrapped = textwrap.wrap(printable(text, 3 * wide), wide) or [""]
-        lines += [(line, size) for line in wrapped]
+        wide = FIRST_WIDE if k == 0 else REST_WIDE
+        wrapped = textwrap.wrap(printable(text, MOST_TITLE_LINES * wide), wide) or [""]
+        lines += [(line, k == 0) for line in wrapped]
     if len(lines) > MOST_TITLE_LINES:
-        lines = [*lines[: MOST_TITLE_LINES - 1], (lines[MOST_TITLE_LINES - 1][0][:56] + "...", TITLE_SIZE)]
+        last, is_first = lines[MOST_TITLE_LINES - 1]
+        wide = FIRST_WIDE if is_first else REST_WIDE
+        lines = [*lines[: MOST_TITLE_LINES - 1], (last[: wide - 3] + "...", is_first)]
     return lines
 
 

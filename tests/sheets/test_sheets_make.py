@@ -36,6 +36,7 @@ from su3d_bench.reports.pictures.items import (
     mask_in_frame,
     png_bytes,
     seen_in,
+    title_lines,
     zoomed,
 )
 from su3d_bench.runs import finished as finished_run
@@ -325,6 +326,22 @@ def test_hostile_titles_make_a_picture_of_the_usual_size(text: str) -> None:
     grey = Panel("panel", np.full((30, 40, 3), 120, np.uint8), np.zeros((30, 40), bool))
     picture = compose(ItemParts((text, text), None, grey, grey))
     assert picture.shape[1] == 960 and 700 < picture.shape[0] < 1000
+
+
+def test_a_question_of_two_lines_stands_above_its_answer_and_what_is_too_long_ends_in_dots() -> None:
+    question = "Which pile of books is closest to the tissue paper, measured between centres?"
+    whole = title_lines((question, "Answer: book A is closest: 0.70 m between centres; " + "book B 1.71 m; " * 3))
+    assert [is_first for _, is_first in whole] == [True, True, False, False]
+    assert " ".join(text for text, is_first in whole if is_first) == question
+    cut = title_lines(("Is it?", "yes " * 200))
+    assert len(cut) == 4 and cut[-1][0].endswith("...") and all(len(text) <= 88 for text, _ in cut)
+
+
+def test_an_arrow_is_spoken_of_where_one_is_drawn(source: RunSource) -> None:
+    draft = replace(drafts_of("reasoning", ["sofa"])[0], scene="painted/a", methods=("collector",), rows=(1,), names=())
+    for one, is_drawn in ((draft, True), (replace(draft, names=("chair", "sofa", "", "")), False)):
+        place = Artist(source).parts(one).place
+        assert (place.ring is not None and place.eye is not None) == is_drawn == ("arrow" in place.title)
 
 
 def frame_of(depth_m: np.ndarray, x_m: float = 0.0) -> Frame:

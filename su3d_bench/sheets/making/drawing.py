@@ -88,13 +88,16 @@ class Artist:
             self._tags(draft, best),
             line=2,
         )
+        ring = _ring(draft, room, answer)
+        stands_at = None if eye is None else _inside(room.above.project(eye[None])[0])
+        has_arrow = ring is not None and stands_at is not None
         place = Panel(
             ("its place, from above" if draft.rows else "from above")
-            + (" (arrow: from the camera)" if eye is not None and draft.rows else ""),
+            + (" (arrow: from the camera)" if has_arrow else ""),
             colour(room.above.shown, _coloured(room, answer, other, PLACE_SHARE)),
             tags=self._tags(draft, room.above),
-            ring=_ring(draft, room, answer),
-            eye=None if eye is None else _inside(room.above.project(eye[None])[0]),
+            ring=ring,
+            eye=stands_at,
         )
         photos = self._room_photos(draft) if photo is None else ()
         return ItemParts(draft.title, photo, room_view, place, photos)

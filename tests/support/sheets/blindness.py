@@ -90,9 +90,10 @@ def _asked(
 ) -> Iterable[tuple[str, Draft]]:
     """The items of a scene, as sheets have them, and what each is of."""
     if kind == "retrieval":
-        able = [method for method in source.methods if source.instances(scene, method).features is not None]
-        drafts = retrieval_drafts(source.of_methods(able), scene, questions_of(source, scene, None, per_kind), encoder)
+        source = source.of_methods([method for method in source.methods if source.has_features(scene, method)])
+        drafts = retrieval_drafts(source, scene, questions_of(source, scene, None, per_kind), encoder)
         return [(draft.question_id, draft) for draft in drafts]
+    source = source.of_methods([method for method in source.methods if source.has_instances(scene, method)])
     if kind == "reasoning":
         drafts = reasoning_drafts(source, scene, None, per_kind, built_in(encoder))
         return [(draft.question_id, draft) for draft in drafts]
@@ -269,9 +270,14 @@ def pairs_of(looks: Looks, one: str, other: str) -> list[tuple[str, Look, Look]]
     return [(thing[0], shown[one], shown[other]) for thing, shown in looks.items() if {one, other} <= shown.keys()]
 
 
-def told_apart(looks_of: Mapping[str, Looks], methods: Sequence[str]) -> dict[tuple[str, str, str], float | None]:
-    """For each kind and pair of methods Holm's p that its pictures are no better told apart than by chance."""
-    names = [(kind, *pair) for kind in looks_of for pair in combinations(methods, 2)]
+def methods_in(looks: Looks) -> list[str]:
+    """The methods of which something is shown."""
+    return sorted({method for shown in looks.values() for method in shown})
+
+
+def told_apart(looks_of: Mapping[str, Looks]) -> dict[tuple[str, str, str], float | None]:
+    """For each kind and pair of its methods Holm's p that the pictures are no better told apart than by chance."""
+    names = [(kind, *pair) for kind, looks in looks_of.items() for pair in combinations(methods_in(looks), 2)]
     raw = [p_of_telling(pairs_of(looks_of[kind], one, other)) for kind, one, other in names]
     return dict(zip(names, holm(raw), strict=True))
 
