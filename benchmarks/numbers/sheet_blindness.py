@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 import folders  # noqa: F401 (makes what tests share known)
-from blindness import ALPHA, Looks, all_looks, asked_alike, told_apart
+from blindness import ALPHA, Looks, all_looks, asked_alike, differs, told_apart
 
 from su3d_bench.core.types import BoolArray, UInt8Array
 from su3d_bench.runs.finished import read_run
@@ -36,7 +36,7 @@ def main() -> int:
     astray: list[Draft] = []
 
     def check(draft: Draft, picture: UInt8Array, blank: UInt8Array, zone: BoolArray) -> None:
-        if ((picture != blank).any(axis=2) & ~zone).any():
+        if (differs(picture, blank) & ~zone).any():
             astray.append(draft)
 
     looks: dict[str, Looks] = {}

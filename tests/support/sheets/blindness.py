@@ -178,9 +178,18 @@ class Onlooker:
 def _holds(view: MapView, member: BoolArray) -> BoolArray:
     """Which pixels (h, w) of a view have anything of ``member``, be it a quarter of one."""
     fine = np.append(member, False)[view.shown.point]
-    height, width = (side // OVERSAMPLING for side in fine.shape)
-    held: Any = fine[: 2 * height, : 2 * width].reshape(height, OVERSAMPLING, width, OVERSAMPLING).any(axis=(1, 3))
-    return np.asarray(held, np.bool_)
+    height, width = (side // OVERSAMPLING * OVERSAMPLING for side in fine.shape)
+    held = np.zeros((height // OVERSAMPLING, width // OVERSAMPLING), np.bool_)
+    for down in range(OVERSAMPLING):
+        for across in range(OVERSAMPLING):
+            held |= fine[down:height:OVERSAMPLING, across:width:OVERSAMPLING]
+    return held
+
+
+def differs(picture: UInt8Array, other: UInt8Array | int) -> BoolArray:
+    """Where (h, w) any channel of ``picture`` (h, w, 3) is another."""
+    red, green, blue = np.moveaxis(picture != other, 2, 0)
+    return np.asarray(red | green | blue, np.bool_)
 
 
 def _put(zone: BoolArray, panel: Panel, mask: BoolArray, at: tuple[int, int], size: tuple[int, int]) -> None:
@@ -199,9 +208,10 @@ def _put(zone: BoolArray, panel: Panel, mask: BoolArray, at: tuple[int, int], si
             cv2.circle(shown, start, 9, 1, -1)
     x, y = at[0] + (size[0] - inner[0]) // 2, at[1] + CAPTION + (size[1] - inner[1]) // 2
     zone[y : y + inner[1], x : x + inner[0]] |= shown > 0
-    names = Image.fromarray(np.zeros((*zone.shape, 3), np.uint8))  # all of it, for their boxes reach over a border
-    draw_tags(ImageDraw.Draw(names), panel.tags[:MOST_TAGS], (x, y), inner)
-    zone |= np.asarray(names).max(axis=2) > 0
+    if panel.tags:
+        names = Image.fromarray(np.zeros((*zone.shape, 3), np.uint8))  # all of it, for their boxes reach over a border
+        draw_tags(ImageDraw.Draw(names), panel.tags[:MOST_TAGS], (x, y), inner)
+        zone |= differs(np.asarray(names), 0)
 
 
 def look_at(picture: UInt8Array, zone: BoolArray) -> Look:
@@ -209,8 +219,8 @@ def look_at(picture: UInt8Array, zone: BoolArray) -> Look:
     size = picture.shape[1] // SMALLER, picture.shape[0] // SMALLER
     cut = tuple(slice(SMALLER * side) for side in size[::-1])
     small: Any = cv2.resize(picture[cut], size, interpolation=cv2.INTER_AREA)
-    blocks: Any = zone[cut].reshape(size[1], SMALLER, size[0], SMALLER)
-    return Look(small, blocks.any(axis=(1, 3)))
+    share: Any = cv2.resize(np.ascontiguousarray(zone[cut]).view(np.uint8) * 255, size, interpolation=cv2.INTER_AREA)
+    return Look(small, share > 0)  # of 16 pixels one is still 16 of 255
 
 
 def features_of(look: Look, zone: BoolArray) -> Float64Array:
