@@ -55,10 +55,12 @@ bench-methods: $(VENV)/test
 reference: demo
 	$(BIN)/su3d-bench check --learn runs/demo --out .ci/reference.json --across-machines 5 --cost-limit 3
 
-# Draws what docs/architecture.md says of the code from the code, and makes docs/verbs.md from the parser.
+# Draws what docs/architecture.md says of the code from the code, makes docs/verbs.md from the parser and
+# docs/originals.md from the protocols' files.
 architecture: $(VENV)/test
 	$(BIN)/python tests/support/house.py
 	$(BIN)/python tests/support/verbs_page.py
+	$(BIN)/python tests/support/originals_page.py
 
 # The documentation site, which works from the disk: open build/site/index.html. Under --quiet mkdocs counts no warnings,
 # and --strict would end nothing.

@@ -13,9 +13,10 @@ from su3d_bench.analysis.inputs import Inputs, method_of, truth_of_scene
 from su3d_bench.analysis.sides import parse_side
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, printable, some
 from su3d_bench.metrics.fitness import why_not_scorable
+from su3d_bench.metrics.matching.remembered import remembering
 from su3d_bench.metrics.protocols.mixtures import Differing, Mixtures, differing
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.scoring import SceneScore, combined_metrics, plain_json, score_scene
+from su3d_bench.metrics.scoring import combined_metrics, pack_scores, plain_json, score_scene, unpack_scores
 from su3d_bench.numerics.shares import EXACT_STEPS, N_ORDERS, Share, choices, shares
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report, run_inline, run_processes
 from su3d_bench.runs.finished import FinishedRun, read_run
@@ -74,7 +75,8 @@ class _Unit:
     choices: tuple[int, ...]
 
 
-Scores = Mapping[int, SceneScore]  # of a scene, by the choice of rules
+# Of a scene, by the choice of rules, as they are packed in files: 256 confusion matrices of 200 classes are 82 MB.
+Scores = Mapping[int, bytes]
 
 
 def rules_apart(first: ProtocolRules, second: ProtocolRules, walk: Walk | None = None) -> RulesApart:
@@ -127,7 +129,8 @@ class Walker:
         @cache
         def values(bits: int) -> Mapping[str, float]:
             rules = _rules(mixtures, inputs, bits)
-            found = combined_metrics(rules, {scene: of_scene[scene][bits] for scene in self.scenes})
+            scores = {scene: unpack_scores(of_scene[scene][bits])[rules.name] for scene in self.scenes}
+            found = combined_metrics(rules, scores)
             undefined = [name for name in mixtures.values if not math.isfinite(found[name])]
             if undefined:
                 raise PredictionError(
@@ -170,14 +173,16 @@ def _score(unit: _Unit, report: Report) -> tuple[str, Scores]:
     run = read_run(unit.folder)
     inputs, truth_of = Inputs(run, unit.method), cache(partial(truth_of_scene, run, unit.scene))
     own = cache(run.encoder)
-    scores: dict[int, SceneScore] = {}
-    for k, bits in enumerate(unit.choices):
-        report(Event(unit.scene, "scoring", k, len(unit.choices)))
-        rules = _rules(unit.mixtures, inputs, bits)
-        truth, prediction = inputs.of_scene(unit.scene, rules, truth_of)
-        if (reason := why_not_scorable(rules, prediction)) is not None:
-            raise PredictionError(f"{printable(unit.scene, 120)}: under {rules.name}: {reason}")
-        scores[bits] = score_scene(rules, truth, prediction, inputs.encoder(rules, prediction, own))
+    scores: dict[int, bytes] = {}
+    with remembering():
+        for k, bits in enumerate(unit.choices):
+            report(Event(unit.scene, "scoring", k, len(unit.choices)))
+            rules = _rules(unit.mixtures, inputs, bits)
+            truth, prediction = inputs.of_scene(unit.scene, rules, truth_of)
+            if (reason := why_not_scorable(rules, prediction)) is not None:
+                raise PredictionError(f"{printable(unit.scene, 120)}: under {rules.name}: {reason}")
+            score = score_scene(rules, truth, prediction, inputs.encoder(rules, prediction, own))
+            scores[bits] = pack_scores({rules.name: score})
     report(Event(unit.scene, SCENE_DONE, len(unit.choices), len(unit.choices)))
     return unit.scene, scores
 

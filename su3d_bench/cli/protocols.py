@@ -6,6 +6,7 @@ import argparse
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.shared.answers import answer_either, answer_tables, remark, show
@@ -16,6 +17,7 @@ from su3d_bench.core.errors import EXIT_DONE, ConfigError, suggest
 
 if TYPE_CHECKING:
     from su3d_bench.metrics.protocols.model import ProtocolRules
+    from su3d_bench.metrics.protocols.originals import Stated
 
 ACTIONS = ("list", "show", "diff")
 
@@ -24,7 +26,8 @@ def add_parser(verbs: Any) -> None:
     parser = add_verb(
         verbs,
         "protocols",
-        "List the protocols; 'show NAME' prints every rule of one, 'diff A B' the rules in which two differ.",
+        "List the protocols and whose evaluations they repeat; 'show NAME' prints every rule of one, 'diff A B' the "
+        "rules in which two differ.",
         (
             "su3d-bench protocols show rooms-semantic --names",
             "su3d-bench protocols diff rooms-semantic replica-mesh-ex6",
@@ -56,6 +59,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.metrics.labels import labels_taken
     from su3d_bench.metrics.protocols.files import protocol_names, rules_files
     from su3d_bench.metrics.protocols.loading import load_protocol
+    from su3d_bench.metrics.protocols.originals import original_of
 
     if arguments.action not in ACTIONS:
         raise ConfigError(f"protocols: unknown action '{arguments.action}'{suggest(arguments.action, ACTIONS)}")
@@ -75,15 +79,32 @@ def call(arguments: argparse.Namespace) -> int:
         rules = load_protocol(arguments.name)
         if arguments.names:
             return _answer_names(arguments, rules)
+        stated = original_of(arguments.name)
         value = rules.model_dump(mode="json") | {"digest": rules.digest, "labels_taken": labels_taken(rules)}
-        answer_either(arguments, value, *_rules_lines(rules, rules_files(arguments.name)))
+        value |= {"original": _plain(stated)}
+        lines = [*_rules_lines(rules, rules_files(arguments.name)), *_original_lines(stated)]
+        answer_either(arguments, value, *lines)
         return EXIT_DONE
-    rows = [load_protocol(name) for name in protocol_names()]
+    rows = [(load_protocol(name), original_of(name)) for name in protocol_names()]
     fields = {"name", "version", "summary", "kind", "datasets", "headline", "ground_truth", "label_space"}
-    width = max(len(rules.name) for rules in rows)
-    lines = [f"{rules.name:<{width}}  {rules.summary}" for rules in rows]
-    answer_either(arguments, [rules.model_dump(mode="json", include=fields) for rules in rows], *lines)
+    values = [rules.model_dump(mode="json", include=fields) | {"original": _plain(stated)} for rules, stated in rows]
+    width = max(len(rules.name) for rules, _ in rows)
+    lines = []
+    for rules, stated in rows:
+        lines.append(f"{rules.name:<{width}}  {rules.summary}")
+        if stated is not None:
+            lines += [f"    {line}" for line in wrap(stated.in_short, 116, break_on_hyphens=False)]
+    answer_either(arguments, values, *lines)
     return EXIT_DONE
+
+
+def _plain(stated: Stated | None) -> dict[str, Any] | None:
+    return stated and stated.original.model_dump(mode="json") | {"of": stated.base}
+
+
+def _original_lines(stated: Stated | None) -> list[str]:
+    facts = {"original": "not said"} if stated is None else stated.facts
+    return ["", *(f"{name:<28} {text}" for name, text in facts.items())]
 
 
 def _answer_diff(arguments: argparse.Namespace) -> int:

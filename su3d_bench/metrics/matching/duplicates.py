@@ -6,8 +6,10 @@ import numpy as np
 
 from su3d_bench.core.maps import Masks
 from su3d_bench.core.types import Int64Array
+from su3d_bench.metrics.matching.remembered import remembered
 
 
+@remembered
 def duplicate_pairs(masks: Masks, n_points: int, iou: float) -> list[tuple[int, int]]:
     """Pairs of masks, the lower first, whose IoU is above ``iou``.
 

@@ -13,6 +13,7 @@ from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Prediction
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array
+from su3d_bench.metrics.matching.remembered import remembered
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.store.scratch import row_blocks
 
@@ -83,7 +84,7 @@ def text_features(
     Raises ``PredictionError`` where ``features`` (K, D) come from an encoder of other dimensions.
     """
     texts = [rules.texts_of(name) for name in names]
-    encoded = encoder.encode_texts([text for of_name in texts for text in of_name])
+    encoded = _encoded(encoder, [text for of_name in texts for text in of_name])
     if encoded.shape[1] != features.shape[1]:
         raise PredictionError(
             f"{rules.name}: features have {features.shape[1]} dimensions, the encoder '{encoder.name}' has "
@@ -95,6 +96,11 @@ def text_features(
     directions = _normalised(np.asarray(encoded, np.float64))
     mean: Float64Array = directions.reshape(len(names), n_prompts, -1).mean(axis=1)
     return mean
+
+
+@remembered
+def _encoded(encoder: Encoder, texts: list[str]) -> Float32Array:
+    return encoder.encode_texts(texts)
 
 
 def device_of(encoder: Encoder) -> str:
@@ -124,6 +130,7 @@ def cosines(features: NDArray[Any], text: NDArray[Any], device: str = CPU) -> Fl
     return product
 
 
+@remembered
 def most_similar(features: np.ndarray, text: np.ndarray, device: str = CPU) -> Int64Array:
     """For each row of ``features`` (K, D) the row of ``text`` (C, D) of highest cosine, the first of equals.
 

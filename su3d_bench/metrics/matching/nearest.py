@@ -9,6 +9,7 @@ import numpy as np
 
 from su3d_bench.core.maps import Instances, Masks, Partition, starts_of
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, IntArray
+from su3d_bench.metrics.matching.remembered import is_remembering, remembered
 from su3d_bench.numerics.geometry import voxel_coordinates
 
 Points = Float32Array | Float64Array
@@ -173,6 +174,7 @@ def first_rows(rows: Int64Array) -> Int64Array:
     return held[is_first] & ((1 << n_bits) - 1)
 
 
+@remembered
 def transfer_masks(
     points: Points, masks: Masks, targets: Points, cap_m: float | None = None, voxel_m: float = 0.0
 ) -> Masks:
@@ -236,10 +238,17 @@ def transfer_values(
         value[own], distance[own] = values[own], 0.0
         missing = wanted & ~own
     rows = np.flatnonzero(missing)
-    distance[rows], nearest_index = nearest(points[order], targets[rows], cap_m)
+    if is_remembering() and 2 * len(rows) > len(targets):  # another rule wants others of the targets
+        of_all = _nearest_of_all(points[order], targets, cap_m)
+        distance[rows], nearest_index = of_all[0][rows], of_all[1][rows]
+    else:
+        distance[rows], nearest_index = nearest(points[order], targets[rows], cap_m)
     reached = rows[nearest_index >= 0]
     value[reached] = values[order][nearest_index[nearest_index >= 0]]
     return value, distance
+
+
+_nearest_of_all = remembered(nearest)
 
 
 def n_farther(distance: Float64Array) -> Int64Array:

@@ -13,8 +13,10 @@ import numpy as np
 from su3d_bench.core.maps import Masks
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 from su3d_bench.metrics.matching.nearest import Points, row_ids
+from su3d_bench.metrics.matching.remembered import is_remembering, remembered
 
 _MAX_CELLS = 4_000_000  # neighbours held at once
+_MOST_KEPT = 12_000_000  # neighbours kept, of 16 bytes each, where they may be asked for again
 
 
 def transfer_votes(
@@ -35,6 +37,14 @@ def transfer_votes(
     wanted_rows = np.flatnonzero(wanted)
     if not len(points) or not len(wanted_rows):
         return value, distance
+    if is_remembering() and 2 * len(wanted_rows) > len(targets) and len(targets) * neighbours <= _MOST_KEPT:
+        # another rule wants others of the targets, and other values of the points
+        place_of_all, all_distances, all_indices = _neighbours_of_all(points, targets, neighbours)
+        place = place_of_all[wanted_rows]
+        votes = np.where(all_distances <= cap_m, values[all_indices], -1)
+        value[wanted_rows], distance[wanted_rows] = _most_votes(votes)[place], all_distances.min(axis=1)[place]
+        distance[distance > cap_m] = np.inf
+        return value, distance
     places, place_of_target = _distinct_places(targets[wanted_rows])
     of_place, nearest_m = np.empty(len(places), np.int64), np.empty(len(places))
     search = _Search(points, neighbours)
@@ -47,6 +57,19 @@ def transfer_votes(
     value[wanted_rows], distance[wanted_rows] = of_place[place_of_target], nearest_m[place_of_target]
     distance[distance > cap_m] = np.inf
     return value, distance
+
+
+@remembered
+def _neighbours_of_all(
+    points: Points, targets: Points, neighbours: int
+) -> tuple[Int64Array, Float64Array, Int64Array]:
+    """The row of every target's place, and of each place the distances and indices of its nearest points."""
+    places, place_of_target = _distinct_places(targets)
+    search = _Search(points, neighbours)
+    step = max(1, _MAX_CELLS // (neighbours + 1))
+    found = [search.nearest(places[start : start + step]) for start in range(0, len(places), step)]
+    distances, indices = (np.concatenate(each) for each in zip(*found, strict=True))
+    return place_of_target, distances, indices
 
 
 def _distinct_places(points: Points) -> tuple[Float64Array, Int64Array]:

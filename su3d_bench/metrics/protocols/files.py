@@ -47,23 +47,32 @@ def rules_file(name: str) -> Path:
 
 @dataclass(frozen=True)
 class Content:
-    """All rules that a file sets or extends, as ``values``; ``files``: the file itself, the one that it extends, ..."""
+    """All rules that a file sets or extends, as ``values``; ``files``: the file itself, the one that it extends, ...
+
+    ``original``: the first of them with a table of that name, and the table.
+    """
 
     values: dict[str, Any]
     files: tuple[Path, ...]
+    original: tuple[Path, dict[str, Any]] | None
 
 
 def read_content(path: Path) -> Content:
     """What a TOML file holds, where ``classes`` names a class table or lists rows [id, name] or [id, name, group].
 
     A file that ``extends`` another, by a protocol's name or by a path from its own folder, has all its rules but those
-    that it sets itself; sections are joined key by key.
+    that it sets itself; sections are joined key by key, but for ``[original]``, which is no rule.
     """
     chain = _chain(path)
     files = tuple(file for file, _ in chain)
+    original = next(((file, own["original"]) for file, own in chain if "original" in own), None)
+    if original is not None and not isinstance(original[1], dict):
+        raise ConfigError(f"{line_of([original[0]], 'original')}: original must be a table, [original]")
     values: dict[str, Any] = {}
     for _, own in reversed(chain):
         for key, value in own.items():
+            if key == "original":
+                continue
             is_section = isinstance(value, dict) and isinstance(values.get(key), dict)
             values[key] = values[key] | value if is_section else value
     table = values.get("classes")
@@ -75,7 +84,7 @@ def read_content(path: Path) -> Content:
         values["classes"] = _read_toml(tables[table])["classes"]
     if "classes" in values:
         values["classes"] = _entries(files, values.get("classes"))
-    return Content(values, files)
+    return Content(values, files, original)
 
 
 def _chain(path: Path) -> list[tuple[Path, dict[str, Any]]]:

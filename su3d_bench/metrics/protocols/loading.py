@@ -16,6 +16,7 @@ from pydantic import ValidationError
 from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.metrics.protocols.files import line_of, protocol_names, read_content, rules_file
 from su3d_bench.metrics.protocols.model import RULES_OF_KIND, SECTIONS, ProtocolRules
+from su3d_bench.metrics.protocols.originals import read_original
 
 
 def protocols_for(dataset: str) -> list[str]:
@@ -73,6 +74,8 @@ def _state(path: Path) -> tuple[int, int] | None:
 def read_protocol(path: Path) -> ProtocolRules:
     """The rules in a TOML file and in those that it extends."""
     content = read_content(path)
+    if content.original is not None:
+        read_original(*content.original)
     try:
         return _made(content.values)
     except ValidationError as error:

@@ -19,6 +19,7 @@ from su3d_bench.core.config import flatten, toml_value
 from su3d_bench.metrics.protocols.files import HEADING, protocol_names, remarks_of, rules_files
 from su3d_bench.metrics.protocols.loading import load_protocol, not_comparable_with
 from su3d_bench.metrics.protocols.model import RULES_OF_KIND, ProtocolRules
+from su3d_bench.metrics.protocols.originals import Original, Stated, original_of
 from su3d_bench.reports.tables.papers.published import Figure, figures_of
 
 PROTOCOLS = "reference/protocols"
@@ -33,7 +34,10 @@ def made_pages() -> dict[str, str]:
     methods = [told_of(name) for name in registry.BUILT_IN["method"]]
     return {
         f"{PROTOCOLS}/index.md": protocols_page(protocols),
-        **{f"{PROTOCOLS}/{rules.name}.md": protocol_page(rules, rules_files(rules.name)) for rules in protocols},
+        **{
+            f"{PROTOCOLS}/{rules.name}.md": protocol_page(rules, rules_files(rules.name), original_of(rules.name))
+            for rules in protocols
+        },
         f"{METHODS}/index.md": methods_page(methods),
         **{f"{METHODS}/{method['name']}.md": method_page(method) for method in methods},
         API: api_page(),
@@ -57,7 +61,7 @@ def _page(title: str, *parts: str) -> str:
 
 
 def protocols_page(protocols: Sequence[ProtocolRules]) -> str:
-    head = ("protocol", "what it measures", "kind", "headline", "datasets")
+    head = ("protocol", "what it measures", "kind", "headline", "datasets", "original")
     rows = [
         (
             _linked([rules.name]),
@@ -65,18 +69,38 @@ def protocols_page(protocols: Sequence[ProtocolRules]) -> str:
             plain(rules.kind),
             plain(", ".join(rules.headline)),
             plain(", ".join(rules.datasets) or "any"),
+            _source(stated.original) if (stated := original_of(rules.name)) else "",
         )
         for rules in protocols
     ]
     return _page(
         "The protocols",
         "<p>A protocol is the rules by which a map becomes numbers. Each has a page, made from the file that the "
-        "program reads: every rule with its source, and what its numbers may not be compared with.</p>",
+        "program reads: every rule with its source, whose evaluation it repeats, how far both were held against each "
+        "other, and what its numbers may not be compared with.</p>",
         table(head, rows, is_stacked=True),
     )
 
 
-def protocol_page(rules: ProtocolRules, files: Sequence[Path]) -> str:
+def _source(original: Original) -> str:
+    """The repository and commit as a link, or that there is none."""
+    if original.place is None:
+        return "none"
+    return f'<a href="{plain(original.place)}">{plain(original.code)} at {plain(str(original.commit)[:7])}</a>'
+
+
+def _original_of(stated: Stated | None) -> list[str]:
+    """The section that says whose evaluation it is."""
+    if stated is None:
+        return []
+    rows = [
+        (plain(name), _source(stated.original) if name == "original" and stated.original.place else prose(text))
+        for name, text in stated.facts.items()
+    ]
+    return ["## Its original", table((), rows, is_stacked=True)]
+
+
+def protocol_page(rules: ProtocolRules, files: Sequence[Path], stated: Stated | None = None) -> str:
     """What ``su3d-bench protocols show NAME`` prints, as a page."""
     remarks = remarks_of(files)
     sources = " ".join(remarks.pop(HEADING, [])).replace(" extends ", "\nextends ").split("\n")
@@ -96,6 +120,7 @@ def protocol_page(rules: ProtocolRules, files: Sequence[Path]) -> str:
         f"<p>{plain(rules.summary)}</p>",
         *(f"<p>{prose(source)}</p>" for source in sources),
         table((), glance, is_stacked=True),
+        *_original_of(stated),
         "## Every rule",
         table(("rule", "value", "source, or that it is ours"), rows, is_stacked=True),
         f"<p>Not set: {_codes(absent)}.</p>" if absent else "",

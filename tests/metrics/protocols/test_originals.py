@@ -1,0 +1,185 @@
+"""Whose evaluation each protocol repeats: a table that must be whole, facts that are shown everywhere, cases that hold."""
+
+from __future__ import annotations
+
+import doctest
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import originals_page
+import pytest
+from pages_of_code import made_pages
+from places import CASES, ROOT
+
+from su3d_bench.cli.main import main
+from su3d_bench.core.errors import ConfigError
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import GroundTruth, LabelSet
+from su3d_bench.metrics.protocols import originals as module
+from su3d_bench.metrics.protocols.files import RULES, protocol_names
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.protocols.originals import original_of
+from su3d_bench.metrics.scoring import combine, score_scene
+
+WHOLE = """
+[original]
+code = "a/b"
+commit = "0123abc"
+files = ["eval.py"]
+licence = "none stated"
+data = "nobody's"
+compared = "AP"
+"""
+
+
+@pytest.mark.parametrize("name", protocol_names())
+def test_every_protocol_says_whose_evaluation_it_is_and_its_cases_are_there(name: str) -> None:
+    stated = original_of(name)
+    assert stated is not None
+    for pattern in stated.original.cases:
+        assert any(ROOT.glob(pattern)), pattern
+
+
+def test_the_facts_of_every_protocol_are_listed_shown_and_on_the_site(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["protocols"]) == 0
+    listed = " ".join(capsys.readouterr().out.split())
+    assert main(["protocols", "--json"]) == 0
+    rows = {row["name"]: row["original"] for row in json.loads(capsys.readouterr().out)}
+    pages = made_pages()
+    for name in protocol_names():
+        stated = original_of(name)
+        assert stated is not None
+        one = stated.original
+        assert " ".join(stated.in_short.split()) in listed
+        assert (rows[name]["code"], rows[name]["of"]) == (one.code, stated.base)
+        assert main(["protocols", "show", name]) == 0
+        shown, page = capsys.readouterr().out, pages[f"reference/protocols/{name}.md"]
+        for fact, text in stated.facts.items():
+            assert f"{fact:<28} {text}" in shown
+            assert f"<td>{fact}</td>" in page
+        assert one.place is None or f'href="{one.place}"' in page
+        assert one.place is None or f'href="{one.place}"' in pages["reference/protocols/index.md"]
+
+
+def test_the_page_of_originals_is_what_the_protocols_say() -> None:
+    assert originals_page.PAGE.read_text() == originals_page.page(), "run make architecture"
+    assert all(f"`{name}`" in originals_page.PAGE.read_text() for name in protocol_names())
+
+
+def own(folder: Path, table: str, base: str = "scannet-instance") -> str:
+    path = folder / "mine.toml"
+    path.write_text(f'extends = "{base}"\nname = "mine"\n{table}')
+    return str(path)
+
+
+def test_a_file_that_extends_another_takes_its_original_over_as_that_of_the_other(tmp_path: Path) -> None:
+    taken = original_of(own(tmp_path, ""))
+    assert taken is not None and taken.base == "scannet-instance"
+    assert taken.original.code == "ScanNet/ScanNet" and taken.facts["original of"].startswith("scannet-instance")
+    stated = original_of(own(tmp_path, WHOLE))
+    assert stated is not None and (stated.base, stated.original.code) == (None, "a/b")
+    assert stated.original.cases == () and stated.original.problems == 0  # the table is taken over whole or not at all
+
+
+def test_what_is_said_of_an_original_moves_no_rule(tmp_path: Path) -> None:
+    with_one, without = load_protocol(own(tmp_path, WHOLE)).digest, load_protocol(own(tmp_path, "")).digest
+    assert with_one == without
+
+
+def test_rules_of_ones_own_need_say_nothing_and_those_of_the_program_must(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (RULES / "rooms-instance.toml").read_text().partition("[original]")[0]
+    mine = tmp_path / "mine.toml"
+    mine.write_text(text.replace('name = "rooms-instance"', 'name = "mine"'))
+    assert original_of(str(mine)) is None
+    assert main(["protocols", "show", str(mine)]) == 0
+    assert f"{'original':<28} not said" in capsys.readouterr().out
+    monkeypatch.setattr(module, "RULES", tmp_path)
+    with pytest.raises(ConfigError, match=r"the table \[original\] is missing"):
+        original_of(str(mine))
+
+
+REFUSED = [
+    (WHOLE.replace('licence = "none stated"\n', ""), "original.licence: is missing; give code, commit, files"),
+    (WHOLE.replace('data = "nobody\'s"\n', ""), "the key 'original.data' is missing"),
+    (WHOLE + 'none = "ours"\n', "original.none: says that there is no original"),
+    (WHOLE + "problems = 3\n", "original.largest_difference: belongs to problems"),
+    (WHOLE + "largest_difference = 0.0\n", "original.largest_difference: belongs to problems"),
+    (WHOLE + 'license = "MIT"\n', "unknown key 'original.license'; did you mean 'licence'?"),
+    (WHOLE.replace("0123abc", "main"), "original.commit: string should match"),
+    (WHOLE.replace('"a/b"', '"https://a/b"'), "original.code: string should match"),
+    ('original = "mine"\n', "original must be a table"),
+]
+
+
+@pytest.mark.parametrize(("table", "message"), REFUSED)
+def test_a_table_that_is_not_whole_is_one_line(
+    table: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["protocols", "show", own(tmp_path, table)]) == 2
+    error = capsys.readouterr().err
+    assert message in error and "mine.toml" in error and error.count("\n") == 1
+
+
+def test_the_examples_hold() -> None:
+    found = doctest.testmod(module)
+    assert found.attempted and not found.failed
+
+
+# ---- what the original evaluators of instances answered of the same made problems
+
+FOUND = json.loads((CASES / "instance_originals.json").read_text())
+LAST_BITS = {"class-agnostic-maskclustering": 1.2e-16}  # its means are summed in another order
+
+
+@pytest.mark.parametrize(("name", "number"), [(name, k) for name in FOUND["answers"] for k in FOUND["answers"][name]])
+def test_a_made_problem_has_the_answer_of_the_original(name: str, number: str) -> None:
+    rules = load_protocol(name)
+    scenes = {str(s): scored(rules, scene) for s, scene in enumerate(FOUND["problems"][number])}
+    found = combine(rules, scenes, with_intervals=False).metrics
+    answer = np.array(FOUND["answers"][name][number], float)  # null is undefined
+    np.testing.assert_allclose([found[key] for key in ("AP", "AP50", "AP25")], answer, rtol=0, atol=LAST_BITS.get(name, 0))
+
+
+def test_thirty_problems_of_each_protocol_differ_in_what_they_answer() -> None:
+    for name, answers in FOUND["answers"].items():
+        assert len(answers) >= 30
+        assert len({tuple(answer) for answer in answers.values()}) > 12, name
+
+
+def scored(rules: ProtocolRules, scene: dict[str, Any]) -> Any:
+    """The score of a scene of runs of points: its truth as [class, number, length], its masks as [start, end]."""
+    ids, names = classes_of(rules)
+    kind, number, length = (np.array(column) for column in zip(*scene["truth"], strict=True))
+    semantic = np.repeat([ids[one] for one in kind.tolist()], length).astype(np.int32)
+    points = np.zeros((len(semantic), 3), np.float32)
+    points[:, 0] = np.arange(len(semantic))
+    known = [one for one in ids if one != -1]
+    labels = LabelSet(rules.label_space, tuple(ids[one] for one in known), tuple(names[one] for one in known))
+    truth = GroundTruth(
+        points, semantic, np.repeat(number, length).astype(np.int32), labels, rules.ground_truth, "made"
+    )
+    rows = [
+        np.concatenate([np.zeros(0, int), *(np.arange(*run) for run in mask["runs"])]) for mask in scene["masks"]
+    ]
+    confidences = np.array([mask["score"] for mask in scene["masks"]], float)
+    called = [names[mask["slot"]] for mask in scene["masks"]]
+    return score_scene(rules, truth, Instances.of(points, rows, confidences, labels=called), None)
+
+
+def classes_of(rules: ProtocolRules) -> tuple[dict[int, int], dict[int, str]]:
+    """Ids and names of a problem's classes: four that are scored, -2 one that is not, -1 void."""
+    if not rules.classes:
+        return {-1: 0, -2: 1, 0: 4, 1: 7, 2: 11, 3: 21}, {one: f"c{one}" for one in range(-2, 4)}
+    first = 0 if rules.name == "scannet200-instance" else 3
+    entries = {k: rules.scored[(7 * k + first) % len(rules.scored)] for k in range(4)}
+    ids, names = {k: one.id for k, one in entries.items()}, {k: one.name for k, one in entries.items()}
+    left = [entry for entry in rules.classes if rules.is_ignored(entry.name)]
+    return (
+        {-1: 0, -2: left[0].id if left else 900, **ids},
+        {-2: left[0].name if left else "nothing", **names},
+    )

@@ -1,0 +1,89 @@
+"""docs/originals.md, made from the protocols' files: whose evaluation each repeats, and how far both were compared.
+
+``python tests/support/originals_page.py`` writes the page; ``--check`` says whether it still holds.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import defaultdict
+
+from places import ROOT
+
+from su3d_bench.metrics.protocols.files import protocol_names
+from su3d_bench.metrics.protocols.originals import Original, original_of
+
+PAGE = ROOT / "docs" / "originals.md"
+HEAD = """# Whose evaluation each protocol repeats
+
+Made by `make architecture` from the table `[original]` of each protocol's file in `su3d_bench/metrics/rules/`; a test fails
+where it does not hold any more. `su3d-bench protocols` lists the same, `su3d-bench protocols show NAME` beside every rule.
+
+A made problem is a small scene with made predictions (ties, empty predictions, void, missing classes, small and doubled
+masks) that the original, run unedited but for versions of Python and its libraries, and this program both answered. The
+difference is the largest of any number of any problem, as a fraction: 0 is equal to the last bit.
+
+## Protocols with an original
+"""
+WITHOUT = """
+## Protocols without one
+
+Their rules are this program's own, or no program is known that gives these numbers.
+"""
+
+
+def page() -> str:
+    with_one: defaultdict[Original, list[str]] = defaultdict(list)
+    without: defaultdict[Original, list[str]] = defaultdict(list)
+    for name in protocol_names():
+        stated = original_of(name)
+        assert stated is not None
+        (with_one if stated.original.none is None else without)[stated.original].append(name)
+    rows = [
+        (_names(names), _link(one), _cell(one.licence), _cell(one.data), _cell(one.held_together))
+        for one, names in with_one.items()
+    ]
+    rest = [(_names(names), _cell(one.none), _cell(one.data)) for one, names in without.items()]
+    return "\n".join(
+        [
+            HEAD,
+            _table(("protocol", "original", "licence of its code", "licence of the data", "compared"), rows),
+            WITHOUT,
+            _table(("protocol", "why", "licence of the data"), rest),
+        ]
+    )
+
+
+def _names(names: list[str]) -> str:
+    return ", ".join(f"`{name}`" for name in names)
+
+
+def _link(one: Original) -> str:
+    return f"[{one.code} at {str(one.commit)[:7]}]({one.place}): {', '.join(f'`{file}`' for file in one.files)}"
+
+
+def _cell(text: str | None) -> str:
+    return " ".join((text or "").split()).replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*")
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    lines = [head, ("---",) * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+
+
+def main(arguments: list[str]) -> int:
+    written = page()
+    if "--check" not in arguments:
+        PAGE.write_text(written)
+        return 0
+    holds = PAGE.is_file() and PAGE.read_text() == written
+    print(
+        "docs/originals.md is what the protocols say"
+        if holds
+        else "docs/originals.md does not hold any more: make architecture"
+    )
+    return int(not holds)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
