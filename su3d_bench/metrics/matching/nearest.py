@@ -238,9 +238,8 @@ def transfer_values(
         value[own], distance[own] = values[own], 0.0
         missing = wanted & ~own
     rows = np.flatnonzero(missing)
-    if is_remembering() and 2 * len(rows) > len(targets):  # another rule wants others of the targets
-        of_all = _nearest_of_all(points[order], targets, cap_m)
-        distance[rows], nearest_index = of_all[0][rows], of_all[1][rows]
+    if is_remembering():
+        distance[rows], nearest_index = _asked(points[order], targets, cap_m).nearest(rows)
     else:
         distance[rows], nearest_index = nearest(points[order], targets[rows], cap_m)
     reached = rows[nearest_index >= 0]
@@ -248,7 +247,26 @@ def transfer_values(
     return value, distance
 
 
-_nearest_of_all = remembered(nearest)
+class _Asked:
+    """The nearest of some points for the targets of a scene, each of which is searched for once."""
+
+    def __init__(self, points: Points, targets: Points, cap_m: float) -> None:
+        self._candidates, self._targets, self._cap_m = Candidates(points), targets, cap_m
+        self._is_known = np.zeros(len(targets), bool)
+        self._distance, self._index = np.empty(len(targets)), np.empty(len(targets), np.int64)
+        self.nbytes = 17 * len(targets) + 64 * len(points)
+
+    def nearest(self, rows: Int64Array) -> tuple[Float64Array, Int64Array]:
+        """``nearest`` for the targets ``rows``."""
+        new = rows[~self._is_known[rows]]
+        self._distance[new], self._index[new] = self._candidates.nearest(self._targets[new], self._cap_m)
+        self._is_known[new] = True
+        return self._distance[rows], self._index[rows]
+
+
+@remembered
+def _asked(points: Points, targets: Points, cap_m: float) -> _Asked:
+    return _Asked(points, targets, cap_m)
 
 
 def n_farther(distance: Float64Array) -> Int64Array:

@@ -59,7 +59,7 @@ def _n_bytes(answer: object) -> int:
         return answer.indptr.nbytes + answer.indices.nbytes
     if isinstance(answer, tuple):
         return sum(map(_n_bytes, answer))
-    return answer.nbytes if isinstance(answer, np.ndarray) else 0
+    return int(getattr(answer, "nbytes", 0))
 
 
 _memory: ContextVar[_Memory | None] = ContextVar("memory", default=None)

@@ -37,7 +37,7 @@ def transfer_votes(
     wanted_rows = np.flatnonzero(wanted)
     if not len(points) or not len(wanted_rows):
         return value, distance
-    if is_remembering() and 2 * len(wanted_rows) > len(targets) and len(targets) * neighbours <= _MOST_KEPT:
+    if is_remembering() and len(targets) * neighbours <= _MOST_KEPT:
         # another rule wants others of the targets, and other values of the points
         place_of_all, all_distances, all_indices = _neighbours_of_all(points, targets, neighbours)
         place = place_of_all[wanted_rows]
