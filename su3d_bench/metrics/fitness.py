@@ -126,7 +126,7 @@ def why_not_content(rules: ProtocolRules, content: ContentFacts, *, has_points: 
     if content.form == "vertex-labels":
         if rules.needs_instances:
             return "needs instances, the prediction has one class a point"
-        can_count = has_points or rules.metric == "scannet"
+        can_count = has_points or rules.metric in {"scannet", "ovo"}
         return None if can_count else "needs the coordinates of the points; name a --dataset"
     if rules.names_points and not has_points:
         return "needs a class for every point, the prediction has masks; name a --dataset to make them a map"

@@ -146,6 +146,7 @@ class ProtocolRules(_Strict):
         "conceptgraphs",
         "scannet",
         "hovsg",
+        "ovo",
         "votenet",
         "query-ap",
         "openlex3d-topn",
@@ -326,7 +327,7 @@ class SemanticRules(ProtocolRules):
     """A class a point."""
 
     values_of_metric: ClassVar[ValuesOfMetric] = dict.fromkeys(
-        ("conceptgraphs", "scannet", "hovsg"), ("mAcc", "mIoU", "F-mIoU")
+        ("conceptgraphs", "scannet", "hovsg", "ovo"), ("mAcc", "mIoU", "F-mIoU")
     )
     candidates = ("object-points",)
     takes_dense = True

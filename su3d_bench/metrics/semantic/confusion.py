@@ -139,12 +139,14 @@ def _n_above(iou: Float64Array) -> tuple[int, ...]:
     return tuple(int((iou > level).sum()) for level in IOU_LEVELS)
 
 
-def scannet_metrics(confusion: IntArray) -> SemanticMetrics:
+def scannet_metrics(confusion: IntArray, *, counts_unseen: bool = False) -> SemanticMetrics:
     """IoU of each class as evaluate_semantic_label.py of ScanNet (commit 3830fce), with the means that it leaves out.
 
     ``confusion`` (C, C + 1), the last column for predictions outside the classes. A class that was never true is 0
     where it was predicted and NaN where it was not; NaN leaves the mean IoU. Recall is NaN for a class that was never
     true; mean accuracy is over the others, as frequency-weighted IoU is. These means are ours, not the original's.
+    ``counts_unseen``: recall is 0 too for a class that was never true and was predicted, so that mean accuracy has it,
+    as iou_acc_from_confmat of ovo/utils/eval_utils.py of OVO (commit cf3b68e).
 
     >>> metrics = scannet_metrics(np.array([[3, 1, 0], [0, 0, 0]]))
     >>> metrics.iou.tolist(), metrics.mean_iou, metrics.mean_accuracy
@@ -156,6 +158,8 @@ def scannet_metrics(confusion: IntArray) -> SemanticMetrics:
     n_predicted = confusion[:, :n_classes].sum(axis=0).astype(np.float64)
     iou = _ratio(hit, n_true + n_predicted - hit)
     recall = _ratio(hit, n_true)
+    if counts_unseen:
+        recall[(n_true == 0) & (n_predicted > 0)] = 0.0
     precision = _ratio(hit, n_predicted)
     f1 = _ratio(2 * hit, n_true + n_predicted)
     return _with_means(np.arange(n_classes), recall, precision, iou, f1, n_true)
@@ -228,7 +232,7 @@ def resampled_semantic(
     """mAcc, mIoU and F-mIoU (R,) of the pooled confusion of the scenes drawn ``weights`` (R, S) times.
 
     Classes that are true somewhere in the drawn scenes count; under ``scannet`` those that are only predicted join the
-    mean IoU with 0. Where the confusion matrices hold ignored classes too, ``is_scored`` (C,) marks the others.
+    mean IoU with 0, under ``ovo`` mAcc too. Where the confusion matrices hold ignored classes too, ``is_scored`` (C,) marks the others.
 
     >>> a = SemanticCounts(np.array([[4, 0, 0], [0, 0, 0]]), np.array([True, True]))
     >>> b = SemanticCounts(np.array([[0, 0, 0], [1, 1, 0]]), np.array([False, True]))
@@ -241,9 +245,9 @@ def resampled_semantic(
     counted = n_true > 0
     if metric == "conceptgraphs":
         n_true = n_true - resampled_points_sliced_away(counts, weights, n_true)
-    recall = np.where(counted, hit / np.maximum(n_true, 1), np.nan)
     union = n_true + n_predicted - hit
-    has_iou = union > 0 if metric == "scannet" else counted
+    recall = np.where(union > 0 if metric == "ovo" else counted, hit / np.maximum(n_true, 1), np.nan)
+    has_iou = union > 0 if metric in {"scannet", "ovo"} else counted
     iou = np.where(has_iou, hit / np.maximum(union, 1), np.nan)
     n_points = n_true.sum(axis=1)
     weighted = (n_true * np.nan_to_num(iou)).sum(axis=1) / np.maximum(n_points, 1)

@@ -97,7 +97,7 @@ class SemanticMetric(Metric[SemanticCounts]):
     @property
     def _entries(self) -> tuple[ClassEntry, ...]:
         """The classes that the metrics number."""
-        return self.rules.scored if self.rules.metric == "scannet" else self.rules.classes
+        return self.rules.scored if self.rules.metric in {"scannet", "ovo"} else self.rules.classes
 
     def _values(self, metrics: SemanticMetrics) -> Values:
         return {
@@ -130,9 +130,10 @@ class SemanticMetric(Metric[SemanticCounts]):
         is_scored = scored_classes(self.rules)
         if self.rules.metric == "hovsg":
             return semantic.hovsg_metrics(whole.confusion, is_scored)
-        if self.rules.metric == "scannet":
+        if self.rules.metric in {"scannet", "ovo"}:
             scored = np.flatnonzero(is_scored)
-            return semantic.scannet_metrics(_keep_columns(whole.confusion, scored)[scored])
+            confusion = _keep_columns(whole.confusion, scored)[scored]
+            return semantic.scannet_metrics(confusion, counts_unseen=self.rules.metric == "ovo")
         has_points = whole.confusion.sum(axis=1) > 0
         keep = np.flatnonzero(has_points if pooled else whole.is_present)
         confusion = whole.confusion.copy()

@@ -183,3 +183,46 @@ def classes_of(rules: ProtocolRules) -> tuple[dict[int, int], dict[int, str]]:
         {-1: 0, -2: left[0].id if left else 900, **ids},
         {-2: left[0].name if left else "nothing", **names},
     )
+
+
+# ---- and those of one class a point
+
+OF_POINTS = json.loads((CASES / "semantic_originals.json").read_text())
+
+
+@pytest.mark.parametrize(("name", "number"), [(name, k) for name in OF_POINTS for k in range(len(OF_POINTS[name]))])
+def test_a_made_problem_of_points_has_the_answer_of_the_original(name: str, number: int) -> None:
+    rules, problem = load_protocol(name), OF_POINTS[name][number]
+    scores = {str(s): scored_points(rules, scene) for s, scene in enumerate(problem["scenes"])}
+    found = combine(rules, scores, with_intervals=False)
+    answer = problem["answer"]
+    if name == "scannet-semantic":  # the IoU of each class that is true or predicted
+        assert {of_class: row["IoU"] for of_class, row in found.per_class.items() if row["IoU"] == row["IoU"]} == answer
+        return
+    each = answer if isinstance(answer, list) else [answer]
+    rows = [found.per_scene[scene] for scene in scores] if isinstance(answer, list) else [found.metrics]
+    for row, of_original in zip(rows, each, strict=True):
+        assert {key: row[key] for key in of_original} == pytest.approx(of_original, rel=0, abs=2.3e-16)
+
+
+def scored_points(rules: ProtocolRules, scene: dict[str, Any]) -> Any:
+    """The score of a scene of points: -1 is void or nothing, 0 to 7 are scored classes, 8 is none that is scored."""
+    left = [(entry.id, entry.name) for entry in rules.classes if rules.is_ignored(entry.name)]
+    of_slot = {k: (entry.id, entry.name) for k in range(8) for entry in [rules.scored[(3 * k + 1) % len(rules.scored)]]}
+    of_slot[8] = left[0] if left else (9999, "none such")
+    kinds, called = np.array(scene["truth"]), np.array(scene["called"])
+    places = np.array(scene.get("places_mm", [[1000 * k, 0, 0] for k in range(len(kinds))])) / 1000
+    own = np.array(scene["own_mm"]) / 1000 if "own_mm" in scene else places
+    ids, names = zip(*of_slot.values(), strict=True)
+    truth = GroundTruth(
+        places.astype(np.float32),
+        np.array([of_slot[k][0] if k >= 0 else 0 for k in kinds.tolist()], np.int32),
+        np.zeros(len(kinds), np.int32),
+        LabelSet(rules.label_space, ids, names),
+        rules.ground_truth,
+        "made",
+    )
+    there = sorted(set(called.tolist()) - {-1})
+    masks = [np.flatnonzero(called == k) for k in there]
+    found = Instances.of(own.astype(np.float32), masks, [1.0] * len(masks), labels=[of_slot[k][1] for k in there])
+    return score_scene(rules, truth, found, None)
