@@ -60,9 +60,7 @@ def transfer_votes(
 
 
 @remembered
-def _neighbours_of_all(
-    points: Points, targets: Points, neighbours: int
-) -> tuple[Int64Array, Float64Array, Int64Array]:
+def _neighbours_of_all(points: Points, targets: Points, neighbours: int) -> tuple[Int64Array, Float64Array, Int64Array]:
     """The row of every target's place, and of each place the distances and indices of its nearest points."""
     places, place_of_target = _distinct_places(targets)
     search = _Search(points, neighbours)

@@ -46,7 +46,9 @@ class Original(BaseModel):
             if there or self.problems or self.cases:
                 raise ValueError("none: says that there is no original; leave out all else but data")
         elif lacking := [field for field in _OF_CODE if field not in there]:
-            raise ValueError(f"{lacking[0]}: is missing; give {', '.join(_OF_CODE)}, or none = why there is no original")
+            raise ValueError(
+                f"{lacking[0]}: is missing; give {', '.join(_OF_CODE)}, or none = why there is no original"
+            )
         if (self.largest_difference is not None) != (self.problems > 0):
             raise ValueError("largest_difference: belongs to problems that both answered, and these need it")
         return self
@@ -125,7 +127,9 @@ def original_of(name: str) -> Stated | None:
     content = read_content(file)
     if content.original is None:
         if file.parent == RULES:
-            raise ConfigError(f"{file}: the table [original] is missing; it says whose evaluation this is, or none = why")
+            raise ConfigError(
+                f"{file}: the table [original] is missing; it says whose evaluation this is, or none = why"
+            )
         return None
     where, table = content.original
     return Stated(read_original(where, table), None if where == file else where.stem)

@@ -142,7 +142,9 @@ def test_a_made_problem_has_the_answer_of_the_original(name: str, number: str) -
     scenes = {str(s): scored(rules, scene) for s, scene in enumerate(FOUND["problems"][number])}
     found = combine(rules, scenes, with_intervals=False).metrics
     answer = np.array(FOUND["answers"][name][number], float)  # null is undefined
-    np.testing.assert_allclose([found[key] for key in ("AP", "AP50", "AP25")], answer, rtol=0, atol=LAST_BITS.get(name, 0))
+    np.testing.assert_allclose(
+        [found[key] for key in ("AP", "AP50", "AP25")], answer, rtol=0, atol=LAST_BITS.get(name, 0)
+    )
 
 
 def test_thirty_problems_of_each_protocol_differ_in_what_they_answer() -> None:
@@ -163,9 +165,7 @@ def scored(rules: ProtocolRules, scene: dict[str, Any]) -> Any:
     truth = GroundTruth(
         points, semantic, np.repeat(number, length).astype(np.int32), labels, rules.ground_truth, "made"
     )
-    rows = [
-        np.concatenate([np.zeros(0, int), *(np.arange(*run) for run in mask["runs"])]) for mask in scene["masks"]
-    ]
+    rows = [np.concatenate([np.zeros(0, int), *(np.arange(*run) for run in mask["runs"])]) for mask in scene["masks"]]
     confidences = np.array([mask["score"] for mask in scene["masks"]], float)
     called = [names[mask["slot"]] for mask in scene["masks"]]
     return score_scene(rules, truth, Instances.of(points, rows, confidences, labels=called), None)
