@@ -16,12 +16,13 @@ from su3d_bench.metrics.protocols.originals import Original, original_of
 PAGE = ROOT / "docs" / "originals.md"
 HEAD = """# Whose evaluation each protocol repeats
 
-Made by `make architecture` from the table `[original]` of each protocol's file in `su3d_bench/metrics/rules/`; a test fails
-where it does not hold any more. `su3d-bench protocols` lists the same, `su3d-bench protocols show NAME` beside every rule.
+Made by `make architecture` from the table `[original]` of each protocol's file in `su3d_bench/metrics/rules/`; a test
+fails where it does not hold any more. `su3d-bench protocols` lists the same, `su3d-bench protocols show NAME` beside
+every rule.
 
-A made problem is a small scene with made predictions (ties, empty predictions, void, missing classes, small and doubled
-masks) that the original, run unedited but for versions of Python and its libraries, and this program both answered. The
-difference is the largest of any number of any problem, as a fraction: 0 is equal to the last bit.
+A made problem is one or several small scenes with made predictions (ties, empty predictions, void, missing classes,
+small and doubled masks) that the original, run unedited but for versions of Python and its libraries, and this program
+both answered. The difference is the largest of any number of any problem, as a fraction: 0 is equal to the last bit.
 
 ## Protocols with an original
 """

@@ -19,10 +19,10 @@ _OF_CODE = ("code", "commit", "files", "licence", "compared")
 class Original(BaseModel):
     """The table ``[original]`` of a protocol's file.
 
-    ``code`` is a repository of GitHub, as owner/name, whose ``files`` at ``commit`` evaluate; ``licence`` is that of the
-    code and ``data`` the terms of what is scored, "none stated" where nobody says. ``compared`` says which numbers of
-    both were held against each other, or why none were; ``problems``: how many made ones both answered, no number
-    of them farther apart than ``largest_difference``; ``cases``: where some lie with the original's answers, as paths from
+    ``code`` is a repository of GitHub, as owner/name, whose ``files`` at ``commit`` evaluate; ``licence`` is that of
+    the code and ``data`` the terms of what is scored, "none stated" where nobody says. ``compared`` says which numbers
+    of both were held against each other, or why none were; ``problems``: how many made ones both answered, no number of
+    them farther apart than ``largest_difference``; ``cases``: where some lie with the original's answers, as paths from
     the repository's root or patterns of such. ``none`` says why there is no original, in place of all but ``data``.
     """
 
@@ -86,7 +86,7 @@ class Original(BaseModel):
     def facts(self) -> dict[str, str]:
         """Everything by what it is called where it is shown, in order, without what is not said."""
         said = {
-            "original": self.none and f"none: {self.none}" or f"{self.code} at {self.commit}",
+            "original": f"{self.code} at {self.commit}" if self.none is None else f"none: {self.none}",
             "its files": ", ".join(self.files),
             "licence of its code": self.licence or "",
             "licence of the data": self.data,
@@ -116,7 +116,7 @@ class Stated:
 
 
 def original_of(name: str) -> Stated | None:
-    """What the protocol called ``name``, or its file, says of its original; None where a file of one's own says nothing.
+    """What the protocol called ``name``, or a file, says of its original; None where a file of one's own says nothing.
 
     A ``ConfigError`` for a table that is not whole, and for a built-in protocol without one.
 

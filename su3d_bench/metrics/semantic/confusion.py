@@ -232,7 +232,8 @@ def resampled_semantic(
     """mAcc, mIoU and F-mIoU (R,) of the pooled confusion of the scenes drawn ``weights`` (R, S) times.
 
     Classes that are true somewhere in the drawn scenes count; under ``scannet`` those that are only predicted join the
-    mean IoU with 0, under ``ovo`` mAcc too. Where the confusion matrices hold ignored classes too, ``is_scored`` (C,) marks the others.
+    mean IoU with 0, under ``ovo`` mAcc too. Where the confusion matrices hold ignored classes too, ``is_scored`` (C,)
+    marks the others.
 
     >>> a = SemanticCounts(np.array([[4, 0, 0], [0, 0, 0]]), np.array([True, True]))
     >>> b = SemanticCounts(np.array([[0, 0, 0], [1, 1, 0]]), np.array([False, True]))

@@ -1,4 +1,4 @@
-"""Whose evaluation each protocol repeats: a table that must be whole, facts that are shown everywhere, cases that hold."""
+"""Whose evaluation each protocol repeats: a table that must be whole, facts shown everywhere, cases that hold."""
 
 from __future__ import annotations
 
@@ -142,9 +142,8 @@ def test_a_made_problem_has_the_answer_of_the_original(name: str, number: str) -
     scenes = {str(s): scored(rules, scene) for s, scene in enumerate(FOUND["problems"][number])}
     found = combine(rules, scenes, with_intervals=False).metrics
     answer = np.array(FOUND["answers"][name][number], float)  # null is undefined
-    np.testing.assert_allclose(
-        [found[key] for key in ("AP", "AP50", "AP25")], answer, rtol=0, atol=LAST_BITS.get(name, 0)
-    )
+    ours = [found[key] for key in ("AP", "AP50", "AP25")]
+    np.testing.assert_allclose(ours, answer, rtol=0, atol=LAST_BITS.get(name, 0))
 
 
 def test_thirty_problems_of_each_protocol_differ_in_what_they_answer() -> None:
