@@ -73,7 +73,8 @@ def _classes_of_features(
     if not len(candidates) or not len(features):
         return np.full(len(features), -1, np.int64)
     text = text_features(rules, [rules.classes[index].name for index in candidates], features, encoder)
-    return candidates[most_similar(features, text, device_of(encoder))]
+    named: Int64Array = candidates[most_similar(features, text, device_of(encoder))]
+    return named
 
 
 def text_features(
