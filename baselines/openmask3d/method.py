@@ -213,7 +213,7 @@ class OpenMask3DSegment3D(OpenMask3D):
         "ECCV 2024, with the features of OpenMask3D (NeurIPS 2023)",
         source="https://github.com/LeapLabTHU/Segment3D, commit 1861478; "
         "https://github.com/OpenMask3D/openmask3d, commit 3bc3fc5",
-        licence="none stated (Segment3D); MIT (OpenMask3D)",
+        licence="Apache-2.0 (Segment3D); MIT (OpenMask3D)",
         needs=("a mesh of the scan", "Segment3D's exported masks; without them weight-free proposals from the mesh"),
         status="as openmask3d; connected parts, dropped ones and the kept share are tested on hand-worked values; no "
         "public file of these proposals was found; Segment3D's score of a part is a mean of its heat map, "

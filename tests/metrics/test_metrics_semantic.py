@@ -20,6 +20,7 @@ from su3d_bench.metrics.semantic.confusion import (
     conceptgraphs_metrics,
     confusion_matrix,
     per_scene,
+    resampled_semantic,
     scannet_metrics,
 )
 from su3d_bench.metrics.semantic.score import _one_a_voxel, _point_owners
@@ -205,3 +206,14 @@ def test_concatenated_scenes_contain_the_classes_of_each() -> None:
     empty = confusion_matrix(np.zeros(0, int), np.zeros(0, int), 2)
     a, b = SemanticCounts(empty, np.array([True, False])), SemanticCounts(empty, np.array([False, True]))
     assert concatenate([a, b]).is_present.tolist() == [True, True]
+
+
+def test_ovo_counts_a_class_that_is_only_predicted_as_0_in_the_mean_accuracy_too() -> None:
+    confusion = np.array([[3, 1, 0], [0, 0, 0]])
+    plain, of_ovo = scannet_metrics(confusion), scannet_metrics(confusion, counts_unseen=True)
+    assert (plain.mean_accuracy, of_ovo.mean_accuracy) == (0.75, 0.375)
+    assert plain.mean_iou == of_ovo.mean_iou == 0.375
+    counts = [SemanticCounts(confusion, np.array([True, False]))]
+    drawn = resampled_semantic(counts, np.ones((1, 1), np.int64), "ovo")
+    assert (drawn["mAcc"][0], drawn["mIoU"][0]) == (of_ovo.mean_accuracy, of_ovo.mean_iou)
+    assert np.isnan(scannet_metrics(np.array([[3, 0, 0], [0, 0, 0]]), counts_unseen=True).recall[1])
