@@ -99,7 +99,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def _plain(stated: Stated | None) -> dict[str, Any] | None:
-    return stated and stated.original.model_dump(mode="json") | {"of": stated.base}
+    return None if stated is None else stated.original.model_dump(mode="json") | {"of": stated.base}
 
 
 def _original_lines(stated: Stated | None) -> list[str]:

@@ -81,7 +81,7 @@ def faulty_map(truth: GroundTruth) -> Instances:
     points = (truth.points + generator.normal(0, 0.004, truth.points.shape)).astype(np.float32)
     points[::7] += np.float32(0.03)
     name_of = dict(zip(truth.labels.ids, truth.labels.names, strict=True))
-    masks, texts = [], []
+    masks, texts = list[Any](), list[str]()
     for k, number in enumerate(np.unique(truth.instance[truth.instance > 0])):
         rows = np.flatnonzero(truth.instance == number)
         rows = rows[generator.random(len(rows)) > 0.1]
