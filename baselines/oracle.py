@@ -63,8 +63,12 @@ class Oracle:
 
 
 def _masks_of(truth: GroundTruth) -> dict[int, Int32Array]:
-    """Instance id -> indices of its points, ascending; an instance has one class, so any point tells it."""
+    """Instance id -> indices of its points, ascending; an instance has one class, so any point tells it.
+
+    Points that evaluations leave out (class -1) are in none.
+    """
     order = np.argsort(truth.instance, kind="stable")
+    order = order[truth.semantic[order] >= 0]
     ids, starts = np.unique(truth.instance[order], return_index=True)
     parts = np.split(order.astype(np.int32), starts[1:])
     return {int(key): part for key, part in zip(ids, parts, strict=True) if key > 0}

@@ -60,16 +60,18 @@ def as_prediction(content: Content, surface: Surface | None, names: Mapping[int,
 
 
 def _masks_of_labels(content: VertexLabels) -> VertexMasks:
-    """One mask a class; ids of 0 and below are no class."""
+    """One mask a class; ids of 0 and below are no class, nor are places in a list below 0."""
     distinct, row = np.unique(content.class_ids, return_inverse=True)
-    masks = select(masks_of_partition(row, len(distinct)), np.flatnonzero(distinct > 0))
-    kept = distinct[distinct > 0].astype(np.int32)
+    is_class = distinct >= (content.numbering == "id")
+    masks = select(masks_of_partition(row, len(distinct)), np.flatnonzero(is_class))
+    kept = distinct[is_class].astype(np.int32)
     return VertexMasks(
         masks.indptr,
         masks.indices,
         n_points=len(content.class_ids),
         scores=np.ones(len(kept)),
         class_numbers=kept,
+        numbering=content.numbering,
         keys=tuple(f"class {number}" for number in kept),
     )
 
@@ -94,6 +96,9 @@ def class_names(content: Content, dataset: str, protocol: str | None) -> dict[in
     if isinstance(content, VertexMasks) and content.numbering == "index":
         scored = dict.fromkeys(tuple(entry.name for entry in rules.scored) for rules in own if rules.kind == "instance")
         lists = [list(enumerate(names)) for names in scored]
+    elif isinstance(content, VertexMasks | VertexLabels) and content.numbering == "line":
+        whole = dict.fromkeys(tuple(entry.name for entry in rules.classes) for rules in own)
+        lists = [list(enumerate(names)) for names in whole]
     pairs = {pair for listed in lists for pair in listed}
     if not pairs or len(pairs) > len({number for number, _ in pairs}):
         known = ", ".join(rules.name for rules in own) or "any that has classes"

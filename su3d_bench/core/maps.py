@@ -99,8 +99,9 @@ class Instances(Masks):
     """A map of K instances over M shared points, one mask an instance.
 
     ``points`` (M, 3) float32 m; ``scores`` (K,) float64; ``features`` (K, D) float32 where the method has features,
-    ``labels`` one class name each where the method itself decides, '' for what it leaves to the feature; ``boxes`` (K,
-    2, 3) float32 axis-aligned minimum and maximum corners; ``centroids`` (K, 3) float32; ``views`` (V, 2) int32 rows
+    ``labels`` one class name each where the method itself decides, '' for what it leaves to the feature, and
+    ``further_labels`` equally many each, what else it may be, the likeliest first and '' for no more; ``boxes`` (K, 2,
+    3) float32 axis-aligned minimum and maximum corners; ``centroids`` (K, 3) float32; ``views`` (V, 2) int32 rows
     (frame index, row of the file or image that the detection came from), those of instance k at
     ``view_indptr[k]:view_indptr[k + 1]``; where the method keeps them, ``view_names`` and ``view_scores`` (V,) float64
     are the names and prediction scores that perception gave in those views.
@@ -125,6 +126,7 @@ class Instances(Masks):
     ids: Int64Array = field(default_factory=lambda: np.zeros(0, np.int64))
     view_names: tuple[str, ...] | None = None
     view_scores: Float64Array | None = None
+    further_labels: tuple[tuple[str, ...], ...] | None = None
 
     def __post_init__(self) -> None:
         arrays = ("points", "indptr", "indices", "scores", "boxes", "centroids", "view_indptr", "views", "ids")
@@ -137,6 +139,9 @@ class Instances(Masks):
             raise PredictionError(f"instances: {k} masks and {len(self.features)} features")
         if self.labels is not None and len(self.labels) != k:
             raise PredictionError(f"instances: {k} masks and {len(self.labels)} labels")
+        further = self.further_labels
+        if further is not None and (self.labels is None or len(further) != k or len(set(map(len, further))) > 1):
+            raise PredictionError(f"instances: {k} masks need labels and equally many further labels each")
         for of_views in (self.view_names, self.view_scores):
             if of_views is not None and len(of_views) != len(self.views):
                 raise PredictionError(
@@ -152,6 +157,7 @@ class Instances(Masks):
         features: FloatArray | None = None,
         *,
         labels: Sequence[str] | None = None,
+        further_labels: Sequence[Sequence[str]] | None = None,
         names: Sequence[str] | None = None,
         captions: Sequence[str] | None = None,
         centroids: Float32Array | None = None,
@@ -197,6 +203,7 @@ class Instances(Masks):
             ids=np.array(ids, np.int64),
             view_names=view_names,
             view_scores=view_scores,
+            further_labels=tuple(map(tuple, further_labels)) if further_labels else None,
         )
 
 

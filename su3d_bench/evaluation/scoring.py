@@ -31,6 +31,7 @@ from su3d_bench.metrics.instance.score import (
     encode_without_classes,
     masks_and_scores,
     named_classes,
+    without_labels,
 )
 from su3d_bench.metrics.labels import labels_counted, under_several_labels
 from su3d_bench.metrics.matching import nearest as transfer
@@ -57,7 +58,7 @@ from su3d_bench.metrics.scoring import QuestionTruth, metric_of, score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.metrics.semantic.panoptic_quality import PanopticCounts
 from su3d_bench.metrics.semantic.panoptic_score import count_segments
-from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
+from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks, ids_of
 from su3d_bench.predictions.own_runs import OwnRuns
 
 NOTHING = Instances.of(np.zeros((0, 3), np.float32), [], labels=())
@@ -212,7 +213,8 @@ def facts_of(content: Content) -> ContentFacts:
     """What the question asks whether a protocol may score ``content``."""
     if isinstance(content, VertexLabels):
         n = len(content.class_ids)
-        return ContentFacts("vertex-labels", n, class_ids=content.class_ids, n_points=n)
+        ids = content.class_ids if content.numbering == "id" else None
+        return ContentFacts("vertex-labels", n, class_ids=ids, n_points=n)
     if not isinstance(content, VertexMasks):
         return ContentFacts.of(content)
     return ContentFacts(
@@ -239,8 +241,9 @@ def score_on_vertices(
     """The outcome of masks or labels over points without coordinates: no neighbours, no coverage."""
     labels, values = truth.labels, truth.values
     if isinstance(content, VertexLabels):
-        class_ids = content.class_ids if len(content.class_ids) else np.zeros(len(labels), np.int32)
-        warnings = label_warnings(scene, rules, content.class_ids.astype(np.int64))
+        predicted = ids_of(content.class_ids, content.numbering, rules)
+        class_ids = predicted if len(predicted) else np.zeros(len(labels), np.int64)
+        warnings = label_warnings(scene, rules, predicted)
         score, ceiling = (_semantic_score(rules, labels, called) for called in (class_ids, labels))
         return SceneOutcome(score, ceiling, warnings=tuple(warnings))
     assert isinstance(content, VertexMasks)
@@ -368,7 +371,7 @@ def score_on_truth(
     if isinstance(content, VertexMasks):
         warnings = class_warnings(scene, rules, content.class_numbers, content.class_ids(rules))
     elif isinstance(content, VertexLabels):
-        warnings = label_warnings(scene, rules, content.class_ids.astype(np.int64))
+        warnings = label_warnings(scene, rules, ids_of(content.class_ids, content.numbering, rules))
     else:
         warnings = check_cloud(scene, content.points, truth.points)
     facts = bound = None
@@ -378,9 +381,7 @@ def score_on_truth(
             facts = mask_facts(masks, scores, len(prediction.points))
             warnings += empty_warnings(scene, facts, masks, getattr(prediction, "names", ()))
         if rules.names_masks and rules.confidences:
-            cap_m, voxel_m = rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
-            moved = transfer.transfer_masks(prediction.points, masks, truth.points, cap_m, voxel_m)
-            values = instance_ap.encode_ground_truth(truth.semantic, truth.instance)
+            values, moved, scores = without_labels(rules, truth, prediction)
             bound = _instance_counts(rules, values, moved, scores, None)
     score = score_scene(rules, truth, prediction, encoder)
     return SceneOutcome(score, _oracle_score(rules, truth), bound, facts, tuple(warnings))
@@ -388,9 +389,7 @@ def score_on_truth(
 
 def map_of(content: Content, points: Float32Array, rules: ProtocolRules) -> Prediction:
     """The map of ``content``; what has no points of its own stands on those of the truth."""
-    if isinstance(content, VertexLabels):
-        return content.masks().on(points, rules)
-    return content.on(points, rules) if isinstance(content, VertexMasks) else content
+    return content.on(points, rules) if isinstance(content, VertexMasks | VertexLabels) else content
 
 
 def _oracle_score(rules: ProtocolRules, truth: GroundTruth) -> SceneScore | None:

@@ -35,6 +35,7 @@ from su3d_bench.metrics.questions.score import AnnotationMetric, ReasoningMetric
 from su3d_bench.metrics.questions.truths import AnnotationTruth, PresenceTruth, ReasoningTruth, RetrievalTruth
 from su3d_bench.metrics.semantic.panoptic_score import PanopticMetric
 from su3d_bench.metrics.semantic.score import SemanticMetric
+from su3d_bench.metrics.semantic.top_k import TopKMetric
 from su3d_bench.numerics.statistics import jackknife_interval, leave_one_out
 from su3d_bench.store.atomic import read_arrays
 
@@ -54,6 +55,7 @@ QuestionTruth = RetrievalTruth | PresenceTruth | AnnotationTruth | ReasoningTrut
 Truth = GroundTruth | OpenLexTruth | QueryTruth | QuestionTruth
 METRICS: dict[str, type[Metric[Any]]] = {
     "semantic": SemanticMetric,
+    "top-k": TopKMetric,
     "instance": InstanceMetric,
     "panoptic": PanopticMetric,
     "boxes": BoxMetric,

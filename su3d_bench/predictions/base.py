@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -19,7 +19,7 @@ from su3d_bench.metrics.protocols.model import ProtocolRules
 
 NO_SCORES = "the file has no scores: 1 for every mask"
 ONES = "the format has no scores: 1 for every object"
-Numbering = Literal["id", "index"]
+Numbering = Literal["id", "index", "line"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +28,8 @@ class VertexMasks(Masks):
 
     ``n_points`` is None where the file does not say it (a list without masks). ``scores`` (K,) are finite.
     ``class_numbers`` (K,) are as the file has them, None where it has no classes: with ``numbering`` "id" class ids of
-    the label space, with "index" positions in the protocol's list of classes. ``features`` (K, D), all-zero rows have
+    the label space, with "index" positions among the classes that a protocol scores, with "line" among all of its list.
+    ``features`` (K, D), all-zero rows have
     none. ``keys`` name the masks in messages.
     """
 
@@ -69,15 +70,10 @@ class VertexMasks(Masks):
             )
 
     def class_ids(self, rules: ProtocolRules) -> Int64Array:
-        """The class id (K,) of each mask, 0 where it has none; positions count the classes that a protocol scores."""
+        """The class id (K,) of each mask, 0 where it has none."""
         if self.class_numbers is None:
             return np.zeros(len(self), np.int64)
-        numbers = self.class_numbers.astype(np.int64)
-        if self.numbering == "id":
-            return numbers
-        ids = np.array([entry.id for entry in rules.scored], np.int64)
-        is_known = (numbers >= 0) & (numbers < len(ids))
-        return np.where(is_known, ids[np.where(is_known, numbers, 0)], 0)
+        return ids_of(self.class_numbers, self.numbering, rules)
 
     def on(self, points: Float32Array, rules: ProtocolRules) -> Instances:
         """The map of the masks on the ``points`` of the truth, with the names of the protocol's classes as labels."""
@@ -88,24 +84,56 @@ class VertexMasks(Masks):
         return Instances.of(points, self, self.scores, self.features, labels=labels, names=self.keys)
 
 
+def ids_of(numbers: Int32Array, numbering: Numbering, rules: ProtocolRules) -> Int64Array:
+    """The class ids that ``numbers`` of any shape stand for under a protocol, 0 for those of none of its classes."""
+    wide = numbers.astype(np.int64)
+    if numbering == "id":
+        return wide
+    ids = np.array([entry.id for entry in (rules.scored if numbering == "index" else rules.classes)], np.int64)
+    is_known = (wide >= 0) & (wide < len(ids))
+    return np.append(ids, 0)[np.where(is_known, wide, len(ids))]
+
+
 @dataclass(frozen=True)
 class VertexLabels:
-    """One class id a point of the ground truth, in its order."""
+    """One class number a point of the ground truth, in its order, and ``further`` (N, k) ones, the likeliest first."""
 
     class_ids: Int32Array
+    further: Int32Array | None = None
+    numbering: Numbering = "id"
 
     def masks(self) -> VertexMasks:
-        """One mask a class."""
-        distinct, row = np.unique(self.class_ids, return_inverse=True)
-        masks = masks_of_partition(row, len(distinct))
-        return VertexMasks(
+        """One mask a class, the first one that a point has."""
+        return self._masks(self.class_ids[:, None])[0]
+
+    def on(self, points: Float32Array, rules: ProtocolRules) -> Instances:
+        """The map of one mask a class, or a row of classes, on the ``points`` of the truth, named as ``rules`` do."""
+        if self.further is None:
+            return self.masks().on(points, rules)
+        masks, numbers = self._masks(np.column_stack([self.class_ids, self.further]))
+        named = masks.on(points, rules)
+        name_of = {entry.id: entry.name for entry in rules.classes}
+        ids = ids_of(numbers[:, 1:], self.numbering, rules)
+        return replace(named, further_labels=tuple(tuple(name_of.get(one, "") for one in row) for row in ids.tolist()))
+
+    def _masks(self, rows: Int32Array) -> tuple[VertexMasks, Int32Array]:
+        """One mask a distinct row (R,) of ``rows`` (N, k), and these rows."""
+        if rows.shape[1] == 1:
+            values, row = np.unique(rows, return_inverse=True)
+            distinct = values[:, None]
+        else:
+            distinct, row = np.unique(rows, axis=0, return_inverse=True)
+        masks, first = masks_of_partition(row.ravel(), len(distinct)), distinct[:, 0]
+        of_rows = VertexMasks(
             masks.indptr,
             masks.indices,
-            n_points=len(self.class_ids),
+            n_points=len(rows),
             scores=np.ones(len(distinct)),
-            class_numbers=distinct.astype(np.int32),
-            keys=tuple(f"class {class_id}" for class_id in distinct),
+            class_numbers=first.astype(np.int32),
+            numbering=self.numbering,
+            keys=tuple(f"class {number}" for number in first),
         )
+        return of_rows, distinct.astype(np.int32)
 
 
 Content = VertexMasks | VertexLabels | Instances | Partition | DenseFeatures  # the last three have their own points

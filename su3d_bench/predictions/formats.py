@@ -19,11 +19,14 @@ from su3d_bench.predictions.openmask3d import OpenMask3d
 from su3d_bench.predictions.own_runs import OwnRuns
 from su3d_bench.predictions.sam3d import Sam3d, Sam3dColours
 from su3d_bench.predictions.scannet_text import OpenSun3dText, ScannetSemanticText, ScannetText
+from su3d_bench.predictions.scannetpp import ScannetppLabels, ScannetppMasks
 
 _ALL: tuple[Reader, ...] = (
     OwnRuns(),
     ScannetText(),
     ScannetSemanticText(),
+    ScannetppMasks(),
+    ScannetppLabels(),
     OpenSun3dText(),
     OpenMask3d(),
     MaskClustering(),

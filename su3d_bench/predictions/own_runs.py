@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from su3d_bench.core.maps import DenseFeatures, Prediction
 from su3d_bench.core.system.files import regular
 from su3d_bench.formats.arrays import kind_of
 from su3d_bench.formats.numpy_files import npy_header_of, npz_names, read_npz
-from su3d_bench.predictions.base import Content, Reader, ScenePrediction, VertexLabels, VertexMasks
+from su3d_bench.predictions.base import Content, Numbering, Reader, ScenePrediction, VertexLabels, VertexMasks
 from su3d_bench.store.atomic import write_npz
 from su3d_bench.store.predictions import (
     OVER_VERTICES,
@@ -28,6 +28,7 @@ from su3d_bench.store.run_folder import JOBS, scene_of_folder
 
 FILE = "prediction.npz"
 FLOATS = ("f2", "f4", "f8")
+NUMBERINGS: dict[str, Numbering] = {name: name for name in get_args(Numbering)}
 
 
 class OwnRuns(Reader):
@@ -64,7 +65,13 @@ class OwnRuns(Reader):
 def write_content(path: Path, content: Content) -> None:
     """Store what a reader gave at ``path``, so that ``OwnRuns`` reads the same."""
     if isinstance(content, VertexLabels):
-        write_npz(path, {"kind": np.array("VertexLabels"), "class_ids": content.class_ids})
+        labels = {
+            "kind": np.array("VertexLabels"),
+            "class_ids": content.class_ids,
+            "further": content.further,
+            "numbering": np.array(content.numbering) if content.numbering != "id" else None,
+        }
+        write_npz(path, {name: array for name, array in labels.items() if array is not None})
     elif isinstance(content, VertexMasks):
         arrays = {
             "kind": np.array("VertexMasks"),
@@ -100,8 +107,9 @@ _VERTEX_ARRAYS = {
     "class_numbers": (1, "i"),
     "features": (2, "f"),
     "class_ids": (1, "i"),
+    "further": (2, "i"),
 }
-_OPTIONAL = ("class_numbers", "features")
+_OPTIONAL = ("class_numbers", "features", "further")
 
 
 def _over_vertices(arrays: Mapping[str, NDArray[Any]], where: str) -> VertexMasks | VertexLabels:
@@ -114,10 +122,14 @@ def _over_vertices(arrays: Mapping[str, NDArray[Any]], where: str) -> VertexMask
             raise PredictionError(f"{where}: lacks '{name}'; evaluate again with --out")
         if array is not None and (array.ndim != n_axes or array.dtype.kind != kind):
             raise PredictionError(f"{where}: '{name}' is {kind_of(array)}; evaluate again with --out")
+    numbering = NUMBERINGS.get(str(arrays.get("numbering", "id")))
     if are_labels:
-        return VertexLabels(arrays["class_ids"])
-    numbering, n_points = str(arrays["numbering"]), int(arrays["n_points"])
-    if numbering not in ("id", "index") or not len(arrays["indptr"]):
+        further = arrays.get("further")
+        if numbering is None or (further is not None and len(further) != len(arrays["class_ids"])):
+            raise PredictionError(f"{where}: holds no labels; evaluate again with --out")
+        return VertexLabels(arrays["class_ids"], further, numbering)
+    n_points = int(arrays["n_points"])
+    if numbering is None or not len(arrays["indptr"]):
         raise PredictionError(f"{where}: holds no masks; evaluate again with --out")
     try:
         return VertexMasks(
@@ -126,7 +138,7 @@ def _over_vertices(arrays: Mapping[str, NDArray[Any]], where: str) -> VertexMask
             n_points=None if n_points < 0 else n_points,
             scores=arrays["scores"],
             class_numbers=arrays.get("class_numbers"),
-            numbering="id" if numbering == "id" else "index",
+            numbering=numbering,
             features=arrays.get("features"),
             keys=tuple(str(key) for key in arrays["keys"]),
         )

@@ -23,6 +23,7 @@ from su3d_bench.predictions.base import SceneFiles, ScenePrediction, VertexLabel
 
 OWN_OUTPUT = "semantic_instance_evaluation"  # the original evaluator's own answer, which it leaves out
 MASK3D_FOLDER = "decoder_-1"  # Mask3D and Segment3D write the lists of the last decoder here
+MASK_OF_RUNS = ".json"  # ScanNet++'s
 MOST_FIRST_LINE = 4096
 MOST_LOOKED_AT = 50
 
@@ -62,18 +63,16 @@ class TextFiles(SceneFiles):
 
 class ScannetText(TextFiles):
     name = "scannet-text"
-    summary = (
-        "ScanNet's submission: <scene>.txt with lines 'mask file, class id, confidence' (Mask3D, Segment3D, ScanNet++)"
-    )
+    summary = "ScanNet's submission: <scene>.txt with lines 'mask file, class id, confidence' (Mask3D, Segment3D)"
 
     def recognise(self, path: Path) -> str | None:
         lines = self.first_lines(path)
         if not lines:
             return None
-        words = next((line.split(" ") for line in lines if line), None)
-        if words is None:
+        if not any(lines):
             return "its .txt files are empty lists"
-        is_list = len(words) == 3 and _number(words[1]) is not None and _number(words[2]) is not None
+        words = list_words(lines)
+        is_list = words is not None and not words[0].endswith(MASK_OF_RUNS)
         return "its .txt files list a mask file, a class and a confidence a line" if is_list else None
 
     def scenes(self, path: Path) -> dict[str, Path]:
@@ -133,6 +132,13 @@ class ScannetSemanticText(TextFiles):
             line = int(np.argmax(is_wrong))
             raise PredictionError(f"{where}:{line + 1}: {int(values[line])} is no class id")
         return ScenePrediction(scene, self.name, place, VertexLabels(values.astype(np.int32)))
+
+
+def list_words(lines: Sequence[str]) -> list[str] | None:
+    """Mask file, class and confidence of the first of ``lines`` that is not empty; None where it is no such line."""
+    words = next((line.split(" ") for line in lines if line), [])
+    is_list = len(words) == 3 and _number(words[1]) is not None and _number(words[2]) is not None
+    return words if is_list else None
 
 
 def read_list(file: Path, *, has_classes: bool = True) -> list[Line]:
@@ -221,7 +227,7 @@ def _read_mask(places: _Places, line: Line, where: str) -> tuple[int, Int32Array
     if not is_inside:
         raise PredictionError(f"{place} is no file inside the folder of the list; copy it there")
     content = _content(file, place)
-    if file.suffix == ".json":
+    if file.suffix == MASK_OF_RUNS:
         return _run_length_mask(content, place)
     values = integer_lines(content, place)
     return len(values), np.flatnonzero(values != 0).astype(np.int32)  # of booleans they are found at once

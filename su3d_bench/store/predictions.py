@@ -36,6 +36,7 @@ FIELDS = {
     "ids": (1, "i"),
     "view_names": (1, "U"),
     "view_scores": (1, "f"),
+    "further_labels": (2, "U"),
 }
 
 
@@ -73,18 +74,22 @@ def prediction_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Pr
     if fault := array_fault(arrays):
         raise PredictionError(f"{where}: {fault}; run the scene again")
     for name in (name for name in FIELDS if name in arrays):
-        if arrays[name].dtype.kind == "U" and len(arrays[name]) > MOST_TEXTS:
-            raise PredictionError(f"{where}: '{name}' holds {len(arrays[name])} texts; is it damaged?")
+        if arrays[name].dtype.kind == "U" and arrays[name].size > MOST_TEXTS:
+            raise PredictionError(f"{where}: '{name}' holds {arrays[name].size} texts; is it damaged?")
     values: dict[str, Any] = {}
     for name in _fields_of(kind):
         value = arrays.get(name)
-        values[name] = tuple(str(item) for item in value) if value is not None and value.dtype.kind == "U" else value
-    optional = {"features", "labels", "view_names", "view_scores"}
+        values[name] = _texts(value) if value is not None and value.dtype.kind == "U" else value
+    optional = {"features", "labels", "view_names", "view_scores", "further_labels"}
     missing = [name for name, value in values.items() if value is None and name not in optional]
     if missing:
         raise PredictionError(f"{where}: lacks '{missing[0]}'; write it again with su3d-bench run")
     prediction: Prediction = kind(**values)
     return prediction
+
+
+def _texts(values: NDArray[Any]) -> tuple[Any, ...]:
+    return tuple(_texts(item) if isinstance(item, np.ndarray) else str(item) for item in values)
 
 
 def array_fault(arrays: Mapping[str, NDArray[Any]]) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Literal
@@ -38,6 +39,10 @@ HIGHER_IS_BETTER = frozenset(
         *GroundingRules.values_of_metric["scanrefer"], *_SHARES, *_OF_BOXES, *_JUDGED, *_OF_SEGMENTS, *_OF_PRESENCE,
     }
 )  # fmt: skip
+
+
+def _is_better_higher(name: str) -> bool:
+    return re.sub(r"^top-\d+ ", "", name) in HIGHER_IS_BETTER
 
 
 def check(run: FinishedRun, reference: Reference) -> Verdict:
@@ -221,9 +226,9 @@ def _compare(where: str, expected: Values, row: Mapping[str, float | None], acro
                 measured,
             )
         elif abs(measured - value.value) > tolerance:
-            is_better = name in HIGHER_IS_BETTER and measured > value.value
+            is_better = _is_better_higher(name) and measured > value.value
             text = "is better than the reference" if is_better else "is worse than the reference"
-            if name not in HIGHER_IS_BETTER:
+            if not _is_better_higher(name):
                 text = "differs from the reference"
             kind: Literal["better", "regression"] = "better" if is_better else "regression"
             yield Finding(kind, f"{where} / {printable(name, 80)}", text, value.value, measured, tolerance)

@@ -141,11 +141,29 @@ def masks_on_truth(
     rules: ProtocolRules, truth: GroundTruth, prediction: Instances | Partition, encoder: Encoder | None
 ) -> ScoredMasks:
     """The masks of a prediction as a protocol of kind ``instance`` scores them."""
-    values, class_ids, labels = _truth_and_labels(rules, truth, prediction, encoder)
+    values, moved, scores = without_labels(rules, truth, prediction)
+    class_ids, labels = _labels(rules, truth, prediction, encoder)
+    return ScoredMasks(values, class_ids, moved, labels, np.ones(len(moved)) if rules.confidence == "ones" else scores)
+
+
+def without_labels(
+    rules: ProtocolRules, truth: GroundTruth, prediction: Instances | Partition
+) -> tuple[Int64Array, Masks, Float64Array]:
+    """The truth (N,) as label * 1000 + instance, the masks on its points, and the prediction's own confidences (K,).
+
+    Points that the truth leaves out (class -1) are void and in no mask.
+    """
     masks, scores = masks_and_scores(prediction)
     cap_m, voxel_m = rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
     moved = transfer.transfer_masks(prediction.points, masks, truth.points, cap_m, voxel_m)
-    return ScoredMasks(values, class_ids, moved, labels, np.ones(len(masks)) if rules.confidence == "ones" else scores)
+    is_left_out = truth.semantic < 0
+    if not is_left_out.any():
+        return encode_truth(rules, truth.semantic, truth.instance), moved, scores
+    values = encode_truth(rules, np.maximum(truth.semantic, 0), np.where(is_left_out, 0, truth.instance))
+    values[is_left_out] = 0  # where whatever nobody annotated is an object, these are no part of it
+    is_kept = ~is_left_out[moved.indices]
+    before = np.append(0, np.cumsum(is_kept))
+    return values, Masks(before[moved.indptr], moved.indices[is_kept]), scores
 
 
 def masks_and_scores(prediction: Instances | Partition) -> tuple[Masks, Float64Array]:
@@ -156,15 +174,20 @@ def masks_and_scores(prediction: Instances | Partition) -> tuple[Masks, Float64A
     return masks, np.ones(len(masks))
 
 
-def _truth_and_labels(
-    rules: ProtocolRules, truth: GroundTruth, prediction: Instances | Partition, encoder: Encoder | None
-) -> tuple[Int64Array, list[int], Int64Array]:
-    """The truth as label * 1000 + instance, the labels that are scored, and the label of each prediction."""
+def encode_truth(rules: ProtocolRules, semantic: IntArray, instance: IntArray) -> Int64Array:
+    """One value a point, label * 1000 + instance, and 0 where it is void."""
     if rules.class_agnostic is not None:
-        values = encode_without_classes(rules, truth.semantic, truth.instance)
-        return values, [OBJECT], np.full(n_predictions(prediction), OBJECT)
-    values = instance_ap.encode_ground_truth(truth.semantic, truth.instance)
-    return values, [entry.id for entry in rules.scored], named_classes(rules, truth.semantic, prediction, encoder)
+        return encode_without_classes(rules, semantic, instance)
+    return instance_ap.encode_ground_truth(semantic, instance)
+
+
+def _labels(
+    rules: ProtocolRules, truth: GroundTruth, prediction: Instances | Partition, encoder: Encoder | None
+) -> tuple[list[int], Int64Array]:
+    """The labels that are scored, and the label (K,) of each prediction."""
+    if rules.class_agnostic is not None:
+        return [OBJECT], np.full(n_predictions(prediction), OBJECT)
+    return [entry.id for entry in rules.scored], named_classes(rules, truth.semantic, prediction, encoder)
 
 
 def named_classes(

@@ -52,6 +52,38 @@ def classes_of_prediction(
     return classes
 
 
+def ranked_classes(
+    rules: ProtocolRules, prediction: Prediction, encoder: Encoder | None, candidates: Int64Array, k: int
+) -> Int64Array:
+    """The ``k`` likeliest classes (K, k) of each instance, row of features or point, the best first, -1 for no more.
+
+    The labels of the method itself, in its order; otherwise the ``candidates`` of highest similarity.
+    """
+    ranked = np.full((n_rows(prediction), k), -1, np.int64)
+    labels = getattr(prediction, "labels", None)
+    if len(ranked):
+        ranked[:, 0] = classes_of_prediction(rules, prediction, encoder, candidates)
+    if labels is not None:
+        index_of = {entry.name: index for index, entry in enumerate(rules.classes)}
+        for row, further in enumerate(getattr(prediction, "further_labels", None) or ()):
+            for rank, label in enumerate(further[: k - 1], start=1):
+                ranked[row, rank] = index_of.get(label, -1)
+    if prediction.features is not None and encoder is not None and len(ranked) and len(candidates):
+        is_open = np.array([labels is None or labels[row] == "" for row in range(len(ranked))], bool)
+        if is_open.any():
+            text = text_features(
+                rules, [rules.classes[index].name for index in candidates], prediction.features, encoder
+            )
+            best = candidates[most_similar_each(prediction.features, text, k)]
+            ranked[is_open, : best.shape[1]] = best[is_open]
+    return ranked
+
+
+def n_rows(prediction: Prediction) -> int:
+    """How many instances, rows of features or points a prediction gives classes to."""
+    return len(prediction) if isinstance(prediction, Instances) else len(prediction.features)
+
+
 def has_every_label(prediction: object) -> bool:
     """Whether the method itself decided all labels."""
     labels = getattr(prediction, "labels", None)
@@ -151,6 +183,24 @@ def most_similar(features: np.ndarray, text: np.ndarray, device: str = CPU) -> I
             if chosen is None:
                 chosen = (_normalised(np.asarray(block, np.float64)) @ directions.T).argmax(axis=1)
             best[rows] = chosen
+    return best
+
+
+def most_similar_each(features: np.ndarray, text: np.ndarray, k: int) -> Int64Array:
+    """For each row of ``features`` (K, D) the ``k`` rows of ``text`` (C, D) of highest cosine (K, min(k, C)).
+
+    The best comes first, the first of equals, as ``most_similar`` has it.
+
+    >>> most_similar_each(np.array([[0.0, 2.0], [3.0, 1.0], [0.0, 0.0]]), np.eye(3, 2), 2).tolist()
+    [[1, 0], [0, 1], [0, 1]]
+    """
+    directions = _normalised(np.asarray(text, np.float64))
+    best = np.empty((len(features), min(k, len(directions))), np.int64)
+    # as in most_similar: one thread and blocks of one size
+    with threadpool_limits(1, user_api="blas"):
+        for rows, block in row_blocks(features, _BLOCK_ROWS):
+            cosine = _normalised(np.asarray(block, np.float64)) @ directions.T
+            best[rows] = np.argsort(-cosine, axis=1, kind="stable")[:, : best.shape[1]]
     return best
 
 

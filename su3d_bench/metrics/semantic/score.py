@@ -195,12 +195,8 @@ def call_points(
         mask = None
         predicted, distance_m = transfer_votes(rules, prediction, classes, targets, is_wanted)
     else:
-        owner, rank = _point_owners(prediction, _taking_part(rules, classes, is_scored))
-        if rules.transfer.evaluation_voxel_m > 0 and not transfer.are_same_points(prediction.points, targets):
-            rank = _one_a_voxel(prediction.points, owner, rank, rules.transfer.evaluation_voxel_m)
-        mask, distance_m = transfer.transfer_values(prediction.points, owner, rank, targets, is_wanted)
-        if rules.transfer.cap_m is not None:
-            mask = np.where(distance_m <= rules.transfer.cap_m, mask, -1)
+        takes_part = _taking_part(rules, classes, is_scored)
+        mask, distance_m = owners_at(rules, prediction, takes_part, targets, is_wanted)
         predicted = np.where(mask >= 0, classes[mask], -1) if len(classes) else mask
     return CalledPoints(
         targets=targets,
@@ -215,6 +211,26 @@ def call_points(
         mask=mask,
         distance_m=distance_m,
     )
+
+
+def owners_at(
+    rules: ProtocolRules,
+    prediction: Prediction,
+    takes_part: BoolArray,
+    targets: transfer.Points,
+    wanted: BoolArray,
+) -> tuple[Int64Array, Float64Array]:
+    """The object, or row of features, whose point is nearest to each wanted target, -1 for none, and how far it is.
+
+    Of the objects only those that ``takes_part`` (K,) names are looked at.
+    """
+    owner, rank = _point_owners(prediction, takes_part)
+    if rules.transfer.evaluation_voxel_m > 0 and not transfer.are_same_points(prediction.points, targets):
+        rank = _one_a_voxel(prediction.points, owner, rank, rules.transfer.evaluation_voxel_m)
+    mask, distance_m = transfer.transfer_values(prediction.points, owner, rank, targets, wanted)
+    if rules.transfer.cap_m is not None:
+        mask = np.where(distance_m <= rules.transfer.cap_m, mask, -1)
+    return mask, distance_m
 
 
 def transfer_votes(
