@@ -18,9 +18,8 @@ if TYPE_CHECKING:
     from su3d_bench.core.interfaces import Encoder
     from su3d_bench.metrics.protocols.model import ProtocolRules
     from su3d_bench.predictions.base import Content, Reader
-    from su3d_bench.predictions.export import LabelledMasks
 
-TARGETS = ("openlex3d", "scannet")
+TARGETS = ("openlex3d", "scannet", "scannetpp")
 
 
 def add_parser(verbs: Any) -> None:
@@ -39,7 +38,8 @@ def add_parser(verbs: Any) -> None:
         "--to",
         required=True,
         choices=TARGETS,
-        help="openlex3d: a cloud, the object of each point and features; scannet: lists of masks with class and score",
+        help="openlex3d: a cloud, the object of each point and features; scannet: lists of masks with class and score; "
+        "scannetpp: such lists with run-length masks, or with a --protocol of kind top-k the classes of every vertex",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder for the files")
     parser.add_argument("--method", help="whose maps of a run (default: the only one that it was asked for)")
@@ -48,13 +48,14 @@ def add_parser(verbs: Any) -> None:
     )
     parser.add_argument("--format", help="the format of the prediction (default: found from its files)")
     parser.add_argument(
-        "--protocol", help="for scannet: whose classes and ground truth (default: the dataset's only one of instances)"
+        "--protocol",
+        help="for scannet and scannetpp: whose classes and ground truth (default: the dataset's only one of instances)",
     )
     parser.add_argument(
         "--text-features",
         type=Path,
         metavar="FILE",
-        help="for scannet: features of class names for predictions that have features: .npz with names and features",
+        help="not for openlex3d: features of class names for predictions with features: .npz with names and features",
     )
 
 
@@ -73,23 +74,23 @@ class Source:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.predictions.export import whole_folder, write_openlex, write_scannet
+    from su3d_bench.predictions.export import whole_folder, write_openlex
 
+    is_openlex = arguments.to == "openlex3d"
     for flag, value in {"--protocol": arguments.protocol, "--text-features": arguments.text_features}.items():
-        if value is not None and arguments.to != "scannet":
-            raise ConfigError(f"{flag} {value}: belongs to --to scannet; leave it out")
+        if value is not None and is_openlex:
+            raise ConfigError(f"{flag} {value}: belongs to --to scannet or scannetpp; leave it out")
     sources = chosen(sources_of(arguments.path, arguments.format, arguments.method), arguments.scenes, arguments.path)
-    names = _names([source.address for source in sources], is_flat=arguments.to == "scannet")
+    names = _names([source.address for source in sources], is_flat=not is_openlex)
     rows = []
     with whole_folder(arguments.out) as folder:
         for source, name in zip(sources, names, strict=True):
             prediction = source.reader.read(source.path, source.scene)
             with _named(source):
-                if arguments.to == "openlex3d":
+                if is_openlex:
                     remarks = write_openlex(prediction.content, folder / name)
                 else:
-                    masks = _labelled(prediction.content, source, arguments)
-                    remarks = write_scannet(masks, name, folder)
+                    remarks = _write_for_classes(prediction.content, source, arguments, name, folder)
             remarks = (*_partial_remark(source.run), *prediction.remarks, *remarks)
             rows.append({"scene": source.address, "remarks": list(remarks)})
     if answer_json(arguments, {"to": arguments.to, "folder": str(arguments.out), "scenes": rows}):
@@ -205,20 +206,31 @@ def _names(addresses: Sequence[str], *, is_flat: bool) -> list[str]:
     return names
 
 
-def _labelled(content: Content, source: Source, arguments: argparse.Namespace) -> LabelledMasks:
-    """The masks on the points of the ground truth, with class ids."""
+def _write_for_classes(
+    content: Content, source: Source, arguments: argparse.Namespace, name: str, folder: Path
+) -> tuple[str, ...]:
+    """The files of a scene for a benchmark whose files have classes over the points of the truth."""
+    from su3d_bench.predictions import export
     from su3d_bench.predictions.base import VertexMasks
-    from su3d_bench.predictions.export import masks_as_they_are, masks_on_truth, needs_truth
 
-    if not needs_truth(content):
-        assert isinstance(content, VertexMasks)
-        return masks_as_they_are(content)
+    is_scannetpp = arguments.to == "scannetpp"
+    if isinstance(content, VertexMasks) and not export.needs_truth(content, "line" if is_scannetpp else "id"):
+        masks = export.masks_as_they_are(content)
+        if is_scannetpp:
+            return export.write_scannetpp(masks, None, name, folder)
+        return export.write_scannet(masks, name, folder)
     if "/" not in source.address:
         raise PredictionError(f"which dataset it is of is not known; name it, such as --scenes replica/{source.scene}")
     dataset, scene = _scene_of(source, is_quiet=arguments.quiet)
-    rules = _rules(arguments.protocol, dataset, source.run)
+    rules = _rules(arguments.protocol, dataset, source.run, is_ranked=is_scannetpp)
     encoder = _encoder(content, source, rules, arguments.text_features)
-    return masks_on_truth(content, rules, dataset.ground_truth(scene, rules.ground_truth), encoder)
+    truth = dataset.ground_truth(scene, rules.ground_truth)
+    if not rules.names_masks:
+        return export.write_scannetpp_labels(content, rules, truth, encoder, name, folder)
+    masks = export.masks_on_truth(content, rules, truth, encoder)
+    if is_scannetpp:
+        return export.write_scannetpp(masks, rules, name, folder)
+    return export.write_scannet(masks, name, folder)
 
 
 def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:
@@ -233,20 +245,23 @@ def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:
     ]
 
 
-def _rules(name: str | None, dataset: Any, run: Path | None) -> ProtocolRules:
-    """The protocol of ``name``, or the dataset's only one of instances with classes."""
+def _rules(name: str | None, dataset: Any, run: Path | None, *, is_ranked: bool) -> ProtocolRules:
+    """The protocol of ``name``, or the dataset's only one of instances with classes; several of one list count as one.
+
+    Those of kind top-k fit only where classes are ranked (``is_ranked``).
+    """
     from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
     from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for
 
     fitting = {rules.name: rules for rules in map(load_protocol, protocols_for(dataset.name)) if _has_masks(rules)}
     if name is None:
-        if len(fitting) != 1:
+        if len({(rules.ground_truth, rules.classes) for rules in fitting.values()}) != 1:
             known = ", ".join(fitting) or "none fits by itself"
             raise ConfigError(f"{dataset.name}: whose classes? name a protocol with --protocol ({known})")
         return next(iter(fitting.values()))
     rules = _of_run(name, run) or load_protocol(name)
     reason = why_not_truth(rules, TruthFacts.of_dataset(dataset))
-    if reason is not None or not _has_masks(rules):
+    if reason is not None or not (_has_masks(rules) or (is_ranked and rules.kind == "top-k")):
         raise ConfigError(f"--protocol {name}: {reason or 'has no classes of instances'}")
     return rules
 

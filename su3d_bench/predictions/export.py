@@ -1,11 +1,13 @@
-"""Predictions in the forms that other evaluators take: OpenLex3D's three files, ScanNet's lists of masks."""
+"""Predictions in the forms that other evaluators take: OpenLex3D's three files, the lists of masks of ScanNet and
+ScanNet++, and the ranked classes of ScanNet++."""
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import PredictionError, StoreError, printable
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition
-from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int64Array
+from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, Int64Array
 from su3d_bench.formats.pcd import write_pcd_points
 from su3d_bench.metrics.instance.score import masks_and_scores, named_classes
 from su3d_bench.metrics.matching import nearest as transfer
@@ -23,12 +25,15 @@ from su3d_bench.metrics.matching.labelling import (
     encoder_warning,
 )
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
+from su3d_bench.metrics.semantic.top_k import ranked_at
+from su3d_bench.predictions.base import Content, Numbering, VertexLabels, VertexMasks
 from su3d_bench.predictions.openlex3d import CLOUD, EMBEDDINGS, INDEX
+from su3d_bench.predictions.scannet_text import MASK_OF_RUNS
 from su3d_bench.store.atomic import make_folder, write_text
 from su3d_bench.store.unfinished import become, unfinished_folder
 
 MASKS_FOLDER = "pred_mask"
+RUNS_FOLDER = "predicted_masks"  # as ScanNet++'s own writer calls it
 ROWS_AT_ONCE = 1 << 14
 FILE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,150}")
 
@@ -153,15 +158,16 @@ class LabelledMasks:
     remarks: tuple[str, ...] = ()
 
 
-def needs_truth(content: Content) -> bool:
-    """Whether masks and class ids are not all in the file: other points, class positions, or features alone."""
-    return not isinstance(content, VertexMasks) or content.class_numbers is None or content.numbering == "index"
+def needs_truth(content: Content, numbering: Numbering = "id") -> bool:
+    """Whether masks and classes of that ``numbering`` are not all in the file: other points or numbers, or none."""
+    return not isinstance(content, VertexMasks) or content.class_numbers is None or content.numbering != numbering
 
 
 def masks_as_they_are(content: VertexMasks) -> LabelledMasks:
-    """Masks over the truth's points with class ids of their own."""
-    assert content.class_numbers is not None and content.numbering == "id"
-    return LabelledMasks(content, content.n_points or 0, content.class_numbers.astype(np.int64), content.scores)
+    """Masks over the truth's points with class ids of their own; of places in a list, from 0, the ids are one more."""
+    assert content.class_numbers is not None and content.numbering != "index"
+    ids = content.class_numbers.astype(np.int64) + (content.numbering == "line")
+    return LabelledMasks(content, content.n_points or 0, ids, content.scores)
 
 
 def masks_on_truth(
@@ -172,7 +178,7 @@ def masks_on_truth(
     Classes are those of the prediction, else what ``encoder`` calls its features among the classes of ``rules``.
     """
     if isinstance(content, VertexLabels | DenseFeatures):
-        raise PredictionError("has no masks, and ScanNet's list needs them")
+        raise PredictionError("has no masks, and a list of masks needs them")
     if isinstance(content, VertexMasks) and content.n_points not in {None, len(truth.points)}:
         raise PredictionError(
             f"is of {content.n_points} points, the ground truth of {len(truth.points)}; both must be of one mesh"
@@ -207,23 +213,95 @@ def write_scannet(labelled: LabelledMasks, scene: str, folder: Path) -> tuple[st
 
     Confidences are written with all their digits: ``%f`` would make equals of what differs in the seventh.
     """
-    scene = file_name(scene)
-    make_folder(folder / MASKS_FOLDER)
+
+    def digits_of(k: int) -> bytes:
+        digits = np.full((labelled.n_points, 2), (ord("0"), ord("\n")), np.uint8)
+        digits[labelled.masks.mask(k), 0] = ord("1")
+        return digits.tobytes()
+
+    return _write_list(labelled, labelled.class_ids - 1, scene, folder, 1, (MASKS_FOLDER, ".txt", digits_of))
+
+
+def write_scannetpp(labelled: LabelledMasks, rules: ProtocolRules | None, scene: str, folder: Path) -> tuple[str, ...]:
+    """``<scene>.txt`` and a file of run lengths for each mask; what cannot be said is left out and told.
+
+    Classes are places in the list of all classes of ``rules``; without these, the ids of the masks are such places + 1.
+    The official script takes confidences from 0 to 1 alone, as AP knows only their order others become ranks.
+    """
+    places = labelled.class_ids - 1
+    if rules is not None:
+        place_of = {entry.id: place for place, entry in enumerate(rules.classes)}
+        places = np.array([place_of.get(class_id, -1) for class_id in labelled.class_ids.tolist()], np.int64)
+    scores = labelled.scores
+    if len(scores) and (scores.min() < 0 or scores.max() > 1):
+        distinct, rank = np.unique(scores, return_inverse=True)
+        remark = "confidences beyond 0 to 1, which the benchmark refuses, were written as their ranks over their number"
+        labelled = replace(labelled, scores=(rank + 1) / len(distinct), remarks=(*labelled.remarks, remark))
+    form = RUNS_FOLDER, MASK_OF_RUNS, lambda k: _runs_json(labelled.masks.mask(k), labelled.n_points)
+    return _write_list(labelled, places, scene, folder, 0, form)
+
+
+def _runs_json(members: Int32Array, n_points: int) -> bytes:
+    """A mask as ScanNet++ has it: its length, and start and length of each run, the first point being 1."""
+    starts = np.flatnonzero(np.diff(members, prepend=-2) > 1)
+    sizes = np.diff(np.append(starts, len(members)))
+    runs = np.column_stack([members[starts] + 1, sizes]).ravel()
+    return json.dumps({"length": n_points, "counts": " ".join(map(str, runs.tolist()))}, indent=4).encode()
+
+
+def _write_list(
+    labelled: LabelledMasks,
+    places: Int64Array,
+    scene: str,
+    folder: Path,
+    first: int,
+    form: tuple[str, str, Callable[[int], bytes]],
+) -> tuple[str, ...]:
+    """``<scene>.txt`` and a file for each mask with points and a place (K,) from 0 on, which is written from ``first``.
+
+    ``form``: folder and suffix of the files of masks, and what is in that of mask k.
+    """
+    scene, (below, suffix, content_of) = file_name(scene), form
+    make_folder(folder / below)
     sizes = labelled.masks.sizes
     lines, n_empty, n_unnamed = [], 0, 0
-    for k, (class_id, score) in enumerate(zip(labelled.class_ids.tolist(), labelled.scores.tolist(), strict=True)):
+    for k, (place, score) in enumerate(zip(places.tolist(), labelled.scores.tolist(), strict=True)):
         if not sizes[k]:
             n_empty += 1
-        elif class_id == 0:
+        elif place < 0:
             n_unnamed += 1
         else:
-            name = f"{MASKS_FOLDER}/{scene}_{k:03d}.txt"
-            digits = np.full((labelled.n_points, 2), (ord("0"), ord("\n")), np.uint8)
-            digits[labelled.masks.mask(k), 0] = ord("1")
-            (folder / name).write_bytes(digits.tobytes())
-            lines.append(f"{name} {class_id} {score!r}\n")
+            name = f"{below}/{scene}_{k:03d}{suffix}"
+            (folder / name).write_bytes(content_of(k))
+            lines.append(f"{name} {place + first} {score!r}\n")
     write_text(folder / f"{scene}.txt", "".join(lines))
     return (*labelled.remarks, *_left_out(len(sizes), n_empty, n_unnamed))
+
+
+def write_scannetpp_labels(
+    content: Content, rules: ProtocolRules, truth: GroundTruth, encoder: Encoder | None, scene: str, folder: Path
+) -> tuple[str, ...]:
+    """``<scene>.txt`` with the classes of every vertex: as many as ``rules`` take, or one where the prediction has one.
+
+    Every vertex has the classes of the nearest object. ``PredictionError`` where there is none to take them from.
+    """
+    prediction = content.on(truth.points, rules) if isinstance(content, VertexMasks | VertexLabels) else content
+    found = ranked_at(rules, truth, prediction, encoder, np.ones(len(truth.points), np.bool_))
+    ranked = found.classes
+    is_open = ranked[:, 0] < 0
+    if is_open.any():
+        raise PredictionError(
+            f"{int(is_open.sum())} of {len(ranked)} vertices have none of the {len(rules.classes)} classes, and "
+            "ScanNet++'s file needs one for every vertex"
+        )
+    if (ranked[:, 1:] < 0).all():
+        ranked = ranked[:, :1]
+    # a class that is said again makes no other number
+    ranked = np.where(ranked < 0, ranked[:, :1], ranked)
+    make_folder(folder)
+    lines = [",".join(map(str, row)) for row in ranked.tolist()]
+    write_text(folder / f"{file_name(scene)}.txt", "\n".join(lines) + "\n")
+    return found.warnings
 
 
 def _left_out(n_masks: int, n_empty: int, n_unnamed: int) -> Sequence[str]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.maps import DenseFeatures, Prediction
+from su3d_bench.core.maps import Prediction
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array
 from su3d_bench.metrics.matching.labelling import (
     candidate_classes,
@@ -26,7 +26,7 @@ from su3d_bench.metrics.metric import Arrays, Counts, Metric, Pooled, SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, SemanticMetrics
-from su3d_bench.metrics.semantic.score import has_feature, owners_at
+from su3d_bench.metrics.semantic.score import owners_at
 
 ONE_CLASS = "the prediction names one class a point: top {k} is top 1"
 
@@ -89,6 +89,30 @@ def top_k_confusion(labels: Int64Array, ranked: Int64Array, n_classes: int) -> I
     return semantic.confusion_matrix(truth, called, n_classes)
 
 
+@dataclass(frozen=True)
+class RankedPoints:
+    """The classes (N, k) that each wanted point of a truth is called, the likeliest first, -1 for no more, and how far
+    (N,) the point is that they come from."""
+
+    classes: Int64Array
+    distance_m: Float64Array
+    warnings: tuple[str, ...]
+
+
+def ranked_at(
+    rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None, wanted: BoolArray
+) -> RankedPoints:
+    """What the ``wanted`` (N,) points of a truth are called: the classes of the nearest object, or row of features."""
+    assert rules.top_k is not None
+    is_present = present(_labels(rules, truth).ravel(), len(rules.classes))
+    ranked = ranked_classes(rules, prediction, encoder, candidate_classes(rules, is_present), rules.top_k)
+    ranked[~np.append(scored_classes(rules), False)[ranked]] = -1
+    row, distance_m = owners_at(rules, prediction, np.ones(len(ranked), np.bool_), truth.points, wanted)
+    classes = np.append(ranked, np.full((1, rules.top_k), -1), axis=0)[row]
+    warning = encoder_warning(rules, prediction, encoder)
+    return RankedPoints(classes, distance_m, () if warning is None else (warning,))
+
+
 class TopKMetric(Metric[TopKCounts]):
     """The likeliest classes of a point against all labels that it has."""
 
@@ -110,23 +134,17 @@ class TopKMetric(Metric[TopKCounts]):
             raise DataError(f"{rules.name}: the truth '{truth.variant}' has no labels on its evaluation points")
         labels = _labels(self.rules, truth)
         is_present = present(labels.ravel(), len(rules.classes))
-        ranked = ranked_classes(rules, prediction, encoder, candidate_classes(rules, is_present), self._k)
-        ranked[~np.append(scored_classes(rules), False)[ranked]] = -1
-        wanted = (labels >= 0).any(axis=1)
-        everything = np.ones(len(ranked), np.bool_)
-        row, distance_m = owners_at(rules, prediction, everything, truth.points, wanted)
-        called = np.where(row[:, None] >= 0, ranked[row], -1) if len(ranked) else np.full((len(row), self._k), -1)
+        wanted: BoolArray = np.any(labels >= 0, axis=1)
         n = len(rules.classes)
+        found = ranked_at(rules, truth, prediction, encoder, wanted)
+        called = found.classes[wanted]
         counts = TopKCounts(
-            top_k_confusion(labels[wanted], called[wanted][:, :1], n),
-            top_k_confusion(labels[wanted], called[wanted], n),
-            is_present,
+            top_k_confusion(labels[wanted], called[:, :1], n), top_k_confusion(labels[wanted], called, n), is_present
         )
-        warnings = [encoder_warning(rules, prediction, encoder)]
-        is_taken = has_feature(prediction) if isinstance(prediction, DenseFeatures) else everything
-        if self._k > 1 and is_taken.any() and (ranked[is_taken, 1:] < 0).all():
+        warnings = list(found.warnings)
+        if self._k > 1 and (called[:, 0] >= 0).any() and (called[:, 1:] < 0).all():
             warnings.append(ONE_CLASS.format(k=self._k))
-        return self.score(counts, prediction, distance_m[wanted], warnings)
+        return self.score(counts, prediction, found.distance_m[wanted], warnings)
 
     def pooled(self, counts: Sequence[TopKCounts]) -> Pooled:
         best, any_of_k = self._metrics(counts)

@@ -46,6 +46,9 @@ NAMES = {
     "replica-reasoning", "scannet-reasoning", "replica-boxes", "rooms-presence", "replica-presence",
     "scannet-presence", "rooms-panoptic", "replica-panoptic", "scannet-panoptic", "scannet-panoptic-oneformer3d",
     "scannet200-panoptic", "grounding",
+    "class-agnostic-maskclustering-scannetpp",
+    "class-agnostic-open3dis-scannetpp", "rooms-top-k", "scannetpp-instance", "scannetpp-open-vocabulary",
+    "scannetpp-semantic",
 }  # fmt: skip
 
 
@@ -74,6 +77,10 @@ def test_each_dataset_has_its_default_protocols() -> None:
     assert protocols_for("scannet") == [
         "class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d", "scannet-instance",
         "scannet-semantic", "scannet200-instance", "scannet200-semantic",
+    ]  # fmt: skip
+    assert protocols_for("scannetpp") == [
+        "class-agnostic-maskclustering-scannetpp", "class-agnostic-open3dis-scannetpp", "scannetpp-instance",
+        "scannetpp-open-vocabulary", "scannetpp-semantic",
     ]  # fmt: skip
     assert {"replica-conceptgraphs-ex6", "replica-mesh-ex6", "replica-openmask3d"} <= set(protocols_for("replica"))
     assert protocols_for("nowhere") == []
@@ -190,8 +197,9 @@ def test_a_rule_that_a_file_leaves_out_asks_for_nothing() -> None:
         "candidates": "object-points", "neighbours": 1, "cap_m": None, "evaluation_voxel_m": 0.0,
     }  # fmt: skip
     assert {key: value for key, value in rules.items() if key not in said} == {
-        "by_default": True, "class_agnostic": None, "void": None, "labels": None, "stuff": (), "ignore": (),
-        "ignore_rule": "exact", "prompts": (), "prompt_names": {}, "encoder": None, "min_region_size": None, "thresholds": (),
+        "by_default": True, "class_numbers": "ids", "class_agnostic": None, "void": None, "labels": None,
+        "stuff": (), "ignore": (), "ignore_rule": "exact", "prompts": (), "prompt_names": {}, "encoder": None,
+        "min_region_size": None, "thresholds": (),
         "confidence": None, "top_k": None, "questions": None, "per_kind": None, "synonyms": None, "merging": None,
         "answers": None, "box_axes": None, "presence": None, "aggregate": "pooled", "not_comparable_with": (),
     }  # fmt: skip
@@ -199,6 +207,7 @@ def test_a_rule_that_a_file_leaves_out_asks_for_nothing() -> None:
 
 KINDS = {
     "semantic": {"takes_dense", "names_points", "takes_votes", "ignores_classes"},
+    "top-k": {"takes_dense", "names_points", "ignores_classes"},
     "instance": {"needs_instances", "ignores_classes"},
     "panoptic": {"needs_instances", "ignores_classes"},
     "boxes": {"needs_own_points", "needs_boxes", "ignores_classes"},
@@ -396,7 +405,12 @@ def test_a_file_that_cannot_be_used_is_told_in_one_line(
 
 
 OPEN_FAULTS = (
-    ("openlex3d-topn", "top_k = 5", "", "top_k: belongs to kind 'queries' and to metric 'openlex3d-topn'"),
+    (
+        "openlex3d-topn",
+        "top_k = 5",
+        "",
+        "top_k: belongs to kind 'queries', and to kind 'top-k' and metric 'openlex3d-topn'",
+    ),
     ("openlex3d-topn", '["synonyms", "missing"', '["mAcc", "missing"', "a protocol of kind 'categories' has synonyms,"),
     ("openlex3d-topn", "[transfer]", 'classes = "rooms"\n[transfer]', "classes: needed where labels count"),
     (
