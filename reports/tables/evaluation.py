@@ -19,6 +19,7 @@ from su3d_bench.reports.tables.run import run_tables
 from su3d_bench.reports.tables.warnings import summed
 
 NAMES = {"ap": "AP", "ap50": "AP50", "ap25": "AP25", "macc": "mAcc", "miou": "mIoU", "fmiou": "F-mIoU"}
+NAMES |= {f"top_{k}_{key}": f"top-{k} {name}" for k in range(1, 10) for key, name in NAMES.items()}
 MOST_NOTES = 12  # warnings that are printed; the file has all
 
 

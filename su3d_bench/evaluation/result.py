@@ -297,7 +297,17 @@ def _once(lines: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(lines))
 
 
+def _key(name: str) -> str:
+    """What the file calls a metric; one of the k likeliest classes has their number before its name.
+
+    >>> _key("mIoU"), _key("top-3 mIoU"), _key("mF1-other")
+    ('miou', 'top_3_miou', 'mf1_other')
+    """
+    likeliest, gap, rest = name.rpartition(" ") if name.startswith("top-") else ("", "", name)
+    return likeliest.replace("-", "_") + gap.replace(" ", "_") + KEYS.get(rest, rest.lower().replace("-", "_"))
+
+
 def _renamed(values: Mapping[str, Any]) -> dict[str, Any]:
     """Values under the names that the file has for them, without counts of classes."""
-    plain = {KEYS.get(name, name.lower().replace("-", "_")): plain_json(value) for name, value in values.items()}
+    plain = {_key(name): plain_json(value) for name, value in values.items()}
     return {name: value for name, value in plain.items() if not name.startswith("n_") and "conceptgraphs" not in name}
