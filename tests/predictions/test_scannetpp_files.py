@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scored_room import ENCODER, ID, LABELS, instances
+from scored_room import ID, LABELS, OneHotEncoder, instances
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import DenseFeatures
@@ -29,6 +29,7 @@ from su3d_bench.predictions.export import (
 from su3d_bench.predictions.formats import READERS, recognise
 from su3d_bench.predictions.own_runs import read_stored, write_content
 
+ENCODER = OneHotEncoder()
 ROOMS, TOP_K = load_protocol("rooms-instance"), load_protocol("rooms-top-k")
 PLACE = {entry.name: place for place, entry in enumerate(ROOMS.classes)}
 
@@ -164,7 +165,7 @@ def test_a_map_is_written_with_the_places_of_its_classes_and_read_back(tmp_path:
     truth = room_truth()
     made = instances(
         truth.points,
-        [[0, 1, 5], [10, 11], [], [20]],
+        [np.array(one, np.int32) for one in ([0, 1, 5], [10, 11], [], [20])],
         ["chair", "table", "lamp", "no class"],
         scores=[0.1 + 0.2, 0.5, 1, 1],
     )

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from places import CASES
-from scored_room import ENCODER, ID, LABELS, instances
+from scored_room import ID, LABELS, OneHotEncoder, instances
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.maps import DenseFeatures, Masks
@@ -28,6 +28,7 @@ from su3d_bench.predictions.formats import recognise
 
 INSTANCE, SEMANTIC = load_protocol("scannetpp-instance"), load_protocol("scannetpp-semantic")
 TOP_K = load_protocol("rooms-top-k")
+ENCODER = OneHotEncoder()
 CLASSES = LabelSet("scannetpp", tuple(c.id for c in SEMANTIC.classes), tuple(c.name for c in SEMANTIC.classes))
 PROBLEMS = {
     name: json.loads((CASES / f"{name}.json").read_text())["problems"]
@@ -84,7 +85,7 @@ def test_a_list_of_masks_has_the_answer_of_the_benchmarks_script(index: int, tmp
         values, lines = one["truth"], []
         semantic = np.where(values > 0, values // 1000 + 1, 0)
         truths[f"{s:010x}"] = truth_of(semantic, np.where(values > 0, values % 1000, 0), one["masked"])
-        masks = np.unpackbits(one["masks"], axis=1)[:, : len(values)] if len(one["labels"]) else []
+        masks: Any = np.unpackbits(one["masks"], axis=1)[:, : len(values)] if len(one["labels"]) else []
         for k, (mask, label, score, file) in enumerate(
             zip(masks, one["labels"], one["scores"].tolist(), one["files"], strict=True)
         ):
@@ -186,9 +187,8 @@ def room_truth() -> GroundTruth:
     """A few objects with a label each."""
     points = np.random.default_rng(1).random((60, 3)).astype(np.float32)
     semantic = np.repeat([ID["chair"], ID["table"], ID["lamp"]], 20).astype(np.int32)
-    return GroundTruth(
-        points, semantic, np.repeat([1, 2, 3], 20).astype(np.int32), LABELS, "mesh-vertices", "made"
-    ), None
+    instance = np.repeat([1, 2, 3], 20).astype(np.int32)
+    return GroundTruth(points, semantic, instance, LABELS, "mesh-vertices", "made for a test")
 
 
 def test_one_class_a_point_makes_top_k_top_1_and_is_said() -> None:
