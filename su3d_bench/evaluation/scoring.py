@@ -193,10 +193,11 @@ def skips_missing_scenes(rules: ProtocolRules) -> bool:
     """Whether the original leaves scenes without a prediction out, so that their objects never count as missed.
 
     evaluate_semantic_instance.py, evaluate_semantic_label.py and those made after them walk the prediction files, but
-    for OpenSUN3D's, which walks the truth's and stops at the first scene without a prediction. A protocol of a user, or
-    of rooms that are made here, has no original.
+    for OpenSUN3D's and those whose files hold places in a list of classes, which stop at the first scene without a
+    prediction. A protocol of a user, or of rooms that are made here, has no original.
     """
-    if rules.metric != "scannet" or rules.name not in protocol_names() or rules.class_agnostic == "numbered":
+    stops = rules.class_agnostic == "numbered" or (rules.class_numbers == "lines" and rules.names_masks)
+    if rules.metric != "scannet" or rules.name not in protocol_names() or stops:
         return False
     return not any(getattr(registry.load("dataset", name), "renders_frames", False) for name in rules.datasets)
 

@@ -16,7 +16,7 @@ from scored_room import ID, LABELS, OneHotEncoder, instances
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.maps import DenseFeatures, Masks
 from su3d_bench.core.types import GroundTruth, LabelSet
-from su3d_bench.evaluation.scoring import map_of
+from su3d_bench.evaluation.scoring import map_of, skips_missing_scenes
 from su3d_bench.metrics.fitness import ContentFacts, why_not_content
 from su3d_bench.metrics.instance.score import without_labels
 from su3d_bench.metrics.protocols.loading import load_protocol
@@ -133,6 +133,10 @@ def test_the_84_classes_are_the_100_without_the_stuff_and_lines_count_from_one()
     assert [entry.id for entry in SEMANTIC.scored] == list(range(1, 101))
     assert len(INSTANCE.scored) == 84 and INSTANCE.classes == SEMANTIC.classes
     assert {"wall", "ceiling", "floor", "doorframe", "paper"} <= set(INSTANCE.ignore)
+
+
+def test_a_scene_without_a_submission_counts_as_missed() -> None:
+    assert not any(map(skips_missing_scenes, (INSTANCE, SEMANTIC)))  # there the script stops
 
 
 def test_files_of_class_ids_are_refused_where_the_benchmark_counts_places() -> None:
