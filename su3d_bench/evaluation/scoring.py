@@ -146,7 +146,9 @@ class Scoring:
         if encoder is not None:
             kept.encoder = encoder.name, encoder.digest
         if facts.n and (rules.n_labels or 0) > 1:
-            given = labels_counted(rules, by_features=encoder is not None)
+            content = prediction.content
+            further = content.further if isinstance(content, VertexLabels) else getattr(content, "further_labels", None)
+            given = labels_counted(rules, by_features=encoder is not None, are_several=further is not None)
             if kept.labels not in (None, given):
                 return f"gives {given} of a point, and {kept.labels} in the scenes before; give all alike"
             kept.labels = given

@@ -114,26 +114,26 @@ class ProtocolRules(_Strict):
 
     ``kind``: ``semantic`` (a class a point), ``top-k`` (the likeliest classes of a point, which may have several
     labels), ``instance`` (masks with a class), ``panoptic`` (every point in a segment of a thing or of ``stuff``),
-    ``queries`` (masks ranked for each text), ``boxes`` (with a class), ``categories`` (how near a point's label comes to
-    those of its object), ``grounding`` (the box of the first mask of each text), or what people are asked otherwise:
+    ``queries`` (masks ranked for each text), ``boxes`` (with a class), ``categories`` (how near a point's label comes
+    to those of its object), ``grounding`` (the box of the first mask of each text), or what people are asked otherwise:
     ``retrieval`` (the first mask of each text), ``presence`` (is there such a thing at all?), ``annotation`` (names and
     shapes of masks), ``reasoning`` (questions that boxes settle). ``questions`` are those of the ``dataset`` itself or
     ``generated`` from the truth, ``per_kind`` of each kind at most; ``synonyms`` names the table of other names of
-    classes. Protocols that are not ``by_default`` run where they are named. ``classes`` is the label set in the order of
-    the original; files of predictions number it by ``ids``, or by ``lines``, places in the list from 0
+    classes. Protocols that are not ``by_default`` run where they are named. ``classes`` is the label set in the order
+    of the original; files of predictions number it by ``ids``, or by ``lines``, places in the list from 0
     (``class_numbers``); ``ignore`` names classes that are known but not scored, and for ``categories`` labels whose
     objects are not. ``vocabulary``: the classifier chooses among ``all`` classes, the ``scored`` ones, or those scored
-    ones that the ``scene``'s ground truth contains. ``prompt`` has ``{}`` for the class name, which ``prompt_names`` may
-    replace; of several ``prompts`` the mean feature counts. ``confidence``: ``ones`` for every mask, the
-    ``prediction``'s own, or for queries the ``similarity`` of mask and text (cosine), or that stretched to 0..1 over the
-    scene's masks for each query. ``top_k``: how many labels of a point, or masks of a query, count; all where absent.
-    ``class_agnostic`` drops the labels: the truth's instances are those of the ``scored`` classes (the rest is void),
-    all ``annotated`` ones, ``numbered``, where a number alone tells an object, whatever its class, or ``everything``,
-    with the points that nobody annotated as one more. ``void``: masks on it are ``false-positives``; where absent, they
-    are dropped at every threshold that their share of void is above, as in ScanNet's script. ``labels``: whether the
-    same mask may stand there under several labels (``top-k``) or under ``one`` alone; where absent, either is scored,
-    and no ranking has both. ``box_axes``: the box of an instance is the smallest around its points along the axes of the
-    ``truth``'s box that it is held against, or along those of the ``world``.
+    ones that the ``scene``'s ground truth contains. ``prompt`` has ``{}`` for the class name, which ``prompt_names``
+    may replace; of several ``prompts`` the mean feature counts. ``confidence``: ``ones`` for every mask, the
+    ``prediction``'s own, or for queries the ``similarity`` of mask and text (cosine), or that stretched to 0..1 over
+    the scene's masks for each query. ``top_k``: how many labels of a point, or masks of a query, count; all where
+    absent. ``class_agnostic`` drops the labels: the truth's instances are those of the ``scored`` classes (the rest is
+    void), all ``annotated`` ones, ``numbered``, where a number alone tells an object, whatever its class, or
+    ``everything``, with the points that nobody annotated as one more. ``void``: masks on it are ``false-positives``;
+    where absent, they are dropped at every threshold that their share of void is above, as in ScanNet's script.
+    ``labels``: whether the same mask may stand there under several labels (``top-k``) or under ``one`` alone; where
+    absent, either is scored, and no ranking has both. ``box_axes``: the box of an instance is the smallest around its
+    points along the axes of the ``truth``'s box that it is held against, or along those of the ``world``.
     """
 
     name: str
