@@ -42,8 +42,11 @@ _CURVES = ("test_metrics_instance", "test_metrics_kernels", "test_metrics_class_
 _SCORES = ("test_metrics_scoring", "test_metrics_results", "numerics/test_statistics")
 _TRANSFER = ("test_metrics_transfer", "test_metrics_neighbours", *_SCORES)
 _TEXTS = ("test_metrics_queries", "test_metrics_openlex3d")
-_QUESTIONS = ("test_annotation_protocol", "test_retrieval_protocol", "questions/test_reasoning_solver")
-_PROTOCOLS = ("test_protocols", "test_metrics_scoring", "evaluation/test_evaluate")
+_QUESTIONS = (
+    "test_annotation_protocol", "test_retrieval_protocol", "test_presence_protocol", "test_grounding_protocol",
+    "questions/test_reasoning_solver",
+)  # fmt: skip
+_PROTOCOLS = ("test_protocols", "test_protocol_files", "test_metrics_scoring", "evaluation/test_evaluate")
 _COMPARE = tuple(f"analysis/test_compare{name}" for name in ("_statistics", "_pairs", ""))
 _GATE = tuple(f"analysis/gate/test_gate{name}" for name in ("_tolerances", "_references", "", "_answers", "_costs"))
 # Of each module, or of all in a folder, the tests that must notice: the quick ones first. Names without a folder stand
@@ -51,6 +54,12 @@ _GATE = tuple(f"analysis/gate/test_gate{name}" for name in ("_tolerances", "_ref
 GUARDS: dict[str, tuple[str, ...]] = {
     "metrics/instance/": (*_CURVES, *_SCORES),
     "metrics/semantic/": ("test_metrics_semantic", "test_metrics_undefined", "test_metrics_hovsg", *_SCORES),
+    "metrics/semantic/panoptic_quality.py": ("test_panoptic_protocol",),
+    "metrics/semantic/panoptic_score.py": ("test_panoptic_protocol",),
+    "metrics/semantic/top_k.py": ("test_metrics_scannetpp",),
+    "metrics/labels.py": ("evaluation/test_labels_counted",),
+    "metrics/matching/remembered.py": ("analysis/test_rules_walk", "analysis/test_walks_of_every_pair"),
+    "metrics/protocols/originals.py": ("test_originals",),
     "metrics/matching/checks.py": (*_SCORES, "evaluation/test_evaluate_checks", "evaluation/test_evaluate"),
     "metrics/matching/kernels.py": ("opensu3d/test_device_results",),
     "metrics/matching/labelling.py": (*_TRANSFER, "test_metrics_hovsg"),

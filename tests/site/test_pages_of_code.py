@@ -80,7 +80,7 @@ def test_every_public_name_has_its_place_in_the_reference(pages: dict[str, str])
 
 
 def test_nothing_in_a_protocol_file_acts_on_its_page(tmp_path: Path) -> None:
-    text = (ROOT / "su3d_bench/metrics/rules/rooms-instance.toml").read_text()
+    text = (ROOT / "su3d_bench/metrics/rules/rooms/rooms-instance.toml").read_text()
     hostile = "</td></table><script>alert(1)</script><img src=x onerror=y> `<b>` **"
     text = text.replace('name = "rooms-instance"', f"name = '{hostile} name'")
     text = re.sub(r'summary = ".*"', f"summary = '{hostile}'", text)

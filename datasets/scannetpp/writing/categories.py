@@ -14,7 +14,7 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.toml import parse_toml
 from su3d_bench.datasets.scannetpp.labels import CLASSES_NAME, INSTANCES_NAME, MAP_NAME
-from su3d_bench.metrics.protocols.files import RULES
+from su3d_bench.metrics.protocols.files import CLASS_TABLES
 
 ROOM_NAME, SCENE_NAME = re.compile(r"([a-z]+)(\d{1,2})"), re.compile(r"0000000(\d)(\d\d)")
 MAP_COLUMNS = ("class", "count", "semantic_map_to", "instance_map_to")
@@ -49,7 +49,7 @@ def room_of(scene: str) -> str | None:
 @cache
 def benchmark_names() -> tuple[str, ...]:
     """The 100 classes of the benchmark in the order of its list."""
-    return tuple(str(row[1]) for row in parse_toml(file_text(RULES / "classes.scannetpp-100.toml"))["classes"])
+    return tuple(str(row[1]) for row in parse_toml(file_text(CLASS_TABLES / "scannetpp-100.toml"))["classes"])
 
 
 def without_instances() -> frozenset[str]:

@@ -20,7 +20,7 @@ from su3d_bench.analysis.gate.reference import (
 )
 from su3d_bench.core.english import plural
 from su3d_bench.core.errors import printable
-from su3d_bench.metrics.protocols.model import GroundingRules, PanopticRules, PresenceQuestionRules
+from su3d_bench.metrics.protocols.kinds import GroundingRules, PanopticRules, PresenceQuestionRules
 from su3d_bench.reports.gate import SCENES, Compared, Finding, Verdict
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.records import NumbersRecord

@@ -27,7 +27,8 @@ from su3d_bench.metrics.matching.labelling import (
     scored_classes,
 )
 from su3d_bench.metrics.metric import C, Metric, Pooled, SceneScore, Values, n_predictions, present
-from su3d_bench.metrics.protocols.model import AP_NAMES, ProtocolRules, TransferRules
+from su3d_bench.metrics.protocols.kinds import AP_NAMES
+from su3d_bench.metrics.protocols.model import ProtocolRules, TransferRules
 
 IntArray = NDArray[np.integer[Any]]
 

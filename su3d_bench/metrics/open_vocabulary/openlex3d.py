@@ -14,7 +14,7 @@ import numpy as np
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array
 from su3d_bench.metrics.open_vocabulary.object_means import ObjectCounts
-from su3d_bench.metrics.protocols.model import CATEGORIES
+from su3d_bench.metrics.protocols.kinds import CATEGORIES
 
 SPACE = "openlex3d"
 _SYNONYMS, _DEPICTIONS, _VIS_SIM, _CLUTTER, _MISSING, _INCORRECT = range(len(CATEGORIES))

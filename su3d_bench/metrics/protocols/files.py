@@ -14,8 +14,8 @@ from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.toml import parse_toml
 
-RULES = Path(__file__).parents[1] / "rules"
-_TABLE_PREFIX = "classes."  # rules/classes.<name>.toml holds a class table, not a protocol
+RULES = Path(__file__).parents[1] / "rules"  # a folder for the protocols of each dataset
+CLASS_TABLES = RULES / "classes"  # no protocols
 HEADING = ""  # stands for the comments above the first rule of a file
 _KEY = re.compile(r"(\w+)\s*=")
 _SECTION = re.compile(r"\[(\w+)\]")
@@ -25,13 +25,18 @@ _ABSENT = re.compile(r"no (\w+)")
 
 def protocol_names() -> list[str]:
     """The names of the built-in protocols."""
-    return sorted(path.stem for path in RULES.glob("*.toml") if not path.name.startswith(_TABLE_PREFIX))
+    return sorted(_places())
+
+
+@cache
+def _places() -> dict[str, Path]:
+    return {path.stem: path for path in RULES.glob("*/*.toml") if path.parent != CLASS_TABLES}
 
 
 @cache
 def class_names() -> tuple[str, ...]:
     """Every name of the class tables, each once, those of the smaller tables first."""
-    tables = [_read_toml(path)["classes"] for path in sorted(RULES.glob(f"{_TABLE_PREFIX}*.toml"))]
+    tables = [_read_toml(path)["classes"] for path in sorted(CLASS_TABLES.glob("*.toml"))]
     return tuple(dict.fromkeys(str(row[1]) for table in sorted(tables, key=len) for row in table))
 
 
@@ -42,7 +47,7 @@ def rules_files(name: str) -> tuple[Path, ...]:
 
 def rules_file(name: str) -> Path:
     """The file of the rules called ``name``, or the path ``name`` itself."""
-    return RULES / f"{name}.toml" if name in protocol_names() else Path(name)
+    return _places().get(name) or Path(name)
 
 
 @dataclass(frozen=True)
@@ -77,7 +82,7 @@ def read_content(path: Path) -> Content:
             values[key] = values[key] | value if is_section else value
     table = values.get("classes")
     if isinstance(table, str):
-        tables = {p.stem.removeprefix(_TABLE_PREFIX): p for p in RULES.glob(f"{_TABLE_PREFIX}*.toml")}
+        tables = {path.stem: path for path in CLASS_TABLES.glob("*.toml")}
         if table not in tables:
             hint = suggest(table, sorted(tables))
             raise ConfigError(f"{line_of(files, 'classes')}: unknown class table '{table}'{hint}")

@@ -15,7 +15,8 @@ from pydantic import ValidationError
 
 from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.metrics.protocols.files import line_of, protocol_names, read_content, rules_file
-from su3d_bench.metrics.protocols.model import RULES_OF_KIND, SECTIONS, ProtocolRules
+from su3d_bench.metrics.protocols.kinds import RULES_OF_KIND
+from su3d_bench.metrics.protocols.model import SECTIONS, ProtocolRules
 from su3d_bench.metrics.protocols.originals import read_original
 
 

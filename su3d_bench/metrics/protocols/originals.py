@@ -126,7 +126,7 @@ def original_of(name: str) -> Stated | None:
     file = rules_file(name)
     content = read_content(file)
     if content.original is None:
-        if file.parent == RULES:
+        if RULES in file.parents:
             raise ConfigError(
                 f"{file}: the table [original] is missing; it says whose evaluation this is, or none = why"
             )

@@ -41,8 +41,8 @@ from su3d_bench.metrics.open_vocabulary.openlex3d import (
     scored_objects,
 )
 from su3d_bench.metrics.open_vocabulary.score import voxel_means
+from su3d_bench.metrics.protocols.kinds import CATEGORIES
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.metrics.protocols.model import CATEGORIES
 from su3d_bench.metrics.scoring import combine as combine_scenes
 from su3d_bench.metrics.scoring import pack_scores, score_scene, unpack_scores
 

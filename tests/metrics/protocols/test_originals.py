@@ -18,7 +18,7 @@ from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import GroundTruth, LabelSet
 from su3d_bench.metrics.protocols import originals as module
-from su3d_bench.metrics.protocols.files import RULES, protocol_names
+from su3d_bench.metrics.protocols.files import protocol_names, rules_file
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.protocols.originals import original_of
@@ -92,7 +92,7 @@ def test_what_is_said_of_an_original_moves_no_rule(tmp_path: Path) -> None:
 def test_rules_of_ones_own_need_say_nothing_and_those_of_the_program_must(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text = (RULES / "rooms-instance.toml").read_text().partition("[original]")[0]
+    text = rules_file("rooms-instance").read_text().partition("[original]")[0]
     mine = tmp_path / "mine.toml"
     mine.write_text(text.replace('name = "rooms-instance"', 'name = "mine"'))
     assert original_of(str(mine)) is None

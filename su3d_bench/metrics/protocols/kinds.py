@@ -1,0 +1,245 @@
+"""The kinds of evaluation: what each needs of a protocol's rules, which numbers it has, what it takes of a map."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from su3d_bench.core.errors import suggest
+from su3d_bench.metrics.protocols.model import CURVE_FIELDS, OWN_FIELDS, ProtocolRules, ValuesOfMetric
+
+AP_NAMES = ("AP", "AP50", "AP25")
+CATEGORIES = ("synonyms", "depictions", "vis_sim", "clutter", "missing", "incorrect")
+
+
+class SemanticRules(ProtocolRules):
+    """A class a point."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = dict.fromkeys(
+        ("conceptgraphs", "scannet", "hovsg", "ovo"), ("mAcc", "mIoU", "F-mIoU")
+    )
+    candidates = ("object-points",)
+    takes_dense = True
+    names_points = True
+    takes_votes = True
+    needs = ("classes", "vocabulary")
+
+
+class TopKRules(ProtocolRules):
+    """The likeliest classes of a point, against one label or several."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = {"scannetpp": ("mIoU", "mAcc")}
+    candidates = ("object-points",)
+    takes_dense = True
+    names_points = True
+    needs = ("classes", "vocabulary", "top_k")
+
+    @property
+    def value_names(self) -> tuple[str, ...]:
+        names = super().value_names
+        return (*names, *(f"top-{self.top_k} {name}" for name in names))
+
+
+class InstanceRules(ProtocolRules):
+    """Masks with a class."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = {"scannet": AP_NAMES}
+    needs_instances = True
+    confidences = ("ones", "prediction")
+    takes = ("class_agnostic", "void", "labels", *CURVE_FIELDS)
+
+    def _check_texts(self) -> None:
+        super()._check_texts()
+        if self.class_agnostic is not None and self.labels is not None:
+            raise ValueError(OWN_FIELDS["labels"])
+
+    def _needed(self) -> tuple[str, ...]:
+        if self.class_agnostic is None:
+            return ("classes", "vocabulary")
+        return ("classes",) if self.class_agnostic == "scored" else ()
+
+
+class PanopticRules(ProtocolRules):
+    """Every point in one segment of a thing or of stuff."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = dict.fromkeys(
+        ("panopticapi", "semantic-kitti"),
+        tuple(f"{quality}{part}" for part in ("", " things", " stuff") for quality in ("PQ", "SQ", "RQ")),
+    )
+    needs_instances = True
+    needs = ("classes", "vocabulary", "stuff")
+
+    def _needed(self) -> tuple[str, ...]:
+        return (*self.needs, "min_region_size") if self.metric == "semantic-kitti" else self.needs
+
+    def _check_metric(self) -> None:
+        super()._check_metric()
+        scored = [entry.name for entry in self.scored]
+        for name in self.stuff:
+            if name not in scored:
+                raise ValueError(f"stuff: '{name}' is no scored class{suggest(name, scored)}")
+
+
+class BoxRules(ProtocolRules):
+    """Boxes with a class."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = {
+        "votenet": ("AP25", "AP50", "centroid", "class", "recall25", "recall50", "precision25", "precision50")
+    }
+    needs_own_points = True
+    needs_boxes = True
+    confidences = ("ones", "prediction")
+    needs = ("classes", "vocabulary", "box_axes")
+    takes = CURVE_FIELDS
+
+    def _check_metric(self) -> None:
+        super()._check_metric()
+        if self.thresholds != (0.25, 0.5):
+            raise ValueError("thresholds: kind 'boxes' takes [0.25, 0.5]")
+
+    def _check_transfer(self) -> None:
+        super()._check_transfer()
+        if self.transfer.cap_m is not None or self.transfer.evaluation_voxel_m > 0:
+            raise ValueError("transfer.cap_m: kind 'boxes' transfers nothing; it takes no cap_m, no evaluation_voxel_m")
+
+
+class QueryRules(ProtocolRules):
+    """Masks ranked for each text."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = {"query-ap": AP_NAMES}
+    candidates = ("each-mask", "map-points")
+    needs_own_points = True
+    text_metrics = ("query-ap",)
+    confidences = ("similarity", "similarity-min-max")
+    takes = ("top_k", *CURVE_FIELDS)
+
+
+class CategoryRules(ProtocolRules):
+    """How near a point's label comes to those of its object."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = {
+        "openlex3d-topn": CATEGORIES,
+        "openlex3d-ranking": ("overall", "synonyms", "secondary"),
+    }
+    candidates = ("object-points",)
+    takes_dense = True
+    needs_own_points = True
+    ignores_classes = False
+    text_metrics = ("openlex3d-ranking",)
+
+    @property
+    def n_labels(self) -> int | None:
+        return self.top_k
+
+    def _needed(self) -> tuple[str, ...]:
+        return ("top_k",) if self.metric == "openlex3d-topn" else ()
+
+
+class GroundingRules(ProtocolRules):
+    """The box of the first mask of each text."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = {"scanrefer": ("Acc@0.25", "Acc@0.5")}
+    needs_own_points = True
+    text_metrics = ("scanrefer",)
+    needs = ("box_axes",)
+
+    def _check_transfer(self) -> None:
+        super()._check_transfer()
+        if self.box_axes != "world":
+            raise ValueError("box_axes: kind 'grounding' takes 'world'")
+        if self.transfer.cap_m is not None or self.transfer.evaluation_voxel_m > 0:
+            raise ValueError("transfer.cap_m: kind 'grounding' transfers nothing; no cap_m, no evaluation_voxel_m")
+
+
+class _JudgedRules(ProtocolRules):
+    """What people are asked otherwise."""
+
+    is_judged = True
+    needs_own_points = True
+
+    def _check_transfer(self) -> None:
+        super()._check_transfer()
+        if self.transfer.cap_m is None:
+            raise ValueError(f"transfer.cap_m: kind '{self.kind}' needs one")
+
+
+class RetrievalRules(_JudgedRules):
+    """The first mask of each text."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = {
+        "retrieval": ("instance", "affordance", "property", "relative", "all", "by name", "reachable")
+    }
+    text_metrics = ("retrieval",)
+    needs = ("questions", "min_region_size")
+    takes = ("per_kind",)
+
+    def _needed(self) -> tuple[str, ...]:
+        return (*self.needs, "synonyms") if self.questions == "generated" else self.needs
+
+
+class PresenceQuestionRules(ProtocolRules):
+    """Is there such a thing at all?"""
+
+    is_judged = True
+    needs_own_points = True
+    values_of_metric: ClassVar[ValuesOfMetric] = {
+        "pope": tuple(
+            f"{measure} {sampling}"
+            for sampling in ("random", "popular", "adversarial")
+            for measure in ("precision", "recall", "F1", "accuracy", "yes-rate", "AUROC")
+        )
+    }
+    text_metrics = ("pope",)
+    needs = ("questions", "min_region_size", "synonyms", "per_kind", "presence")
+
+    def _needed(self) -> tuple[str, ...]:
+        if self.questions == "dataset":
+            raise ValueError("questions: kind 'presence' takes 'generated'")
+        return self.needs
+
+    def _check_transfer(self) -> None:
+        super()._check_transfer()
+        if self.transfer.cap_m is not None or self.transfer.evaluation_voxel_m > 0:
+            raise ValueError("transfer.cap_m: kind 'presence' transfers nothing; no cap_m, no evaluation_voxel_m")
+
+
+class AnnotationRules(_JudgedRules):
+    """Names and shapes of masks."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = {
+        "annotation": (
+            *("label n", "label n'", "well-merged", "under-merged", "over-merged"),
+            *("well-merged n'", "under-merged n'", "over-merged n'"),
+        )
+    }
+    goes_by_names = True
+    needs = ("min_region_size", "synonyms", "merging")
+
+
+class ReasoningRules(_JudgedRules):
+    """Questions that boxes settle."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = {"reasoning": ("answer", "objects")}
+    goes_by_names = True
+    needs = ("questions", "min_region_size", "synonyms", "answers")
+    takes = ("per_kind",)
+
+    def _needed(self) -> tuple[str, ...]:
+        if self.questions == "dataset":
+            raise ValueError("questions: kind 'reasoning' takes 'generated'")
+        return self.needs
+
+
+RULES_OF_KIND: dict[str, type[ProtocolRules]] = {
+    "semantic": SemanticRules,
+    "top-k": TopKRules,
+    "instance": InstanceRules,
+    "panoptic": PanopticRules,
+    "boxes": BoxRules,
+    "queries": QueryRules,
+    "categories": CategoryRules,
+    "grounding": GroundingRules,
+    "retrieval": RetrievalRules,
+    "presence": PresenceQuestionRules,
+    "annotation": AnnotationRules,
+    "reasoning": ReasoningRules,
+}

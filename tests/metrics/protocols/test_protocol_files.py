@@ -1,0 +1,233 @@
+"""Files of protocols: what they say of their rules and extend, and one clear line for one that cannot be used."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from su3d_bench.cli.main import main
+from su3d_bench.core.errors import ConfigError
+from su3d_bench.metrics.protocols.files import HEADING, protocol_names, read_remarks, remarks_of, rules_file
+from su3d_bench.metrics.protocols.loading import load_protocol, not_comparable_with
+
+
+def edited(tmp_path: Path, base: str, old: str, new: str) -> str:
+    text = rules_file(base).read_text().replace(f'name = "{base}"', 'name = "mine"')
+    text = re.sub(r"^version = \d+$", "version = 1", text, flags=re.MULTILINE)
+    assert old in text
+    path = tmp_path / "mine.toml"
+    path.write_text(text.replace(old, new))
+    return str(path)
+
+
+def test_a_protocol_may_be_a_file(tmp_path: Path) -> None:
+    assert load_protocol(edited(tmp_path, "rooms-semantic", "version = 1", "version = 7")).version == 7
+
+
+def test_a_file_is_read_as_it_is_now_wherever_the_name_of_it_leads(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for folder, base in (("first", "rooms-instance"), ("second", "replica-openmask3d")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "mine.toml").write_text(f'extends = "{base}"\nname = "mine"\n')
+        monkeypatch.chdir(tmp_path / folder)
+        assert load_protocol("mine.toml").datasets == load_protocol(base).datasets
+    Path("mine.toml").write_text('extends = "rooms-semantic"\nname = "mine"\n')
+    assert load_protocol("mine.toml").kind == "semantic"
+
+
+def test_a_file_may_list_its_own_classes(tmp_path: Path) -> None:
+    rows = '[[40, "floor"], [93, "wall"], [31, "ceiling"], [20, "chair"]]'
+    path = edited(tmp_path, "rooms-semantic", 'classes = "rooms"', f"classes = {rows}")
+    assert [entry.name for entry in load_protocol(path).scored] == ["chair"]
+
+
+FAULTS = (
+    ("semantic", "vocabulary =", "vocabluary =", "mine.toml:14: unknown key 'vocabluary'; did you mean 'vocabulary'?"),
+    ("semantic", "candidates =", "candidate =", "unknown key 'transfer.candidate'; did you mean 'candidates'?"),
+    ("semantic", "version = 1", 'version = "1"', "mine.toml:4: version: input should be a valid integer, not '1'"),
+    ("semantic", "version = 1", "", "mine.toml: the key 'version' is missing"),
+    ("semantic", '"rooms"  #', '"room"  #', "unknown class table 'room'; did you mean 'rooms'?"),
+    ("semantic", '"rooms"  #', "[1]  #", "classes must be a table's name or rows of [id, name]"),
+    ("semantic", '"rooms"  #', '[[1, "a"], [2]]  #', "classes must be a table's name or rows of [id, name]"),
+    ("semantic", '"rooms"  #', '[[1, "a", "b", "c"]]  #', "classes must be a table's name or rows"),
+    ("semantic", '"rooms"  #', '[[1, "a"], [1, "b"]]  #', "each id and each name may stand there once"),
+    ("semantic", '"an image of {}"', '"an image"', "prompt: 'an image' has no {} for the class name"),
+    ("semantic", '["floor", "wall"', '["flor", "wall"', "'flor' is no class; did you mean 'floor'?"),
+    ("semantic", '["mAcc", "F-mIoU"]', '["AP"]', "a protocol of kind 'semantic' has mAcc, mIoU, F-mIoU"),
+    ("semantic", "version = 1", "version = 1\nmin_region_size = 3", "belong to kind 'instance'"),
+    ("instance", "min_region_size = 100", "", "kind 'instance' needs metric 'scannet', min_region_size"),
+    ("instance", "0.9000000000000004, 0.25,", "0.9", "thresholds: 0.25 and 0.5 must be among them"),
+    ("instance", '"map-points"', '"object-points"', "kind 'instance' takes 'map-points'"),
+    ("instance", "version = 1", "version = ", "mine.toml: is no valid TOML"),
+    ("semantic", '"object-points"', '"map-points"', "kind 'semantic' takes 'object-points'"),
+    ("semantic", "voxel_m = 0.0", "voxel_m = 0.02\nneighbours = 2", "of neighbours that vote nothing is left out"),
+    ("semantic", 'vocabulary = "scored"', "# none", "vocabulary: belongs to protocols that choose among classes"),
+    ("semantic", "version = 1", 'version = 1\nprompts = ["{}"]', "prompt: give either prompt or prompts"),
+    ("semantic", 'metric = "conceptgraphs"', 'metric = "query-ap"', "kind 'semantic' needs metric 'conceptgraphs' or"),
+    ("semantic", 'classes = "rooms"', "# none", "classes: needed where labels count"),
+    ("semantic", "version = 1", "version = 1\ntop_k = 5", "top_k: belongs to kind 'queries'"),
+    ("semantic", "version = 1", 'version = 1\nclass_agnostic = "scored"', "class_agnostic: belongs to kind 'instance'"),
+    ("instance", "version = 1", 'version = 1\nclass_agnostic = "scored"', "class_agnostic: takes no prompt"),
+    ("semantic", "version = 1", 'version = 1\nvoid = "false-positives"', "void: belongs to kind 'instance'"),
+    ("instance", 'confidence = "prediction"', 'confidence = "similarity"', "takes ones or prediction"),
+    ("instance", "[transfer]", "[transfer]\nneighbours = 2", "transfer.neighbours: belongs to kind 'semantic'"),
+    ("annotation", "version = 1", 'version = 1\nprompt = "{}"', "it takes no prompt and no encoder"),
+    ("annotation", "version = 1", 'version = 1\nencoder = "x"', "it takes no prompt and no encoder"),
+    ("retrieval", "min_region_size = 100", "", "questions: kinds 'retrieval', 'reasoning' and 'presence' need them"),
+    ("retrieval", "version = 1", 'version = 1\nconfidence = "ones"', "confidence belong to kind 'instance'"),
+    ("instance", 'name = "mine"', 'name = "rooms-instance"', "the protocol name 'rooms-instance' is built in"),
+)
+
+
+@pytest.mark.parametrize(("kind", "old", "new", "message"), FAULTS, ids=[fault[3] for fault in FAULTS])
+def test_a_file_that_cannot_be_used_is_told_in_one_line(
+    tmp_path: Path, kind: str, old: str, new: str, message: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_protocol(edited(tmp_path, f"rooms-{kind}", old, new))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+OPEN_FAULTS = (
+    (
+        "openlex3d-topn",
+        "top_k = 5",
+        "",
+        "top_k: belongs to kind 'queries', and to kind 'top-k' and metric 'openlex3d-topn'",
+    ),
+    ("openlex3d-topn", '["synonyms", "missing"', '["mAcc", "missing"', "a protocol of kind 'categories' has synonyms,"),
+    ("openlex3d-topn", "[transfer]", 'classes = "rooms"\n[transfer]', "classes: needed where labels count"),
+    (
+        "openlex3d-ranking",
+        '["overall"',
+        '["clutter"',
+        "a protocol of kind 'categories' has overall, synonyms, secondary",
+    ),
+    ("openlex3d-queries", "cap_m = 0.03162277660168379", "", "transfer.cap_m: 'each-mask' needs one"),
+    ("openlex3d-queries", "voxel_m = 0.0", "voxel_m = 0.02", "needs one, and no evaluation_voxel_m"),
+    ("openlex3d-queries", '"each-mask"', '"object-points"', "kind 'queries' takes 'each-mask' or 'map-points'"),
+    ("openlex3d-queries", '"similarity-min-max"', '"ones"', "kind 'queries' takes similarity or similarity-min-max"),
+    ("query-ap", "min_region_size = 1", "", "kind 'queries' needs metric 'query-ap', min_region_size"),
+)
+
+
+@pytest.mark.parametrize(("base", "old", "new", "message"), OPEN_FAULTS, ids=[fault[3] for fault in OPEN_FAULTS])
+def test_a_file_of_the_open_vocabulary_kinds_that_cannot_be_used_is_told_in_one_line(
+    tmp_path: Path, base: str, old: str, new: str, message: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_protocol(edited(tmp_path, base, old, new))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_remarks_of_a_file_stand_beside_the_rules_that_they_speak_of(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(
+        '# Heading.\nname = "a # b"  # the name\n# above\nversion = 1  # [X]\n# no encoder: any\nthresholds = [\n'
+        "    0.5,\n]\n# of the section\n[transfer]\ncap_m = 1.0\n# no neighbours\n# at the end\n"
+    )
+    assert read_remarks(path) == {
+        "": ["Heading."],
+        "name": ["the name"],
+        "version": ["above", "[X]"],
+        "encoder": ["no encoder: any"],
+        "thresholds": [],
+        "transfer": ["of the section", "at the end"],
+        "transfer.cap_m": [],
+        "transfer.neighbours": ["no neighbours"],
+    }
+
+
+@pytest.mark.parametrize("name", protocol_names())
+def test_show_prints_every_rule_with_what_its_file_says_of_it(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["protocols", "show", name]) == 0
+    text = capsys.readouterr().out
+    rules = load_protocol(name)
+    for key in rules.model_dump(exclude={"transfer", "prompt_names", "classes", "merging", "answers", "presence"}):
+        assert f"\n{key} " in text
+    for line in rules_file(name).read_text().splitlines():
+        comment = line.partition("  # ")[2] or line.partition("# ")[2] * line.startswith("#")
+        assert comment in text
+    assert all(other in text for other in not_comparable_with(rules))
+
+
+def test_a_missing_file_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_protocol(str(tmp_path / "none.toml"))
+
+
+# what a file extends
+
+
+def extending(folder: Path, name: str, parent: str, rest: str = "") -> str:
+    path = folder / f"{name}.toml"
+    path.write_text(f'extends = "{parent}"\nname = "{name}"\n{rest}')
+    return str(path)
+
+
+def test_a_file_that_extends_another_sets_only_what_differs(tmp_path: Path) -> None:
+    rest = 'ignore = ["other"]\n[transfer]\ncap_m = 0.5\n'
+    mine = load_protocol(extending(tmp_path, "mine", "replica-conceptgraphs-ex6", rest))
+    base = load_protocol("replica-conceptgraphs-ex6")
+    assert (mine.ignore, mine.transfer.cap_m, mine.transfer.candidates) == (("other",), 0.5, "object-points")
+    assert mine.model_copy(update={"name": base.name, "ignore": base.ignore, "transfer": base.transfer}) == base
+
+
+def test_files_extend_one_another_by_path_and_the_nearest_decides(tmp_path: Path) -> None:
+    (tmp_path / "below").mkdir()
+    extending(tmp_path, "first", "rooms-semantic", 'version = 3\nprompt = "{}"\n')
+    extending(tmp_path / "below", "second", "../first.toml", "version = 4\n")
+    third = load_protocol(extending(tmp_path, "third", "below/second.toml"))
+    assert (third.name, third.version, third.prompt, third.kind) == ("third", 4, "{}", "semantic")
+
+
+EXTENSION_FAULTS = (
+    ("mine.toml", "", "extends itself: mine.toml -> mine.toml"),
+    ("other.toml", "", "extends itself: mine.toml -> other.toml -> mine.toml"),
+    ("rooms-semantics", "", "mine.toml:1: extends the unknown protocol 'rooms-semantics'; did you mean"),
+    ("none.toml", "", "none.toml: cannot be read"),
+    ("rooms-semantic", "version = 0", "mine.toml:3: version: input should be greater than or equal to 1, not 0"),
+    ("rooms-semantic", 'colour = "red"', "mine.toml:3: unknown key 'colour'"),
+    ("rooms-semantic", 'metric = "query-ap"', "kind 'semantic' needs metric 'conceptgraphs' or"),
+)
+
+
+@pytest.mark.parametrize(("parent", "rest", "message"), EXTENSION_FAULTS, ids=[one[2] for one in EXTENSION_FAULTS])
+def test_an_extension_that_cannot_be_used_is_told_in_one_line(
+    tmp_path: Path, parent: str, rest: str, message: str
+) -> None:
+    extending(tmp_path, "other", "mine.toml")
+    with pytest.raises(ConfigError) as caught:
+        load_protocol(extending(tmp_path, "mine", parent, rest))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_without_a_heading_takes_none_from_what_it_extends(tmp_path: Path) -> None:
+    (tmp_path / "base.toml").write_text('# Of the base.\nname = "base"\nversion = 1  # the first\n')
+    (tmp_path / "mine.toml").write_text('extends = "base.toml"\nname = "mine"\n# no colour of its own\nversion = 2\n')
+    remarks = remarks_of([tmp_path / "mine.toml", tmp_path / "base.toml"])
+    assert remarks[HEADING] == ["extends base:", "Of the base."]
+    assert remarks["version"] == ["no colour of its own"]  # there is no rule called colour
+    assert "colour" not in remarks
+
+
+def test_what_a_file_extends_is_a_name_or_a_path(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text('extends = 3\nname = "mine"\n')
+    with pytest.raises(ConfigError, match=r"extends must be a protocol's name or the path of a \.toml file, not 3"):
+        load_protocol(str(tmp_path / "mine.toml"))
+
+
+def test_show_prints_the_rules_that_a_file_extends_with_their_sources(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["protocols", "show", "replica-conceptgraphs-ex4"]) == 0
+    text = capsys.readouterr().out
+    assert "extends replica-conceptgraphs-ex6:" in text
+    assert "[U] conceptgraph/utils/eval.py" in text
+    assert "    [C], n_exclude = 4" in text
+    assert "[C], n_exclude = 6" not in text
+    assert "    [E], raw hyphenated names" in text
