@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from hashlib import blake2b
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from su3d_bench.core.maps import Masks
-from su3d_bench.core.types import BoolArray
 from su3d_bench.metrics.protocols.model import ProtocolRules
+
+if TYPE_CHECKING:
+    from su3d_bench.core.maps import Masks
+    from su3d_bench.core.types import BoolArray
 
 ONE, SEVERAL = "one label", "the top labels of a mask"
 LEAST_SEVERAL = 0.5  # of the masks; single masks can be there twice by chance
@@ -61,10 +62,13 @@ def under_several_labels(masks: Masks, labels: Sequence[str | int]) -> BoolArray
     """Whether the same points stand there under another label too, of each mask; empty masks do not.
 
     >>> import numpy as np
+    >>> from su3d_bench.core.maps import Masks
     >>> masks = Masks.of_sets([np.array([1, 2]), np.array([3]), np.array([1, 2]), np.array([3])])
     >>> under_several_labels(masks, ("chair", "lamp", "stool", "lamp")).tolist()
     [True, False, True, False]
     """
+    import numpy as np
+
     keys = [blake2b(masks.mask(k).tobytes(), digest_size=16).digest() for k in range(len(masks))]
     seen: dict[bytes, set[str | int]] = {}
     for key, label in zip(keys, labels, strict=True):

@@ -132,7 +132,7 @@ def test_the_examples_hold() -> None:
 
 # ---- what the original evaluators of instances answered of the same made problems
 
-FOUND = json.loads((CASES / "instance_originals.json").read_text())
+FOUND = json.loads((CASES / "originals_instance.json").read_text())
 LAST_BITS = {"class-agnostic-maskclustering": 1.2e-16}  # its means are summed in another order
 
 
@@ -186,7 +186,7 @@ def classes_of(rules: ProtocolRules) -> tuple[dict[int, int], dict[int, str]]:
 
 # ---- and those of one class a point
 
-OF_POINTS = json.loads((CASES / "semantic_originals.json").read_text())
+OF_POINTS = json.loads((CASES / "originals_semantic.json").read_text())
 
 
 @pytest.mark.parametrize(("name", "number"), [(name, k) for name in OF_POINTS for k in range(len(OF_POINTS[name]))])

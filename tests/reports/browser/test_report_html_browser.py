@@ -216,8 +216,8 @@ OPERATE = """(part, kind, k) => {
 def names_of_controls(browser: Chromium) -> set[tuple[str, str, str]]:
     found = browser.run(
         "[...document.querySelectorAll('a[href], button, select, input, textarea, summary, canvas')]"
-        ".filter((one) => !one.matches('button.sort, button.to-gallery')).map((one) => [one.closest('section')?.id"
-        " || one.closest('nav')?.id || one.className, one.localName,"
+        ".filter((one) => !one.matches('button.sort, button.to-gallery, a.to-map'))"
+        ".map((one) => [one.closest('section')?.id || one.closest('nav')?.id || one.className, one.localName,"
         " (one.labels?.[0]?.textContent || one.getAttribute('aria-label')"
         " || one.textContent).trim()])"
     )

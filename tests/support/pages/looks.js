@@ -253,7 +253,7 @@ globalThis.looks = (() => {
       }
     }
     for (const el of all('a[href^="#"]')) {
-      say(document.getElementById(decodeURIComponent(el.hash.slice(1))), `${told(el)}: leads nowhere`);
+      say(document.getElementById(decodeURIComponent(el.hash.slice(1).split('?')[0])), `${told(el)}: leads nowhere`);
     }
     for (const el of all('link[href], [src], [srcset], [poster], [background], form[action], object[data]')) {
       for (const key of ['href', 'src', 'srcset', 'poster', 'background', 'action', 'data']) {

@@ -11,6 +11,7 @@ import os
 import signal
 import time
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -142,6 +143,7 @@ def _painting(scene: str, index: int) -> tuple[Any, Float32Array]:
     return objects, depth_m
 
 
+@cache
 def _surface(scene: str, n_frames: int) -> tuple[Float32Array, Any]:
     points, instance = [], []
     for index in range(n_frames):
@@ -150,7 +152,10 @@ def _surface(scene: str, n_frames: int) -> tuple[Float32Array, Any]:
         pose[0, 3] = 0.05 * index
         points.append(back_project(depth_m, INTRINSICS, pose, np.ones((HEIGHT, WIDTH), bool)))
         instance.append(objects.reshape(-1) + 1)
-    return np.concatenate(points).astype(np.float32), np.concatenate(instance).astype(np.int32)
+    surface = np.concatenate(points).astype(np.float32), np.concatenate(instance).astype(np.int32)
+    for array in surface:
+        array.flags.writeable = False
+    return surface
 
 
 class Collector:
