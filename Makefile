@@ -56,7 +56,7 @@ reference: demo
 	$(BIN)/su3d-bench check --learn runs/demo --out .ci/reference.json --across-machines 5 --cost-limit 3
 
 # Draws what docs/architecture.md says of the code from the code, makes docs/verbs.md from the parser and
-# docs/originals.md from the protocols' files.
+# docs/numbers/originals.md from the protocols' files.
 architecture: $(VENV)/test
 	$(BIN)/python tests/support/house.py
 	$(BIN)/python tests/support/verbs_page.py

@@ -1,8 +1,8 @@
 """How often a 95 % interval holds the truth, over benchmarks that are drawn from a world whose truth is known.
 
-``python benchmarks coverage_of_intervals [--simulations 2000] [--write docs/statistics.md]`` prints the tables of
-docs/statistics.md and, with ``--write``, puts them there; two minutes on one idle core. Exit code 1: a
-cell is below 90.
+``python benchmarks coverage_of_intervals [--simulations 2000] [--write docs/numbers/statistics.md]`` prints the tables
+of docs/numbers/statistics.md and, with ``--write``, puts them there; two minutes on one idle core. Exit code 1: a cell
+is below 90.
 
 The world is made of scenes: which classes they hold, how large these are, how hard the scene, its classes and its
 instances are for two methods that are equally good. Truth is what the metric gives over very many scenes. Numbers,

@@ -15,6 +15,7 @@ from pathlib import Path
 from su3d_bench.core.errors import ScenesMissing
 from su3d_bench.core.system.files import file_text
 from su3d_bench.datasets.recordings.made_rooms import read_marker
+from su3d_bench.datasets.recordings.places import folders_in
 from su3d_bench.datasets.scannet.labels import FIRST_TABLE_NAME, TABLE_NAME
 
 # The scenes of OpenSU3D's evaluation, in the order of its section IV-A.
@@ -78,16 +79,8 @@ class ScanFolders:
 def find_scans(root: Path) -> ScanFolders:
     """Every scan in ``PLACES`` below ``root``; none is no error here."""
     folders: dict[str, list[Path]] = {}
-    places, made, seen = [], set[str](), set[tuple[int, int]]()
-    for place in (root / name for name in PLACES):
-        try:
-            identity = place.stat().st_dev, place.stat().st_ino
-            children = sorted(child for child in place.iterdir() if child.is_dir())
-        except OSError:
-            continue
-        if identity in seen:  # a link, or a file system that takes scannet and ScanNet for one
-            continue
-        seen.add(identity)
+    places, made = [], set[str]()
+    for place, children in folders_in(root, PLACES):
         rooms = read_marker(place)
         scans = [child for child in children if _is_scan(child, rooms)]
         if scans:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from su3d_bench.core.errors import DataError, ScenesMissing
 from su3d_bench.datasets.recordings.made_rooms import read_marker
+from su3d_bench.datasets.recordings.places import folders_in
 from su3d_bench.datasets.recordings.recorded_frames import read_text
 from su3d_bench.datasets.scannetpp.labels import BENCHMARK_FOLDER, LIST_NAMES
 
@@ -70,16 +71,8 @@ def read_split(path: Path) -> tuple[str, ...]:
 def find_scenes(root: Path) -> SceneFolders:
     """Every scene in ``PLACES`` below ``root``; none is no error here."""
     folder_of: dict[str, Path] = {}
-    places, made, seen = [], set[str](), set[tuple[int, int]]()
-    for place in (root / name for name in PLACES):
-        try:
-            identity = place.stat().st_dev, place.stat().st_ino
-            children = sorted(child for child in place.iterdir() if child.is_dir())
-        except OSError:
-            continue
-        if identity in seen:  # a link, or a file system that takes scannetpp and ScanNetPP for one
-            continue
-        seen.add(identity)
+    places, made = [], set[str]()
+    for place, children in folders_in(root, PLACES):
         scenes = [child for child in children if _is_scene(child)]
         if scenes:
             rooms = read_marker(place)

@@ -44,11 +44,13 @@ def few_scenes(n_scenes: int) -> str | None:
     """What must stand beneath intervals over so few scenes; None where they are enough, or where none has any.
 
     >>> few_scenes(4)
-    'intervals over 4 scenes are rough, as all over fewer than 10: docs/statistics.md'
+    'intervals over 4 scenes are rough, as all over fewer than 10: docs/numbers/statistics.md'
     """
     if not 1 < n_scenes < FEW_SCENES:
         return None
-    return f"intervals over {n_scenes} scenes are rough, as all over fewer than {FEW_SCENES}: docs/statistics.md"
+    return (
+        f"intervals over {n_scenes} scenes are rough, as all over fewer than {FEW_SCENES}: docs/numbers/statistics.md"
+    )
 
 
 def with_interval(value: float | None, interval: Sequence[float] | None) -> str:

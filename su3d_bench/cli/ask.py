@@ -91,7 +91,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 def _refined(job: JobFolder, wanted: str) -> tuple[RefinedNames | None, str]:
     """Labels n' where they are wanted and there, and which names these are."""
-    from su3d_bench.questions.refined_names import read_records
+    from su3d_bench.questions.refining.refined_names import read_records
 
     records = None if wanted == "label" else read_records(job)
     if records is None:

@@ -13,7 +13,7 @@ from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 
 LEVEL = 0.95
 ALPHA = 0.05  # a two-sided p below it is called a difference
-FEW_SCENES = 10  # below it an interval is said to be rough: docs/statistics.md shows how often it holds the truth
+FEW_SCENES = 10  # an interval over fewer is said to be rough: docs/numbers/statistics.md shows how often it holds
 MOST_GROUPS = 500  # scenes that are left out one by one; the largest validation set in use has 312
 LEAST_ITEMS = 10  # of fewer a t interval of a change or an agreement holds the truth in less than 90 of 100 sets
 NO_SPREAD = 1e-12  # pseudo-values of fractions that differ by less differ by rounding

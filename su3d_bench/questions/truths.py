@@ -22,10 +22,10 @@ from su3d_bench.metrics.questions.truths import (
     TrueAnswer,
 )
 from su3d_bench.metrics.scoring import QuestionTruth
+from su3d_bench.questions.absent.presence import counted_rooms, presence_questions
 from su3d_bench.questions.generator import chosen, generate, right_by_name
 from su3d_bench.questions.known_objects import is_called, known_objects
 from su3d_bench.questions.model import Question, new_question
-from su3d_bench.questions.presence import counted_rooms, presence_questions
 from su3d_bench.questions.reasoning.asking import BUILT_IN, MapSolver, built_in, given_answer
 from su3d_bench.questions.reasoning.generated import generate_questions
 from su3d_bench.questions.reasoning.scene_map import SceneMap, map_of
@@ -141,7 +141,7 @@ def _reasoning_truth(
 
 def voted_names(instances: Instances) -> RefinedNames | None:
     """Label n' by vote: of the names that the best views gave, the one with the greatest sum of prediction scores."""
-    from su3d_bench.questions.refinement import top_names, vote
+    from su3d_bench.questions.refining.refinement import top_names, vote
 
     if instances.view_names is None or instances.view_scores is None:
         return None

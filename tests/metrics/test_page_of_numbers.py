@@ -1,4 +1,4 @@
-"""What docs/numbers.md works out by hand is what the program computes, and the modules that it names are there."""
+"""What docs/numbers/how-made.md works out by hand is what the program computes, and the modules it names are there."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from places import ROOT
 from su3d_bench.metrics.instance.average_precision import THRESHOLDS, ap_columns
 from su3d_bench.metrics.instance.precision_recall import average_precision
 
-PAGE = (ROOT / "docs" / "numbers.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "numbers" / "how-made.md").read_text(encoding="utf-8")
 ROWS = re.findall(r"^\| [A-C] \| ([\d.]+) \| [^|]* \| ([^|]+) \|$", PAGE, re.MULTILINE)
 FOUND = [(float(confidence), float(iou.rpartition("= ")[2])) for confidence, iou in ROWS]
 N_CHAIRS = 3

@@ -1,4 +1,4 @@
-"""What docs/statistics.md says of intervals, and the program that simulates it."""
+"""What docs/numbers/statistics.md says of intervals, and the program that simulates it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from places import ROOT
 
 coverage = benchmark_program("coverage_of_intervals")
 
-PAGE = (ROOT / "docs" / "statistics.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "numbers" / "statistics.md").read_text(encoding="utf-8")
 
 
 def cells(table: str) -> dict[str, list[str]]:

@@ -20,7 +20,7 @@ from su3d_bench.core.system.timing import peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.costs import UpdateTimes, pooled, summarise
 from su3d_bench.numerics.statistics import growth_exponent
-from su3d_bench.reports.pictures.timing import POINTS, UPDATES, _anytime, _memory, _stages, _update_cost
+from su3d_bench.reports.pictures.plots.timing import POINTS, UPDATES, _anytime, _memory, _stages, _update_cost
 from su3d_bench.reports.tables.timing import AnytimePoint
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run, read_update_times

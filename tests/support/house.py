@@ -18,6 +18,7 @@ from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
 
+from made_documents import write_or_check
 from places import ROOT
 
 PACKAGE = ROOT / "su3d_bench"
@@ -243,14 +244,7 @@ def page_with(parts: dict[str, str], page: str) -> str:
 
 def main(arguments: list[str]) -> int:
     """Write the page, or with ``--check`` say whether it still holds."""
-    page = PAGE.read_text(encoding="utf-8")
-    new = page_with(drawn(), page)
-    if "--check" not in arguments:
-        PAGE.write_text(new, encoding="utf-8")
-    elif new != page:
-        print(f"{PAGE.relative_to(ROOT)}: the code has another shape; run: make architecture")
-        return 1
-    return 0
+    return write_or_check(PAGE, page_with(drawn(), PAGE.read_text(encoding="utf-8")), arguments)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""docs/originals.md, made from the protocols' files: whose evaluation each repeats, and how far both were compared.
+"""docs/numbers/originals.md, made from the protocols' files: whose evaluation each repeats, and how both were compared.
 
 ``python tests/support/originals_page.py`` writes the page; ``--check`` says whether it still holds.
 """
@@ -9,12 +9,13 @@ import sys
 from collections import defaultdict
 from collections.abc import Sequence
 
+from made_documents import cell, write_or_check
 from places import ROOT
 
 from su3d_bench.metrics.protocols.files import protocol_names
 from su3d_bench.metrics.protocols.originals import Original, original_of
 
-PAGE = ROOT / "docs" / "originals.md"
+PAGE = ROOT / "docs" / "numbers" / "originals.md"
 HEAD = """# Whose evaluation each protocol repeats
 
 Made by `make architecture` from the table `[original]` of each protocol's file in `su3d_bench/metrics/rules/`; a test
@@ -42,10 +43,10 @@ def page() -> str:
         assert stated is not None
         (with_one if stated.original.none is None else without)[stated.original].append(name)
     rows = [
-        (_names(names), _link(one), _cell(one.licence), _cell(one.data), _cell(one.held_together))
+        (_names(names), _link(one), cell(one.licence), cell(one.data), cell(one.held_together))
         for one, names in with_one.items()
     ]
-    rest = [(_names(names), _cell(one.none), _cell(one.data)) for one, names in without.items()]
+    rest = [(_names(names), cell(one.none), cell(one.data)) for one, names in without.items()]
     return "\n".join(
         [
             HEAD,
@@ -64,27 +65,13 @@ def _link(one: Original) -> str:
     return f"[{one.code} at {str(one.commit)[:7]}]({one.place}): {', '.join(f'`{file}`' for file in one.files)}"
 
 
-def _cell(text: str | None) -> str:
-    return " ".join((text or "").split()).replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*")
-
-
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     lines = [head, ("---",) * len(head), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
 
 
 def main(arguments: list[str]) -> int:
-    written = page()
-    if "--check" not in arguments:
-        PAGE.write_text(written)
-        return 0
-    holds = PAGE.is_file() and PAGE.read_text() == written
-    print(
-        "docs/originals.md is what the protocols say"
-        if holds
-        else "docs/originals.md does not hold any more: make architecture"
-    )
-    return int(not holds)
+    return write_or_check(PAGE, page(), arguments)
 
 
 if __name__ == "__main__":

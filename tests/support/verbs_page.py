@@ -9,6 +9,7 @@ import argparse
 import sys
 from collections.abc import Iterator
 
+from made_documents import cell, write_or_check
 from places import ROOT
 
 from su3d_bench.cli.main import build_parser
@@ -40,7 +41,7 @@ MORE = {
     "[running/clusters.md](running/clusters.md); what a run leaves behind: "
     "[running/run-folder.md](running/run-folder.md); GPUs: [running/gpu.md](running/gpu.md).",
     "ablate": "A sweep as variants in one run; `--beside all opensu3d@scheme4` puts other methods into the same "
-    "run: the five tables of the paper from one ([results.md](results.md)).",
+    "run: the five tables of the paper from one ([results.md](numbers/results.md)).",
     "report tables": "The paper's tables, with the figures as reported beside, in Markdown, LaTeX, CSV or HTML; "
     "`report verify` recomputes every cell.",
     "report html": "One page that works offline: tables that sort, confusion, errors, timing, every map in 3D.",
@@ -55,8 +56,8 @@ MORE = {
     "sheets score": "The paper's Tables IV and V with agreement: [human-evaluation.md](questions/human-evaluation.md).",
     "compare": "Exact sign-flip test with the smallest p that so many scenes allow, corrected where much is "
     "compared, and the paired difference with its interval; other data, rules or encoders are "
-    "refused: [statistics.md](statistics.md).",
-    "plan": "At 80 % power, from the variance of finished runs: [statistics.md](statistics.md).",
+    "refused: [statistics.md](numbers/statistics.md).",
+    "plan": "At 80 % power, from the variance of finished runs: [statistics.md](numbers/statistics.md).",
     "attribute": "Merged, split, duplicate, mislabelled, background, missed; geometry, association, label.",
     "datasets check": "Names what is missing, damaged or contradictory, and whether frames and ground truth meet: "
     "[datasets.md](datasets.md).",
@@ -72,7 +73,7 @@ MORE = {
 def page() -> str:
     verbs = list(_verbs(build_parser()))
     rows = [
-        f"| [`{name}`](#su3d-bench-{name.replace(' ', '-')}) | {_cell(_summary(parser))} |" for name, parser in verbs
+        f"| [`{name}`](#su3d-bench-{name.replace(' ', '-')}) | {cell(_summary(parser))} |" for name, parser in verbs
     ]
     parts = [HEAD, "\n".join(["| verb | what it does |", "|---|---|", *rows]) + "\n"]
     return "\n".join([*parts, *(_section(name, parser) for name, parser in verbs)])
@@ -94,7 +95,7 @@ def _summary(parser: argparse.ArgumentParser) -> str:
 def _section(name: str, parser: argparse.ArgumentParser) -> str:
     examples = [line.strip() for line in (parser.epilog or "").splitlines()[1:] if line.strip()]
     rows = [
-        f"| `{_cell(_usage(action))}` | {_cell((action.help or '').replace('%%', '%'))} |"
+        f"| `{cell(_usage(action))}` | {cell((action.help or '').replace('%%', '%'))} |"
         for action in parser._actions
         if action.help != argparse.SUPPRESS and not IN_EVERY & set(action.option_strings)
     ]
@@ -118,20 +119,8 @@ def _usage(action: argparse.Action) -> str:
     return names if action.nargs == 0 else f"{names} {several}"
 
 
-def _cell(text: str) -> str:
-    return " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;")
-
-
 def main(arguments: list[str]) -> int:
-    written = page()
-    if "--check" not in arguments:
-        PAGE.write_text(written)
-        return 0
-    holds = PAGE.is_file() and PAGE.read_text() == written
-    print(
-        "docs/verbs.md is what the parser says" if holds else "docs/verbs.md does not hold any more: make architecture"
-    )
-    return int(not holds)
+    return write_or_check(PAGE, page(), arguments)
 
 
 if __name__ == "__main__":

@@ -135,7 +135,7 @@ def _completion(folder: Path) -> Read:
 
 def _refined_names(folder: Path) -> Read:
     from su3d_bench.core.digests import digest_file
-    from su3d_bench.questions.refined_names import FILE_NAME, SCHEMA, read_records
+    from su3d_bench.questions.refining.refined_names import FILE_NAME, SCHEMA, read_records
     from su3d_bench.questions.undesired import FilterConfig
     from su3d_bench.store.run_folder import RunFolder
 

@@ -1,0 +1,1 @@
+"""Things that a scene has not and that are asked for all the same."""

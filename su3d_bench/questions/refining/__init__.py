@@ -1,0 +1,1 @@
+"""Names of objects made better by a language model that is shown them."""
