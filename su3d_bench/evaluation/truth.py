@@ -32,7 +32,7 @@ from su3d_bench.core.errors import (
 from su3d_bench.core.registry import FILES_OF_TRUTH
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import GroundTruth, Int64Array
-from su3d_bench.datasets.openlex3d import FACE_CORNERS, VISIBLE, OpenLexRelease
+from su3d_bench.datasets.openlex3d.release import FACE_CORNERS, VISIBLE, OpenLexRelease
 from su3d_bench.evaluation.request import Request
 from su3d_bench.evaluation.truth_values import FLAG, TruthValues, check_said
 from su3d_bench.formats.arrays import MOST_POINTS
@@ -43,7 +43,7 @@ from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth
 from su3d_bench.predictions.base import scene_files
-from su3d_bench.predictions.scenes import Match, Source, match_scenes, planned_scenes
+from su3d_bench.predictions.scenes import Match, Source, is_known, match_scenes, planned_scenes
 from su3d_bench.questions.files.datasets import is_foreign, read_foreign_queries
 from su3d_bench.questions.files.queries import VARIANT as QUERY_OBJECTS
 from su3d_bench.questions.files.queries import query_truth, read_query_file
@@ -118,7 +118,7 @@ def kind_of_truth(request: Request) -> Callable[[Request, Sequence[Source]], Sce
 
 def _folder_truths(request: Request, sources: Sequence[Source]) -> SceneTruths:
     assert request.ground_truth is not None
-    kind = OpenLexTruths if OpenLexRelease.is_at(request.ground_truth) else TextTruths
+    kind = OpenLexTruths if OpenLexRelease.datasets_at(request.ground_truth) else TextTruths
     check_said(request.truth_values, is_text=kind is TextTruths)
     return kind(request, sources)
 
@@ -244,17 +244,19 @@ def choose_scenes(words: Sequence[str], known: Sequence[str], where: str) -> lis
 
 
 class OpenLexTruths(SceneTruths):
-    """OpenLex3D's labels and queries, which lie beside the mesh of the dataset."""
+    """OpenLex3D's labels and queries of one dataset, whose own data lie below the data root."""
 
     def __init__(self, request: Request, sources: Sequence[Source]) -> None:
-
         assert request.ground_truth is not None
-        self._path = request.ground_truth
-        self._release = OpenLexRelease(request.ground_truth, data_root())
-        self.where, self.dataset_name, known = shown(request.ground_truth), None, self._release.scenes()
+        self._path, self.dataset_name = request.ground_truth, None
+        self.where = shown(request.ground_truth)
+        self._release = _labelled_release(request, sources)
+        known = self._release.scenes()
         self.scenes = tuple(choose_scenes(request.scenes, known, self.where)) if request.scenes else known
         requested = self.scenes if request.scenes else ()
-        matches, self.remarks = match_scenes(sources, known, None, self.where, requested)
+        name = self._release.dataset
+        is_named = any(source.dataset_of(scene) == name for source in sources for scene in source.scenes)
+        matches, self.remarks = match_scenes(sources, known, name if is_named else None, self.where, requested)
         self.matches = [match for match in matches if match.scene in self.scenes]
 
     @property
@@ -269,6 +271,34 @@ class OpenLexTruths(SceneTruths):
 
     def of_scene(self, rules: ProtocolRules, scene: str) -> Truth:
         return self._release.truth(scene, rules.ground_truth)
+
+
+def _labelled_release(request: Request, sources: Sequence[Source]) -> OpenLexRelease:
+    """The labels of the dataset that is named, else of the only one that the scenes or the predictions fit."""
+    assert request.ground_truth is not None
+    where, folder = shown(request.ground_truth), request.ground_truth
+    each = {name: OpenLexRelease(folder, data_root(), name) for name in OpenLexRelease.datasets_at(folder)}
+    if request.dataset is not None:
+        if request.dataset not in each:
+            hint = suggest(request.dataset, each)
+            raise ConfigError(f"{where}: has no labels of '{request.dataset}', only of {', '.join(each)}{hint}")
+        return each[request.dataset]
+    if len(each) == 1:
+        return next(iter(each.values()))
+    asked = request.scenes or [scene for source in sources for scene in source.scenes]
+    fitting = [
+        name
+        for name, release in each.items()
+        if any(one.partition("/")[0] == name or _names_one(one, release.scenes()) for one in asked)
+    ]
+    if len(fitting) != 1:
+        raise ConfigError(f"{where}: has labels of {', '.join(each)}; say of which with --dataset NAME")
+    return each[fitting[0]]
+
+
+def _names_one(word: str, scenes: Sequence[str]) -> bool:
+    """Whether a scene, a pattern of scenes or a prediction's name fits one of ``scenes``."""
+    return "/" not in word and (bool(fnmatch.filter(scenes, word)) or is_known(word, scenes))
 
 
 # ---- texts

@@ -67,7 +67,7 @@ def match_scenes(
     ]
     remarks = [f"left out, of another dataset: {printable(', '.join(foreign), 200)}"] if foreign else []
     own = {name: _plain(name.rpartition("/")[2]) for name in names if name not in foreign}
-    if len(requested) == 1 and len(own) == 1 and not _is_known(next(iter(own)), known):
+    if len(requested) == 1 and len(own) == 1 and not is_known(next(iter(own)), known):
         name = next(iter(own))
         remark = f"{requested[0]}: the prediction '{printable(name, 80)}' is taken for it, as the only one"
         return [Match(requested[0], name, names[name])], [*remarks, remark]
@@ -97,7 +97,8 @@ def _scene_of(name: str, plain: str, known: Sequence[str], where: str) -> str:
     raise PredictionError(f"{where}: no ground truth for the predicted scene '{printable(name, 80)}'{hint}")
 
 
-def _is_known(name: str, known: Sequence[str]) -> bool:
+def is_known(name: str, known: Sequence[str]) -> bool:
+    """Whether a prediction's name fits one of the scenes; one with a dataset before it fits whatever there is."""
     return "/" in name or any(_plain(scene) == _plain(name) or _goes_on(name, scene) for scene in known)
 
 

@@ -16,7 +16,7 @@ from prediction_files import (
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.datasets.openlex3d import VISIBLE_NAME
+from su3d_bench.datasets.openlex3d.labels import VISIBLE_NAME
 from su3d_bench.evaluation.evaluate import Request, evaluate
 
 PAINTED = f"{SCENES}/painted.py:Painted"

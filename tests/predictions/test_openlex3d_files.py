@@ -13,16 +13,9 @@ from damage import damages, outcomes, truncations
 from open_scene import ENCODER, OBJECTS, PROMPTS, instances_with
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
-from su3d_bench.datasets.openlex3d import (
-    Corners,
-    OpenLexFiles,
-    categories_truth,
-    queries_truth,
-    read_categories,
-    read_prompts,
-    read_queries,
-    replica_corners,
-)
+from su3d_bench.datasets.openlex3d.labels import OpenLexFiles, read_categories, read_prompts, read_queries
+from su3d_bench.datasets.openlex3d.points import LabelledPoints, face_corners_of
+from su3d_bench.datasets.openlex3d.release import categories_truth, queries_truth
 from su3d_bench.datasets.recordings.recorded_frames import MAX_TEXT_BYTES
 from su3d_bench.datasets.replica.mesh_truth import AnnotatedMesh
 from su3d_bench.formats.ply import ListColumn
@@ -91,11 +84,11 @@ def test_an_object_may_have_no_clutter(tmp_path: Path) -> None:
 # ---- from files to a score
 
 
-def corners() -> Corners:
+def corners() -> LabelledPoints:
     """Each object as points of a box."""
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.random((50, 3)) * 0.3 + [i, 0, 0] for i in range(len(OBJECTS))]).astype(np.float32)
-    return Corners(points, np.repeat(list(OBJECTS), 50), "made for a test")
+    return LabelledPoints(points, np.repeat(list(OBJECTS), 50), "made for a test")
 
 
 def write_visible(root: Path, points: np.ndarray) -> None:
@@ -134,7 +127,7 @@ def test_the_corners_of_a_replica_mesh_keep_the_numbers_of_all_objects() -> None
     faces = ListColumn(np.array([0, 3, 6]), np.array([0, 1, 2, 1, 2, 3]))
     without_class = np.zeros(2, np.int32)
     mesh = AnnotatedMesh(vertices, faces, np.array([7, 0]), without_class, without_class, {})
-    found = replica_corners(mesh)
+    found = face_corners_of(mesh)
     assert found.object_of_point.tolist() == [7, 7, 7, 0, 0, 0]
     assert found.points[3].tolist() == vertices[1].tolist()
 

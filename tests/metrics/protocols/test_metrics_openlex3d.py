@@ -371,13 +371,10 @@ def plain_ranking(truth: OpenLexTruth, prediction: Any) -> dict[str, float]:
 
 def test_a_cloud_is_reduced_as_open3d_reduces_it() -> None:
     open3d = pytest.importorskip("open3d")
-    points = np.random.default_rng(0).random((2000, 3)) - 0.37
+    points = (np.random.default_rng(0).random((2000, 3)) - 0.37).astype(np.float32)
     theirs = open3d.t.geometry.PointCloud(points).voxel_down_sample(0.05).point.positions.numpy()
-    ours = voxel_means(points, 0.05)
-    assert len(ours) == len(theirs) < 1900
-    distance, index = transfer.nearest(theirs, ours)
-    assert distance.max() < 1e-6  # theirs are added up in single precision
-    assert len(set(index.tolist())) == len(ours)
+    assert len(theirs) < 1900
+    assert sorted(voxel_means(points, 0.05).tolist()) == sorted(theirs.tolist())
 
 
 def test_without_voxels_every_point_speaks_for_itself() -> None:

@@ -194,7 +194,7 @@ def _rooms_mesh(folder: Path) -> Read:
 def _openlex3d(folder: Path) -> Read:
     from test_openlex3d_files import corners, write_visible, written
 
-    from su3d_bench.datasets.openlex3d import categories_truth, queries_truth
+    from su3d_bench.datasets.openlex3d.release import categories_truth, queries_truth
 
     files, mesh = written(folder), corners()
     write_visible(folder, mesh.points[::5])

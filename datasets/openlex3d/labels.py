@@ -1,8 +1,9 @@
-"""OpenLex3D's ground truth: labels in tiers for the objects of a scene, prompts, and queries with their objects.
+"""The files of OpenLex3D's release: labels of objects in tiers, prompts, and queries with their objects.
 
-The release (``gt_openlex3d.zip``) has ``<dataset>/prompt_list.txt`` and in ``<dataset>/<scene>/`` the files
-``gt_categories.json``, ``gt_visible_cloud.pcd`` and ``gt_categories_query_to_object_mapping_<level>.json``; which point
-belongs to which object comes from the base data. Source: openlex3d at commit 3dbad2b.
+The release (``gt_openlex3d.zip``) has ``<dataset>/prompt_list.txt`` and in ``<dataset>/<scene>/`` two files of
+categories, ``gt_categories.json`` by object and ``gt_categories_query_to_object_mapping_<level>.json`` by text, and
+where only a part of the scene was seen ``gt_visible_cloud.pcd``; which point belongs to which object comes from the
+base data. Source: openlex3d at commit 3dbad2b.
 """
 
 from __future__ import annotations
@@ -11,34 +12,26 @@ import json
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from su3d_bench.core.digests import digest_file, digest_json
 from su3d_bench.core.errors import DataError, GroundTruthMissing, printable
-from su3d_bench.core.types import Float32Array, Int64Array
+from su3d_bench.core.types import Float32Array
 from su3d_bench.datasets.recordings.recorded_frames import parsed_json, read_text
-from su3d_bench.datasets.replica.folders import find_original_scene, original_name
-from su3d_bench.datasets.replica.mesh_truth import MESH_NAME, AnnotatedMesh, read_annotated_mesh
 from su3d_bench.formats.pcd import read_pcd_points
-from su3d_bench.metrics.matching.nearest import nearest
-from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels, OpenLexTruth
-from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
+from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels
+from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
 
 PROMPTS_NAME = "prompt_list.txt"
 CATEGORIES_NAME = "gt_categories.json"
 VISIBLE_NAME = "gt_visible_cloud.pcd"
-VISIBLE_RADIUS_M = 0.05  # how far the face corner may be that says to which object a visible point belongs
 MOST_ID = 2**31 - 1
 
 Level = Literal["l0", "l1", "all"]
 LEVELS: tuple[Level, ...] = ("l0", "l1", "all")  # synonyms, what depicts them, both
-DATASET = "replica"  # of those that OpenLex3D labels, the one whose mesh can be read here
 QUERY_LEVEL: Level = "l0"  # the level that the release evaluates unless another is asked for
-VISIBLE, FACE_CORNERS = "openlex3d-visible", "openlex3d-face-corners"
 
 
 def queries_name(level: Level) -> str:
@@ -75,10 +68,15 @@ class OpenLexFiles:
         """The texts of ``level`` and the objects that each speaks of."""
         return read_queries(self._of_scene(queries_name(level)), f"{self.where}: {queries_name(level)}")
 
+    @property
+    def has_visible_points(self) -> bool:
+        """Whether the release says which part of the scene its images show."""
+        return os.path.exists(self._of_scene(VISIBLE_NAME))
+
     def visible_points(self) -> Float32Array:
         """The points (N, 3) in m that the scene's images show."""
         where, path = f"{self.where}: {VISIBLE_NAME}", self._of_scene(VISIBLE_NAME)
-        if not path.exists():
+        if not self.has_visible_points:
             raise _missing(path, where)
         with np.errstate(over="ignore"):
             points = read_pcd_points(path, where).astype(np.float32)
@@ -89,103 +87,6 @@ class OpenLexFiles:
 
     def _of_scene(self, name: str) -> Path:
         return self.root / self.dataset / self.scene / name
-
-
-@dataclass(frozen=True)
-class Corners:
-    """The corners of all faces of the annotated mesh, a vertex of four faces four times.
-
-    ``points`` (N, 3) float32 m, ``object_of_point`` (N,) int64 as the base data numbers its objects; ``source`` says
-    which mesh it is.
-    """
-
-    points: Float32Array
-    object_of_point: Int64Array
-    source: str
-
-
-def replica_corners(mesh: AnnotatedMesh) -> Corners:
-    """Of Replica: every object counts, with a class or without.
-
-    The original takes a face whose object the scene's list does not have for one of object 0; here it keeps its number.
-    """
-    return Corners(
-        mesh.vertices[mesh.corners.values],
-        np.repeat(mesh.object_of_face, mesh.corners.lengths).astype(np.int64),
-        f"the faces of {MESH_NAME}",
-    )
-
-
-def categories_truth(files: OpenLexFiles, corners: Corners) -> OpenLexTruth:
-    """The truth of ``openlex3d-topn`` and ``openlex3d-ranking``: visible points with the objects of the nearest corner.
-
-    A point without a corner nearer than 5 cm has no object.
-    """
-    points = files.visible_points()
-    distance, nearest_rows = nearest(corners.points, points, VISIBLE_RADIUS_M)
-    nearest_rows[distance >= VISIBLE_RADIUS_M] = -1
-    return OpenLexTruth(
-        points,
-        np.append(corners.object_of_point, -1)[nearest_rows],
-        files.objects(),
-        files.prompts(),
-        VISIBLE,
-        f"{VISIBLE_NAME}, {CATEGORIES_NAME} and {PROMPTS_NAME} of OpenLex3D, objects from {corners.source}",
-    )
-
-
-def queries_truth(files: OpenLexFiles, corners: Corners, level: Level) -> QueryTruth:
-    """The truth of ``openlex3d-queries``: the corners of all faces with the object of their face."""
-    return QueryTruth(
-        corners.points,
-        corners.object_of_point,
-        files.queries(level),
-        FACE_CORNERS,
-        f"{queries_name(level)} of OpenLex3D, objects from {corners.source}",
-    )
-
-
-@dataclass(frozen=True)
-class OpenLexRelease:
-    """The release below ``folder``, and the original release of Replica below ``data_root``."""
-
-    folder: Path
-    data_root: Path
-
-    @staticmethod
-    def is_at(folder: Path) -> bool:
-        """Whether a folder of ground truth is the release."""
-        return (folder / DATASET / PROMPTS_NAME).is_file()
-
-    def scenes(self) -> tuple[str, ...]:
-        """The scenes with labels, in alphabetical order."""
-        return tuple(sorted(path.parent.name for path in (self.folder / DATASET).glob(f"*/{CATEGORIES_NAME}")))
-
-    def digest(self, scene: str) -> str:
-        """A key of the labels and queries of a scene; the mesh is that of Replica's release."""
-        files = [self.folder / DATASET / PROMPTS_NAME, *sorted((self.folder / DATASET / scene).iterdir())]
-        return digest_json({file.name: digest_file(file) for file in files if file.is_file()})
-
-    def truth(self, scene: str, variant: str) -> OpenLexTruth | QueryTruth:
-        """The truth of a scene; ``GroundTruthMissing`` where one of its files is not there."""
-        files = OpenLexFiles(self.folder, DATASET, scene)
-        corners = _corners(self.data_root, scene)
-        if variant == VISIBLE:
-            return categories_truth(files, corners)
-        return queries_truth(files, corners, QUERY_LEVEL)
-
-
-@lru_cache(maxsize=1)
-def _corners(data_root: Path, scene: str) -> Corners:
-    """The corners of a scene; the last ones are kept, because every protocol asks for them anew."""
-    where = f"{DATASET}/{scene}"
-    original = find_original_scene(data_root, scene)
-    if original is None:
-        raise GroundTruthMissing(
-            f"{where}: no mesh for OpenLex3D's objects; expected {original_name(scene)}/habitat of the original "
-            f"release in {data_root / 'replica_v1'}"
-        )
-    return replica_corners(read_annotated_mesh(original, where))
 
 
 def read_prompts(path: Path, where: str) -> tuple[str, ...]:
