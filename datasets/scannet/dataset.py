@@ -19,7 +19,15 @@ from su3d_bench.datasets.recordings.registration import Grid, make_registration
 from su3d_bench.datasets.recordings.source import RgbdSource
 from su3d_bench.datasets.scannet.annotations import segments_name
 from su3d_bench.datasets.scannet.checks import annotation_problems, recording_problems
-from su3d_bench.datasets.scannet.folders import PAPER_SCENES, SPLITS, ScanFolders, find_scans, no_scans, split_scenes
+from su3d_bench.datasets.scannet.folders import (
+    OVO_SCENES,
+    PAPER_SCENES,
+    SPLITS,
+    ScanFolders,
+    find_scans,
+    no_scans,
+    split_scenes,
+)
 from su3d_bench.datasets.scannet.frames import ScannetFrames, Walk, read_walk
 from su3d_bench.datasets.scannet.labels import TABLE_NAME, LabelTable, read_label_table
 from su3d_bench.datasets.scannet.recordings import (
@@ -89,8 +97,8 @@ class ScanNet:
         return self.tree.scenes
 
     def groups(self) -> Mapping[str, Sequence[str]]:
-        """The official splits, and the paper's five scenes, each by its name; whether they are here or not."""
-        return {split: split_scenes(split) for split in SPLITS} | {"paper": PAPER_SCENES}
+        """The official splits, and the five scenes of the paper and of OVO, by name; whether they are here or not."""
+        return {split: split_scenes(split) for split in SPLITS} | {"paper": PAPER_SCENES, "ovo": OVO_SCENES}
 
     def places(self) -> Sequence[Path]:
         """Where scans are, or else would be looked for first."""

@@ -20,6 +20,8 @@ from su3d_bench.datasets.scannet.labels import FIRST_TABLE_NAME, TABLE_NAME
 
 # The scenes of OpenSU3D's evaluation, in the order of its section IV-A.
 PAPER_SCENES = ("scene0000_00", "scene0034_00", "scene0164_03", "scene0525_01", "scene0549_00")
+# The scenes of OVO's evaluation, data/working/configs/ScanNet/eval_info.yaml at commit cf3b68e, which HOV-SG has too.
+OVO_SCENES = ("scene0011_00", "scene0050_00", "scene0231_00", "scene0378_00", "scene0518_00")
 SPLITS = ("train", "val", "test")
 BASES = ("", "scannet", "ScanNet", "scannetv2", "ScanNetV2", "scannet_v2", "scannet200", "ScanNet200")
 # "scans" and "scans_test" as the download script makes them, "v2/scans" as the server has them

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from damage import damages, outcomes, truncations
 from open_scene import ENCODER, OBJECTS, PROMPTS, instances_with
+from test_openlex3d_original import write_visible
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.datasets.openlex3d.labels import OpenLexFiles, read_categories, read_prompts, read_queries
@@ -91,17 +92,9 @@ def corners() -> LabelledPoints:
     return LabelledPoints(points, np.repeat(list(OBJECTS), 50), "made for a test")
 
 
-def write_visible(root: Path, points: np.ndarray) -> None:
-    fields = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1"
-    size = f"WIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}"
-    head = f"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n{fields}\n{size}\nDATA binary\n"
-    content = head.encode() + points.astype("<f4").tobytes()
-    (root / "replica/room0/gt_visible_cloud.pcd").write_bytes(content)
-
-
 def test_the_files_with_the_points_of_a_mesh_can_be_scored(tmp_path: Path) -> None:
     files, mesh = written(tmp_path), corners()
-    write_visible(tmp_path, mesh.points[::2] + np.float32(0.001))
+    write_visible(tmp_path / "replica/room0", mesh.points[::2] + np.float32(0.001))
     masks = [np.flatnonzero(mesh.object_of_point == one) for one in OBJECTS]
     words = [labels.synonyms[0] for labels in OBJECTS.values()]
     prediction = instances_with(mesh.points, masks, ENCODER.encode_texts(words))
@@ -117,7 +110,7 @@ def test_the_files_with_the_points_of_a_mesh_can_be_scored(tmp_path: Path) -> No
 def test_a_visible_point_far_from_every_corner_has_no_object(tmp_path: Path) -> None:
     mesh = corners()
     files = written(tmp_path)
-    write_visible(tmp_path, np.array([mesh.points[0] + [0.02, 0, 0], mesh.points[0] + [0, 9, 0]]))
+    write_visible(tmp_path / "replica/room0", np.array([mesh.points[0] + [0.02, 0, 0], mesh.points[0] + [0, 9, 0]]))
     truth = categories_truth(files, mesh)
     assert truth.object_of_point.tolist() == [7, -1]
 
@@ -196,7 +189,7 @@ def test_files_that_are_missing_or_too_large_are_told(tmp_path: Path) -> None:
     files = written(tmp_path)
     with pytest.raises(GroundTruthMissing, match=r"replica/room0: gt_visible_cloud\.pcd: is not there; expected"):
         files.visible_points()
-    write_visible(tmp_path, np.array([[0, 0, 0], [np.nan, 0, 0]]))
+    write_visible(tmp_path / "replica/room0", np.array([[0, 0, 0], [np.nan, 0, 0]]))
     with pytest.raises(DataError, match=r"replica/room0: gt_visible_cloud\.pcd: point 1 is at \[nan, 0.0, 0.0\]"):
         files.visible_points()
     large = tmp_path / "large"

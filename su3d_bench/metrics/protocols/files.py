@@ -36,7 +36,7 @@ def _places() -> dict[str, Path]:
 @cache
 def class_names() -> tuple[str, ...]:
     """Every name of the class tables, each once, those of the smaller tables first."""
-    tables = [_read_toml(path)["classes"] for path in sorted(CLASS_TABLES.glob("*.toml"))]
+    tables = [_class_rows(path) for path in sorted(CLASS_TABLES.glob("*.toml"))]
     return tuple(dict.fromkeys(str(row[1]) for table in sorted(tables, key=len) for row in table))
 
 
@@ -86,10 +86,26 @@ def read_content(path: Path) -> Content:
         if table not in tables:
             hint = suggest(table, sorted(tables))
             raise ConfigError(f"{line_of(files, 'classes')}: unknown class table '{table}'{hint}")
-        values["classes"] = _read_toml(tables[table])["classes"]
+        values["classes"] = _class_rows(tables[table])
     if "classes" in values:
         values["classes"] = _entries(files, values.get("classes"))
     return Content(values, files, original)
+
+
+def _class_rows(path: Path) -> list[Any]:
+    """The rows of a class table: those of the one that it ``extends``, then its own.
+
+    With ``groups`` of ``thirds`` the first third of all rows, rounded down, is head, the second common, the next tail.
+    """
+    content = _read_toml(path)
+    rows = content.get("classes", [])
+    if "extends" in content:
+        rows = [*_class_rows(CLASS_TABLES / f"{content['extends']}.toml"), *rows]
+    if content.get("groups") != "thirds":
+        return rows
+    third = len(rows) // 3
+    groups = [*(["head"] * third), *(["common"] * third), *(["tail"] * third)]
+    return [[*row[:2], *groups[place : place + 1]] for place, row in enumerate(rows)]
 
 
 def _chain(path: Path) -> list[tuple[Path, dict[str, Any]]]:

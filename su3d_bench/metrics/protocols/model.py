@@ -55,15 +55,17 @@ class TransferRules(_Strict):
     ``candidates``: ``object-points`` (only points that belong to an instance, as ConceptGraphs concatenates its object
     clouds), ``map-points`` (all points of the map; the nearest being background means no instance) or ``each-mask`` (a
     point is in every mask that has a point nearer than the cap). ``neighbours``: above 1 a point takes the class that
-    most of so many nearest object points have, the first class of equals; objects that overlap vote each.
+    most of so many nearest object points have, or with ``votes`` of ``masks`` that of the object that most of them
+    belong to, the first of equals; objects that overlap vote each.
     ``cap_m``: farther neighbours do not count, no cap when absent; a point without a neighbour is predicted as nothing.
     Where ``evaluation_voxel_m`` is above 0, each mask is first reduced to one point a voxel; under kind ``categories``
-    the whole cloud is, to the mean of the points. With a single neighbour, predictions on the scored points themselves
-    are taken as they are.
+    the whole cloud is, to the mean of the points. With a single neighbour, and where masks are voted for, predictions
+    on the scored points themselves are taken as they are.
     """
 
     candidates: Literal["object-points", "map-points", "each-mask"]
     neighbours: Annotated[int, Field(ge=1, le=100)] = 1
+    votes: Literal["classes", "masks"] = "classes"
     cap_m: Annotated[float, Field(gt=0)] | None = None
     evaluation_voxel_m: Annotated[float, Field(ge=0)] = 0.0
 
@@ -271,6 +273,8 @@ class ProtocolRules(_Strict):
             raise ValueError("transfer.cap_m: 'each-mask' needs one, and no evaluation_voxel_m")
         if transfer.neighbours > 1 and not self.takes_votes:
             raise ValueError("transfer.neighbours: belongs to kind 'semantic'")
+        if transfer.neighbours == 1 and transfer.votes == "masks":
+            raise ValueError("transfer.votes: a single neighbour holds no vote; give more neighbours")
         if transfer.neighbours > 1 and transfer.evaluation_voxel_m > 0:
             raise ValueError("transfer.evaluation_voxel_m: of neighbours that vote nothing is left out; set it to 0")
 

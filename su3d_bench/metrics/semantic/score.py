@@ -104,7 +104,7 @@ class SemanticMetric(Metric[SemanticCounts]):
             "mAcc": metrics.mean_accuracy,
             "mIoU": metrics.mean_iou,
             "F-mIoU": metrics.frequency_weighted_iou,
-            **({"pAcc": metrics.point_accuracy} if self.rules.metric == "hovsg" else {}),
+            **({"pAcc": metrics.point_accuracy} if self.rules.metric in {"hovsg", "ovo"} else {}),
             "mPrecision": metrics.mean_precision,
             "mF1": metrics.mean_f1,
             "mF1-conceptgraphs": metrics.mean_f1_conceptgraphs,
@@ -156,8 +156,8 @@ class CalledPoints:
     """The P points that a protocol of kind ``semantic`` looks at, and what a prediction calls them.
 
     ``source`` (P,): the truth's point that each one takes its class from. ``true_class`` and ``predicted`` (P,) are -1
-    for none; ``mask`` (P,) is the object, or row of features, that gives the predicted class, None where several
-    neighbours vote; ``distance_m`` (P,) of its point. ``is_wanted`` (P,) points are in the matrix, ``is_scored`` (P,)
+    for none; ``mask`` (P,) is the object, or row of features, that gives the predicted class, None where classes are
+    voted for; ``distance_m`` (P,) of its point. ``is_wanted`` (P,) points are in the matrix, ``is_scored`` (P,)
     ones of a scored class. ``is_present`` (C,) scored classes are in the scene, ``is_counted`` (C,) ones in the matrix;
     ``classes`` are those of the prediction's objects.
     """
@@ -191,7 +191,11 @@ def call_points(
     is_counted = _counted_classes(rules, is_scored, is_present)
     is_wanted = (true_class >= 0) & is_counted[true_class]
     classes = classes_of_prediction(rules, prediction, encoder, candidate_classes(rules, is_present))
-    if rules.transfer.neighbours > 1:
+    votes_for_masks = rules.transfer.votes == "masks" and not isinstance(prediction, DenseFeatures)
+    if votes_for_masks and not transfer.are_same_points(prediction.points, targets):
+        mask, distance_m = transfer_votes(rules, prediction, classes, targets, is_wanted, of_masks=True)
+        predicted = np.where(mask >= 0, classes[mask], -1) if len(classes) else mask
+    elif rules.transfer.neighbours > 1 and not votes_for_masks:
         mask = None
         predicted, distance_m = transfer_votes(rules, prediction, classes, targets, is_wanted)
     else:

@@ -192,7 +192,7 @@ def test_a_rule_that_a_file_leaves_out_asks_for_nothing() -> None:
     }  # fmt: skip
     rules = RULES_OF_KIND["semantic"].model_validate(said).model_dump()
     assert rules["transfer"] == {
-        "candidates": "object-points", "neighbours": 1, "cap_m": None, "evaluation_voxel_m": 0.0,
+        "candidates": "object-points", "neighbours": 1, "votes": "classes", "cap_m": None, "evaluation_voxel_m": 0.0,
     }  # fmt: skip
     assert {key: value for key, value in rules.items() if key not in said} == {
         "by_default": True, "class_numbers": "ids", "class_agnostic": None, "void": None, "labels": None,

@@ -192,15 +192,33 @@ def _rooms_mesh(folder: Path) -> Read:
 
 
 def _openlex3d(folder: Path) -> Read:
-    from test_openlex3d_files import corners, write_visible, written
+    from test_openlex3d_files import corners, written
+    from test_openlex3d_original import write_visible
 
     from su3d_bench.datasets.openlex3d.release import categories_truth, queries_truth
 
     files, mesh = written(folder), corners()
-    write_visible(folder, mesh.points[::5])
+    write_visible(folder / "replica/room0", mesh.points[::5])
     return lambda: every_one_of(
         iter((files.prompts, lambda: categories_truth(files, mesh), lambda: queries_truth(files, mesh, "all")))
     )
+
+
+def _openlex3d_points(dataset: str, scene: str) -> Make:
+    def make(folder: Path) -> Read:
+        from test_openlex3d_original import SAMPLED, of_dataset, write_objects
+
+        from su3d_bench.datasets.openlex3d.points import points_of
+
+        if dataset == "hm3d":
+            write_objects(folder / "hm3d" / scene, of_dataset(dataset)["scenes"][scene])
+        else:
+            place = folder / "scannetpp/prepared_semantics" / SAMPLED.name
+            place.parent.mkdir(parents=True)
+            place.write_bytes(SAMPLED.read_bytes())
+        return lambda: points_of(dataset, folder, scene)
+
+    return make
 
 
 def _ply(form: str) -> Make:
@@ -348,6 +366,9 @@ TARGETS = (
     Target("openlex3d queries", _openlex3d, ("replica/room0/*_all.json",)),
     Target("openlex3d prompts", _openlex3d, ("replica/prompt_list.txt",)),
     Target("openlex3d cloud", _openlex3d, ("replica/room0/*.pcd",)),
+    Target("openlex3d points of scannetpp", _openlex3d_points("scannetpp", "0a76e06478"), ("scannetpp/*/*.pth",)),
+    Target("openlex3d objects of hm3d", _openlex3d_points("hm3d", "00824"), ("hm3d/00824/scene_info.json",)),
+    Target("openlex3d clouds of hm3d", _openlex3d_points("hm3d", "00824"), ("hm3d/00824/objects/*.ply",)),
     *(Target(f"ply {form}", _ply(form), ("a.ply",)) for form in ("ascii", "binary_little_endian", "binary_big_endian")),
     *(Target(f"pcd {form}", _pcd(form), ("a.pcd",)) for form in ("ascii", "binary", "binary_compressed")),
     Target("hdf5 contiguous", _hdf5(), ("*.h5",)),
