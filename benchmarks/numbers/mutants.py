@@ -41,7 +41,7 @@ LEAST_S = 60.0
 _CURVES = ("test_metrics_instance", "test_metrics_kernels", "test_metrics_class_agnostic", "test_metrics_undefined")
 _SCORES = ("test_metrics_scoring", "test_metrics_results", "numerics/test_statistics")
 _TRANSFER = ("test_metrics_transfer", "test_metrics_neighbours", *_SCORES)
-_TEXTS = ("test_metrics_queries", "test_metrics_openlex3d")
+_TEXTS = ("test_metrics_queries", "test_metrics_openlex3d", "test_openlex3d_original")
 _QUESTIONS = (
     "test_annotation_protocol", "test_retrieval_protocol", "test_presence_protocol", "test_grounding_protocol",
     "questions/test_reasoning_solver",
