@@ -27,6 +27,7 @@ from su3d_bench.core.types import (
     Surface,
     WholeObject,
 )
+from su3d_bench.datasets import openscan
 from su3d_bench.datasets.rooms.rendering.render import LEVELS, add_noise
 
 if TYPE_CHECKING:  # what makes a room is imported where one is made: a list of scenes needs none of it
@@ -168,6 +169,7 @@ class Rooms:
     label_space = "replica"
     renders_frames = True
     variants: tuple[str, ...] = ("mesh-vertices", "face-corners")
+    further_truths = openscan.FURTHER_TRUTHS
     image_domain: ImageDomain = "rendered-rooms"
     Options = RoomOptions
 
@@ -275,7 +277,12 @@ class Rooms:
         return {object_id: int(n) for object_id, n in enumerate(counts) if object_id}
 
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:
-        """Labelled scan vertices (``mesh-vertices``) or the corners of every face in face order (``face-corners``)."""
+        """Labelled scan vertices (``mesh-vertices``) or the corners of every face in face order (``face-corners``).
+
+        Under the name of one of OpenScan's aspects: the vertices, with attributes in the place of classes.
+        """
+        if variant in self.further_truths:
+            return self._attribute_truth(scene, variant)
         if variant not in self.variants:
             raise GroundTruthMissing(
                 f"rooms/{scene}: no ground truth '{variant}'; there is {' and '.join(self.variants)}"
@@ -287,6 +294,15 @@ class Rooms:
             points, owner = scan.vertices[scan.faces.reshape(-1)], np.repeat(scan.object_id, 4)
         source = f"rooms generator {GENERATOR_VERSION}: surface seen on the walk, {variant}"
         return GroundTruth(points, self._class_of_object(scene)[owner], owner, label_set(), variant, source)
+
+    def _attribute_truth(self, scene: str, variant: str) -> GroundTruth:
+        from su3d_bench.datasets.rooms.attributes import attribute_of_object
+
+        scan = self.scan(scene)
+        owner = scan.object_of_vertex()
+        attributes = attribute_of_object(self.objects(scene), variant)[owner]
+        source = f"rooms generator {GENERATOR_VERSION}: attributes of the objects, as far as the walk sees them"
+        return GroundTruth(scan.vertices, attributes, owner, openscan.label_set(variant), variant, source)
 
     def _class_of_object(self, scene: str) -> Int32Array:
         return np.array([0, *[room_object.class_id for room_object in self.objects(scene)]], np.int32)

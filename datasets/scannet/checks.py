@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.datasets import openscan
 from su3d_bench.datasets.recordings.registration import Grid, make_registration
 from su3d_bench.datasets.recordings.source import RgbdSource
 from su3d_bench.datasets.scannet.annotations import aggregation_name, read_objects, read_segments, segments_name
@@ -51,6 +52,7 @@ def annotation_problems(files: Mapping[str, Path], scan: str, where: str) -> Ite
     readers: dict[str, Callable[[Path], object]] = {
         TABLE_NAME: lambda path: read_label_table(path, where),
         FIRST_TABLE_NAME: lambda path: read_label_table(path, where),
+        openscan.RAW_NAME: openscan.read_attributes,
         meta_name(scan): lambda path: read_axis_alignment(path, where),
         segments_name(scan): lambda path: read_segments(path, scan, where),
         aggregation_name(scan): lambda path: read_objects(path, scan, where),

@@ -9,11 +9,13 @@ from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
 from su3d_bench.core.types import Float64Array, Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo, Surface
+from su3d_bench.datasets import openscan
 from su3d_bench.datasets.recordings.recorded_frames import reading
 from su3d_bench.datasets.recordings.registration import Grid, make_registration
 from su3d_bench.datasets.recordings.source import RgbdSource
@@ -75,6 +77,7 @@ class ScanNet:
     scene_names = r"scene\d{4}_\d\d"
     label_space = "scannet"
     variants: tuple[str, ...] = ("nyu40-vertices", "scannet200-vertices")
+    further_truths = openscan.FURTHER_TRUTHS
     Options = ScannetOptions
 
     def __init__(self, root: Path, options: ScannetOptions | None = None) -> None:
@@ -146,6 +149,8 @@ class ScanNet:
         return total.hexdigest()
 
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:
+        if variant in self.further_truths:
+            return self._attribute_truth(scene, variant)
         if variant not in self.variants:
             hint = suggest(variant, self.variants)
             raise GroundTruthMissing(f"{self._where(scene)}: no ground truth '{variant}'{hint}")
@@ -159,6 +164,32 @@ class ScanNet:
                 f"into {self.tree.table_folders()[0]}"
             )
         return scannet200_truth(scan, table)
+
+    def _attribute_truth(self, scene: str, variant: str) -> GroundTruth:
+        """OpenScan's attributes of the annotated objects; void where an object has none."""
+        where, path = self._where(scene), self._openscan
+        if path is None:
+            raise GroundTruthMissing(
+                f"{where}: no ground truth '{variant}'; {openscan.RAW_NAME} is missing, get it by {openscan.PAGE} and put "
+                f"it into {self.tree.table_folders()[0]}"
+            )
+        attributes = self._attributes.get(scene)
+        if attributes is None:
+            raise GroundTruthMissing(f"{where}: no ground truth '{variant}'; {path.name} has no record of this scan")
+        scan = self._annotated_scan(scene)
+        id_of = openscan.attribute_ids(attributes, variant, where)
+        of_object = [*(id_of.get(entry.id, 0) for entry in scan.objects), 0]
+        semantic = np.array(of_object, np.int32)[scan.object_of_vertex]
+        labels = openscan.label_set(variant)
+        return GroundTruth(scan.vertices, semantic, scan.instance, labels, variant, f"the attributes in {path.name}")
+
+    @cached_property
+    def _attributes(self) -> Mapping[str, openscan.Attributes]:
+        return {} if self._openscan is None else openscan.read_attributes(self._openscan)
+
+    @property
+    def _openscan(self) -> Path | None:
+        return self.tree.find_label_table(openscan.RAW_NAME)
 
     def instance_mesh(self, scene: str) -> InstanceMesh:
         return instance_mesh(self._annotated_scan(scene), self._label_tables)
@@ -221,7 +252,7 @@ class ScanNet:
     def _small_files(self, scene: str) -> tuple[Path, ...]:
         """What is read of the scene beside its recording, as far as it is there."""
         paths = [self.tree.find_file(scene, name) for name in (meta_name(scene), *truth_names(scene))]
-        return tuple(path for path in (*paths, *self.tree.label_tables()) if path is not None)
+        return tuple(path for path in (*paths, *self.tree.label_tables(), self._openscan) if path is not None)
 
     def _truth_files(self, scene: str) -> dict[str, Path]:
         """The path of each file of the truth."""

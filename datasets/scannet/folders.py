@@ -37,7 +37,8 @@ SUBFOLDERS = (
     "validation",
 )
 PLACES = tuple(dict.fromkeys("/".join(part for part in (b, s) if part) or "." for b in BASES for s in SUBFOLDERS))
-TABLE_FOLDERS = ("tasks", "metadata", "v2/tasks", "v1/tasks")  # beside the scans, where some keep the label table
+# beside the scans, where some keep the label table, and OpenScan's attributes
+TABLE_FOLDERS = ("tasks", "metadata", "v2/tasks", "v1/tasks", "openscan", "OpenScan")
 SCAN_NAME = re.compile(r"scene\d{4}_\d{2}")
 EXPORTS = ("pose", "data/pose", "exported", "_info.txt")  # what tells a folder with exported frames
 SCANNET_URL = "http://www.scan-net.org"

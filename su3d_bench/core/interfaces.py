@@ -98,6 +98,13 @@ class Dataset(Protocol):
 
 
 @runtime_checkable
+class HasFurtherTruths(Protocol):
+    """Ground truths with labels of other label spaces than its own: label space -> the one of ``ground_truth``."""
+
+    further_truths: Mapping[str, str]
+
+
+@runtime_checkable
 class HasPlaces(Protocol):
     """The folders that a dataset searches."""
 
@@ -363,6 +370,7 @@ class Closes(Protocol):
 INTERFACES = {"dataset": Dataset, "method": Method}
 ABILITIES = {
     "dataset": (
+        HasFurtherTruths,
         HasPlaces,
         HasStatus,
         HasGroups,

@@ -5,7 +5,8 @@ Each ``why_not_...`` gives the reason as a clause without the protocol's name, N
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -30,7 +31,8 @@ class TruthFacts:
     """What a truth offers.
 
     ``label_space`` None: it does not say whose labels it has. ``has_points``: its points have coordinates;
-    ``knows_questions``: it has questions with all right answers.
+    ``knows_questions``: it has questions with all right answers; ``further``: of label spaces beside its own, the truth
+    that has their labels.
     """
 
     name: str
@@ -39,12 +41,18 @@ class TruthFacts:
     has_points: bool = True
     has_instances: bool = True
     knows_questions: bool = False
+    further: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def of_dataset(cls, dataset: Any) -> TruthFacts:
         """Those of a dataset, class or object."""
-        knows_questions = hasattr(dataset, "queries")
-        return cls(dataset.name, dataset.label_space, tuple(dataset.variants), knows_questions=knows_questions)
+        return cls(
+            dataset.name,
+            dataset.label_space,
+            tuple(dataset.variants),
+            knows_questions=hasattr(dataset, "queries"),
+            further=getattr(dataset, "further_truths", {}),
+        )
 
 
 @dataclass(frozen=True)
@@ -102,7 +110,7 @@ def why_not_truth(rules: ProtocolRules, truth: TruthFacts) -> str | None:
         return "needs the objects of a dataset; name one with --dataset"
     if rules.needs_instances and not truth.has_instances:
         return "needs instances, the ground truth holds class ids alone (expected class id * 1000 + instance)"
-    if truth.label_space is None:
+    if truth.label_space is None or truth.further.get(rules.label_space) == rules.ground_truth:
         return None
     if rules.label_space != truth.label_space:
         return f"it scores the labels of '{rules.label_space}', {truth.name} has those of '{truth.label_space}'"

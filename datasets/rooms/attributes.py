@@ -1,0 +1,36 @@
+"""OpenScan's attributes of the objects of a room, from ``attributes.toml`` and from what each is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from su3d_bench.core.system.files import file_text
+from su3d_bench.core.toml import parse_toml
+from su3d_bench.core.types import Int32Array
+from su3d_bench.datasets.openscan import attribute_id
+
+if TYPE_CHECKING:
+    from su3d_bench.datasets.rooms.truth import RoomObject
+
+MATERIAL = "material"
+
+
+def attribute_of_object(objects: Sequence[RoomObject], variant: str) -> Int32Array:
+    """The attribute (n + 1,) of every object in an aspect, by the object's id; 0 for none, and for what is no object."""
+    aspect = variant.partition("-")[2]
+    ids = _ids(variant)
+    words = [known.material if aspect == MATERIAL else known.class_name for known in objects]
+    return np.array([0, *(ids.get(word, 0) for word in words)], np.int32)
+
+
+@cache
+def _ids(variant: str) -> dict[str, int]:
+    """The attribute of each class, or material, in an aspect."""
+    table = parse_toml(file_text(Path(__file__).with_name("attributes.toml")))[variant.partition("-")[2]]
+    ids = {name: attribute_id(variant, words) for words, names in table.items() for name in names}
+    return {name: known for name, known in ids.items() if known is not None}
