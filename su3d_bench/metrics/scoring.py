@@ -29,6 +29,7 @@ from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
 from su3d_bench.metrics.open_vocabulary.score import CategoriesMetric, QueryMetric
 from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.questions.chains import ChainMetric
 from su3d_bench.metrics.questions.grounding import GroundingMetric
 from su3d_bench.metrics.questions.presence import PresenceMetric
 from su3d_bench.metrics.questions.score import AnnotationMetric, ReasoningMetric, RetrievalMetric
@@ -62,6 +63,7 @@ METRICS: dict[str, type[Metric[Any]]] = {
     "queries": QueryMetric,
     "categories": CategoriesMetric,
     "grounding": GroundingMetric,
+    "object-chains": ChainMetric,
     "retrieval": RetrievalMetric,
     "presence": PresenceMetric,
     "annotation": AnnotationMetric,

@@ -10,6 +10,7 @@ from su3d_bench.core.errors import FramesMissing, GroundTruthMissing
 from su3d_bench.core.interfaces import Encoder, HasQueries, KnowsObjects
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import GroundTruth
+from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.truths import (
     AnnotationTruth,
@@ -23,6 +24,7 @@ from su3d_bench.metrics.questions.truths import (
 )
 from su3d_bench.metrics.scoring import QuestionTruth
 from su3d_bench.questions.absent.presence import counted_rooms, presence_questions
+from su3d_bench.questions.chains.made import chain_truth
 from su3d_bench.questions.generator import chosen, generate, right_by_name
 from su3d_bench.questions.known_objects import is_called, known_objects
 from su3d_bench.questions.model import Question, new_question
@@ -64,7 +66,7 @@ def question_truth(
     truth: GroundTruth,
     refine: Refine | None = None,
     solver: MapSolver | None = None,
-) -> QuestionTruth:
+) -> QuestionTruth | QueryTruth:
     """The truth of a scene under a protocol that asks questions.
 
     ``refine`` gives labels n', by vote where absent; ``solver`` answers questions to reasoning, the built-in one where
@@ -74,6 +76,8 @@ def question_truth(
     if rules.kind == "annotation":
         return _annotation_truth(rules.min_region_size, truth, refine or voted_names)
     objects = scene_objects(dataset, scene, truth, rules.min_region_size)
+    if rules.kind == "object-chains":
+        return chain_truth(f"{dataset.name}/{scene}", truth, objects, rules.per_kind)
     if rules.presence is not None:
         rooms = counted_rooms()
         asked = presence_questions(f"{dataset.name}/{scene}", truth, objects, rules.per_kind or len(objects), rooms)

@@ -176,6 +176,23 @@ class RetrievalRules(_JudgedRules):
         return (*self.needs, "synonyms") if self.questions == "generated" else self.needs
 
 
+class ObjectChainRules(_JudgedRules):
+    """The first mask of each text that leads to an object."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = {
+        "beacon3d": (
+            *("case", "object", "class", "appearance", "geometry", "spatial", "functionality"),
+            *("chain", "coarse alone", "fine alone", "neither"),
+        )
+    }
+    text_metrics = ("beacon3d",)
+
+    def _needed(self) -> tuple[str, ...]:
+        if self.questions == "dataset":
+            raise ValueError("questions: kind 'object-chains' takes 'generated', or queries of a file where absent")
+        return ("questions", "min_region_size", "synonyms") if self.questions == "generated" else ()
+
+
 class PresenceQuestionRules(ProtocolRules):
     """Is there such a thing at all?"""
 
@@ -238,6 +255,7 @@ RULES_OF_KIND: dict[str, type[ProtocolRules]] = {
     "queries": QueryRules,
     "categories": CategoryRules,
     "grounding": GroundingRules,
+    "object-chains": ObjectChainRules,
     "retrieval": RetrievalRules,
     "presence": PresenceQuestionRules,
     "annotation": AnnotationRules,

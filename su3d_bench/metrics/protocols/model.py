@@ -141,7 +141,7 @@ class ProtocolRules(_Strict):
     summary: str
     kind: Literal[
         "semantic", "top-k", "instance", "panoptic", "boxes", "queries", "categories",
-        "grounding", "retrieval", "presence", "annotation", "reasoning",
+        "grounding", "object-chains", "retrieval", "presence", "annotation", "reasoning",
     ]  # fmt: skip
     metric: Literal[
         "conceptgraphs",
@@ -156,6 +156,7 @@ class ProtocolRules(_Strict):
         "panopticapi",
         "semantic-kitti",
         "scanrefer",
+        "beacon3d",
         "retrieval",
         "pope",
         "annotation",
