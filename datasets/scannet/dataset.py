@@ -177,7 +177,7 @@ class ScanNet:
         if attributes is None:
             raise GroundTruthMissing(f"{where}: no ground truth '{variant}'; {path.name} has no record of this scan")
         scan = self._annotated_scan(scene)
-        id_of = openscan.attribute_ids(attributes, variant, where)
+        id_of = openscan.attribute_ids(attributes, variant, f"{where}: {path.name}")
         of_object = [*(id_of.get(entry.id, 0) for entry in scan.objects), 0]
         semantic = np.array(of_object, np.int32)[scan.object_of_vertex]
         labels = openscan.label_set(variant)

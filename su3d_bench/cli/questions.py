@@ -15,7 +15,7 @@ from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, counted, s
 if TYPE_CHECKING:
     from su3d_bench.questions.model import Question
 
-ACTIONS = ("make", "show", "audit")
+ACTIONS = ("make", "show", "audit", "score")
 PAPER = "paper"
 SOURCES = ("auto", "generated")
 N_SHOWN = 20
@@ -26,15 +26,20 @@ def add_parser(verbs: Any) -> None:
     parser = add_verb(
         verbs,
         "questions",
-        "Make sets of queries with known answers from ground truth, show a set, or see whether questions are right.",
+        "Make sets of queries with known answers, show a set, see whether its questions are right, or score answers.",
         (
             "su3d-bench questions make --scenes 'rooms/*' --per-kind 40 --leave-out disputed.csv --out queries.toml",
             "su3d-bench questions audit --scenes 'rooms/*' --n 200 --out audit",
         ),
         call,
     )
-    parser.add_argument("action", metavar="make|show|audit")
-    parser.add_argument("file", nargs="?", help="show: a set (.toml, .csv, ScanRefer, Nr3D, SQA3D), or 'paper'")
+    parser.add_argument("action", metavar="make|show|audit|score")
+    parser.add_argument(
+        "file",
+        nargs="?",
+        help="show: a set (.toml, .csv, ScanRefer, Nr3D, SQA3D, Beacon3D), or 'paper'; "
+        "score: a metadata_*.json of Beacon3D",
+    )
     parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="addresses or patterns such as 'rooms/*'")
     parser.add_argument("--per-kind", type=int, metavar="N", help="at most N of each kind and scene (default: all)")
     parser.add_argument(
@@ -56,13 +61,19 @@ def add_parser(verbs: Any) -> None:
     )
     parser.add_argument("--per-page", type=int, default=12, metavar="N", help="audit: questions a sheet (default: 12)")
     parser.add_argument("--score", type=Path, metavar="FILE", help="audit: add up the verdicts in this audit.csv")
+    parser.add_argument(
+        "--answers", type=Path, metavar="FILE", help="score: JSON with what a system answered, in Beacon3D's order"
+    )
     add_table_format(parser)
 
 
 def call(arguments: argparse.Namespace) -> int:
     if arguments.action not in ACTIONS:
         raise ConfigError(f"questions: unknown action '{arguments.action}'{suggest(arguments.action, ACTIONS)}")
-    return {"make": _make, "show": _show, "audit": _audit}[arguments.action](arguments)
+    if arguments.answers is not None and arguments.action != "score":
+        raise ConfigError("questions: --answers belongs to score")
+    calls = {"make": _make, "show": _show, "audit": _audit, "score": _score_answers}
+    return calls[arguments.action](arguments)
 
 
 def _make(arguments: argparse.Namespace) -> int:
@@ -205,4 +216,14 @@ def _score(arguments: argparse.Namespace) -> int:
 
     verdicts = read_verdicts(arguments.score)
     answer_tables(arguments, audit_json(verdicts), [audit_table(verdicts)])
+    return EXIT_DONE
+
+
+def _score_answers(arguments: argparse.Namespace) -> int:
+    from su3d_bench.questions.chains.report import answered_json, answered_numbers, answered_table
+
+    if arguments.file is None or arguments.answers is None:
+        raise ConfigError("questions score: needs a metadata_*.json of Beacon3D and --answers FILE")
+    kind, numbers = answered_numbers(Path(arguments.file), arguments.answers)
+    answer_tables(arguments, answered_json(kind, numbers), [answered_table(kind, numbers)])
     return EXIT_DONE

@@ -19,6 +19,7 @@ from su3d_bench.questions.chains.beacon3d_files import Chains, Questions, Reply
 
 LEAST_SCORE, MOST_SCORE = 1.0, 5.0
 RIGHT_FROM = 4.0  # the score from which an answer counts as right for its object
+FIRST = ("case", "object")  # of the numbers
 TAGS = ("class", "appearance", "geometry", "spatial", "existence", "functionality")
 
 
@@ -42,8 +43,9 @@ def grounding_numbers(chains: Chains, right: Mapping[str, Mapping[int, bool]]) -
         is_right = np.array([right[scene][row] for row in range(len(cases))], bool)
         for name, of_scene in judge_chains(cases, is_right).items():
             rows.setdefault(name, []).extend(of_scene.tolist())
-    shares = {name: float(np.mean(values)) for name, values in rows.items() if values}
-    return [Number(name, share, share, len(rows[name])) for name, share in shares.items()]
+    asked = {name: rows[name] for name in (*FIRST, *rows) if rows[name]}
+    shares = {name: float(np.mean(values)) for name, values in asked.items()}
+    return [Number(name, share, share, len(asked[name])) for name, share in shares.items()]
 
 
 def answer_numbers(questions: Questions, replies: Mapping[tuple[str, str], Reply]) -> list[Number]:

@@ -2,9 +2,10 @@
 
 ScanRefer: a JSON list of ``scene_id``, ``object_id``, ``description``. Nr3D: a CSV with ``scan_id``, ``target_id``,
 ``utterance``. SQA3D: a JSON with ``questions`` of ``scene_id``, ``situation``, ``question``, ``question_id``, whose
-answers stand in a file of annotations beside it. Object ids are ScanNet's own, one less than the truth's here.
+answers stand in a file of annotations beside it. Beacon3D: ``metadata_*.json``, see ``chains/beacon3d_files``. Object ids
+are ScanNet's own, one less than the truth's here.
 
-Other files of these and of OpenEQA, Beacon3D and ScanQA are known, and refused with what to give instead. Sources: the
+Other files of these and of OpenEQA and ScanQA are known, and refused with what to give instead. Sources: the
 files' descriptions in facebookresearch/open-eqa at b5752aa, Beacon3D's data and daveredrum/ScanRefer.
 """
 
@@ -22,6 +23,12 @@ from typing import Any
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.system.files import file_bytes, opened
 from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
+from su3d_bench.questions.chains.beacon3d_files import (
+    chains_of,
+    kind_of_metadata,
+    questions_of_objects,
+    read_metadata,
+)
 from su3d_bench.questions.files.queries import MOST_OBJECTS_ID, is_text
 from su3d_bench.questions.model import REASONING, Question, new_question
 
@@ -30,11 +37,16 @@ MOST_BYTES = 256 << 20  # ScanRefer's training set has some 40 MB
 MOST_QUESTIONS = 300_000  # Sr3D+ has 114,532 sentences
 NR3D_COLUMNS = ("scan_id", "target_id", "utterance")
 OWN_FORM = "write scene, text and objects of such questions as CSV or TOML"
+OWN_OR_BEACON = f"of Beacon3D give metadata_*_qa.json, or {OWN_FORM}"
 # What is no set of questions with objects: the keys of its entries, whose file it is, and what to do.
 REFUSED_ENTRIES = (
     ({"question", "answer", "episode_history"}, "OpenEQA's questions, answered in words from a walk", OWN_FORM),
-    ({"question", "answers", "object_ids"}, "ScanQA's form (Beacon3D's *_qa.json too), answered in words", OWN_FORM),
-    ({"scan_id", "target_id", "utterance"}, "Nr3D or Sr3D as JSON", "give nr3d.csv or sr3d.csv as released"),
+    ({"question", "answers", "object_ids"}, "ScanQA's form, answered in words", OWN_OR_BEACON),
+    (
+        {"scan_id", "target_id", "utterance"},
+        "Nr3D, Sr3D or Beacon3D's list as JSON",
+        "give nr3d.csv or sr3d.csv as released, or Beacon3D's metadata_*_grounding.json",
+    ),
     ({"scene_id", "object_id", "caption"}, "captions for ScanRefer", "give ScanRefer_filtered_train.json or _val.json"),
     ({"scene_id", "object_id", "bbox"}, "boxes predicted for ScanRefer", "give ScanRefer_filtered_val.json itself"),
 )
@@ -71,6 +83,8 @@ def read_foreign(path: Path) -> tuple[Question, ...]:
         rows = _placed(_csv_rows(text, where), where, "row", 2)
         return tuple(_sentences(rows, ("scan_id", "utterance", "target_id"), "Nr3D"))
     content = _json_of(text, where)
+    if kind_of_metadata(content) is not None:
+        return tuple(_of_objects(content, where))
     _refuse_others(content, where)
     if isinstance(content, list):
         rows = _placed(content, where, "entry")
@@ -81,7 +95,9 @@ def read_foreign(path: Path) -> tuple[Question, ...]:
 
 
 def read_foreign_queries(path: Path) -> dict[str, tuple[TextQuery, ...]]:
-    """The sentences of each scene that name an object, each as often as the file has it."""
+    """The sentences of each scene that name an object, each as often as the file has it; Beacon3D's in their chains."""
+    if path.suffix.lower() == ".json" and kind_of_metadata(content := read_metadata(path)) == "grounding":
+        return dict(chains_of(content, printable(str(path), 200)).cases)
     queries_of_scene: dict[str, list[TextQuery]] = {}
     for question in read_foreign(path):
         if not question.is_known:
@@ -105,12 +121,19 @@ def _refuse_others(content: Any, where: str) -> None:
         return
     if isinstance(content.get("annotations"), list):
         raise DataError(f"{where}: SQA3D's answers; give the file of questions beside it, ..._questions_...")
-    first = next(iter(content.values()))
-    if _is_scene(next(iter(content))) and isinstance(first, Mapping):
-        raise DataError(
-            f"{where}: scenes with classes and objects below, as in Beacon3D's metadata_*.json; give its "
-            "*_grounding.json, which has ScanRefer's form"
-        )
+
+
+def _of_objects(content: Any, where: str) -> Iterator[Question]:
+    """Beacon3D's texts as relative queries, its questions as reasoning questions with the object they are about."""
+    if kind_of_metadata(content) == "grounding":
+        for scene, cases in chains_of(content, where).cases.items():
+            for case in cases:
+                text = " ".join(case.text.split())
+                yield new_question(f"{DATASET}/{scene}", "relative", text, case.object_ids, "Beacon3D")
+        return
+    for asked in questions_of_objects(content, where).entries:
+        text, reply = " ".join(asked.question.split()), " ".join(asked.answer.split())
+        yield new_question(f"{DATASET}/{asked.scene}", REASONING, text, None, "Beacon3D", reply)
 
 
 def _is_one_a_line(text: str) -> bool:

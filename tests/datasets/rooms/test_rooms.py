@@ -13,10 +13,15 @@ from pydantic import ValidationError
 from scipy.spatial import cKDTree
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.core.maps import Instances
+from su3d_bench.datasets.openscan import label_set
+from su3d_bench.datasets.rooms.attributes import attribute_of_object
 from su3d_bench.datasets.rooms.dataset import DEFAULT_SCENES, N_STRUCTURE, Rooms
 from su3d_bench.datasets.rooms.kept import MESH_ARRAYS, kept_mesh, kept_walk
 from su3d_bench.datasets.rooms.rendering.mesh import RoomMesh
 from su3d_bench.datasets.rooms.scan import RoomScan
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.numerics.geometry import back_project
 
 SMALL = Rooms.Options(width=96, height=72, n_frames=80, mesh_spacing_m=0.03)
@@ -334,3 +339,19 @@ def test_the_default_scenes_are_furnished(rooms: Rooms) -> None:
     assert len(DEFAULT_SCENES) == 8
     for scene in DEFAULT_SCENES:
         assert 25 <= len(rooms.objects(scene)) - N_STRUCTURE <= 62
+
+
+def test_a_room_is_scored_by_an_aspect_and_what_has_no_attribute_is_void(rooms: Rooms) -> None:
+    truth = rooms.ground_truth(SCENE, "openscan-type")
+    of_object = attribute_of_object(rooms.objects(SCENE), "openscan-type")
+    assert np.array_equal(truth.semantic, of_object[truth.instance])
+    assert (truth.instance > 0).all() and not truth.semantic.all() and truth.semantic.any()
+    rules = load_protocol("openscan-type")
+    named = [number for number in np.unique(truth.instance) if of_object[number]]
+    masks = [np.flatnonzero(truth.instance == number) for number in named]
+    labels = [label_set("openscan-type").name_of(int(of_object[number])) for number in named]
+    void = np.flatnonzero(truth.semantic == 0)
+    right = Instances.of(truth.points, [*masks, void], labels=[*labels, labels[0]])
+    wrong = Instances.of(truth.points, masks, labels=[labels[0]] * len(labels))
+    found = [combine(rules, {"a": score_scene(rules, truth, one, None)}).metrics["AP50"] for one in (right, wrong)]
+    assert found[0] == 1.0 and found[1] < 0.5

@@ -1,0 +1,172 @@
+"""OpenScan's attributes: its file, which word is which class, as the truth of a scan and of the built-in rooms."""
+
+from __future__ import annotations
+
+import doctest
+import json
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from damage import damages, outcomes, truncations
+from scannet_scan import SCAN, write_floor_truth
+from scannet_scans import dataset, write_scan
+
+from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.core.system.files import file_text
+from su3d_bench.core.toml import parse_toml
+from su3d_bench.datasets import openscan
+from su3d_bench.datasets.openscan import KEYS, RAW_NAME, attribute_id, attribute_ids, label_set, read_attributes
+from su3d_bench.datasets.rooms import attributes as of_rooms
+from su3d_bench.datasets.rooms.attributes import attribute_of_object
+from su3d_bench.datasets.rooms.classes import CLASS_BY_NAME, MATERIALS
+from su3d_bench.datasets.rooms.dataset import Rooms
+from su3d_bench.datasets.scannet.dataset import ScanNet
+from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
+from su3d_bench.metrics.protocols.loading import load_protocol
+
+# A record as README.md of the release has it.
+RECORD = {
+    "scene_id": SCAN,
+    "object_id": "0",
+    "object_name": "chair",
+    "material": "wood",
+    "affordance": "sleep",
+    "property": "soft",
+    "type": "source of illumination",
+    "manner": "steered by handlebars",
+    "synonyms": "bedside table",
+    "requirement": "water and sun",
+    "element": "88 keys",
+}
+SENTENCES = {
+    "openscan-material": "This term is made of wood",
+    "openscan-affordance": "This term is used for sleep",
+    "openscan-property": "This term is soft",
+    "openscan-type": "This term is a source of illumination",
+    "openscan-manner": "This term can be steered by handlebars",
+    "openscan-synonym": "This term is related to bedside table",
+    "openscan-requirement": "this term requires water and sun",
+    "openscan-element": "This term has 88 keys",
+}
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data root with one annotated scan, whose only object has the id 0, and OpenScan's records of it."""
+    root = tmp_path_factory.mktemp("openscan")
+    write_floor_truth(write_scan(root, n_frames=1), spacing_m=0.5)
+    write(root / RAW_NAME, [RECORD])
+    return root
+
+
+def write(path: Path, records: Any) -> Path:
+    path.write_text(records if isinstance(records, str) else json.dumps(records))
+    return path
+
+
+def test_the_words_of_a_record_are_the_sentences_of_the_lists(tmp_path: Path) -> None:
+    known = read_attributes(write(tmp_path / RAW_NAME, [RECORD]))[SCAN]
+    for variant, sentence in SENTENCES.items():
+        (class_id,) = attribute_ids(known, variant, "here").values()
+        assert label_set(variant).name_of(class_id) == sentence
+    assert set(SENTENCES) == set(KEYS)
+
+
+def test_a_word_is_the_shortest_sentence_that_ends_with_it_and_a_part_of_a_word_is_none() -> None:
+    names = {word: attribute_id("openscan-type", word) for word in ("bag", "handbag", "toy animal", "toy_animal", "ag")}
+    assert names == {"bag": 69, "handbag": 38, "toy animal": 70, "toy_animal": 70, "ag": None}
+    assert attribute_id("openscan-element", "keys") == 24 and attribute_id("openscan-element", "88 keys") == 26
+
+
+def test_the_truth_of_a_scan_has_the_attributes_of_its_objects(scan: Path) -> None:
+    truth = dataset(scan).ground_truth(SCAN, "openscan-material")
+    plain = dataset(scan).ground_truth(SCAN, "nyu40-vertices")
+    assert (truth.labels, truth.variant) == (label_set("openscan-material"), "openscan-material")
+    assert np.array_equal(truth.instance, plain.instance) and np.array_equal(truth.points, plain.points)
+    assert set(truth.semantic[truth.instance == 1].tolist()) == {1} and not truth.semantic[truth.instance != 1].any()
+    facts = TruthFacts.of_dataset(ScanNet)
+    assert why_not_truth(load_protocol("openscan-material"), facts) is None
+    assert why_not_truth(load_protocol("rooms-instance"), facts) is not None
+
+
+def test_an_object_without_a_word_is_void(tmp_path: Path) -> None:
+    words = read_attributes(write(tmp_path / RAW_NAME, [RECORD | {"material": "", "element": "other"}]))[SCAN]
+    assert attribute_ids(words, "openscan-material", "here") == attribute_ids(words, "openscan-element", "x") == {0: 0}
+
+
+def test_a_missing_file_or_scan_says_how_to_get_it(scan: Path, tmp_path: Path) -> None:
+    bare = dataset(tmp_path)
+    write_floor_truth(write_scan(tmp_path, n_frames=1), spacing_m=0.5)
+    with pytest.raises(GroundTruthMissing, match=rf"{RAW_NAME} is missing, get it by https://github.com/YoujunZhao"):
+        bare.ground_truth(SCAN, "openscan-type")
+    write(tmp_path / RAW_NAME, [RECORD | {"scene_id": "scene0001_00"}])
+    with pytest.raises(GroundTruthMissing, match="has no record of this scan"):
+        dataset(tmp_path).ground_truth(SCAN, "openscan-type")
+    assert dataset(tmp_path).digest(SCAN) != dataset(scan).digest(SCAN)
+
+
+@pytest.mark.parametrize(
+    ("records", "line"),
+    [
+        ("{", "not JSON"),
+        ({}, "holds no list of 1 to 1000000 records; download it again"),
+        ([1], "record 1 is no table; expected scene_id, object_id"),
+        ([RECORD | {"scene_id": None}], "record 1: 'scene_id' must be a few words"),
+        ([RECORD, RECORD], "record 2: object 0 of scene0000_00 has a record already"),
+        ([RECORD | {"object_id": "-1"}], "'object_id' must be a whole number; found -1"),
+        ([RECORD | {"type": ["seat"]}], "record 1: 'type' must be a few words"),
+        ([RECORD | {"material": "w" * 300}], "record 1: 'material' must be a few words"),
+        ([RECORD | {"material": "woood"}], "object 0 has the material 'woood', which is none of the 10 of OpenScan"),
+    ],
+)
+def test_what_is_wrong_with_the_file_is_one_line(records: Any, line: str, tmp_path: Path) -> None:
+    path = write(tmp_path / RAW_NAME, records)
+    with pytest.raises(DataError) as error:
+        attribute_ids(read_attributes(path)[SCAN], "openscan-material", "here")
+    assert line in str(error.value) and "\n" not in str(error.value)
+
+
+def test_damaged_files_are_read_or_refused_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / RAW_NAME
+    content = json.dumps([RECORD, RECORD | {"object_id": 1}]).encode()
+
+    def read(damaged: bytes) -> object:
+        path.write_bytes(damaged)
+        known = read_attributes(path)
+        return [attribute_ids(words, variant, RAW_NAME) for words in known.values() for variant in KEYS]
+
+    n_read, n_refused = outcomes(read, chain(truncations(content), damages(content, 600)), must_name=RAW_NAME)
+    assert n_read > 20 and n_refused > 400
+
+
+def test_the_table_of_the_rooms_names_their_classes_and_attributes_each_once() -> None:
+    table = parse_toml(file_text(Path(of_rooms.__file__).with_name("attributes.toml")))
+    assert {f"openscan-{aspect}" for aspect in table} == set(KEYS)
+    for aspect, words in table.items():
+        names = [name for of_word in words.values() for name in of_word]
+        assert len(names) == len(set(names)) and len(names) >= 8, aspect
+        assert set(names) <= (set(MATERIALS) if aspect == "material" else set(CLASS_BY_NAME)), aspect
+        ids = [attribute_id(f"openscan-{aspect}", word) for word in words]
+        assert None not in ids and len(set(ids)) == len(ids), aspect
+
+
+def test_objects_of_a_room_have_the_attributes_of_their_class_and_of_what_they_are_made(tmp_path: Path) -> None:
+    objects = Rooms(tmp_path).objects("office0")
+    for one, affordance, material in zip(
+        objects,
+        attribute_of_object(objects, "openscan-affordance")[1:],
+        attribute_of_object(objects, "openscan-material")[1:],
+        strict=True,
+    ):
+        if one.class_name == "chair":
+            assert label_set("openscan-affordance").name_of(affordance) == "This term is used for sit"
+        if one.material in ("wooden", "metal"):
+            assert label_set("openscan-material").name_of(material).endswith({"wooden": "wood"}.get(one.material, "metal"))
+    assert {one.class_name for one in objects} >= {"chair"} and {one.material for one in objects} >= {"wooden"}
+
+
+def test_the_examples_hold() -> None:
+    assert not doctest.testmod(openscan).failed
