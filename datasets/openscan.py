@@ -2,7 +2,8 @@
 
 ``openscan_val_raw.json`` is a list of records with ``scene_id``, ``object_id`` (ScanNet's own) and a word or two under
 each aspect. Which class a word is says the list of its aspect, whose sentences hold the words ("This term is used for
-sit"). Source: README.md and Evaluation/MaskClustering/preprocess/scannet/prepare_gt.py of YoujunZhao/OpenScan at 0df39dd.
+sit"). Source: README.md and Evaluation/MaskClustering/preprocess/scannet/prepare_gt.py of YoujunZhao/OpenScan at
+0df39dd.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def attribute_id(variant: str, words: str) -> int | None:
 
 
 def read_attributes(path: Path) -> Mapping[str, Attributes]:
-    """The words of every object of each scan, by its id there; a ``DataError`` of one line where the file is damaged."""
+    """The words of every object of each scan, by its id there; a ``DataError`` where the file is damaged."""
     where = f"openscan: {path.name}"
     content = parsed_json(read_bytes(path, where), where)
     if not isinstance(content, list) or not 1 <= len(content) <= MOST_RECORDS:

@@ -65,6 +65,7 @@ GUARDS: dict[str, tuple[str, ...]] = {
     "metrics/matching/labelling.py": (*_TRANSFER, "test_metrics_hovsg"),
     "metrics/matching/": _TRANSFER,
     "metrics/open_vocabulary/": _TEXTS,
+    "metrics/questions/chains.py": ("test_chain_protocol", "questions/test_beacon3d"),
     "metrics/questions/": _QUESTIONS,
     "metrics/attribution/": ("analysis/test_attribution", "analysis/test_attribution_runs"),
     "metrics/costs.py": ("reports/test_timing_report",),

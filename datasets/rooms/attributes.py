@@ -21,7 +21,7 @@ MATERIAL = "material"
 
 
 def attribute_of_object(objects: Sequence[RoomObject], variant: str) -> Int32Array:
-    """The attribute (n + 1,) of every object in an aspect, by the object's id; 0 for none, and for what is no object."""
+    """The attribute (n + 1,) of every object in an aspect by the object's id, 0 for none; that of id 0 is 0."""
     aspect = variant.partition("-")[2]
     ids = _ids(variant)
     words = [known.material if aspect == MATERIAL else known.class_name for known in objects]

@@ -170,8 +170,8 @@ class ScanNet:
         where, path = self._where(scene), self._openscan
         if path is None:
             raise GroundTruthMissing(
-                f"{where}: no ground truth '{variant}'; {openscan.RAW_NAME} is missing, get it by {openscan.PAGE} and put "
-                f"it into {self.tree.table_folders()[0]}"
+                f"{where}: no ground truth '{variant}'; {openscan.RAW_NAME} is missing, get it by {openscan.PAGE} and "
+                f"put it into {self.tree.table_folders()[0]}"
             )
         attributes = self._attributes.get(scene)
         if attributes is None:

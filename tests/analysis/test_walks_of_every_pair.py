@@ -51,7 +51,8 @@ RULES = [load_protocol(name) for name in protocol_names()]
 def pairs_of(dataset: str) -> Iterator[tuple[ProtocolRules, ProtocolRules]]:
     fitting = [rules for rules in RULES if rules.kind in KINDS and dataset in rules.datasets]
     for first, second in combinations(fitting, 2):
-        if first.kind == second.kind and set(first.headline) & set(second.value_names):
+        is_one = (first.kind, first.label_space) == (second.kind, second.label_space)  # no truth has both labels
+        if is_one and set(first.headline) & set(second.value_names):
             yield first, second
 
 

@@ -164,7 +164,8 @@ def test_objects_of_a_room_have_the_attributes_of_their_class_and_of_what_they_a
         if one.class_name == "chair":
             assert label_set("openscan-affordance").name_of(affordance) == "This term is used for sit"
         if one.material in ("wooden", "metal"):
-            assert label_set("openscan-material").name_of(material).endswith({"wooden": "wood"}.get(one.material, "metal"))
+            sentence = label_set("openscan-material").name_of(material)
+            assert sentence.endswith({"wooden": "wood", "metal": "metal"}[one.material])
     assert {one.class_name for one in objects} >= {"chair"} and {one.material for one in objects} >= {"wooden"}
 
 

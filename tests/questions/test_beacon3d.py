@@ -90,7 +90,7 @@ def test_without_a_judge_scores_have_a_least_and_a_most_and_say_how_to_bring_one
     shown = capsys.readouterr().out
     assert "66.7 to 100.0" in shown and "give each answer its 'score'" in shown
     judged = numbers(tmp_path, QA, [*said[:2], {"pred": "blue", "score": 4}])
-    assert (judged["case"].least, judged["object"].least) == (pytest.approx(11 / 12), 1.0)
+    assert judged["case"].least == pytest.approx(11 / 12) and judged["object"].least == 1.0
 
 
 def test_the_texts_of_a_file_ask_a_map_in_their_chains_and_are_questions_too(tmp_path: Path) -> None:
@@ -120,7 +120,11 @@ def changed(content: dict[str, Any], change: Callable[[dict[str, Any]], object])
         (changed(GROUNDING, lambda of: of.update({"3": [1]})), [], "expected scenes, classes and objects one in"),
         (changed(GROUNDING, lambda of: of["27"]["chain_1"].append({})), [], "a text must have text, obj_id, tag"),
         (changed(GROUNDING, lambda of: of["27"]["chain_1"].append(FINE | {"obj_id": ["-1"]})), [], "must hold object"),
-        (changed(GROUNDING, lambda of: of["27"]["chain_1"].append(FINE | {"text": "\x1b"})), [], "'text' must be words"),
+        (
+            changed(GROUNDING, lambda of: of["27"]["chain_1"].append(FINE | {"text": "\x1b"})),
+            [],
+            "'text' must be words",
+        ),
         (
             changed(GROUNDING, lambda of: of["27"]["chain_1"].append(COARSE | {"tag": "spatial"})),
             [],

@@ -141,13 +141,9 @@ NR3D_ROW = {"item_id": "nr3d_0", "scan_id": "scene0000_00", "target_id": 9, "utt
     ("name", "content", "line"),
     [
         ("open-eqa-v0.json", OPENEQA, "OpenEQA's questions, .*; write scene, text and objects"),
-        ("scannet_qa.json", SCANQA, r"ScanQA's form \(Beacon3D's \*_qa.json too\)"),
-        (
-            "metadata_scannet_grounding.json",
-            {"scene0000_00": {"box": {"3": []}}},
-            r"Beacon3D's .*; give its \*_grounding",
-        ),
-        ("nr3d.json", [NR3D_ROW], "Nr3D or Sr3D as JSON; give nr3d.csv"),
+        ("scannet_qa.json", SCANQA, r"ScanQA's form, answered in words; of Beacon3D give metadata_\*_qa.json"),
+        ("scannet_grounding.json", [NR3D_ROW | {"target_id": [9]}], r"give .*Beacon3D's metadata_\*_grounding.json"),
+        ("nr3d.json", [NR3D_ROW], "Nr3D, Sr3D or Beacon3D's list as JSON; give nr3d.csv"),
         ("scanrefer.jsonl", NR3D_ROW, "one JSON object a line, .*; give ScanRefer_filtered_train.json or nr3d.csv"),
         ("nr3d.json", f"{json.dumps(NR3D_ROW)}\n{json.dumps(NR3D_ROW)}\n", "one JSON object a line"),
         ("nr3d.csv", "scan_id,utterance\nscene0000_00,plant\n", "row 2: has no 'target_id'"),

@@ -102,8 +102,9 @@ def judge_chains(cases: Sequence[ChainedText], is_right: BoolArray) -> Mapping[s
         fine_of.setdefault(object_number, []).append(fine)
         chains.append((fine, coarse))
     assert all(len(fine) == CHAINS_EACH for fine in fine_of.values())
-    fine, coarse = np.array(chains, bool).reshape(-1, 2).T
+    is_fine, is_coarse = np.array(chains, bool).reshape(-1, 2).T
     rows = {tag: is_right[[tag in case.tags for case in cases]] for tag in TAGS}
     rows |= {"case": is_right, "object": np.array([all(each) for each in fine_of.values()], bool)}
-    rows |= {"chain": fine & coarse, COARSE_ONLY: ~fine & coarse, FINE_ONLY: fine & ~coarse, NEITHER: ~fine & ~coarse}
+    rows |= {"chain": is_fine & is_coarse, COARSE_ONLY: ~is_fine & is_coarse}
+    rows |= {FINE_ONLY: is_fine & ~is_coarse, NEITHER: ~is_fine & ~is_coarse}
     return rows

@@ -57,9 +57,7 @@ def answer_numbers(questions: Questions, replies: Mapping[tuple[str, str], Reply
     numbers = [Number(name, float(row.mean()), float(row.mean()), n) for name, row in (("EM", em), ("EM-R", em_r))]
     numbers.append(Number("settled", settled, settled, n))
     numbers.append(Number("case", _share(low), _share(high), n))
-    least, most = (
-        float((scores.reshape(-1, CHAINS_EACH) >= RIGHT_FROM).all(axis=1).mean()) for scores in (low, high)
-    )
+    least, most = (float((scores.reshape(-1, CHAINS_EACH) >= RIGHT_FROM).all(axis=1).mean()) for scores in (low, high))
     numbers.append(Number("object", least, most, n // CHAINS_EACH))
     for tag in TAGS:
         of_tag = np.array([one == tag for one in tags])

@@ -57,7 +57,7 @@ class Reply:
 
 @dataclass(frozen=True)
 class Questions:
-    """Three questions of each object, one after the other; ``entries``: those of the list, each text of a scene once."""
+    """Three questions of each object, one after the other; ``entries``: those of the list, each text once a scene."""
 
     asked: tuple[AskedOfObject, ...]
     entries: tuple[AskedOfObject, ...]

@@ -59,9 +59,7 @@ def chains_of(
 def _meaning(object_id: int, questions: Sequence[Question]) -> list[Question]:
     """Properties and relations that one object alone has, one sort after the other, each sort by a digest."""
     alone = {
-        one.text: one
-        for one in questions
-        if one.answers == (object_id,) and one.kind.startswith((PROPERTY, RELATIVE))
+        one.text: one for one in questions if one.answers == (object_id,) and one.kind.startswith((PROPERTY, RELATIVE))
     }
     turn = dict[frozenset[str], int]()
     ranked = []

@@ -21,8 +21,8 @@ from su3d_bench.questions.chains.beacon3d_files import (
 from su3d_bench.reports.tables.model import Cell, Table, TableRow, percent
 
 JUDGE = (
-    "where two numbers stand, answers wait for a judge: the least and the most that one can make of them. Let a language "
-    "model score them as evaluate_qa.py of Beacon3D does and give each answer its 'score', 1 to 5"
+    "where two numbers stand, answers wait for a judge: the least and the most that one can make of them; let a "
+    "language model score them as evaluate_qa.py of Beacon3D does, and give each answer its 'score', 1 to 5"
 )
 
 

@@ -2,8 +2,8 @@
 
 ScanRefer: a JSON list of ``scene_id``, ``object_id``, ``description``. Nr3D: a CSV with ``scan_id``, ``target_id``,
 ``utterance``. SQA3D: a JSON with ``questions`` of ``scene_id``, ``situation``, ``question``, ``question_id``, whose
-answers stand in a file of annotations beside it. Beacon3D: ``metadata_*.json``, see ``chains/beacon3d_files``. Object ids
-are ScanNet's own, one less than the truth's here.
+answers stand in a file of annotations beside it. Beacon3D: ``metadata_*.json``, see ``chains/beacon3d_files``. Object
+ids are ScanNet's own, one less than the truth's here.
 
 Other files of these and of OpenEQA and ScanQA are known, and refused with what to give instead. Sources: the
 files' descriptions in facebookresearch/open-eqa at b5752aa, Beacon3D's data and daveredrum/ScanRefer.

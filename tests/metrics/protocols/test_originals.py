@@ -175,7 +175,8 @@ def classes_of(rules: ProtocolRules) -> tuple[dict[int, int], dict[int, str]]:
     if not rules.classes:
         return {-1: 0, -2: 1, 0: 4, 1: 7, 2: 11, 3: 21}, {one: f"c{one}" for one in range(-2, 4)}
     first = 0 if rules.name == "scannet200-instance" else 3
-    entries = {k: rules.scored[(7 * k + first) % len(rules.scored)] for k in range(4)}
+    step = 3 if rules.name.startswith("openscan") else 7  # the next would be the first again among 21
+    entries = {k: rules.scored[(step * k + first) % len(rules.scored)] for k in range(4)}
     ids, names = {k: one.id for k, one in entries.items()}, {k: one.name for k, one in entries.items()}
     left = [entry for entry in rules.classes if rules.is_ignored(entry.name)]
     return (

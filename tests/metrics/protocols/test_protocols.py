@@ -46,7 +46,8 @@ NAMES = {
     "scannet200-panoptic", "grounding",
     "class-agnostic-maskclustering-scannetpp",
     "class-agnostic-open3dis-scannetpp", "rooms-top-k", "scannetpp-instance", "scannetpp-open-vocabulary",
-    "scannetpp-semantic",
+    "scannetpp-semantic", "openscan-affordance", "openscan-property", "openscan-type", "openscan-manner",
+    "openscan-synonym", "openscan-requirement", "openscan-element", "openscan-material", "beacon3d", "rooms-beacon3d",
 }  # fmt: skip
 
 
@@ -113,7 +114,8 @@ def test_instance_protocols_use_the_original_thresholds_and_size(name: str) -> N
         n_points = MIN_REGION_SIZE if rules.kind == "instance" and name != "opensun3d-challenge" else 1
         assert (rules.thresholds, rules.min_region_size) == (THRESHOLDS, n_points)
     else:
-        n_vertices = MIN_REGION_SIZE if rules.is_judged else 1 if rules.metric == "semantic-kitti" else None
+        asks = rules.is_judged and (rules.kind != "object-chains" or rules.questions is not None)
+        n_vertices = MIN_REGION_SIZE if asks else 1 if rules.metric == "semantic-kitti" else None
         assert (rules.thresholds, rules.min_region_size, rules.confidence) == ((), n_vertices, None)
 
 
@@ -212,6 +214,7 @@ KINDS = {
     "queries": {"needs_own_points", "ignores_classes"},
     "categories": {"takes_dense", "needs_own_points"},
     "grounding": {"needs_own_points", "ignores_classes"},
+    "object-chains": {"is_judged", "needs_own_points", "ignores_classes"},
     "retrieval": {"is_judged", "needs_own_points", "ignores_classes"},
     "presence": {"is_judged", "needs_own_points", "ignores_classes"},
     "annotation": {"is_judged", "needs_own_points", "goes_by_names", "ignores_classes"},

@@ -70,6 +70,30 @@ def _scannet(folder: Path) -> Read:
     return _whole_dataset(lambda: ScanNet(folder, ScannetOptions()), "scene0000_00")
 
 
+def _openscan(folder: Path) -> Read:
+    from test_openscan import RECORD, write
+
+    from su3d_bench.datasets.openscan import KEYS, RAW_NAME, attribute_ids, read_attributes
+
+    path = write(folder / RAW_NAME, [RECORD, RECORD | {"object_id": "7", "type": ""}])
+    return lambda: [
+        attribute_ids(words, variant, path.name) for words in read_attributes(path).values() for variant in KEYS
+    ]
+
+
+def _beacon3d(kind: str) -> Make:
+    def make(folder: Path) -> Read:
+        from test_beacon3d import GROUNDING, QA, written
+
+        from su3d_bench.questions.chains.report import answered_numbers
+
+        answers = [{"correct": 1}, {"object_id": 3}] * 2 if kind == "grounding" else [{"pred": "red", "score": 2}] * 3
+        paths = written(folder, GROUNDING if kind == "grounding" else QA, answers)
+        return lambda: answered_numbers(*paths)
+
+    return make
+
+
 def _aligned_scannet(folder: Path) -> Read:
     from scannet_scan import write_floor_truth
     from scannet_scans import write_scan
@@ -335,6 +359,8 @@ TARGETS = (
     Target("scannet aggregation", _scannet, (f"{SCAN}/*.aggregation.json",), 0.15),
     Target("scannet table", _scannet, ("*.tsv",), 0.15),
     Target("scannet facts", _aligned_scannet, (f"{SCAN}/scene0000_00.txt",), 0.15),
+    Target("openscan attributes", _openscan, ("*.json",)),
+    *(Target(f"beacon3d {kind}", _beacon3d(kind), ("*.json",)) for kind in ("grounding", "qa")),
     Target("sens", _sens("sens01_toy.sens"), ("a.sens",)),
     Target("sens raw", _sens("sens02_toy_raw.sens"), ("a.sens",)),
     Target("scannet python export", _scannet_export("python"), (f"{SCAN}/*/*",), 0.15),
