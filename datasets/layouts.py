@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from su3d_bench.datasets.arkitscenes.writing import ArkitScenesLayout
 from su3d_bench.datasets.replica.writing import ReplicaLayout
 from su3d_bench.datasets.scannet.writing.exports import CppExportLayout, PythonExportLayout
 from su3d_bench.datasets.scannet.writing.layout import SensLayout
@@ -17,6 +18,7 @@ _ALL: tuple[Layout, ...] = (
     PythonExportLayout(),
     CppExportLayout(),
     ScannetppLayout(),
+    ArkitScenesLayout(),
     TumLayout(),
 )
 LAYOUTS: Mapping[str, Layout] = {layout.name: layout for layout in _ALL}

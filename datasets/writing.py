@@ -128,6 +128,9 @@ class Layout(ABC):
     def write_shared(self, dataset: ScannedDataset, scene: str, out: Path) -> None:  # noqa: B027 - none for some
         """Write what all scenes share; a ``StoreError`` where there is another."""
 
+    def write_lists(self, dataset: ScannedDataset, names: Sequence[str], out: Path) -> None:  # noqa: B027 - none for some
+        """Write what lists the scenes of a folder, by their names in the layout: all that are or will be there."""
+
     @abstractmethod
     def frame_names(self, index: int) -> Sequence[str]:
         """The files of a frame, by their names in the folder in which the scene is built."""
@@ -173,6 +176,7 @@ def plan_scenes(layout: Layout, dataset: ScannedDataset, scenes: Sequence[str], 
     marker = {"generator": f"su3d-bench {dataset.name}", "version": layout.settings[0]}
     marker |= {"scenes": dict(sorted(marked.items()))} | layout.marker_extras(sorted(marked))
     write_json(folder / MARKER, marker)
+    layout.write_lists(dataset, sorted(marked), out)
     for target in pending:
         for folder in (target.partial, *(path for path in target.partial.rglob("*") if path.is_dir())):
             clear_unfinished(folder)

@@ -25,6 +25,7 @@ DATASETS = {
     "replica": "su3d_bench.datasets.replica.dataset:Replica",
     "scannet": "su3d_bench.datasets.scannet.dataset:ScanNet",
     "scannetpp": "su3d_bench.datasets.scannetpp.dataset:ScanNetPP",
+    "arkitscenes": "su3d_bench.datasets.arkitscenes.dataset:ArkitScenes",
     "tum": "su3d_bench.datasets.tum.dataset:Tum",
     "rgbd": "su3d_bench.datasets.rgbd.dataset:Rgbd",
 }

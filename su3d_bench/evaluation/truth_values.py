@@ -15,7 +15,7 @@ from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.types import Int64Array
 from su3d_bench.evaluation.request import ValuesForm
 from su3d_bench.metrics.fitness import LARGEST_NYU40_ID
-from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
+from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS, values_of_numbers
 from su3d_bench.metrics.instance.score import OBJECT
 from su3d_bench.metrics.protocols.model import ProtocolRules
 
@@ -111,15 +111,13 @@ class TruthValues:
         """The values (N,) of a scene as a protocol scores them, and the label (N,) of each point, 0 for none.
 
         Numbers become 1001, 1002, ... in ascending order, as do all instances under a protocol that goes by numbers
-        alone. As in OpenSUN3D's script n and 1000 + n are one object, 1000 is one too, and from 2000 on none is.
+        alone.
         """
         form = self.form(rules)
         if form == "classes":
             return values, values
         if form == "numbers":
-            low = (values > 0) & (values < INSTANCES_PER_CLASS)
-            values = np.where(low, values + OBJECT * INSTANCES_PER_CLASS, values)
-            values = np.where(values // INSTANCES_PER_CLASS == OBJECT, values, 0)
+            values = values_of_numbers(values)
         if form == "numbers" or rules.class_agnostic == "numbered":
             is_object = values >= INSTANCES_PER_CLASS
             number = np.unique(values[is_object], return_inverse=True)[1]

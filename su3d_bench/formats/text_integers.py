@@ -14,6 +14,7 @@ DIGIT_AND_NEWLINE = 0x0A30  # "0\n" as a little-endian pair
 MOST_DIGITS = 18  # of a number that int64 surely holds
 LIMIT = 1 << 62
 WORD = 8  # characters, the first of which is the lowest byte
+LFS_POINTER = b"version https://git-lfs.github.com/spec/"  # how the file begins that stands for one not fetched
 ZEROS = 0x3030303030303030  # "00000000"
 # Neighbours become one number of twice their width: two digits, then two pairs of digits, then two of four.
 PAIRS = tuple(
@@ -78,6 +79,8 @@ def _eight_digits(words: NDArray[np.uint64], n_digits: NDArray[np.int64]) -> NDA
 
 def _any_numbers(content: bytes, where: str) -> IntegerArray:
     """The values of lines with signs or blanks around them."""
+    if content.startswith(LFS_POINTER):
+        raise PredictionError(f"{where}: is a pointer of Git LFS, not the file; run git lfs pull in its repository")
     lines = content.splitlines()
     values = np.empty(len(lines), np.int64)
     for number, line in enumerate(lines, 1):

@@ -13,7 +13,7 @@ from su3d_bench.cli.shared.answers import answer_either
 from su3d_bench.cli.shared.flags import add_group, add_settings, add_verb
 from su3d_bench.core.errors import EXIT_DONE
 
-LAYOUTS = ("native", "replica", "scannet", "scannet-python", "scannet-cpp", "scannetpp", "tum")
+LAYOUTS = ("native", "replica", "scannet", "scannet-python", "scannet-cpp", "scannetpp", "arkitscenes", "tum")
 MAX_LISTED = 40
 
 
@@ -116,6 +116,7 @@ def _add_make(actions: Any) -> None:
         "replica: every file of Replica, the render and the original release, about 300 MB a room; scannet: scans with "
         ".sens, mesh and annotation; scannet-python, scannet-cpp: the same, frames as ScanNet's readers export them "
         "(C++: about 1 GB a room); scannetpp: the iPhone's frames, mesh and annotation of ScanNet++; "
+        "arkitscenes: the OpenSUN3D challenge's scenes of ARKitScenes with queries and truth; "
         "tum: the RGB-D benchmark, without ground truth (default: native)",
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="the data root to make (native: default $SU3D_DATA)")

@@ -131,6 +131,20 @@ def encode_ground_truth(semantic: IntArray, instance: IntArray) -> Int64Array:
     return value
 
 
+def values_of_numbers(numbers: IntArray) -> Int64Array:
+    """One value a point, 1000 + the number of its object, and 0 for none, of numbers of objects without classes.
+
+    As in the OpenSUN3D challenge's script n and 1000 + n are one object, 1000 is one too, and from 2000 on none is
+    (load_ids and get_instances in eval_utils/util_3d.py of OpenSun3D/cvpr24-challenge at 59db30f).
+
+    >>> values_of_numbers(np.array([0, 1, 7, 1007, 1000, 2000])).tolist()
+    [0, 1001, 1007, 1007, 1000, 0]
+    """
+    numbers = np.asarray(numbers, np.int64)
+    values = np.where((numbers > 0) & (numbers < INSTANCES_PER_CLASS), numbers + INSTANCES_PER_CLASS, numbers)
+    return np.where(values // INSTANCES_PER_CLASS == 1, values, 0)
+
+
 def last_line_of_each_mask_file(files: Sequence[str]) -> list[tuple[int, int]]:
     """Pairs (line of first occurrence, line of last occurrence), one a distinct mask file, in order of the first.
 

@@ -1,0 +1,237 @@
+"""The phone's recording: colour, depth, confidence and a camera file an image, put together by their times."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.core.errors import DataError, FramesMissing
+from su3d_bench.core.types import Float32Array, Float64Array, Frame, UInt8Array
+from su3d_bench.datasets.arkitscenes.folders import TRAJECTORY_NAME
+from su3d_bench.datasets.arkitscenes.trajectory import Trajectory, read_trajectory
+from su3d_bench.datasets.recordings.recorded_frames import (
+    StoredDepth,
+    depth_m_of_values,
+    left_out,
+    numbers,
+    pinhole,
+    read_text,
+    reading,
+)
+from su3d_bench.formats.images import Size, decode_colour, decode_depth, read_bytes, sized
+
+Images = Literal["lowres", "wide"]
+LOWRES, WIDE, DEPTH, FINE_DEPTH, CONFIDENCE = "lowres_wide", "wide", "lowres_depth", "highres_depth", "confidence"
+COLOUR_FOLDER: Mapping[Images, str] = {"lowres": LOWRES, "wide": WIDE}
+UNITS_PER_METRE = 1000.0  # DATA.md of apple/ARKitScenes at 7283761: millimetres
+DEPTH_M_OF_VALUE = depth_m_of_values(UNITS_PER_METRE)
+MOST_CONFIDENCE = 2
+# The readers of Apple and of the challenge look for a camera file of the time itself, then 1 ms before and after.
+NEIGHBOURS_MS = (0, -1, 1)
+MOST_DEPTH_AWAY_MS = 5  # of a wide image's depth, which has the time of its own frame: half of a sixtieth of a second
+LARGEST_SIDE = 16384
+ADVICE = "download the scene again"
+logger = logging.getLogger(__name__)
+
+
+def camera_folder(colour: str) -> str:
+    return f"{colour}_intrinsics"
+
+
+@dataclass(frozen=True)
+class Image:
+    """The names below the folder of one frame's files; ``confidence`` is None where it is not asked for."""
+
+    time_ms: int
+    colour: str
+    depth: str
+    camera: str
+    confidence: str | None = None
+
+    @property
+    def names(self) -> list[str]:
+        return [self.colour, self.depth, self.camera, *([] if self.confidence is None else [self.confidence])]
+
+
+@dataclass(frozen=True)
+class PhoneRecording:
+    """The usable images of a scene in the order of their times, with the row of the pose of each.
+
+    ``missing`` says, a line for each reason, what was left out because something of it is not there.
+    """
+
+    where: str
+    folder: Path
+    images: tuple[Image, ...]
+    rows: tuple[int, ...]
+    trajectory: Trajectory
+    missing: tuple[str, ...]
+
+    def files(self) -> list[Path]:
+        names = [name for image in self.images for name in image.names]
+        return [self.folder / TRAJECTORY_NAME, *(self.folder / name for name in names)]
+
+
+def times_in(folder: Path, scene: str, suffix: str) -> dict[int, str]:
+    """Time in milliseconds -> name of each file ``<scene>_<seconds><suffix>`` in a folder; empty where there is none."""
+    form = re.compile(rf"{scene}_(\d{{1,9}}(?:\.\d{{1,9}})?){re.escape(suffix)}")
+    try:
+        names = sorted(os.listdir(folder))
+    except (FileNotFoundError, NotADirectoryError):
+        return {}
+    matches = {name: form.fullmatch(name) for name in names}
+    return {round(float(match[1]) * 1000): name for name, match in matches.items() if match is not None}
+
+
+def open_recording(folder: Path, scene: str, images: Images, least_confidence: int, where: str) -> PhoneRecording:
+    """The recording of a scene; ``FramesMissing`` where it has no images, ``DataError`` where none can be used."""
+    colour_folder = COLOUR_FOLDER[images]
+    with reading(where):
+        colours = times_in(folder / colour_folder, scene, ".png")
+        depths = times_in(folder / DEPTH, scene, ".png")
+        fine = times_in(folder / FINE_DEPTH, scene, ".png") if images == "wide" else {}
+        cameras = times_in(folder / camera_folder(colour_folder), scene, ".pincam")
+        sure = times_in(folder / CONFIDENCE, scene, ".png") if least_confidence else {}
+    if not colours and not depths:
+        raise FramesMissing(f"{where}: has no images in {folder / colour_folder} and none in {DEPTH}; {ADVICE}")
+    if least_confidence and not sure:
+        raise DataError(
+            f"{where}: {CONFIDENCE}/ is missing, which option least_confidence needs; the challenge does not download "
+            "it, leave the option at 0 or download it"
+        )
+    trajectory = read_trajectory(folder / TRAJECTORY_NAME, f"{where}: {TRAJECTORY_NAME}")
+    # The challenge walks the depth images of low resolution; images of the wide camera are fewer than those.
+    times = sorted(depths if images == "lowres" else colours)
+    lacking, unposed, found, rows = list[str](), list[str](), list[Image](), list[int]()
+    for time_ms, row in zip(times, trajectory.nearest(np.array(times, float) / 1000).tolist(), strict=True):
+        named = f"{scene}_{time_ms / 1000:.3f}"
+        depth = _depth_of(time_ms, images, depths, fine)
+        camera = next((cameras[time_ms + ms] for ms in NEIGHBOURS_MS if time_ms + ms in cameras), None)
+        of_confidence = sure.get(time_ms) if least_confidence else ""
+        if time_ms not in colours or depth is None or camera is None or of_confidence is None:
+            lacking.append(named)
+        elif row < 0:
+            unposed.append(named)
+        else:
+            confidence = f"{CONFIDENCE}/{of_confidence}" if of_confidence else None
+            colour = f"{colour_folder}/{colours[time_ms]}"
+            found.append(Image(time_ms, colour, depth, f"{camera_folder(colour_folder)}/{camera}", confidence))
+            rows.append(row)
+    what = "images lack another image or a camera file of their time"
+    remarks = [left_out(where, lacking, what, len(found))] if lacking else []
+    no_pose = f"images have no pose nearer than 0.3 s in {TRAJECTORY_NAME}"
+    remarks += [left_out(where, unposed, no_pose, len(found))] if unposed else []
+    if not found:
+        raise DataError(remarks[0] if remarks else f"{where}: has no images in {colour_folder}; {ADVICE}")
+    for line in remarks:
+        logger.warning("%s", line)
+    return PhoneRecording(where, folder, tuple(found), tuple(rows), trajectory, tuple(remarks))
+
+
+def _depth_of(time_ms: int, images: Images, depths: Mapping[int, str], fine: Mapping[int, str]) -> str | None:
+    """The depth image of a time: for the wide camera that of the laser scanner, else the phone's nearest."""
+    if time_ms in fine:
+        return f"{FINE_DEPTH}/{fine[time_ms]}"
+    reach = 0 if images == "lowres" else MOST_DEPTH_AWAY_MS
+    near = sorted(range(-reach, reach + 1), key=abs)
+    return next((f"{DEPTH}/{depths[time_ms + ms]}" for ms in near if time_ms + ms in depths), None)
+
+
+def read_camera(path: Path, where: str) -> tuple[Size, Float64Array]:
+    """Width and height, and the intrinsics (3, 3), of a file ``.pincam``: one line, width height fx fy cx cy."""
+    words = read_text(path, where, ADVICE).split()
+    if len(words) != 6:
+        raise DataError(f"{where}: has {len(words)} values; expected one line width height fx fy cx cy")
+    width, height, *camera = numbers(words, where)
+    if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE and width == int(width) and height == int(height)):
+        raise DataError(f"{where}: the image has {width:g}x{height:g} pixels; {ADVICE}")
+    return (int(width), int(height)), pinhole(*camera, where=where)
+
+
+class PhoneFrames(Sequence[Frame]):
+    """Every ``stride``-th usable frame, read when it is asked for; a file that cannot be used is a ``DataError``.
+
+    Frames have at most ``width`` columns: colour is averaged, depth and confidence are taken from the nearest pixel.
+    """
+
+    def __init__(self, recording: PhoneRecording, stride: int, width: int, least_confidence: int) -> None:
+        self._recording, self._stride = recording, stride
+        self._width, self._least = width, least_confidence
+        self._depth = StoredDepth(recording.where, DEPTH_M_OF_VALUE)
+
+    def __len__(self) -> int:
+        return len(self._recording.images[:: self._stride])
+
+    def __getitem__(self, position: int) -> Frame:  # type: ignore[override]
+        index = range(len(self._recording.images))[:: self._stride][position]
+        image = self._recording.images[index]
+        full, intrinsics = read_camera(self._recording.folder / image.camera, self._at(image.camera))
+        size = self._size(full)
+        rgb = sized(decode_colour, self._content(image.colour), full, self._at(image.colour), "as its camera file says")
+        scale = np.array(size) / np.array(full)
+        intrinsics[:2, :2] *= scale[:, None]
+        intrinsics[:2, 2] = (intrinsics[:2, 2] + 0.5) * scale - 0.5  # the middle of the first pixel is at 0
+        return Frame(
+            index=index,
+            timestamp_s=image.time_ms / 1000,
+            rgb=_colour_at(rgb, size),
+            depth_m=self._depth_m(image, full, size),
+            camera_to_world=self._recording.trajectory.poses[self._recording.rows[index]],
+            intrinsics=intrinsics,
+        )
+
+    def _size(self, full: Size) -> Size:
+        width = min(self._width, full[0])
+        return width, max(1, round(full[1] * width / full[0]))
+
+    def _depth_m(self, image: Image, full: Size, size: Size) -> Float32Array:
+        values = decode_depth(self._content(image.depth), self._at(image.depth))
+        self._check_shape(values.shape[1::-1], full, image.depth, image.colour)
+        depth_m = self._depth.depth_m(values)
+        if image.confidence is not None:
+            confidence = decode_colour(self._content(image.confidence), self._at(image.confidence))[..., 0]
+            self._check_shape(confidence.shape[1::-1], full, image.confidence, image.colour)
+            if confidence.max(initial=0) > MOST_CONFIDENCE:
+                raise DataError(f"{self._at(image.confidence)}: has values to {confidence.max()}; expected 0, 1 and 2")
+            confidence = _nearest_at(confidence, values.shape[1::-1])
+            depth_m = np.where(confidence >= self._least, depth_m, np.float32(0))
+        return _nearest_at(depth_m, size)
+
+    def _check_shape(self, actual: tuple[int, ...], full: Size, name: str, colour: str) -> None:
+        """Depth may be coarser than colour; both must show the same field of view."""
+        if abs(actual[0] * full[1] - actual[1] * full[0]) > max(full):
+            raise DataError(
+                f"{self._at(name)} is {actual[0]}x{actual[1]} and {colour} is {full[0]}x{full[1]}; both must show the "
+                f"same view; {ADVICE}"
+            )
+
+    def _at(self, name: str) -> str:
+        return f"{self._recording.where}: {name}"
+
+    def _content(self, name: str) -> bytes:
+        return read_bytes(self._recording.folder / name, self._at(name), ADVICE)
+
+
+def _colour_at(colour: UInt8Array, size: Size) -> UInt8Array:
+    import cv2
+
+    if (colour.shape[1], colour.shape[0]) == size:
+        return colour
+    return np.asarray(cv2.resize(colour, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _nearest_at(image: NDArray[Any], size: tuple[int, ...]) -> NDArray[Any]:
+    import cv2
+
+    if (image.shape[1], image.shape[0]) == tuple(size):
+        return image
+    wanted = (int(size[0]), int(size[1]))
+    return np.asarray(cv2.resize(image, wanted, interpolation=cv2.INTER_NEAREST_EXACT), image.dtype)
