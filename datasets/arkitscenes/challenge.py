@@ -71,7 +71,7 @@ class Challenge:
     @cached_property
     def groups(self) -> dict[str, tuple[str, ...]]:
         """The scenes of each part; those of the development set are known without its list."""
-        found = {GROUPS["development"]: DEVELOPMENT_SCENES}
+        found: dict[str, tuple[str, ...]] = {GROUPS["development"]: DEVELOPMENT_SCENES}
         for path in self._lists("challenge"):
             part = path.name.removeprefix("challenge_").removesuffix("_scenes.csv")
             found[GROUPS[part]] = tuple(dict.fromkeys(scene for _, scene, _ in read_list(path, SCENES_COLUMNS)))

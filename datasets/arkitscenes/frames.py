@@ -150,10 +150,10 @@ def read_camera(path: Path, where: str) -> tuple[Size, Float64Array]:
     words = read_text(path, where, ADVICE).split()
     if len(words) != 6:
         raise DataError(f"{where}: has {len(words)} values; expected one line width height fx fy cx cy")
-    width, height, *camera = numbers(words, where)
+    width, height, fx, fy, cx, cy = numbers(words, where)
     if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE and width == int(width) and height == int(height)):
         raise DataError(f"{where}: the image has {width:g}x{height:g} pixels; {ADVICE}")
-    return (int(width), int(height)), pinhole(*camera, where=where)
+    return (int(width), int(height)), pinhole(fx, fy, cx, cy, where)
 
 
 class PhoneFrames(Sequence[Frame]):

@@ -177,7 +177,7 @@ class DatasetTruths(SceneTruths):
     def of_scene(self, rules: ProtocolRules, scene: str) -> Truth:
         if rules.ground_truth != QUERY_OBJECTS:
             truth = self._truth(scene, rules.ground_truth)
-            if not rules.is_judged:
+            if not rules.asks:
                 return truth
             from su3d_bench.questions.truths import question_truth
 
@@ -344,7 +344,7 @@ class TextTruths(SceneTruths):
     def why_not(self, rules: ProtocolRules, *, is_named: bool) -> str | None:
         if rules.ground_truth == QUERY_OBJECTS:
             return _why_no_queries(is_named=is_named)
-        if rules.is_judged and not is_named:
+        if rules.asks and not is_named:
             return f"{NOT_MEANT} texts"
         if not is_named and (self.dataset_name not in rules.datasets or not rules.by_default):
             return f"{NOT_MEANT} {self.dataset_name}"

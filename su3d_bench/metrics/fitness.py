@@ -106,7 +106,7 @@ class ContentFacts:
 
 def why_not_truth(rules: ProtocolRules, truth: TruthFacts) -> str | None:
     """Why no prediction at all can be scored under a protocol against a truth."""
-    if (rules.is_judged or rules.needs_boxes) and not truth.has_points:
+    if (rules.asks or rules.needs_boxes) and not truth.has_points:
         return "needs the objects of a dataset; name one with --dataset"
     if rules.needs_instances and not truth.has_instances:
         return "needs instances, the ground truth holds class ids alone (expected class id * 1000 + instance)"

@@ -6,11 +6,13 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from su3d_bench.core.errors import FramesMissing, GroundTruthMissing
 from su3d_bench.core.interfaces import Encoder, HasQueries, KnowsObjects
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import GroundTruth
-from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
+from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.truths import (
     AnnotationTruth,
@@ -73,6 +75,8 @@ def question_truth(
     absent.
     """
     assert rules.min_region_size is not None
+    if rules.kind == "queries" and rules.questions == "dataset":
+        return _query_truth(own_questions(dataset, scene), truth)
     if rules.kind == "annotation":
         return _annotation_truth(rules.min_region_size, truth, refine or voted_names)
     objects = scene_objects(dataset, scene, truth, rules.min_region_size)
@@ -88,7 +92,19 @@ def question_truth(
         questions = own_questions(dataset, scene)
     else:
         questions = generate(f"{dataset.name}/{scene}", objects, rules.per_kind)
+    if rules.kind == "queries":
+        return _query_truth(questions, truth)
     return RetrievalTruth(truth, tuple(_asked(question, objects) for question in questions))
+
+
+def _query_truth(questions: Sequence[Question], truth: GroundTruth) -> QueryTruth:
+    """The texts with the objects that answer them, over the labelled points; each text once."""
+    answers: dict[str, set[int]] = {}
+    for question in questions:
+        answers.setdefault(question.text, set()).update(question.answers or ())
+    queries = tuple(TextQuery(text, tuple(sorted(ids))) for text, ids in answers.items())
+    owner = np.where(truth.instance > 0, truth.instance, -1).astype(np.int64)
+    return QueryTruth(truth.points, owner, queries, truth.variant, truth.source, truth.labels.space)
 
 
 def _asked(question: Question, objects: SceneMap) -> AskedText:

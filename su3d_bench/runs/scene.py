@@ -376,7 +376,7 @@ class _Scene:
         return scores, unscored
 
     def _truth_of(self, rules: ProtocolRules, truth: GroundTruth, refined_in: JobFolder | None) -> Truth:
-        if not rules.is_judged:
+        if not rules.asks:
             return truth
         refine = None if refined_in is None else partial(refined_names, refined_in)
         return question_truth(rules, self.dataset, self.job.scene_name, truth, refine, self.solver)

@@ -103,14 +103,17 @@ class BoxRules(ProtocolRules):
 
 
 class QueryRules(ProtocolRules):
-    """Masks ranked for each text."""
+    """Masks ranked for each text, of a file of queries or, with ``questions``, of a scene's own."""
 
     values_of_metric: ClassVar[ValuesOfMetric] = {"query-ap": AP_NAMES}
     candidates = ("each-mask", "map-points")
     needs_own_points = True
     text_metrics = ("query-ap",)
     confidences = ("similarity", "similarity-min-max")
-    takes = ("top_k", *CURVE_FIELDS)
+    takes = ("top_k", "questions", "per_kind", *CURVE_FIELDS)
+
+    def _needed(self) -> tuple[str, ...]:
+        return ("synonyms",) if self.questions == "generated" else ()
 
 
 class CategoryRules(ProtocolRules):

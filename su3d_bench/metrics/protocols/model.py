@@ -13,7 +13,9 @@ from su3d_bench.core.errors import suggest
 ValuesOfMetric = Mapping[str, tuple[str, ...]]
 BOX_AXES = Literal["truth", "world"]
 CURVE_FIELDS = ("min_region_size", "thresholds", "confidence")
-_NEEDS_QUESTIONS = "questions: kinds 'retrieval', 'reasoning' and 'presence' need them, and min_region_size"
+_NEEDS_QUESTIONS = (
+    "questions: kinds 'retrieval', 'reasoning' and 'presence' need them, and min_region_size; 'queries' may have them"
+)
 _ONLY_CURVES = "min_region_size, thresholds and confidence belong to kind 'instance', 'boxes' or 'queries'"
 # The fields that not every kind has, and what is said where one is missing or out of place.
 OWN_FIELDS = {
@@ -312,6 +314,11 @@ class ProtocolRules(_Strict):
     def compares_texts(self) -> bool:
         """Whether features are compared with texts whatever labels there are."""
         return self.metric in self.text_metrics
+
+    @property
+    def asks(self) -> bool:
+        """Whether a scene's truth is questions about it, the dataset's or made, rather than its labelled points."""
+        return self.is_judged or self.questions is not None
 
     def texts_of(self, name: str) -> tuple[str, ...]:
         """The texts that stand for the class, label or query ``name``; their mean feature counts."""
