@@ -147,6 +147,10 @@ class ArkitScenes:
             raise GroundTruthMissing(f"{self._where(scene)}: no ground truth '{variant}'{hint}")
         return self.challenge.ground_truth(scene, self.surface(scene).vertices)
 
+    def asked_text(self, scene: str) -> str:
+        """What the scene is searched for; ``GroundTruthMissing`` where no list has its query."""
+        return self.challenge.query(scene)
+
     def queries(self, scene: str) -> Sequence[ChallengeQuery]:
         """The scene's query with the numbers of the objects that answer it; ``GroundTruthMissing`` without either."""
         return answered(self.ground_truth(scene, VARIANT), self.challenge.query(scene))

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from su3d_bench.metrics.protocols.model import ProtocolRules
     from su3d_bench.predictions.base import Content, Reader
 
-TARGETS = ("openlex3d", "scannet", "scannetpp")
+TARGETS = ("openlex3d", "scannet", "scannetpp", "opensun3d")
+QUERY_RULES = "opensun3d-queries"
 
 
 def add_parser(verbs: Any) -> None:
@@ -39,7 +40,8 @@ def add_parser(verbs: Any) -> None:
         required=True,
         choices=TARGETS,
         help="openlex3d: a cloud, the object of each point and features; scannet: lists of masks with class and score; "
-        "scannetpp: such lists with run-length masks, or with a --protocol of kind top-k the classes of every vertex",
+        "scannetpp: such lists with run-length masks, or with a --protocol of kind top-k the classes of every vertex; "
+        "opensun3d: the masks that answer the query of each scene of arkitscenes, with confidences",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder for the files")
     parser.add_argument("--method", help="whose maps of a run (default: the only one that it was asked for)")
@@ -78,8 +80,10 @@ def call(arguments: argparse.Namespace) -> int:
 
     is_openlex = arguments.to == "openlex3d"
     for flag, value in {"--protocol": arguments.protocol, "--text-features": arguments.text_features}.items():
-        if value is not None and is_openlex:
-            raise ConfigError(f"{flag} {value}: belongs to --to scannet or scannetpp; leave it out")
+        is_unused = is_openlex or (arguments.to == "opensun3d" and flag == "--protocol")
+        if value is not None and is_unused:
+            others = "scannet or scannetpp" if flag == "--protocol" else "scannet, scannetpp or opensun3d"
+            raise ConfigError(f"{flag} {value}: belongs to --to {others}; leave it out")
     sources = chosen(sources_of(arguments.path, arguments.format, arguments.method), arguments.scenes, arguments.path)
     names = _names([source.address for source in sources], is_flat=not is_openlex)
     rows = []
@@ -89,6 +93,8 @@ def call(arguments: argparse.Namespace) -> int:
             with _named(source):
                 if is_openlex:
                     remarks = write_openlex(prediction.content, folder / name)
+                elif arguments.to == "opensun3d":
+                    remarks = _write_answer(prediction.content, source, arguments, name, folder)
                 else:
                     remarks = _write_for_classes(prediction.content, source, arguments, name, folder)
             remarks = (*_partial_remark(source.run), *prediction.remarks, *remarks)
@@ -231,6 +237,32 @@ def _write_for_classes(
     if is_scannetpp:
         return export.write_scannetpp(masks, rules, name, folder)
     return export.write_scannet(masks, name, folder)
+
+
+def _write_answer(
+    content: Content, source: Source, arguments: argparse.Namespace, name: str, folder: Path
+) -> tuple[str, ...]:
+    """The masks of a scene that answer what its dataset is searched for: as they are, or asked of a map."""
+    from su3d_bench.core.interfaces import AsksText
+    from su3d_bench.metrics.protocols.loading import load_protocol
+    from su3d_bench.predictions import opensun3d
+    from su3d_bench.predictions.base import VertexMasks
+
+    if isinstance(content, VertexMasks) and opensun3d.is_answer(content):
+        return opensun3d.write_opensun3d(opensun3d.answer_as_it_is(content), name, folder)
+    if "/" not in source.address:
+        raise PredictionError(
+            f"which dataset it is of is not known; name it, such as --scenes arkitscenes/{source.scene}"
+        )
+    dataset, scene = _scene_of(source, is_quiet=arguments.quiet)
+    if not isinstance(dataset, AsksText):
+        raise PredictionError("its dataset asks for nothing in its scenes; --to opensun3d takes scenes of arkitscenes")
+    rules = load_protocol(QUERY_RULES)
+    encoder = _encoder(content, source, rules, arguments.text_features)
+    asked = dataset.asked_text(scene)
+    vertices = dataset.surface(scene).vertices
+    answer = opensun3d.answer_to(asked, content, rules, vertices, encoder)
+    return opensun3d.write_opensun3d(answer, name, folder)
 
 
 def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:

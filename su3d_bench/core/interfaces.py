@@ -171,6 +171,13 @@ class HasQueries(Protocol):
 
 
 @runtime_checkable
+class AsksText(Protocol):
+    """The one text that a scene is searched for, known without its truth; the answer lies on the vertices of its mesh."""
+
+    def asked_text(self, scene: str) -> str: ...
+
+
+@runtime_checkable
 class RendersFrames(Protocol):
     """True where frames are computed and not read.
 
@@ -379,6 +386,7 @@ ABILITIES = {
         SaysUp,
         HasSurface,
         HasQueries,
+        AsksText,
         KnowsObjects,
         RendersFrames,
         HasSketches,

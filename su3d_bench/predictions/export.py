@@ -33,7 +33,7 @@ from su3d_bench.store.atomic import make_folder, write_text
 from su3d_bench.store.unfinished import become, unfinished_folder
 
 MASKS_FOLDER = "pred_mask"
-RUNS_FOLDER = "predicted_masks"  # as ScanNet++'s own writer calls it
+RUNS_FOLDER = "predicted_masks"  # as ScanNet++'s own writer and the OpenSUN3D challenge call it
 ROWS_AT_ONCE = 1 << 14
 FILE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,150}")
 
@@ -213,13 +213,15 @@ def write_scannet(labelled: LabelledMasks, scene: str, folder: Path) -> tuple[st
 
     Confidences are written with all their digits: ``%f`` would make equals of what differs in the seventh.
     """
+    form = MASKS_FOLDER, ".txt", lambda k: digits_of(labelled, k)
+    return write_list(labelled, labelled.class_ids - 1, scene, folder, 1, form)
 
-    def digits_of(k: int) -> bytes:
-        digits = np.full((labelled.n_points, 2), (ord("0"), ord("\n")), np.uint8)
-        digits[labelled.masks.mask(k), 0] = ord("1")
-        return digits.tobytes()
 
-    return _write_list(labelled, labelled.class_ids - 1, scene, folder, 1, (MASKS_FOLDER, ".txt", digits_of))
+def digits_of(labelled: LabelledMasks, k: int) -> bytes:
+    """Mask k as ScanNet's benchmark has it: a line for each point, 1 where it is in the mask."""
+    digits = np.full((labelled.n_points, 2), (ord("0"), ord("\n")), np.uint8)
+    digits[labelled.masks.mask(k), 0] = ord("1")
+    return digits.tobytes()
 
 
 def write_scannetpp(labelled: LabelledMasks, rules: ProtocolRules | None, scene: str, folder: Path) -> tuple[str, ...]:
@@ -238,7 +240,7 @@ def write_scannetpp(labelled: LabelledMasks, rules: ProtocolRules | None, scene:
         remark = "confidences beyond 0 to 1, which the benchmark refuses, were written as their ranks over their number"
         labelled = replace(labelled, scores=(rank + 1) / len(distinct), remarks=(*labelled.remarks, remark))
     form = RUNS_FOLDER, MASK_OF_RUNS, lambda k: _runs_json(labelled.masks.mask(k), labelled.n_points)
-    return _write_list(labelled, places, scene, folder, 0, form)
+    return write_list(labelled, places, scene, folder, 0, form)
 
 
 def _runs_json(members: Int32Array, n_points: int) -> bytes:
@@ -249,15 +251,16 @@ def _runs_json(members: Int32Array, n_points: int) -> bytes:
     return json.dumps({"length": n_points, "counts": " ".join(map(str, runs.tolist()))}, indent=4).encode()
 
 
-def _write_list(
+def write_list(
     labelled: LabelledMasks,
     places: Int64Array,
     scene: str,
     folder: Path,
-    first: int,
+    first: int | None,
     form: tuple[str, str, Callable[[int], bytes]],
 ) -> tuple[str, ...]:
-    """``<scene>.txt`` and a file for each mask with points and a place (K,) from 0 on, which is written from ``first``.
+    """``<scene>.txt`` and a file for each mask with points and a place (K,) from 0 on, which is written from ``first``;
+    where that is None, lines have no class.
 
     ``form``: folder and suffix of the files of masks, and what is in that of mask k.
     """
@@ -273,7 +276,7 @@ def _write_list(
         else:
             name = f"{below}/{scene}_{k:03d}{suffix}"
             (folder / name).write_bytes(content_of(k))
-            lines.append(f"{name} {place + first} {score!r}\n")
+            lines.append(f"{name} {score!r}\n" if first is None else f"{name} {place + first} {score!r}\n")
     write_text(folder / f"{scene}.txt", "".join(lines))
     return (*labelled.remarks, *_left_out(len(sizes), n_empty, n_unnamed))
 
