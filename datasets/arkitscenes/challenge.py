@@ -1,4 +1,4 @@
-"""What the OpenSUN3D challenge says of scenes of ARKitScenes: its lists, the query of each, and the vertices that answer.
+"""What the OpenSUN3D challenge says of scenes of ARKitScenes: its lists, the query of each, the vertices that answer.
 
 It is read from a checkout of OpenSun3D/cvpr24-challenge as it stands: ``challenge_track_1`` with
 ``benchmark_file_lists/`` and ``benchmark_data/gt_development_scenes/``.
@@ -123,7 +123,8 @@ class Challenge:
         if self.folder is not None:
             return f"copy it from {CHALLENGE_URL} into {self.folder}"
         return (
-            f"clone {CHALLENGE_URL} beside the scenes, or name the clone: --set arkitscenes.challenge=path/to/{CHECKOUT}"
+            f"clone {CHALLENGE_URL} beside the scenes, or name the clone: --set "
+            f"arkitscenes.challenge=path/to/{CHECKOUT}"
         )
 
     def _lists(self, kind: str) -> list[Path]:
@@ -172,10 +173,7 @@ def read_list(path: Path, columns: Sequence[str]) -> Iterator[tuple[str, str, st
         yield f"{where}: row {number}", row[0], row[2]
 
 
-def answered(truth: GroundTruth, text: str) -> tuple[ChallengeQuery, ...]:
-    """The one query of a scene with the numbers of all its objects; none where the truth has no object."""
+def answered(truth: GroundTruth, text: str) -> ChallengeQuery:
+    """The query of a scene with the numbers of all its objects; without any, every mask is wrong."""
     numbers = np.unique(truth.instance[truth.instance > 0])
-    query = ChallengeQuery(text, tuple(int(number) for number in numbers))
-    return (query,) if query.answers else ()
-
-
+    return ChallengeQuery(text, tuple(int(number) for number in numbers))

@@ -43,7 +43,7 @@ READER_VERSION = 1  # raise it whenever the same files come out as other frames 
 
 
 class ArkitScenesOptions(BaseModel):
-    """``images``: those of 256x192 at up to 60 a second, as the challenge's loader takes them, or of the ``wide`` camera
+    """``images``: those of 256x192 at up to 60 a second, as the challenge's loader takes them, or the ``wide`` camera's
     with the laser scanner's depth where it is there. ``width``: columns of the frames, at most. ``least_confidence``:
     depth that the phone was less sure of (0 to 2) is left out. ``challenge``: a clone of the challenge's repository,
     where it does not lie beside the scenes."""
@@ -153,7 +153,7 @@ class ArkitScenes:
 
     def queries(self, scene: str) -> Sequence[ChallengeQuery]:
         """The scene's query with the numbers of the objects that answer it; ``GroundTruthMissing`` without either."""
-        return answered(self.ground_truth(scene, VARIANT), self.challenge.query(scene))
+        return (answered(self.ground_truth(scene, VARIANT), self.challenge.query(scene)),)
 
     def instance_mesh(self, scene: str) -> InstanceMesh:
         raise GroundTruthMissing(

@@ -81,7 +81,7 @@ class PhoneRecording:
 
 
 def times_in(folder: Path, scene: str, suffix: str) -> dict[int, str]:
-    """Time in milliseconds -> name of each file ``<scene>_<seconds><suffix>`` in a folder; empty where there is none."""
+    """Time in milliseconds -> name of each file ``<scene>_<seconds><suffix>`` in a folder; empty without a folder."""
     form = re.compile(rf"{scene}_(\d{{1,9}}(?:\.\d{{1,9}})?){re.escape(suffix)}")
     try:
         names = sorted(os.listdir(folder))
@@ -151,7 +151,7 @@ def read_camera(path: Path, where: str) -> tuple[Size, Float64Array]:
     if len(words) != 6:
         raise DataError(f"{where}: has {len(words)} values; expected one line width height fx fy cx cy")
     width, height, fx, fy, cx, cy = numbers(words, where)
-    if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE and width == int(width) and height == int(height)):
+    if not all(1 <= side <= LARGEST_SIDE and side == int(side) for side in (width, height)):
         raise DataError(f"{where}: the image has {width:g}x{height:g} pixels; {ADVICE}")
     return (int(width), int(height)), pinhole(fx, fy, cx, cy, where)
 

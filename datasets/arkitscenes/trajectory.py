@@ -27,7 +27,7 @@ class Trajectory:
     poses: Float64Array
 
     def nearest(self, times_s: Float64Array, most_s: float = MOST_DIFFERENCE_S) -> Int64Array:
-        """The row of the pose nearest to each time, the later of two as near; -1 where none is nearer than ``most_s``."""
+        """The row of the pose nearest to each time, the later of equals; -1 where none is nearer than ``most_s``."""
         after = np.clip(np.searchsorted(self.times_s, times_s), 0, len(self.times_s) - 1)
         before = np.maximum(after - 1, 0)
         is_before = np.abs(times_s - self.times_s[before]) < np.abs(times_s - self.times_s[after])

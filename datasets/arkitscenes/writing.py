@@ -87,12 +87,13 @@ class ArkitScenesLayout(Layout):
         import cv2
 
         height, width = frame.depth_m.shape
-        size = WIDTH, round(height * WIDTH / width)
+        columns = min(WIDTH, width)
+        size = columns, round(height * columns / width)
         rgb = np.asarray(cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
         depth_m = np.asarray(cv2.resize(frame.depth_m, size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
         depth = depth_in_units(depth_m, UNITS_PER_METRE)
         confidence = np.where(depth > 0, MOST_CONFIDENCE, 0).astype(np.uint8)
-        scale = np.array(size) / (width, height)
+        scale = np.array(size) / np.array((width, height))
         focal = np.diag(frame.intrinsics)[:2] * scale
         centre = (frame.intrinsics[:2, 2] + 0.5) * scale - 0.5  # the middle of the first pixel is at 0
         camera = " ".join(repr(float(value)) for value in (*focal, *centre))

@@ -172,7 +172,7 @@ class HasQueries(Protocol):
 
 @runtime_checkable
 class AsksText(Protocol):
-    """The one text that a scene is searched for, known without its truth; the answer lies on the vertices of its mesh."""
+    """The one text that a scene is searched for, known without its truth; its mesh has the vertices of the answer."""
 
     def asked_text(self, scene: str) -> str: ...
 

@@ -228,7 +228,9 @@ def test_datasets_that_are_not_here_have_a_line_each_and_more_when_they_are_name
     lines = capsys.readouterr().out.splitlines()
     assert "  rooms/living0    1600 frames" in lines and max(map(len, lines[1:])) <= 80
     start = lines.index("not here (su3d-bench datasets list NAME says how to get one):")
-    assert [line.split()[0] for line in lines[start + 1 :]] == ["replica", "scannet", "scannetpp", "tum", "rgbd"]
+    assert [line.split()[0] for line in lines[start + 1 :]] == [
+        *("replica", "scannet", "scannetpp", "arkitscenes", "tum", "rgbd")
+    ]
     assert lines[start + 1] == "  replica    looked for in Replica, replica, ."
     assert main(["datasets", "list", "tum"]) == 0
     named = capsys.readouterr().out

@@ -34,7 +34,8 @@ ROOM, SCAN, N_FRAMES, SIZE = "bathroom0", "scene9400_00", 12, (80, 60)
 SCANNET = ("scannet", "scannet-python", "scannet-cpp")
 SCANNETPP_SCENE = "0000000400"
 ADDRESS = dict.fromkeys(SCANNET, SCAN) | {"replica": ROOM, "tum": ROOM, "scannetpp": SCANNETPP_SCENE}
-UNITS_PER_METRE = dict.fromkeys((*SCANNET, "scannetpp"), 1000.0) | {"replica": 6553.5, "tum": 5000.0}
+ADDRESS["arkitscenes"] = SCANNETPP_SCENE[2:]
+UNITS_PER_METRE = dict.fromkeys((*SCANNET, "scannetpp", "arkitscenes"), 1000.0) | {"replica": 6553.5, "tum": 5000.0}
 FRAMES_PER_SECOND = dict.fromkeys(LAYOUTS, 30) | {"scannetpp": 60}  # the iPhone's video
 
 
@@ -109,7 +110,7 @@ def test_the_layouts_of_scannet_hold_the_same_jpeg_bytes_and_depth_values(made: 
 def test_colour_is_equal_where_the_codec_loses_nothing_and_near_elsewhere(made: dict[str, Path], rooms: Rooms) -> None:
     for name in LAYOUTS:
         for ours, theirs in zip(rooms.frames(ROOM, 1), frames(made, name), strict=True):
-            if name == "tum":
+            if name in {"tum", "arkitscenes"}:
                 np.testing.assert_array_equal(ours.rgb, theirs.rgb)
             else:
                 assert np.abs(ours.rgb.astype(int) - theirs.rgb).mean() < 6
@@ -125,6 +126,7 @@ def test_colour_is_equal_where_the_codec_loses_nothing_and_near_elsewhere(made: 
         ("scannet-cpp", 6e-6),
         ("scannetpp", 1e-12),
         ("tum", 5e-9),
+        ("arkitscenes", 1e-12),
     ],
 )
 def test_poses_times_and_camera_are_within_what_the_format_prints(
@@ -132,7 +134,11 @@ def test_poses_times_and_camera_are_within_what_the_format_prints(
 ) -> None:
     for ours, theirs in zip(rooms.frames(ROOM, 1), frames(made, name), strict=True):
         assert ours.index == theirs.index
-        assert abs(ours.timestamp_s - theirs.timestamp_s * FRAMES_PER_SECOND[name] / 30) < 1e-6
+        time_s = theirs.timestamp_s * FRAMES_PER_SECOND[name] / 30
+        if name == "arkitscenes":  # times that begin at 1000 s, in milliseconds
+            assert abs(ours.timestamp_s - (time_s - 1000)) < 6e-4
+        else:
+            assert abs(ours.timestamp_s - time_s) < 1e-6
         np.testing.assert_allclose(theirs.camera_to_world, ours.camera_to_world, rtol=0, atol=tolerance)
         np.testing.assert_allclose(theirs.intrinsics, ours.intrinsics, rtol=1e-5)
 
@@ -234,6 +240,28 @@ def test_every_room_has_a_scene_name_of_scannetpp_of_its_own() -> None:
     assert scannetpp_categories.room_of("036bce3393") is None
     with pytest.raises(DataError, match=r"^rooms/living100: has no scene name"):
         scannetpp_categories.scene_name("living100")
+
+
+def test_a_room_of_arkitscenes_has_the_files_of_the_challenge_and_the_objects_of_its_query(
+    made: dict[str, Path], rooms: Rooms
+) -> None:
+    scene, root = ADDRESS["arkitscenes"], made["arkitscenes"]
+    folder = root / "ChallengeDevelopmentSet" / scene
+    names = {path.name for path in folder.iterdir()}
+    images = {"lowres_wide", "lowres_depth", "lowres_wide_intrinsics", "confidence"}
+    assert names == {*images, "lowres_wide.traj", f"{scene}_3dod_mesh.ply"}
+    assert sorted((folder / "lowres_depth").iterdir())[1].name == f"{scene}_1000.033.png"
+    assert all(len(list((folder / name).iterdir())) == N_FRAMES for name in images)
+    lists = root / "challenge_track_1/benchmark_file_lists"
+    assert (lists / "queries_development_scenes.csv").read_text() == f"video_id,visit_id,query\n{scene},000000,cup\n"
+    dataset = reader(made, "arkitscenes")
+    truth, ours = dataset.ground_truth(scene, "query-vertices"), rooms.ground_truth(ROOM, "mesh-vertices")
+    cups = [known.id for known in rooms.objects(ROOM) if known.class_name == "cup"]
+    np.testing.assert_array_equal(truth.points, ours.points)
+    for number, object_id in enumerate(cups, 1):
+        np.testing.assert_array_equal(truth.instance == number, ours.instance == object_id)
+    assert [(query.text, query.answers) for query in dataset.queries(scene)] == [("cup", (1, 2))] and len(cups) == 2
+    assert dataset.groups() == {"opensun3d-development": (scene,)}
 
 
 def test_a_room_of_tum_is_not_scored(made: dict[str, Path]) -> None:

@@ -24,7 +24,9 @@ from su3d_bench.datasets.writing import finish_scene, plan_scenes, write_frames
 ROOM = "living7"
 SCANNET = ("scannet", "scannet-python", "scannet-cpp")
 ADDRESS = dict.fromkeys(SCANNET, "scene9007_00") | {"replica": ROOM, "tum": ROOM, "scannetpp": "0000000007"}
+ADDRESS["arkitscenes"] = "00000007"
 TRUTH = {"replica": "mesh-vertices"} | dict.fromkeys(SCANNET, "nyu40-vertices") | {"scannetpp": "scannetpp"}
+TRUTH["arkitscenes"] = "query-vertices"
 
 
 def reader(name: str, root: Path) -> Any:

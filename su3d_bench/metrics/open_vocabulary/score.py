@@ -242,6 +242,7 @@ class QueryMetric(CurveMetric):
             top_k=rules.top_k,
             min_region_size=rules.min_region_size,
             thresholds=rules.thresholds,
+            matches_by_confidence=rules.metric != "opensun3d",
         )
         asked_for = np.unique(np.array([each for query in truth.queries for each in query.object_ids], np.int64))
         wanted = np.isin(truth.object_of_point, asked_for[asked_for >= 0])

@@ -105,15 +105,20 @@ class BoxRules(ProtocolRules):
 class QueryRules(ProtocolRules):
     """Masks ranked for each text, of a file of queries or, with ``questions``, of a scene's own."""
 
-    values_of_metric: ClassVar[ValuesOfMetric] = {"query-ap": AP_NAMES}
+    values_of_metric: ClassVar[ValuesOfMetric] = dict.fromkeys(("query-ap", "opensun3d"), AP_NAMES)
     candidates = ("each-mask", "map-points")
     needs_own_points = True
-    text_metrics = ("query-ap",)
+    text_metrics = ("query-ap", "opensun3d")
     confidences = ("similarity", "similarity-min-max")
     takes = ("top_k", "questions", "per_kind", *CURVE_FIELDS)
 
     def _needed(self) -> tuple[str, ...]:
         return ("synonyms",) if self.questions == "generated" else ()
+
+    def _check_metric(self) -> None:
+        super()._check_metric()
+        if self.metric == "opensun3d" and self.top_k is not None:
+            raise ValueError("top_k: metric 'opensun3d' counts every mask of a scene")
 
 
 class CategoryRules(ProtocolRules):

@@ -153,6 +153,7 @@ class ProtocolRules(_Strict):
         "ovo",
         "votenet",
         "query-ap",
+        "opensun3d",
         "openlex3d-topn",
         "openlex3d-ranking",
         "panopticapi",

@@ -48,6 +48,7 @@ NAMES = {
     "class-agnostic-open3dis-scannetpp", "rooms-top-k", "scannetpp-instance", "scannetpp-open-vocabulary",
     "scannetpp-semantic", "openscan-affordance", "openscan-property", "openscan-type", "openscan-manner",
     "openscan-synonym", "openscan-requirement", "openscan-element", "openscan-material", "beacon3d", "rooms-beacon3d",
+    "opensun3d-masks", "opensun3d-queries",
 }  # fmt: skip
 
 

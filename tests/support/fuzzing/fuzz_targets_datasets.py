@@ -146,6 +146,21 @@ def _scannetpp(poses: Literal["colmap", "tracking"], *, packed: bool = False) ->
     return make
 
 
+def _arkitscenes(images: Literal["lowres", "wide"] = "lowres", *, is_3dod: bool = False) -> Make:
+    def make(folder: Path) -> Read:
+        from arkitscenes_scene import SCENE, write_images, write_scene
+
+        from su3d_bench.datasets.arkitscenes.dataset import ArkitScenes
+
+        place = write_scene(folder, is_3dod=is_3dod)
+        if images == "wide":
+            write_images(place, "wide", "highres_depth", (32, 24), (32, 24))
+        options = ArkitScenes.Options(images=images, least_confidence=0 if images == "wide" else 2)
+        return _whole_dataset(lambda: ArkitScenes(folder, options), SCENE)
+
+    return make
+
+
 def _depth_stream(folder: Path) -> Read:
     import zlib
 
@@ -375,6 +390,13 @@ TARGETS = (
     Target("scannetpp mesh", _scannetpp("colmap"), ("data/*/scans/*.ply",), 0.15),
     Target("scannetpp annotation", _scannetpp("colmap"), ("data/*/scans/*.json", "data/*/scans/*.txt"), 0.15),
     Target("scannetpp lists", _scannetpp("colmap"), ("metadata/*/*", "splits/*"), 0.15),
+    Target("arkitscenes images", _arkitscenes(), ("*/*/lowres_*/*.png", "*/*/confidence/*.png"), 0.15),
+    Target("arkitscenes wide images", _arkitscenes("wide"), ("*/*/wide/*", "*/*/highres_depth/*"), 0.15),
+    Target("arkitscenes cameras", _arkitscenes(is_3dod=True), ("3dod/*/*/*/*/*.pincam",), 0.15),
+    Target("arkitscenes trajectory", _arkitscenes(), ("*/*/*.traj",), 0.15),
+    Target("arkitscenes mesh", _arkitscenes(), ("*/*/*.ply",), 0.15),
+    Target("opensun3d lists", _arkitscenes(), ("challenge_track_1/benchmark_file_lists/*",), 0.15),
+    Target("opensun3d truth", _arkitscenes(), ("challenge_track_1/benchmark_data/*/*",), 0.15),
     Target("rgbd description", _rgbd(camera_axes="opengl", depth_invalid=[3]), ("rgbd/desk/rgbd.toml",)),
     Target("rgbd frames", _rgbd(), ("rgbd/desk/data/colour/*", "rgbd/desk/data/depth/*")),
     Target("rgbd poses", _rgbd(), ("rgbd/desk/data/*.pose.txt",)),
