@@ -260,7 +260,7 @@ def write_list(
     form: tuple[str, str, Callable[[int], bytes]],
 ) -> tuple[str, ...]:
     """``<scene>.txt`` and a file for each mask with points and a place (K,) from 0 on, which is written from ``first``;
-    where that is None, lines have no class.
+    where that is None, lines have no class, and files are numbered without gaps.
 
     ``form``: folder and suffix of the files of masks, and what is in that of mask k.
     """
@@ -274,7 +274,8 @@ def write_list(
         elif place < 0:
             n_unnamed += 1
         else:
-            name = f"{below}/{scene}_{k:03d}{suffix}"
+            number = k if first is not None else len(lines)
+            name = f"{below}/{scene}_{number:03d}{suffix}"
             (folder / name).write_bytes(content_of(k))
             lines.append(f"{name} {score!r}\n" if first is None else f"{name} {place + first} {score!r}\n")
     write_text(folder / f"{scene}.txt", "".join(lines))
