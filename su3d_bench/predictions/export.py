@@ -267,7 +267,7 @@ def write_list(
     scene, (below, suffix, content_of) = file_name(scene), form
     make_folder(folder / below)
     sizes = labelled.masks.sizes
-    lines, n_empty, n_unnamed = [], 0, 0
+    lines, n_empty, n_unnamed = list[str](), 0, 0
     for k, (place, score) in enumerate(zip(places.tolist(), labelled.scores.tolist(), strict=True)):
         if not sizes[k]:
             n_empty += 1
