@@ -98,7 +98,7 @@ def _class_rows(path: Path) -> list[Any]:
     With ``groups`` of ``thirds`` the first third of all rows, rounded down, is head, the second common, the next tail.
     """
     content = _read_toml(path)
-    rows = content.get("classes", [])
+    rows: list[Any] = content.get("classes", [])
     if "extends" in content:
         rows = [*_class_rows(CLASS_TABLES / f"{content['extends']}.toml"), *rows]
     if content.get("groups") != "thirds":
