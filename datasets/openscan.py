@@ -35,6 +35,7 @@ RAW_NAME = "openscan_val_raw.json"
 PAGE = "https://github.com/YoujunZhao/OpenScan"
 MOST_RECORDS = 1_000_000  # the validation set has 10,388
 MOST_CHARACTERS = 200
+SPELT_TWICE = {"\u00a0hang clothes": "hang clothes (34)"}  # in the lists with a blank of another kind
 WITHOUT = frozenset(("", "none", "other"))  # an object has no attribute of the aspect
 
 Attributes = Mapping[int, Mapping[str, str]]  # object id -> aspect's key -> word
@@ -57,6 +58,7 @@ def attribute_id(variant: str, words: str) -> int | None:
     (4, 22)
     """
     words = words.replace("_", " ")
+    words = SPELT_TWICE.get(words, words)
     found = [
         (len(name), class_id)
         for class_id, name in zip(label_set(variant).ids, label_set(variant).names, strict=True)

@@ -78,6 +78,7 @@ def test_the_words_of_a_record_are_the_sentences_of_the_lists(tmp_path: Path) ->
 def test_a_word_is_the_shortest_sentence_that_ends_with_it_and_a_part_of_a_word_is_none() -> None:
     names = {word: attribute_id("openscan-type", word) for word in ("bag", "handbag", "toy animal", "toy_animal", "ag")}
     assert names == {"bag": 69, "handbag": 38, "toy animal": 70, "toy_animal": 70, "ag": None}
+    assert [attribute_id("openscan-affordance", f"{blank}hang clothes") for blank in ("", "\u00a0")] == [79, 34]
     assert attribute_id("openscan-element", "keys") == 24 and attribute_id("openscan-element", "88 keys") == 26
 
 
