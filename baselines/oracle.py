@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.maps import Instances
-from su3d_bench.core.types import Detections, Frame, GroundTruth, Int32Array, PerceptionNeeds, SceneInfo
+from su3d_bench.core.types import Detections, Frame, GroundTruth, Int32Array, PerceptionNeeds, SceneInfo, TrueGraph
 from su3d_bench.perception.embedded.naming import scene_caption
 
 
@@ -52,7 +54,7 @@ class Oracle:
         assert truth is not None
         masks = {key: mask for key, mask in _masks_of(truth).items() if truth.semantic[mask[0]] > 0}
         labels = tuple(truth.labels.name_of(int(truth.semantic[mask[0]])) for mask in masks.values())
-        return Instances.of(
+        found = Instances.of(
             truth.points,
             list(masks.values()),
             labels=labels,
@@ -60,6 +62,17 @@ class Oracle:
             captions=tuple(scene_caption(label) for label in labels),
             ids=list(masks),
         )
+        return found if truth.graph is None else _with_graph(found, truth.graph)
+
+
+def _with_graph(instances: Instances, graph: TrueGraph) -> Instances:
+    """The map with the annotated relations of its objects as edges; of several between two the first alone counts."""
+    row_of = {int(key): row for row, key in enumerate(instances.ids)}
+    kept = [one for one in graph.relations if one[0] in row_of and one[2] in row_of]
+    names = tuple(dict.fromkeys(predicate for _, predicate, _ in kept)) or ("none",)
+    edges = np.array([(row_of[subject], row_of[other]) for subject, _, other in kept], np.int32).reshape(-1, 2)
+    scores = np.array([[float(name == predicate) for name in names] for _, predicate, _ in kept], np.float64)
+    return replace(instances, edges=edges, edge_scores=scores.reshape(-1, len(names)), predicates=names)
 
 
 def _masks_of(truth: GroundTruth) -> dict[int, Int32Array]:

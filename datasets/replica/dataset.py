@@ -55,6 +55,9 @@ from su3d_bench.datasets.replica.mesh_truth import (
     triangle_mesh,
     vertex_truth,
 )
+from su3d_bench.datasets.replica.scene_graphs import FILES as GRAPH_FILES
+from su3d_bench.datasets.replica.scene_graphs import VARIANT as SCENE_GRAPH
+from su3d_bench.datasets.replica.scene_graphs import find_graph_folder, graph_truth
 
 READER_VERSION = 3  # raise it whenever the same files come out as other frames or another truth
 
@@ -72,7 +75,9 @@ class Replica:
     reads_made_rooms = True
     scene_names = r"(room_?[0-2]|office_?[0-4])"  # those of made rooms are among them
     label_space = "replica"
-    variants: tuple[str, ...] = ("mesh-vertices", "face-corners", "conceptgraphs", "openmask3d", "ovo-51", "boxes")
+    variants: tuple[str, ...] = (
+        "mesh-vertices", "face-corners", "conceptgraphs", "openmask3d", "ovo-51", "boxes", SCENE_GRAPH
+    )  # fmt: skip
     Options = ReplicaOptions
 
     def __init__(self, root: Path, options: ReplicaOptions | None = None) -> None:
@@ -177,6 +182,8 @@ class Replica:
                 return self._cloud_truth(scene)
             case "openmask3d" | "ovo-51":
                 return self._label_file_truth(scene, variant)
+            case "replicassg":
+                return graph_truth(self.root, scene, self._annotated_mesh(scene), self._where(scene))
             case "boxes":
                 return box_truth(object_boxes_of(self._info(scene), self._where(scene)))
         hint = suggest(variant, self.variants)
@@ -247,7 +254,9 @@ class Replica:
         sequence = find_semantic_sequence(self.root, scene)
         clouds = () if sequence is None else (*cloud_files(sequence), self._folder(scene) / REFERENCE_CLOUD)
         labels = {variant: self._label_file(scene, variant) for variant in ("openmask3d", "ovo-51")}
-        return {"conceptgraphs": clouds} | {
+        graphs = find_graph_folder(self.root)
+        of_graph = () if graphs is None else tuple(graphs / name for name in GRAPH_FILES)
+        return {"conceptgraphs": clouds, SCENE_GRAPH: of_graph} | {
             variant: () if path is None else (path,) for variant, path in labels.items()
         }
 

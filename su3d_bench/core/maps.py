@@ -104,7 +104,9 @@ class Instances(Masks):
     3) float32 axis-aligned minimum and maximum corners; ``centroids`` (K, 3) float32; ``views`` (V, 2) int32 rows
     (frame index, row of the file or image that the detection came from), those of instance k at
     ``view_indptr[k]:view_indptr[k + 1]``; where the method keeps them, ``view_names`` and ``view_scores`` (V,) float64
-    are the names and prediction scores that perception gave in those views.
+    are the names and prediction scores that perception gave in those views. Where the method makes a scene graph,
+    ``edges`` (E, 2) int32 are rows of subject and object and ``edge_scores`` (E, P) float64 how well each of
+    ``predicates`` fits.
 
     >>> import numpy as np, su3d_bench as su3d
     >>> points = np.array([[0, 0, 0], [1, 0, 0], [5, 5, 1]], np.float32)
@@ -127,6 +129,9 @@ class Instances(Masks):
     view_names: tuple[str, ...] | None = None
     view_scores: Float64Array | None = None
     further_labels: tuple[tuple[str, ...], ...] | None = None
+    edges: Int32Array | None = None
+    edge_scores: Float64Array | None = None
+    predicates: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         arrays = ("points", "indptr", "indices", "scores", "boxes", "centroids", "view_indptr", "views", "ids")
@@ -147,6 +152,22 @@ class Instances(Masks):
                 raise PredictionError(
                     f"instances: {len(self.views)} views and {len(of_views)} names or scores of views"
                 )
+        self._check_graph(k)
+
+    def _check_graph(self, k: int) -> None:
+        edges, scores, predicates = self.edges, self.edge_scores, self.predicates
+        if edges is None or scores is None or predicates is None:
+            if (edges, scores, predicates) != (None, None, None):
+                raise PredictionError("instances: a scene graph needs edges, edge_scores and predicates, all three")
+            return
+        if edges.shape != (len(edges), 2) or scores.shape != (len(edges), len(predicates)) or not predicates:
+            raise PredictionError(
+                f"instances: edges {edges.shape} and edge_scores {scores.shape} do not fit {len(predicates)} predicates"
+            )
+        if len(set(predicates)) != len(predicates) or not np.isfinite(scores).all():
+            raise PredictionError("instances: predicates must differ and edge_scores be finite")
+        if len(edges) and not 0 <= int(edges.min()) <= int(edges.max()) < k:
+            raise PredictionError(f"instances: an edge names the instance {int(edges.max())} of {k} (0..{k - 1})")
 
     @classmethod
     def of(

@@ -153,6 +153,21 @@ class WholeObject:
 
 
 @dataclass(frozen=True)
+class TrueGraph:
+    """A scene graph that people made: the class id of each object, by its instance id, whether or not it has points,
+    and relations as instance id of the subject, predicate, instance id of the object."""
+
+    class_of_object: Mapping[int, int]
+    relations: tuple[tuple[int, str, int], ...]
+
+    def __post_init__(self) -> None:
+        for relation in self.relations:
+            for object_id in relation[::2]:
+                if object_id not in self.class_of_object:
+                    raise DataError(f"scene graph: a relation names object {object_id}, which is none of the graph")
+
+
+@dataclass(frozen=True)
 class GroundTruth:
     """Labelled points of a scene in one ``variant`` (mesh-vertices, face-corners, ...).
 
@@ -163,6 +178,7 @@ class GroundTruth:
     ``every_semantic`` (N, K) int32 where points may have several classes: all of them in the order of the annotation,
     then 0; ``semantic`` and ``instance`` are of the one object that stands for the point. ``semantic`` -1 marks points
     that evaluations leave out, in the truth and in predictions; only truths whose protocols ask for it have such.
+    ``graph`` where people annotated how objects lie to one another.
 
     >>> import numpy as np, su3d_bench as su3d
     >>> labels = su3d.LabelSet("mine", (3,), ("chair",))
@@ -181,6 +197,7 @@ class GroundTruth:
     evaluation_points: Float32Array | None = None
     boxes: ObjectBoxes | None = None
     every_semantic: Int32Array | None = None
+    graph: TrueGraph | None = None
 
     def __post_init__(self) -> None:
         check_arrays(self, f"ground truth '{self.variant}'", ("points", "semantic", "instance"), DataError)

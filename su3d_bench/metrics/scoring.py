@@ -34,6 +34,7 @@ from su3d_bench.metrics.questions.grounding import GroundingMetric
 from su3d_bench.metrics.questions.presence import PresenceMetric
 from su3d_bench.metrics.questions.score import AnnotationMetric, ReasoningMetric, RetrievalMetric
 from su3d_bench.metrics.questions.truths import AnnotationTruth, PresenceTruth, ReasoningTruth, RetrievalTruth
+from su3d_bench.metrics.relations.score import RelationMetric
 from su3d_bench.metrics.semantic.panoptic_score import PanopticMetric
 from su3d_bench.metrics.semantic.score import SemanticMetric
 from su3d_bench.metrics.semantic.top_k import TopKMetric
@@ -64,6 +65,7 @@ METRICS: dict[str, type[Metric[Any]]] = {
     "categories": CategoriesMetric,
     "grounding": GroundingMetric,
     "object-chains": ChainMetric,
+    "relations": RelationMetric,
     "retrieval": RetrievalMetric,
     "presence": PresenceMetric,
     "annotation": AnnotationMetric,

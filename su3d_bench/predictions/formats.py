@@ -11,6 +11,7 @@ from su3d_bench.predictions.gradslam import Gradslam
 from su3d_bench.predictions.hovsg import HovSg
 from su3d_bench.predictions.mask_archives import MaskClustering, Open3dis, OpenIns3d, OpenYolo3d
 from su3d_bench.predictions.online.esam import Esam
+from su3d_bench.predictions.online.fross import Fross
 from su3d_bench.predictions.online.onlineanyseg import OnlineAnySeg
 from su3d_bench.predictions.online.ovo import Ovo
 from su3d_bench.predictions.online.rayfronts import RayFronts
@@ -43,6 +44,7 @@ _ALL: tuple[Reader, ...] = (
     RayFronts(),
     Esam(),
     OnlineAnySeg(),
+    Fross(),
 )
 READERS: dict[str, Reader] = {reader.name: reader for reader in _ALL}
 

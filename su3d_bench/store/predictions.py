@@ -37,10 +37,13 @@ FIELDS = {
     "view_names": (1, "U"),
     "view_scores": (1, "f"),
     "further_labels": (2, "U"),
+    "edges": (2, "i"),
+    "edge_scores": (2, "f"),
+    "predicates": (1, "U"),
 }
 
 
-ROWS = {"points": (3,), "boxes": (2, 3), "centroids": (3,), "views": (2,)}  # the shape of each row, where it is fixed
+ROWS = {"points": (3,), "boxes": (2, 3), "centroids": (3,), "views": (2,), "edges": (2,)}  # the shape of each row, where it is fixed
 # Kinds of what is kept of predictions over the points of files that have no coordinates; ``predictions.own_runs`` reads
 # them.
 OVER_VERTICES = ("VertexMasks", "VertexLabels")
@@ -80,7 +83,9 @@ def prediction_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Pr
     for name in _fields_of(kind):
         value = arrays.get(name)
         values[name] = _texts(value) if value is not None and value.dtype.kind == "U" else value
-    optional = {"features", "labels", "view_names", "view_scores", "further_labels"}
+    optional = {
+        "features", "labels", "view_names", "view_scores", "further_labels", "edges", "edge_scores", "predicates"
+    }  # fmt: skip
     missing = [name for name, value in values.items() if value is None and name not in optional]
     if missing:
         raise PredictionError(f"{where}: lacks '{missing[0]}'; write it again with su3d-bench run")

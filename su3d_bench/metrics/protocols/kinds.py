@@ -8,6 +8,7 @@ from su3d_bench.core.errors import suggest
 from su3d_bench.metrics.protocols.model import CURVE_FIELDS, OWN_FIELDS, ProtocolRules, ValuesOfMetric
 
 AP_NAMES = ("AP", "AP50", "AP25")
+GEOMETRIC = ("on", "under", "in", "above", "next to", "near")  # what boxes tell, as numerics.relations has it
 CATEGORIES = ("synonyms", "depictions", "vis_sim", "clutter", "missing", "incorrect")
 
 
@@ -158,6 +159,29 @@ class GroundingRules(ProtocolRules):
             raise ValueError("transfer.cap_m: kind 'grounding' transfers nothing; no cap_m, no evaluation_voxel_m")
 
 
+class RelationRules(ProtocolRules):
+    """Objects of a scene graph, predicates between them, and triplets of both."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = {
+        "replicassg": ("object R@1", "predicate R@1", "relationship R@1", "object mR@1", "predicate mR@1")
+    }
+    needs_instances = True
+    needs = ("classes", "vocabulary", "predicates", "relations")
+
+    def _check_metric(self) -> None:
+        super()._check_metric()
+        if len(set(self.predicates)) != len(self.predicates):
+            raise ValueError("predicates: each may stand there once")
+        strange = [name for name in self.predicates if name not in GEOMETRIC]
+        if self.relations == "geometric" and strange:
+            raise ValueError(f"predicates: boxes do not tell '{strange[0]}', but {', '.join(GEOMETRIC)}")
+
+    def _check_transfer(self) -> None:
+        super()._check_transfer()
+        if self.transfer.cap_m is None or self.transfer.evaluation_voxel_m > 0:
+            raise ValueError("transfer.cap_m: kind 'relations' needs one, and no evaluation_voxel_m")
+
+
 class _JudgedRules(ProtocolRules):
     """What people are asked otherwise."""
 
@@ -264,6 +288,7 @@ RULES_OF_KIND: dict[str, type[ProtocolRules]] = {
     "categories": CategoryRules,
     "grounding": GroundingRules,
     "object-chains": ObjectChainRules,
+    "relations": RelationRules,
     "retrieval": RetrievalRules,
     "presence": PresenceQuestionRules,
     "annotation": AnnotationRules,

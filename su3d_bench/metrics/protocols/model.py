@@ -36,6 +36,8 @@ OWN_FIELDS = {
     "answers": "answers: kind 'reasoning' needs it, others take none",
     "box_axes": "box_axes: kinds 'boxes' and 'grounding' need it, others take none",
     "presence": "presence: kind 'presence' needs it, others take none",
+    "predicates": "predicates: kind 'relations' needs those that are asked for, others take none",
+    "relations": "relations: kind 'relations' needs to say whose they are, others take none",
 }
 
 
@@ -117,7 +119,8 @@ class ProtocolRules(_Strict):
     ``kind``: ``semantic`` (a class a point), ``top-k`` (the likeliest classes of a point, which may have several
     labels), ``instance`` (masks with a class), ``panoptic`` (every point in a segment of a thing or of ``stuff``),
     ``queries`` (masks ranked for each text), ``boxes`` (with a class), ``categories`` (how near a point's label comes
-    to those of its object), ``grounding`` (the box of the first mask of each text), or what people are asked otherwise:
+    to those of its object), ``grounding`` (the box of the first mask of each text), ``relations`` (objects, predicates
+    and triplets of a scene graph), or what people are asked otherwise:
     ``retrieval`` (the first mask of each text), ``presence`` (is there such a thing at all?), ``annotation`` (names and
     shapes of masks), ``reasoning`` (questions that boxes settle). ``questions`` are those of the ``dataset`` itself or
     ``generated`` from the truth, ``per_kind`` of each kind at most; ``synonyms`` names the table of other names of
@@ -136,6 +139,7 @@ class ProtocolRules(_Strict):
     ``labels``: whether the same mask may stand there under several labels (``top-k``) or under ``one`` alone; where
     absent, either is scored, and no ranking has both. ``box_axes``: the box of an instance is the smallest around its
     points along the axes of the ``truth``'s box that it is held against, or along those of the ``world``.
+    ``predicates`` are those of the relations asked for, which people ``annotated`` or boxes give (``geometric``).
     """
 
     name: str
@@ -143,7 +147,7 @@ class ProtocolRules(_Strict):
     summary: str
     kind: Literal[
         "semantic", "top-k", "instance", "panoptic", "boxes", "queries", "categories",
-        "grounding", "object-chains", "retrieval", "presence", "annotation", "reasoning",
+        "grounding", "object-chains", "relations", "retrieval", "presence", "annotation", "reasoning",
     ]  # fmt: skip
     metric: Literal[
         "conceptgraphs",
@@ -160,6 +164,7 @@ class ProtocolRules(_Strict):
         "semantic-kitti",
         "scanrefer",
         "beacon3d",
+        "replicassg",
         "retrieval",
         "pope",
         "annotation",
@@ -194,6 +199,8 @@ class ProtocolRules(_Strict):
     answers: AnswerRules | None = None
     box_axes: BOX_AXES | None = None
     presence: PresenceRules | None = None
+    predicates: tuple[str, ...] = ()
+    relations: Literal["annotated", "geometric"] | None = None
     aggregate: Literal["pooled", "scene-mean"] = "pooled"
     headline: Annotated[tuple[str, ...], Field(min_length=1)]
     not_comparable_with: tuple[str, ...] = ()
