@@ -57,6 +57,7 @@ GUARDS: dict[str, tuple[str, ...]] = {
     "metrics/semantic/panoptic_quality.py": ("test_panoptic_protocol",),
     "metrics/semantic/panoptic_score.py": ("test_panoptic_protocol",),
     "metrics/semantic/top_k.py": ("test_metrics_scannetpp",),
+    "metrics/relations/": ("test_relation_protocol",),
     "metrics/labels.py": ("evaluation/test_labels_counted",),
     "metrics/matching/remembered.py": ("analysis/test_rules_walk", "analysis/test_walks_of_every_pair"),
     "metrics/protocols/originals.py": ("test_originals",),

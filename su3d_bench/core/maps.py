@@ -157,7 +157,7 @@ class Instances(Masks):
     def _check_graph(self, k: int) -> None:
         edges, scores, predicates = self.edges, self.edge_scores, self.predicates
         if edges is None or scores is None or predicates is None:
-            if (edges, scores, predicates) != (None, None, None):
+            if any(part is not None for part in (edges, scores, predicates)):
                 raise PredictionError("instances: a scene graph needs edges, edge_scores and predicates, all three")
             return
         if edges.shape != (len(edges), 2) or scores.shape != (len(edges), len(predicates)) or not predicates:

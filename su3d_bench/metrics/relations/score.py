@@ -161,7 +161,8 @@ class RelationMetric(Metric[RelationCounts]):
         values: Values = {name: float(value[0]) for name, value in recalls(sums).items()}
         n_objects, n_relations = int(sums["n_objects"].sum()), int(sums["n_relations"].sum())
         values |= dict(zip((f"n_{name}" for name in NAMES[:3]), (n_objects, n_relations, n_relations), strict=True))
-        return Pooled(values, {name: {"R@1": float(value[0])} for name, value in self._single(sums).items()})
+        single = {name: float(value[0]) for name, value in self._single(sums).items()}
+        return Pooled(values, {name: {"R@1": value} for name, value in single.items() if not np.isnan(value)})
 
     def _single(self, sums: Mapping[str, Float64Array]) -> dict[str, Float64Array]:
         """The recall (R,) of each class and each predicate that some scene has."""

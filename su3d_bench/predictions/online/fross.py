@@ -24,6 +24,7 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.relations.graphs import last_best
 from su3d_bench.predictions.base import ONES, Reader, ScenePrediction, first_found, instances_of
+from su3d_bench.store.unpacking import Allowance, UnpackingError
 
 START, SUFFIX = "predictions_", ".pkl"
 LISTS = "replica-relations"  # the protocol with the lists by which numbers are named
@@ -47,7 +48,15 @@ class Fross(Reader):
 
     def read_scene(self, place: Path, scene: str) -> ScenePrediction:
         where = f"{shown(place)}: {printable(scene, 80)}"
-        instances = scene_graph(_content(place)[scene], load_protocol(LISTS), where)
+        graph = _content(place)[scene]
+        clouds = graph.get("pcd") if isinstance(graph, dict) else None
+        allowance = Allowance(place.stat().st_size)
+        try:  # objects that share their points cost the file a few bytes and memory for each
+            for cloud in clouds if isinstance(clouds, list) else ():
+                allowance.spend(4 * cloud.size if isinstance(cloud, np.ndarray) else 0)
+        except UnpackingError as error:
+            raise PredictionError(f"{where}: {error}") from error
+        instances = scene_graph(graph, load_protocol(LISTS), where)
         return ScenePrediction(scene, self.name, place, instances, (ONES,))
 
 

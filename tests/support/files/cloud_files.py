@@ -184,9 +184,25 @@ def write_small(folder: Path, format: str) -> Path:
     elif format == "onlineanyseg":
         masks = [np.arange(6) < 3, np.arange(6) > 2]
         write_onlineanyseg(scene, points, masks, list(np.ones((2, 8), np.float32)))
+    elif format == "fross":
+        write_fross(folder / "predictions_gaussian_test.pkl", [points[:4], points[4:]])
     else:
         write_openlex(scene, points, np.array([0, 0, 1, 1, 0, 1]), RNG.normal(size=(2, 8)))
     return folder
 
 
-FORMATS = ("conceptgraphs", "gradslam", "hovsg", "openlex3d", "ovo", "rayfronts", "esam", "onlineanyseg")
+def write_fross(path: Path, clouds: list[Any]) -> None:
+    """A scene graph of the scene room0, a chain of edges through its objects."""
+    k = len(clouds)
+    graph = {
+        "pcd": [np.asarray(cloud, np.float64) for cloud in clouds],
+        "cls": np.eye(150, dtype=np.int64)[np.arange(k) + 27],
+        "edge_index": np.array([np.arange(k - 1), np.arange(1, k)]),
+        "edge_cls": np.eye(50)[np.full(k - 1, 28)],
+        "mean": np.zeros((k, 3)),
+        "cov": np.zeros((k, 3, 3)),
+    }
+    path.write_bytes(pickle.dumps({"room0": graph}))
+
+
+FORMATS = ("conceptgraphs", "gradslam", "hovsg", "openlex3d", "ovo", "rayfronts", "esam", "onlineanyseg", "fross")

@@ -39,7 +39,7 @@ def _used_up(ask: Callable[[str], Any], scene: str) -> object:
 
 def _replica(folder: Path) -> Read:
     from replica_clouds import write_clouds
-    from replica_scene import CHAIR, QUADS, TABLE, TWO_OBJECTS, WALL, write_original, write_render
+    from replica_scene import CHAIR, QUADS, TABLE, TWO_OBJECTS, WALL, write_original, write_render, write_scene_graphs
     from scannet_scan import grid, write_mesh
     from test_replica_problems import box
     from test_replica_truths import write_labels
@@ -56,6 +56,7 @@ def _replica(folder: Path) -> Read:
     write_mesh(folder / "Replica/room0_mesh.ply", *grid(4, 2))
     write_labels(folder, "Replica/ground_truth/room0.txt", [20066, 80066, 30, 256003, 20000, 0, 20066, 0])
     write_labels(folder, "Replica/semantic_gt/room0.txt", [CHAIR, WALL, TABLE, CHAIR, CHAIR, WALL, WALL, TABLE])
+    write_scene_graphs(folder, [(0, "chair"), (5, "table")], [(0, 5, "near")])
     (folder / "Replica/rooms.json").write_text('{"scenes": {"room0": "abc", "other": "def"}}')
     return _whole_dataset(lambda: Replica(folder), "room0")
 
@@ -365,6 +366,7 @@ TARGETS = (
     Target("replica marker", _replica, ("Replica/rooms.json",), 0.15),
     Target("replica mesh", _replica, ("replica_v1/room_0/habitat/*.ply", "Replica/room0_mesh.ply"), 0.15),
     Target("replica objects", _replica, ("replica_v1/room_0/habitat/*.json",), 0.15),
+    Target("replica scene graphs", _replica, ("ReplicaSSG/*.json",), 0.15),
     Target("replica clouds", _replica, ("Replica-semantic/**/*.h5", "Replica/**/*.h5"), 0.15),
     Target("replica first pose", _replica, ("Replica-semantic/**/traj_w_c.txt",), 0.15),
     Target("replica labels", _replica, ("Replica/ground_truth/*.txt", "Replica/semantic_gt/*.txt"), 0.15),

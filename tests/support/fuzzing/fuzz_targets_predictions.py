@@ -212,7 +212,7 @@ OVER_VERTICES = (
     *("scannet-text", "scannet-semantic-text", "openmask3d", "maskclustering", "open3dis", "openyolo3d", "openins3d"),
     *("sam3d", "su3d-bench"),
 )
-WITH_OWN_POINTS = ("conceptgraphs", "hovsg", "openlex3d", "ovo", "rayfronts", "esam", "onlineanyseg")
+WITH_OWN_POINTS = ("conceptgraphs", "hovsg", "openlex3d", "ovo", "rayfronts", "esam", "onlineanyseg", "fross")
 TARGETS = (
     *(Target(f"prediction {name}", _format(name), ("**/*",)) for name in OVER_VERTICES),
     *(Target(f"prediction {name}", _cloud_format(name), ("**/*",)) for name in WITH_OWN_POINTS),

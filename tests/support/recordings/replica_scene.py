@@ -11,6 +11,7 @@ import numpy as np
 
 from su3d_bench.datasets.replica.folders import replica_label_set
 from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
+from su3d_bench.metrics.protocols.loading import load_protocol
 
 WIDTH, HEIGHT, SCALE = 12, 8, 6553.5
 CAMERA = {"w": WIDTH, "h": HEIGHT, "fx": 6.0, "fy": 6.5, "cx": 5.5, "cy": 3.5, "scale": SCALE}
@@ -75,3 +76,20 @@ def write_original(
 #                                0 1 2
 QUADS = [[0, 1, 4, 3], [3, 4, 7, 6], [1, 2, 5, 4], [4, 5, 8, 7]]
 TWO_OBJECTS = [(0, CHAIR), (5, TABLE)]
+
+
+def write_scene_graphs(root: Path, objects: list[tuple[int, str]], relations: list[tuple[int, int, str]]) -> Path:
+    """ReplicaSSG's annotation of room_0, and of another scan, with the classes of its protocol."""
+    rules = load_protocol("replica-relations")
+    folder = root / "ReplicaSSG"
+    folder.mkdir(parents=True)
+    rows = [{"label": label, "id": str(number)} for number, label in objects]
+    triples = [[subject, other, rules.predicates.index(name), name] for subject, other, name in relations]
+    scans = {"objects": rows, "relationships": triples}
+    for key, content in scans.items():
+        of_scans = [{"scan": "apartment_0", key: []}, {"scan": "room_0", key: content}]
+        (folder / f"{key}.json").write_text(json.dumps({"scans": of_scans}))
+    meant = {"chair": "chair", "sofa": "chair", "table": "table", "wall": "unknown"}
+    lists = {"VisualGenome_list": [entry.name for entry in rules.classes], "VisualGenome_rel": list(rules.predicates)}
+    (folder / "replica_to_visual_genome.json").write_text(json.dumps({"Replica2VisualGenome": meant, **lists}))
+    return folder
