@@ -42,9 +42,9 @@ class Fross(Reader):
 
     def scenes(self, path: Path) -> Mapping[str, Path]:
         files = _files(path)
-        if len(files) != 1:
+        if len(files) > 1:
             raise PredictionError(f"{shown(path)}: has {len(files)} files {START}*{SUFFIX}; give one of them")
-        return dict.fromkeys(_content(files[0]), files[0])
+        return {scene: file for file in files for scene in _content(file)}
 
     def read_scene(self, place: Path, scene: str) -> ScenePrediction:
         where = f"{shown(place)}: {printable(scene, 80)}"

@@ -185,7 +185,7 @@ def write_small(folder: Path, format: str) -> Path:
         masks = [np.arange(6) < 3, np.arange(6) > 2]
         write_onlineanyseg(scene, points, masks, list(np.ones((2, 8), np.float32)))
     elif format == "fross":
-        write_fross(folder / "predictions_gaussian_test.pkl", [points[:4], points[4:]])
+        write_fross(scene / "predictions_gaussian_test.pkl", [points[:4], points[4:]])
     else:
         write_openlex(scene, points, np.array([0, 0, 1, 1, 0, 1]), RNG.normal(size=(2, 8)))
     return folder
@@ -202,6 +202,7 @@ def write_fross(path: Path, clouds: list[Any]) -> None:
         "mean": np.zeros((k, 3)),
         "cov": np.zeros((k, 3, 3)),
     }
+    path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(pickle.dumps({"room0": graph}))
 
 
