@@ -31,7 +31,7 @@ from su3d_bench.datasets.scannet.folders import (
     split_scenes,
 )
 from su3d_bench.datasets.scannet.frames import ScannetFrames, Walk, read_walk
-from su3d_bench.datasets.scannet.labels import TABLE_NAME, LabelTable, read_label_table
+from su3d_bench.datasets.scannet.labels import TABLE_NAME, LabelTable, nyu40_label_set, read_label_table
 from su3d_bench.datasets.scannet.recordings import (
     SourceKind,
     describe_recording,
@@ -235,15 +235,31 @@ class ScanNet:
 
     def _motion(self, scene: str) -> Float64Array | None:
         """What is applied to the world; None for nothing."""
-        if not self.options.axis_align:
-            return None
+        return self._alignment(scene) if self.options.axis_align else None
+
+    def axis_alignment(self, scene: str) -> Float64Array:
+        """The motion (4, 4) that turns the truth along the walls; the identity where ``axis_align`` did it already."""
+        return np.eye(4) if self.options.axis_align else self._alignment(scene)
+
+    def _alignment(self, scene: str) -> Float64Array:
         path = self.tree.find_file(scene, meta_name(scene))
         if path is None:
             raise DataError(
-                f"{self._where(scene)}: {meta_name(scene)} is missing; axis_align needs it, copy it into "
+                f"{self._where(scene)}: {meta_name(scene)} is missing; what lies along the walls needs it, copy it into "
                 f"{self.tree.folders[scene][0]}"
             )
         return read_axis_alignment(path, self._where(scene))
+
+    def nyu40_class(self, category: str) -> str | None:
+        """The class of NYU40 that the table of the release gives a raw category; None where it has none."""
+        table = next((table for table in self._label_tables if table.name == TABLE_NAME), None)
+        if table is None:
+            raise DataError(
+                f"{self.name}: {TABLE_NAME} of the release is missing, by which names of objects have classes; put it "
+                f"into {self.tree.table_folders()[0]}"
+            )
+        class_id = table.nyu40_of.get(category)
+        return None if class_id is None else nyu40_label_set().name_of(class_id)
 
     @cached_property
     def _label_tables(self) -> Sequence[LabelTable]:

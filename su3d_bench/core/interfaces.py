@@ -16,6 +16,7 @@ from su3d_bench.core.types import (
     BoolArray,
     Detections,
     Float32Array,
+    Float64Array,
     Frame,
     GroundTruth,
     InstanceMesh,
@@ -161,6 +162,20 @@ class KnowsObjects(Protocol):
     """The objects of a scene as they are, of which the ground truth may hold what a recording saw alone."""
 
     def whole_objects(self, scene: str) -> Sequence[WholeObject]: ...
+
+
+@runtime_checkable
+class NamesCategories(Protocol):
+    """The class of NYU40 that the dataset's table gives what an annotator typed; None where it is not there."""
+
+    def nyu40_class(self, category: str) -> str | None: ...
+
+
+@runtime_checkable
+class IsAligned(Protocol):
+    """The rigid motion (4, 4) from the frame of the truth to one whose axes are the walls."""
+
+    def axis_alignment(self, scene: str) -> Float64Array: ...
 
 
 @runtime_checkable

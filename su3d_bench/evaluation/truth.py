@@ -29,6 +29,7 @@ from su3d_bench.core.errors import (
     shown,
     suggest,
 )
+from su3d_bench.core.interfaces import IsAligned, NamesCategories
 from su3d_bench.core.registry import FILES_OF_TRUTH
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import GroundTruth, Int64Array
@@ -186,7 +187,12 @@ class DatasetTruths(SceneTruths):
         if scene not in self._queries:
             raise GroundTruthMissing(f"{self.where}/{scene}: the file of queries has none of this scene")
         truth = self._truth(scene, self._dataset.variants[0])
-        return query_truth(truth, self._queries[scene], f"{self.where}/{scene}")
+        dataset, where = self._dataset, f"{self.where}/{scene}"
+        is_grouped = rules.kind == "grounding" and isinstance(dataset, NamesCategories)
+        class_of = dataset.nyu40_class if is_grouped else None
+        needs_axes = rules.box_axes == "aligned" and isinstance(dataset, IsAligned)
+        alignment = dataset.axis_alignment(scene) if needs_axes else None
+        return query_truth(truth, self._queries[scene], where, class_of, alignment)
 
     def _truth(self, scene: str, variant: str) -> GroundTruth:
         if (scene, variant) not in self._kept:

@@ -31,7 +31,8 @@ class Question:
 
     ``scene``: ``<dataset>/<scene>``; ``kind``: one of ``KINDS``, or ``reasoning``; ``answers``: ids of all instances
     of the ground truth that are right, ascending, None where nobody knows; ``source``: where the question comes from.
-    ``reply``: the right answer in words, where a question has one besides objects.
+    ``reply``: the right answer in words, where a question has one besides objects; ``name`` and ``groups`` as in
+    ``TextQuery``.
     """
 
     id: str
@@ -41,6 +42,8 @@ class Question:
     answers: tuple[int, ...] | None
     source: str
     reply: str = ""
+    name: str = ""
+    groups: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         where = f"question '{printable(self.text, 60)}'"

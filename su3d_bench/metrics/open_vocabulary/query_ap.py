@@ -24,10 +24,16 @@ _SMALLEST_RANGE = 1e-8  # openlex3d's floor of the range over which similarities
 
 @dataclass(frozen=True)
 class TextQuery:
-    """A text and the ids of the objects that it speaks of."""
+    """A text and the ids of the objects that it speaks of.
+
+    ``groups``: those in which it is scored apart from others, such as ``unique``; ``name``: what the file calls the
+    object, '' where it does not.
+    """
 
     text: str
     object_ids: tuple[int, ...]
+    groups: tuple[str, ...] = ()
+    name: str = ""
 
     def __post_init__(self) -> None:
         if len(set(self.object_ids)) != len(self.object_ids):
@@ -38,7 +44,8 @@ class TextQuery:
 class QueryTruth:
     """Objects of a scene and the texts that ask for them.
 
-    ``points`` (N, 3) float32 m, ``object_of_point`` (N,) int64, -1 for none.
+    ``points`` (N, 3) float32 m, ``object_of_point`` (N,) int64, -1 for none. ``alignment`` (4, 4): the rigid motion
+    into the frame whose axes are the walls, where the dataset has one that its points were not moved by.
     """
 
     points: Float32Array
@@ -47,6 +54,7 @@ class QueryTruth:
     variant: str
     source: str
     space: str = SPACE
+    alignment: Float64Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.points)

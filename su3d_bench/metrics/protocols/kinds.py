@@ -96,6 +96,8 @@ class BoxRules(ProtocolRules):
         super()._check_metric()
         if self.thresholds != (0.25, 0.5):
             raise ValueError("thresholds: kind 'boxes' takes [0.25, 0.5]")
+        if self.box_axes == "aligned":
+            raise ValueError("box_axes: kind 'boxes' takes 'truth' or 'world'")
 
     def _check_transfer(self) -> None:
         super()._check_transfer()
@@ -146,15 +148,18 @@ class CategoryRules(ProtocolRules):
 class GroundingRules(ProtocolRules):
     """The box of the first mask of each text."""
 
-    values_of_metric: ClassVar[ValuesOfMetric] = {"scanrefer": ("Acc@0.25", "Acc@0.5")}
+    values_of_metric: ClassVar[ValuesOfMetric] = {
+        "scanrefer": tuple(f"{group}Acc@{iou}" for group in ("", "unique ", "multiple ") for iou in ("0.25", "0.5")),
+        "referit3d": ("accuracy", "easy", "hard", "view-dependent", "view-independent"),
+    }
     needs_own_points = True
-    text_metrics = ("scanrefer",)
+    text_metrics = ("scanrefer", "referit3d")
     needs = ("box_axes",)
 
     def _check_transfer(self) -> None:
         super()._check_transfer()
-        if self.box_axes != "world":
-            raise ValueError("box_axes: kind 'grounding' takes 'world'")
+        if self.box_axes not in ("world", "aligned"):
+            raise ValueError("box_axes: kind 'grounding' takes 'world' or 'aligned'")
         if self.transfer.cap_m is not None or self.transfer.evaluation_voxel_m > 0:
             raise ValueError("transfer.cap_m: kind 'grounding' transfers nothing; no cap_m, no evaluation_voxel_m")
 

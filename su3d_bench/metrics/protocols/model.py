@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from su3d_bench.core.errors import suggest
 
 ValuesOfMetric = Mapping[str, tuple[str, ...]]
-BOX_AXES = Literal["truth", "world"]
+BOX_AXES = Literal["truth", "world", "aligned"]
 CURVE_FIELDS = ("min_region_size", "thresholds", "confidence")
 _NEEDS_QUESTIONS = (
     "questions: kinds 'retrieval', 'reasoning' and 'presence' need them, and min_region_size; 'queries' may have them"
@@ -138,7 +138,8 @@ class ProtocolRules(_Strict):
     where absent, they are dropped at every threshold that their share of void is above, as in ScanNet's script.
     ``labels``: whether the same mask may stand there under several labels (``top-k``) or under ``one`` alone; where
     absent, either is scored, and no ranking has both. ``box_axes``: the box of an instance is the smallest around its
-    points along the axes of the ``truth``'s box that it is held against, or along those of the ``world``.
+    points along the axes of the ``truth``'s box that it is held against, or along those of the ``world``, or of the
+    ``aligned`` world, which the dataset's own motion turned along the walls (the world where it has none).
     ``predicates`` are those of the relations asked for, which people ``annotated`` or boxes give (``geometric``).
     """
 
@@ -164,6 +165,7 @@ class ProtocolRules(_Strict):
         "semantic-kitti",
         "scanrefer",
         "beacon3d",
+        "referit3d",
         "replicassg",
         "retrieval",
         "pope",

@@ -1,7 +1,9 @@
 """Protocols of kind ``grounding``: does the box of the instance ranked first meet the box of the object meant?
 
-Source: ``eval_ref_one_sample`` of lib/eval_helper.py and ``box3d_iou`` of utils/box_util.py (daveredrum/ScanRefer at
-9d74830): boxes along the axes of the world, right from an IoU of 0.25 or 0.5 on.
+Sources: ``eval_ref_one_sample`` of lib/eval_helper.py, ``box3d_iou`` of utils/box_util.py and ``export`` of
+data/scannet/load_scannet_data.py (daveredrum/ScanRefer at 9d74830): boxes along the walls, right from an IoU of 0.25 or
+0.5 on; ``analyze_predictions`` of referit3d/analysis/deepnet_predictions.py (referit3d/referit3d at 725a5d3): a choice
+among given objects.
 """
 
 from __future__ import annotations
@@ -10,44 +12,120 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.maps import Instances, Partition
-from su3d_bench.core.types import Float64Array
+from su3d_bench.core.maps import Instances, Masks, Partition
+from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 from su3d_bench.metrics.instance.score import score_of_masks
 from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.matching.labelling import encoder_warning
+from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, text_features
 from su3d_bench.metrics.metric import SceneScore
-from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
+from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
 from su3d_bench.metrics.questions.score import ShareMetric, first_instances
 from su3d_bench.metrics.questions.shares import share_counts
 
 THRESHOLDS = (0.25, 0.5)
+EVERY = "all"  # the group of every text that counts
 _SMALLEST_VOLUME = 1e-8  # the original adds it to the union
 
 
 class GroundingMetric(ShareMetric):
-    """Of the instance ranked first for each text, does its box overlap that of an object that the text means?"""
+    """Of the instance ranked first for each text, does its box overlap that of an object that the text means?
+
+    Under metric ``referit3d`` the boxes of all objects are given: does it stand in the place of the right one?
+    """
 
     truth = QueryTruth
 
     def per_scene(self, truth: QueryTruth, prediction: Instances | Partition, encoder: Encoder | None) -> SceneScore:
-        first = first_instances(self.rules, [query.text for query in truth.queries], prediction, encoder)
+        turn = truth.alignment if self.rules.box_axes == "aligned" else None
         masks = transfer.masks_of(prediction)
-        iou = np.zeros(len(truth.queries))
-        for row, (k, query) in enumerate(zip(first.tolist(), truth.queries, strict=True)):
-            if k >= 0 and len(masks.mask(k)):
-                box = box_around(prediction.points[masks.mask(k)])
-                iou[row] = max((box_iou(box, true) for true in _boxes_of(query, truth)), default=0.0)
-        n_right = [int((iou >= threshold).sum()) for threshold in THRESHOLDS]
-        counts = share_counts([len(iou)] * len(THRESHOLDS), n_right)
+        ids = np.unique(truth.object_of_point[truth.object_of_point >= 0])
+        true_points = aligned(truth.points, turn)
+        given = [box_around(true_points[truth.object_of_point == key]) for key in ids.tolist()]
+        is_meant = np.array([np.isin(ids, query.object_ids) for query in truth.queries]).reshape(-1, len(ids))
+        boxes = _boxes_of(aligned(prediction.points, turn), masks)
+        if self.rules.metric == "referit3d":
+            is_right = self._chosen(truth, prediction, encoder, boxes, given, is_meant)
+            judged = {"": is_right}
+        else:
+            texts = [query.text for query in truth.queries]
+            first = first_instances(self.rules, texts, prediction, encoder).tolist()
+            iou = np.array([_best_iou(boxes.get(k), given, row) for k, row in zip(first, is_meant, strict=True)])
+            judged = {f"Acc@{threshold:g}": iou >= threshold for threshold in THRESHOLDS}
+        counts = share_counts(*zip(*[self._share(name, truth, judged) for name in self.rules.value_names], strict=True))
         asked_for = [object_id for query in truth.queries for object_id in query.object_ids]
         wanted = np.isin(truth.object_of_point, np.array(asked_for, np.int64))
         warnings = [encoder_warning(self.rules, prediction, encoder)]
         return score_of_masks(self, counts, prediction, truth.points, wanted, warnings)
 
+    def _share(self, name: str, truth: QueryTruth, judged: dict[str, BoolArray]) -> tuple[int, int]:
+        """How many texts a value such as ``unique Acc@0.25`` or ``easy`` is over, and how many are right."""
+        group, _, measure = name.rpartition(" ") if "" not in judged else (name, "", "")
+        rows = in_group([query.groups for query in truth.queries], group or EVERY, self.rules.metric)
+        return int(rows.sum()), int((rows & judged[measure]).sum())
 
-def _boxes_of(query: TextQuery, truth: QueryTruth) -> Sequence[Float64Array]:
-    return [box_around(truth.points[truth.object_of_point == object_id]) for object_id in query.object_ids]
+    def _chosen(
+        self,
+        truth: QueryTruth,
+        prediction: Instances | Partition,
+        encoder: Encoder | None,
+        boxes: dict[int, Float64Array],
+        given: Sequence[Float64Array],
+        is_meant: BoolArray,
+    ) -> BoolArray:
+        """Whether (Q,) the given object in whose place the first instance stands that meets any of them is meant."""
+        iou = {row: np.array([box_iou(box, other) for other in given]) for row, box in boxes.items()}
+        rows = np.array([row for row, values in iou.items() if values.any()], np.int64)
+        if not len(rows) or not truth.queries:
+            return np.zeros(len(truth.queries), bool)
+        if prediction.features is None or encoder is None:
+            raise PredictionError(f"{self.rules.name}: needs features and an encoder to compare texts with them")
+        text = text_features(self.rules, [query.text for query in truth.queries], prediction.features, encoder)
+        first = rows[cosines(prediction.features[rows], text, device_of(encoder)).argmax(axis=0)]
+        choice: Int64Array = np.array([choose(iou[row]) for row in first.tolist()], np.int64)
+        answer: BoolArray = is_meant[np.arange(len(choice)), choice]
+        return answer
+
+
+def choose(scores: Float64Array) -> int:
+    """The object with the greatest of ``scores`` (G,), the first of equals."""
+    return int(scores.argmax())
+
+
+def in_group(groups: Sequence[Sequence[str]], group: str, metric: str) -> BoolArray:
+    """Which texts (Q,) with such groups a value of ``group`` is over; ``all`` and ``accuracy`` are every one's.
+
+    Of a choice among given objects every one is what is easy or hard: Nr3D leaves some out.
+
+    >>> in_group([("easy",), ("left out",)], "accuracy", "referit3d").tolist()
+    [True, False]
+    """
+    wanted = {group}
+    if metric == "referit3d" and group == "accuracy":
+        wanted = {"easy", "hard"}
+    elif group == EVERY:
+        return np.ones(len(groups), bool)
+    return np.array([not wanted.isdisjoint(of_text) for of_text in groups], bool)
+
+
+def aligned(points: transfer.Points, motion: Float64Array | None) -> transfer.Points:
+    """Points (N, 3) moved by a rigid motion (4, 4) and kept in float32, as the original keeps what it aligned."""
+    if motion is None:
+        return points
+    moved = np.column_stack([np.asarray(points, np.float64), np.ones(len(points))]) @ motion.T
+    return moved[:, :3].astype(np.float32)
+
+
+def _boxes_of(points: transfer.Points, masks: Masks) -> dict[int, Float64Array]:
+    """The box of each mask that has points, by its row."""
+    return {row: box_around(points[masks.mask(row)]) for row in np.flatnonzero(masks.sizes).tolist()}
+
+
+def _best_iou(box: Float64Array | None, given: Sequence[Float64Array], is_meant: BoolArray) -> float:
+    if box is None:
+        return 0.0
+    return max((box_iou(box, given[place]) for place in np.flatnonzero(is_meant).tolist()), default=0.0)
 
 
 def box_around(points: transfer.Points) -> Float64Array:

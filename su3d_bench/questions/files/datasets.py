@@ -1,9 +1,10 @@
 """Sentences that people wrote about ScanNet's scenes: files of ScanRefer, Nr3D (Sr3D) and SQA3D as question sets.
 
-ScanRefer: a JSON list of ``scene_id``, ``object_id``, ``description``. Nr3D: a CSV with ``scan_id``, ``target_id``,
-``utterance``. SQA3D: a JSON with ``questions`` of ``scene_id``, ``situation``, ``question``, ``question_id``, whose
-answers stand in a file of annotations beside it. Beacon3D: ``metadata_*.json``, see ``chains/beacon3d_files``. Object
-ids are ScanNet's own, one less than the truth's here.
+ScanRefer: a JSON list of ``scene_id``, ``object_id``, ``description``, and ``object_name`` by which a sentence is unique
+or multiple. Nr3D: a CSV with ``scan_id``, ``target_id``, ``utterance``, and ``stimulus_id``, ``tokens`` and
+``mentions_target_class`` by which one is easy or hard, by the view or not, or left out. SQA3D: a JSON with ``questions``
+of ``scene_id``, ``situation``, ``question``, ``question_id``, whose answers stand in a file of annotations beside it.
+Beacon3D: ``metadata_*.json``, see ``chains/beacon3d_files``. Object ids are ScanNet's own, one less than the truth's here.
 
 Other files of these and of OpenEQA and ScanQA are known, and refused with what to give instead. Sources: the
 files' descriptions in facebookresearch/open-eqa at b5752aa, Beacon3D's data and daveredrum/ScanRefer.
@@ -16,6 +17,7 @@ import io
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -29,6 +31,7 @@ from su3d_bench.questions.chains.beacon3d_files import (
     questions_of_objects,
     read_metadata,
 )
+from su3d_bench.questions.files.groups import nr3d_groups
 from su3d_bench.questions.files.queries import MOST_OBJECTS_ID, is_text
 from su3d_bench.questions.model import REASONING, Question, new_question
 
@@ -105,7 +108,8 @@ def read_foreign_queries(path: Path) -> dict[str, tuple[TextQuery, ...]]:
                 f"{printable(str(path), 200)}: {question.source} names no objects; nothing can be scored by it"
             )
         scene = question.scene.rpartition("/")[2]
-        queries_of_scene.setdefault(scene, []).append(TextQuery(question.text, question.answers or ()))
+        query = TextQuery(question.text, question.answers or (), question.groups, question.name)
+        queries_of_scene.setdefault(scene, []).append(query)
     return {scene: tuple(queries) for scene, queries in queries_of_scene.items()}
 
 
@@ -171,7 +175,23 @@ def _sentences(rows: Iterable[tuple[str, Any]], keys: tuple[str, str, str], sour
     """A question for each row, which comes with its place; ``keys``: those of scene, sentence and object."""
     for at, row in rows:
         scene, text = _word(row, keys[0], at), _sentence(row, keys[1], at)
-        yield new_question(f"{DATASET}/{scene}", "relative", text, _answer(row, keys[2], at), source)
+        question = new_question(f"{DATASET}/{scene}", "relative", text, _answer(row, keys[2], at), source)
+        yield replace(question, name=_optional(row, "object_name", at) or "", groups=_groups(row, at))
+
+
+def _groups(row: Any, at: str) -> tuple[str, ...]:
+    """The groups of a row of Nr3D; none where its file has no such column."""
+    stimulus = _optional(row, "stimulus_id", at)
+    if stimulus is None:
+        return ()
+    return nr3d_groups(stimulus, _optional(row, "tokens", at), _optional(row, "mentions_target_class", at), at)
+
+
+def _optional(row: Any, key: str, at: str) -> str | None:
+    value = row.get(key)
+    if value is not None and (not isinstance(value, str) or not is_text(value)):
+        raise DataError(f"{at}: '{key}' must be a text; found {printable(repr(value), 40)}")
+    return value
 
 
 def _csv_rows(text: str, where: str) -> list[Any]:

@@ -18,10 +18,11 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.toml import parse_toml
-from su3d_bench.core.types import GroundTruth
+from su3d_bench.core.types import Float64Array, GroundTruth
 from su3d_bench.datasets.recordings.recorded_frames import read_text
 from su3d_bench.formats.tables.separated import separated_rows
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
+from su3d_bench.questions.files.groups import ClassOfName, grouped_by_truth, scanrefer_groups
 from su3d_bench.reports.tables.formats import meant
 
 COLUMNS = ("scene", "text", "objects")
@@ -75,8 +76,17 @@ def read_query_file(path: Path) -> dict[str, tuple[TextQuery, ...]]:
     return {scene: tuple(queries) for scene, queries in queries_of_scene.items()}
 
 
-def query_truth(truth: GroundTruth, queries: tuple[TextQuery, ...], where: str) -> QueryTruth:
-    """The queries of a scene over the instances of its ground truth; an object that is not there is an error."""
+def query_truth(
+    truth: GroundTruth,
+    queries: tuple[TextQuery, ...],
+    where: str,
+    class_of: ClassOfName | None = None,
+    alignment: Float64Array | None = None,
+) -> QueryTruth:
+    """The queries of a scene over the instances of its ground truth; an object that is not there is an error.
+
+    Their groups are those of the file, by ``class_of`` where it names objects, and else by the classes of the truth.
+    """
     known = set(np.unique(truth.instance[truth.instance > 0]).tolist())
     for query in queries:
         for object_id in query.object_ids:
@@ -87,7 +97,11 @@ def query_truth(truth: GroundTruth, queries: tuple[TextQuery, ...], where: str) 
                 )
     owner = truth.instance.astype(np.int64)
     owner[owner <= 0] = -1
-    return QueryTruth(truth.points, owner, queries, VARIANT, f"queries of a file, objects from {truth.source}")
+    named = queries if class_of is None else scanrefer_groups(queries, class_of)
+    source = f"queries of a file, objects from {truth.source}"
+    return QueryTruth(
+        truth.points, owner, grouped_by_truth(named, truth), VARIANT, source, alignment=alignment
+    )
 
 
 def _toml_rows(text: str, where: str) -> Iterator[QueryRow]:
