@@ -1,8 +1,8 @@
 """ReplicaSSG's scene graphs of Replica: ``objects.json``, ``relationships.json`` and ``replica_to_visual_genome.json``.
 
-Source: files/ of Howardkhh/ReplicaSSG at 9419097 and Merging/evaluate.py of Howardkhh/FROSS at 645153b. The files stand in
-``ReplicaSSG/`` beside the scenes or anywhere they are looked for below the data root. Objects whose label means none of
-the listed classes of Visual Genome (``unknown``) are none of the graph.
+Source: files/ of Howardkhh/ReplicaSSG at 9419097 and Merging/evaluate.py of Howardkhh/FROSS at 645153b. The files stand
+in ``ReplicaSSG/`` below the data root or beside the scenes. Objects whose label means none of the listed classes of
+Visual Genome (``unknown``) are none of the graph.
 """
 
 from __future__ import annotations
@@ -87,7 +87,10 @@ def _objects(path: Path, scan: str, class_of_label: Mapping[str, int], where: st
     """Instance id -> class id of the objects of a scan that have one."""
     answer: dict[int, int] = {}
     for row in _rows(path, scan, "objects", where):
-        number, label = row.get("id") if isinstance(row, dict) else None, row.get("label") if isinstance(row, dict) else 0
+        number, label = (
+            row.get("id") if isinstance(row, dict) else None,
+            row.get("label") if isinstance(row, dict) else 0,
+        )
         word = str(number)
         if not isinstance(label, str) or not (word.isascii() and word.isdigit() and len(word) < 10):
             raise DataError(f"{where}: {scan}: an object is {shown(row)}; expected an id and a label")

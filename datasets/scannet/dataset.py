@@ -245,8 +245,8 @@ class ScanNet:
         path = self.tree.find_file(scene, meta_name(scene))
         if path is None:
             raise DataError(
-                f"{self._where(scene)}: {meta_name(scene)} is missing; what lies along the walls needs it, copy it into "
-                f"{self.tree.folders[scene][0]}"
+                f"{self._where(scene)}: {meta_name(scene)} is missing; what lies along the walls needs it, copy it "
+                f"into {self.tree.folders[scene][0]}"
             )
         return read_axis_alignment(path, self._where(scene))
 

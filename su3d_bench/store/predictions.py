@@ -43,7 +43,13 @@ FIELDS = {
 }
 
 
-ROWS = {"points": (3,), "boxes": (2, 3), "centroids": (3,), "views": (2,), "edges": (2,)}  # the shape of each row, where it is fixed
+ROWS = {
+    "points": (3,),
+    "boxes": (2, 3),
+    "centroids": (3,),
+    "views": (2,),
+    "edges": (2,),
+}  # the shape of each row, where it is fixed
 # Kinds of what is kept of predictions over the points of files that have no coordinates; ``predictions.own_runs`` reads
 # them.
 OVER_VERTICES = ("VertexMasks", "VertexLabels")

@@ -36,7 +36,10 @@ SCANREFER = json.dumps(
          "description": "a white cabinet in the corner", "token": []},
     ]
 )  # fmt: skip
-NR3D = 'stimulus_id,scan_id,instance_type,target_id,utterance\ns,scene0525_00,plant,9,"The plant, far right"\n'
+NR3D = (
+    "stimulus_id,scan_id,instance_type,target_id,utterance,tokens,mentions_target_class\n"
+    "scene0525_00-plant-2-9-4,scene0525_00,plant,9,\"The plant, far right\",\"['the', 'plant', 'right']\",True\n"
+)
 SQA_QUESTION = {"scene_id": "scene0380_00", "situation": "I sit.", "question": "What is in front?", "question_id": 7}
 SQA3D = json.dumps({"questions": [SQA_QUESTION]})
 SQA3D_ANSWERS = json.dumps({"annotations": [{"question_id": 7, "answers": [{"answer": "table"}]}]})

@@ -1,8 +1,8 @@
 """Scene graphs of FROSS: one pickle of all scenes, objects with points and classes, edges with shares of predicates.
 
 Source: Merging/main.py of Howardkhh/FROSS at 645153b. Classes and predicates are numbers without names; what they are
-called is told by how many there are: ReplicaSSG's list of Visual Genome, 150 and 50. Of equal scores the last counts, as
-in its Merging/evaluate.py.
+called is told by how many there are: ReplicaSSG's list of Visual Genome, 150 and 50. Of equal scores the last counts,
+as in its Merging/evaluate.py.
 """
 
 from __future__ import annotations

@@ -105,7 +105,9 @@ def grouped_by_truth(queries: Iterable[TextQuery], truth: GroundTruth) -> tuple[
     goes by.
     """
     ids, first = np.unique(truth.instance, return_index=True)
-    class_of = {key: class_id for key, class_id in zip(ids.tolist(), truth.semantic[first].tolist(), strict=True) if key}
+    class_of = {
+        key: class_id for key, class_id in zip(ids.tolist(), truth.semantic[first].tolist(), strict=True) if key
+    }
     classes = list(class_of.values())
     answer = []
     for query in queries:

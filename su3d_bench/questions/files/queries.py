@@ -99,9 +99,7 @@ def query_truth(
     owner[owner <= 0] = -1
     named = queries if class_of is None else scanrefer_groups(queries, class_of)
     source = f"queries of a file, objects from {truth.source}"
-    return QueryTruth(
-        truth.points, owner, grouped_by_truth(named, truth), VARIANT, source, alignment=alignment
-    )
+    return QueryTruth(truth.points, owner, grouped_by_truth(named, truth), VARIANT, source, alignment=alignment)
 
 
 def _toml_rows(text: str, where: str) -> Iterator[QueryRow]:

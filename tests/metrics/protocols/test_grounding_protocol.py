@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from places import CASES
+from scannet_scan import SCAN
+from scannet_scans import write_scan
 from scored_room import ENCODER, instances, nothing, room, truth_as_prediction
 
 from su3d_bench.core.errors import ConfigError, DataError
+from su3d_bench.datasets.scannet.dataset import ScanNet
+from su3d_bench.datasets.scannet.labels import TABLE_NAME
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
 from su3d_bench.metrics.protocols.loading import load_protocol, read_protocol
-from su3d_bench.metrics.questions.grounding import box_iou
+from su3d_bench.metrics.questions.grounding import aligned, box_around, box_iou, choose, in_group
 from su3d_bench.metrics.scoring import combine, pack_scores, plain_json, score_scene, unpack_scores
 from su3d_bench.questions.files.datasets import read_foreign_queries
+from su3d_bench.questions.files.groups import scanrefer_groups
 from su3d_bench.questions.files.queries import query_truth
 
 RULES = load_protocol("grounding")
@@ -82,7 +88,7 @@ def test_sentences_are_read_from_the_files_of_scanrefer_and_nr3d(tmp_path: Path)
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ('box_axes = "truth"', "box_axes: kind 'grounding' takes 'world'"),
+        ('box_axes = "truth"', "box_axes: kind 'grounding' takes 'world' or 'aligned'"),
         ("[transfer]\ncap_m = 0.05", "transfer.cap_m: kind 'grounding' transfers nothing"),
         ("min_region_size = 5", "min_region_size, thresholds and confidence belong to kind"),
     ],
@@ -93,3 +99,139 @@ def test_wrong_rules_are_told_in_one_line(line: str, message: str, tmp_path: Pat
     with pytest.raises(ConfigError) as caught:
         read_protocol(path)
     assert message in str(caught.value)
+
+
+# ---- groups
+
+
+GROUPED = json.loads((CASES / "grounding02_groups.json").read_text())["problems"]
+CHOSEN = json.loads((CASES / "grounding03_nr3d.json").read_text())["problems"]
+GIVEN = load_protocol("grounding-given")
+
+
+def share(rows: np.ndarray, right: np.ndarray) -> float | None:
+    return float((rows & right).sum() / rows.sum()) if rows.any() else None
+
+
+@pytest.mark.parametrize("index", range(len(GROUPED)))
+def test_what_scanrefer_calls_unique_and_its_shares_hold_to_the_last_bit(index: int, tmp_path: Path) -> None:
+    problem = GROUPED[index]
+    path = tmp_path / "ScanRefer_filtered_val.json"
+    path.write_text(json.dumps(problem["rows"]))
+    of_scene = {
+        scene: iter(scanrefer_groups(queries, problem["classes"].get))
+        for scene, queries in read_foreign_queries(path).items()
+    }
+    groups = [next(of_scene[row["scene_id"]]).groups for row in problem["rows"]]
+    assert [int(one == ("multiple",)) for one in groups] == problem["multiple"]
+    iou = np.array([box_iou(np.array(row["predicted"]), np.array(row["true"])) for row in problem["rows"]])
+    for name, answer in zip(RULES.value_names, problem["answer"], strict=True):
+        group, _, measure = name.rpartition(" ")
+        found = share(in_group(groups, group or "all", "scanrefer"), iou >= float(measure.removeprefix("Acc@")))
+        assert (found or 0.0) == answer  # it says 0 of nothing
+
+
+@pytest.mark.parametrize("index", range(len(CHOSEN)))
+def test_the_sentences_that_nr3d_counts_and_its_shares_hold_to_the_last_bit(index: int, tmp_path: Path) -> None:
+    problem, path = CHOSEN[index], tmp_path / "nr3d.csv"
+    names = ("scan_id", "target_id", "utterance", "stimulus_id", "tokens", "mentions_target_class")
+    with path.open("w", newline="") as file:
+        table = csv.DictWriter(file, names, extrasaction="ignore")
+        table.writeheader()
+        table.writerows(problem["rows"])
+    groups = [query.groups for query in read_foreign_queries(path)["scene0011_00"]]
+    right = np.array([choose(np.array(row["logits"])) == row["target"] for row in problem["rows"]])
+    counted = in_group(groups, "accuracy", "referit3d")
+    assert counted.sum() == problem["counted"]
+    found = [share(in_group(groups, name, "referit3d"), right) for name in GIVEN.value_names]
+    assert [None if one is None else one * 100 for one in found] == (problem["answer"] or [None] * 5)
+
+
+def test_there_are_thirty_problems_of_each_grounding() -> None:
+    assert [len(one) for one in (PROBLEMS, GROUPED, CHOSEN)] == [30, 30, 30]
+
+
+def test_queries_of_other_files_are_grouped_by_the_classes_of_the_truth() -> None:
+    found = values(PERFECT, asking(*ASKED))
+    # the lamp is the only one; of two chairs the first is found
+    assert (found["unique Acc@0.5"], found["multiple Acc@0.5"], found["n_multiple Acc@0.5"]) == (1.0, 0.5, 2)
+    groups = [query.groups for query in asking(*ASKED).queries]
+    assert groups[2] == ("multiple", "easy", "view-dependent") and groups[1][0] == "unique"
+    own = asking(TextQuery("the chair", (2,), ("hard", "view-independent")))
+    assert own.queries[0].groups == ("hard", "view-independent", "multiple")
+
+
+def test_a_choice_is_among_the_boxes_that_are_given() -> None:
+    def chosen(prediction: object, *queries: TextQuery) -> dict[str, float | None]:
+        score = score_scene(GIVEN, asking(*queries), prediction, ENCODER)  # type: ignore[arg-type]
+        found: dict[str, float | None] = plain_json(combine(GIVEN, {"a": score}).metrics)
+        return found
+
+    found = chosen(PERFECT, *ASKED)
+    assert (found["accuracy"], found["easy"], found["hard"], found["view-dependent"]) == (2 / 3, 2 / 3, None, 0.0)
+    assert PERFECT.features is not None
+    lamp = np.flatnonzero(TRUTH.instance == 5)
+    part = lamp[TRUTH.points[lamp, 2] < 0.1]  # too little of it for any IoU: the place is what counts
+    assert chosen(instances(TRUTH.points, [part], None, PERFECT.features[4:5]), ASKED[1])["accuracy"] == 1.0
+    beyond = np.vstack([TRUTH.points, TRUTH.points[lamp] + 50]).astype(np.float32)
+    far = np.arange(len(TRUTH.points), len(beyond))
+    both = instances(beyond, [far, lamp], None, PERFECT.features[[4, 4]])
+    assert chosen(both, ASKED[1])["accuracy"] == 1.0  # the first stands in the place of nothing that is given
+    left_out = TextQuery("a lamp", (5,), ("left out",))
+    assert chosen(PERFECT, left_out)["accuracy"] is None
+    assert chosen(nothing(TRUTH), ASKED[1])["accuracy"] == 0.0
+
+
+def test_boxes_stand_along_the_walls_that_the_dataset_knows() -> None:
+    rows = TRUTH.instance == 4
+    turn = np.eye(4)
+    turn[:2, :2] = [[np.cos(0.6), -np.sin(0.6)], [np.sin(0.6), np.cos(0.6)]]
+    turn[:3, 3] = 3, -2, 0.5
+    low = np.flatnonzero(rows & (TRUTH.points[:, 0] < 3.45))  # about half of the table
+    assert PERFECT.features is not None
+    part = instances(TRUTH.points, [low], None, PERFECT.features[3:4])
+    shares = []
+    for alignment in (None, turn):
+        truth = query_truth(TRUTH, (TextQuery("table", (4,)),), "here", alignment=alignment)
+        moved = [box_around(aligned(TRUTH.points[kept], alignment)) for kept in (low, np.flatnonzero(rows))]
+        assert values(part, truth)["Acc@0.5"] == float(box_iou(*moved) >= 0.5)
+        shares.append(box_iou(*moved))
+    assert shares[0] < 0.5 < shares[1] + 0.5 and shares[0] != shares[1]
+    back = aligned(aligned(TRUTH.points, turn), np.linalg.inv(turn))
+    assert np.abs(back - TRUTH.points).max() < 1e-5
+
+
+def test_scannet_gives_its_axis_alignment_and_the_classes_of_names(tmp_path: Path) -> None:
+    folder = write_scan(tmp_path)
+    dataset = ScanNet(tmp_path)
+    assert dataset.axis_alignment(SCAN)[:3, 3].tolist() == [5, 6, 7]
+    turned = ScanNet(tmp_path, ScanNet.Options(axis_align=True))
+    assert np.array_equal(turned.axis_alignment(SCAN), np.eye(4))
+    assert dataset.nyu40_class("chair") == "chair" and dataset.nyu40_class("nonsense") is None
+    (folder / f"{SCAN}.txt").unlink()
+    with pytest.raises(DataError, match=r"\.txt is missing; what lies along the walls needs it"):
+        ScanNet(tmp_path).axis_alignment(SCAN)
+    (tmp_path / TABLE_NAME).unlink()
+    with pytest.raises(DataError, match="is missing, by which names of objects have classes"):
+        ScanNet(tmp_path).nyu40_class("chair")
+
+
+@pytest.mark.parametrize(
+    ("stimulus", "tokens", "message"),
+    [
+        ("scene0011_00-chair-two-4-5", "['a']", "'stimulus_id' must be scan-class-n-target-others"),
+        ("scene0011_00-chair-3-4-5", "['a']", "says 3 objects and names 1 others"),
+        ("scene0011_00-chair-2-4-5", "['a'", "'tokens' must be a list of words"),
+        ("scene0011_00-chair-2-4-5", "__import__('os').getcwd()", "'tokens' must be a list of words"),
+        ("scene0011_00-chair-2-4-5", "(" * 9000, "'tokens' must be a list of words"),
+    ],
+)
+def test_each_fault_of_a_row_of_nr3d_is_one_line(tmp_path: Path, stimulus: str, tokens: str, message: str) -> None:
+    path = tmp_path / "nr3d.csv"
+    with path.open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(("scan_id", "target_id", "utterance", "stimulus_id", "tokens"))
+        table.writerow(("scene0011_00", "4", "the chair", stimulus, tokens))
+    with pytest.raises(DataError, match=message) as caught:
+        read_foreign_queries(path)
+    assert "nr3d.csv: row 2" in str(caught.value) and "\n" not in str(caught.value)
