@@ -43,7 +43,7 @@ NAMES = {
     "scannet-retrieval", "rooms-annotation", "replica-annotation", "scannet-annotation", "rooms-reasoning",
     "replica-reasoning", "scannet-reasoning", "replica-boxes", "rooms-presence", "replica-presence",
     "scannet-presence", "rooms-panoptic", "replica-panoptic", "scannet-panoptic", "scannet-panoptic-oneformer3d",
-    "scannet200-panoptic", "grounding",
+    "scannet200-panoptic", "grounding", "scannet-ovo20", "scannet-ovo200",
     "class-agnostic-maskclustering-scannetpp",
     "class-agnostic-open3dis-scannetpp", "rooms-top-k", "scannetpp-instance", "scannetpp-open-vocabulary",
     "scannetpp-semantic", "openscan-affordance", "openscan-property", "openscan-type", "openscan-manner",
