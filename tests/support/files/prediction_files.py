@@ -268,6 +268,7 @@ def written_in(tmp_path: Path, format: str) -> Path:
     writers: dict[str, Callable[[], object]] = {
         "scannet-text": lambda: write_scannet_text(folder, TOY),
         "scannet-semantic-text": lambda: (folder / f"{name}.txt").write_text("3\n-1\n39\n"),
+        "scannetpp-semantic": lambda: (folder / f"{name}.txt").write_text("3,1,2\n0,99,5\n39,2,2\n"),
         "openmask3d": lambda: write_openmask3d(folder, TOY, FEATURES[:, :4]),
         "maskclustering": lambda: write_maskclustering(folder, TOY),
         "open3dis": lambda: write_open3dis(folder, TOY),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fuzz_targets_counts
 import fuzz_targets_datasets
 import fuzz_targets_perception
 import fuzz_targets_predictions
@@ -10,6 +11,7 @@ import fuzz_targets_runs
 TARGETS = {
     one.name: one
     for one in (
+        *fuzz_targets_counts.TARGETS,
         *fuzz_targets_datasets.TARGETS,
         *fuzz_targets_perception.TARGETS,
         *fuzz_targets_predictions.TARGETS,

@@ -343,6 +343,7 @@ def _questions(name: str, text_of: Callable[[Any], str]) -> Make:
     def make(folder: Path) -> Read:
         import test_question_files
 
+        from su3d_bench.questions.files.datasets import is_foreign, read_foreign_queries
         from su3d_bench.questions.files.files import read_questions
 
         path = folder / name
@@ -350,7 +351,10 @@ def _questions(name: str, text_of: Callable[[Any], str]) -> Make:
         if name.startswith("v1"):
             answers = folder / "v1_balanced_sqa_annotations_val_scannetv2.json"
             answers.write_text(test_question_files.SQA3D_ANSWERS)
-        return lambda: read_questions(path)
+        asked: list[Read] = [partial(read_questions, path)]
+        if name in ("q.json", "q.csv") and is_foreign(path):  # sentences to ground
+            asked.append(partial(read_foreign_queries, path))
+        return lambda: every_one_of(iter(asked))
 
     return make
 

@@ -54,12 +54,20 @@ def _cloud_format(name: str) -> Make:
 
 
 def _scannetpp(folder: Path) -> Read:
+    """ScanNet++'s masks of runs, which both readers of lists take."""
     from prediction_files import TOY, write_scannetpp_json
 
-    from su3d_bench.predictions.formats import READERS
+    from su3d_bench.predictions.formats import READERS, recognise
 
     write_scannetpp_json(folder, TOY)
-    return lambda: READERS["scannet-text"].read(folder, "scene0011_00")
+    by_lines, by_ids = READERS["scannetpp"], READERS["scannet-text"]
+
+    def asked() -> Iterator[Read]:
+        yield lambda: recognise(folder, None)
+        for reader in (by_lines, by_ids):
+            yield partial(reader.read, folder, "scene0011_00")
+
+    return lambda: every_one_of(asked())
 
 
 def _pickle(kind: str) -> Make:
@@ -210,7 +218,7 @@ def _conceptgraphs_inside(folder: Path) -> Read:
 
 OVER_VERTICES = (
     *("scannet-text", "scannet-semantic-text", "openmask3d", "maskclustering", "open3dis", "openyolo3d", "openins3d"),
-    *("sam3d", "su3d-bench"),
+    *("sam3d", "sam3d-colours", "su3d-bench", "scannetpp-semantic", "opensun3d-challenge"),
 )
 WITH_OWN_POINTS = ("conceptgraphs", "hovsg", "openlex3d", "ovo", "rayfronts", "esam", "onlineanyseg", "fross")
 TARGETS = (

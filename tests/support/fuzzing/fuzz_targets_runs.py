@@ -261,11 +261,14 @@ def _method_config(folder: Path) -> Read:
 def _protocol(folder: Path) -> Read:
     from su3d_bench.metrics.protocols.files import rules_file
     from su3d_bench.metrics.protocols.loading import read_protocol
+    from su3d_bench.metrics.protocols.originals import original_of
 
     for name in ("rooms-semantic", "openlex3d-topn", "rooms-instance"):
         (folder / f"{name}.toml").write_bytes(rules_file(name).read_bytes())
     files = sorted(folder.glob("*.toml"))
-    return lambda: every_one_of(iter([partial(read_protocol, file) for file in files]))
+    return lambda: every_one_of(
+        partial(read, str(file)) for file in files for read in (lambda name: read_protocol(Path(name)), original_of)
+    )
 
 
 def _published(folder: Path) -> Read:

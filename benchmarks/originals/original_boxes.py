@@ -1,0 +1,89 @@
+"""VoteNet's evaluation of boxes over made problems."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+from multiprocessing.pool import ThreadPool
+from pathlib import Path
+
+import numpy as np
+from made_boxes import SLOTS, Problem, drawn, names_of, scored
+from original_code import STOPS, Ask, Original, load, silence
+from places import CASES
+
+from su3d_bench.core.types import Float64Array
+from su3d_bench.metrics.instance.box_counts import PLACES, THRESHOLDS
+from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.scoring import combine
+
+
+def votenet(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
+    """AP and recall at each threshold of each slot that is true and their means, by VoteNet's calculator.
+
+    Its processes are threads. Of a class that is called and nowhere true it divides by zero, and the mean over the
+    classes is then no number.
+    """
+    absent = ["trimesh", "plyfile", "matplotlib"]
+    module = load(checkout / "models/ap_helper.py", [checkout / "utils", checkout / "models"], absent=absent)
+    sys.modules["eval_det"].Pool = ThreadPool  # type: ignore[attr-defined]
+
+    def ask(problem: Problem) -> Float64Array:
+        answer = []
+        for threshold in THRESHOLDS:
+            judge = module.APCalculator(threshold)
+            found, true = [], []
+            for scene in problem:
+                for boxes, kind in ((found, "found"), (true, "true")):
+                    boxes.append([])
+                    for one in scene[kind]:
+                        length, height, width = one["sizes"]
+                        corners = module.get_3d_box((length, width, height), scene["heading"], one["middle"])
+                        boxes[-1].append((one["slot"], corners, *([one["score"]] if kind == "found" else [])))
+            judge.step(found, true)
+            values = judge.compute_metrics()
+            is_true = {one["slot"] for scene in problem for one in scene["true"]}
+            for kind, mean in (("Average Precision", "mAP"), ("Recall", "AR")):
+                of_slots = [values[f"{k} {kind}"] if k in is_true else np.nan for k in SLOTS]
+                answer.append([*of_slots, values[mean] if _is_whole(problem) else np.nan])
+        return np.array(answer, float).ravel()
+
+    return ask
+
+
+def _is_whole(problem: Problem) -> bool:
+    """Whether every class that is called is true somewhere."""
+    called, true = ({one["slot"] for scene in problem for one in scene[kind]} for kind in ("found", "true"))
+    return called <= true
+
+
+def ours(rules: ProtocolRules, problem: Problem) -> Float64Array:
+    """The same of this program."""
+    found = combine(rules, {str(s): scored(rules, scene) for s, scene in enumerate(problem)}, with_intervals=False)
+    names = [name for _, name in names_of(rules).values()]
+    answer = []
+    for place in PLACES:
+        for kind in ("AP", "recall"):
+            mean = found.metrics[kind + place] if _is_whole(problem) else np.nan
+            answer.append([*(found.per_class[name][kind + place] for name in names), mean])
+    return np.array(answer, float).ravel()
+
+
+def keep(rules: ProtocolRules, ask: Ask, seed: int, n: int) -> None:
+    """The original's answers to the first ``n`` drawn problems that it answers."""
+    kept, index = list[dict[str, object]](), 0
+    while len(kept) < n:
+        problem = drawn(seed, index)
+        index += 1
+        with contextlib.suppress(*STOPS), silence():
+            answer = [None if value != value else float(value) for value in ask(problem)]
+            kept.append({"scenes": problem, "answer": answer})
+    lines = ",\n".join(json.dumps(one, separators=(",", ":")) for one in kept)
+    source = (
+        "models/ap_helper.py and utils/eval_det.py of facebookresearch/votenet, at the commit in the protocol's file"
+    )
+    (CASES / "boxes01_votenet.json").write_text(f'{{"source": "{source}",\n"problems": [\n{lines}]}}\n')
+
+
+ORIGINALS = (Original(("replica-boxes",), "models/ap_helper.py", votenet, drawn, ours, keep),)

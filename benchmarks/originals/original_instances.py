@@ -1,0 +1,232 @@
+"""The original evaluators of instances, each over the same made problems."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import types
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from made_instances import LEFT_OUT, SCORED, VOID, Problem, Scene, classes_of, columns_of, drawn, members, scored
+from original_code import STOPS, Ask, Original, load, of_python_3, recorded, silence, without_gpu
+from places import CASES
+
+from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
+from su3d_bench.metrics.instance import average_precision
+from su3d_bench.metrics.protocols.model import ProtocolRules
+
+SCANNET = "BenchmarkScripts/3d_evaluation/evaluate_semantic_instance.py"
+SHORT = (",", ":")
+MOST = 200  # of a list of classes
+Answer = Float64Array  # AP, AP50, AP25, then the AP of each slot at each threshold
+
+
+@dataclass(frozen=True)
+class Given:
+    """A scene as evaluators want it: ``values`` (N,) class * 1000 + number, and K masks with classes and scores."""
+
+    values: Int64Array
+    masks: BoolArray
+    called: Int64Array
+    scores: Float64Array
+
+    @classmethod
+    def of(cls, scene: Scene, ids: dict[int, int]) -> Given:
+        slots, numbers = columns_of(scene)
+        values = np.array([ids[one] for one in slots.tolist()]) * 1000 + numbers
+        values[slots == VOID] = 0
+        masks = np.zeros((len(scene["masks"]), len(values)), bool)
+        for row, mask in zip(masks, scene["masks"], strict=True):
+            row[members(mask)] = True
+        called = np.array([ids[mask["slot"]] for mask in scene["masks"]], np.int64)
+        return cls(values, masks, called, np.array([mask["score"] for mask in scene["masks"]], float))
+
+    def write_truth(self, file: Path) -> None:
+        np.savetxt(file, self.values, fmt="%d")
+
+
+def emptied(folder: Path) -> Path:
+    """The folder, new."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return folder
+
+
+def answered(table: Any, averages: dict[str, Any], rows: list[int]) -> Answer:
+    """An answer from an original's table (1, C, T) and its averages."""
+    means = [averages[name] for name in ("all_ap", "all_ap_50%", "all_ap_25%")]
+    return np.array([*means, *np.asarray(table)[0][rows].ravel()], float)
+
+
+def scannet(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
+    """ScanNet's script, over text files."""
+    code = of_python_3(checkout / "BenchmarkScripts", folder / "code")
+    script = code / "3d_evaluation/evaluate_semantic_instance.py"
+    words = ["--pred_path", str(folder / "pred"), "--gt_path", str(folder / "gt")]
+    module = load(script, [code], words, ["plyfile", "imageio"])
+    ids, _ = classes_of(rules)
+    rows = [module.VALID_CLASS_IDS.tolist().index(ids[one]) for one in SCORED]
+    tables, averages = recorded(module, "evaluate_matches"), recorded(module, "compute_averages")
+
+    def ask(problem: Problem) -> Answer:
+        pred, truth = emptied(folder / "pred"), emptied(folder / "gt")
+        (pred / "masks").mkdir()
+        for s, scene in enumerate(problem):
+            one, lines = Given.of(scene, ids), []
+            one.write_truth(truth / f"{s}.txt")
+            for k, mask in enumerate(one.masks):
+                np.savetxt(pred / f"masks/{s}_{k:03d}.txt", mask, fmt="%d")
+                lines.append(f"masks/{s}_{k:03d}.txt {one.called[k]} {float(one.scores[k])!r}\n")
+            (pred / f"{s}.txt").write_text("".join(lines))
+        files = [[str(where / f"{s}.txt") for s in range(len(problem))] for where in (pred, truth)]
+        module.evaluate(*files, str(pred), str(folder / "answer.txt"))
+        return answered(tables[-1], averages[-1], rows)
+
+    return ask
+
+
+def _of_arrays(module: types.ModuleType, folder: Path, ids: dict[int, int], classes: list[int], **named: Any) -> Ask:
+    """Scripts that are handed masks, scores and classes as arrays."""
+    tables, averages = recorded(module, "evaluate_matches"), recorded(module, "compute_averages")
+
+    def ask(problem: Problem) -> Answer:
+        truth, predicted = emptied(folder / "gt"), {}
+        for s, scene in enumerate(problem):
+            one = Given.of(scene, ids)
+            one.write_truth(truth / f"{s}.txt")
+            predicted[str(s)] = {
+                "pred_masks": one.masks.T, "pred_scores": np.ones(len(one.scores)), "pred_classes": one.called
+            }  # fmt: skip
+        module.evaluate(predicted, str(truth), output_file=str(folder / "answer.txt"), **named)
+        table = tables[-1][0] if isinstance(tables[-1], tuple) else tables[-1]
+        return answered(table, averages[-1], classes)
+
+    return ask
+
+
+def openmask3d(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
+    """OpenMask3D's script for ScanNet200, every confidence 1."""
+    home = checkout / "openmask3d/evaluation"
+    module = load(home / "eval_semantic_instance.py", [home], absent=["plyfile", "imageio"])
+    ids, _ = classes_of(rules)
+    places = [entry.id for entry in rules.scored]
+    return _of_arrays(module, folder, ids, [places.index(ids[one]) for one in SCORED], dataset="scannet200")
+
+
+def maskclustering(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
+    """MaskClustering's script, with --no_class where the protocol has no classes; every confidence 1."""
+    without_gpu()
+    is_plain = rules.class_agnostic is None
+    of_data = "scannetpp" if "scannetpp" in rules.datasets else "scannet"
+    words = ["--pred_path", str(folder / "pred"), "--gt_path", str(folder / "gt"), "--dataset", of_data]
+    words += ["--output_file", str(folder / "class_agnostic.txt"), *([] if is_plain else ["--no_class"])]
+    module = load(checkout / "evaluation/evaluate.py", [checkout], words)
+    # of ScanNet++ it goes over 1,554 classes in squares, seconds a problem; a class that no problem has is undefined
+    module.CLASS_LABELS, module.VALID_CLASS_IDS = module.CLASS_LABELS[:MOST], module.VALID_CLASS_IDS[:MOST]
+    known = list(module.VALID_CLASS_IDS)
+    ids = {VOID: 0, LEFT_OUT: 2, **{k: known[7 * k + 3] for k in SCORED}}  # 2 is none of its classes
+    rows = [known.index(ids[one]) for one in SCORED] if is_plain else [0]
+    tables, averages = recorded(module, "evaluate_matches"), recorded(module, "compute_averages")
+
+    def ask(problem: Problem) -> Answer:
+        pred, truth = emptied(folder / "pred"), emptied(folder / "gt")
+        for s, scene in enumerate(problem):
+            one = Given.of(scene, ids)
+            one.write_truth(truth / f"{s}.txt")
+            scores, arrays = np.ones(len(one.scores)), {"pred_masks": one.masks.T, "pred_classes": one.called}
+            np.savez(pred / f"{s}.npz", pred_score=scores, **arrays)
+        files = [
+            [str(pred / f"{s}.npz") for s in range(len(problem))],
+            [f"{truth}/{s}.txt" for s in range(len(problem))],
+        ]
+        module.evaluate(*files, str(pred), str(folder / "answer.txt"))
+        return answered(tables[-1], averages[-1], rows)
+
+    return ask
+
+
+def open3dis(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
+    """Open3DIS' evaluator: its 198 classes of ScanNet200, or its 84 of ScanNet++; every confidence 1."""
+    home = checkout / "open3dis"
+    module = load(home / "evaluation/scannetv2_inst_eval.py", [checkout], absent=["plyfile"])
+    ids, names = classes_of(rules)
+    if is_scannetpp := "scannetpp" in rules.datasets:
+        lists = load(home / "dataset/scannetpp.py", [])
+        labels, every = lists.INSTANCE_BENCHMARK84_SCANNET_PP, lists.SEMANTIC_INSTANCE_BENCHMARK84_SCANNET_PP
+        numbers = {one: every.index(names[one]) for one in (LEFT_OUT, *SCORED)}
+    else:
+        labels = load(home / "dataset/scannet200.py", []).INSTANCE_CAT_SCANNET_200
+        numbers = {LEFT_OUT: 0, **{one: labels.index(names[one]) + 2 for one in SCORED}}  # 0 and 1: wall and floor
+    first = 16 if is_scannetpp else 2  # classes before those of instances
+    is_plain = rules.class_agnostic is None
+    kind = "scannetpp_benchmark" if is_scannetpp else "scannet200"
+    judge = module.ScanNetEval(class_labels=labels, use_label=is_plain, dataset_name=kind)
+    tables = recorded(judge, "evaluate_matches")
+    rows = [numbers[one] - first for one in SCORED] if is_plain else [0]
+
+    def ask(problem: Problem) -> Answer:
+        semantic, instance, predicted = [], [], []
+        for s, scene in enumerate(problem):
+            slots, number = columns_of(scene)
+            semantic.append(np.array([numbers.get(one, -100) for one in slots.tolist()], np.int32))
+            instance.append(np.where(slots == VOID, -100, number - 1).astype(np.int32))
+            one = Given.of(scene, ids)
+            predicted.append(
+                [
+                    {"scan_id": str(s), "label_id": numbers[mask["slot"]] - first + 1, "conf": 1.0, "pred_mask": row}
+                    for mask, row in zip(scene["masks"], one.masks, strict=True)
+                ]
+            )
+        averages = judge.evaluate(predicted, semantic, instance, str(folder))
+        return answered(tables[-1][0], averages, rows)
+
+    return ask
+
+
+def ours(rules: ProtocolRules, problem: Problem) -> Answer:
+    """What this program answers."""
+    counts: list[Any] = [scored(rules, scene).counts for scene in problem]
+    curve = average_precision.combine(counts, rules.thresholds)
+    rows = [0]
+    if rules.class_agnostic is None:
+        ids, places = classes_of(rules)[0], [entry.id for entry in rules.scored]
+        rows = [places.index(ids[one]) for one in SCORED]
+    return np.array([curve.ap, curve.ap50, curve.ap25, *curve.table[rows].ravel()], float)
+
+
+def keep(rules: ProtocolRules, ask: Ask, seed: int, n: int) -> None:
+    """The original's answers to the first ``n`` problems of the file of cases that it answers."""
+    file = CASES / "originals_instance.json"
+    content = json.loads(file.read_text())
+    kept: dict[str, list[float | None]] = {}
+    for number, problem in content["problems"].items():
+        with contextlib.suppress(*STOPS), silence():
+            kept[number] = [None if value != value else float(value) for value in ask(problem)[:3]]
+        if len(kept) == n:
+            break
+    content["answers"] = dict(sorted({**content["answers"], rules.name: kept}.items()))
+    parts = [f'{{"origin": {json.dumps(content["origin"])}']
+    for name in ("problems", "answers"):
+        lines = [f'"{key}": {json.dumps(value, separators=SHORT)}' for key, value in content[name].items()]
+        parts.append(f'"{name}": {{\n' + ",\n".join(lines) + "}")
+    file.write_text(",\n".join(parts) + "}\n")
+
+
+HERE = {"drawn": drawn, "ours": ours, "keep": keep}
+ORIGINALS = (
+    Original(("scannet-instance",), SCANNET, scannet, **HERE),
+    Original(("scannet200-instance",), "openmask3d/evaluation/eval_semantic_instance.py", openmask3d, **HERE),
+    Original(
+        ("class-agnostic-maskclustering", "scannetpp-open-vocabulary"), "evaluation/evaluate.py", maskclustering, **HERE
+    ),
+    Original(
+        ("class-agnostic-open3dis", "class-agnostic-open3dis-scannetpp", "scannetpp-open-vocabulary"),
+        "open3dis/evaluation/scannetv2_inst_eval.py",
+        open3dis,
+        **HERE,
+    ),
+)

@@ -1,0 +1,95 @@
+"""Made problems of boxes, which VoteNet's evaluation and this program both answer.
+
+A problem is a list of scenes. In a scene all boxes are turned about y by one ``heading`` in radians: ``true`` boxes
+with a class, a middle and sizes in metres, and those ``found`` with a confidence too, no two in a problem alike.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import Float64Array, GroundTruth, LabelSet, ObjectBoxes, OrientedBox
+from su3d_bench.metrics.metric import SceneScore
+from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.scoring import score_scene
+
+Scene = dict[str, Any]
+Problem = list[Scene]
+SLOTS = range(4)
+OFF = 0.0002  # sides of true boxes lie on half millimetres
+CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
+
+
+def drawn(seed: int, index: int) -> Problem:
+    """Problem ``index``: boxes near the true ones, beside them, twice, of other classes, none, of a missing one.
+
+    No side of a found box lies on one of a true box: there the clipping of the original goes wrong, and a box has an
+    IoU of 3.6 with itself.
+    """
+    rng = np.random.default_rng([seed, index])
+    n_found = iter(rng.permutation(100) / 100)
+    return [_drawn_scene(rng, n_found) for _ in range(rng.integers(1, 4))]
+
+
+def _drawn_scene(rng: np.random.Generator, confidences: Any) -> Scene:
+    true = [
+        {
+            "slot": int(rng.choice(SLOTS)),
+            "middle": _short(rng.uniform(0, 3, 3)),
+            "sizes": _short(rng.uniform(0.3, 2, 3)),
+        }
+        for _ in range(rng.integers(1, 6))
+    ]
+    found: list[dict[str, Any]] = []
+    for _ in range(rng.choice([0, 1, 3, 5, 8])):
+        of = true[int(rng.integers(len(true)))]
+        away, by = rng.choice([0.02, 0.05, 0.2, 0.6], 2)
+        one = {
+            "slot": of["slot"] if rng.random() < 0.8 else int(rng.choice(SLOTS)),
+            "middle": [round(one + OFF, 4) for one in _short(of["middle"] + away * rng.normal(size=3))],
+            "sizes": _short(of["sizes"] * np.exp(by * rng.normal(size=3))),
+        }
+        if found and rng.random() < 0.15:
+            one = {**found[-1]}  # the same box again, under another confidence
+        found.append({**one, "score": float(next(confidences))})
+    return {"heading": float(rng.choice([0.0, round(rng.uniform(0, 3), 3)])), "true": true, "found": found}
+
+
+def _short(metres: Float64Array) -> list[float]:
+    return [float(one) for one in metres.round(3)]
+
+
+def turn(heading: float) -> Float64Array:
+    """The rotation about y."""
+    c, s = np.cos(heading), np.sin(heading)
+    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+
+
+def names_of(rules: ProtocolRules) -> dict[int, tuple[int, str]]:
+    """The id and name of each slot's class."""
+    return {k: (entry.id, entry.name) for k in SLOTS for entry in [rules.scored[5 * k + 2]]}
+
+
+def scored(rules: ProtocolRules, scene: Scene) -> SceneScore:
+    """The score of a scene; an instance is the corners of its box."""
+    classes, rotation = names_of(rules), turn(scene["heading"])
+    labels = LabelSet(rules.label_space, *(tuple(column) for column in zip(*classes.values(), strict=True)))
+    true = {k + 1: one for k, one in enumerate(scene["true"])}
+    boxes = {k: OrientedBox(np.array(one["middle"]), np.array(one["sizes"]), rotation) for k, one in true.items()}
+    of_instance = {k: classes[one["slot"]][0] for k, one in true.items()}
+    none = np.zeros(0, np.int32)
+    truth = GroundTruth(
+        np.zeros((0, 3), np.float32), none, none, labels, rules.ground_truth, "made",
+        boxes=ObjectBoxes(boxes, of_instance, labels),
+    )  # fmt: skip
+    found = scene["found"]
+    corners = [(CORNERS * one["sizes"]) @ rotation.T + one["middle"] for one in found]
+    points = np.concatenate([np.zeros((0, 3)), *corners]).astype(np.float32)
+    masks = [np.arange(8 * k, 8 * k + 8) for k in range(len(found))]
+    called = [classes[one["slot"]][1] for one in found]
+    confidences = np.array([one["score"] for one in found], float)
+    return score_scene(rules, truth, Instances.of(points, masks, confidences, labels=called), None)

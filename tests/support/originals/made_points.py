@@ -1,0 +1,90 @@
+"""Made problems of one class a point, which original evaluators and this program both answer.
+
+A problem is a list of scenes. A scene has the ``truth`` of every point and what it is ``called``: 0 to 7 are scored
+classes, 8 is none that is scored, -1 void or nothing. ``places_mm`` are where the true points are, ``own_mm`` those of
+the prediction and ``seen_mm`` those that are scored, where these are others.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import GroundTruth, LabelSet
+from su3d_bench.metrics.metric import SceneScore
+from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.scoring import score_scene
+
+Scene = dict[str, Any]
+Problem = list[Scene]
+VOID, OTHER = -1, 8
+
+
+def drawn(seed: int, index: int) -> Problem:
+    """Problem ``index`` on the points themselves: missing classes, void, nothing called, wrong classes."""
+    rng = np.random.default_rng([seed, index])
+    scenes = []
+    for _ in range(rng.integers(1, 4)):
+        there = rng.choice(8, rng.integers(1, 5), replace=False)
+        truth = rng.choice([*there, *there, OTHER, VOID], n := int(rng.integers(1, 18)))
+        guess = rng.choice([*range(OTHER + 1), VOID], n)
+        scenes.append({"truth": truth.tolist(), "called": np.where(rng.random(n) < 0.5, truth, guess).tolist()})
+    return scenes
+
+
+def drawn_in_space(seed: int, index: int) -> Problem:
+    """Problem ``index`` with three clouds: points of the truth, of the prediction and to be scored; some coincide.
+
+    The prediction has classes that are scored and true in the scene alone.
+    """
+    rng = np.random.default_rng([seed, index, 3])
+    scenes = []
+    for _ in range(rng.integers(1, 4)):
+        there = rng.choice(8, rng.integers(1, 5), replace=False)
+        clouds = [rng.integers(0, 1000, (rng.integers(4, 14), 3)) for _ in range(3)]
+        for cloud in clouds:
+            cloud[-1] = clouds[0][rng.integers(len(clouds[0]))]
+        truth = [*there, *rng.choice([*there, OTHER], len(clouds[0]))][: len(clouds[0])]
+        scored = sorted({int(one) for one in truth} - {OTHER})
+        scenes.append(
+            {
+                "truth": [int(one) for one in truth],
+                "called": rng.choice(scored, len(clouds[1])).tolist(),
+                **{key: cloud.tolist() for key, cloud in zip(("places_mm", "own_mm", "seen_mm"), clouds, strict=True)},
+            }
+        )
+    return scenes
+
+
+def classes_of(rules: ProtocolRules) -> dict[int, tuple[int, str]]:
+    """The id and name that a protocol has for each slot but void."""
+    left = [(entry.id, entry.name) for entry in rules.classes if rules.is_ignored(entry.name)]
+    scored = {k: rules.scored[(3 * k + 1) % len(rules.scored)] for k in range(OTHER)}
+    return {
+        **{k: (entry.id, entry.name) for k, entry in scored.items()},
+        OTHER: left[0] if left else (9999, "none such"),
+    }
+
+
+def scored(rules: ProtocolRules, scene: Scene) -> SceneScore:
+    """The score of a scene under a protocol of points."""
+    of_slot = classes_of(rules)
+    kinds, called = np.array(scene["truth"]), np.array(scene["called"])
+    places = np.array(scene.get("places_mm", [[1000 * k, 0, 0] for k in range(len(kinds))])) / 1000
+    own = np.array(scene["own_mm"]) / 1000 if "own_mm" in scene else places
+    ids, names = zip(*of_slot.values(), strict=True)
+    truth = GroundTruth(
+        places.astype(np.float32),
+        np.array([of_slot[k][0] if k >= 0 else 0 for k in kinds.tolist()], np.int32),
+        np.zeros(len(kinds), np.int32),
+        LabelSet(rules.label_space, ids, names),
+        rules.ground_truth,
+        "made",
+        evaluation_points=(np.array(scene["seen_mm"]) / 1000).astype(np.float32) if "seen_mm" in scene else None,
+    )
+    there = sorted(set(called.tolist()) - {VOID})
+    masks = [np.flatnonzero(called == k) for k in there]
+    found = Instances.of(own.astype(np.float32), masks, [1.0] * len(masks), labels=[of_slot[k][1] for k in there])
+    return score_scene(rules, truth, found, None)
