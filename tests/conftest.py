@@ -21,6 +21,7 @@ sys.path += sorted({str(file.parent) for file in TESTS.rglob("*.py")} - {*sys.pa
 from chat_server import ChatServer, chat_server  # noqa: E402 (it is found by the line above)
 from chromium import Chromium  # noqa: E402
 from gated_runs import gate_reference, gate_reference_file, gated, gated_copy  # noqa: E402, F401
+from painted_sheets import painted_folder, painted_source  # noqa: E402, F401
 
 # Tables are folded for who says how wide he sees them, as pytest-xdist does to its workers.
 os.environ.pop("COLUMNS", None)

@@ -51,7 +51,10 @@ def list_methods() -> pandas.DataFrame:
 
 def list_protocols() -> pandas.DataFrame:
     """The protocols of the program: ``name``, ``summary``, ``kind``, ``datasets`` and ``headline`` metrics by commas,
-    ``label_space`` (string), ``version`` (int64). ``load_protocol`` has every rule of one.
+    ``label_space``, ``original`` (string), ``version`` (int64). ``load_protocol`` has every rule of one.
+
+    ``original`` is the repository and commit whose evaluation it repeats, or "none: " and why; ``su3d-bench protocols
+    show`` says what was compared, and by how much both differ.
 
     >>> import su3d_bench as su3d
     >>> protocols = su3d.list_protocols().set_index("name")
@@ -60,13 +63,13 @@ def list_protocols() -> pandas.DataFrame:
     """
     from su3d_bench.metrics.protocols.files import protocol_names
     from su3d_bench.metrics.protocols.loading import load_protocol
+    from su3d_bench.metrics.protocols.originals import original_of
 
-    columns = dict.fromkeys(("name", "summary", "kind", "datasets", "headline", "label_space"), TEXT)
-    rows = [
-        (one.name, one.summary, one.kind, ", ".join(one.datasets), ", ".join(one.headline), one.label_space or "")
-        for one in map(load_protocol, protocol_names())
-    ]
-    versions = [load_protocol(name).version for name in protocol_names()]
-    return listed_frame(
-        {**columns, "version": WHOLE}, [(*row, version) for row, version in zip(rows, versions, strict=True)]
-    )
+    columns = dict.fromkeys(("name", "summary", "kind", "datasets", "headline", "label_space", "original"), TEXT)
+    rows = []
+    for name in protocol_names():
+        one, stated = load_protocol(name), original_of(name)
+        lists = (", ".join(one.datasets), ", ".join(one.headline))
+        original = stated.facts["original"] if stated is not None else ""
+        rows.append((one.name, one.summary, one.kind, *lists, one.label_space or "", original, one.version))
+    return listed_frame({**columns, "version": WHOLE}, rows)

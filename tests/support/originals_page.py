@@ -25,6 +25,8 @@ every rule.
 A made problem is one or several small scenes with made predictions (ties, empty predictions, void, missing classes,
 small and doubled masks) that the original, run unedited but for versions of Python and its libraries, and this program
 both answered. The difference is the largest of any number of any problem, as a fraction: 0 is equal to the last bit.
+From the source tree `python benchmarks against_originals PROTOCOL CHECKOUT` asks again, of a checkout of the original
+that you made yourself; without words it lists the protocols for which it can.
 
 ## Protocols with an original
 """

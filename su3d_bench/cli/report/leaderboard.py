@@ -17,7 +17,7 @@ def add_parser(actions: Any) -> None:
     parser = add_verb(
         actions,
         NAME,
-        "Rank the runs below a folder, once protocol, data and counts are known to agree.",
+        "Rank the runs below a folder that agree in protocol, data, counts and labels (one label or the top k).",
         (
             "su3d-bench report leaderboard runs",
             "su3d-bench report leaderboard submissions --protocols rooms-instance --format html --out board.html",

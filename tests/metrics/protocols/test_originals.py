@@ -18,6 +18,7 @@ import pytest
 from pages_of_code import made_pages
 from places import CASES, ROOT
 
+from su3d_bench.api.lists import list_protocols
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.metrics.protocols import originals as module
@@ -50,11 +51,12 @@ def test_the_facts_of_every_protocol_are_listed_shown_and_on_the_site(capsys: py
     listed = " ".join(capsys.readouterr().out.split())
     assert main(["protocols", "--json"]) == 0
     rows = {row["name"]: row["original"] for row in json.loads(capsys.readouterr().out)}
-    pages = made_pages()
+    pages, in_python = made_pages(), list_protocols().set_index("name")["original"]
     for name in protocol_names():
         stated = original_of(name)
         assert stated is not None
         one = stated.original
+        assert in_python[name] == stated.facts["original"]
         assert " ".join(stated.in_short.split()) in listed
         assert (rows[name]["code"], rows[name]["of"]) == (one.code, stated.base)
         assert main(["protocols", "show", name]) == 0

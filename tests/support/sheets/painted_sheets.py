@@ -1,0 +1,48 @@
+"""Fixtures of tests of sheets: a finished run of a painted scene, and what sheets are made of from it."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from painted import colour_perception
+
+if TYPE_CHECKING:
+    from su3d_bench.sheets.making.run_source import RunSource
+
+
+@pytest.fixture(scope="session")
+def painted_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a finished run in ``run`` and a file of queries."""
+    from made_sheets import RUN
+
+    from su3d_bench.cli.main import main
+    from su3d_bench.runs import scene as scene_run
+
+    path = tmp_path_factory.mktemp("sheets")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", colour_perception)
+        patch.setenv("SU3D_DATA", str(path / "data"))
+        patch.chdir(path)
+        assert main(RUN) == 0
+    rows = [("painted/a", "chair", "1", "instance"), ("painted/a", "a green sofa", "2", "property")]
+    rows += [("painted/a", "=HYPERLINK(0)", "", "relative"), ("painted/a", "<script>x</script>", "3", "affordance")]
+    text = io.StringIO(newline="")
+    csv.writer(text).writerows([("scene", "text", "objects", "kind"), *rows])
+    (path / "queries.csv").write_text(text.getvalue())
+    return path
+
+
+@pytest.fixture
+def painted_source(painted_folder: Path, monkeypatch: pytest.MonkeyPatch) -> RunSource:
+    """The run, judged by rules of the built-in rooms, whose label space the painted scenes have."""
+    from su3d_bench.metrics.protocols.loading import load_protocol
+    from su3d_bench.runs.finished import read_run
+    from su3d_bench.sheets.making.run_source import RunSource
+
+    monkeypatch.setenv("SU3D_DATA", str(painted_folder / "data"))
+    monkeypatch.setattr(RunSource, "rules", lambda self, scene, kind: load_protocol(f"rooms-{kind}"))
+    return RunSource(read_run(painted_folder / "run"))
