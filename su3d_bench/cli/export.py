@@ -243,7 +243,7 @@ def _write_answer(
     content: Content, source: Source, arguments: argparse.Namespace, name: str, folder: Path
 ) -> tuple[str, ...]:
     """The masks of a scene that answer what its dataset is searched for: as they are, or asked of a map."""
-    from su3d_bench.core.interfaces import AsksText
+    from su3d_bench.core.interfaces import AsksText, HasSurface
     from su3d_bench.metrics.protocols.loading import load_protocol
     from su3d_bench.predictions import opensun3d
     from su3d_bench.predictions.base import VertexMasks
@@ -255,7 +255,7 @@ def _write_answer(
             f"which dataset it is of is not known; name it, such as --scenes arkitscenes/{source.scene}"
         )
     dataset, scene = _scene_of(source, is_quiet=arguments.quiet)
-    if not isinstance(dataset, AsksText):
+    if not isinstance(dataset, AsksText) or not isinstance(dataset, HasSurface):
         raise PredictionError("its dataset asks for nothing in its scenes; --to opensun3d takes scenes of arkitscenes")
     rules = load_protocol(QUERY_RULES)
     encoder = _encoder(content, source, rules, arguments.text_features)
