@@ -101,7 +101,7 @@ OF_OPEN_VOCABULARY = (
     ("openlex3d-queries", "voxel_m = 0.0", "voxel_m = 0.02", "needs one, and no evaluation_voxel_m"),
     ("openlex3d-queries", '"each-mask"', '"object-points"', "kind 'queries' takes 'each-mask' or 'map-points'"),
     ("openlex3d-queries", '"similarity-min-max"', '"ones"', "kind 'queries' takes similarity or similarity-min-max"),
-    ("query-ap", "min_region_size = 1", "", "kind 'queries' needs metric 'query-ap', min_region_size"),
+    ("query-ap", "min_region_size = 1", "", "kind 'queries' needs metric 'query-ap' or 'opensun3d', min_region_size"),
 )
 
 
