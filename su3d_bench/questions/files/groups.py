@@ -76,7 +76,7 @@ def nr3d_groups(stimulus: str, tokens: str | None, mentions: str | None, at: str
     """
     parts = stimulus.split("-", 4)
     others = parts[4].split("-") if len(parts) == 5 else []
-    numbers = [word for word in (*parts[2:4], *others) if word]
+    numbers = [*parts[2:4], *(word for word in others if word)]
     if len(parts) < 4 or not all(word.isascii() and word.isdigit() and len(word) < 10 for word in numbers):
         raise DataError(f"{at}: 'stimulus_id' must be scan-class-n-target-others; found {printable(stimulus, 60)}")
     n = int(parts[2])
