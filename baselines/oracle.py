@@ -62,6 +62,7 @@ class Oracle:
             captions=tuple(scene_caption(label) for label in labels),
             ids=list(masks),
         )
+        found = replace(found, places=truth.places)
         return found if truth.graph is None else _with_graph(found, truth.graph)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from su3d_bench.datasets.arkitscenes.writing import ArkitScenesLayout
+from su3d_bench.datasets.hm3dsem.writing import HovSgWalkLayout
 from su3d_bench.datasets.replica.writing import ReplicaLayout
 from su3d_bench.datasets.scannet.writing.exports import CppExportLayout, PythonExportLayout
 from su3d_bench.datasets.scannet.writing.layout import SensLayout
@@ -19,6 +20,7 @@ _ALL: tuple[Layout, ...] = (
     CppExportLayout(),
     ScannetppLayout(),
     ArkitScenesLayout(),
+    HovSgWalkLayout(),
     TumLayout(),
 )
 LAYOUTS: Mapping[str, Layout] = {layout.name: layout for layout in _ALL}

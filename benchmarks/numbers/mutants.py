@@ -52,6 +52,7 @@ _GATE = tuple(f"analysis/gate/test_gate{name}" for name in ("_tolerances", "_ref
 # Of each module, or of all in a folder, the tests that must notice: the quick ones first. Names without a folder stand
 # in tests/metrics or below.
 GUARDS: dict[str, tuple[str, ...]] = {
+    "metrics/graphs/": ("test_hovsg_graphs",),
     "metrics/instance/": (*_CURVES, *_SCORES),
     "metrics/semantic/": ("test_metrics_semantic", "test_metrics_undefined", "test_metrics_hovsg", *_SCORES),
     "metrics/semantic/panoptic_quality.py": ("test_panoptic_protocol",),

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.given import features_given, points_given, scores_given, sets_given, views_given
+from su3d_bench.core.places import Places
 from su3d_bench.core.types import (
     BoolArray,
     Float32Array,
@@ -107,6 +108,7 @@ class Instances(Masks):
     are the names and prediction scores that perception gave in those views. Where the method makes a scene graph,
     ``edges`` (E, 2) int32 are rows of subject and object and ``edge_scores`` (E, P) float64 how well each of
     ``predicates`` fits.
+    ``places``: floors and rooms, which files may have; they are not kept with a run.
 
     >>> import numpy as np, su3d_bench as su3d
     >>> points = np.array([[0, 0, 0], [1, 0, 0], [5, 5, 1]], np.float32)
@@ -132,6 +134,7 @@ class Instances(Masks):
     edges: Int32Array | None = None
     edge_scores: Float64Array | None = None
     predicates: tuple[str, ...] | None = None
+    places: Places | None = None
 
     def __post_init__(self) -> None:
         arrays = ("points", "indptr", "indices", "scores", "boxes", "centroids", "view_indptr", "views", "ids")

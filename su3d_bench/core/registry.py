@@ -26,6 +26,7 @@ DATASETS = {
     "scannet": "su3d_bench.datasets.scannet.dataset:ScanNet",
     "scannetpp": "su3d_bench.datasets.scannetpp.dataset:ScanNetPP",
     "arkitscenes": "su3d_bench.datasets.arkitscenes.dataset:ArkitScenes",
+    "hm3dsem": "su3d_bench.datasets.hm3dsem.dataset:Hm3dSem",
     "tum": "su3d_bench.datasets.tum.dataset:Tum",
     "rgbd": "su3d_bench.datasets.rgbd.dataset:Rgbd",
 }

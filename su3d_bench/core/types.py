@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, Su3dError
+from su3d_bench.core.places import Places
 
 BoolArray = NDArray[np.bool_]
 UInt8Array = NDArray[np.uint8]
@@ -178,7 +179,7 @@ class GroundTruth:
     ``every_semantic`` (N, K) int32 where points may have several classes: all of them in the order of the annotation,
     then 0; ``semantic`` and ``instance`` are of the one object that stands for the point. ``semantic`` -1 marks points
     that evaluations leave out, in the truth and in predictions; only truths whose protocols ask for it have such.
-    ``graph`` where people annotated how objects lie to one another.
+    ``graph`` where people annotated how objects lie to one another, ``places`` where floors and rooms are known.
 
     >>> import numpy as np, su3d_bench as su3d
     >>> labels = su3d.LabelSet("mine", (3,), ("chair",))
@@ -198,6 +199,7 @@ class GroundTruth:
     boxes: ObjectBoxes | None = None
     every_semantic: Int32Array | None = None
     graph: TrueGraph | None = None
+    places: Places | None = None
 
     def __post_init__(self) -> None:
         check_arrays(self, f"ground truth '{self.variant}'", ("points", "semantic", "instance"), DataError)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.maps import Instances, Partition, Prediction
+from su3d_bench.metrics.graphs.places import NEEDS_PLACES
 from su3d_bench.metrics.labels import LEAST_SEVERAL, under_several_labels
 from su3d_bench.metrics.matching.labelling import has_every_label
 from su3d_bench.metrics.open_vocabulary.score import NEEDS_FEATURES
@@ -63,7 +64,7 @@ class ContentFacts:
     bring their own. ``n``: how many masks or rows of features. ``n_dimensions`` of the features, None without any.
     ``has_names``: some instance has a name or label. ``class_ids``: classes given as ids of the label space.
     ``n_points``: over how many points of the truth it lies, None where it has its own or says no number. ``n_several``:
-    how many of its masks stand there under another label too.
+    how many of its masks stand there under another label too. ``has_places``: it has floors and rooms above them.
     """
 
     form: Form
@@ -75,6 +76,7 @@ class ContentFacts:
     class_ids: NDArray[np.integer[Any]] | None = None
     n_points: int | None = None
     n_several: int = 0
+    has_places: bool = False
 
     @property
     def are_several(self) -> bool:
@@ -94,6 +96,7 @@ class ContentFacts:
                 has_labels=prediction.labels is not None,
                 has_every_label=has_every_label(prediction),
                 has_names=any(labels_n(prediction)),
+                has_places=prediction.places is not None,
             )
         return cls(
             "partition" if isinstance(prediction, Partition) else "dense", len(prediction.features), n_dimensions
@@ -170,6 +173,8 @@ def why_not_map(rules: ProtocolRules, content: ContentFacts) -> str | None:
         return "needs instances, and the method gives one feature a point"
     if (reason := _why_not_labels(rules, content)) is not None:
         return reason
+    if rules.needs_places and content.n and not content.has_places:
+        return NEEDS_PLACES
     if rules.goes_by_names:
         if content.form != "instances":
             return "needs instances with names, and the method gives a partition"
@@ -230,7 +235,7 @@ def why_not_length(content: ContentFacts, n_points: int) -> str | None:
 
 def n_feature_dimensions(rules: ProtocolRules, content: ContentFacts) -> int | None:
     """The dimensions of the features that must be named; None where labels are there or the protocol needs none."""
-    if rules.class_agnostic is not None or rules.goes_by_names or not content.n:
+    if rules.class_agnostic is not None or rules.goes_by_names or rules.needs_places or not content.n:
         return None
     has_names = content.has_labels if content.form == "vertex-masks" else content.has_every_label
     return None if has_names and not (content.has_own_points and rules.compares_texts) else content.n_dimensions

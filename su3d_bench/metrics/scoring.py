@@ -21,6 +21,8 @@ from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.core.system.damage import DAMAGE
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.fitness import why_not_scorable
+from su3d_bench.metrics.graphs.objects import ObjectMetric
+from su3d_bench.metrics.graphs.places import PlaceMetric
 from su3d_bench.metrics.instance.box_score import BoxMetric
 from su3d_bench.metrics.instance.score import InstanceMetric
 from su3d_bench.metrics.matching import nearest as transfer
@@ -66,6 +68,8 @@ METRICS: dict[str, type[Metric[Any]]] = {
     "grounding": GroundingMetric,
     "object-chains": ChainMetric,
     "relations": RelationMetric,
+    "objects": ObjectMetric,
+    "places": PlaceMetric,
     "retrieval": RetrievalMetric,
     "presence": PresenceMetric,
     "annotation": AnnotationMetric,

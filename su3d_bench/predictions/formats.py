@@ -9,6 +9,7 @@ from su3d_bench.predictions.base import Reader
 from su3d_bench.predictions.conceptgraphs import ConceptGraphs
 from su3d_bench.predictions.gradslam import Gradslam
 from su3d_bench.predictions.hovsg import HovSg
+from su3d_bench.predictions.hovsg_graph import HovSgGraph
 from su3d_bench.predictions.mask_archives import MaskClustering, Open3dis, OpenIns3d, OpenYolo3d
 from su3d_bench.predictions.online.esam import Esam
 from su3d_bench.predictions.online.fross import Fross
@@ -39,6 +40,7 @@ _ALL: tuple[Reader, ...] = (
     ConceptGraphs(),
     Gradslam(),
     HovSg(),
+    HovSgGraph(),
     OpenLex3d(),
     Ovo(),
     RayFronts(),

@@ -35,6 +35,8 @@ SCANNET = ("scannet", "scannet-python", "scannet-cpp")
 SCANNETPP_SCENE = "0000000400"
 ADDRESS = dict.fromkeys(SCANNET, SCAN) | {"replica": ROOM, "tum": ROOM, "scannetpp": SCANNETPP_SCENE}
 ADDRESS["arkitscenes"] = SCANNETPP_SCENE[2:]
+ADDRESS["hm3dsem"] = "00000-bathroom000"
+SAME_CAMERA = [name for name in LAYOUTS if name != "hm3dsem"]  # whose images are wider
 UNITS_PER_METRE = dict.fromkeys((*SCANNET, "scannetpp", "arkitscenes"), 1000.0) | {"replica": 6553.5, "tum": 5000.0}
 FRAMES_PER_SECOND = dict.fromkeys(LAYOUTS, 30) | {"scannetpp": 60}  # the iPhone's video
 
@@ -75,7 +77,7 @@ def test_the_adapter_finds_the_room_and_knows_that_it_is_rendered(made: dict[str
     assert (info.n_frames, info.image_domain) == (N_FRAMES, "rendered-rooms")
 
 
-@pytest.mark.parametrize("name", LAYOUTS)
+@pytest.mark.parametrize("name", SAME_CAMERA)
 def test_depth_is_that_of_the_room_rounded_to_the_unit_of_the_layout(
     made: dict[str, Path], rooms: Rooms, name: str
 ) -> None:
@@ -108,7 +110,7 @@ def test_the_layouts_of_scannet_hold_the_same_jpeg_bytes_and_depth_values(made: 
 
 
 def test_colour_is_equal_where_the_codec_loses_nothing_and_near_elsewhere(made: dict[str, Path], rooms: Rooms) -> None:
-    for name in LAYOUTS:
+    for name in SAME_CAMERA:
         for ours, theirs in zip(rooms.frames(ROOM, 1), frames(made, name), strict=True):
             if name in {"tum", "arkitscenes"}:
                 np.testing.assert_array_equal(ours.rgb, theirs.rgb)
@@ -262,6 +264,25 @@ def test_a_room_of_arkitscenes_has_the_files_of_the_challenge_and_the_objects_of
         np.testing.assert_array_equal(truth.instance == number, ours.instance == object_id)
     assert [(query.text, query.answers) for query in dataset.queries(scene)] == [("cup", (1, 2))] and len(cups) == 2
     assert dataset.groups() == {"opensun3d-development": (scene,)}
+
+
+def test_a_walk_of_hm3dsem_shows_the_room_in_the_middle_of_90_degrees_and_stands_upright(
+    made: dict[str, Path], rooms: Rooms
+) -> None:
+    turn = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    for ours, theirs in zip(rooms.frames(ROOM, 1), frames(made, "hm3dsem"), strict=True):
+        assert theirs.rgb.shape == (60, 100, 3) and theirs.intrinsics[:2].tolist() == [[50.0, 0, 50], [0, 50, 30]]
+        np.testing.assert_array_equal(theirs.rgb[:, 10:90], ours.rgb)
+        expected = np.rint(ours.depth_m.astype(np.float64) * 1000)
+        np.testing.assert_allclose(theirs.depth_m[:, 10:90], expected / 1000, rtol=1e-6)
+        assert not theirs.depth_m[:, :10].any() and not theirs.depth_m[:, 90:].any()
+        np.testing.assert_allclose(theirs.camera_to_world[:3], turn @ ours.camera_to_world[:3], atol=1e-15)
+    truth, scan = reader(made, "hm3dsem").ground_truth(ADDRESS["hm3dsem"], "hovsg-objects"), rooms.scan(ROOM)
+    assert set(np.unique(truth.instance)) == set(range(1, truth.instance.max() + 1))
+    np.testing.assert_allclose(truth.points.max(axis=0), (scan.vertices @ turn.T).max(axis=0), atol=0.02)
+    assert len(truth.points) > 0.9 * len(np.unique(np.floor(scan.vertices / 0.02), axis=0)) - 100
+    names = {truth.labels.name_of(one) for one in np.unique(truth.semantic).tolist()}
+    assert {"wall", "floor", "ceiling", "toilet", "sink"} <= names
 
 
 def test_a_room_of_tum_is_not_scored(made: dict[str, Path]) -> None:

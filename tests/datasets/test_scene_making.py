@@ -25,8 +25,9 @@ ROOM = "living7"
 SCANNET = ("scannet", "scannet-python", "scannet-cpp")
 ADDRESS = dict.fromkeys(SCANNET, "scene9007_00") | {"replica": ROOM, "tum": ROOM, "scannetpp": "0000000007"}
 ADDRESS["arkitscenes"] = "00000007"
+ADDRESS["hm3dsem"] = "00000-living00007"
 TRUTH = {"replica": "mesh-vertices"} | dict.fromkeys(SCANNET, "nyu40-vertices") | {"scannetpp": "scannetpp"}
-TRUTH["arkitscenes"] = "query-vertices"
+TRUTH |= {"arkitscenes": "query-vertices", "hm3dsem": "hovsg-objects"}
 
 
 def reader(name: str, root: Path) -> Any:

@@ -13,7 +13,17 @@ from su3d_bench.cli.shared.answers import answer_either
 from su3d_bench.cli.shared.flags import add_group, add_settings, add_verb
 from su3d_bench.core.errors import EXIT_DONE
 
-LAYOUTS = ("native", "replica", "scannet", "scannet-python", "scannet-cpp", "scannetpp", "arkitscenes", "tum")
+LAYOUTS = (
+    "native",
+    "replica",
+    "scannet",
+    "scannet-python",
+    "scannet-cpp",
+    "scannetpp",
+    "arkitscenes",
+    "hm3dsem",
+    "tum",
+)
 MAX_LISTED = 40
 
 
@@ -117,6 +127,7 @@ def _add_make(actions: Any) -> None:
         ".sens, mesh and annotation; scannet-python, scannet-cpp: the same, frames as ScanNet's readers export them "
         "(C++: about 1 GB a room); scannetpp: the iPhone's frames, mesh and annotation of ScanNet++; "
         "arkitscenes: the OpenSUN3D challenge's scenes of ARKitScenes with queries and truth; "
+        "hm3dsem: walks as HOV-SG generates them, with their truth; "
         "tum: the RGB-D benchmark, without ground truth (default: native)",
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="the data root to make (native: default $SU3D_DATA)")

@@ -9,6 +9,7 @@ from su3d_bench.metrics.protocols.model import CURVE_FIELDS, OWN_FIELDS, Protoco
 
 AP_NAMES = ("AP", "AP50", "AP25")
 GEOMETRIC = ("on", "under", "in", "above", "next to", "near")  # what boxes tell, as numerics.relations has it
+OBJECT_RANKS = (5, 10, 25, 100, 250, 500)  # config/eval_graph.yaml of hovsg/HOV-SG at 71a8069
 CATEGORIES = ("synonyms", "depictions", "vis_sim", "clutter", "missing", "incorrect")
 
 
@@ -187,6 +188,50 @@ class RelationRules(ProtocolRules):
             raise ValueError("transfer.cap_m: kind 'relations' needs one, and no evaluation_voxel_m")
 
 
+class _GraphRules(ProtocolRules):
+    """Parts of a scene graph, matched one to one with the true ones."""
+
+    needs_own_points = True
+
+    def _check_transfer(self) -> None:
+        super()._check_transfer()
+        if self.transfer.cap_m is not None or self.transfer.evaluation_voxel_m > 0:
+            raise ValueError(f"transfer.cap_m: kind '{self.kind}' transfers nothing; no cap_m, no evaluation_voxel_m")
+
+
+class ObjectRules(_GraphRules):
+    """Objects, and where the true category stands among all."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = {
+        "hovsg-objects": (
+            "AUC",
+            *(f"top-{k}" for k in OBJECT_RANKS),
+            *(f"object {name}" for name in ("AP", "accuracy", "precision", "recall")),
+        )
+    }
+    needs = ("classes", "vocabulary")
+
+    @property
+    def n_labels(self) -> int | None:
+        """All that there are: the whole ranking counts."""
+        return None
+
+
+class PlaceRules(_GraphRules):
+    """Floors and rooms."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = {
+        "hovsg-places": (
+            "number of floors",
+            *(f"floor {name}" for name in ("accuracy", "precision", "recall")),
+            "room precision",
+            "room recall",
+            *(f"room {name}" for name in ("AP", "accuracy@0.6", "precision@0.6", "recall@0.4")),
+        )
+    }
+    needs_places = True
+
+
 class _JudgedRules(ProtocolRules):
     """What people are asked otherwise."""
 
@@ -294,6 +339,8 @@ RULES_OF_KIND: dict[str, type[ProtocolRules]] = {
     "grounding": GroundingRules,
     "object-chains": ObjectChainRules,
     "relations": RelationRules,
+    "objects": ObjectRules,
+    "places": PlaceRules,
     "retrieval": RetrievalRules,
     "presence": PresenceQuestionRules,
     "annotation": AnnotationRules,

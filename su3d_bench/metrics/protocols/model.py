@@ -119,8 +119,9 @@ class ProtocolRules(_Strict):
     ``kind``: ``semantic`` (a class a point), ``top-k`` (the likeliest classes of a point, which may have several
     labels), ``instance`` (masks with a class), ``panoptic`` (every point in a segment of a thing or of ``stuff``),
     ``queries`` (masks ranked for each text), ``boxes`` (with a class), ``categories`` (how near a point's label comes
-    to those of its object), ``grounding`` (the box of the first mask of each text), ``relations`` (objects, predicates
-    and triplets of a scene graph), or what people are asked otherwise:
+    to those of its object), ``grounding`` (the box of the first mask of each text), ``object-chains`` (one object by
+    each of its texts), ``relations`` (objects, predicates and triplets of a scene graph), ``objects`` (matched one to
+    one, with the rank of their category), ``places`` (floors and rooms), or what people are asked otherwise:
     ``retrieval`` (the first mask of each text), ``presence`` (is there such a thing at all?), ``annotation`` (names and
     shapes of masks), ``reasoning`` (questions that boxes settle). ``questions`` are those of the ``dataset`` itself or
     ``generated`` from the truth, ``per_kind`` of each kind at most; ``synonyms`` names the table of other names of
@@ -148,7 +149,8 @@ class ProtocolRules(_Strict):
     summary: str
     kind: Literal[
         "semantic", "top-k", "instance", "panoptic", "boxes", "queries", "categories",
-        "grounding", "object-chains", "relations", "retrieval", "presence", "annotation", "reasoning",
+        "grounding", "object-chains", "relations", "objects", "places",
+        "retrieval", "presence", "annotation", "reasoning",
     ]  # fmt: skip
     metric: Literal[
         "conceptgraphs",
@@ -167,6 +169,8 @@ class ProtocolRules(_Strict):
         "beacon3d",
         "referit3d",
         "replicassg",
+        "hovsg-objects",
+        "hovsg-places",
         "retrieval",
         "pope",
         "annotation",
@@ -215,6 +219,7 @@ class ProtocolRules(_Strict):
     goes_by_names: ClassVar[bool] = False  # of instances, without features
     needs_own_points: ClassVar[bool] = False  # objects are found by the points of the map itself
     needs_boxes: ClassVar[bool] = False  # in the truth
+    needs_places: ClassVar[bool] = False  # of floors and rooms, in the truth and in the prediction
     is_judged: ClassVar[bool] = False  # its counts are how many were judged and how many are right
     names_points: ClassVar[bool] = False  # a class for every point
     needs_instances: ClassVar[bool] = False  # in the truth and in the prediction
@@ -254,7 +259,7 @@ class ProtocolRules(_Strict):
         if self.class_agnostic is not None and self.needs_instances:
             if texts or self.vocabulary or self.encoder:
                 raise ValueError("class_agnostic: takes no prompt, vocabulary or encoder")
-        elif self.goes_by_names:
+        elif self.goes_by_names or self.needs_places:
             if texts or self.encoder:
                 raise ValueError(f"prompt: kind '{self.kind}' compares no features; it takes no prompt and no encoder")
         elif (self.prompt is None) == (not self.prompts):

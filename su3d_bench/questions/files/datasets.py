@@ -1,10 +1,11 @@
 """Sentences that people wrote about ScanNet's scenes: files of ScanRefer, Nr3D (Sr3D) and SQA3D as question sets.
 
-ScanRefer: a JSON list of ``scene_id``, ``object_id``, ``description``, and ``object_name`` by which a sentence is unique
-or multiple. Nr3D: a CSV with ``scan_id``, ``target_id``, ``utterance``, and ``stimulus_id``, ``tokens`` and
-``mentions_target_class`` by which one is easy or hard, by the view or not, or left out. SQA3D: a JSON with ``questions``
-of ``scene_id``, ``situation``, ``question``, ``question_id``, whose answers stand in a file of annotations beside it.
-Beacon3D: ``metadata_*.json``, see ``chains/beacon3d_files``. Object ids are ScanNet's own, one less than the truth's here.
+ScanRefer: a JSON list of ``scene_id``, ``object_id``, ``description``, and ``object_name`` by which a sentence is
+unique or multiple. Nr3D: a CSV with ``scan_id``, ``target_id``, ``utterance``, and ``stimulus_id``, ``tokens`` and
+``mentions_target_class`` by which one is easy or hard, by the view or not, or left out. SQA3D: a JSON with
+``questions`` of ``scene_id``, ``situation``, ``question``, ``question_id``, whose answers stand in a file of
+annotations beside it. Beacon3D: ``metadata_*.json``, see ``chains/beacon3d_files``. Object ids are ScanNet's own, one
+less than the truth's here.
 
 Other files of these and of OpenEQA and ScanQA are known, and refused with what to give instead. Sources: the
 files' descriptions in facebookresearch/open-eqa at b5752aa, Beacon3D's data and daveredrum/ScanRefer.

@@ -12,6 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from hm3dsem_walk import write_graph
 from ply_files import write_ply_as
 from prediction_files import TorchFile, torch_text
 
@@ -175,6 +176,8 @@ def write_small(folder: Path, format: str) -> Path:
         write_gradslam(scene / "saved-map/pointclouds", points, RNG.normal(size=(6, 8)).astype(np.float16))
     elif format == "hovsg":
         write_hovsg(scene, {0: points[:4], 1: points[4:]}, RNG.normal(size=(2, 8)).astype(np.float32))
+    elif format == "hovsg-graph":
+        write_graph(scene / "graph")
     elif format == "ovo":
         write_ovo(scene, points, [5, -1, 5, 0, 0, 5], {5: np.ones(8, np.float32), 0: np.ones((1, 8), np.float32)})
     elif format == "rayfronts":

@@ -162,6 +162,15 @@ def _arkitscenes(images: Literal["lowres", "wide"] = "lowres", *, is_3dod: bool 
     return make
 
 
+def _hm3dsem(folder: Path) -> Read:
+    from hm3dsem_walk import SCENE, write_walk
+
+    from su3d_bench.datasets.hm3dsem.dataset import Hm3dSem
+
+    write_walk(folder)
+    return _whole_dataset(lambda: Hm3dSem(folder), SCENE)
+
+
 def _depth_stream(folder: Path) -> Read:
     import zlib
 
@@ -403,6 +412,11 @@ TARGETS = (
     Target("arkitscenes mesh", _arkitscenes(), ("*/*/*.ply",), 0.15),
     Target("opensun3d lists", _arkitscenes(), ("challenge_track_1/benchmark_file_lists/*",), 0.15),
     Target("opensun3d truth", _arkitscenes(), ("challenge_track_1/benchmark_data/*/*",), 0.15),
+    Target("hm3dsem frames", _hm3dsem, ("hm3dsem_walks/*/*/rgb/*", "hm3dsem_walks/*/*/depth/*"), 0.3),
+    Target("hm3dsem poses", _hm3dsem, ("hm3dsem_walks/*/*/pose/*",), 0.3),
+    Target("hm3dsem truth", _hm3dsem, ("hm3dsem_walks/*/*/scene_info.json",), 0.5),
+    Target("hm3dsem clouds", _hm3dsem, ("hm3dsem_walks/*/*/objects/*",), 0.3),
+    Target("hm3dsem annotation", _hm3dsem, ("hm3d/*/*/*.txt",), 0.3),
     Target("rgbd description", _rgbd(camera_axes="opengl", depth_invalid=[3]), ("rgbd/desk/rgbd.toml",)),
     Target("rgbd frames", _rgbd(), ("rgbd/desk/data/colour/*", "rgbd/desk/data/depth/*")),
     Target("rgbd poses", _rgbd(), ("rgbd/desk/data/*.pose.txt",)),

@@ -224,6 +224,7 @@ WITH_OWN_POINTS = ("conceptgraphs", "hovsg", "openlex3d", "ovo", "rayfronts", "e
 TARGETS = (
     *(Target(f"prediction {name}", _format(name), ("**/*",)) for name in OVER_VERTICES),
     *(Target(f"prediction {name}", _cloud_format(name), ("**/*",)) for name in WITH_OWN_POINTS),
+    Target("prediction hovsg-graph", _cloud_format("hovsg-graph"), ("**/*",)),
     Target("prediction gradslam", _cloud_format("gradslam"), ("**/pc_points.h5", "**/pc_embeddings.h5")),
     Target("prediction conceptgraphs inside", _conceptgraphs_inside, ("plain.pkl",)),
     Target("prediction scannet++", _scannetpp, ("**/*",)),

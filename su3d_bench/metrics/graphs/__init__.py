@@ -1,0 +1,1 @@
+"""Objects, rooms and floors of a scene graph, matched one to one."""

@@ -1,0 +1,216 @@
+"""Protocols of kind ``objects``: predicted objects matched one to one with the true ones, and where the true category
+of a match stands among all categories.
+
+Source: ``evaluate_objects`` of hovsg/eval/hm3dsem_evaluator.py, hovsg/HOV-SG at commit 71a8069.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.maps import Instances, Partition
+from su3d_bench.core.types import Float64Array, GroundTruth, Int64Array
+from su3d_bench.metrics.graphs.overlaps import (
+    THRESHOLDS,
+    Cloud,
+    best_pairs,
+    found_at,
+    larger_share,
+    rates,
+    summed,
+    trapezoid,
+)
+from su3d_bench.metrics.instance.score import score_of_masks
+from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching.labelling import (
+    class_index_of_ids,
+    cosines,
+    device_of,
+    encoder_warning,
+    has_every_label,
+    text_features,
+)
+from su3d_bench.metrics.metric import Arrays, Counts, Metric, Pooled, SceneScore
+from su3d_bench.metrics.protocols.kinds import OBJECT_RANKS
+from su3d_bench.metrics.protocols.model import ProtocolRules
+
+RADIUS_M = 0.02  # evaluate_objects: points of two objects nearer than this lie together
+RANK_STEP = 10  # evaluate_objects: the curve has a point at every tenth k from 0
+HALF = int(np.flatnonzero(THRESHOLDS == 0.5)[0])
+FEW_LABELS = "labels name the first categories of an object alone: the true one counts as none where it is not there"
+
+
+@dataclass(frozen=True)
+class MatchedObjects(Counts):
+    """What one scene, or several, adds.
+
+    ``n_objects`` (2,): predicted and true ones. ``n_found`` (T,): pairs whose overlap is above each threshold.
+    ``n_ranked`` (C + 1,): pairs by the rank of the true category, from 1 on; the last, those where it has none.
+    """
+
+    stored_as = "matched-objects"
+    arrays: ClassVar[Arrays] = {
+        "n_objects": ("i", ("sides",)),
+        "n_found": ("i", ("thresholds",)),
+        "n_ranked": ("i", ("ranks",)),
+    }
+
+    n_objects: Int64Array
+    n_found: Int64Array
+    n_ranked: Int64Array
+
+    def contradiction(self) -> str | None:
+        """More pairs than objects, or pairs found at a threshold and not at a lower one."""
+        if len(self.n_objects) != 2:
+            return f"'n_objects' has {len(self.n_objects)} numbers"
+        n_pairs, most = int(self.n_ranked.sum()), int(self.n_objects.min())
+        if n_pairs > most or (np.diff([most, *self.n_found]) > 0).any():
+            return f"'n_found' or 'n_ranked' has more pairs than the {most} that there can be, or more at a threshold"
+        return None
+
+
+class ObjectMetric(Metric[MatchedObjects]):
+    """HOV-SG's objects: every predicted one is matched, and its feature ranks all categories."""
+
+    truth = GroundTruth
+    counts = MatchedObjects
+
+    def per_scene(self, truth: GroundTruth, prediction: Instances | Partition, encoder: Encoder | None) -> SceneScore:
+        masks = transfer.masks_of(prediction)
+        predicted = [Cloud(np.asarray(prediction.points[members], np.float64)) for members in masks.sets()]
+        ids, objects = objects_of(truth)
+        overlap = object_overlaps(predicted, objects, boxes_of(truth, ids, objects))
+        rows, columns = best_pairs(overlap)
+        n_places = len(self.rules.classes)
+        rank = self._ranks(truth, ids, prediction, encoder, rows, columns)
+        counts = MatchedObjects(
+            np.array(overlap.shape, np.int64),
+            found_at(overlap[rows, columns]),
+            np.bincount(np.where(rank > 0, rank, n_places + 1) - 1, minlength=n_places + 1),
+        )
+        warnings = [encoder_warning(self.rules, prediction, encoder)]
+        if has_every_label(prediction) and len(masks):
+            warnings.append(FEW_LABELS)
+        return score_of_masks(self, counts, prediction, truth.points, truth.instance > 0, warnings)
+
+    def _ranks(
+        self,
+        truth: GroundTruth,
+        ids: Int64Array,
+        prediction: Instances | Partition,
+        encoder: Encoder | None,
+        rows: Int64Array,
+        columns: Int64Array,
+    ) -> Int64Array:
+        """The rank (n,) of the true category of each pair, 0 where it has none."""
+        first_point = np.unique(truth.instance, return_index=True)[1][-len(ids) :] if len(ids) else ids
+        category = class_index_of_ids(self.rules, truth.semantic[first_point])[columns]
+        if not len(rows):
+            return np.zeros(0, np.int64)
+        if isinstance(prediction, Instances) and has_every_label(prediction):
+            return _ranks_of_labels(self.rules, prediction, rows, category)
+        if prediction.features is None or encoder is None:
+            raise PredictionError(f"{self.rules.name}: needs features and an encoder, or labels, to rank categories by")
+        names = [entry.name for entry in self.rules.classes]
+        text = text_features(self.rules, names, prediction.features, encoder)
+        features = np.asarray(prediction.features)[rows]
+        rank = ranks_among(cosines(features, text, device_of(encoder)), category)
+        return np.where(np.asarray(features).any(axis=1), rank, 0)
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        return {"thresholds": len(THRESHOLDS), "ranks": len(self.rules.classes) + 1, "sides": 2}
+
+    def pooled(self, counts: Sequence[MatchedObjects]) -> Pooled:
+        values = self.resampled(counts, np.ones((1, len(counts)), np.int64))
+        return Pooled({name: float(value[0]) for name, value in values.items()})
+
+    def resampled(self, counts: Sequence[MatchedObjects], weights: Int64Array) -> Mapping[str, Float64Array]:
+        n_objects, n_found, n_ranked = (
+            summed([getattr(of_scene, name) for of_scene in counts], weights)
+            for name in ("n_objects", "n_found", "n_ranked")
+        )
+        n_predicted, n_true = n_objects[:, 0], n_objects[:, 1]
+        at = rates(n_found, n_predicted, n_true)
+        n_places = len(self.rules.classes)
+        n_pairs = n_ranked.sum(axis=1, keepdims=True)
+        within = np.concatenate([np.zeros((len(weights), 1)), np.cumsum(n_ranked[:, :-1], axis=1)], axis=1)
+        nothing = np.where(n_true > 0, 0.0, np.nan)[:, None]  # the original divides by the number of pairs
+        share = np.where(n_pairs > 0, within / np.maximum(n_pairs, 1), nothing)
+        ks = np.arange(0, n_places, RANK_STEP)
+        area = trapezoid(share[:, ks], np.broadcast_to(ks / n_places, (len(share), len(ks))))
+        columns = [area, *(share[:, min(k, n_places)] for k in OBJECT_RANKS)]
+        columns += [at.area, at.accuracy[:, HALF], at.precision[:, HALF], at.recall[:, HALF]]
+        return dict(zip(self.rules.value_names, columns, strict=True))
+
+
+def objects_of(truth: GroundTruth) -> tuple[Int64Array, list[Cloud]]:
+    """The ids (T,) of a truth's objects, ascending, and the cloud of each."""
+    order = np.argsort(truth.instance, kind="stable")
+    ids, starts = np.unique(truth.instance[order], return_index=True)
+    parts = np.split(order, starts[1:])
+    kept = [(int(key), part) for key, part in zip(ids, parts, strict=True) if key > 0]
+    clouds = [Cloud(np.asarray(truth.points[part], np.float64)) for _, part in kept]
+    return np.array([key for key, _ in kept], np.int64), clouds
+
+
+def boxes_of(truth: GroundTruth, ids: Int64Array, objects: Sequence[Cloud]) -> Float64Array:
+    """The lowest and highest corners (T, 2, 3) of the boxes by which the objects are first met.
+
+    Their given centre and sides along the axes of the world, however the box was turned, as the original takes them.
+    """
+    given = {} if truth.places is None else truth.places.object_boxes
+    corners = np.zeros((len(ids), 2, 3))
+    for row, (key, cloud) in enumerate(zip(ids.tolist(), objects, strict=True)):
+        if key in given:
+            centre, sides = given[key]
+            corners[row] = centre - sides / 2, centre + sides / 2
+        else:
+            corners[row] = cloud.corners
+    return corners
+
+
+def object_overlaps(predicted: Sequence[Cloud], objects: Sequence[Cloud], boxes: Float64Array) -> Float64Array:
+    """The overlap (P, T) of the clouds of each pair whose boxes share a volume; 0 where they do not."""
+    overlap = np.zeros((len(predicted), len(objects)))
+    for row, cloud in enumerate(predicted):
+        if not len(cloud.points):
+            continue
+        sides = np.minimum(cloud.corners[1], boxes[:, 1]) - np.maximum(cloud.corners[0], boxes[:, 0])
+        for column in np.flatnonzero((sides > 0).all(axis=1)).tolist():
+            overlap[row, column] = larger_share(cloud, objects[column], RADIUS_M)
+    return overlap
+
+
+def ranks_among(similarity: Float64Array, category: Int64Array) -> Int64Array:
+    """The rank (n,), from 1, of each row's ``category`` among all classes (n, C), 0 where that is -1.
+
+    Of equals the last in the list comes first, as in an ascending order that is turned round; the original's sort
+    leaves open which does.
+
+    >>> ranks_among(np.array([[0.1, 0.9, 0.3]] * 3), np.array([1, 0, -1])).tolist()
+    [1, 3, 0]
+    """
+    own = similarity[np.arange(len(category)), category][:, None]
+    is_later = np.arange(similarity.shape[1]) > category[:, None]
+    before = (similarity > own) | ((similarity == own) & is_later)
+    rank: Int64Array = 1 + before.sum(axis=1)
+    return np.where(category >= 0, rank, 0)
+
+
+def _ranks_of_labels(rules: ProtocolRules, prediction: Instances, rows: Int64Array, category: Int64Array) -> Int64Array:
+    """The place of the true category among the labels of each instance, 0 where it is none of them."""
+    assert prediction.labels is not None
+    further = prediction.further_labels or ((),) * len(prediction)
+    rank = np.zeros(len(rows), np.int64)
+    for place, (row, index) in enumerate(zip(rows.tolist(), category.tolist(), strict=True)):
+        labels = (prediction.labels[row], *further[row])
+        name = rules.classes[index].name if index >= 0 else None
+        rank[place] = labels.index(name) + 1 if name in labels else 0
+    return np.minimum(rank, len(rules.classes))

@@ -1,0 +1,233 @@
+"""Walks through HM3DSem: frames and truth as HOV-SG's tools write them, and one line for what is damaged."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hm3dsem_walk import CHAIR, POSES, ROOM, SCENE, SHORT, WALL, WIDTH, info, write_graph, write_walk
+
+from su3d_bench.cli.main import main
+from su3d_bench.core.errors import DataError, GroundTruthMissing, PredictionError, ScenesMissing
+from su3d_bench.core.maps import Instances
+from su3d_bench.datasets.hm3dsem.dataset import Hm3dSem
+from su3d_bench.datasets.hm3dsem.truth import label_set
+from su3d_bench.datasets.hm3dsem.writing import category_of, scene_name
+from su3d_bench.datasets.rooms.classes import CLASSES
+from su3d_bench.predictions.formats import READERS, recognise
+
+
+@pytest.fixture
+def walk(tmp_path: Path) -> Path:
+    return write_walk(tmp_path)
+
+
+def test_frames_have_habitats_poses_in_opencvs_axes_millimetres_and_a_camera_of_90_degrees(
+    walk: Path, tmp_path: Path
+) -> None:
+    first, second = Hm3dSem(tmp_path).frames(SCENE, 1)
+    assert first.camera_to_world.tolist() == np.diag([1.0, -1, -1, 1]).tolist()
+    np.testing.assert_array_equal(second.camera_to_world, POSES[1] @ np.diag([1.0, -1, -1, 1]))
+    assert first.depth_m[0, :3].tolist() == pytest.approx([0.0, 0.05, 0.1])
+    assert second.rgb[0, 0].tolist() == [10, 20, 30]
+    assert first.intrinsics.tolist() == [[WIDTH / 2, 0, 4], [0, WIDTH / 2, 3], [0, 0, 1]]
+    assert (first.index, second.index, len(Hm3dSem(tmp_path).frames(SCENE, 2))) == (0, 1, 1)
+
+
+def test_the_truth_holds_objects_in_the_order_of_the_file_with_floors_rooms_and_boxes(
+    walk: Path, tmp_path: Path
+) -> None:
+    truth = Hm3dSem(tmp_path).ground_truth(SCENE, "hovsg-objects")
+    np.testing.assert_allclose(truth.points, np.concatenate([CHAIR, WALL]), rtol=1e-6)
+    assert truth.instance.tolist() == [1] * 6 + [2] * 6
+    assert [truth.labels.name_of(truth.semantic[k]) for k in (0, 6)] == ["chair", "wall"]
+    assert truth.places is not None
+    (floor,), (room,) = truth.places.floors, truth.places.rooms
+    assert (floor.lowest_m, floor.highest_m, room.middle_m, room.category) == (0.0, 2.4, 1.0, "office")
+    np.testing.assert_array_equal(room.points, ROOM)
+    np.testing.assert_allclose(truth.places.object_boxes[1][1], np.ptp(CHAIR, axis=0) + 0.02)
+
+
+def test_a_category_that_the_list_does_not_have_is_no_class(walk: Path, tmp_path: Path) -> None:
+    change(walk, lambda content: content["objects"][0].update(category="chaise of doom"))
+    assert Hm3dSem(tmp_path).ground_truth(SCENE, "hovsg-objects").semantic[:6].tolist() == [0] * 6
+
+
+def test_scenes_groups_and_a_word_on_each(walk: Path, tmp_path: Path) -> None:
+    dataset = Hm3dSem(tmp_path)
+    assert (dataset.scenes(), dataset.status(SCENE)) == ((SCENE,), "2 frames, ground truth")
+    assert {name: len(scenes) for name, scenes in dataset.groups().items()} == {"hovsg": 8, "walks": 10}
+    assert len(dataset.files(SCENE)) == 2 * 3 + 1 + 2 + 1 and len(dataset.digest(SCENE)) == 64
+    assert dataset.up(SCENE).axis == "y" and list(dataset.problems(SCENE)) == []
+    with pytest.raises(DataError, match=rf"^hm3dsem: no scene 'x'; .*{SCENE}"):
+        dataset.info("x", 1)
+    with pytest.raises(ScenesMissing, match="datasets make rooms --layout hm3dsem"):
+        Hm3dSem(tmp_path / "nowhere").scenes()
+
+
+def test_a_walk_without_truth_has_frames_and_says_so(walk: Path, tmp_path: Path) -> None:
+    before = Hm3dSem(tmp_path).digest(SCENE)
+    (walk / "scene_info.json").unlink()
+    dataset = Hm3dSem(tmp_path)
+    assert dataset.status(SCENE) == "2 frames, no ground truth (scene_info.json is missing)"
+    assert list(dataset.problems(SCENE)) == [] and dataset.digest(SCENE) != before
+    for ask in (lambda: dataset.ground_truth(SCENE, "hovsg-objects"), lambda: dataset.instance_mesh(SCENE)):
+        with pytest.raises(GroundTruthMissing):
+            ask()
+
+
+def change(walk: Path, edit: Callable[[Any], object]) -> None:
+    content: Any = info()
+    edit(content)
+    (walk / "scene_info.json").write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (lambda c: c.pop("levels"), "has no list 'levels'"),
+        (lambda c: c["objects"].append(c["objects"][0]), "object 3 stands there twice"),
+        (lambda c: c["objects"].clear(), "has no object"),
+        (lambda c: c["objects"].insert(0, 5), "objects[0] is 5"),
+        (lambda c: c["objects"][1].update(id=-1), "objects[1]: 'id' is -1"),
+        (lambda c: c["objects"][1].update(category=7), "'category' is 7"),
+        (lambda c: c["objects"][1].update(obb_dims=[1, -1, 1]), "are no centre and sides of a box"),
+        (lambda c: c["objects"][1].update(obb_center=[1, "x", 1]), "'obb_center' is no list of metres"),
+        (lambda c: c["regions"][0].update(floor_id=9), "'floor_id' names no level"),
+        (lambda c: c["regions"][0].update(bev_region_points=[[0, 1]]), "has the shape (1, 2)"),
+        (lambda c: c["regions"][0].update(min_height=True), "'min_height' is True; expected metres"),
+        (lambda c: c["regions"][0].update(category=[1]), "'category' is [1]"),
+        (lambda c: c["levels"][0].update(upper=1e99), "'upper' is 1e+99"),
+    ],
+)
+def test_a_damaged_scene_info_is_one_line_that_says_where(
+    walk: Path, tmp_path: Path, edit: Callable[[Any], object], words: str
+) -> None:
+    change(walk, edit)
+    (line,) = Hm3dSem(tmp_path).problems(SCENE)
+    assert line.startswith(f"hm3dsem/{SCENE}: scene_info.json") and words in line and "\n" not in line
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        (f"pose/{SHORT}_000001.txt", None, r"pose/..._000001.txt is missing"),
+        (f"pose/{SHORT}_000001.txt", "1 2 3", "has 3 values"),
+        (f"pose/{SHORT}_000001.txt", " ".join(["2"] * 16), "is no rigid pose"),
+        (f"pose/{SHORT}_000001.txt", " ".join(["nan"] * 16), "is no rigid pose"),
+        (f"rgb/{SHORT}_000001.png", None, r"rgb/..._000001.png is missing"),
+        ("depth/notes.txt", "x", "belongs to no frame"),
+        ("objects/7.ply", None, "objects/7.ply"),
+        ("objects/7.ply", "ply", "objects/7.ply"),
+    ],
+)
+def test_a_damaged_file_of_a_walk_is_one_line(
+    walk: Path, tmp_path: Path, name: str, content: str | None, words: str
+) -> None:
+    (walk / name).unlink() if content is None else (walk / name).write_text(content)
+    (line,) = Hm3dSem(tmp_path).problems(SCENE)
+    assert line.startswith(f"hm3dsem/{SCENE}: ") and words in line and "\n" not in line
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("ids\n", "does not begin with 'HM3D Semantic Annotations'"),
+        ("HM3D Semantic Annotations\n3,0A0B0C,chair\n", ":2: is '3,0A0B0C,chair'"),
+        ('HM3D Semantic Annotations\n3,0A0B0C,"chair",5\n3,0A0B0C,"wall",5\n', ":3: object 3 stands there twice"),
+        ('HM3D Semantic Annotations\n3,0A0B0C,"sofa, old",5\n', "object 3 is not that of the scene's .semantic.txt"),
+    ],
+)
+def test_truth_that_is_not_of_the_scenes_annotation_is_one_line(
+    walk: Path, tmp_path: Path, text: str, words: str
+) -> None:
+    (tmp_path / "hm3d/val" / SCENE / f"{SHORT}.semantic.txt").write_text(text)
+    (line,) = Hm3dSem(tmp_path).problems(SCENE)
+    assert words in line and "\n" not in line
+
+
+def test_every_class_of_the_rooms_has_a_category_and_every_room_a_scene_name() -> None:
+    known = set(label_set().names)
+    assert len(known) == 1624 and all(category_of(one.name) in known for one in CLASSES)
+    names = {scene_name(f"{kind}{k}") for kind in ("living", "bathroom", "studio") for k in (0, 7, 999)}
+    assert len(names) == 9 and {len(name) for name in names} == {len(SCENE)}
+    for wrong in ("living1000", "attic0", "x/y0"):
+        with pytest.raises(DataError, match="has no scene name"):
+            scene_name(wrong)
+
+
+def test_a_scene_graph_is_read_with_floors_rooms_features_and_the_names_as_captions(tmp_path: Path) -> None:
+    write_graph(tmp_path / "runs" / SCENE / "graph")
+    reader = recognise(tmp_path / "runs")
+    assert reader.name == "hovsg-graph" and list(reader.scenes(tmp_path / "runs")) == [SCENE]
+    found = reader.read(tmp_path / "runs", SCENE).content
+    assert isinstance(found, Instances) and found.features is not None and found.places is not None
+    assert (found.captions, found.labels, found.names) == (("chair", "wall"), None, ("object 0_0_0", "object 0_0_1"))
+    assert found.features.tolist() == np.eye(4)[:2].tolist() and found.sizes.tolist() == [6, 6]
+    (floor,), (room,) = found.places.floors, found.places.rooms
+    assert (floor.lowest_m, floor.highest_m) == (0.0, 2.4)
+    assert (room.lowest_m, room.highest_m, room.middle_m, room.category) == (0.0, 2.4, 1.2, "office")
+
+
+def test_objects_come_in_the_order_of_their_files_names_as_the_original_loads_them(tmp_path: Path) -> None:
+    graph = write_graph(tmp_path / "graph")
+    for ending in ("ply", "json"):
+        (graph / f"objects/0_0_1.{ending}").rename(graph / f"objects/0_0_10.{ending}")
+        (graph / f"objects/0_0_2.{ending}").write_bytes((graph / f"objects/0_0_0.{ending}").read_bytes())
+    found = READERS["hovsg-graph"].read(graph, tmp_path.name).content
+    assert isinstance(found, Instances) and found.names == ("object 0_0_0", "object 0_0_10", "object 0_0_2")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("floors/0.json", "{", "not JSON"),
+        ("floors/0.json", "[]", "is no JSON object"),
+        ("floors/0.json", '{"vertices": [1, 2]}', "expected corners of a box"),
+        ("rooms/0_0.json", '{"room_height": "x", "room_zero_level": 0}', "'room_height' holds no metres"),
+        ("rooms/0_0.json", '{"room_height": [1], "room_zero_level": 0}', "must be one number each"),
+        ("rooms/0_0.ply", None, "has no .ply beside it"),
+        ("objects/0_0_0.json", None, "has no .json beside it"),
+        ("objects/0_0_0.json", '{"embedding": [1, 2]}', "embeddings have 2 and 4 dimensions"),
+        ("objects/0_0_0.json", '{"embedding": "x"}', "'embedding' is no list of numbers"),
+        ("objects/0_0_0.json", '{"name": 5}', "'name' is 5"),
+        ("objects/3_1_0.json", "{}", "has no .ply beside it"),
+    ],
+)
+def test_a_damaged_scene_graph_is_one_line(tmp_path: Path, name: str, content: str | None, words: str) -> None:
+    graph = write_graph(tmp_path / "graph")
+    (graph / name).unlink() if content is None else (graph / name).write_text(content)
+    with pytest.raises(PredictionError) as error:
+        READERS["hovsg-graph"].read(graph, tmp_path.name)
+    assert words in str(error.value) and "\n" not in str(error.value)
+
+
+def test_an_object_without_an_embedding_has_a_row_of_zeros_and_is_counted(tmp_path: Path) -> None:
+    graph = write_graph(tmp_path / "graph")
+    (graph / "objects/0_0_0.json").write_text('{"embedding": "", "name": null}')
+    read = READERS["hovsg-graph"].read(graph, tmp_path.name)
+    assert isinstance(read.content, Instances) and read.content.features is not None
+    assert not read.content.features[0].any() and "objects without an embedding: 1" in read.remarks
+
+
+def test_a_scene_graph_is_evaluated_under_both_protocols_from_files(
+    walk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path))
+    write_graph(tmp_path / "runs" / SCENE / "graph")
+    names = [text for name in label_set().names for text in (name, f"There is the {name} in the scene.")]
+    features = np.zeros((len(names), 4), np.float32)
+    features[:, 2] = 1
+    for row, name in enumerate(("chair", "wall")):
+        for k, text in enumerate(names):
+            if text in (name, f"There is the {name} in the scene."):
+                features[k] = np.eye(4)[row]
+    np.savez(tmp_path / "texts.npz", names=np.array(names), features=features)
+    words = ["evaluate", str(tmp_path / "runs"), "--dataset", "hm3dsem", "--text-features", str(tmp_path / "texts.npz")]
+    assert main([*words, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)["protocols"]
+    assert found["hm3dsem-objects"]["metrics"]["top_5"] == found["hm3dsem-places"]["metrics"]["room recall"] == 1.0
