@@ -36,7 +36,7 @@ class Place:
     step: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ChainedText(TextQuery):
     """A text, by what it tells its objects (``tags``, those of ``TAGS``), and every place where it stands."""
 
@@ -85,7 +85,7 @@ def judge_chains(cases: Sequence[ChainedText], is_right: BoolArray) -> Mapping[s
     An object is right where the finest text of each of its chains is; a chain where all its texts are. Every object
     must have ``CHAINS_EACH`` chains.
 
-    >>> fine = [ChainedText(f"the {k}", (1,), frozenset(("class",)), (Place(0, k, 0),)) for k in range(3)]
+    >>> fine = [ChainedText(f"the {k}", (1,), tags=frozenset(), places=(Place(0, k, 0),)) for k in range(3)]
     >>> rows = judge_chains(fine, np.array([True, True, False]))
     >>> rows["case"].mean().round(2), rows["object"].tolist(), rows["appearance"].tolist()
     (np.float64(0.67), [False], [])

@@ -232,7 +232,7 @@ def _case(entry: Any, at: str) -> ChainedText:
         if not (word.isascii() and word.isdigit() and len(word) < 11 and int(word) < MOST_OBJECTS_ID):
             raise DataError(f"{at}: 'obj_id' must hold object ids; found {printable(word, 40)}")
         ids[int(word) + 1] = None
-    return ChainedText(text, tuple(ids), frozenset(tag.lower().split("-")))
+    return ChainedText(text, tuple(ids), tags=frozenset(tag.lower().split("-")))
 
 
 def _words(value: Any, key: str, at: str) -> str:

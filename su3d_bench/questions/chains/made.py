@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -49,9 +50,9 @@ def chains_of(
             continue
         for number, question in enumerate(fine[:CHAINS_EACH]):
             for step, one in enumerate((question, coarse)):
-                known = cases.get(one.text) or ChainedText(one.text, one.answers or (), _tags(one))
+                known = cases.get(one.text) or ChainedText(one.text, one.answers or (), tags=_tags(one))
                 places = (*known.places, Place(n_objects, number, step))
-                cases[one.text] = ChainedText(known.text, known.object_ids, known.tags, places)
+                cases[one.text] = replace(known, places=places)
         n_objects += 1
     return tuple(cases.values())
 

@@ -27,10 +27,10 @@ TRUTH = room()
 PERFECT = truth_as_prediction(TRUTH, with_labels=False)
 CLASS, LOOK, WHERE = frozenset(("class",)), frozenset(("class", "appearance")), frozenset(("class", "spatial"))
 # Objects 2 and 3 are chairs, of which the first is ranked first; 5 is the lamp, found by whatever names it.
-CHAIR = ChainedText("chair", (2, 3), CLASS, tuple(Place(0, k, 1) for k in range(3)))
-LEFT = tuple(ChainedText(f"chair {k} of the left", (2,), WHERE, (Place(0, k, 0),)) for k in range(3))
+CHAIR = ChainedText("chair", (2, 3), tags=CLASS, places=tuple(Place(0, k, 1) for k in range(3)))
+LEFT = tuple(ChainedText(f"chair {k} of the left", (2,), tags=WHERE, places=(Place(0, k, 0),)) for k in range(3))
 RIGHT = tuple(replace(one, object_ids=(3,)) for one in LEFT)
-LAMP = tuple(ChainedText(f"white lamp {k}", (5,), LOOK, (Place(1, k, 0),)) for k in range(3))
+LAMP = tuple(ChainedText(f"white lamp {k}", (5,), tags=LOOK, places=(Place(1, k, 0),)) for k in range(3))
 
 
 def values(prediction: object, *cases: ChainedText) -> dict[str, float | None]:

@@ -14,6 +14,7 @@ from scannet_scans import write_scan
 from scored_room import ENCODER, instances, nothing, room, truth_as_prediction
 
 from su3d_bench.core.errors import ConfigError, DataError
+from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.scannet.dataset import ScanNet
 from su3d_bench.datasets.scannet.labels import TABLE_NAME
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
@@ -184,7 +185,7 @@ def test_a_choice_is_among_the_boxes_that_are_given() -> None:
 
 def test_boxes_stand_along_the_walls_that_the_dataset_knows() -> None:
     rows = TRUTH.instance == 4
-    turn = np.eye(4)
+    turn: Float64Array = np.eye(4)
     turn[:2, :2] = [[np.cos(0.6), -np.sin(0.6)], [np.sin(0.6), np.cos(0.6)]]
     turn[:3, 3] = 3, -2, 0.5
     low = np.flatnonzero(rows & (TRUTH.points[:, 0] < 3.39))  # an IoU of 0.47, along the turned axes of 0.51
@@ -193,7 +194,8 @@ def test_boxes_stand_along_the_walls_that_the_dataset_knows() -> None:
     for alignment, right in ((None, 0.0), (turn, 1.0)):
         truth = query_truth(TRUTH, (TextQuery("table", (4,)),), "here", alignment=alignment)
         assert values(part, truth)["Acc@0.5"] == right
-    back = aligned(aligned(TRUTH.points, turn), np.linalg.inv(turn))
+    backward = np.asarray(np.linalg.inv(turn), np.float64)
+    back = aligned(aligned(TRUTH.points, turn), backward)
     assert np.abs(back - TRUTH.points).max() < 1e-5
 
 

@@ -138,7 +138,8 @@ def test_an_object_without_a_feature_has_no_category_and_no_points_no_overlap() 
     cube = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
     truth = truth_of([cube, cube + 5], [1, 2])
     found = map_of([cube, np.zeros((0, 3))], features=np.array([[0.0, 0.0], [0.0, 1.0]], np.float32))
-    score = score_scene(rules_of(2), truth, found, GivenTexts(["c0", "c1"], np.eye(2, dtype=np.float32)))
+    encoder: Any = GivenTexts(["c0", "c1"], np.eye(2, dtype=np.float32))
+    score = score_scene(rules_of(2), truth, found, encoder)
     assert isinstance(score.counts, MatchedObjects)
     assert score.counts.n_ranked.tolist() == [1, 0, 1] and score.counts.n_found.tolist() == [1] * 10 + [0]
 

@@ -45,7 +45,8 @@ class TableEncoder:
 
     def encode_texts(self, texts: Sequence[str]) -> Float32Array:
         rows = np.array([self.table[text] for text in texts], np.float32)
-        return rows / np.linalg.norm(rows, axis=1, keepdims=True)
+        features: Float32Array = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+        return features
 
 
 def metres(places: list[list[int]]) -> Float32Array:

@@ -169,7 +169,7 @@ def test_a_made_problem_of_points_has_the_answer_of_the_original(name: str, numb
     scores = {str(s): read(rules, scene) for s, scene in enumerate(problem["scenes"])}
     found = combine(rules, scores, with_intervals=False)
     if rules.metric == "ovo":  # with the means of thirds, NaN where no class of one is true or called
-        values = found.metrics | {
+        values = dict(found.metrics) | {
             f"{group} {key}": value for group, row in found.groups.items() for key, value in row.items()
         }
         wanted = {key: np.nan if value is None else value for key, value in problem["answer"].items()}
