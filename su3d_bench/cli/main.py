@@ -44,6 +44,7 @@ VERBS = (
     "methods",
     "new",
     "models",
+    "fetch",
     "protocols",
     "texts",
     "export",

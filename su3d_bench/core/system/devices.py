@@ -21,7 +21,7 @@ EXPECTED_DEVICE = "expected cpu, cuda or cuda:N"
 LARGEST_BATCH = 256
 # float16 has units of its own from compute capability 7.0 (Volta) on; before it, half is no faster or not there.
 HALF_CAPABILITY = (7, 0)
-EXTRA_PACKAGES = {"torch", "transformers", "safetensors", "onnx", "tokenizers", "openai"}
+EXTRA_PACKAGES = {"torch", "transformers", "safetensors", "onnx", "tokenizers", "openai", "huggingface_hub"}
 INSTALLED_AS = {"open_clip": "open_clip_torch", "ram": "git+https://github.com/xinyu1205/recognize-anything"}
 _log = logging.getLogger(__name__)
 

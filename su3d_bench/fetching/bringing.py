@@ -1,0 +1,276 @@
+"""What is asked for, what of it is missing here, and how it comes to its place: brought, checked, unpacked, moved.
+
+Below the root (of models, of data) lies ``.fetched``: what is under way, and the record. Into the place where datasets
+and models are looked for goes only what is whole: scenes and files of models are moved there by their names.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+
+from su3d_bench.core.errors import ConfigError, DataError, ModelMissing, StoreError
+from su3d_bench.datasets.replica.folders import (
+    OFFICIAL_SCENES,
+    ORIGINAL_FILES,
+    find_original_scene,
+    find_render_tree,
+)
+from su3d_bench.fetching.archives import members, unpack_tar_gz, unpack_zip
+from su3d_bench.fetching.checksums import Stated, checked
+from su3d_bench.fetching.download import Patience, Wanted, Watch, bring, unfinished_bytes
+from su3d_bench.fetching.hub import hub_files
+from su3d_bench.fetching.record import STATE, Arrived, record_path, recorded_sha256, write_arrival
+from su3d_bench.fetching.sources import Source, Sources
+from su3d_bench.perception.models.catalogue import MODELS, PROFILE_MODELS
+from su3d_bench.perception.models.files import locate
+from su3d_bench.store.atomic import make_folder, write_error
+from su3d_bench.store.unfinished import clear_unfinished, hold_folder
+
+RENDER, ORIGINAL = "Replica", "replica_v1"  # folders of the two trees, as the archives' own names have them
+UNPACKED = "unpacked"
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A source that was asked for: its ``root`` here, and where it lies already, None where it is to be fetched."""
+
+    source: Source
+    root: Path
+    here: Path | None = None
+
+    @property
+    def state(self) -> Path:
+        return self.root / STATE / self.source.name
+
+
+@dataclass(frozen=True)
+class Brought:
+    """What came of a source: where it lies, its files as they came, and what is to be said of it."""
+
+    source: Source
+    place: Path
+    files: tuple[Arrived, ...]
+    remarks: tuple[str, ...] = ()
+
+
+def plan_models(sources: Sources, names: Sequence[str], profile: str | None, root: Path) -> list[Planned]:
+    """The models ``names`` and those of a profile, each with where it lies already."""
+    if profile is not None and profile not in PROFILE_MODELS:
+        known = ", ".join(PROFILE_MODELS)
+        raise ConfigError(f"fetch models --for {profile}: that profile loads none of these models; known: {known}")
+    wanted = [*names, *(PROFILE_MODELS[profile] if profile is not None else ())]
+    if not wanted:
+        raise ConfigError("fetch models: name models, or the profile that needs them: --for paper")
+    return [_planned_model(sources.named(name, "models"), root) for name in dict.fromkeys(wanted)]
+
+
+def _planned_model(source: Source, root: Path) -> Planned:
+    try:
+        files = locate(source.name, folder=root) if source.name in MODELS else None
+    except (ModelMissing, ConfigError):
+        files = None
+    return Planned(source, root, None if files is None else files.folder)
+
+
+def plan_replica(sources: Sources, names: Sequence[str], root: Path) -> list[Planned]:
+    """The two parts of Replica, or those of ``names`` (``frames``, ``meshes``)."""
+    wanted = [name if name.startswith("replica-") else f"replica-{name}" for name in names]
+    chosen = [sources.named(name, "replica") for name in dict.fromkeys(wanted)] or sources.of("replica")
+    return [Planned(source, root, _replica_here(source, root)) for source in chosen]
+
+
+def _replica_here(source: Source, root: Path) -> Path | None:
+    if source.archive == "zip":
+        tree = find_render_tree(root)
+        is_whole = tree is not None and set(OFFICIAL_SCENES) <= set(tree.scenes)
+        return tree.folder if tree is not None and is_whole and (tree.folder / "cam_params.json").is_file() else None
+    folders = [find_original_scene(root, scene) for scene in OFFICIAL_SCENES]
+    whole = [f for f in folders if f is not None and all((f / "habitat" / n).is_file() for n in ORIGINAL_FILES)]
+    return whole[0].parent if len(whole) == len(OFFICIAL_SCENES) else None
+
+
+def fetch(planned: Planned, watch: Watch, patience: Patience | None = None, *, keep_archives: bool = False) -> Brought:
+    """Bring a source to its place; raises ``ConfigError``, ``DataError`` or ``StoreError`` where it does not get there.
+
+    A second call goes on where the first one ended.
+    """
+    assert planned.here is None
+    source, root = planned.source, planned.root
+    wanted = hub_files(source) if source.hub is not None else plain_files(source)
+    place = root / source.name if source.archive is None else root
+    missing = wanted if source.archive is not None else [file for file in wanted if not _is_there(file, place)]
+    check_space(planned, missing)
+    arrived = tuple(bring_file(planned, file, watch, patience) for file in missing)
+    if source.archive is None:
+        _move_files([planned.state / file.name for file in missing], place)
+        _remove(planned.state)
+        return Brought(source, place, arrived, _remarks(planned, arrived))
+    there, left = _unpack(planned, watch, keep_archives=keep_archives)
+    return Brought(source, there, arrived, (*_remarks(planned, arrived), *left))
+
+
+def plain_files(source: Source) -> list[Wanted]:
+    """The files of a source that lie on servers of their own."""
+    return [
+        Wanted(file.name, file.address, source.hosts, file.n_bytes, Stated(file.sha256, file.md5_prefix))
+        for file in source.files
+    ]
+
+
+def bring_file(planned: Planned, wanted: Wanted, watch: Watch, patience: Patience | None = None) -> Arrived:
+    """Bring one file into the state of ``planned``, where it may lie already, and record it."""
+    place = planned.state / wanted.name
+    known = None if wanted.stated.is_published else recorded_sha256(planned.root, planned.source.name, wanted.name)
+    wanted = replace(wanted, stated=replace(wanted.stated, recorded=known))
+    if place.is_file():
+        sha256, wrong = checked(place, wanted.stated)
+        if wrong is not None or wanted.n_bytes not in (None, place.stat().st_size):
+            raise DataError(f"{place}: {wrong or 'has another size than is stated'}; delete it and fetch anew")
+    else:
+        try:
+            sha256 = bring(wanted, place, watch, patience)
+        except DataError as error:
+            if known is not None and "first download" in str(error):
+                raise DataError(f"{error}; the first one is recorded in {record_path(planned.root)}") from error
+            raise
+    n_bytes = place.stat().st_size
+    arrived = Arrived(planned.source.name, wanted.name, wanted.address, n_bytes, sha256, wanted.stated.kinds)
+    if known is None:
+        write_arrival(planned.root, arrived)
+    return arrived
+
+
+def check_space(planned: Planned, files: Sequence[Wanted]) -> None:
+    """``StoreError`` where the disk lacks the room for what is still to come; a zip archive needs it twice."""
+    sizes = [file.n_bytes for file in files]
+    total = sum(size for size in sizes if size is not None) if None not in sizes else planned.source.n_bytes or 0
+    held = sum(_size(planned.state / file.name) or unfinished_bytes(planned.state / file.name) for file in files)
+    needed = total - held + (total if planned.source.archive == "zip" else 0)
+    check_room(planned.root, needed, planned.source.name)
+
+
+def check_room(root: Path, needed: int, what: str) -> None:
+    """``StoreError`` where the disk of ``root`` has fewer than ``needed`` bytes free."""
+    above = next(folder for folder in (root, *root.parents) if folder.is_dir())
+    free = shutil.disk_usage(above).free
+    if needed > free:
+        raise StoreError(
+            f"{what}: takes {needed:,} bytes more below {root}, and its disk has {free:,} free; free some space, or "
+            "name a folder on another disk"
+        )
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
+
+
+def _is_there(wanted: Wanted, place: Path) -> bool:
+    path = place / wanted.name
+    if not path.exists():
+        return False
+    _, wrong = checked(path, wanted.stated)
+    if wrong is not None:
+        raise DataError(f"{path}: is another file than the published one: {wrong}; move it away and fetch again")
+    return True
+
+
+def _move_files(files: Sequence[Path], folder: Path) -> None:
+    make_folder(folder)
+    for file in files:  # the weights last, without which nothing takes the folder for a model
+        try:
+            os.replace(file, folder / file.name)
+        except OSError as error:
+            raise write_error(folder / file.name, error) from error
+
+
+def _unpack(planned: Planned, watch: Watch, *, keep_archives: bool) -> tuple[Path, list[str]]:
+    """Unpack what lies in the state, and move each scene to its place; where the scenes lie, and what is to be said."""
+    source, state = planned.source, planned.state
+    archives = [state / file.name for file in source.files]
+    folder = state / UNPACKED
+    make_folder(folder)
+    handle = _held(folder)
+    try:
+        if source.archive == "zip":
+            room = sum(size for name, size in members(archives[0]) if _rendered(PurePosixPath(name)) is not None)
+            check_room(planned.root, room - _size_of_tree(folder), f"{source.name}, unpacked,")
+            n, top = unpack_zip(archives[0], folder, _rendered, watch), RENDER
+        else:
+            n, top = unpack_tar_gz(archives, folder, _annotated, watch), ORIGINAL
+        if not n:
+            raise DataError(f"{archives[0]}: holds nothing of {source.what}; name the right one with --mirror")
+        place = planned.root / top
+        left = _move_tree(folder / top, place)
+    finally:
+        if handle is not None:
+            os.close(handle)
+    _remove(folder if keep_archives else state)
+    return place, [f"{name} was there already and is left as it is" for name in left]
+
+
+def _held(folder: Path) -> int | None:
+    try:
+        return hold_folder(folder)
+    except BlockingIOError:
+        raise StoreError(f"{folder}: another process is unpacking there; wait for its end") from None
+    except OSError:  # a disk without locks
+        return None
+
+
+def _rendered(path: PurePosixPath) -> PurePosixPath | None:
+    """Where a member of NICE-SLAM's archive goes: everything of its folder, as datasets/replica reads it."""
+    return path if path.parts[:1] == (RENDER,) and not path.name.startswith(".") else None
+
+
+def _annotated(path: PurePosixPath) -> PurePosixPath | None:
+    """Where a member of the release goes: the two files of a scene that datasets/replica reads, whatever is above."""
+    if len(path.parts) < 3 or path.parts[-2] != "habitat" or path.name not in ORIGINAL_FILES:
+        return None
+    return PurePosixPath(ORIGINAL, *path.parts[-3:])
+
+
+def _size_of_tree(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def _move_tree(unpacked: Path, place: Path) -> list[str]:
+    """Move what lies in ``unpacked`` to ``place``, a scene at a time; the names of what is there and stays as it is."""
+    left = []
+    for folder, _, _ in os.walk(unpacked):
+        clear_unfinished(Path(folder))
+    make_folder(place)
+    # Loose files (cam_params.json) first: with a scene's folder a dataset is there.
+    for child in sorted(unpacked.iterdir(), key=lambda path: (path.is_dir(), path.name)):
+        target = place / child.name
+        if target.exists():
+            left.append(child.name)
+            continue
+        try:
+            os.rename(child, target)
+        except OSError as error:
+            raise write_error(target, error) from error
+    return left
+
+
+def _remove(folder: Path) -> None:
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def _remarks(planned: Planned, arrived: Sequence[Arrived]) -> tuple[str, ...]:
+    remarks = []
+    if unstated := [file.name for file in arrived if not file.held_against]:
+        first = unstated[0] + (f" and {len(unstated) - 1} more" if len(unstated) > 1 else "")
+        remarks.append(
+            f"the publisher states no checksum of {first}: that of this first download is recorded in "
+            f"{record_path(planned.root)}, and the next one is held against it"
+        )
+    if planned.source.name == "ram-plus":
+        remarks.append("RAM++ runs through its own package or an export of it; see docs/methods/models.md")
+    return tuple(remarks)

@@ -1,0 +1,57 @@
+"""What was brought into a folder: address, size, SHA-256, and what it was held against, kept beside the data."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from su3d_bench.core.errors import StoreError
+from su3d_bench.store.atomic import read_json, write_json
+
+STATE = ".fetched"  # below the folder of models or of data: what is under way, and the record
+RECORD = "record.json"
+
+
+@dataclass(frozen=True)
+class Arrived:
+    """One file as it came; ``held_against`` names what its content agreed with, empty where nobody states anything."""
+
+    source: str
+    name: str
+    address: str
+    n_bytes: int
+    sha256: str
+    held_against: tuple[str, ...]
+
+
+def record_path(root: Path) -> Path:
+    return root / STATE / RECORD
+
+
+def recorded_sha256(root: Path, source: str, name: str) -> str | None:
+    """The SHA-256 that the file had when it was first brought below ``root``; None where it never was."""
+    entry = _entries(root).get(f"{source}/{name}")
+    sha256 = entry.get("sha256") if isinstance(entry, dict) else None
+    return sha256 if isinstance(sha256, str) else None
+
+
+def write_arrival(root: Path, arrived: Arrived) -> None:
+    """Keep what is known of a file; the entry of an earlier one of its name is replaced."""
+    entries = _entries(root)
+    entry = asdict(arrived)
+    if not arrived.held_against:
+        entry["remark"] = "the publisher states no checksum: this is that of the first download"
+    entries[f"{arrived.source}/{arrived.name}"] = entry
+    write_json(record_path(root), {"files": entries})
+
+
+def _entries(root: Path) -> dict[str, Any]:
+    path = record_path(root)
+    if not path.exists():
+        return {}
+    content = read_json(path)
+    entries = content.get("files") if isinstance(content, dict) else None
+    if not isinstance(entries, dict):
+        raise StoreError(f"{path}: is no record of what was fetched; move it away to begin another")
+    return entries
