@@ -100,6 +100,8 @@ def unpack_tar_gz(parts: Sequence[Path], folder: Path, goes_to: Place, watch: Wa
                 continue
             _write(plain.part(size), place, size)
             plain.skip(padded - size)
+        while plain.read(PIECE):  # to the checksum of the whole
+            pass
     return n_found
 
 

@@ -23,7 +23,15 @@ from su3d_bench.fetching.archives import members, unpack_tar_gz, unpack_zip
 from su3d_bench.fetching.checksums import Stated, checked
 from su3d_bench.fetching.download import Patience, Wanted, Watch, bring, unfinished_bytes
 from su3d_bench.fetching.hub import hub_files
-from su3d_bench.fetching.record import STATE, Arrived, record_path, recorded_sha256, write_arrival
+from su3d_bench.fetching.record import (
+    STATE,
+    Arrived,
+    record_path,
+    recorded_sha256,
+    unpacked_names,
+    write_arrival,
+    write_unpacked,
+)
 from su3d_bench.fetching.sources import Source, Sources
 from su3d_bench.perception.models.catalogue import MODELS, PROFILE_MODELS
 from su3d_bench.perception.models.files import locate
@@ -84,6 +92,11 @@ def plan_replica(sources: Sources, names: Sequence[str], root: Path) -> list[Pla
 
 
 def _replica_here(source: Source, root: Path) -> Path | None:
+    """Where it lies: all that an earlier call unpacked, or the official scenes, however they came."""
+    place = root / (RENDER if source.archive == "zip" else ORIGINAL)
+    names = unpacked_names(root, source.name)
+    if names and all((place / name).exists() for name in names):
+        return place
     if source.archive == "zip":
         tree = find_render_tree(root)
         is_whole = tree is not None and set(OFFICIAL_SCENES) <= set(tree.scenes)
@@ -207,7 +220,12 @@ def _unpack(planned: Planned, watch: Watch, *, keep_archives: bool) -> tuple[Pat
         if not n:
             raise DataError(f"{archives[0]}: holds nothing of {source.what}; name the right one with --mirror")
         place = planned.root / top
+        names = [path.name for path in (folder / top).iterdir()]
         left = _move_tree(folder / top, place)
+        write_unpacked(planned.root, source.name, sorted(names))
+    except DataError:
+        _remove(folder)  # what came out of a damaged archive is not to be passed over by the next call
+        raise
     finally:
         if handle is not None:
             os.close(handle)

@@ -41,7 +41,7 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Patience:
-    """How often in a row a download that brings nothing new is taken up again, and after which pause at first."""
+    """How often a broken download is taken up again, counted anew when bytes came, and after which pause at first."""
 
     n_retries: int = 3
     pause_s: float = 1.0
@@ -128,10 +128,10 @@ class _Download:
                     ) from None
                 self._begin_anew()
             except Broken as reason:
-                n_idle = 0 if self._n_held > n_before else n_idle + 1
+                n_idle = 1 if self._n_held > n_before else n_idle + 1
                 if n_idle > self._patience.n_retries:
                     raise DataError(self._broken_off(reason)) from None
-                time.sleep(min(self._patience.pause_s * 2**n_idle, 60.0))
+                time.sleep(min(self._patience.pause_s * 2 ** min(n_idle - 1, 6), 60.0))
 
     def _is_whole(self) -> bool:
         """Without a stated size, the server is asked once more whether that is all."""

@@ -150,8 +150,8 @@ class Source(_Strict):
         """The same files out of the folder ``address`` of another server; for the hub, another endpoint."""
         check_address(address)
         hosts = (urlsplit(address).hostname or "",)
-        if self.hub is not None:
-            return self.model_copy(update={"endpoint": address.rstrip("/"), "hosts": hosts})
+        if self.hub is not None:  # mirrors of the hub leave large files in its own store
+            return self.model_copy(update={"endpoint": address.rstrip("/"), "hosts": (*self.hosts, *hosts)})
         files = tuple(file.model_copy(update={"address": f"{address.rstrip('/')}/{file.name}"}) for file in self.files)
         return self.model_copy(update={"files": files, "hosts": hosts})
 
