@@ -1,0 +1,64 @@
+"""The table of what can be fetched, held against what the rest of the program says of the same things."""
+
+from __future__ import annotations
+
+import pytest
+
+from su3d_bench.datasets.replica.folders import RENDER_URL
+from su3d_bench.fetching.sources import built_in, check_address
+from su3d_bench.perception.models.catalogue import MODELS, ModelForm
+
+
+def form_of(name: str) -> ModelForm:
+    """The form of a model that the table's entry is."""
+    source, forms = built_in().named(name, "models"), MODELS[name].forms
+    kind = "transformers" if source.hub is not None and name != "ram-plus" else "original"
+    return next(form for form in forms if form.form == kind)
+
+
+def test_every_model_can_be_fetched_and_nothing_else_is_called_one() -> None:
+    assert {source.name for source in built_in().of("models")} == set(MODELS)
+
+
+@pytest.mark.parametrize("name", list(MODELS))
+def test_the_table_says_of_a_model_what_the_catalogue_says(name: str) -> None:
+    source, form = built_in().named(name), form_of(name)
+    assert source.licence.name == MODELS[name].licence
+    assert source.n_bytes is not None and abs(source.n_bytes / 1e6 - form.size_mb) < 2
+    if source.hub is not None:
+        assert source.hub.repository == form.repository and source.hub.files == form.files
+        stated = {file.name: file.sha256 for file in source.hub.weights if file.name in form.sha256}
+    else:
+        assert [file.address for file in source.files] == [form.source]
+        stated = {file.name: file.sha256 for file in source.files}
+    assert stated == dict(form.sha256)
+
+
+def test_replica_comes_from_the_address_that_the_dataset_names() -> None:
+    assert built_in().named("replica-frames").files[0].address == RENDER_URL
+    assert [file.n_bytes for file in built_in().named("replica-meshes").files] == [2_000_000_000] * 16 + [1_859_047_808]
+
+
+def test_every_fact_says_where_it_was_read_and_every_file_comes_encrypted() -> None:
+    for source in built_in().entries.values():
+        assert source.licence.read_at and (source.n_bytes is not None or source.group == "scannet")
+        for file in source.files:
+            assert file.read_at and file.address.startswith("https://")
+
+
+@pytest.mark.parametrize(
+    ("address", "said"),
+    [
+        ("http://example.org/a", "is not encrypted"),
+        ("file:///etc/passwd", "is no address"),
+        ("https://", "is no address"),
+        ("https://[::1", "is no address"),
+        ("https://example.org/a b\n", "is no address"),
+        ("https://user@example.org/a", "a name or password"),
+        ("https://evil-hf.co/a", "is not named for it"),
+        ("https://hf.co.example.org/a", "is not named for it"),
+    ],
+)
+def test_an_address_that_cannot_be_trusted_is_refused(address: str, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        check_address(address, ["huggingface.co", "*.hf.co"])
