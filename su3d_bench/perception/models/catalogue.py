@@ -246,11 +246,11 @@ _ENTRIES = (
                 "497c178836ba66698ca226c7895317e6e800034be986452dbd2593298d50e87d",
                 "xinyu1205/recognize-anything-plus-model",
             ),
-            # What the package's own onnx/export.py writes, beside the tag list of its ram/data.
+            # What onnx/export.py of the package's pull request 204, not merged, writes, beside the tag list of its ram/data.
             ModelForm(
                 "onnx",
                 ("ram_plus.onnx", "ram_tag_list.txt"),
-                "onnx/export.py of https://github.com/xinyu1205/recognize-anything",
+                "onnx/export.py of https://github.com/xinyu1205/recognize-anything/pull/204",
                 3010,
             ),
         ),
