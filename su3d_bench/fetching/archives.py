@@ -79,8 +79,10 @@ def unpack_tar_gz(parts: Sequence[Path], folder: Path, goes_to: Place, watch: Wa
     n_packed = sum(part.stat().st_size for part in parts)
     n_found, done = 0, set[PurePosixPath]()
     with _reading(parts[0]), ExitStack() as stack:
-        packed = stack.enter_context(io.BufferedReader(_Joined(parts, watch, n_packed), PIECE))
-        plain = _Bounded(stack.enter_context(gzip.GzipFile(fileobj=packed, mode="rb")), Allowance(n_packed))
+        packed = stack.enter_context(io.BufferedReader(_Joined(parts, watch, n_packed), PIECE))  # type: ignore[type-var]
+        unpacked = gzip.GzipFile(fileobj=packed, mode="rb")
+        stack.callback(unpacked.close)
+        plain = _Bounded(unpacked, Allowance(n_packed))
         for name, kind, size in _tar_members(plain):
             is_file = kind in (tarfile.REGTYPE, tarfile.AREGTYPE)
             target = None if kind == tarfile.DIRTYPE else goes_to(_plain(name))
@@ -182,7 +184,7 @@ class _Joined(io.RawIOBase):
 class _Bounded:
     """A stream of which each byte is counted against an allowance before it is made."""
 
-    def __init__(self, stream: IO[bytes], allowance: Allowance) -> None:
+    def __init__(self, stream: gzip.GzipFile, allowance: Allowance) -> None:
         self._stream, self._allowance = stream, allowance
 
     def exactly(self, n: int) -> bytes:
@@ -208,7 +210,7 @@ class _Bounded:
             n -= len(piece)
 
     def part(self, size: int) -> IO[bytes]:
-        return io.BufferedReader(_Part(self, size), BLOCK)
+        return io.BufferedReader(_Part(self, size), BLOCK)  # type: ignore[type-var]
 
 
 class _Part(io.RawIOBase):

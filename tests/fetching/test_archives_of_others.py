@@ -87,12 +87,10 @@ def test_what_was_unpacked_before_is_passed_over(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["../out.txt", "/tmp/out.txt", "room/../../out.txt", "C:\\out.txt", "a\\..\\..\\out"])
 def test_a_member_that_leads_out_of_the_folder_ends_it(tmp_path: Path, name: str) -> None:
-    for unpack in (
-        lambda: unpack_zip(zipped(tmp_path / "a.zip", {name: b"x"}), tmp_path / "out", anywhere, silent),
-        lambda: unpack_tar_gz([tarred(tmp_path / "a.tar.gz", {name: b"x"})], tmp_path / "out", anywhere, silent),
-    ):
-        with pytest.raises(DataError, match="leads out of the folder; nothing of it was put in place"):
-            unpack()
+    with pytest.raises(DataError, match="leads out of the folder; nothing of it was put in place"):
+        unpack_zip(zipped(tmp_path / "a.zip", {name: b"x"}), tmp_path / "out", anywhere, silent)
+    with pytest.raises(DataError, match="leads out of the folder; nothing of it was put in place"):
+        unpack_tar_gz([tarred(tmp_path / "a.tar.gz", {name: b"x"})], tmp_path / "out", anywhere, silent)
     assert not (tmp_path / "out").exists() and not (tmp_path / "out.txt").exists()
 
 

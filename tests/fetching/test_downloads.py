@@ -25,6 +25,7 @@ SHA256 = hashlib.sha256(CONTENT).hexdigest()
 OTHER = np.random.default_rng(1).bytes(900_000)
 ONCE = Patience(n_retries=0, pause_s=0.0, timeout_s=5.0)
 NAME = "weights.pth"
+OPEN_FACTS: dict[str, Any] = {"n_bytes": None, "stated": Stated()}
 
 
 @pytest.fixture
@@ -80,34 +81,34 @@ def test_a_server_that_ignores_ranges_is_read_from_the_beginning(server: FileSer
 
 
 def test_a_file_that_changed_after_the_break_is_read_from_the_beginning(server: FileServer, tmp_path: Path) -> None:
-    place, open_facts = tmp_path / NAME, {"n_bytes": None, "stated": Stated()}
+    place = tmp_path / NAME
     server.files[f"/{NAME}"] = Served(OTHER, breaks_after=[500_000])
     with pytest.raises(DataError, match="goes on"):
-        fetched(server, place, **open_facts)
+        fetched(server, place, **OPEN_FACTS)
     server.files[f"/{NAME}"] = Served(CONTENT)
-    assert fetched(server, place, **open_facts) == SHA256
+    assert fetched(server, place, **OPEN_FACTS) == SHA256
     assert place.read_bytes() == CONTENT
 
 
 def test_a_file_that_grew_under_a_tag_that_stayed_is_read_from_the_beginning(
     server: FileServer, tmp_path: Path
 ) -> None:
-    place, open_facts = tmp_path / NAME, {"n_bytes": None, "stated": Stated()}
+    place = tmp_path / NAME
     server.files[f"/{NAME}"] = Served(OTHER[:800_000], etag='"one"', breaks_after=[500_000])
     with pytest.raises(DataError, match="goes on"):
-        fetched(server, place, **open_facts)
+        fetched(server, place, **OPEN_FACTS)
     server.files[f"/{NAME}"] = Served(CONTENT, etag='"one"')
-    fetched(server, place, **open_facts)
+    fetched(server, place, **OPEN_FACTS)
     assert place.read_bytes() == CONTENT
 
 
 def test_parts_that_nothing_ties_together_are_never_joined(server: FileServer, tmp_path: Path) -> None:
-    place, open_facts = tmp_path / NAME, {"n_bytes": None, "stated": Stated()}
+    place = tmp_path / NAME
     server.files[f"/{NAME}"] = Served(OTHER, etag='W/"weak"', breaks_after=[500_000])
     with pytest.raises(DataError, match="goes on"):
-        fetched(server, place, **open_facts)
+        fetched(server, place, **OPEN_FACTS)
     server.files[f"/{NAME}"] = Served(CONTENT, etag='W/"weak"')
-    fetched(server, place, **open_facts)
+    fetched(server, place, **OPEN_FACTS)
     assert place.read_bytes() == CONTENT and server.asked[-1].range is None
 
 

@@ -246,7 +246,7 @@ _ENTRIES = (
                 "497c178836ba66698ca226c7895317e6e800034be986452dbd2593298d50e87d",
                 "xinyu1205/recognize-anything-plus-model",
             ),
-            # What onnx/export.py of the package's pull request 204, not merged, writes, beside the tag list of its ram/data.
+            # What onnx/export.py of the package's open pull request 204 writes, beside the tag list of its ram/data.
             ModelForm(
                 "onnx",
                 ("ram_plus.onnx", "ram_tag_list.txt"),

@@ -72,7 +72,7 @@ class RamTagger:
 
 
 class OnnxRamTagger:
-    """RAM++ as ``onnx/export.py`` of its pull request 204 exports it: ``image`` (1, 3, 384, 384) to ``tag`` (1, T), 1 where it holds."""
+    """RAM++ as its pull request 204 exports it: ``image`` (1, 3, 384, 384) to ``tag`` (1, T), 1 where it holds."""
 
     name = "ram-onnx"
     caveat: str | None = None
