@@ -154,8 +154,8 @@ def no_render_tree(root: Path) -> ScenesMissing:
     """What to say where no scene was found: where it was looked for and how to get data."""
     return ScenesMissing(
         f"replica: no scene in {root} or in its folder Replica (a scene is a folder such as room0 with traj.txt and "
-        f"results/); su3d-bench fetch replica brings them, or unpack {RENDER_URL} there, set SU3D_DATA to where it is, or "
-        f"make rooms in this layout: su3d-bench datasets make rooms --layout replica --out {root}"
+        f"results/); su3d-bench fetch replica brings them; or unpack {RENDER_URL} there, set SU3D_DATA to where it is, "
+        f"or make rooms in this layout: su3d-bench datasets make rooms --layout replica --out {root}"
     )
 
 

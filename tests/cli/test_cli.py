@@ -266,7 +266,7 @@ def test_an_internal_error_is_one_line_and_exit_code_4(
 
 def test_an_interrupt_says_whether_the_same_command_goes_on() -> None:
     on = {" ".join(verb) for verb, parser in every_verb() if parser.get_default("takes_up")}
-    assert on == {"run", "ablate", "datasets make", "report html"}
+    assert on == {"run", "ablate", "datasets make", "report html", "fetch models", "fetch replica", "fetch scannet"}
 
 
 def test_a_verb_that_keeps_nothing_begins_anew(
