@@ -32,6 +32,7 @@ VERBS = (
     "check",
     "compare",
     "plan",
+    "reproduce",
     "attribute",
     "report",
     "runs",

@@ -18,6 +18,7 @@ from typing import Any
 from su3d_bench.core.errors import GroundTruthMissing, StoreError, counted, error_line
 from su3d_bench.core.interfaces import (
     Closes,
+    Encoder,
     Method,
     RendersFrames,
     SceneTools,
@@ -106,6 +107,13 @@ def failed_outcomes(job: SceneJob, reason: str) -> tuple[MethodOutcome, ...]:
         if "score" not in folder.seals():
             write_text(folder.log, f"failed: {one_line(line)}\n")
     return tuple(MethodOutcome(job.scene, part.name, error=line) for part in job.methods)
+
+
+def scores_again(job: SceneJob, part: Part, encoder: Encoder) -> dict[str, SceneScore]:
+    """What the map that ``job.folder`` holds of ``part`` scores, by protocol; nothing is written."""
+    folder = RunFolder(job.folder).job(job.scene, part.name)
+    scores, _ = _Scene(job, lambda event: None).scores(part, encoder, read_prediction(folder.prediction), folder)
+    return scores
 
 
 def _guarded(scene: _Scene, part: Part) -> MethodOutcome:
@@ -335,11 +343,11 @@ class _Scene:
     ) -> None:
         """Score under every protocol that has a truth here, draw the map, and seal; reasons for the others go along."""
         prediction = read_prediction(folder.prediction)
-        scores, unscored = self._scores(part, perception, prediction, folder)
+        scores, unscored = self.scores(part, perception.encoder, prediction, folder)
         files = [folder.counts]
         write_bytes(folder.counts, pack_scores(scores))
         for share in self.job.anytime if build_method(part).needs.frames else ():
-            early, _ = self._scores(part, perception, read_prediction(folder.anytime(share)), None)
+            early, _ = self.scores(part, perception.encoder, read_prediction(folder.anytime(share)), None)
             write_bytes(folder.anytime_counts(share), pack_scores(early))
             files.append(folder.anytime_counts(share))
         if self.job.pictures:
@@ -352,8 +360,8 @@ class _Scene:
         remarks = {"unscored": unscored, "warnings": list(dict.fromkeys(log.warnings)), REMARK: doubts}
         folder.seal("score", key, [*files, folder.log], remarks)
 
-    def _scores(
-        self, part: Part, perception: Perception, prediction: Prediction, refined_in: JobFolder | None
+    def scores(
+        self, part: Part, encoder: Encoder, prediction: Prediction, refined_in: JobFolder | None
     ) -> tuple[dict[str, SceneScore], dict[str, str]]:
         """The scores under every protocol that can score the map, and why the others cannot."""
         scores: dict[str, SceneScore] = {}
@@ -372,7 +380,7 @@ class _Scene:
             self.says(part, f"scoring {n} of {counted(len(self.job.protocols), 'protocol')}")
             renamed = self._prediction_in_words_of(truth, part, prediction)
             known = self._truth_of(rules, truth, refined_in)
-            scores[rules.name] = score_scene(rules, known, renamed, perception.encoder)
+            scores[rules.name] = score_scene(rules, known, renamed, encoder)
         return scores, unscored
 
     def _truth_of(self, rules: ProtocolRules, truth: GroundTruth, refined_in: JobFolder | None) -> Truth:

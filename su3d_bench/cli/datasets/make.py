@@ -52,7 +52,7 @@ def make(arguments: argparse.Namespace) -> int:
     """Make what was asked for and print, scene by scene, whether it was made or was there already."""
     if arguments.jobs is not None and arguments.jobs < 1:
         raise ConfigError(f"--jobs {arguments.jobs}: expected 1 or more")
-    part = _dataset_part(arguments.dataset, arguments.set)
+    part = dataset_part(arguments.dataset, arguments.set)
     scenes = _scenes(part, arguments.scenes)
     is_native = arguments.layout == "native"
     if arguments.out is None and not is_native:
@@ -60,7 +60,7 @@ def make(arguments: argparse.Namespace) -> int:
     out = arguments.out or data_root()
     make_folder(out)
     with RunFolder(out).locked():
-        made = _make_native(part, scenes, out, arguments) if is_native else _make_files(part, scenes, out, arguments)
+        made = _make_native(part, scenes, out, arguments) if is_native else make_files(part, scenes, out, arguments)
     reader = part.name if is_native else LAYOUTS[arguments.layout].reader
     rows = [
         {
@@ -76,7 +76,7 @@ def make(arguments: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-def _dataset_part(name: str, assignments: Sequence[str]) -> Part:
+def dataset_part(name: str, assignments: Sequence[str]) -> Part:
     dataset_class = registry.load("dataset", name)
     if not all(hasattr(dataset_class, wanted) for wanted in WHAT_A_LAYOUT_TAKES):
         raise ConfigError(f"datasets make {name}: its scenes are not made here; known: rooms")
@@ -103,7 +103,8 @@ def _make_native(part: Part, scenes: Sequence[str], out: Path, arguments: argpar
     return set(scenes)
 
 
-def _make_files(part: Part, scenes: Sequence[str], out: Path, arguments: argparse.Namespace) -> set[str]:
+def make_files(part: Part, scenes: Sequence[str], out: Path, arguments: argparse.Namespace) -> set[str]:
+    """Write scenes in the layout of ``arguments``, whose ``jobs`` and ``quiet`` count too; those that were not there."""
     layout, dataset = LAYOUTS[arguments.layout], build_dataset(part, data_root())
     units = []
     for target in plan_scenes(layout, dataset, scenes, out):

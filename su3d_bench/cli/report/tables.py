@@ -70,11 +70,9 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def _tables(arguments: argparse.Namespace) -> list[Table]:
-    from su3d_bench.analysis.tables import choose, found_tables, is_scores, measured_results, refuse_unscored
-    from su3d_bench.reports.tables.ablation import ablation_table
-    from su3d_bench.reports.tables.judged import JUDGED, judged_table
-    from su3d_bench.reports.tables.papers.paper import Shown, paper_table, selection_tables
-    from su3d_bench.runs.planning.ablation import read_rows
+    from su3d_bench.analysis.paper_tables import numbered_tables
+    from su3d_bench.analysis.tables import choose, found_tables, measured_results, refuse_unscored
+    from su3d_bench.reports.tables.papers.paper import Shown, selection_tables
 
     shown = Shown(
         metrics=tuple(arguments.metrics),
@@ -94,13 +92,6 @@ def _tables(arguments: argparse.Namespace) -> list[Table]:
     measured = choose(every, arguments.methods, arguments.protocols, arguments.datasets)
     if not arguments.table:
         return [*selection_tables(measured, shown, with_published=with_published), *found]
-    tables = []
-    for number in dict.fromkeys(arguments.table):
-        if number == "I":
-            sweep = [row for run in arguments.runs if not is_scores(run) for row in read_rows(run)]
-            tables.append(ablation_table(measured, sweep, shown, with_published=with_published))
-        elif number in JUDGED:
-            tables.append(judged_table(number, measured, shown, with_published=with_published))
-        else:
-            tables += paper_table(number, measured, shown, with_published=with_published)
-    return tables
+    return numbered_tables(
+        tuple(dict.fromkeys(arguments.table)), measured, arguments.runs, shown, with_published=with_published
+    )

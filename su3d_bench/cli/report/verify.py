@@ -1,4 +1,4 @@
-"""``su3d-bench report verify``: whether the cells of a paper still are what their runs give."""
+"""``su3d-bench report verify``: whether the cells of a paper still are what their runs give, and bundles what they say."""
 
 from __future__ import annotations
 
@@ -9,26 +9,53 @@ from typing import Any
 
 from su3d_bench.cli.shared.answers import answer_either
 from su3d_bench.cli.shared.flags import add_verb
-from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, counted
+from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted
 
 NAME = "verify"
+BUNDLE = ".zip"
 
 
 def add_parser(actions: Any) -> None:
     parser = add_verb(
         actions,
         NAME,
-        "Recompute the cells of LaTeX tables from the runs that they name; exit code 1 where one differs.",
-        ("su3d-bench report verify paper.tex", "su3d-bench report verify tables/*.tex --root results --json"),
+        "Recompute the cells of LaTeX tables from their runs, or score a bundle anew; exit code 1 where one differs.",
+        ("su3d-bench report verify paper.tex", "su3d-bench report verify reproduced/opensu3d/bundle.zip --json"),
         call,
     )
-    parser.add_argument("files", nargs="+", type=Path, metavar="TEX", help="LaTeX made by report tables, or around it")
+    parser.add_argument(
+        "files", nargs="+", type=Path, metavar="FILE", help="LaTeX by report tables, or around it; or bundle.zip of reproduce"
+    )
     parser.add_argument(
         "--root", type=Path, metavar="DIR", help="where the runs' folders are (default: here, then beside the file)"
     )
 
 
 def call(arguments: argparse.Namespace) -> int:
+    bundles = [file for file in arguments.files if file.suffix.lower() == BUNDLE]
+    if bundles and len(bundles) < len(arguments.files):
+        raise ConfigError("report verify: bundles and LaTeX are verified apart; name the one or the other")
+    return _verify_bundles(bundles, arguments) if bundles else _verify_papers(arguments)
+
+
+def _verify_bundles(bundles: list[Path], arguments: argparse.Namespace) -> int:
+    from su3d_bench.reproducing.verifying import verify_bundle
+
+    if arguments.root is not None:
+        raise ConfigError("--root: a bundle brings its runs; leave it out")
+    found = [verify_bundle(bundle) for bundle in bundles]
+    lines = []
+    for one in found:
+        lines += [f"{one.bundle}: {fault}" for fault in one.faults]
+        how = "to the last bit" if one.is_to_the_bit else "integers the same, values within 1e-9"
+        said = f"differs: {counted(len(one.faults), 'fault')}" if one.faults else f"holds, {how}"
+        looked_at = f"{counted(one.n_files, 'file')}, {counted(one.n_scores, 'score')} made anew, {counted(one.n_cells, 'cell')}"
+        lines.append(f"{one.bundle}: {looked_at}; {said}")
+    answer_either(arguments, {"bundles": [asdict(one) for one in found]}, *lines)
+    return EXIT_CHECK_FAILED if any(one.faults for one in found) else EXIT_DONE
+
+
+def _verify_papers(arguments: argparse.Namespace) -> int:
     from su3d_bench.analysis.tables import check_paper
 
     checks = [check for file in arguments.files for check in check_paper(file, arguments.root)]

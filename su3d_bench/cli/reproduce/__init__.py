@@ -1,0 +1,201 @@
+"""``su3d-bench reproduce``: a paper's experiments: what they need, the runs, measured beside reported, the bundle."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from su3d_bench.cli.run import add_executor_flags
+from su3d_bench.cli.shared.answers import answer, answer_document, answer_json, formatted, remark, show, written
+from su3d_bench.cli.shared.flags import add_settings, add_table_format, add_verb
+from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INCOMPLETE, ConfigError, RunIncomplete, counted
+
+if TYPE_CHECKING:
+    from su3d_bench.reports.tables.model import Table
+    from su3d_bench.reproducing.asked import Asked, AskedRun
+    from su3d_bench.reproducing.preflight import Preflight
+    from su3d_bench.reproducing.recipe import Experiment, Recipe
+
+OF_A_RUN = ("jobs", "limit", "solver", "offline", "executor", "ray_address", "gpus_per_job", "retries", "slurm")
+
+
+def add_parser(verbs: Any) -> None:
+    parser = add_verb(
+        verbs,
+        "reproduce",
+        "Do a paper's experiments again: what is missing, the runs, its tables beside the printed ones, one archive.",
+        (
+            "su3d-bench reproduce opensu3d --table II III --dry-run",
+            "su3d-bench reproduce opensu3d --table I II III IV V reasoning --rehearse",
+        ),
+        call,
+        takes_up=True,
+    )
+    parser.add_argument("recipe", metavar="RECIPE", nargs="?", help="its name, or a file of your own (default: list them)")
+    parser.add_argument("--table", nargs="+", default=[], metavar="NAME", help="these experiments alone (default: all)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where all goes (default: reproduced/<recipe>)")
+    parser.add_argument("--dry-run", action="store_true", help="say what is missing and what it will cost, and end")
+    parser.add_argument("--probe", action="store_true", help="first measure what updates cost here, a few of each method")
+    parser.add_argument("--rehearse", action="store_true", help="the same on rooms made in the same layouts, no weights")
+    parser.add_argument("--rooms", nargs="+", metavar="ROOM", help="of a rehearsal (default: the recipe's)")
+    parser.add_argument(
+        "--room-settings", nargs="+", metavar="KEY=VALUE", help="options of the rooms, such as n_frames=80 width=160"
+    )
+    parser.add_argument(
+        "--predictions", nargs="+", default=[], metavar="METHOD=DIR", help="of methods that are none here, as evaluate takes"
+    )
+    parser.add_argument("--profile", help="whose perception (default: the recipe's)")
+    parser.add_argument("--encoder", help="of all runs, such as embedded (default: the recipe's)")
+    parser.add_argument("--device", help="cpu, cuda or cuda:1 (default: cpu)")
+    parser.add_argument("--jobs", type=int, metavar="N", help="scenes side by side (default: the CPU cores)")
+    parser.add_argument("--limit", type=int, metavar="N", help="only the first N updates of each scene")
+    parser.add_argument("--solver", choices=("built-in", "llm"), help="who answers, as run --solver")
+    parser.add_argument("--offline", action=argparse.BooleanOptionalAction, help="ask no language model, as run --offline")
+    add_executor_flags(parser)
+    add_settings(parser, "of all runs, such as perception.paper.captions=model")
+    parser.add_argument(
+        "--bundle", type=Path, metavar="FILE", help="the archive (default: bundle.zip in the folder of --out)"
+    )
+    add_table_format(parser)
+
+
+def call(arguments: argparse.Namespace) -> int:
+    from su3d_bench.reproducing.recipe import load_recipe
+
+    if arguments.recipe is None:
+        return _list_recipes(arguments)
+    recipe = load_recipe(arguments.recipe)
+    experiments = recipe.chosen(arguments.table)
+    rehearsal = [name for name in ("rooms", "room_settings") if getattr(arguments, name)]
+    if rehearsal and not arguments.rehearse:
+        raise ConfigError(f"--{rehearsal[0].replace('_', '-')}: belongs to --rehearse; leave it out, or rehearse")
+    out = arguments.out or Path("reproduced") / (recipe.name + ("-rehearsal" if arguments.rehearse else ""))
+    if not arguments.rehearse:
+        return _reproduce(recipe, experiments, _asked(arguments), out, arguments)
+    from su3d_bench.cli.reproduce.rehearsal import rehearsed
+    from su3d_bench.reproducing.probe import environment
+
+    asked = rehearsed(recipe, experiments, _asked(arguments), out, arguments)
+    with environment(SU3D_DATA=str((out / "data").absolute())):
+        return _reproduce(recipe, experiments, asked, out, arguments)
+
+
+def _list_recipes(arguments: argparse.Namespace) -> int:
+    from su3d_bench.reproducing.recipe import load_recipe, recipe_names
+
+    recipes = [load_recipe(name) for name in recipe_names()]
+    value = [{"name": one.name, "title": one.title, "tables": [each.name for each in one.experiments]} for one in recipes]
+    if not answer_json(arguments, value):
+        answer(*(f"{one['name']:<14} {', '.join(one['tables'])}" for one in value))  # type: ignore[arg-type]
+    return EXIT_DONE
+
+
+def _asked(arguments: argparse.Namespace) -> Asked:
+    from su3d_bench.reproducing.asked import Asked
+
+    values = {name: getattr(arguments, name) for name in OF_A_RUN if getattr(arguments, name) is not None}
+    return Asked(arguments.profile, arguments.encoder, arguments.device, values, tuple(arguments.set))
+
+
+def _reproduce(
+    recipe: Recipe, experiments: Sequence[Experiment], asked: Asked, out: Path, arguments: argparse.Namespace
+) -> int:
+    from su3d_bench.reproducing.asked import asked_runs
+    from su3d_bench.reproducing.predictions import named_predictions
+    from su3d_bench.reproducing.preflight import preflight
+
+    runs = asked_runs(recipe, experiments, asked)
+    named = named_predictions(experiments, arguments.predictions)
+    known = preflight(runs, out)
+    if not known.missing and arguments.probe:
+        _probe(runs, out, arguments)
+        known = preflight(runs, out)
+    if arguments.dry_run:
+        _show(known, arguments)
+        return EXIT_CHECK_FAILED if known.missing else EXIT_DONE
+    _say(known, arguments)
+    if known.missing:
+        first = known.missing[0]
+        more = f" and {len(known.missing) - 1} more" if len(known.missing) > 1 else ""
+        how = f"; get it with: {first.how}" if first.how else ""
+        raise ConfigError(
+            f"reproduce {recipe.name}: {first.kind} {first.name} is missing{more}{how}; --dry-run lists all, --rehearse "
+            "does without"
+        )
+    failures = [failure for run in runs for failure in _carry_out(run, out, arguments)]
+    from su3d_bench.reproducing.predictions import evaluate_predictions
+
+    folders = [run.folder(out) for run in runs] + evaluate_predictions(named, experiments, asked, out)
+    _answer(recipe, experiments, folders, out, arguments)
+    if failures:
+        raise RunIncomplete(f"reproduce {recipe.name}: {counted(len(failures), 'scene')} failed; {failures[0]}")
+    return EXIT_DONE
+
+
+def _probe(runs: Sequence[AskedRun], out: Path, arguments: argparse.Namespace) -> None:
+    from su3d_bench.reproducing.probe import probe
+
+    remark(f"unit costs of this machine: {probe(runs, out)}", quiet=arguments.quiet)
+
+
+def _show(known: Preflight, arguments: argparse.Namespace) -> None:
+    from su3d_bench.reproducing.tables import preflight_tables
+
+    if not answer_json(arguments, known.to_json()):
+        answer_document(formatted(preflight_tables(known), arguments))
+
+
+def _say(known: Preflight, arguments: argparse.Namespace) -> None:
+    from su3d_bench.reproducing.tables import summary
+
+    for line in summary(known):
+        remark(line, quiet=arguments.quiet)
+
+
+def _carry_out(run: AskedRun, out: Path, arguments: argparse.Namespace) -> list[str]:
+    """Lines of what failed."""
+    from su3d_bench.cli.shared.bars import progress
+    from su3d_bench.reproducing.asked import carry_out, plan_of
+
+    plan = plan_of(run, out)
+    with progress(len(plan.jobs), is_quiet=arguments.quiet) as report:
+        result = carry_out(run, plan, report)
+    for line in result.remarks:
+        remark(line, quiet=arguments.quiet)
+    remark(f"run folder: {plan.folder.path}", quiet=arguments.quiet)
+    return [line for _, _, line in result.failures]
+
+
+def _answer(
+    recipe: Recipe, experiments: Sequence[Experiment], folders: Sequence[Path], out: Path, arguments: argparse.Namespace
+) -> None:
+    """The tables on stdout and in ``tables.md``, every cell in ``compared.json``, pictures, and the archive."""
+    from su3d_bench.reproducing.bundle import write_bundle
+    from su3d_bench.reproducing.differences import Results, compared_all
+    from su3d_bench.reproducing.pictures import draw_queries
+    from su3d_bench.reproducing.recipe import recipe_bytes
+    from su3d_bench.reproducing.tables import compared_json, result_tables
+    from su3d_bench.store.atomic import write_json
+
+    results = Results(tuple(folders))
+    cells = compared_all(experiments, results)
+    tables: list[Table] = result_tables(experiments, cells, results)
+    value = compared_json(recipe, cells)
+    written(out / "tables.md", formatted(tables, argparse.Namespace(table_format="markdown"), is_file=True))
+    write_json(out / "compared.json", value)
+    if not answer_json(arguments, value):
+        answer_document(formatted(tables, arguments))
+        show()
+    for picture in draw_queries(experiments, results, out / "pictures", arguments.device or "cpu"):
+        remark(f"picture: {picture}", quiet=arguments.quiet)
+    bundle = arguments.bundle or out / "bundle.zip"
+    with nullcontext():
+        write_bundle(bundle, recipe.name, recipe_bytes(arguments.recipe), folders, out)
+    remark(f"bundle: {bundle}", quiet=arguments.quiet)
+    remark(f"next: su3d-bench report verify {bundle}", quiet=arguments.quiet)
+
+
+__all__ = ["EXIT_INCOMPLETE", "add_parser", "call"]

@@ -1,0 +1,177 @@
+"""From the experiments of a recipe to what is asked of the runner: one run for each dataset and encoder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from su3d_bench.core import registry
+from su3d_bench.core.config import Settings
+from su3d_bench.core.errors import ConfigError, printable
+from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.reports.tables.ablation import SweepRow
+from su3d_bench.reproducing.recipe import Experiment, Recipe
+from su3d_bench.runs.executors.local import Report
+from su3d_bench.runs.planning.ablation import ablation_rows, write_rows
+from su3d_bench.runs.planning.asked import asked_settings
+from su3d_bench.runs.planning.held import Into
+from su3d_bench.runs.planning.plan import Plan, make_plan, named_method
+from su3d_bench.runs.planning.scenes import split_address
+from su3d_bench.runs.runner import RunResult, publish, run_plan
+from su3d_bench.store.atomic import is_file
+
+RUNS = "runs"
+
+
+@dataclass(frozen=True)
+class Asked:
+    """How the recipe is carried out this time: None stands for what it says itself.
+
+    ``values`` are further values of a run by key (``jobs``, ``limit``, ``executor`` and the like), ``assignments`` as
+    ``run --set`` takes them. ``scenes``: dataset -> addresses in place of the recipe's, as a rehearsal has them.
+    """
+
+    profile: str | None = None
+    encoder: str | None = None
+    device: str | None = None
+    values: Mapping[str, Any] = ()  # type: ignore[assignment]
+    assignments: tuple[str, ...] = ()
+    scenes: Mapping[str, tuple[str, ...]] | None = None
+
+
+@dataclass(frozen=True)
+class AskedRun:
+    """One run: ``name`` is its folder's below ``runs/``; ``rows`` are those of sweeps."""
+
+    name: str
+    dataset: str
+    profile: str
+    encoder: str
+    stride: int
+    scenes: tuple[str, ...]
+    methods: tuple[str, ...]
+    protocols: tuple[str, ...]
+    settings: tuple[str, ...]
+    experiments: tuple[str, ...]
+    rows: tuple[SweepRow, ...] = ()
+    device: str | None = None
+    values: Mapping[str, Any] = ()  # type: ignore[assignment]
+
+    def folder(self, out: Path) -> Path:
+        return out / RUNS / self.name
+
+
+def sweep_rows(experiment: Experiment) -> tuple[SweepRow, ...]:
+    """The rows of an experiment that varies settings; none of another."""
+    return ablation_rows(experiment.varied, experiment.vary, is_grid=False) if experiment.vary else ()
+
+
+def methods_of(experiment: Experiment) -> tuple[str, ...]:
+    """What an experiment runs, a sweep's variants first."""
+    return tuple(dict.fromkeys([*(row.method for row in sweep_rows(experiment)), *experiment.methods]))
+
+
+def method_of_row(experiment: Experiment, method: str, row: str | None) -> str:
+    """What stands for a printed row: a variant of a sweep, ``METHOD@ROW`` where that is run, else the method."""
+    for swept in sweep_rows(experiment):
+        if row == f"{swept.parameter}={swept.value.strip('[]')}".replace(" ", ""):
+            return swept.method
+    variant = f"{method}@{row}"
+    return variant if variant in experiment.methods else method
+
+
+def asked_runs(recipe: Recipe, experiments: Sequence[Experiment], asked: Asked) -> tuple[AskedRun, ...]:
+    """The runs that give all ``experiments``; those of one dataset, encoder and stride are one.
+
+    A ``ConfigError`` for a method, protocol or dataset that is not known.
+    """
+    found: dict[tuple[str, str, int], AskedRun] = {}
+    for experiment in experiments:
+        methods = methods_of(experiment)
+        for method in methods:
+            named_method(method)
+        encoder = asked.encoder or experiment.encoder or recipe.encoder
+        for dataset, scenes in _by_dataset(experiment, asked).items():
+            key = dataset, encoder, experiment.stride
+            run = found.get(key) or AskedRun(
+                name="",
+                dataset=dataset,
+                profile=asked.profile or recipe.profile,
+                encoder=encoder,
+                stride=experiment.stride,
+                scenes=(),
+                methods=(),
+                protocols=(),
+                settings=(*recipe.settings, f"perception.models.encoder={encoder}", *asked.assignments),
+                experiments=(),
+                device=asked.device,
+                values=dict(asked.values),
+            )
+            found[key] = replace(
+                run,
+                scenes=_joined(run.scenes, scenes),
+                methods=_joined(run.methods, methods),
+                protocols=_joined(run.protocols, _fitting(experiment, dataset)),
+                experiments=_joined(run.experiments, (experiment.name,)),
+                rows=_joined(run.rows, sweep_rows(experiment)),
+            )
+    usual = asked.encoder or recipe.encoder
+    return tuple(replace(run, name=_name(run, usual)) for run in found.values() if run.methods)
+
+
+def _joined(first: Sequence[Any], second: Sequence[Any]) -> tuple[Any, ...]:
+    return tuple(dict.fromkeys([*first, *second]))
+
+
+def _name(run: AskedRun, usual: str) -> str:
+    stride = f"stride{run.stride}" if run.stride else ""
+    return "-".join(filter(None, (run.dataset, run.encoder if run.encoder != usual else "", stride)))
+
+
+def _by_dataset(experiment: Experiment, asked: Asked) -> dict[str, tuple[str, ...]]:
+    by_dataset: dict[str, tuple[str, ...]] = {}
+    for address in experiment.scenes:
+        dataset, scene = split_address(address)
+        if not scene or (dataset not in registry.names("dataset") and ".py:" not in dataset):
+            raise ConfigError(f"experiment {experiment.name}: '{printable(address, 100)}' is no scene of a dataset")
+        by_dataset[dataset] = (*by_dataset.get(dataset, ()), address)
+    if asked.scenes is None:
+        return by_dataset
+    return {dataset: asked.scenes[dataset] for dataset in by_dataset if dataset in asked.scenes}
+
+
+def _fitting(experiment: Experiment, dataset: str) -> tuple[str, ...]:
+    """The experiment's protocols that score a dataset; a ``ConfigError`` where none does."""
+    truth = TruthFacts.of_dataset(registry.load("dataset", dataset))
+    names = tuple(name for name in experiment.protocols if why_not_truth(load_protocol(name), truth) is None)
+    if experiment.protocols and not names:
+        raise ConfigError(f"experiment {experiment.name}: none of its protocols fits the dataset '{dataset}'")
+    return names
+
+
+def plan_of(run: AskedRun, out: Path) -> Plan:
+    """The plan of a run; what its folder holds already is joined with, so that a table more makes it longer."""
+    values = dict(run.values) | {
+        "scenes": run.scenes,
+        "methods": run.methods,
+        "protocols": run.protocols,
+        "profile": run.profile,
+        "stride": run.stride or None,
+        "pictures": False,
+    }
+    settings: Settings = asked_settings(values, device=run.device, config=None, source_of=lambda key: f"recipe, {key}")
+    folder = run.folder(out)
+    into: Into = "extend" if is_file(folder / "run.toml") else "own"
+    return make_plan(settings, run.settings, folder, into=into)
+
+
+def carry_out(run: AskedRun, plan: Plan, report: Report) -> RunResult:
+    """Do what of ``plan`` is not done yet; the rows of a sweep are left beside its metrics."""
+    result = run_plan(plan, report)
+    if run.rows and result.is_complete:
+        write_rows(plan.folder.path, run.rows, joins=True)
+        publish(plan)
+    return result

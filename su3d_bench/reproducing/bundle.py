@@ -1,0 +1,231 @@
+"""A reproduction as one archive: the recipe, predictions, records and counts of its runs, and their SHA-256.
+
+A zip without compression, its members in the order of their names, with one date and one mode: the same folder gives
+the same bytes on every machine. What is in a prediction is compressed already.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import stat
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import IO, Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from su3d_bench import __version__
+from su3d_bench.core.digests import digest_bytes, digest_file
+from su3d_bench.core.errors import StoreError, counted, printable, shown
+from su3d_bench.core.printing import escaped_json
+from su3d_bench.store.atomic import is_file, make_folder, replacing
+from su3d_bench.store.run_folder import RECORDS, RunFolder
+from su3d_bench.store.unpacking import Allowance, UnpackingError, allowance_of, check_member, member_bytes
+
+MANIFEST, RECIPE, COMPARED, TABLES = "manifest.json", "recipe.toml", "compared.json", "tables.md"
+RUNS = "runs"
+DATE = (1980, 1, 1, 0, 0, 0)  # the first that a zip can have
+MODE = (stat.S_IFREG | 0o644) << 16
+MOST_MEMBERS = 200_000
+MOST_MANIFEST = 64 << 20
+PIECE = 1 << 20
+_OF_A_JOB = re.compile(r"(prediction|anytime-[0-9.e+-]+)(\.npz|\.features\.npy)|anytime-[0-9.e+-]+-counts\.npz"
+                       r"|counts\.npz|updates\.csv|log\.txt|done\.json|refined_names\.json")  # fmt: skip
+_SAFE = re.compile(r"[^/\\:\x00-\x1f\x7f]+(/[^/\\:\x00-\x1f\x7f]+)*")
+Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
+class Entry(BaseModel):
+    """One file of a bundle."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    n_bytes: Annotated[int, Field(ge=0)]
+    sha256: Sha256
+
+
+class Manifest(BaseModel):
+    """What a bundle holds: ``runs`` are the folders of its runs."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    schema_version: Annotated[Literal[1], Field(alias="schema")]
+    program: str
+    recipe: str
+    runs: tuple[str, ...]
+    files: dict[str, Entry]
+
+
+def write_bundle(place: Path, recipe: str, recipe_file: bytes, runs: Sequence[Path], out: Path) -> None:
+    """The archive of ``runs`` and of what ``out`` holds beside them at ``place``, whole or not at all."""
+    sources: dict[str, Path] = {name: out / name for name in (COMPARED, TABLES) if is_file(out / name)}
+    names = [f"{RUNS}/{folder.name}" for folder in runs]
+    for folder, name in zip(runs, names, strict=True):
+        sources |= {f"{name}/{file.relative_to(folder).as_posix()}": file for file in _files_of(folder)}
+    entries = {name: {"n_bytes": file.stat().st_size, "sha256": digest_file(file)} for name, file in sources.items()}
+    entries[RECIPE] = {"n_bytes": len(recipe_file), "sha256": digest_bytes(recipe_file)}
+    manifest = {
+        "schema": 1,
+        "program": f"su3d-bench {__version__}",
+        "recipe": recipe,
+        "runs": sorted(names),
+        "files": dict(sorted(entries.items())),
+    }
+    make_folder(place.absolute().parent)
+    with replacing(place) as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
+        archive.writestr(_member(MANIFEST), escaped_json(manifest, indent=1) + "\n")
+        for name in sorted(entries):
+            if name == RECIPE:
+                archive.writestr(_member(name), recipe_file)
+            else:
+                _add(archive, name, sources[name], str(entries[name]["sha256"]))
+
+
+def _member(name: str) -> zipfile.ZipInfo:
+    info = zipfile.ZipInfo(name, DATE)
+    info.external_attr, info.create_system = MODE, 3
+    return info
+
+
+def _add(archive: zipfile.ZipFile, name: str, file: Path, sha256: str) -> None:
+    """A file in pieces; a ``StoreError`` where it changes meanwhile."""
+    digest = hashlib.sha256()
+    info = _member(name)
+    info.file_size = file.stat().st_size
+    with file.open("rb") as source, archive.open(info, "w") as member:
+        while piece := source.read(PIECE):
+            digest.update(piece)
+            member.write(piece)
+    if digest.hexdigest() != sha256:
+        raise StoreError(f"{shown(file)}: changed while it was packed; pack again when its run has ended")
+
+
+def _files_of(folder: Path) -> Iterator[Path]:
+    """What of a run goes into a bundle: records, maps, counts, times and the replies of language models."""
+    yield from (folder / name for name in RECORDS if is_file(folder / name))
+    for job in RunFolder(folder).jobs():
+        yield from sorted(file for file in job.path.iterdir() if is_file(file) and _OF_A_JOB.fullmatch(file.name))
+    yield from sorted(file for file in (folder / "language").rglob("*") if is_file(file) and not file.is_symlink())
+
+
+def is_bundle(path: Path) -> bool:
+    """Whether a file is called as a bundle is."""
+    return path.suffix.lower() == ".zip"
+
+
+@dataclass(frozen=True)
+class Unpacked:
+    """A bundle in a folder, all of its files those of its manifest."""
+
+    folder: Path
+    manifest: Manifest
+
+    @property
+    def runs(self) -> tuple[Path, ...]:
+        return tuple(self.folder / name for name in self.manifest.runs)
+
+
+def unpack(bundle: Path, into: Path) -> Unpacked:
+    """The files of ``bundle`` in the empty folder ``into``.
+
+    A ``StoreError`` where it is no bundle, a name leads out of the folder, a file is not the one of the manifest, is
+    missing or beside it, or it would unpack to more than it is.
+    """
+    where = shown(bundle)
+    try:
+        with zipfile.ZipFile(bundle) as archive:
+            members = _members(archive, where)
+            allowance = allowance_of(archive)
+            manifest = _manifest(member_bytes(archive, members[MANIFEST], allowance), where)
+            _refuse_others(members, manifest, where)
+            for name, entry in manifest.files.items():
+                _unpack_one(archive, members[name], entry, into, allowance, where)
+    except (zipfile.BadZipFile, UnpackingError, EOFError, NotImplementedError) as error:
+        raise StoreError(f"{where}: is no bundle, or damaged: {printable(str(error), 160)}") from error
+    except OSError as error:
+        raise StoreError(f"{where}: cannot be unpacked: {error.strerror or error}") from error
+    return Unpacked(into, manifest)
+
+
+def _members(archive: zipfile.ZipFile, where: str) -> dict[str, zipfile.ZipInfo]:
+    infos = archive.infolist()
+    if len(infos) > MOST_MEMBERS:
+        raise StoreError(f"{where}: has {len(infos)} files; a bundle has at most {MOST_MEMBERS}")
+    members: dict[str, zipfile.ZipInfo] = {}
+    for info in infos:
+        name = info.filename
+        kind = stat.S_IFMT(info.external_attr >> 16)
+        if info.orig_filename != name or not is_safe(name) or kind not in (0, stat.S_IFREG):
+            raise StoreError(f"{where}: '{printable(name, 120)}' is no plain file below its folder; not unpacked")
+        if name.casefold() in members:
+            raise StoreError(f"{where}: holds '{printable(name, 120)}' twice; not unpacked")
+        members[name.casefold()] = info
+    if MANIFEST not in members or members[MANIFEST].file_size > MOST_MANIFEST:
+        raise StoreError(f"{where}: has no {MANIFEST} of a bundle; make one with su3d-bench reproduce")
+    return {info.filename: info for info in members.values()}
+
+
+def is_safe(name: str) -> bool:
+    """Whether a name leads to a file below the folder that it is unpacked into, on every system.
+
+    >>> is_safe("runs/a/run.json"), is_safe("../a"), is_safe("/a"), is_safe("a//b"), is_safe("C:a")
+    (True, False, False, False, False)
+    """
+    parts = PurePosixPath(name).parts
+    return bool(_SAFE.fullmatch(name)) and len(name) <= 1000 and not {".", ".."} & set(name.split("/")) and bool(parts)
+
+
+def _manifest(content: bytes, where: str) -> Manifest:
+    try:
+        value = json.loads(content)
+        value = {**value, "runs": tuple(value.get("runs", ()))} if isinstance(value, Mapping) else value
+        return Manifest.model_validate(value)
+    except ValidationError as error:
+        key = printable(".".join(map(str, error.errors()[0]["loc"])), 120)
+        raise StoreError(f"{where}: {MANIFEST}: {key or 'it'} is not as a bundle has it") from error
+    except (ValueError, RecursionError, TypeError) as error:
+        raise StoreError(f"{where}: {MANIFEST} is no JSON of a bundle") from error
+
+
+def _refuse_others(members: Mapping[str, zipfile.ZipInfo], manifest: Manifest, where: str) -> None:
+    named = {*manifest.files, MANIFEST}
+    missing = sorted(named - set(members))
+    beside = sorted(set(members) - named)
+    if missing:
+        raise StoreError(f"{where}: {counted(len(missing), 'file')} of its manifest missing, such as {_one(missing)}")
+    if beside:
+        raise StoreError(f"{where}: {counted(len(beside), 'file')} beside its manifest, such as {_one(beside)}")
+    for name in manifest.runs:
+        if not is_safe(name) or f"{name}/run.json" not in manifest.files:
+            raise StoreError(f"{where}: its manifest names the run '{printable(name, 100)}', of which it holds no record")
+
+
+def _one(names: Sequence[str]) -> str:
+    return printable(names[0], 120)
+
+
+def _unpack_one(
+    archive: zipfile.ZipFile, info: zipfile.ZipInfo, entry: Entry, into: Path, allowance: Allowance, where: str
+) -> None:
+    if info.file_size != entry.n_bytes:
+        said = f"has {info.file_size} bytes, its manifest says {entry.n_bytes}"
+        raise StoreError(f"{where}: {printable(info.filename, 120)} {said}")
+    check_member(info, allowance)
+    place = into / info.filename
+    make_folder(place.parent)
+    with archive.open(info) as member, place.open("xb") as out:
+        digest = _copy(member, out)
+    if digest != entry.sha256:
+        raise StoreError(f"{where}: {printable(info.filename, 120)} is not the file of its manifest (other SHA-256)")
+
+
+def _copy(source: IO[bytes], out: IO[bytes]) -> str:
+    digest = hashlib.sha256()
+    while piece := source.read(PIECE):
+        digest.update(piece)
+        out.write(piece)
+    return digest.hexdigest()

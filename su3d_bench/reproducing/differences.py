@@ -1,0 +1,326 @@
+"""Each printed number beside the measured one: the difference with its interval, and what may have caused it."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from su3d_bench.analysis.tables import measured_results
+from su3d_bench.core import registry
+from su3d_bench.core.config import toml_value
+from su3d_bench.core.errors import ConfigError, Su3dError, counted, printable, some
+from su3d_bench.metrics.protocols.files import protocol_names
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.reports.tables.model import Cell, Measured, Table, TableRow
+from su3d_bench.reports.tables.papers.paper import PAPER_PROFILE, PAPER_SCENES
+from su3d_bench.reports.tables.papers.published import OPEN, Figure
+from su3d_bench.reproducing.asked import method_of_row
+from su3d_bench.reproducing.recipe import Experiment
+from su3d_bench.runs.finished import FinishedRun, read_run
+
+_NAMES = ("name", "version", "summary", "original", "headline", "not_comparable_with", "datasets", "by_default")
+_EVERY = re.compile(r"every (\d+)(?:st|nd|rd|th)")
+MOST_RULES = 4
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A printed cell. ``reported`` as printed in per cent; ``measured``, ``interval`` and ``difference`` in points of
+    per cent, None where nothing was measured, and ``why_not`` says why; ``causes`` in the order of their weight."""
+
+    experiment: str
+    method: str
+    row: str
+    dataset: str
+    metric: str
+    reported: str
+    measured: float | None = None
+    interval: tuple[float, float] | None = None
+    protocol: str | None = None
+    run: str | None = None
+    run_method: str | None = None
+    n_scenes: int = 0
+    causes: tuple[str, ...] = ()
+    why_not: str = ""
+    source: str = ""
+
+    @property
+    def difference(self) -> float | None:
+        return None if self.measured is None else self.measured - float(self.reported)
+
+    @property
+    def difference_interval(self) -> tuple[float, float] | None:
+        if self.interval is None:
+            return None
+        return self.interval[0] - float(self.reported), self.interval[1] - float(self.reported)
+
+    @property
+    def is_within(self) -> bool:
+        """Whether the printed number lies in the interval of the measured one."""
+        return self.interval is not None and self.interval[0] <= float(self.reported) <= self.interval[1]
+
+
+@dataclass(frozen=True)
+class Results:
+    """The finished runs of a reproduction, each read once."""
+
+    folders: tuple[Path, ...]
+
+    @cached_property
+    def runs(self) -> Mapping[str, FinishedRun]:
+        return {str(folder): read_run(folder) for folder in self.folders}
+
+    @cached_property
+    def measured(self) -> Sequence[Measured]:
+        return measured_results(self.folders)
+
+
+def compared(experiment: Experiment, results: Results) -> list[Compared]:
+    """Every printed cell of an experiment, in the order of ``published.toml``."""
+    cells = []
+    for figure in experiment.printed():
+        for metric in figure.values:
+            cells.append(_cell(experiment, figure, metric, results))
+    return cells
+
+
+def _cell(experiment: Experiment, figure: Figure, printed: str, results: Results) -> Compared:
+    method = method_of_row(experiment, figure.method, figure.row)
+    name = experiment.metric(figure, printed)
+    reported = figure.percent(printed)
+    assert reported is not None
+    blank = Compared(
+        experiment.name, figure.method, figure.row or figure.method, figure.dataset, printed, reported,
+        source=f"{figure.source}: {figure.setup}",
+    )  # fmt: skip
+    row = _measured(experiment, figure, method, name, results)
+    if row is None:
+        return _with(blank, why_not=_why_not(experiment, figure, method, name, results))
+    interval = row.intervals.get(name)
+    value = row.metrics[name]
+    assert value is not None
+    return _with(
+        blank,
+        measured=100.0 * value,
+        interval=None if interval is None else (100.0 * interval[0], 100.0 * interval[1]),
+        protocol=row.protocol,
+        run=row.run,
+        run_method=row.method,
+        n_scenes=len(row.per_scene),
+        causes=tuple(causes(figure, row, results.runs.get(row.run))),
+    )
+
+
+def _with(cell: Compared, **values: Any) -> Compared:
+    return Compared(**{**vars(cell), **values})
+
+
+def _measured(
+    experiment: Experiment, figure: Figure, method: str, metric: str, results: Results
+) -> Measured | None:
+    """The row that stands beside a figure: under its own protocol, else the first of the experiment that has it."""
+    wanted = list(dict.fromkeys([*([figure.protocol] if figure.protocol else []), *experiment.protocols]))
+    wanted = [name for name in wanted if name in experiment.protocols]
+    for protocol in wanted:
+        for row in results.measured:
+            is_of_data = bool(row.per_scene) and figure.dataset.startswith(row.datasets)
+            if (row.method, row.protocol) == (method, protocol) and is_of_data and row.metrics.get(metric) is not None:
+                return row
+    return None
+
+
+def _why_not(experiment: Experiment, figure: Figure, method: str, metric: str, results: Results) -> str:
+    if figure.method in experiment.predictions:
+        return f"no method here: give its predictions with --predictions '{figure.method}=DIR'"
+    mine = [row for row in results.measured if row.method == method and row.protocol in experiment.protocols]
+    if not mine:
+        return f"no run has {printable(method, 60)} under {some(experiment.protocols, 3)}"
+    failed = [scene for row in mine for scene in row.failed]
+    if failed:
+        return f"{printable(method, 60)} failed on {some(failed, 3)}"
+    if all(metric not in row.metrics for row in mine):
+        return f"no such metric under {some([row.protocol for row in mine], 3)}"
+    return f"not scored on {figure.dataset}"
+
+
+# ---- causes
+
+
+def causes(figure: Figure, row: Measured, run: FinishedRun | None) -> Iterator[str]:
+    """In what the row of a run was made otherwise than the printed number, as far as both sides say."""
+    yield from _of_judges(figure, row)
+    yield from _of_protocol(figure, row)
+    yield from _of_scenes(figure, row)
+    yield from _of_encoder(figure, row)
+    yield from _of_proposals(figure, row, run)
+    yield from _of_frames(figure, row, run)
+    yield from _of_labels(figure, row, run)
+    if row.changed and not (figure.row and "=" in figure.row):
+        yield f"settings: {some(row.changed, 4)}"
+
+
+def _of_judges(figure: Figure, row: Measured) -> Iterator[str]:
+    if "judged by a person" in figure.setup and not row.is_by_people:
+        yield "judges: the ground truth in place of a person, on questions of its own"
+
+
+def _of_protocol(figure: Figure, row: Measured) -> Iterator[str]:
+    if figure.protocol is None or figure.protocol == row.protocol:
+        return
+    if not {figure.protocol, row.protocol} <= set(protocol_names()):
+        yield f"protocol rule: {row.protocol} in place of {figure.protocol}"
+        return
+    theirs, ours = (load_protocol(name).as_json for name in (figure.protocol, row.protocol))
+    keys = [key for key in dict.fromkeys([*theirs, *ours]) if key not in _NAMES and theirs.get(key) != ours.get(key)]
+    said = f" (other {', '.join(keys[:MOST_RULES])}{' and more' if len(keys) > MOST_RULES else ''})" if keys else ""
+    yield f"protocol rule: {row.protocol} in place of {figure.protocol}{said}"
+
+
+def _of_scenes(figure: Figure, row: Measured) -> Iterator[str]:
+    made = next((part for part in (row.caveat or "").split("; ") if part.startswith("made rooms")), None)
+    if made is not None:
+        yield f"scenes: {counted(len(row.scenes), 'room')} made by the program, not {figure.dataset}'s scenes"
+        return
+    papers = {f"{row.datasets}/{name}" for name in PAPER_SCENES.get(row.datasets, ())}
+    if papers and figure.dataset == row.datasets and row.scenes != papers:
+        yield f"scenes: {len(row.scenes & papers)} of the paper's {len(papers)}, {len(row.scenes - papers)} others"
+    if row.failed or row.unscored:
+        yield f"scenes: {len(row.failed) + len(row.unscored)} of {row.n_planned} without a score"
+
+
+def _of_encoder(figure: Figure, row: Measured) -> Iterator[str]:
+    if row.encoder is None:
+        return
+    name = figure.protocol or row.protocol
+    wanted = load_protocol(name).encoder if name in protocol_names() else None
+    if "ncoder is open" in figure.setup:
+        yield f"encoder: {row.encoder}; which the paper took is open"
+    elif wanted is not None and row.encoder != wanted:
+        yield f"encoder: {row.encoder} in place of {wanted}"
+    elif "OVSeg" in figure.setup:
+        yield f"encoder: {row.encoder} in place of OVSeg's"
+
+
+def _of_proposals(figure: Figure, row: Measured, run: FinishedRun | None) -> Iterator[str]:
+    theirs = figure.system.proposals
+    own = None if run is None else run.settings.get(("method", row.method, "proposals"))
+    if isinstance(own, str):
+        yield f"proposals: {toml_value(own)} of {row.method} in place of {_open(theirs)}"
+    elif row.profile is not None and row.profile != PAPER_PROFILE:
+        yield f"proposals: masks of the profile '{row.profile}' in place of {_open(theirs)}"
+
+
+def _open(fact: str) -> str:
+    return "what the paper leaves open" if fact == OPEN else fact
+
+
+def _of_frames(figure: Figure, row: Measured, run: FinishedRun | None) -> Iterator[str]:
+    if row.limit:
+        yield f"stride: only the first {counted(row.limit, 'update')} of each scene"
+    theirs = figure.system.frames
+    ours = None if run is None else _stride(row, run)
+    every = _EVERY.match(theirs)
+    if ours is None or theirs == OPEN:
+        return
+    wanted = 1 if theirs.startswith("all") else int(every[1]) if every else None
+    if wanted is not None and wanted != ours:
+        yield f"stride: every {ours}. frame in place of {theirs}"
+
+
+def _stride(row: Measured, run: FinishedRun) -> int | None:
+    stride = run.settings.get(("stride",), 0) or run.settings.get(("method", row.method, "stride"))
+    if stride is None and row.method.partition("@")[0] in registry.METHODS:
+        return None
+    return None if stride is None else int(stride)
+
+
+def _of_labels(figure: Figure, row: Measured, run: FinishedRun | None) -> Iterator[str]:
+    theirs = figure.system.labels
+    if run is None or theirs == OPEN or not theirs.startswith("the "):
+        return
+    record = run.results.get((row.method, row.protocol))
+    ours = None if record is None else record.labels
+    if ours is not None and ours != theirs:
+        yield f"labels a mask: {ours} in place of {theirs}"
+
+
+# ---- tables
+
+
+def comparison_table(experiment: Experiment, cells: Sequence[Compared]) -> Table:
+    """A row a printed row and dataset; of each metric what was printed, measured, and the difference."""
+    metrics = list(dict.fromkeys(cell.metric for cell in cells))
+    marks: dict[tuple[str, ...], str] = {}
+    rows = []
+    for key in dict.fromkeys((cell.source, cell.row, cell.method, cell.dataset) for cell in cells):
+        mine = {cell.metric: cell for cell in cells if (cell.source, cell.row, cell.method, cell.dataset) == key}
+        said = tuple(dict.fromkeys(line for cell in mine.values() for line in _said(cell)))
+        mark = marks.setdefault(said, f"[{len(marks) + 1}]")
+        shown = tuple(text for metric in metrics for text in _shown(mine.get(metric)))
+        rows.append(TableRow(f"{key[1]} on {key[3]} {mark}", tuple(map(Cell, shown))))
+    notes = [f"{mark} {'; '.join(said)}" for said, mark in marks.items()]
+    n = len(cells)
+    n_measured = sum(cell.measured is not None for cell in cells)
+    n_within = sum(cell.is_within for cell in cells)
+    return Table(
+        name=f"compared-{experiment.name}",
+        caption=f"{experiment.title}: reported beside measured, per cent; difference = measured - reported.",
+        head="row",
+        columns=tuple(f"{metric} {what}" for metric in metrics for what in ("reported", "measured", "difference")),
+        rows=tuple(rows),
+        notes=(
+            f"{n_measured} of {counted(n, 'printed cell')} measured, {n_within} printed within the 95 % interval of the "
+            "measured; that of a difference is the interval over scenes of the measured number alone",
+            *notes,
+            *([experiment.note] if experiment.note else []),
+        ),
+        heading=f"{experiment.name}.",
+    )
+
+
+def _said(cell: Compared) -> list[str]:
+    if cell.measured is None:
+        return [f"not measured: {cell.why_not}"]
+    what = list(cell.causes) or ["nothing is known to differ: protocol, encoder, proposals and stride are the paper's"]
+    return [f"under {cell.protocol}", *what]
+
+
+def _shown(cell: Compared | None) -> tuple[str, str, str]:
+    if cell is None:
+        return "-", "-", "-"
+    if cell.measured is None:
+        return cell.reported, "-", "-"
+    difference, ends = cell.difference, cell.difference_interval
+    measured = f"{cell.measured:.1f}" + (f" [{cell.interval[0]:.1f}, {cell.interval[1]:.1f}]" if cell.interval else "")
+    return cell.reported, measured, f"{difference:+.1f}" + (f" [{ends[0]:+.1f}, {ends[1]:+.1f}]" if ends else "")
+
+
+def compared_all(experiments: Sequence[Experiment], results: Results) -> dict[str, list[Compared]]:
+    """The cells of every experiment that has printed figures."""
+    return {one.name: compared(one, results) for one in experiments if one.figures}
+
+
+def tables_of(experiment: Experiment, results: Results) -> list[Table]:
+    """The paper's own table of an experiment, as ``report tables --table`` makes it; none where nothing can be shown."""
+    from su3d_bench.analysis.paper_tables import numbered_tables
+    from su3d_bench.analysis.tables import choose
+    from su3d_bench.reports.tables.papers.paper import Shown
+    from su3d_bench.reproducing.asked import methods_of
+
+    if experiment.table is None:
+        return []
+    mine = [row for row in results.measured if row.protocol in experiment.protocols]
+    methods = [name for name in methods_of(experiment) if any(row.method == name for row in mine)]
+    folders = [folder for folder in results.folders if any(row.run == str(folder) for row in mine)]
+    try:
+        rows = choose(mine, methods, ())
+        return numbered_tables([experiment.table], rows, folders, Shown(intervals=True), with_published=True)
+    except ConfigError as error:
+        raise ConfigError(f"experiment {experiment.name}: {error}") from error
+
+
+__all__ = ["Compared", "Results", "Su3dError", "compared", "compared_all", "comparison_table", "tables_of"]
