@@ -201,7 +201,9 @@ def _refuse_others(members: Mapping[str, zipfile.ZipInfo], manifest: Manifest, w
         raise StoreError(f"{where}: {counted(len(beside), 'file')} beside its manifest, such as {_one(beside)}")
     for name in manifest.runs:
         if not is_safe(name) or f"{name}/run.json" not in manifest.files:
-            raise StoreError(f"{where}: its manifest names the run '{printable(name, 100)}', of which it holds no record")
+            raise StoreError(
+                f"{where}: its manifest names the run '{printable(name, 100)}', of which it holds no record"
+            )
 
 
 def _one(names: Sequence[str]) -> str:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from su3d_bench.core.config import toml_value
@@ -17,7 +16,7 @@ from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.system.timing import calibration_ms, hardware_line
 from su3d_bench.core.toml import parse_toml
-from su3d_bench.runs.executors.local import SCENE_DONE, Event
+from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
 from su3d_bench.store.atomic import write_text
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
@@ -25,6 +24,7 @@ FILE = Path(__file__).resolve().parent / "unit_costs.toml"
 NAME = "unit_costs.toml"  # of a probe's, in the folder of the reproduction
 MOST_BYTES = 1 << 20
 N_CALIBRATIONS = 15
+LEAST_MS = 1e-3  # where a clock is too coarse for it
 COMPILING = "compiling"  # how an event begins that is once a process, see runs.scene
 START = ""  # stands for what a run takes before its first scene
 Amount = Annotated[float, Field(ge=0, le=1e15, allow_inf_nan=False)]
@@ -91,8 +91,22 @@ def write_costs(path: Path, costs: UnitCosts) -> None:
 
 
 def calibrated_ms() -> float:
-    """The fixed piece of work of ``calibration_ms`` on this machine now: the median of several."""
-    return float(np.median([calibration_ms() for _ in range(N_CALIBRATIONS)]))
+    """The fixed piece of work of ``calibration_ms`` on this machine, in milliseconds of processor time: the least of
+    several, which what runs beside lengthens least."""
+    calibration_ms()
+    return min(_calibration() for _ in range(N_CALIBRATIONS))
+
+
+def _calibration() -> float:
+    start = time.process_time()
+    calibration_ms()
+    return max(1e3 * (time.process_time() - start), LEAST_MS)
+
+
+def clock_of(device: str) -> Callable[[], float]:
+    """Which clock prices are taken by: processor time, which nothing beside moves, where the processor does the work;
+    elsewhere the clock on the wall."""
+    return time.process_time if device == "cpu" else time.perf_counter
 
 
 @dataclass
@@ -102,14 +116,18 @@ class Stopwatch:
     ``spent``: (method, what) -> seconds over all scenes, where what is ``feed``, ``once`` or ``scene``.
     """
 
-    then: object = None
+    clock: Callable[[], float]
+    then: Report | None = None
     spent: dict[tuple[str, str], float] = field(default_factory=dict)
     start_s: float = 0.0
     _open: dict[str, tuple[float, str, str]] = field(default_factory=dict)
-    _begun: float = field(default_factory=time.perf_counter)
+    _begun: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._begun = self.clock()
 
     def __call__(self, event: Event) -> None:
-        now = time.perf_counter()
+        now = self.clock()
         if event.unit and not self.spent and not self._open:
             self.start_s = now - self._begun
         before = self._open.pop(event.unit, None)
@@ -119,7 +137,7 @@ class Stopwatch:
         if event.unit and event.label != SCENE_DONE:
             what = "once" if event.doing.startswith(COMPILING) else "scene" if event.doing else "feed"
             self._open[event.unit] = (now, event.label, what)
-        if callable(self.then):
+        if self.then is not None:
             self.then(event)
 
 

@@ -9,16 +9,17 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.analysis.tables import measured_results
+from su3d_bench.analysis.paper_tables import numbered_tables
+from su3d_bench.analysis.tables import choose, measured_results
 from su3d_bench.core import registry
 from su3d_bench.core.config import toml_value
-from su3d_bench.core.errors import ConfigError, Su3dError, counted, printable, some
+from su3d_bench.core.errors import ConfigError, counted, printable, some
 from su3d_bench.metrics.protocols.files import protocol_names
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.reports.tables.model import Cell, Measured, Table, TableRow
-from su3d_bench.reports.tables.papers.paper import PAPER_PROFILE, PAPER_SCENES
+from su3d_bench.reports.tables.papers.paper import PAPER_PROFILE, PAPER_SCENES, Shown
 from su3d_bench.reports.tables.papers.published import OPEN, Figure
-from su3d_bench.reproducing.asked import method_of_row
+from su3d_bench.reproducing.asked import method_of_row, methods_of
 from su3d_bench.reproducing.recipe import Experiment
 from su3d_bench.runs.finished import FinishedRun, read_run
 
@@ -81,11 +82,7 @@ class Results:
 
 def compared(experiment: Experiment, results: Results) -> list[Compared]:
     """Every printed cell of an experiment, in the order of ``published.toml``."""
-    cells = []
-    for figure in experiment.printed():
-        for metric in figure.values:
-            cells.append(_cell(experiment, figure, metric, results))
-    return cells
+    return [_cell(experiment, figure, metric, results) for figure in experiment.printed() for metric in figure.values]
 
 
 def _cell(experiment: Experiment, figure: Figure, printed: str, results: Results) -> Compared:
@@ -119,9 +116,7 @@ def _with(cell: Compared, **values: Any) -> Compared:
     return Compared(**{**vars(cell), **values})
 
 
-def _measured(
-    experiment: Experiment, figure: Figure, method: str, metric: str, results: Results
-) -> Measured | None:
+def _measured(experiment: Experiment, figure: Figure, method: str, metric: str, results: Results) -> Measured | None:
     """The row that stands beside a figure: under its own protocol, else the first of the experiment that has it."""
     wanted = list(dict.fromkeys([*([figure.protocol] if figure.protocol else []), *experiment.protocols]))
     wanted = [name for name in wanted if name in experiment.protocols]
@@ -228,7 +223,7 @@ def _of_frames(figure: Figure, row: Measured, run: FinishedRun | None) -> Iterat
         return
     wanted = 1 if theirs.startswith("all") else int(every[1]) if every else None
     if wanted is not None and wanted != ours:
-        yield f"stride: every {ours}. frame in place of {theirs}"
+        yield f"stride: one frame in {ours} in place of {theirs}"
 
 
 def _stride(row: Measured, run: FinishedRun) -> int | None:
@@ -268,17 +263,17 @@ def comparison_table(experiment: Experiment, cells: Sequence[Compared]) -> Table
     n_within = sum(cell.is_within for cell in cells)
     return Table(
         name=f"compared-{experiment.name}",
-        caption=f"{experiment.title}: reported beside measured, per cent; difference = measured - reported.",
+        caption=f": {experiment.title}; reported beside measured, per cent; difference = measured - reported.",
         head="row",
         columns=tuple(f"{metric} {what}" for metric in metrics for what in ("reported", "measured", "difference")),
         rows=tuple(rows),
         notes=(
-            f"{n_measured} of {counted(n, 'printed cell')} measured, {n_within} printed within the 95 % interval of the "
-            "measured; that of a difference is the interval over scenes of the measured number alone",
+            f"{n_measured} of {counted(n, 'printed cell')} measured, {n_within} printed within the 95 % interval of "
+            "the measured; that of a difference is the interval over scenes of the measured number alone",
             *notes,
             *([experiment.note] if experiment.note else []),
         ),
-        heading=f"{experiment.name}.",
+        heading=experiment.name,
     )
 
 
@@ -295,7 +290,10 @@ def _shown(cell: Compared | None) -> tuple[str, str, str]:
     if cell.measured is None:
         return cell.reported, "-", "-"
     difference, ends = cell.difference, cell.difference_interval
-    measured = f"{cell.measured:.1f}" + (f" [{cell.interval[0]:.1f}, {cell.interval[1]:.1f}]" if cell.interval else "")
+    assert difference is not None
+    measured = f"{cell.measured:.1f}"
+    if cell.interval is not None:
+        measured += f" [{cell.interval[0]:.1f}, {cell.interval[1]:.1f}]"
     return cell.reported, measured, f"{difference:+.1f}" + (f" [{ends[0]:+.1f}, {ends[1]:+.1f}]" if ends else "")
 
 
@@ -305,12 +303,7 @@ def compared_all(experiments: Sequence[Experiment], results: Results) -> dict[st
 
 
 def tables_of(experiment: Experiment, results: Results) -> list[Table]:
-    """The paper's own table of an experiment, as ``report tables --table`` makes it; none where nothing can be shown."""
-    from su3d_bench.analysis.paper_tables import numbered_tables
-    from su3d_bench.analysis.tables import choose
-    from su3d_bench.reports.tables.papers.paper import Shown
-    from su3d_bench.reproducing.asked import methods_of
-
+    """The paper's own table of an experiment, as ``report tables --table`` makes it; none where it has none."""
     if experiment.table is None:
         return []
     mine = [row for row in results.measured if row.protocol in experiment.protocols]
@@ -321,6 +314,3 @@ def tables_of(experiment: Experiment, results: Results) -> list[Table]:
         return numbered_tables([experiment.table], rows, folders, Shown(intervals=True), with_published=True)
     except ConfigError as error:
         raise ConfigError(f"experiment {experiment.name}: {error}") from error
-
-
-__all__ = ["Compared", "Results", "Su3dError", "compared", "compared_all", "comparison_table", "tables_of"]

@@ -24,9 +24,8 @@ def named_predictions(experiments: Sequence[Experiment], texts: Sequence[str]) -
         if not equals or not path:
             raise ConfigError(f"--predictions {printable(text, 80)}: expected METHOD=DIR")
         if method not in known:
-            raise ConfigError(
-                f"--predictions: this recipe takes none of '{printable(method, 60)}'{suggest(method, known, 'it takes')}"
-            )
+            hint = suggest(method, known, "it takes")
+            raise ConfigError(f"--predictions: this recipe takes none of '{printable(method, 60)}'{hint}")
         if not Path(path).exists():
             raise ConfigError(f"--predictions {printable(method, 60)}: there is no {printable(path, 200)}")
         named[method] = Path(path)

@@ -1,4 +1,4 @@
-"""What a reproduction needs: what of it is here, what is missing with bytes and a way to get it, and what it will cost."""
+"""What a reproduction needs: what of it is here, what is missing and how to get it, and what all will cost."""
 
 from __future__ import annotations
 
@@ -235,12 +235,15 @@ def _model(name: str, config: PerceptionConfig, *, is_required: bool) -> Need:
         files = locate(name, forms, path=place[0], folder=place[1])
     except ModelMissing:
         n_bytes = next(form.size_mb for form in entry.forms) * float(MB)
-        return Need("model", name, is_here=False, n_bytes=n_bytes, how=FETCH_MODELS, is_required=is_required, remark=remark)
+        return Need(
+            "model", name, is_here=False, n_bytes=n_bytes, how=FETCH_MODELS, is_required=is_required, remark=remark
+        )
     return Need("model", name, is_here=True, n_bytes=0.0, remark=str(files.folder))
 
 
 def _machine(runs: Sequence[AskedRun], out: Path, estimates: Sequence[Estimate]) -> Iterator[Need]:
-    """Room on the disk, in memory and on the GPU, where it is known how much is needed."""
+    """Room on the disk, in memory and on the GPU, where it is known how much is needed; what is estimated is not
+    required, a GPU where one is asked for is."""
     import psutil
 
     disk = [one.disk_bytes for one in estimates if one.disk_bytes is not None]
@@ -257,7 +260,8 @@ def _machine(runs: Sequence[AskedRun], out: Path, estimates: Sequence[Estimate])
 
 def _room(kind: str, name: str, needed: float, free: float | None) -> Need:
     remark = "no GPU is seen by torch here" if free is None else f"{free / 1e9:.1f} GB are free"
-    return Need(kind, name, is_here=free is not None and needed <= free, n_bytes=needed, remark=remark)
+    is_enough = free is not None and needed <= free
+    return Need(kind, name, is_here=is_enough, n_bytes=needed, is_required=free is None, remark=remark)
 
 
 def _existing(path: Path) -> Path:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from su3d_bench.reproducing.asked import AskedRun, carry_out, plan_of
-from su3d_bench.reproducing.costs import NAME, Stopwatch, UnitCost, measured_costs, measured_here, write_costs
+from su3d_bench.reproducing.costs import NAME, Stopwatch, UnitCost, clock_of, measured_costs, measured_here, write_costs
 from su3d_bench.runs.executors.local import Report
 from su3d_bench.store.run_folder import RunFolder
 from su3d_bench.store.scratch import TemporaryFolder
@@ -37,14 +37,16 @@ def _probed(run: AskedRun, report: Report | None) -> tuple[UnitCost, ...]:
         short = replace(run, values=values)
         whole = plan_of(short, folder)
         plan = replace(whole, jobs=whole.jobs[:1])
-        watch = Stopwatch(report)
+        watch = Stopwatch(clock_of(run.device or "cpu"), report)
         result = carry_out(replace(short, rows=()), plan, watch)
         jobs = [(one.scene, one.method, run.profile) for one in result.outcomes if one.method in plan.methods]
         failed = {(scene, method) for scene, method, _ in result.failures}
         done = [job for job in jobs if job[:2] not in failed]
         if not done:
             return ()
-        return measured_costs(watch, RunFolder(plan.folder.path), done, run.device or "cpu", _bytes_below(folder / "cache"))
+        return measured_costs(
+            watch, RunFolder(plan.folder.path), done, run.device or "cpu", _bytes_below(folder / "cache")
+        )
 
 
 def _bytes_below(folder: Path) -> int:

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from su3d_bench.core.errors import ConfigError, printable, reading, suggest
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.toml import parse_toml
-from su3d_bench.reports.tables.papers.published import Figure, PaperTable, figures_of
+from su3d_bench.reports.tables.papers.published import Figure, PaperTable, published
 
 FOLDER = Path(__file__).resolve().parent / "recipes"
 MOST_BYTES = 1 << 20
@@ -67,7 +67,7 @@ class Experiment(BaseModel):
                 raise ConfigError(
                     f"experiment {self.name}: figures have no '{printable(unknown, 60)}'{suggest(unknown, known)}"
                 )
-            figures = figures_of(**choice)
+            figures = [one for one in published() if all(getattr(one, key) == said for key, said in choice.items())]
             if not figures:
                 said = ", ".join(f"{key} = {value}" for key, value in choice.items())
                 raise ConfigError(f"experiment {self.name}: published.toml holds no figure of {printable(said, 200)}")
@@ -86,7 +86,7 @@ class Rehearsal(BaseModel):
     model_config = _STRICT
 
     rooms: Annotated[tuple[Word, ...], Field(min_length=1)] = ("bedroom0", "office0")
-    settings: tuple[Word, ...] = ("n_frames=400",)
+    settings: tuple[Word, ...] = ("n_frames=200", "width=320", "height=240")
     profile: Literal["embedded", "oracle"] = "embedded"
 
 

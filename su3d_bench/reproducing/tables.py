@@ -8,7 +8,7 @@ from typing import Any
 
 from su3d_bench.core.errors import counted
 from su3d_bench.metrics.costs import summarise
-from su3d_bench.reports.tables.model import Table, text_table
+from su3d_bench.reports.tables.model import Prose, Table, text_table
 from su3d_bench.reports.tables.timing import timing_tables
 from su3d_bench.reproducing.asked import methods_of
 from su3d_bench.reproducing.differences import Compared, Results, comparison_table, tables_of
@@ -44,19 +44,22 @@ def preflight_tables(known: Preflight) -> list[Table]:
     rows = [["what", "name", "is here", "bytes", "how to get it"]]
     rows += [[need.kind, need.name, _state(need), _bytes(need), need.how or "-"] for need in known.needs]
     remarks = [f"{need.name}: {need.remark}" for need in known.needs if need.remark and not need.is_here]
-    here = text_table("needs", rows, heading="Needed.", caption=_said(known), notes=remarks)
+    here = text_table("needs", rows, heading="Needed", caption=f": {_said(known)}", notes=remarks)
     prices = [["run", "time", "disk", "memory", "GPU memory"]]
     for one in known.estimates:
         gpu = "-" if not one.device_bytes else size(one.device_bytes)
         prices.append([one.name, duration(one.seconds), size(one.disk_bytes), size(one.memory_bytes), gpu])
     notes = [f"unit costs of {one.name}: measured on {one.where}" for one in known.estimates if not one.unknown]
     notes += [
-        f"{one.name}: no unit cost of {', '.join(one.unknown)} was measured under its profile and device; --probe measures "
-        "them here"
+        f"{one.name}: no unit cost of {', '.join(one.unknown)} was measured under its profile and device; --probe "
+        "measures them here"
         for one in known.estimates
         if one.unknown
     ]
-    return [here, text_table("price", prices, heading="Price.", caption=_total(known), notes=dict.fromkeys(notes))]
+    return [
+        here,
+        text_table("price", prices, heading="Price", caption=f": {_total(known)}", notes=dict.fromkeys(notes)),
+    ]
 
 
 def _state(need: Need) -> str:
@@ -71,18 +74,18 @@ def _said(known: Preflight) -> str:
     missing = known.missing
     n_bytes = sum(need.n_bytes or 0.0 for need in missing if need.kind in ("model", "scene"))
     if not missing:
-        return "Everything that is required is here."
+        return "everything that is required is here."
     return f"{counted(len(missing), 'thing')} missing, about {size(n_bytes)} to fetch."
 
 
 def _total(known: Preflight) -> str:
     hours = known.hours
-    return "How long all takes is not known." if hours is None else f"All runs take about {duration(3600 * hours)}."
+    return "how long all takes is not known." if hours is None else f"all runs take about {duration(3600 * hours)}."
 
 
 def summary(known: Preflight) -> Iterator[str]:
     """The preflight in a few lines."""
-    yield f"preflight: {_said(known)} {_total(known)}"
+    yield f"preflight: {_said(known)[:-1]}; {_total(known)}"
     for need in known.needs:
         if not need.is_here:
             yield f"  missing: {need.kind} {need.name}" + (f" ({need.remark})" if need.remark else "")
@@ -90,9 +93,9 @@ def summary(known: Preflight) -> Iterator[str]:
 
 def result_tables(
     experiments: Sequence[Experiment], cells: Mapping[str, Sequence[Compared]], results: Results
-) -> list[Table]:
+) -> list[Table | Prose]:
     """Of each experiment the paper's own table, and under it reported beside measured; of timing its tables."""
-    tables: list[Table] = []
+    tables: list[Table | Prose] = []
     for experiment in experiments:
         tables += tables_of(experiment, results)
         if cells.get(experiment.name):
@@ -102,7 +105,7 @@ def result_tables(
     return tables
 
 
-def _timing(experiment: Experiment, results: Results) -> list[Table]:
+def _timing(experiment: Experiment, results: Results) -> Sequence[Table | Prose]:
     timed = [
         times
         for run in results.runs.values()

@@ -121,10 +121,15 @@ def difference(kept: Mapping[str, NDArray[Any]], ours: Mapping[str, NDArray[Any]
     for name, before in kept.items():
         now = ours[name]
         if before.dtype != now.dtype or before.shape != now.shape:
-            return f"'{printable(name, 100)}' is {before.dtype} of {before.shape}, its map gives {now.dtype} of {now.shape}"
+            forms = f"{before.dtype} of {before.shape}, its map gives {now.dtype} of {now.shape}"
+            return f"'{printable(name, 100)}' is {forms}"
         if before.tobytes() == now.tobytes():
             continue
-        if before.dtype.kind == "f" and not to_the_bit and np.allclose(before, now, rtol=0, atol=TOLERANCE, equal_nan=True):
+        if (
+            before.dtype.kind == "f"
+            and not to_the_bit
+            and np.allclose(before, now, rtol=0, atol=TOLERANCE, equal_nan=True)
+        ):
             continue
         places = np.flatnonzero((before != now).ravel())
         k = int(places[0]) if len(places) else 0

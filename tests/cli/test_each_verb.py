@@ -54,6 +54,7 @@ CASES: dict[str, tuple[list[str], int, str]] = {
     ),
     "report leaderboard": (["out", "--out", "board.md"], 0, "board.md"),
     "report verify": (["tables.tex"], 0, ""),
+    "reproduce": (["opensu3d", "--table", "II", "--dry-run"], 1, "su3d-bench fetch replica"),
     "runs list": (["."], 0, "opensu3d"),
     "runs show": (["out"], 0, "take it up again: su3d-bench run --config out/run.toml --out out"),
     "runs remove": (["sweep", "--yes"], 0, "removed sweep: complete"),

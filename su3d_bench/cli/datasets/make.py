@@ -104,7 +104,7 @@ def _make_native(part: Part, scenes: Sequence[str], out: Path, arguments: argpar
 
 
 def make_files(part: Part, scenes: Sequence[str], out: Path, arguments: argparse.Namespace) -> set[str]:
-    """Write scenes in the layout of ``arguments``, whose ``jobs`` and ``quiet`` count too; those that were not there."""
+    """Write scenes in the layout of ``arguments``, whose ``jobs`` and ``quiet`` count; those that were not there."""
     layout, dataset = LAYOUTS[arguments.layout], build_dataset(part, data_root())
     units = []
     for target in plan_scenes(layout, dataset, scenes, out):

@@ -1,4 +1,4 @@
-"""``su3d-bench report verify``: whether the cells of a paper still are what their runs give, and bundles what they say."""
+"""``su3d-bench report verify``: whether the cells of a paper, or a bundle's numbers, still are what their runs give."""
 
 from __future__ import annotations
 
@@ -24,7 +24,11 @@ def add_parser(actions: Any) -> None:
         call,
     )
     parser.add_argument(
-        "files", nargs="+", type=Path, metavar="FILE", help="LaTeX by report tables, or around it; or bundle.zip of reproduce"
+        "files",
+        nargs="+",
+        type=Path,
+        metavar="FILE",
+        help="LaTeX by report tables, or around it; or bundle.zip of reproduce",
     )
     parser.add_argument(
         "--root", type=Path, metavar="DIR", help="where the runs' folders are (default: here, then beside the file)"
@@ -49,7 +53,8 @@ def _verify_bundles(bundles: list[Path], arguments: argparse.Namespace) -> int:
         lines += [f"{one.bundle}: {fault}" for fault in one.faults]
         how = "to the last bit" if one.is_to_the_bit else "integers the same, values within 1e-9"
         said = f"differs: {counted(len(one.faults), 'fault')}" if one.faults else f"holds, {how}"
-        looked_at = f"{counted(one.n_files, 'file')}, {counted(one.n_scores, 'score')} made anew, {counted(one.n_cells, 'cell')}"
+        counts = (counted(one.n_files, "file"), counted(one.n_scores, "score"), counted(one.n_cells, "cell"))
+        looked_at = "{}, {} made anew, {}".format(*counts)
         lines.append(f"{one.bundle}: {looked_at}; {said}")
     answer_either(arguments, {"bundles": [asdict(one) for one in found]}, *lines)
     return EXIT_CHECK_FAILED if any(one.faults for one in found) else EXIT_DONE

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.run import add_executor_flags
 from su3d_bench.cli.shared.answers import answer, answer_document, answer_json, formatted, remark, show, written
 from su3d_bench.cli.shared.flags import add_settings, add_table_format, add_verb
-from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INCOMPLETE, ConfigError, RunIncomplete, counted
+from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, RunIncomplete, counted
 
 if TYPE_CHECKING:
-    from su3d_bench.reports.tables.model import Table
     from su3d_bench.reproducing.asked import Asked, AskedRun
     from su3d_bench.reproducing.preflight import Preflight
     from su3d_bench.reproducing.recipe import Experiment, Recipe
@@ -34,18 +32,28 @@ def add_parser(verbs: Any) -> None:
         call,
         takes_up=True,
     )
-    parser.add_argument("recipe", metavar="RECIPE", nargs="?", help="its name, or a file of your own (default: list them)")
+    parser.add_argument(
+        "recipe", metavar="RECIPE", nargs="?", help="its name, or a file of your own (default: list them)"
+    )
     parser.add_argument("--table", nargs="+", default=[], metavar="NAME", help="these experiments alone (default: all)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where all goes (default: reproduced/<recipe>)")
     parser.add_argument("--dry-run", action="store_true", help="say what is missing and what it will cost, and end")
-    parser.add_argument("--probe", action="store_true", help="first measure what updates cost here, a few of each method")
-    parser.add_argument("--rehearse", action="store_true", help="the same on rooms made in the same layouts, no weights")
+    parser.add_argument(
+        "--probe", action="store_true", help="first measure what updates cost here, a few of each method"
+    )
+    parser.add_argument(
+        "--rehearse", action="store_true", help="the same on rooms made in the same layouts, no weights"
+    )
     parser.add_argument("--rooms", nargs="+", metavar="ROOM", help="of a rehearsal (default: the recipe's)")
     parser.add_argument(
         "--room-settings", nargs="+", metavar="KEY=VALUE", help="options of the rooms, such as n_frames=80 width=160"
     )
     parser.add_argument(
-        "--predictions", nargs="+", default=[], metavar="METHOD=DIR", help="of methods that are none here, as evaluate takes"
+        "--predictions",
+        nargs="+",
+        default=[],
+        metavar="METHOD=DIR",
+        help="of methods that are none here, as evaluate takes",
     )
     parser.add_argument("--profile", help="whose perception (default: the recipe's)")
     parser.add_argument("--encoder", help="of all runs, such as embedded (default: the recipe's)")
@@ -53,7 +61,9 @@ def add_parser(verbs: Any) -> None:
     parser.add_argument("--jobs", type=int, metavar="N", help="scenes side by side (default: the CPU cores)")
     parser.add_argument("--limit", type=int, metavar="N", help="only the first N updates of each scene")
     parser.add_argument("--solver", choices=("built-in", "llm"), help="who answers, as run --solver")
-    parser.add_argument("--offline", action=argparse.BooleanOptionalAction, help="ask no language model, as run --offline")
+    parser.add_argument(
+        "--offline", action=argparse.BooleanOptionalAction, help="ask no language model, as run --offline"
+    )
     add_executor_flags(parser)
     add_settings(parser, "of all runs, such as perception.paper.captions=model")
     parser.add_argument(
@@ -87,9 +97,11 @@ def _list_recipes(arguments: argparse.Namespace) -> int:
     from su3d_bench.reproducing.recipe import load_recipe, recipe_names
 
     recipes = [load_recipe(name) for name in recipe_names()]
-    value = [{"name": one.name, "title": one.title, "tables": [each.name for each in one.experiments]} for one in recipes]
+    value = [
+        {"name": one.name, "title": one.title, "tables": [each.name for each in one.experiments]} for one in recipes
+    ]
     if not answer_json(arguments, value):
-        answer(*(f"{one['name']:<14} {', '.join(one['tables'])}" for one in value))  # type: ignore[arg-type]
+        answer(*(f"{one['name']:<14} {', '.join(one['tables'])}" for one in value))
     return EXIT_DONE
 
 
@@ -122,8 +134,8 @@ def _reproduce(
         more = f" and {len(known.missing) - 1} more" if len(known.missing) > 1 else ""
         how = f"; get it with: {first.how}" if first.how else ""
         raise ConfigError(
-            f"reproduce {recipe.name}: {first.kind} {first.name} is missing{more}{how}; --dry-run lists all, --rehearse "
-            "does without"
+            f"reproduce {recipe.name}: {first.kind} {first.name} is missing{more}{how}; --dry-run lists all, "
+            "--rehearse does without"
         )
     failures = [failure for run in runs for failure in _carry_out(run, out, arguments)]
     from su3d_bench.reproducing.predictions import evaluate_predictions
@@ -182,7 +194,7 @@ def _answer(
 
     results = Results(tuple(folders))
     cells = compared_all(experiments, results)
-    tables: list[Table] = result_tables(experiments, cells, results)
+    tables = result_tables(experiments, cells, results)
     value = compared_json(recipe, cells)
     written(out / "tables.md", formatted(tables, argparse.Namespace(table_format="markdown"), is_file=True))
     write_json(out / "compared.json", value)
@@ -192,10 +204,6 @@ def _answer(
     for picture in draw_queries(experiments, results, out / "pictures", arguments.device or "cpu"):
         remark(f"picture: {picture}", quiet=arguments.quiet)
     bundle = arguments.bundle or out / "bundle.zip"
-    with nullcontext():
-        write_bundle(bundle, recipe.name, recipe_bytes(arguments.recipe), folders, out)
+    write_bundle(bundle, recipe.name, recipe_bytes(arguments.recipe), folders, out)
     remark(f"bundle: {bundle}", quiet=arguments.quiet)
     remark(f"next: su3d-bench report verify {bundle}", quiet=arguments.quiet)
-
-
-__all__ = ["EXIT_INCOMPLETE", "add_parser", "call"]

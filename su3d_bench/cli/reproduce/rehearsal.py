@@ -1,4 +1,4 @@
-"""A rehearsal: the recipe's runs on rooms that are made in the layouts of its datasets, under a profile without weights."""
+"""A rehearsal: the recipe's runs on rooms made in the layouts of its datasets, under a profile without weights."""
 
 from __future__ import annotations
 
@@ -29,7 +29,9 @@ def rehearsed(
     datasets = dict.fromkeys(split_address(scene)[0] for one in experiments for scene in one.scenes)
     unknown = [name for name in datasets if name not in LAYOUTS and name != "rooms"]
     if unknown:
-        raise ConfigError(f"--rehearse: no room can be made in the layout of {some(unknown, 3)}; there are {some([*LAYOUTS], 9)}")
+        raise ConfigError(
+            f"--rehearse: no room can be made in the layout of {some(unknown, 3)}; there are {some([*LAYOUTS], 9)}"
+        )
     scenes: dict[str, tuple[str, ...]] = {}
     data = out / "data"
     make_folder(data)

@@ -1,0 +1,89 @@
+"""Archives of others: no name leads out of the folder, no size is believed, what is no bundle is one line."""
+
+from __future__ import annotations
+
+import json
+import stat
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from su3d_bench.cli.main import main
+from su3d_bench.core.digests import digest_bytes
+from su3d_bench.core.errors import StoreError
+from su3d_bench.reproducing.bundle import unpack
+
+
+def written(place: Path, members: dict[str, bytes], **changed: object) -> Path:
+    """An archive whose manifest is right, but for what is ``changed``."""
+    entries = {name: {"n_bytes": len(content), "sha256": digest_bytes(content)} for name, content in members.items()}
+    manifest = {"schema": 1, "program": "su3d-bench", "recipe": "mine", "runs": [], "files": entries, **changed}
+    with zipfile.ZipFile(place, "w") as archive:
+        archive.writestr("manifest.json", json.dumps(manifest))
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return place
+
+
+@pytest.mark.parametrize("name", ["../evil", "a/../../evil", "/evil", "a//b", "./a", "C:evil", "a\\..\\b", "a/"])
+def test_no_name_leads_out_of_the_folder(tmp_path: Path, name: str) -> None:
+    into = tmp_path / "into"
+    with pytest.raises(StoreError, match="is no plain file below its folder; not unpacked"):
+        unpack(written(tmp_path / "b.zip", {name: b"x"}), into)
+    assert not into.exists() and not (tmp_path / "evil").exists()
+
+
+def test_a_link_is_not_unpacked(tmp_path: Path) -> None:
+    link = zipfile.ZipInfo("link")
+    link.external_attr = (stat.S_IFLNK | 0o777) << 16
+    with zipfile.ZipFile(tmp_path / "b.zip", "w") as archive:
+        archive.writestr("manifest.json", "{}")
+        archive.writestr(link, "/etc/passwd")
+    with pytest.raises(StoreError, match="'link' is no plain file"):
+        unpack(tmp_path / "b.zip", tmp_path / "into")
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+@pytest.mark.parametrize("other", ["a", "A"])
+def test_a_name_that_stands_twice_is_refused(tmp_path: Path, other: str) -> None:
+    with zipfile.ZipFile(tmp_path / "b.zip", "w") as archive:
+        for name in ("manifest.json", "a", other):
+            archive.writestr(name, "{}")
+    with pytest.raises(StoreError, match="twice; not unpacked"):
+        unpack(tmp_path / "b.zip", tmp_path / "into")
+
+
+def test_what_would_unpack_to_far_more_than_it_is_is_refused(tmp_path: Path) -> None:
+    zeros = bytes(200 << 20)
+    entries = {"a": {"n_bytes": len(zeros), "sha256": digest_bytes(zeros)}}
+    manifest = {"schema": 1, "program": "", "recipe": "", "runs": [], "files": entries}
+    with zipfile.ZipFile(tmp_path / "b.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("manifest.json", json.dumps(manifest))
+        archive.writestr("a", zeros)
+    with pytest.raises(StoreError, match="unpacks to more than 128 MiB"):
+        unpack(tmp_path / "b.zip", tmp_path / "into")
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"files": {"gone": {"n_bytes": 0, "sha256": "0" * 64}}}, "1 file of its manifest missing, such as gone"),
+        ({"files": {}}, "1 file beside its manifest, such as a"),
+        ({"files": {"a": {"n_bytes": 7, "sha256": "0" * 64}}}, "a has 1 bytes, its manifest says 7"),
+        ({"files": {"a": {"n_bytes": -1, "sha256": "x"}}}, "manifest.json: files.a.n_bytes is not as a bundle has it"),
+        ({"runs": ["../up"]}, "its manifest names the run '../up', of which it holds no record"),
+        ({"schema": 2}, "manifest.json: schema is not as a bundle has it"),
+    ],
+)
+def test_a_manifest_that_is_not_the_archives_is_one_line(tmp_path: Path, changed: dict[str, object], says: str) -> None:
+    with pytest.raises(StoreError) as raised:
+        unpack(written(tmp_path / "b.zip", {"a": b"x"}, **changed), tmp_path / "into")
+    assert says in str(raised.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK", b"PK\x03\x04" + bytes(100), b"not a zip"])
+def test_what_is_no_archive_is_one_line(tmp_path: Path, content: bytes, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "b.zip").write_bytes(content)
+    assert main(["report", "verify", str(tmp_path / "b.zip")]) == 2
+    assert "b.zip: is no bundle, or damaged" in capsys.readouterr().err

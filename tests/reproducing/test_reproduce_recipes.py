@@ -1,0 +1,96 @@
+"""Recipes: each finds its printed figures and methods here; a wrong one is one line that says where and what."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from su3d_bench.core.errors import ConfigError
+from su3d_bench.reports.tables.papers.published import figures_of, published
+from su3d_bench.reproducing.asked import Asked, asked_runs, method_of_row
+from su3d_bench.reproducing.recipe import load_recipe, recipe_names
+
+OWN = """
+schema = 1
+name = "mine"
+title = "Mine"
+[[experiment]]
+name = "a"
+title = "A"
+methods = ["opensu3d"]
+scenes = ["replica/room0"]
+protocols = ["replica-openmask3d"]
+figures = [{ table = "III" }]
+"""
+
+
+@pytest.mark.parametrize("name", recipe_names())
+def test_each_recipe_of_the_program_asks_for_runs_of_methods_scenes_and_protocols_that_there_are(name: str) -> None:
+    recipe = load_recipe(name)
+    runs = asked_runs(recipe, recipe.experiments, Asked())
+    assert {one for run in runs for one in run.experiments} == {one.name for one in recipe.experiments}
+    assert all(run.methods and run.scenes and run.protocols for run in runs)
+
+
+@pytest.mark.parametrize("name", recipe_names())
+def test_each_printed_row_is_of_a_method_that_is_run_or_of_predictions_that_are_taken(name: str) -> None:
+    recipe = load_recipe(name)
+    for experiment in recipe.experiments:
+        (*_, methods) = (run.methods for run in asked_runs(recipe, [experiment], Asked()))
+        for figure in experiment.printed():
+            method = method_of_row(experiment, figure.method, figure.row)
+            assert method in methods or figure.method in experiment.predictions, figure
+
+
+def test_opensu3ds_recipe_has_every_figure_that_is_printed_in_its_paper() -> None:
+    printed = [figure for one in load_recipe("opensu3d").experiments for figure in one.printed()]
+    assert [figure for figure in published() if figure.table is not None and figure not in printed] == []
+    assert figures_of(table="I") == printed[:9]
+
+
+def test_rows_of_a_sweep_are_the_variants_that_it_makes() -> None:
+    (sweep, *_) = load_recipe("opensu3d").experiments
+    rows = {figure.row: method_of_row(sweep, figure.method, figure.row) for figure in sweep.printed()}
+    assert rows["m=1"] == "opensu3d@top_m=1"
+    assert rows["m=5"] == rows["k=3"] == rows["ratios=0.8,1,1.2"] == "opensu3d"
+    assert rows["ratios=0.1,1,1.1"] == "opensu3d@crop_ratios=[0.1,1,1.1]"
+
+
+def test_tables_of_other_encoders_are_other_runs(tmp_path: Path) -> None:
+    recipe = load_recipe("opensu3d")
+    runs = asked_runs(recipe, recipe.chosen(["II", "III"]), Asked())
+    assert [(run.name, run.encoder) for run in runs] == [
+        ("replica", "clip-vit-h-14"),
+        ("replica-clip-vit-l-14-336", "clip-vit-l-14-336"),
+    ]
+    (one,) = asked_runs(recipe, recipe.chosen(["II", "III"]), Asked(encoder="embedded"))
+    assert one.folder(tmp_path) == tmp_path / "runs" / "replica"
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (("methods =", "method ="), "experiment 1 method: unknown key; did you mean 'methods'?"),
+        (("schema = 1", "schema = 2"), "schema"),
+        (('table = "III"', 'table = "IX"'), "experiment a: published.toml holds no figure of table = IX"),
+        (('table = "III"', 'tabel = "III"'), "experiment a: figures have no 'tabel'; did you mean 'table'?"),
+        (('methods = ["opensu3d"]', ""), "names no methods, no vary and no predictions"),
+        (("[[experiment]]", "[experiment"), "is no TOML"),
+    ],
+)
+def test_a_wrong_recipe_is_one_line(tmp_path: Path, change: tuple[str, str], says: str) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(OWN)
+    assert load_recipe(str(file)).experiments[0].printed() == figures_of(table="III")
+    file.write_text(OWN.replace(*change))
+    with pytest.raises(ConfigError) as raised:
+        load_recipe(str(file))
+    assert str(raised.value).startswith("mine.toml: ") and says in str(raised.value)
+
+
+def test_an_unknown_recipe_or_table_is_named_with_what_is_near() -> None:
+    with pytest.raises(ConfigError, match="no recipe is called 'opensu'; did you mean 'opensu3d'"):
+        load_recipe("opensu")
+    with pytest.raises(ConfigError, match="recipe 'opensu3d' has no table 'VI'"):
+        load_recipe("opensu3d").chosen(["VI"])
