@@ -22,6 +22,7 @@ from su3d_bench import __version__
 from su3d_bench.core.digests import digest_bytes, digest_file
 from su3d_bench.core.errors import StoreError, counted, printable, shown
 from su3d_bench.core.printing import escaped_json
+from su3d_bench.core.system.files import opened, regular
 from su3d_bench.store.atomic import is_file, make_folder, replacing
 from su3d_bench.store.run_folder import RECORDS, RunFolder
 from su3d_bench.store.unpacking import Allowance, UnpackingError, allowance_of, check_member, member_bytes
@@ -96,7 +97,7 @@ def _add(archive: zipfile.ZipFile, name: str, file: Path, sha256: str) -> None:
     digest = hashlib.sha256()
     info = _member(name)
     info.file_size = file.stat().st_size
-    with file.open("rb") as source, archive.open(info, "w") as member:
+    with opened(file) as source, archive.open(info, "w") as member:
         while piece := source.read(PIECE):
             digest.update(piece)
             member.write(piece)
@@ -137,7 +138,7 @@ def unpack(bundle: Path, into: Path) -> Unpacked:
     """
     where = shown(bundle)
     try:
-        with zipfile.ZipFile(bundle) as archive:
+        with zipfile.ZipFile(regular(bundle)) as archive:
             members = _members(archive, where)
             allowance = allowance_of(archive)
             manifest = _manifest(member_bytes(archive, members[MANIFEST], allowance), where)

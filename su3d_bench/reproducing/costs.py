@@ -187,7 +187,7 @@ def _beside(
 
 
 def _n_updates(job: JobFolder) -> int:
-    return max(job.updates.read_bytes().count(b"\n") - 1, 0)
+    return max(file_bytes(job.updates).count(b"\n") - 1, 0)
 
 
 def _bytes_of(job: JobFolder) -> int:

@@ -229,9 +229,9 @@ def test_datasets_that_are_not_here_have_a_line_each_and_more_when_they_are_name
     assert "  rooms/living0    1600 frames" in lines and max(map(len, lines[1:])) <= 80
     start = lines.index("not here (su3d-bench datasets list NAME says how to get one):")
     assert [line.split()[0] for line in lines[start + 1 :]] == [
-        *("replica", "scannet", "scannetpp", "arkitscenes", "tum", "rgbd")
+        *("replica", "scannet", "scannetpp", "arkitscenes", "hm3dsem", "tum", "rgbd")
     ]
-    assert lines[start + 1] == "  replica    looked for in Replica, replica, ."
+    assert lines[start + 1] == "  replica      looked for in Replica, replica, ."
     assert main(["datasets", "list", "tum"]) == 0
     named = capsys.readouterr().out
     assert "tum: no sequence in " in named and "scannet" not in named
@@ -266,7 +266,8 @@ def test_an_internal_error_is_one_line_and_exit_code_4(
 
 def test_an_interrupt_says_whether_the_same_command_goes_on() -> None:
     on = {" ".join(verb) for verb, parser in every_verb() if parser.get_default("takes_up")}
-    assert on == {"run", "ablate", "datasets make", "report html", "fetch models", "fetch replica", "fetch scannet"}
+    fetch = ("fetch models", "fetch replica", "fetch scannet")
+    assert on == {"run", "ablate", "reproduce", "datasets make", "report html", *fetch}
 
 
 def test_a_verb_that_keeps_nothing_begins_anew(

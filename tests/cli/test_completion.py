@@ -15,7 +15,7 @@ from su3d_bench.cli.main import main
 
 ASKED = {
     "": {"run", "report", "datasets", "cache"},
-    "re": {"report", "refine"},
+    "re": {"report", "refine", "reproduce"},
     "report ": {"tables", "timing", "html", "samples", "rerun", "leaderboard", "verify"},
     "report tables --form": {"--format"},
     "report tables runs/demo --format ": {"text", "markdown", "latex", "csv", "html"},

@@ -82,6 +82,7 @@ CASES: dict[str, list[list[str]]] = {
     "fetch models": [[HOSTILE], ["sam-vit-h", "--mirror", f"sam-vit-h={HOSTILE}"], ["sam-vit-h", "--accept", HOSTILE]],
     "fetch replica": [[HOSTILE], ["--dry-run", "--sources", HOSTILE]],
     "fetch scannet": [[HOSTILE], ["--script", HOSTILE, "--accept", "scannet"]],
+    "reproduce": [["opensu3d", "--table", HOSTILE], [HOSTILE], ["opensu3d", "--out", HOSTILE, "--dry-run"]],
     "cache list": [[], ["--json"]],
     "cache size": [[]],
     "cache clear": [["all"], [HOSTILE]],

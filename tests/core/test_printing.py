@@ -167,5 +167,5 @@ def test_nothing_is_printed_but_through_the_door() -> None:
         "core/printing.py",
         "perception/embedded/training/train.py",
     )
-    asks_of_it = "cli/doctor/checks.py"  # whether it is a terminal
-    assert found == {package / name for name in (*through_it, asks_of_it)}
+    ask_of_it = ("cli/doctor/checks.py", "cli/fetch/asking.py")  # whether it is a terminal
+    assert found == {package / name for name in (*through_it, *ask_of_it)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import tomllib
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -100,14 +101,17 @@ def test_scanrefer_objects_are_one_more_than_its_ids_and_equal_sentences_share_a
     (tmp_path / "ScanRefer.json").write_text(SCANREFER)
     text = "a white cabinet in the corner"
     assert read_questions(tmp_path / "ScanRefer.json") == (
-        new_question("scannet/scene0000_00", "relative", text, (5, 40), "ScanRefer"),
+        replace(new_question("scannet/scene0000_00", "relative", text, (5, 40), "ScanRefer"), name="cabinet"),
     )
 
 
 def test_nr3d_is_known_by_its_columns(tmp_path: Path) -> None:
     (tmp_path / "nr3d.csv").write_text(NR3D)
     assert read_questions(tmp_path / "nr3d.csv") == (
-        new_question("scannet/scene0525_00", "relative", "The plant, far right", (10,), "Nr3D"),
+        replace(
+            new_question("scannet/scene0525_00", "relative", "The plant, far right", (10,), "Nr3D"),
+            groups=("easy", "view-dependent"),
+        ),
     )
 
 

@@ -157,7 +157,7 @@ def test_axis_align_turns_poses_and_mesh_alike(tmp_path: Path) -> None:
     assert plain.digest(SCAN) != turned.digest(SCAN)
     (folder / f"{SCAN}.txt").unlink()
     assert len(dataset(tmp_path).frames(SCAN, 1)) == 5
-    with pytest.raises(DataError, match=rf"^{WHERE}: {SCAN}\.txt is missing; axis_align needs it"):
+    with pytest.raises(DataError, match=rf"^{WHERE}: {SCAN}\.txt is missing; what lies along the walls needs it"):
         dataset(tmp_path, axis_align=True).frames(SCAN, 1)
 
 

@@ -48,7 +48,8 @@ NAMES = {
     "class-agnostic-open3dis-scannetpp", "rooms-top-k", "scannetpp-instance", "scannetpp-open-vocabulary",
     "scannetpp-semantic", "openscan-affordance", "openscan-property", "openscan-type", "openscan-manner",
     "openscan-synonym", "openscan-requirement", "openscan-element", "openscan-material", "beacon3d", "rooms-beacon3d",
-    "opensun3d-masks", "opensun3d-queries",
+    "opensun3d-masks", "opensun3d-queries", "grounding-given", "rooms-relations", "replica-relations",
+    "hm3dsem-objects", "hm3dsem-places",
 }  # fmt: skip
 
 
@@ -202,7 +203,8 @@ def test_a_rule_that_a_file_leaves_out_asks_for_nothing() -> None:
         "stuff": (), "ignore": (), "ignore_rule": "exact", "prompts": (), "prompt_names": {}, "encoder": None,
         "min_region_size": None, "thresholds": (),
         "confidence": None, "top_k": None, "questions": None, "per_kind": None, "synonyms": None, "merging": None,
-        "answers": None, "box_axes": None, "presence": None, "aggregate": "pooled", "not_comparable_with": (),
+        "answers": None, "box_axes": None, "presence": None, "predicates": (), "relations": None,
+        "aggregate": "pooled", "not_comparable_with": (),
     }  # fmt: skip
 
 
@@ -216,6 +218,9 @@ KINDS = {
     "categories": {"takes_dense", "needs_own_points"},
     "grounding": {"needs_own_points", "ignores_classes"},
     "object-chains": {"is_judged", "needs_own_points", "ignores_classes"},
+    "relations": {"needs_instances", "ignores_classes"},
+    "objects": {"needs_own_points", "ignores_classes"},
+    "places": {"needs_own_points", "ignores_classes"},
     "retrieval": {"is_judged", "needs_own_points", "ignores_classes"},
     "presence": {"is_judged", "needs_own_points", "ignores_classes"},
     "annotation": {"is_judged", "needs_own_points", "goes_by_names", "ignores_classes"},
