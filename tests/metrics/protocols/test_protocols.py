@@ -48,7 +48,8 @@ NAMES = {
     "class-agnostic-open3dis-scannetpp", "rooms-top-k", "scannetpp-instance", "scannetpp-open-vocabulary",
     "scannetpp-semantic", "openscan-affordance", "openscan-property", "openscan-type", "openscan-manner",
     "openscan-synonym", "openscan-requirement", "openscan-element", "openscan-material", "beacon3d", "rooms-beacon3d",
-    "opensun3d-masks", "opensun3d-queries", "grounding-given", "rooms-relations", "replica-relations",
+    "opensun3d-masks", "opensun3d-queries", "grounding-given", "scannetpp-presence",
+    "rooms-relations", "replica-relations",
     "hm3dsem-objects", "hm3dsem-places",
 }  # fmt: skip
 
