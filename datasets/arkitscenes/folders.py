@@ -12,8 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from su3d_bench.core.errors import ScenesMissing
-from su3d_bench.datasets.recordings.made_rooms import read_marker
-from su3d_bench.datasets.recordings.places import folders_in
+from su3d_bench.datasets.recordings.places import scenes_in
 
 BASES = ("", "arkitscenes", "ARKitScenes", "opensun3d")
 DEVELOPMENT = "ChallengeDevelopmentSet"
@@ -57,17 +56,7 @@ class SceneFolders:
 
 def find_scenes(root: Path) -> SceneFolders:
     """Every scene in ``PLACES`` below ``root``; none is no error here."""
-    folder_of: dict[str, Path] = {}
-    places, made = [], set[str]()
-    for place, children in folders_in(root, PLACES):
-        scenes = [child for child in children if _is_scene(child)]
-        if scenes:
-            rooms = read_marker(place)
-            places.append(place)
-            made |= {scene.name for scene in scenes if scene.name in rooms}
-        for scene in scenes:
-            folder_of.setdefault(scene.name, scene)
-    return SceneFolders(root, tuple(places), dict(sorted(folder_of.items())), frozenset(made))
+    return SceneFolders(root, *scenes_in(root, PLACES, _is_scene))
 
 
 def _is_scene(folder: Path) -> bool:

@@ -13,8 +13,7 @@ from functools import cached_property
 from pathlib import Path
 
 from su3d_bench.core.errors import DataError, ScenesMissing
-from su3d_bench.datasets.recordings.made_rooms import read_marker
-from su3d_bench.datasets.recordings.places import folders_in
+from su3d_bench.datasets.recordings.places import scenes_in
 from su3d_bench.datasets.recordings.recorded_frames import read_text
 from su3d_bench.datasets.scannetpp.labels import BENCHMARK_FOLDER, LIST_NAMES
 
@@ -70,17 +69,7 @@ def read_split(path: Path) -> tuple[str, ...]:
 
 def find_scenes(root: Path) -> SceneFolders:
     """Every scene in ``PLACES`` below ``root``; none is no error here."""
-    folder_of: dict[str, Path] = {}
-    places, made = [], set[str]()
-    for place, children in folders_in(root, PLACES):
-        scenes = [child for child in children if _is_scene(child)]
-        if scenes:
-            rooms = read_marker(place)
-            places.append(place)
-            made |= {scene.name for scene in scenes if scene.name in rooms}
-        for scene in scenes:
-            folder_of.setdefault(scene.name, scene)
-    return SceneFolders(root, tuple(places), dict(sorted(folder_of.items())), frozenset(made))
+    return SceneFolders(root, *scenes_in(root, PLACES, _is_scene))
 
 
 def _is_scene(folder: Path) -> bool:

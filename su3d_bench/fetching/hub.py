@@ -62,7 +62,7 @@ def hub_files(source: Source) -> list[Wanted]:
 def _info(hub: Any, endpoint: str, repository: str) -> Any:
     try:
         info = hub.HfApi(endpoint=endpoint, token=False).model_info(repository, files_metadata=True, timeout=TIMEOUT_S)
-    except Exception as error:
+    except Exception as error:  # of HTTP, of JSON, of what a server left out: the library gives them no class in common
         if isinstance(error, MemoryError):
             raise
         reason = printable(str(error).split("\n")[0], 200) or type(error).__name__
