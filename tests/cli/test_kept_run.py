@@ -18,7 +18,7 @@ from su3d_bench.runs import scene as scene_run
 
 PAINTED = f"{SCENES}/painted.py:Painted"
 COLLECTOR = f"{SCENES}/painted.py:Collector"
-WHAT = ["--methods", COLLECTOR, "--protocols", "rooms-semantic", "rooms-instance"]
+WHAT = ["--methods", COLLECTOR, "--protocols", "rooms-semantic", "rooms-instance", "--no-pictures"]
 INTO = ["--out", "runs/demo"]
 SAME = ["run", f"{PAINTED}/[ab]", *WHAT, *INTO]
 OTHER = "su3d-bench: runs/demo: holds another run ("

@@ -11,7 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from damage import damages, outcomes, truncations
+from damage import N_DAMAGES, damages, outcomes, truncations
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.formats import hdf5
@@ -184,7 +184,7 @@ def test_every_truncation_and_damage_is_read_or_refused_in_one_line(tmp_path: Pa
 
     assert outcomes(read, truncations(content), must_name=WHERE) == (0, len(content))
     n_read, n_refused = outcomes(read, damages(content), must_name=WHERE)
-    assert n_read + n_refused == 2_000
+    assert n_read + n_refused == N_DAMAGES
     assert min(n_read, n_refused) > 100
 
 

@@ -48,13 +48,14 @@ def test_no_reader_waits_for_a_pipe_or_reads_a_device(
     sample = Sample(TARGETS[name], tmp_path / "sample")
     with bounded_addresses(MOST_ADDRESSES_BYTES):
         sample.read()
-        for file in one_of_each_kind(sample.whole):
-            for shape in ENDLESS:
+        files = one_of_each_kind(sample.whole)
+        for k, file in enumerate(files):
+            for shape in [*ENDLESS][k % 2 :: 2] if len(files) > 1 else ENDLESS:
                 assert sample.meet(Input(0, file, None, shape)).fault is None, f"{file} is a {shape}"
 
 
 def one_of_each_kind(files: Iterable[str]) -> list[str]:
-    """Of files whose names differ in digits alone, the first; at most 12."""
+    """Of files whose names differ in digits alone, the first; at most 12. Where they are several, they take turns."""
     kinds = {re.sub(r"\d+", "0", file): file for file in sorted(files, reverse=True)}
     return sorted(kinds.values())[:12]
 

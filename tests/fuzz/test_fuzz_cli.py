@@ -14,11 +14,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 VERBS = dict(verbs())
-EXAMPLES = int(os.environ.get("SU3D_FUZZ_EXAMPLES", "15"))  # of each verb; more in a long run
+EXAMPLES = int(os.environ.get("SU3D_FUZZ_EXAMPLES", "6"))  # of each verb; more in a long run
 QUIET = settings(
     max_examples=EXAMPLES,
     deadline=None,
-    derandomize=EXAMPLES == 15,
+    derandomize=EXAMPLES == 6,
     database=None,
     suppress_health_check=list(HealthCheck),
 )

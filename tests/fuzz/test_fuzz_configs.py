@@ -31,7 +31,7 @@ SECTIONS: dict[tuple[str, ...], type[BaseModel]] = {
 QUIET = settings(
     max_examples=2 * EXAMPLES,
     deadline=None,
-    derandomize=EXAMPLES == 15,
+    derandomize=EXAMPLES == 6,
     database=None,
     suppress_health_check=list(HealthCheck),
 )

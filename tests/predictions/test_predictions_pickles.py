@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from damage import damages, outcomes, truncations
+from damage import N_DAMAGES, damages, outcomes, truncations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from same_values import assert_same
@@ -393,7 +393,7 @@ def test_every_cut_of_a_pickle_is_one_error(tmp_path: Path, kind: str) -> None:
 def test_damaged_pickles_are_read_or_refused_but_nothing_else(tmp_path: Path, kind: str) -> None:
     content = written(tmp_path, kind)
     n_read, n_refused = outcomes(reader(tmp_path, kind), damages(content), must_name=kind, refusal=PredictionError)
-    assert n_read + n_refused == 2000 and n_refused > 100
+    assert n_read + n_refused == N_DAMAGES and n_refused > 0.05 * N_DAMAGES
 
 
 TEXTS = ("latin1", "<", "f4", "U1", "O8", "F", "storage", "0", "torch.sparse_coo", "torch.float32")
@@ -414,7 +414,7 @@ CALLS = st.builds(
 )
 
 
-@settings(max_examples=3000, deadline=None)
+@settings(max_examples=600, deadline=None)
 @given(steps=st.lists(STEPS | CALLS, min_size=1, max_size=8), with_torch=st.booleans())
 def test_programs_of_valid_parts_are_read_or_refused_but_nothing_else(steps: list[bytes], with_torch: bool) -> None:
     content = b"\x80\x04(" + b"".join(steps) + b"t."

@@ -11,7 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from damage import damages, outcomes, truncations
+from damage import N_DAMAGES, damages, outcomes, truncations
 from replica_scene import (
     CAMERA,
     CHAIR,
@@ -443,5 +443,5 @@ def test_every_truncation_and_damage_is_read_or_refused_in_one_line(
     # a trajectory of fewer lines or digits is still one; its poses are counted against the frames elsewhere
     assert sum(outcomes(read, truncations(content), must_name=where)) == len(content)
     n_read, n_refused = outcomes(read, damages(content), must_name=where)
-    assert n_read + n_refused == 2_000
+    assert n_read + n_refused == N_DAMAGES
     assert min(n_read, n_refused) > 20

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from damage import damages, outcomes, truncations
+from damage import N_DAMAGES, damages, outcomes, truncations
 from replica_clouds import CLOUDS, REFERENCE, SEQUENCE, write_clouds
 from replica_scene import CHAIR, QUADS, TABLE, TWO_OBJECTS, write_original, write_render
 from scored_room import instances
@@ -179,7 +179,7 @@ def test_damaged_label_files_are_read_or_refused_in_one_line(tmp_path: Path) -> 
     assert n_refused == len(content) - 2
     n_read, n_refused = outcomes(read, damages(content), must_name="replica/room0: room0.txt")
     assert min(n_read, n_refused) > 100
-    assert n_read + n_refused == 2_000
+    assert n_read + n_refused == N_DAMAGES
 
 
 def test_files_and_digest_cover_every_released_truth(tmp_path: Path) -> None:
