@@ -167,7 +167,7 @@ def alone(rules: ProtocolRules, run_folder: Path) -> Any:
     return combine(rules, {scene: score_scene(rules, truth, prediction, NamingEncoder())}).metrics
 
 
-@pytest.mark.parametrize(("dataset", "first", "second"), list(pairs_to_walk()), ids=lambda one: getattr(one, "name", one))
+@pytest.mark.parametrize(("dataset", "first", "second"), [*pairs_to_walk()], ids=lambda one: getattr(one, "name", one))
 def test_the_steps_between_two_protocols_sum_to_the_difference_of_their_numbers(
     dataset: str, first: ProtocolRules, second: ProtocolRules, runs: dict[str, Path]
 ) -> None:

@@ -185,7 +185,7 @@ def test_every_truncation_and_damage_is_read_or_refused_in_one_line(tmp_path: Pa
     assert outcomes(read, truncations(content), must_name=WHERE) == (0, len(content))
     n_read, n_refused = outcomes(read, damages(content), must_name=WHERE)
     assert n_read + n_refused == N_DAMAGES
-    assert min(n_read, n_refused) > 100
+    assert min(n_read, n_refused) > 0.02 * N_DAMAGES
 
 
 def test_a_promise_without_data_is_refused_in_little_memory(tmp_path: Path) -> None:

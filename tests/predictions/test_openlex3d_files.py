@@ -231,4 +231,4 @@ def test_every_truncation_and_random_damage_is_read_or_one_error(tmp_path: Path,
     cut = outcomes(read_damaged, truncations(plain), must_name=WHERE)
     hurt = outcomes(read_damaged, damages(plain), must_name=WHERE)
     assert sum(cut) == len(plain) and sum(hurt) == N_DAMAGES
-    assert hurt[1] > 100
+    assert hurt[1] > 0.05 * N_DAMAGES

@@ -444,4 +444,4 @@ def test_every_truncation_and_damage_is_read_or_refused_in_one_line(
     assert sum(outcomes(read, truncations(content), must_name=where)) == len(content)
     n_read, n_refused = outcomes(read, damages(content), must_name=where)
     assert n_read + n_refused == N_DAMAGES
-    assert min(n_read, n_refused) > 20
+    assert min(n_read, n_refused) > 0.01 * N_DAMAGES

@@ -178,7 +178,7 @@ def test_damaged_label_files_are_read_or_refused_in_one_line(tmp_path: Path) -> 
     assert n_read == 2  # the last number without its end of line, and with a digit less
     assert n_refused == len(content) - 2
     n_read, n_refused = outcomes(read, damages(content), must_name="replica/room0: room0.txt")
-    assert min(n_read, n_refused) > 100
+    assert min(n_read, n_refused) > 0.02 * N_DAMAGES
     assert n_read + n_refused == N_DAMAGES
 
 
