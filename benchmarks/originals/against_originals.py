@@ -26,12 +26,13 @@ import original_boxes
 import original_instances
 import original_points
 import original_queries
+import original_segments
 from original_code import STOPS, Original, silence
 
 from su3d_bench.metrics.protocols.loading import load_protocol
 
 LARGEST = 1e-7
-FAMILIES = (original_instances, original_points, original_boxes, original_queries)
+FAMILIES = (original_instances, original_points, original_boxes, original_queries, original_segments)
 ORIGINALS: tuple[Original, ...] = tuple(one for family in FAMILIES for one in family.ORIGINALS)
 
 

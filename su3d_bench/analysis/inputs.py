@@ -15,6 +15,7 @@ from su3d_bench.evaluation.scoring import with_confidences_of_files
 from su3d_bench.evaluation.texts import GivenTexts, read_text_features
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.runs.finished import FinishedRun
+from su3d_bench.runs.parts import as_told
 from su3d_bench.store.predictions import read_prediction
 
 TruthOf = Callable[[str], GroundTruth]  # by the variant that a protocol asks for
@@ -53,7 +54,12 @@ class Inputs:
         if self._run.data.truth_files is not None:
             truth = self._files.truth(scene, rules)
             return truth, self._files.prediction(scene, self._method, rules, len(truth.points))
-        return truth_of(rules.ground_truth), self.of_map(scene)
+        truth = truth_of(rules.ground_truth)
+        prediction = self.of_map(scene)
+        if (part := self._run.told_truth(self._method)) is None:
+            return truth, prediction
+        first: str = self._run.dataset(scene).variants[0]
+        return truth, as_told(part, rules, truth, prediction, lambda: truth_of(first).labels)
 
     def _read_map(self, scene: str) -> Prediction:
         return read_prediction(self._run.folder.job(scene, self._method).prediction)

@@ -57,7 +57,7 @@ from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import QuestionTruth, metric_of, score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.metrics.semantic.panoptic_quality import PanopticCounts
-from su3d_bench.metrics.semantic.panoptic_score import count_segments
+from su3d_bench.metrics.semantic.panoptic_score import count_segments, told_truth
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks, ids_of
 from su3d_bench.predictions.own_runs import OwnRuns
 
@@ -397,11 +397,12 @@ def map_of(content: Content, points: Float32Array, rules: ProtocolRules) -> Pred
 
 def _oracle_score(rules: ProtocolRules, truth: GroundTruth) -> SceneScore | None:
     """What the truth itself scores through the same steps; None where it has no instances to hand over."""
-    if not truth.instance.any():
+    told = told_truth(rules, truth)
+    if not told.instance.any():
         return None
     method_class = registry.load("method", "oracle")
     oracle = method_class(method_class.Config())
-    oracle.receive_truth(truth)
+    oracle.receive_truth(told)
     return score_scene(rules, truth, oracle.finish(), None)
 
 

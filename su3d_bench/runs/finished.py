@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
+from su3d_bench.core import registry
 from su3d_bench.core.config import KeyPath, Settings, flatten, read_file, resolve, toml_value
 from su3d_bench.core.errors import (
     ConfigError,
@@ -36,7 +37,7 @@ from su3d_bench.metrics.protocols.loading import load_protocol, read_rules
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import SceneScore, unpack_scores
 from su3d_bench.predictions.formats import recognise
-from su3d_bench.runs.parts import build_dataset, part_of
+from su3d_bench.runs.parts import Part, build_dataset, part_of
 from su3d_bench.runs.planning.scenes import (
     cache_root,
     data_root,
@@ -154,6 +155,12 @@ class FinishedRun:
     def dataset(self, scene: str) -> Any:
         """The dataset of ``scene``, whose data are those of the run; a ``DataError`` where they are others."""
         return self.data.dataset(scene)
+
+    def told_truth(self, method: str) -> Part | None:
+        """The method with its settings where it is one of the program's own that is told the truth."""
+        is_own = method in registry.METHODS and method not in self.made_elsewhere
+        is_told = is_own and hasattr(registry.load("method", method), "receive_truth")
+        return part_of("method", method, self.data.settings) if is_told else None
 
     def encoder(self, device: str = "cpu") -> Encoder:
         """The text tower that the run's features go with; a ``PredictionError`` where it is another here."""

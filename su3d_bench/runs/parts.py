@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from su3d_bench.core import registry
 from su3d_bench.core.config import Settings, resolve
+from su3d_bench.core.interfaces import TakesTruth
+from su3d_bench.core.maps import Prediction
+from su3d_bench.core.types import GroundTruth, LabelSet
+from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.semantic.panoptic_score import told_truth
 from su3d_bench.runs.own.watch import checked_dataset, checked_method, made, settings_model
 
 
@@ -41,3 +47,23 @@ def build_method(part: Part) -> Any:
     """A fresh method of ``part``."""
     method_class = registry.load("method", part.target)
     return checked_method(made(method_class, method_class.Config.model_validate_json(part.options)))
+
+
+def as_told(
+    part: Part, rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, first: Callable[[], LabelSet]
+) -> Prediction:
+    """``prediction``, a map of the method ``part``; that of a method that is told the truth is made anew where it must
+    be told another one under ``rules``.
+
+    So it is where ``truth`` names its classes otherwise than the ``first`` truth of the dataset, from which the map
+    came, and where stuff counts that has no instances.
+    """
+    method = build_method(part)
+    if not isinstance(method, TakesTruth):
+        return prediction
+    told = told_truth(rules, truth)
+    if told is truth and truth.labels == first():
+        return prediction
+    method.receive_truth(told)
+    made_anew: Prediction = method.finish()
+    return made_anew

@@ -57,7 +57,7 @@ from su3d_bench.runs.feeding import (
     warm_up,
 )
 from su3d_bench.runs.job import JobInputs, MethodOutcome, SceneJob, config_key, refuse_other_run, stride_of
-from su3d_bench.runs.parts import Part, build_dataset, build_method
+from su3d_bench.runs.parts import Part, as_told, build_dataset, build_method
 from su3d_bench.runs.planning.poses import REMARK, PosesContradicted, judged
 from su3d_bench.store.atomic import write_bytes, write_text
 from su3d_bench.store.predictions import read_prediction
@@ -378,9 +378,9 @@ class _Scene:
                 unscored[rules.name] = reason
                 continue
             self.says(part, f"scoring {n} of {counted(len(self.job.protocols), 'protocol')}")
-            renamed = self._prediction_in_words_of(truth, part, prediction)
+            told = as_told(part, rules, truth, prediction, lambda: self.first_truth.labels)
             known = self._truth_of(rules, truth, refined_in)
-            scores[rules.name] = score_scene(rules, known, renamed, encoder)
+            scores[rules.name] = score_scene(rules, known, told, encoder)
         return scores, unscored
 
     def _truth_of(self, rules: ProtocolRules, truth: GroundTruth, refined_in: JobFolder | None) -> Truth:
@@ -388,13 +388,3 @@ class _Scene:
             return truth
         refine = None if refined_in is None else partial(refined_names, refined_in)
         return question_truth(rules, self.dataset, self.job.scene_name, truth, refine, self.solver)
-
-    def _prediction_in_words_of(self, truth: GroundTruth, part: Part, prediction: Prediction) -> Prediction:
-        """``prediction``; that of a method that was told the truth is told anew where ``truth`` names its classes
-        otherwise than the truth that it was told: a dataset may have two sets of labels."""
-        method = build_method(part)
-        if not isinstance(method, TakesTruth) or truth.labels == self.first_truth.labels:
-            return prediction
-        method.receive_truth(truth)
-        renamed: Prediction = method.finish()
-        return renamed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -104,6 +105,29 @@ def rule_of(rules: ProtocolRules) -> Rule:
     return "panopticapi" if rules.metric == "panopticapi" else "semantic-kitti"
 
 
+def told_truth(rules: ProtocolRules, truth: GroundTruth) -> GroundTruth:
+    """The truth that a method is told under a protocol, if it is told any: as it stands, but for where stuff counts.
+
+    There every labelled point belongs to a segment, and what the annotation gives a class and no instance, as
+    ScanNet++'s does with walls, becomes one instance a class.
+
+    >>> from su3d_bench.core.types import LabelSet
+    >>> from su3d_bench.metrics.protocols.loading import load_protocol
+    >>> names = LabelSet("replica", (93, 20), ("wall", "chair"))
+    >>> ids = np.array([93, 20, 0, 93], np.int32), np.array([0, 5, 0, 0], np.int32)
+    >>> truth = GroundTruth(np.zeros((4, 3), np.float32), *ids, names, "mesh-vertices", "by hand")
+    >>> told_truth(load_protocol("rooms-panoptic"), truth).instance.tolist()
+    [6, 5, 0, 6]
+    """
+    is_open = (truth.semantic > 0) & (truth.instance <= 0)
+    if not rules.stuff or not is_open.any():
+        return truth
+    number = np.unique(truth.semantic[is_open], return_inverse=True)[1]
+    instance = truth.instance.copy()
+    instance[is_open] = truth.instance.max(initial=0) + 1 + number
+    return replace(truth, instance=instance)
+
+
 def count_segments(
     rules: ProtocolRules,
     semantic: NDArray[np.integer[Any]],
@@ -115,14 +139,14 @@ def count_segments(
     """The counts of K masks on the N points of a truth with class ids (N,) and instance numbers (N,), 0 for none.
 
     A point in several masks belongs to that of the greatest score, the first of equals; masks whose class id (K,) is
-    not scored take no point.
+    not scored take no point. Points of class -1 are left out of truth and masks.
     """
     called = _scored_index(rules, class_ids)
     order = np.argsort(-scores, kind="stable")
     order = order[called[order] >= 0]
     first = transfer.first_owner(transfer.select(masks, order), len(semantic))
     owner = np.where(first >= 0, order[first], -1) if len(order) else first
-    predicted = Segments(np.append(called, -1)[owner], owner)
+    predicted = Segments(np.where(np.asarray(semantic) < 0, -1, np.append(called, -1)[owner]), owner)
     truth = Segments(_scored_index(rules, semantic), np.asarray(instance, np.int64))
     size = rules.min_region_size or 1
     return panoptic_quality.per_scene(truth, predicted, things_of(rules), rule_of(rules), size)

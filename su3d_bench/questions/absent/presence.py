@@ -27,7 +27,10 @@ from su3d_bench.questions.reasoning.scene_map import SceneMap, is_room_surface
 
 RANDOM, POPULAR, ADVERSARIAL = SAMPLINGS
 # Labels of what nobody sorted: no thing to ask for.
-_NO_NAMES = frozenset(("object", "objects", "other", "undefined", "background", "unannotated", "void"))
+_NO_NAMES = frozenset((
+    "object", "objects", "other", "undefined", "background", "unannotated", "void",
+    "unknown", "unknown/remove", "partial",  # HM3DSem's
+))  # fmt: skip
 Rooms = Sequence[Sequence[str]]
 
 

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from places import CASES
 from scored_room import ENCODER, LABELS, instances, nothing, room, truth_as_prediction
 
+from su3d_bench.core import registry
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError
-from su3d_bench.core.types import Float32Array, UInt8Array
+from su3d_bench.core.types import Float32Array, GroundTruth, LabelSet, UInt8Array
 from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.metrics.protocols.loading import load_protocol, read_protocol
 from su3d_bench.metrics.questions.presence import relevancies
@@ -194,6 +195,23 @@ def test_what_may_be_called_like_something_that_is_there_is_not_absent() -> None
     assert not [name for name in absent for known in there if is_called(name, known) or is_called(known, name)]
     assert not [name for name in absent if is_room_surface(name)]
     assert {"bed", "toilet"} <= set(absent)
+
+
+@pytest.mark.parametrize("name", ["rooms", "replica", "scannet", "scannetpp", "hm3dsem"])
+def test_every_dataset_with_names_of_classes_is_asked_for_absent_things_by_the_same_rules(name: str) -> None:
+    rules = load_protocol(f"{name}-presence")
+    classes = load_protocol("scannet200-panoptic" if name == "scannet" else f"{name}-panoptic").classes
+    ids, called = zip(*((entry.id, entry.name) for entry in classes), strict=True)
+    of_point = np.array([ids[called.index("chair")], ids[called.index("wall")]], np.int32)
+    numbers = np.array([1, 2], np.int32)
+    labels = LabelSet(rules.label_space, ids, called)
+    truth = GroundTruth(np.zeros((2, 3), np.float32), of_point, numbers, labels, rules.ground_truth, "by hand")
+    absent = absent_names(truth, known_objects(truth, 1))
+    assert {"chair", "wall", "unknown", "unknown/remove", "partial", "object"}.isdisjoint(absent)
+    assert {"sink", "toilet", "lamp"} & set(called) <= set(absent) and len(absent) > 40
+    same = {"presence", "per_kind", "synonyms", "prompt", "min_region_size", "headline"}
+    assert rules.model_dump(include=same) == RULES.model_dump(include=same)
+    assert name in registry.DATASETS and rules.ground_truth in registry.load("dataset", name).variants
 
 
 def test_where_nothing_absent_is_left_less_is_asked() -> None:

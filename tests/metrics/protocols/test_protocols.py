@@ -50,7 +50,7 @@ NAMES = {
     "openscan-synonym", "openscan-requirement", "openscan-element", "openscan-material", "beacon3d", "rooms-beacon3d",
     "opensun3d-masks", "opensun3d-queries", "grounding-given", "scannetpp-presence",
     "rooms-relations", "replica-relations",
-    "hm3dsem-objects", "hm3dsem-places",
+    "hm3dsem-objects", "hm3dsem-places", "scannetpp-panoptic", "hm3dsem-panoptic", "hm3dsem-presence",
 }  # fmt: skip
 
 

@@ -1,0 +1,105 @@
+"""panopticapi, the evaluator of COCO's panoptic task, over made problems of labelled points."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from made_segments import (
+    LEFT_OUT,
+    N_SCORED,
+    N_THINGS,
+    Problem,
+    Scene,
+    classes_of,
+    drawn,
+    has_left_out,
+    our_qualities,
+)
+from original_code import STOPS, Ask, Original, load, silence
+from places import CASES
+
+from su3d_bench.core.types import Float64Array
+from su3d_bench.metrics.protocols.model import ProtocolRules
+
+FILE = "panopticapi/evaluation.py"
+OVERALL = ("pq", "sq", "rq")
+
+
+def panopticapi(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
+    """The script over pairs of images of one line, a pixel a point, each scene in a process of its own."""
+    from PIL import Image
+
+    module = load(checkout / FILE, [checkout])
+    of_slot = classes_of(rules)
+    categories = {entry.id: {"isthing": int(entry.name not in rules.stuff)} for entry in rules.scored}
+
+    def written(name: str, values: Float64Array, segments: list[dict[str, Any]]) -> dict[str, Any]:
+        ids = values.astype(np.int64)
+        image = np.stack([ids % 256, ids // 256 % 256, ids // 65536], axis=-1).astype(np.uint8)[None]
+        Image.fromarray(image).save(folder / name)
+        return {"image_id": 1, "file_name": name, "segments_info": segments}
+
+    def images(scene: Scene) -> tuple[dict[str, Any], dict[str, Any]]:
+        truth, instance, owner = (np.array(scene[key]) for key in ("truth", "instance", "owner"))
+        kept = truth != LEFT_OUT if has_left_out(rules) else np.ones(len(truth), bool)
+        truth, instance, owner = truth[kept], instance[kept], owner[kept]
+        called = np.append(scene["called"], -1).astype(int)[owner]
+        pair = []
+        for name, slot, number in (("truth.png", truth, instance), ("found.png", called, owner + 1)):
+            is_in = (slot >= 0) & (slot < N_SCORED)
+            number = np.where(slot < N_THINGS, number, 0)
+            ids = np.where(is_in, 1000 * (slot + 1) + number, 0)
+            segments = [
+                {
+                    "id": key,
+                    "category_id": of_slot[key // 1000 - 1][0],
+                    "iscrowd": int(key % 1000 == 0 and key // 1000 <= N_THINGS),
+                }
+                for key in np.unique(ids[is_in]).tolist()
+            ]
+            for one in segments:
+                one["area"] = int((ids == one["id"]).sum())
+            pair.append(written(name, ids, segments))
+        return pair[0], pair[1]
+
+    def ask(problem: Problem) -> Float64Array:
+        stat = module.PQStat()
+        for scene in problem:
+            stat += module.pq_compute_single_core(0, [images(scene)], str(folder), str(folder), categories)
+        rows, of_class = [], {}
+        for is_thing in (None, True, False):
+            row, each = stat.pq_average(categories, isthing=is_thing)
+            rows += [row[key] for key in OVERALL]
+            of_class |= each
+        slots = [of_class[number] for number, _ in list(of_slot.values())[:N_SCORED]]
+        return np.array([*rows, *(slot[key] for slot in slots for key in OVERALL)], float)
+
+    return ask
+
+
+def keep(rules: ProtocolRules, ask: Ask, seed: int, n: int) -> None:
+    """The original's answers to the first ``n`` drawn problems to which it answers something new."""
+    file = CASES / "panoptic03_labelled_points.json"
+    kept: dict[str, dict[str, Any]] = {}
+    for problem in (drawn(seed, index) for index in itertools.count()):
+        try:
+            with silence():
+                answer = [float(value) for value in ask(problem)]
+        except STOPS:
+            continue
+        kept.setdefault(str(answer), {"scenes": problem, "answer": answer})
+        if len(kept) == n:
+            break
+    content = {**(json.loads(file.read_text()) if file.is_file() else {}), rules.name: [*kept.values()]}
+    blocks = [
+        f'"{name}": [\n' + ",\n".join(json.dumps(one, separators=(",", ":")) for one in rows) + "]"
+        for name, rows in content.items()
+    ]
+    file.write_text("{" + ",\n".join(blocks) + "}\n")
+
+
+ORIGINALS = (Original(("scannetpp-panoptic", "hm3dsem-panoptic"), FILE, panopticapi, drawn, our_qualities, keep),)

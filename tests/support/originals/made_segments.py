@@ -1,0 +1,95 @@
+"""Made problems of labelled points in segments of things and of stuff, which panopticapi and this program both answer.
+
+A problem is a list of scenes. A scene has the ``truth`` of every point, its ``instance`` (0 for none), its ``owner``
+among the predicted masks (-1 for none) and what each mask is ``called``. 0 to 2 are things, 3 and 4 stuff, 5 is a class
+that is not scored, -1 no label, -2 a point that evaluations leave out where the dataset has such.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import Float64Array, GroundTruth, LabelSet
+from su3d_bench.metrics.metric import SceneScore
+from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.scoring import combine, score_scene
+from su3d_bench.metrics.semantic.panoptic_quality import QUALITIES
+
+Scene = dict[str, Any]
+Problem = list[Scene]
+N_THINGS, N_SCORED, OTHER, UNLABELLED, LEFT_OUT = 3, 5, 5, -1, -2
+PARTS = ("", " things", " stuff")
+
+
+def drawn(seed: int, index: int) -> Problem:
+    """Problem ``index``: crowds, void, points that are left out, masks of no scored class, overlaps of one half."""
+    rng = np.random.default_rng([seed, index, 7])
+    scenes = []
+    for _ in range(rng.integers(1, 4)):
+        sizes = rng.integers(1, 7, rng.integers(2, 8))
+        of_part = rng.choice([0, 0, 1, 2, 3, 3, 4, OTHER, UNLABELLED, LEFT_OUT], len(sizes))
+        is_crowd = rng.random(len(sizes)) < 0.25
+        part = np.repeat(np.arange(len(sizes)), sizes)
+        owner = np.where(
+            rng.random(len(part)) < rng.choice([0.0, 0.3, 0.5]), rng.integers(-1, len(sizes), len(part)), part
+        )
+        there, owner = np.unique(np.append(owner, -1), return_inverse=True)
+        guess = rng.integers(0, OTHER + 1, len(sizes))
+        called = np.where((rng.random(len(sizes)) < 0.7) & (of_part >= 0), of_part, guess)[there[1:]]
+        scenes.append(
+            {
+                "truth": of_part[part].tolist(),
+                "instance": np.where(is_crowd | (of_part < 0) | (of_part >= N_THINGS), 0, np.arange(len(sizes)) + 1)[
+                    part
+                ].tolist(),
+                "owner": (owner[:-1] - 1).tolist(),
+                "called": called.tolist(),
+            }
+        )
+    return scenes
+
+
+def classes_of(rules: ProtocolRules) -> dict[int, tuple[int, str]]:
+    """The id and name that a protocol has for each slot of a class."""
+    things = [entry for entry in rules.scored if entry.name not in rules.stuff]
+    stuff = [entry for entry in rules.scored if entry.name in rules.stuff]
+    left = [entry for entry in rules.classes if rules.is_ignored(entry.name)]
+    chosen = [*(things[(7 * k + 2) % len(things)] for k in range(N_THINGS)), *stuff[: N_SCORED - N_THINGS], left[0]]
+    return {slot: (entry.id, entry.name) for slot, entry in enumerate(chosen)}
+
+
+def has_left_out(rules: ProtocolRules) -> bool:
+    """Whether the truth has points that evaluations leave out; elsewhere they have no label."""
+    return rules.label_space == "scannetpp"
+
+
+def scored(rules: ProtocolRules, scene: Scene) -> SceneScore:
+    """The score of a scene, its points a metre from one another."""
+    of_slot = classes_of(rules)
+    id_of = {slot: number for slot, (number, _) in of_slot.items()}
+    id_of |= {UNLABELLED: 0, LEFT_OUT: -1 if has_left_out(rules) else 0}
+    n, owner = len(scene["truth"]), np.array(scene["owner"])
+    points = np.column_stack([np.arange(n), np.zeros((n, 2))]).astype(np.float32)
+    truth = GroundTruth(
+        points,
+        np.array([id_of[slot] for slot in scene["truth"]], np.int32),
+        np.array(scene["instance"], np.int32),
+        LabelSet(rules.label_space, *zip(*of_slot.values(), strict=True)),
+        rules.ground_truth,
+        "made",
+    )
+    names = [of_slot[slot][1] for slot in scene["called"]]
+    masks = [np.flatnonzero(owner == k) for k in range(len(names))]
+    return score_scene(rules, truth, Instances.of(points, masks, None, labels=names), None)
+
+
+def our_qualities(rules: ProtocolRules, problem: Problem) -> Float64Array:
+    """PQ, SQ and RQ of all classes, of things, of stuff, and of each slot, 0 for one of which there is nothing."""
+    found = combine(rules, {str(s): scored(rules, scene) for s, scene in enumerate(problem)}, with_intervals=False)
+    means = [found.metrics[name + part] for part in PARTS for name in QUALITIES]
+    slots = [name for _, name in classes_of(rules).values()][:N_SCORED]
+    of_slots = [found.per_class[slot][name] for slot in slots for name in QUALITIES]
+    return np.array([*means, *np.nan_to_num(of_slots)], float)
