@@ -114,8 +114,8 @@ def conceptgraphs(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
         finally:
             os.chdir(before)
         rows = [[np.mean(one[key]) for key in OF_CONCEPTGRAPHS.values()] for one in answers[n_before:]]
-        if np.isnan(rows).any():
-            raise ArithmeticError("it divides by no points where a scene has none that is scored")
+        if np.isnan(rows[-1]).any():
+            raise ArithmeticError("its means are of no class where no scene has a scored point")
         return np.array(rows[-1:] + rows[:-1], float)  # that of all scenes first
 
     return ask
@@ -157,7 +157,6 @@ def our_means(rules: ProtocolRules, problem: Problem) -> Float64Array:
 
 def keep(rules: ProtocolRules, ask: Ask, seed: int, n: int) -> None:
     """The original's answers to the first ``n`` drawn problems that it answers, no two alike."""
-    file = CASES / "originals_semantic.json"
     kept, index, is_of_space = list[dict[str, Any]](), 0, rules.metric == "conceptgraphs"
     while len(kept) < n:
         problem = (drawn_in_space if is_of_space else drawn)(seed, index)
@@ -169,10 +168,16 @@ def keep(rules: ProtocolRules, ask: Ask, seed: int, n: int) -> None:
             answer = {name: float(value) for name, value in zip(names, first, strict=True) if value == value}
             if answer not in [one["answer"] for one in kept]:
                 kept.append({"scenes": problem, "answer": answer})
-    content = {**json.loads(file.read_text()), rules.name: kept}
+    rewritten(rules.name, kept)
+
+
+def rewritten(name: str, kept: list[dict[str, Any]]) -> None:
+    """The file of cases of points with those of one protocol in place of what it had of it."""
+    file = CASES / "originals_semantic.json"
+    content = {**json.loads(file.read_text()), name: kept}
     blocks = [
-        f'"{name}": [\n' + ",\n".join(json.dumps(one, separators=SHORT) for one in rows) + "]"
-        for name, rows in content.items()
+        f'"{key}": [\n' + ",\n".join(json.dumps(one, separators=SHORT) for one in rows) + "]"
+        for key, rows in content.items()
     ]
     file.write_text("{" + ",\n".join(blocks) + "}\n")
 

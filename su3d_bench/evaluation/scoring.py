@@ -58,6 +58,7 @@ from su3d_bench.metrics.scoring import QuestionTruth, metric_of, score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.metrics.semantic.panoptic_quality import PanopticCounts
 from su3d_bench.metrics.semantic.panoptic_score import count_segments, told_truth
+from su3d_bench.metrics.semantic.score import with_unnamed
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks, ids_of
 from su3d_bench.predictions.own_runs import OwnRuns
 
@@ -287,7 +288,10 @@ def _melted(scene: str, rules: ProtocolRules, values: Int64Array) -> list[str]:
 
 def _semantic_score(rules: ProtocolRules, labels: Int64Array, class_ids: np.ndarray) -> SceneScore:
     true_class = class_index_of_ids(rules, labels)
-    counts = semantic.per_scene(true_class, class_index_of_ids(rules, class_ids), scored_classes(rules))
+    called = class_index_of_ids(rules, class_ids)
+    if class_ids.any():  # else nothing was predicted
+        called = with_unnamed(rules, called)
+    counts = semantic.per_scene(true_class, called, scored_classes(rules))
     return _score(rules, counts, len(np.unique(class_ids)), int((true_class >= 0).sum()))
 
 

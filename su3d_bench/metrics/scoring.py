@@ -30,7 +30,7 @@ from su3d_bench.metrics.metric import MOST_COUNTED, Counts, Metric, SceneScore, 
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
 from su3d_bench.metrics.open_vocabulary.score import CategoriesMetric, QueryMetric
-from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.protocols.model import Kind, ProtocolRules
 from su3d_bench.metrics.questions.chains import ChainMetric
 from su3d_bench.metrics.questions.grounding import GroundingMetric
 from su3d_bench.metrics.questions.presence import PresenceMetric
@@ -57,7 +57,7 @@ __all__ = [
 EVERY_SCENE = "every scene"  # stands before a warning that all scenes share, where else the name of one stands
 QuestionTruth = RetrievalTruth | PresenceTruth | AnnotationTruth | ReasoningTruth
 Truth = GroundTruth | OpenLexTruth | QueryTruth | QuestionTruth
-METRICS: dict[str, type[Metric[Any]]] = {
+METRICS: dict[Kind, type[Metric[Any]]] = {
     "semantic": SemanticMetric,
     "top-k": TopKMetric,
     "instance": InstanceMetric,

@@ -165,7 +165,8 @@ def test_counts_without_the_axis_of_a_single_class_are_refused() -> None:
 def test_classes_that_should_have_points_and_have_none_score_zero(dtype: type[np.float32] | type[np.float64]) -> None:
     with np.errstate(all="raise"):
         metrics = conceptgraphs_metrics(np.zeros((2, 3), np.int64), np.arange(2), dtype)
-    assert (metrics.mean_accuracy, metrics.mean_iou, metrics.frequency_weighted_iou) == (0.0, 0.0, 0.0)
+    assert (metrics.mean_accuracy, metrics.mean_iou) == (0.0, 0.0)
+    assert math.isnan(metrics.frequency_weighted_iou)  # of no point at all
 
 
 def test_a_scene_without_truth_has_no_value_and_moves_none() -> None:
@@ -206,6 +207,19 @@ def test_a_scene_that_moves_no_mean_takes_part_in_the_interval() -> None:
     scored = {str(n): score(ROOM, confusion({A: {A: n, N: 10 - n}})) for n in (4, 5, 6)}
     # 4.303, of Student's t with 2 degrees of freedom, times 0.1 / sqrt(3)
     assert combine(rules, scored).intervals["mAcc"] == pytest.approx((0.5 - 0.24841, 0.5 + 0.24841), abs=1e-5)
+
+
+def test_a_scene_without_a_scored_point_has_no_f_miou_under_conceptgraphs_and_adds_nothing_to_the_pooled_row() -> None:
+    # compute_metrics of conceptgraph/utils/eval.py: denominators of at least 1, but F-mIoU over the sum of all points
+    empty, other = confusion({}, present=[A, B]), confusion({A: {A: 4, B: 1}, B: {B: 3}})
+    rules = ROOM.model_copy(update={"aggregate": "scene-mean"})
+    for asked in (ROOM, rules):
+        result = combine(asked, {"empty": score(asked, empty), "other": score(asked, other)})
+        assert np.isnan(result.per_scene["empty"]["F-mIoU"])
+        assert (result.per_scene["empty"]["mAcc"], result.per_scene["empty"]["mIoU"]) == (0.0, 0.0)
+        assert result.pooled == combine(asked, {"other": score(asked, other)}).pooled
+        assert result.scene_mean["F-mIoU"] == result.per_scene["other"]["F-mIoU"]
+        assert result.scene_mean["mAcc"] == pytest.approx(result.per_scene["other"]["mAcc"] / 2)
 
 
 # ---- the column that ConceptGraphs slices away

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from su3d_bench.core.errors import suggest
-from su3d_bench.metrics.protocols.model import CURVE_FIELDS, OWN_FIELDS, ProtocolRules, ValuesOfMetric
+from su3d_bench.metrics.protocols.model import CURVE_FIELDS, OWN_FIELDS, Kind, ProtocolRules, ValuesOfMetric
 
 AP_NAMES = ("AP", "AP50", "AP25")
 GEOMETRIC = ("on", "under", "in", "above", "next to", "near")  # what boxes tell, as numerics.relations has it
@@ -24,6 +24,13 @@ class SemanticRules(ProtocolRules):
     names_points = True
     takes_votes = True
     needs = ("classes", "vocabulary")
+    takes = ("unnamed",)
+
+    def _check_metric(self) -> None:
+        super()._check_metric()
+        names = [entry.name for entry in self.classes]
+        if self.unnamed is not None and self.unnamed not in names:
+            raise ValueError(f"unnamed: '{self.unnamed}' is no class{suggest(self.unnamed, names)}")
 
 
 class TopKRules(ProtocolRules):
@@ -328,7 +335,7 @@ class ReasoningRules(_JudgedRules):
         return self.needs
 
 
-RULES_OF_KIND: dict[str, type[ProtocolRules]] = {
+RULES_OF_KIND: dict[Kind, type[ProtocolRules]] = {
     "semantic": SemanticRules,
     "top-k": TopKRules,
     "instance": InstanceRules,

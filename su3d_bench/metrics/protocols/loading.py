@@ -92,7 +92,8 @@ def read_rules(values: Mapping[str, Any], where: str) -> ProtocolRules:
 
 
 def _made(values: Mapping[str, Any]) -> ProtocolRules:
-    rules = RULES_OF_KIND.get(str(values.get("kind")), ProtocolRules)
+    said = values.get("kind")
+    rules = next((rules for kind, rules in RULES_OF_KIND.items() if kind == said), ProtocolRules)
     return rules.model_validate(_with_tuples(values))
 
 

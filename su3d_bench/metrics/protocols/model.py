@@ -10,7 +10,17 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from su3d_bench.core.errors import suggest
 
-ValuesOfMetric = Mapping[str, tuple[str, ...]]
+# Each list stands here alone: what goes by a kind or a metric has keys of this type, and mypy finds a misspelt one.
+Kind = Literal[
+    "semantic", "top-k", "instance", "panoptic", "boxes", "queries", "categories", "grounding", "object-chains",
+    "relations", "objects", "places", "retrieval", "presence", "annotation", "reasoning",
+]  # fmt: skip
+MetricName = Literal[
+    "conceptgraphs", "scannet", "scannetpp", "hovsg", "ovo", "votenet", "query-ap", "opensun3d", "openlex3d-topn",
+    "openlex3d-ranking", "panopticapi", "semantic-kitti", "scanrefer", "beacon3d", "referit3d", "replicassg",
+    "hovsg-objects", "hovsg-places", "retrieval", "pope", "annotation", "reasoning",
+]  # fmt: skip
+ValuesOfMetric = Mapping[MetricName, tuple[str, ...]]
 BOX_AXES = Literal["truth", "world", "aligned"]
 CURVE_FIELDS = ("min_region_size", "thresholds", "confidence")
 _NEEDS_QUESTIONS = (
@@ -23,6 +33,7 @@ OWN_FIELDS = {
     "class_agnostic": "class_agnostic: belongs to kind 'instance'",
     "void": "void: belongs to kind 'instance'",
     "stuff": "stuff: kind 'panoptic' needs the classes that are no things, others take none",
+    "unnamed": "unnamed: belongs to kind 'semantic'",
     "labels": "labels: belongs to kind 'instance', where masks have classes",
     "vocabulary": "vocabulary: belongs to protocols that choose among classes, and these need it",
     "min_region_size": _ONLY_CURVES,
@@ -141,41 +152,15 @@ class ProtocolRules(_Strict):
     absent, either is scored, and no ranking has both. ``box_axes``: the box of an instance is the smallest around its
     points along the axes of the ``truth``'s box that it is held against, or along those of the ``world``, or of the
     ``aligned`` world, which the dataset's own motion turned along the walls (the world where it has none).
+    ``unnamed``: the class as which objects and points count that have none; they have none where it is absent.
     ``predicates`` are those of the relations asked for, which people ``annotated`` or boxes give (``geometric``).
     """
 
     name: str
     version: Annotated[int, Field(ge=1)]
     summary: str
-    kind: Literal[
-        "semantic", "top-k", "instance", "panoptic", "boxes", "queries", "categories",
-        "grounding", "object-chains", "relations", "objects", "places",
-        "retrieval", "presence", "annotation", "reasoning",
-    ]  # fmt: skip
-    metric: Literal[
-        "conceptgraphs",
-        "scannet",
-        "scannetpp",
-        "hovsg",
-        "ovo",
-        "votenet",
-        "query-ap",
-        "opensun3d",
-        "openlex3d-topn",
-        "openlex3d-ranking",
-        "panopticapi",
-        "semantic-kitti",
-        "scanrefer",
-        "beacon3d",
-        "referit3d",
-        "replicassg",
-        "hovsg-objects",
-        "hovsg-places",
-        "retrieval",
-        "pope",
-        "annotation",
-        "reasoning",
-    ]
+    kind: Kind
+    metric: MetricName
     datasets: tuple[str, ...]
     by_default: bool = True
     label_space: str
@@ -185,6 +170,7 @@ class ProtocolRules(_Strict):
     class_agnostic: Literal["scored", "annotated", "numbered", "everything"] | None = None
     void: Literal["false-positives"] | None = None
     stuff: tuple[str, ...] = ()
+    unnamed: str | None = None
     labels: Literal["one", "top-k"] | None = None
     ignore: tuple[str, ...] = ()
     ignore_rule: Literal["exact", "substring"] = "exact"

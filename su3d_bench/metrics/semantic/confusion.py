@@ -100,8 +100,8 @@ def conceptgraphs_metrics(
 
     ``confusion`` (C, C) or (C, C + 1). Rows and columns are sliced together, as in the original; what fell outside the
     kept columns counts as missed only where it stands in the extra column. Denominators are at least 1, so a class
-    without points scores 0 and stays in the mean. ``dtype`` float32 computes as the original does, to the last bit.
-    No class: all NaN.
+    without points scores 0 and stays in the mean; F-mIoU of no point at all is NaN, as 0/0 is there. ``dtype`` float32
+    computes as the original does, to the last bit. No class: all NaN.
 
     ``f1_conceptgraphs`` is the original's F1, 2PR / max(1, P + R), which is no harmonic mean below P + R = 1.
 
@@ -200,8 +200,6 @@ def _with_means(
     f1_conceptgraphs = 2 * precision * recall / np.maximum(1.0, precision + recall)
     n_points = float(n_true.sum())
     weighted = (n_true * np.nan_to_num(iou)).sum() / n_points if n_points > 0 else np.nan
-    if len(class_index) and n_points == 0 and not np.isnan(iou).any():
-        weighted = 0.0  # classes that should have points and have none: all scores are 0
     return SemanticMetrics(
         class_index=class_index,
         recall=recall,

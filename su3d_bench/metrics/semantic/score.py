@@ -190,7 +190,8 @@ def call_points(
         true_class = np.where(source >= 0, class_of_label[source], -1)
     is_counted = _counted_classes(rules, is_scored, is_present)
     is_wanted = (true_class >= 0) & is_counted[true_class]
-    classes = classes_of_prediction(rules, prediction, encoder, candidate_classes(rules, is_present))
+    candidates = candidate_classes(rules, is_present)
+    classes = with_unnamed(rules, classes_of_prediction(rules, prediction, encoder, candidates))
     votes_for_masks = rules.transfer.votes == "masks" and not isinstance(prediction, DenseFeatures)
     if votes_for_masks and not transfer.are_same_points(prediction.points, targets):
         mask, distance_m = transfer_votes(rules, prediction, classes, targets, is_wanted, of_masks=True)
@@ -202,6 +203,8 @@ def call_points(
         takes_part = _taking_part(rules, classes, is_scored)
         mask, distance_m = owners_at(rules, prediction, takes_part, targets, is_wanted)
         predicted = np.where(mask >= 0, classes[mask], -1) if len(classes) else mask
+    if len(classes):
+        predicted = with_unnamed(rules, predicted)
     return CalledPoints(
         targets=targets,
         source=source,
@@ -215,6 +218,19 @@ def call_points(
         mask=mask,
         distance_m=distance_m,
     )
+
+
+def with_unnamed(rules: ProtocolRules, class_index: Int64Array) -> Int64Array:
+    """The class indices of objects, or of points where something was predicted, with ``unnamed`` in place of -1.
+
+    >>> from su3d_bench.metrics.protocols.loading import load_protocol
+    >>> [with_unnamed(load_protocol(f"scannet-{name}"), np.array([-1, 3])).tolist() for name in ("semantic", "ovo20")]
+    [[-1, 3], [20, 3]]
+    """
+    if rules.unnamed is None:
+        return class_index
+    named = next(index for index, entry in enumerate(rules.classes) if entry.name == rules.unnamed)
+    return np.where(class_index < 0, named, class_index)
 
 
 def owners_at(

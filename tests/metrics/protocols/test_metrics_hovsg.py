@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,13 +14,17 @@ from hypothesis import strategies as st
 from places import CASES
 from scored_room import ENCODER, ID, LABELS, OneHotEncoder, instances, noisy, nothing, room, truth_as_prediction
 
+from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
 from su3d_bench.core.types import Float32Array, GroundTruth, LabelSet, UInt8Array
+from su3d_bench.evaluation.scoring import score_on_vertices
+from su3d_bench.evaluation.truth import VertexTruth
 from su3d_bench.metrics.matching.labelling import text_features
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine, pack_scores, score_scene, unpack_scores
 from su3d_bench.metrics.semantic.confusion import confusion_matrix, hovsg_metrics, per_scene
+from su3d_bench.predictions.base import VertexLabels
 
 GOLDEN = json.loads((CASES / "conceptgraphs_golden.json").read_text())["hovsg"]
 HOVSG, EXACT, OVO = (load_protocol(name) for name in ("replica-hovsg", "replica-hovsg-exact", "replica-ovo51"))
@@ -218,6 +223,54 @@ def test_objects_that_overlap_vote_each_and_one_without_a_class_does_not() -> No
         alone = replace(truth, semantic=np.where(truth.instance == 2, truth.semantic, 0).astype(np.int32))
         score = score_scene(HOVSG, fitting(HOVSG, alone), prediction, None)
         assert combine(HOVSG, {"a": score}).per_class["chair"]["recall"] == recall
+
+
+def test_under_ovo_what_has_no_class_is_called_the_last_class_of_its_list() -> None:
+    """update_confmat takes -1 as an index: of the column of the last class."""
+    lists = {name: load_protocol(name).unnamed for name in ("replica-ovo51", "scannet-ovo20", "scannet-ovo200")}
+    assert lists == {"replica-ovo51": "switch", "scannet-ovo20": "background", "scannet-ovo200": "mattress"}
+    truth = fitting(OVO, room())
+    switch = next(entry.id for entry in OVO.classes if entry.name == "switch")
+    chairs = np.flatnonzero(truth.instance == 2)
+    is_switch = truth.instance == 2
+    with_switch = replace(truth, semantic=np.where(is_switch, switch, truth.semantic).astype(np.int32))
+    for found in (
+        instances(truth.points, [chairs], ["unheard"]),  # an object of no class
+        instances(truth.points, [chairs[:1]], ["switch"]),  # vertices in no mask
+        instances(truth.points + np.float32(0.001), [chairs, chairs[:9]], ["unheard", "chair"]),  # it votes
+    ):
+        result = combine(OVO, {"a": score_scene(OVO, with_switch, found, None)})
+        assert result.per_class["switch"]["recall"] > 0.9
+    of_chairs = combine(OVO, {"a": score_scene(OVO, truth, instances(truth.points, [chairs], ["unheard"]), None)})
+    assert of_chairs.per_class["switch"]["IoU"] == 0.0  # never true, and predicted: it counts
+    assert set(metrics(OVO, with_switch, nothing(truth))) == {0.0}
+
+
+@pytest.mark.parametrize(
+    ("base", "line", "message"),
+    [
+        ("replica-ovo51", 'unnamed = "swich"', "unnamed: 'swich' is no class; did you mean 'switch'?"),
+        ("rooms-instance", 'unnamed = "chair"', "unnamed: belongs to kind 'semantic'"),
+    ],
+)
+def test_a_wrong_class_for_what_has_none_is_one_line(base: str, line: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text(f'extends = "{base}"\nname = "mine"\n{line}\n')
+    with pytest.raises(ConfigError) as caught:
+        load_protocol(str(tmp_path / "mine.toml"))
+    assert message in str(caught.value) and "mine.toml:3" in str(caught.value)
+
+
+def test_a_class_a_vertex_beside_files_of_truth_counts_alike() -> None:
+    rules = load_protocol("scannet-ovo20")
+    labels = np.array([1, 1, 2, 0])
+    truth = VertexTruth(labels * 1000 + 1, labels, ())
+    called = VertexLabels(np.array([1, -1, 0, -1], np.int32))
+    outcome = score_on_vertices(rules, truth, "a", called, None)
+    found = combine(rules, {"a": outcome.score})
+    assert found.per_class["background"]["IoU"] == 0.0  # two labelled vertices are called so
+    assert (found.per_class["wall"]["recall"], found.metrics["mIoU"]) == (0.5, pytest.approx(0.5 / 3))
+    none = score_on_vertices(rules, truth, "a", VertexLabels(np.zeros(0, np.int32)), None)
+    assert np.isnan(combine(rules, {"a": none.score}).per_class["background"]["IoU"])
 
 
 def test_objects_of_the_first_class_vote_as_all_others() -> None:

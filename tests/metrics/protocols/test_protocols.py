@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -30,7 +30,8 @@ from su3d_bench.metrics.instance.average_precision import MIN_REGION_SIZE, THRES
 from su3d_bench.metrics.protocols.files import protocol_names, rules_file
 from su3d_bench.metrics.protocols.kinds import RULES_OF_KIND
 from su3d_bench.metrics.protocols.loading import load_protocol, not_comparable_with, protocols_for
-from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.protocols.model import Kind, MetricName, ProtocolRules
+from su3d_bench.metrics.scoring import METRICS
 
 NAMES = {
     "class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d", "openlex3d-queries",
@@ -201,6 +202,7 @@ def test_a_rule_that_a_file_leaves_out_asks_for_nothing() -> None:
     }  # fmt: skip
     assert {key: value for key, value in rules.items() if key not in said} == {
         "by_default": True, "class_numbers": "ids", "class_agnostic": None, "void": None, "labels": None,
+        "unnamed": None,
         "stuff": (), "ignore": (), "ignore_rule": "exact", "prompts": (), "prompt_names": {}, "encoder": None,
         "min_region_size": None, "thresholds": (),
         "confidence": None, "top_k": None, "questions": None, "per_kind": None, "synonyms": None, "merging": None,
@@ -232,6 +234,12 @@ KINDS = {
 def test_kinds_differ_in_what_they_take() -> None:
     facts = set.union(*KINDS.values())
     assert {kind: {fact for fact in facts if getattr(rules, fact)} for kind, rules in RULES_OF_KIND.items()} == KINDS
+
+
+def test_every_kind_has_rules_and_a_metric_and_every_metric_belongs_to_a_kind() -> None:
+    assert set(RULES_OF_KIND) == set(METRICS) == set(get_args(Kind))
+    names = [name for rules in RULES_OF_KIND.values() for name in rules.values_of_metric]
+    assert set(names) == set(get_args(MetricName))
 
 
 def test_what_a_prediction_holds_is_told_by_its_kind() -> None:

@@ -1,4 +1,9 @@
-"""Made problems of objects that vote for the points near them, scored by this program."""
+"""Made problems of objects that vote for the points near them, which OVO's script and this program both answer.
+
+A problem is a list of scenes. A scene has the ``truth`` of every vertex, an index of a class or -1, void. Either a
+class is ``called`` on each vertex, or ``places_mm`` are where the vertices are, ``own_mm`` the points of a map,
+``owner`` the object of each, -1 for none, and ``of_object`` the class of each object. Predicted -1 is no class.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +12,72 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.maps import Instances
-from su3d_bench.core.types import GroundTruth, LabelSet
+from su3d_bench.core.types import Float64Array, GroundTruth, LabelSet
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.scoring import score_scene
+from su3d_bench.metrics.scoring import combine, score_scene
+
+Problem = list[dict[str, Any]]
+N_SLOTS, NONE = 8, -1
+OVERALL = ("mIoU", "mAcc", "F-mIoU", "pAcc")
+GROUPS = ("head", "common", "tail")
+
+
+def drawn(seed: int, index: int) -> Problem:
+    """Problem ``index`` in slots, the last for what is unnamed: void, missing classes, objects of no class."""
+    rng = np.random.default_rng([seed, index, 5])
+    scenes = []
+    for _ in range(rng.integers(1, 4)):
+        there = rng.choice(N_SLOTS, rng.integers(1, 5), replace=False)
+        truth = rng.choice([*there, *there, NONE], n := int(rng.integers(3, 18)))
+        scene: dict[str, Any] = {"truth": truth.tolist()}
+        if rng.random() < 0.3:
+            called = np.where(rng.random(n) < 0.5, truth, rng.choice([*there, N_SLOTS - 1, NONE], n))
+            scenes.append(scene | {"called": called.tolist()})
+            continue
+        n_objects, n_points = int(rng.integers(1, 6)), int(rng.integers(7, 20))
+        owner = rng.integers(-1, n_objects, n_points)
+        owner[:5] = rng.integers(0, n_objects, 5)  # it ends in an error where fewer than five points vote
+        scenes.append(
+            scene
+            | {
+                "places_mm": rng.integers(0, 1000, (n, 3)).tolist(),
+                "own_mm": rng.integers(-100, 1100, (n_points, 3)).tolist(),
+                "owner": owner.tolist(),
+                "of_object": rng.choice([*there, *there, rng.integers(N_SLOTS), NONE], n_objects).tolist(),
+            }
+        )
+    return scenes
+
+
+def slots_of(rules: ProtocolRules, problem: Problem) -> Problem:
+    """The problem in the indices of a protocol's classes."""
+    named = [k for k, entry in enumerate(rules.classes) if entry.name != rules.unnamed]
+    unnamed = next(k for k, entry in enumerate(rules.classes) if entry.name == rules.unnamed)
+    index = np.array([*(named[(7 * k + 1) % len(named)] for k in range(N_SLOTS - 1)), unnamed, NONE])
+    is_never_true = rules.unnamed == "background"
+    true = np.where((index == unnamed) & is_never_true, NONE, index)
+    of_key = {"truth": true, "called": index, "of_object": index}
+    return [
+        {key: of_key[key][values].tolist() if key in of_key else values for key, values in scene.items()}
+        for scene in problem
+    ]
+
+
+def our_means(rules: ProtocolRules, problem: Problem) -> Float64Array:
+    """The means over all classes and over thirds of them, NaN where a third has no class that is true or called."""
+    found = combine(rules, {str(s): scored(rules, scene) for s, scene in enumerate(problem)}, with_intervals=False)
+    of_groups = [found.groups[group][key] for group in GROUPS for key in OVERALL[:2]]
+    return np.array([*(found.metrics[key] for key in OVERALL), *of_groups], float)
 
 
 def scored(rules: ProtocolRules, scene: dict[str, Any]) -> Any:
-    """The score of vertices of classes, -1 is void; a class is ``called`` on each, or of the objects of a map."""
+    """The score of vertices of classes, -1 is void; a class is ``called`` on each, or of the objects of a map, where -1
+    is none."""
     kinds = np.array(scene["truth"])
     places = np.array(scene.get("places_mm", [[1000 * k, 0, 0] for k in range(len(kinds))])) / 1000
     if "called" in scene:
-        own, owner, of_object = places, np.array(scene["called"]), list(range(len(rules.classes)))
+        own, owner, of_object = places, np.array(scene["called"]), [*range(len(rules.classes)), NONE]
+        owner = np.where(owner < 0, len(rules.classes), owner)
     else:
         own, owner, of_object = np.array(scene["own_mm"]) / 1000, np.array(scene["owner"]), scene["of_object"]
     there = sorted(set(owner.tolist()) - {-1})
@@ -33,7 +93,7 @@ def scored(rules: ProtocolRules, scene: dict[str, Any]) -> Any:
         "made",
     )
     masks = [np.flatnonzero(owner == k) for k in there]
-    names = [rules.classes[of_object[k]].name for k in there]
+    names = [rules.classes[of_object[k]].name if of_object[k] >= 0 else "of no class" for k in there]
     return score_scene(
         rules, truth, Instances.of(own.astype(np.float32), masks, [1.0] * len(masks), labels=names), None
     )

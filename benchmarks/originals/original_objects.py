@@ -1,0 +1,97 @@
+"""OVO's evaluation over made problems of objects that vote for the vertices near them, or of a class a vertex."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from made_objects import GROUPS, OVERALL, Problem, drawn, our_means, slots_of
+from original_code import STOPS, Ask, Original, load, silence, without_gpu
+from original_instances import emptied
+from original_points import SHORT, rewritten
+
+from su3d_bench.core.types import Float64Array
+from su3d_bench.metrics.protocols.model import ProtocolRules
+
+FILE = "ovo/utils/eval_utils.py"
+LISTS = {
+    "replica-ovo51": "Replica/eval_info",
+    "scannet-ovo20": "ScanNet/eval_info",
+    "scannet-ovo200": "ScanNet/eval_info_200",
+}
+
+
+def ovo(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:
+    """The script over files of a class a vertex, those of objects as run_eval.py makes them; its lists of classes are
+    read from its own settings."""
+    import torch
+    import yaml
+
+    without_gpu()
+    module = load(checkout / FILE, [checkout], absent=["seaborn", "matplotlib", "pandas"])
+    info = yaml.safe_load((checkout / f"data/working/configs/{LISTS[rules.name]}.yaml").read_text())
+    info.setdefault("num_classes", len(info["class_names_reduced"]))
+    void = -1 if -1 in info["map_to_reduced"] else 0  # no vertex's label in ScanNet
+    ids = [entry.id if entry.id in info["map_to_reduced"] else None for entry in rules.classes]  # background is none
+    place = np.array([info["map_to_reduced"].get(one, info["num_classes"] - 1) for one in ids] + [-1])
+
+    def labels_of(scene: dict[str, Any]) -> Float64Array:
+        if "called" in scene:
+            return place[scene["called"]]
+        owner = torch.tensor(scene["owner"])
+        own, seen = (np.array(scene[key]) / 1000 for key in ("own_mm", "places_mm"))
+        of_vertex, *_ = module.match_labels_to_vtx(owner, torch.tensor(own), torch.tensor(seen))
+        return place[np.array(scene["of_object"])[of_vertex.numpy()]]
+
+    def ask(problem: Problem) -> Float64Array:
+        problem = slots_of(rules, problem)
+        pred, truth = emptied(folder / "pred"), emptied(folder / "gt")
+        for s, scene in enumerate(problem):
+            (pred / f"{s}.txt").write_text("\n".join(str(int(one)) for one in labels_of(scene)))
+            (truth / f"{s}.txt").write_text(
+                "\n".join(str(void if one < 0 else ids[one] or void) for one in scene["truth"])
+            )
+        scenes = [str(s) for s in range(len(problem))]
+        _, confusion = module.eval_semantics(pred, truth, scenes, info, verbose=False, return_metrics=True)
+        iou, has_iou, weights, acc, has_acc = module.iou_acc_from_confmat(
+            confusion, info["num_classes"], info["ignore"]
+        )
+        means = [np.mean(iou[has_iou]), np.mean(acc[has_acc])]
+        means += [np.sum(one[has_iou] * weights[has_iou]) / weights[has_iou].sum() for one in (iou, acc)]
+        third = len(iou) // 3
+        for k in range(len(GROUPS)):
+            rows = slice(third * k, third * (k + 1))
+            means += [np.mean(one[rows][has_iou[rows]]) for one in (iou, acc)]
+        return np.array(means, float)
+
+    return ask
+
+
+def keep(rules: ProtocolRules, ask: Ask, seed: int, n: int) -> None:
+    """The original's answers to the first ``n`` drawn problems to which it answers something new."""
+    kept: dict[str, str] = {}
+    names = [*OVERALL, *(f"{group} {key}" for group in GROUPS for key in OVERALL[:2])]
+    for problem in (drawn(seed, index) for index in itertools.count()):
+        try:
+            with silence():
+                values = ask(problem)
+        except STOPS:
+            continue
+        answer = {key: None if value != value else float(value) for key, value in zip(names, values, strict=True)}
+        kept.setdefault(
+            str(answer), json.dumps({"scenes": slots_of(rules, problem), "answer": answer}, separators=SHORT)
+        )
+        if len(kept) == n:
+            break
+    rewritten(rules.name, [json.loads(text) for text in kept.values()])
+
+
+def ours(rules: ProtocolRules, problem: Problem) -> Float64Array:
+    """The same of this program."""
+    return our_means(rules, slots_of(rules, problem))
+
+
+ORIGINALS = (Original(tuple(LISTS), FILE, ovo, drawn, ours, keep),)
