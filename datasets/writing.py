@@ -19,6 +19,7 @@ from su3d_bench.core.digests import digest_json
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int32Array, UInt8Array
+from su3d_bench.datasets.joined_lists import JoinedList
 from su3d_bench.datasets.recordings.made_rooms import MARKER, read_marker
 from su3d_bench.store.atomic import make_folder, write_bytes, write_json, write_text
 from su3d_bench.store.unfinished import clear_unfinished
@@ -27,7 +28,7 @@ FRAMES_PER_SECOND = 30.0
 
 
 class ScannedObject(Protocol):
-    """An object with its id in the scan, its class, and its axis-aligned box in the world, metres."""
+    """An object with its id in the scan, its class, its material, and its axis-aligned box in the world, metres."""
 
     @property
     def id(self) -> int: ...
@@ -35,6 +36,8 @@ class ScannedObject(Protocol):
     def class_id(self) -> int: ...
     @property
     def class_name(self) -> str: ...
+    @property
+    def material(self) -> str: ...
     @property
     def box_min(self) -> Sequence[float]: ...
     @property
@@ -76,7 +79,8 @@ class SceneTarget:
 
     ``folder`` bears the scene's name in the layout. ``frames`` is the name in it of what holds the frames; where that
     is one file, it is written whole. ``truth`` are the other files without which the scene is not whole. ``apart`` are
-    files and folders with a place outside ``folder``, each with its name while the scene is built.
+    files and folders with a place outside ``folder``, each with its name while the scene is built; ``joined`` the files
+    of all scenes that have rows of this one.
     """
 
     scene: str
@@ -85,6 +89,7 @@ class SceneTarget:
     frames: str
     truth: tuple[Path, ...] = ()
     apart: tuple[tuple[str, Path], ...] = ()
+    joined: tuple[JoinedList, ...] = ()
 
     @property
     def partial(self) -> Path:
@@ -97,7 +102,8 @@ class SceneTarget:
 
     @property
     def is_whole(self) -> bool:
-        return all(path.exists() for path in (self.folder / self.frames, *self.truth))
+        is_there = all(path.exists() for path in (self.folder / self.frames, *self.truth))
+        return is_there and all(one.has(self.folder.name) for one in self.joined)
 
 
 class Layout(ABC):
@@ -168,11 +174,14 @@ def plan_scenes(layout: Layout, dataset: ScannedDataset, scenes: Sequence[str], 
         )
         if strange is not None:
             raise StoreError(f"{strange}: is there already and was made elsewhere; choose another folder with --out")
+    every = marked | {target.folder.name: target.key for target in targets}
+    for joined in {one.place: one for target in targets for one in target.joined}.values():
+        joined.check_is_ours(every)
     pending = [target for target in targets if not target.is_whole]
     if not pending:
         return []
     layout.write_shared(dataset, pending[0].scene, out)
-    marked |= {target.folder.name: target.key for target in targets}
+    marked = every
     marker = {"generator": f"su3d-bench {dataset.name}", "version": layout.settings[0]}
     marker |= {"scenes": dict(sorted(marked.items()))} | layout.marker_extras(sorted(marked))
     write_json(folder / MARKER, marker)
@@ -220,6 +229,8 @@ def finish_scene(layout: Layout, dataset: ScannedDataset, target: SceneTarget) -
                 shutil.rmtree(place)
             place.parent.mkdir(parents=True, exist_ok=True)
             os.replace(target.partial / name, place)
+        for joined in target.joined:
+            joined.join(target.partial, target.folder.name)
         if target.folder.exists():
             _add_files(target.partial, target.folder)
         else:

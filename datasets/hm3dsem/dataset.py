@@ -18,6 +18,7 @@ from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh,
 from su3d_bench.datasets.hm3dsem.folders import (
     GROUPS,
     INFO_NAME,
+    LABELS_OF,
     OBJECTS,
     PLACES,
     POSE,
@@ -37,6 +38,7 @@ from su3d_bench.datasets.hm3dsem.truth import (
     read_info,
     read_truth,
 )
+from su3d_bench.datasets.openlex3d import release as openlex3d
 from su3d_bench.datasets.recordings.recorded_frames import RecordedFrames, Recording, reading
 
 READER_VERSION = 1  # raise it whenever the same files come out as other frames or another truth
@@ -56,6 +58,7 @@ class Hm3dSem:
     scene_names = SCENE_NAMES
     label_space = LABEL_SPACE
     variants: tuple[str, ...] = (VARIANT,)
+    further_truths = openlex3d.FURTHER_TRUTHS
     Options = Hm3dSemOptions
 
     def __init__(self, root: Path, options: Hm3dSemOptions | None = None) -> None:
@@ -136,6 +139,9 @@ class Hm3dSem:
             yield str(error)
 
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:
+        if variant in self.further_truths.values():
+            self._folder(scene)
+            return openlex3d.truth_below(self.root, LABELS_OF, scene, variant)
         if variant not in self.variants:
             hint = suggest(variant, self.variants)
             raise GroundTruthMissing(f"{self._where(scene)}: no ground truth '{variant}'{hint}")
@@ -178,4 +184,5 @@ class Hm3dSem:
             return ()
         annotation = annotation_file(self.root, folder)
         clouds = sorted((folder / OBJECTS).glob("*.ply"))
-        return (folder / INFO_NAME, *clouds, *(() if annotation is None else (annotation,)))
+        labels = openlex3d.label_files(self.root, LABELS_OF, scene)
+        return (folder / INFO_NAME, *clouds, *(() if annotation is None else (annotation,)), *labels)

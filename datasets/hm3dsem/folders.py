@@ -23,6 +23,7 @@ PLACES = tuple(f"{base}{split}" for base in (f"{WALKS_FOLDER}/", "hm3dsem/", "HM
 RELEASE_PLACES = tuple(f"{base}/{split}" for base in ("hm3d", "HM3D", "hm3dsem", "HM3DSem") for split in SPLITS)
 SCENE_NAMES = r"\d{5}-[A-Za-z0-9]{11}"
 COLOUR, DEPTH, POSE, INFO_NAME, OBJECTS = "rgb", "depth", "pose", "scene_info.json", "objects"
+LABELS_OF = "hm3d"  # as OpenLex3D calls the dataset
 WALKS_URL = "https://github.com/hovsg/HOV-SG#habitat-matterport-3d-semantics"
 # The scenes that HOV-SG evaluates by its README, and those that its generator has poses for.
 EVALUATED = (

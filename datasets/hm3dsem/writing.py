@@ -8,22 +8,20 @@ generator's ``semantic/``, from which it makes those clouds, is not written.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping, Sequence
-from functools import cache
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.errors import DataError
 from su3d_bench.core.places import UP
-from su3d_bench.core.system.files import file_text
-from su3d_bench.core.toml import parse_toml
 from su3d_bench.core.types import Float64Array, Frame, Int64Array, UInt8Array
-from su3d_bench.datasets.hm3dsem.folders import COLOUR, DEPTH, INFO_NAME, OBJECTS, POSE, SPLIT, WALKS_FOLDER
+from su3d_bench.datasets.hm3dsem.categories import category_of, room_category, scene_name
+from su3d_bench.datasets.hm3dsem.folders import COLOUR, DEPTH, INFO_NAME, LABELS_OF, OBJECTS, POSE, SPLIT, WALKS_FOLDER
 from su3d_bench.datasets.hm3dsem.frames import TO_HABITAT, UNITS_PER_METRE
 from su3d_bench.datasets.hm3dsem.truth import HEADER
+from su3d_bench.datasets.openlex3d import writing as openlex3d
+from su3d_bench.datasets.openlex3d.labels import CATEGORIES_NAME
 from su3d_bench.datasets.writing import Layout, ScannedDataset, ScannedObject, SceneTarget
 from su3d_bench.formats.images import depth_in_units, png_bytes
 from su3d_bench.formats.ply import Column, PlyElement, write_ply
@@ -31,36 +29,12 @@ from su3d_bench.metrics.graphs.overlaps import voxel_ids, voxel_means
 from su3d_bench.store.atomic import make_folder, write_json, write_text
 
 LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
-ROOM_NAME = re.compile(r"([a-z]{1,8})(\d{1,3})")
-NAME_LENGTH = 11
 CLOUD_VOXEL_M, ROOM_VOXEL_M = 0.02, 0.05  # create_hm3dsem_walks_gt.py
 REGION = FLOOR = 0
 STAGED_ANNOTATION = ".annotation"
 CLOUDS = "scene_rgb.ply", "scene_panoptic.ply"
 # From a world whose z points up to Habitat's: x stays, y is up, z comes towards the viewer.
 TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-
-
-@cache
-def _facts() -> Mapping[str, Any]:
-    return parse_toml(file_text(Path(__file__).with_name("categories.toml")))
-
-
-def category_of(class_name: str) -> str:
-    """What HM3DSem calls a class of the rooms."""
-    return str(_facts()["classes"].get(class_name, class_name.replace("-", " ")))
-
-
-def scene_name(room: str) -> str:
-    """The scene that a room is: kitchen7 is 00000-kitchen0007; raises ``DataError`` for what has no such name.
-
-    >>> scene_name("bathroom12")
-    '00000-bathroom012'
-    """
-    match = ROOM_NAME.fullmatch(room)
-    if match is None or match[1] not in _facts()["rooms"]:
-        raise DataError(f"rooms/{room}: has no scene name; choose a room from 0 to 999 of its kind")
-    return f"00000-{match[1]}{int(match[2]):0{NAME_LENGTH - len(match[1])}d}"
 
 
 class HovSgWalkLayout(Layout):
@@ -79,10 +53,13 @@ class HovSgWalkLayout(Layout):
     def target(self, scene: str, key: str, out: Path) -> SceneTarget:
         name = scene_name(scene)
         folder, release = self.scenes_folder(out) / name, out / "hm3d" / SPLIT / name
-        apart = ((STAGED_ANNOTATION, release / f"{_short(name)}.semantic.txt"),)
-        return SceneTarget(
-            scene, key, folder, POSE, (folder / INFO_NAME, *(folder / cloud for cloud in CLOUDS), apart[0][1]), apart
-        )
+        annotation, labels = release / f"{_short(name)}.semantic.txt", openlex3d.labels_folder(out, LABELS_OF, name)
+        truth = (folder / INFO_NAME, *(folder / cloud for cloud in CLOUDS), annotation, labels / CATEGORIES_NAME)
+        apart = ((STAGED_ANNOTATION, annotation), (openlex3d.STAGED, labels))
+        return SceneTarget(scene, key, folder, POSE, truth, apart)
+
+    def write_shared(self, dataset: ScannedDataset, scene: str, out: Path) -> None:
+        openlex3d.write_prompts(out, LABELS_OF)
 
     def frame_names(self, index: int) -> Sequence[str]:
         return tuple(f"{kind}/walk_{index:06d}.{end}" for kind, end in ((COLOUR, "png"), (DEPTH, "png"), (POSE, "txt")))
@@ -110,6 +87,8 @@ class HovSgWalkLayout(Layout):
         write_json(folder / INFO_NAME, _info(target.scene, points, seen))
         lines = [f'{known.id},{_hex(known.id)},"{category_of(known.class_name)}",{REGION}' for known in seen]
         write_text(folder / STAGED_ANNOTATION, "\n".join([HEADER, *lines]) + "\n")
+        numbers = {known.id: known.id for known in seen}
+        openlex3d.write_labels(folder / openlex3d.STAGED, target.folder.name, seen, numbers)
 
 
 def _short(scene: str) -> str:
@@ -151,8 +130,7 @@ def _element(points: Float64Array, colours: UInt8Array) -> PlyElement:
 
 def _info(scene: str, points: Float64Array, objects: Sequence[ScannedObject]) -> dict[str, Any]:
     """The content of ``scene_info.json``."""
-    match = ROOM_NAME.fullmatch(scene)
-    category = _facts()["rooms"][match[1]] if match else "unknown room"
+    category = room_category(scene)
     heights = points[:, UP]
     low, high = float(heights.min()), float(heights.max())
     flat = points.copy()

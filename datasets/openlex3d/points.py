@@ -22,10 +22,13 @@ from su3d_bench.formats.arrays import MOST_POINTS, checked_points, kind_of
 from su3d_bench.formats.ply import read_ply
 from su3d_bench.formats.torch_zip import read_torch
 
+SAMPLED_DATASET = "scannetpp"
 SAMPLED_FOLDER = "prepared_semantics"  # beside data/ of ScanNet++
 SAMPLED_POINTS, SAMPLED_OBJECTS = "sampled_coords", "sampled_instance_anno_id"
 HOW_TO_SAMPLE = "semantic.prep.prepare_training_data of github.com/scannetpp/scannetpp writes it"
-HM3D_BASES = ("hm3d", "hm3d/val", "hm3dsem_walks", "hm3dsem_walks/val", "HM3D", ".")
+HM3D_BASES = (
+    "hm3d", "hm3d/val", "hm3dsem_walks", "hm3dsem_walks/val", "HM3D", ".", "hm3dsem/val", "HM3DSem/val", "val"
+)  # fmt: skip
 HM3D_URL = "http://aisdatasets.cs.uni-freiburg.de/openlex3d/hm3d"
 SCENE_INFO, OBJECTS_FOLDER = "scene_info.json", "objects"
 MOST_OBJECTS = 2**16  # the original keeps ids in 16 bits
@@ -77,13 +80,18 @@ def face_corners_of(mesh: AnnotatedMesh) -> LabelledPoints:
 # ---- ScanNet++
 
 
-def _of_scannetpp(data_root: Path, scene: str) -> LabelledPoints:
+def sampled_points_file(data_root: Path, scene: str) -> Path | None:
+    """Where the sampled points of a scene are; None where they are not."""
     name = f"{SAMPLED_FOLDER}/{scene}.pth"
-    path = next((file for base in SCANNETPP_BASES if (file := data_root / base / name).is_file()), None)
+    return next((file for base in SCANNETPP_BASES if (file := data_root / base / name).is_file()), None)
+
+
+def _of_scannetpp(data_root: Path, scene: str) -> LabelledPoints:
+    path = sampled_points_file(data_root, scene)
     if path is None:
         raise GroundTruthMissing(
-            f"scannetpp/{scene}: no points for OpenLex3D's objects; expected {name} in {data_root / 'scannetpp'}, "
-            f"{HOW_TO_SAMPLE}"
+            f"scannetpp/{scene}: no points for OpenLex3D's objects; expected {SAMPLED_FOLDER}/{scene}.pth in "
+            f"{data_root / 'scannetpp'}, {HOW_TO_SAMPLE}"
         )
     return read_sampled_points(path, f"scannetpp/{scene}: {path.name}")
 

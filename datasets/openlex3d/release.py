@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from su3d_bench.core.digests import digest_file, digest_json
+from su3d_bench.core.errors import GroundTruthMissing
 from su3d_bench.datasets.openlex3d.labels import (
     CATEGORIES_NAME,
     PROMPTS_NAME,
@@ -18,15 +21,21 @@ from su3d_bench.datasets.openlex3d.labels import (
     OpenLexFiles,
     queries_name,
 )
-from su3d_bench.datasets.openlex3d.points import LabelledPoints, points_of
+from su3d_bench.datasets.openlex3d.points import SAMPLED_DATASET, LabelledPoints, points_of, sampled_points_file
 from su3d_bench.metrics.matching.nearest import nearest
+from su3d_bench.metrics.open_vocabulary.openlex3d import SPACE as LABELS
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
+from su3d_bench.metrics.open_vocabulary.query_ap import SPACE as QUERIES
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
 
 DATASETS = ("replica", "scannetpp", "hm3d")  # as the release calls them, and below the data root their own data
 ALL_SEEN = ("scannetpp", "hm3d")  # whose scenes may have no cloud of visible points: all that the base data has counts
 VISIBLE_RADIUS_M = 0.05  # how far the labelled point may be that says to which object a visible point belongs
 VISIBLE, FACE_CORNERS = "openlex3d-visible", "openlex3d-face-corners"
+FURTHER_TRUTHS: Mapping[str, str] = {LABELS: VISIBLE, QUERIES: FACE_CORNERS}  # label space -> ground truth
+RELEASE_FOLDER = "gt_openlex3d"
+PLACES = (RELEASE_FOLDER, f"openlex3d/{RELEASE_FOLDER}", f"OpenLex3D/{RELEASE_FOLDER}", "openlex3d", "OpenLex3D")
+PAGE = "https://github.com/openlex3d/openlex3d"
 
 
 def categories_truth(files: OpenLexFiles, labelled: LabelledPoints) -> OpenLexTruth:
@@ -92,6 +101,47 @@ class OpenLexRelease:
         if variant == VISIBLE:
             return categories_truth(files, labelled)
         return queries_truth(files, labelled, QUERY_LEVEL)
+
+
+def label_files(root: Path, dataset: str, scene: str) -> tuple[Path, ...]:
+    """The files of a scene's labels below the data root, sampled points too; none where the release is not there."""
+    found = _find(root, dataset, scene)
+    if found is None:
+        return ()
+    release, name = found
+    folder = release.folder / dataset
+    labels = sorted(path for path in (folder / name).iterdir() if path.is_file())
+    points = sampled_points_file(root, name) if dataset == SAMPLED_DATASET else None
+    return (folder / PROMPTS_NAME, *labels, *(() if points is None else (points,)))
+
+
+def truth_below(root: Path, dataset: str, scene: str, variant: str) -> Any:
+    """The truth of a dataset's scene, from the release and the base data below the data root.
+
+    An ``OpenLexTruth`` or a ``QueryTruth``, as ``variant`` says; neither is a ``GroundTruth``.
+    """
+    found = _find(root, dataset, scene)
+    if found is None:
+        raise GroundTruthMissing(
+            f"{dataset}/{scene}: no ground truth '{variant}'; expected {RELEASE_FOLDER}/{dataset}/{_names(scene)[-1]}/"
+            f"{CATEGORIES_NAME} of OpenLex3D ({PAGE}) in {root}"
+        )
+    release, name = found
+    return release.truth(name, variant)
+
+
+def _find(root: Path, dataset: str, scene: str) -> tuple[OpenLexRelease, str] | None:
+    """The release below ``root`` with the labels of a scene, and what that calls it."""
+    for place in PLACES:
+        for name in _names(scene):
+            if (root / place / dataset / name / CATEGORIES_NAME).is_file():
+                return OpenLexRelease(root / place, root, dataset), name
+    return None
+
+
+def _names(scene: str) -> tuple[str, ...]:
+    """What the release may call a scene: of HM3D's walks the number before the hyphen."""
+    return tuple(dict.fromkeys((scene, scene.partition("-")[0])))
 
 
 @lru_cache(maxsize=1)

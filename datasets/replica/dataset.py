@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict
 from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing, counted, suggest
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh, OrientedBox, SceneInfo, Surface
+from su3d_bench.datasets.openlex3d import release as openlex3d
 from su3d_bench.datasets.recordings.made_rooms import read_marker
 from su3d_bench.datasets.recordings.meshes import read_surface
 from su3d_bench.datasets.replica.boxes import box_truth, object_boxes_of, read_boxes
@@ -78,6 +79,7 @@ class Replica:
     variants: tuple[str, ...] = (
         "mesh-vertices", "face-corners", "conceptgraphs", "openmask3d", "ovo-51", "boxes", SCENE_GRAPH
     )  # fmt: skip
+    further_truths = openlex3d.FURTHER_TRUTHS
     Options = ReplicaOptions
 
     def __init__(self, root: Path, options: ReplicaOptions | None = None) -> None:
@@ -173,6 +175,8 @@ class Replica:
 
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:
         self._folder(scene)
+        if variant in self.further_truths.values():
+            return openlex3d.truth_below(self.root, self.name, scene, variant)
         match variant:
             case "mesh-vertices":
                 return vertex_truth(self._annotated_mesh(scene))
@@ -256,7 +260,8 @@ class Replica:
         labels = {variant: self._label_file(scene, variant) for variant in ("openmask3d", "ovo-51")}
         graphs = find_graph_folder(self.root)
         of_graph = () if graphs is None else tuple(graphs / name for name in GRAPH_FILES)
-        return {"conceptgraphs": clouds, SCENE_GRAPH: of_graph} | {
+        lex = openlex3d.label_files(self.root, self.name, scene)
+        return {"conceptgraphs": clouds, SCENE_GRAPH: of_graph, "openlex3d": lex} | {
             variant: () if path is None else (path,) for variant, path in labels.items()
         }
 

@@ -23,6 +23,7 @@ from su3d_bench.formats.images import read_bytes
 VARIANT = "replicassg"
 OBJECTS, RELATIONS, CLASSES = "objects.json", "relationships.json", "replica_to_visual_genome.json"
 FILES = (OBJECTS, RELATIONS, CLASSES)
+UNKNOWN = "unknown"  # a label that means none of the listed classes
 FOLDER_NAMES = ("ReplicaSSG", "ReplicaSSG/files", "replicassg")
 URL = "https://github.com/Howardkhh/ReplicaSSG"
 MOST_BYTES = 64 << 20  # the released ones have 0.3 MB

@@ -16,6 +16,7 @@ from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
 from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo, Surface
+from su3d_bench.datasets.openlex3d import release as openlex3d
 from su3d_bench.datasets.recordings.recorded_frames import reading
 from su3d_bench.datasets.scannetpp.annotations import MASK_NAME, MESH_NAME, SEGMENTS_NAME
 from su3d_bench.datasets.scannetpp.folders import (
@@ -74,6 +75,7 @@ class ScanNetPP:
     scene_names = SCENE_NAMES
     label_space = LABEL_SPACE
     variants: tuple[str, ...] = (VARIANT,)
+    further_truths = openlex3d.FURTHER_TRUTHS
     Options = ScannetppOptions
 
     def __init__(self, root: Path, options: ScannetppOptions | None = None) -> None:
@@ -152,6 +154,9 @@ class ScanNetPP:
         return total.hexdigest()
 
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:
+        if variant in self.further_truths.values():
+            self._folder(scene)
+            return openlex3d.truth_below(self.root, self.name, scene, variant)
         if variant not in self.variants:
             hint = suggest(variant, self.variants)
             raise GroundTruthMissing(f"{self._where(scene)}: no ground truth '{variant}'{hint}")
@@ -203,6 +208,7 @@ class ScanNetPP:
         paths = [self._folder(scene) / SCANS / name for name in TRUTH_NAMES]
         lists = self.tree.benchmark_folder(scene)
         paths += [] if lists is None else [lists / name for name in LIST_NAMES]
+        paths += openlex3d.label_files(self.root, self.name, scene)
         return tuple(path for path in paths if path.is_file())
 
     def _truth_files(self, scene: str) -> dict[str, Path]:

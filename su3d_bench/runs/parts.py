@@ -12,7 +12,9 @@ from su3d_bench.core.config import Settings, resolve
 from su3d_bench.core.interfaces import TakesTruth
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.types import GroundTruth, LabelSet
+from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.scoring import Truth
 from su3d_bench.metrics.semantic.panoptic_score import told_truth
 from su3d_bench.runs.own.watch import checked_dataset, checked_method, made, settings_model
 
@@ -50,16 +52,18 @@ def build_method(part: Part) -> Any:
 
 
 def as_told(
-    part: Part, rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, first: Callable[[], LabelSet]
+    part: Part, rules: ProtocolRules, truth: Truth, prediction: Prediction, first: Callable[[], LabelSet]
 ) -> Prediction:
     """``prediction``, a map of the method ``part``; that of a method that is told the truth is made anew where it must
     be told another one under ``rules``.
 
     So it is where ``truth`` names its classes otherwise than the ``first`` truth of the dataset, from which the map
-    came, and where stuff counts that has no instances.
+    came, and where stuff counts that has no instances. Of OpenLex3D's labels it is told the first synonyms.
     """
     method = build_method(part)
-    if not isinstance(method, TakesTruth):
+    if isinstance(truth, OpenLexTruth):
+        truth = truth.by_first_synonym()
+    if not isinstance(method, TakesTruth) or not isinstance(truth, GroundTruth):
         return prediction
     told = told_truth(rules, truth)
     if told is truth and truth.labels == first():

@@ -352,7 +352,7 @@ class _Scene:
             files.append(folder.anytime_counts(share))
         if self.job.pictures:
             self.says(part, "drawing the map")
-            truth_to_draw = next(iter(self._truths.values()), None)
+            truth_to_draw = next((known for known in self._truths.values() if isinstance(known, GroundTruth)), None)
             files += draw_scene(prediction, truth_to_draw, folder.pictures, f"{self.job.scene}, {part.name}")
         reasons = [Unscored(self.job.scene, part.name, *pair) for pair in unscored.items()]
         write_text(folder.log, log.text(*not_scored_lines(reasons), "done"))

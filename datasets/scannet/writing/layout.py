@@ -16,14 +16,17 @@ import numpy as np
 
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Float64Array, Frame
+from su3d_bench.datasets.joined_lists import JoinedList
+from su3d_bench.datasets.openscan import KEYS, RAW_NAME
+from su3d_bench.datasets.rooms.attributes import attribute_words
 from su3d_bench.datasets.scannet.labels import TABLE_NAME
 from su3d_bench.datasets.scannet.sens.header import SensHeader
 from su3d_bench.datasets.scannet.sens.read import FRAME_RECORD, MICROSECONDS, MOTION_RECORD
 from su3d_bench.datasets.scannet.sens.write import SensFrame, write_sens
 from su3d_bench.datasets.scannet.truth import meta_name, truth_names
-from su3d_bench.datasets.scannet.writing.categories import label_table_text, room_of, scan_name
-from su3d_bench.datasets.scannet.writing.truth import write_scan_truth
-from su3d_bench.datasets.writing import Layout, ScannedDataset, SceneTarget, write_shared_text
+from su3d_bench.datasets.scannet.writing.categories import categories, label_table_text, room_of, scan_name
+from su3d_bench.datasets.scannet.writing.truth import annotation_id, write_scan_truth
+from su3d_bench.datasets.writing import Layout, ScannedDataset, ScannedObject, SceneTarget, write_shared_text
 from su3d_bench.formats.images import JPEG_QUALITY, depth_in_units, image_size, jpeg_bytes
 
 LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
@@ -56,7 +59,9 @@ class ScannetLayout(Layout):
         scan = scan_name(scene)
         folder = out / SCANS_FOLDER / scan
         names = (*truth_names(scan), meta_name(scan))
-        return SceneTarget(scene, key, folder, self.holder(scan), tuple(folder / name for name in names))
+        truth = tuple(folder / name for name in names)
+        attributes = JoinedList(".openscan.json", out / RAW_NAME, "scene_id")
+        return SceneTarget(scene, key, folder, self.holder(scan), truth, joined=(attributes,))
 
     def marker_extras(self, names: Sequence[str]) -> dict[str, Any]:
         return {"rooms": {scan: room for scan in names if (room := room_of(scan)) is not None}}
@@ -65,7 +70,9 @@ class ScannetLayout(Layout):
         write_shared_text(out / TABLE_NAME, label_table_text(), "is another label table than that of the rooms")
 
     def write_truth(self, dataset: ScannedDataset, target: SceneTarget) -> None:
-        write_scan_truth(dataset, target.scene, target.folder.name, target.partial)
+        seen = write_scan_truth(dataset, target.scene, target.folder.name, target.partial)
+        (attributes,) = target.joined
+        attributes.stage(target.partial, [attribute_record(target.folder.name, known) for known in seen])
 
 
 class SensLayout(ScannetLayout):
@@ -96,6 +103,14 @@ class SensLayout(ScannetLayout):
             write_sens(target.partial / target.frames, header, records, np.zeros(0, MOTION_RECORD))
         if (target.partial / PIECES).exists():
             shutil.rmtree(target.partial / PIECES)
+
+
+def attribute_record(scan: str, known: ScannedObject) -> dict[str, str]:
+    """An object as OpenScan's raw validation set has it, under its id in the annotation of the scan."""
+    words = attribute_words(known.class_name, known.material)
+    name = categories()[known.class_name].raw_category
+    row = {"scene_id": scan, "object_id": str(annotation_id(known)), "object_name": name}
+    return row | {key: words.get(key, "none") for key in KEYS.values()}
 
 
 def size_of(jpeg: bytes) -> tuple[int, int]:

@@ -16,7 +16,7 @@ from su3d_bench.core.types import Float64Array, Int64Array, UInt8Array
 from su3d_bench.datasets.scannet.annotations import aggregation_name, segments_name
 from su3d_bench.datasets.scannet.truth import labels_name, mesh_name, meta_name
 from su3d_bench.datasets.scannet.writing.categories import categories, nyu40_colours, scene_type
-from su3d_bench.datasets.writing import Scan, ScannedDataset
+from su3d_bench.datasets.writing import Scan, ScannedDataset, ScannedObject
 from su3d_bench.formats.images import list_column, triangles_of
 from su3d_bench.formats.ply import Column, PlyElement, write_ply
 from su3d_bench.store.atomic import make_folder, write_text
@@ -24,8 +24,13 @@ from su3d_bench.store.atomic import make_folder, write_text
 MIN_COSINE = 0.9  # faces that meet at more than 26 degrees belong to two segments
 
 
-def write_scan_truth(dataset: ScannedDataset, scene: str, scan: str, folder: Path) -> None:
-    """Write the files of ``scene`` under the name ``scan`` into ``folder``."""
+def annotation_id(known: ScannedObject) -> int:
+    """The id of an object in the annotation, which counts from 0."""
+    return known.id - 1
+
+
+def write_scan_truth(dataset: ScannedDataset, scene: str, scan: str, folder: Path) -> list[ScannedObject]:
+    """Write the files of ``scene`` under the name ``scan`` into ``folder``; the objects that are annotated."""
     make_folder(folder)
     surface, objects = dataset.scan(scene), dataset.objects(scene)
     owner, segments = object_of_vertex(surface), segment_of_vertex(surface)
@@ -40,14 +45,16 @@ def write_scan_truth(dataset: ScannedDataset, scene: str, scan: str, folder: Pat
     write_ply(folder / labels_name(scan), [_vertices(surface, label_colours, {"label": labels}), face_element])
     params = {"minCosine": str(MIN_COSINE)}
     _write_json(folder / segments_name(scan), {"params": params, "sceneId": scan, "segIndices": segments.tolist()})
+    seen = [known for known in objects if (owner == known.id).any()]
     groups = [
-        {"id": object_id - 1, "objectId": object_id - 1, "segments": np.unique(segments[owner == object_id]).tolist(),
-         "label": category.raw_category}
-        for object_id, category in category_of.items() if (owner == object_id).any()
+        {"id": annotation_id(known), "objectId": annotation_id(known),
+         "segments": np.unique(segments[owner == known.id]).tolist(), "label": category_of[known.id].raw_category}
+        for known in seen
     ]  # fmt: skip
     aggregation = {"sceneId": f"scannet.{scan}", "appId": "su3d-bench", "segGroups": groups}
     _write_json(folder / aggregation_name(scan), aggregation | {"segmentsFile": f"scannet.{segments_name(scan)}"})
     write_text(folder / meta_name(scan), _facts_of(dataset, scene))
+    return seen
 
 
 def object_of_vertex(scan: Scan) -> Int64Array:

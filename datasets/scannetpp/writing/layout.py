@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,9 @@ import numpy as np
 
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int64Array
+from su3d_bench.datasets.openlex3d import writing as openlex3d
+from su3d_bench.datasets.openlex3d.labels import CATEGORIES_NAME
+from su3d_bench.datasets.openlex3d.points import SAMPLED_FOLDER
 from su3d_bench.datasets.scannet.writing.truth import object_of_vertex, segment_of_vertex
 from su3d_bench.datasets.scannetpp.annotations import MASK_NAME, MESH_NAME, OBJECTS_NAME, SEGMENTS_NAME
 from su3d_bench.datasets.scannetpp.folders import IPHONE, SCANS
@@ -42,6 +45,8 @@ LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
 SCENES_FOLDER = "data"
 PIECES = ".depth"
 MASKED = ("tv-screen",)  # laser scanners see little of what is dark and bright at once
+LABELS_OF = "scannetpp"  # as OpenLex3D calls the dataset
+NO_OBJECT = -100  # in what the official toolbox samples
 CORNER = 0.5  # of the first pixel, from its middle
 
 
@@ -62,7 +67,12 @@ class ScannetppLayout(Layout):
         folder = out / SCENES_FOLDER / scene_name(scene)
         poses = (f"{COLMAP}/{CAMERAS_NAME}", f"{COLMAP}/{IMAGES_NAME}", TRACKING_NAME)
         truth = (*(folder / IPHONE / name for name in poses), *(folder / SCANS / name for name in TRUTH_NAMES))
-        return SceneTarget(scene, key, folder, f"{IPHONE}/{DEPTH_NAME}", truth)
+        labels = openlex3d.labels_folder(out, LABELS_OF, folder.name)
+        sampled = out / SAMPLED_FOLDER / f"{folder.name}.pth"
+        apart = ((openlex3d.STAGED, labels), (sampled.name, sampled))
+        return SceneTarget(
+            scene, key, folder, f"{IPHONE}/{DEPTH_NAME}", (*truth, labels / CATEGORIES_NAME, sampled), apart
+        )
 
     def marker_extras(self, names: Sequence[str]) -> dict[str, Any]:
         return {"rooms": {scene: room for scene in names if (room := room_of(scene)) is not None}}
@@ -71,6 +81,7 @@ class ScannetppLayout(Layout):
         make_folder(out / BENCHMARK_FOLDER)
         for name, text in list_texts().items():
             write_shared_text(out / BENCHMARK_FOLDER / name, text, "is another list than that of the rooms")
+        openlex3d.write_prompts(out, LABELS_OF)
 
     def frame_names(self, index: int) -> Sequence[str]:
         return f"{IPHONE}/{COLOUR_FOLDER}/{_image_name(index)}", f"{PIECES}/{index:06d}"
@@ -107,7 +118,25 @@ class ScannetppLayout(Layout):
             for index, pose in enumerate(poses)
         }
         write_text(target.partial / IPHONE / TRACKING_NAME, json.dumps(tracked, indent=1) + "\n")
-        _write_scan(dataset.scan(target.scene), dataset.objects(target.scene), target.folder.name, scans)
+        scan = dataset.scan(target.scene)
+        numbers = _write_scan(scan, dataset.objects(target.scene), target.folder.name, scans)
+        self._write_labels(scan, dataset.objects(target.scene), numbers, target)
+
+    def _write_labels(
+        self, scan: Scan, objects: Sequence[ScannedObject], numbers: Mapping[int, int], target: SceneTarget
+    ) -> None:
+        """OpenLex3D's labels, and the sampled points with the objects of the nearest vertices that they are for.
+
+        Of what is sampled the official toolbox keeps classes with instances alone; points are the vertices themselves.
+        """
+        kept = {known.id for known in objects if words()[known.class_name] not in without_instances()}
+        numbers = {key: number for key, number in numbers.items() if key in kept}
+        owner = object_of_vertex(scan)
+        number_of = np.full(int(max(owner.max(initial=0), *numbers, 0)) + 1, NO_OBJECT, np.int64)
+        number_of[list(numbers)] = list(numbers.values())
+        openlex3d.write_labels(target.partial / openlex3d.STAGED, target.folder.name, objects, numbers)
+        path = target.partial / f"{target.folder.name}.pth"
+        openlex3d.write_sampled_points(path, target.folder.name, scan.vertices.astype(np.float64), number_of[owner])
 
 
 def _image_name(index: int) -> str:
@@ -134,7 +163,8 @@ def _at_depth_size(depth_m: Float32Array) -> Float32Array:
     return np.asarray(cv2.resize(depth_m, DEPTH_SIZE, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
 
 
-def _write_scan(scan: Scan, objects: Sequence[ScannedObject], scene: str, folder: Path) -> None:
+def _write_scan(scan: Scan, objects: Sequence[ScannedObject], scene: str, folder: Path) -> dict[int, int]:
+    """Write the annotated mesh; the object ids of the annotation by those of the scan."""
     owner, segments = object_of_vertex(scan), segment_of_vertex(scan)
     faces = triangles_of(scan.faces)
     columns: dict[str, Column] = {name: scan.vertices[:, i].astype(np.float32) for i, name in enumerate("xyz")}
@@ -149,6 +179,7 @@ def _write_scan(scan: Scan, objects: Sequence[ScannedObject], scene: str, folder
     seen.sort(key=lambda known: words()[known.class_name] not in without_instances())
     groups = [_group(number, known, segments[owner == known.id]) for number, known in enumerate(seen)]
     _write_json(folder / OBJECTS_NAME, {"sceneId": scene, "appId": "su3d-bench", "segGroups": groups})
+    return {known.id: int(group["objectId"]) for known, group in zip(seen, groups, strict=True)}
 
 
 def _group(number: int, known: ScannedObject, segments: Int64Array) -> dict[str, Any]:

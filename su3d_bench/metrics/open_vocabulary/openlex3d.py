@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, GroundTruth, Int64Array, LabelSet
 from su3d_bench.metrics.open_vocabulary.object_means import ObjectCounts
 from su3d_bench.metrics.protocols.kinds import CATEGORIES
 
@@ -55,6 +55,22 @@ class OpenLexTruth:
             )
         if not self.prompts:
             raise DataError(f"ground truth '{self.variant}': has no prompts; give the list of all labels")
+
+    def by_first_synonym(self) -> GroundTruth:
+        """The objects that have a synonym, each an instance of the class of its first one."""
+        first = {object_id: labels.synonyms[0] for object_id, labels in self.objects.items() if labels.synonyms}
+        names = tuple(dict.fromkeys(first.values()))
+        ids, row = np.unique(self.object_of_point, return_inverse=True)
+        class_of = [names.index(first[object_id]) + 1 if object_id in first else 0 for object_id in ids.tolist()]
+        semantic = np.array(class_of, np.int32)[row]
+        return GroundTruth(
+            self.points,
+            semantic,
+            np.where(semantic > 0, self.object_of_point + 1, 0).astype(np.int32),
+            LabelSet(self.space, tuple(range(1, len(names) + 1)), names),
+            self.variant,
+            self.source,
+        )
 
 
 def bare(label: str) -> str:

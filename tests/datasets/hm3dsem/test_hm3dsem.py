@@ -14,9 +14,9 @@ from hm3dsem_walk import CHAIR, POSES, ROOM, SCENE, SHORT, WALL, WIDTH, info, wr
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError, GroundTruthMissing, PredictionError, ScenesMissing
 from su3d_bench.core.maps import Instances
+from su3d_bench.datasets.hm3dsem.categories import category_of, scene_name
 from su3d_bench.datasets.hm3dsem.dataset import Hm3dSem
 from su3d_bench.datasets.hm3dsem.truth import label_set
-from su3d_bench.datasets.hm3dsem.writing import category_of, scene_name
 from su3d_bench.datasets.rooms.classes import CLASSES
 from su3d_bench.predictions.formats import READERS, recognise
 

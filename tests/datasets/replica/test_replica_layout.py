@@ -13,6 +13,7 @@ from scanned_stage import CHAIR, N_FRAMES, WALL, Stage, Surface, files_below
 from scanned_stage import write_scene as write_scene_in
 
 from su3d_bench.core.errors import DataError, StoreError
+from su3d_bench.datasets.openlex3d.labels import LEVELS
 from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.datasets.replica.mesh_truth import INFO_NAME, MESH_NAME
 from su3d_bench.datasets.replica.writing import DEPTH_SCALE, ReplicaLayout
@@ -39,6 +40,11 @@ def test_the_tree_is_that_of_replica_and_nothing_else(tmp_path: Path) -> None:
         "Replica/room7/traj.txt",
         f"replica_v1/room_7/{MESH_NAME}",
         f"replica_v1/room_7/{INFO_NAME}",
+        *(f"ReplicaSSG/{name}" for name in ("objects.json", "relationships.json", "replica_to_visual_genome.json")),
+        "gt_openlex3d/replica/prompt_list.txt",
+        "gt_openlex3d/replica/room7/gt_categories.json",
+        "gt_openlex3d/replica/room7/gt_visible_cloud.pcd",
+        *(f"gt_openlex3d/replica/room7/gt_categories_query_to_object_mapping_{level}.json" for level in LEVELS),
     }
     assert Replica(tmp_path).scenes() == ("room7",)
 

@@ -20,6 +20,7 @@ class Thing:
     id: int
     class_id: int
     class_name: str
+    material: str
     box_min: tuple[float, float, float]
     box_max: tuple[float, float, float]
 
@@ -55,8 +56,8 @@ class Stage:
 
     def objects(self, scene: str) -> Sequence[Thing]:
         return (
-            Thing(1, WALL, "wall", (0, 0, 0.1), (2, 1 / 3, 0.1)),
-            Thing(4, CHAIR, "chair", (2, 0, 0.1), (3, 1 / 3, 0.1)),
+            Thing(1, WALL, "wall", "stone", (0, 0, 0.1), (2, 1 / 3, 0.1)),
+            Thing(4, CHAIR, "chair", "wooden", (2, 0, 0.1), (3, 1 / 3, 0.1)),
         )
 
     def trajectory(self, scene: str) -> np.ndarray:
