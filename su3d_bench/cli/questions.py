@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.shared.answers import answer, answer_either, answer_json, answer_tables, remark
 from su3d_bench.cli.shared.flags import add_table_format, add_verb
+from su3d_bench.cli.shared.language import add_language_flags, answer_estimate, chat_client
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, counted, suggest
 
 if TYPE_CHECKING:
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
 ACTIONS = ("make", "show", "audit", "score")
 PAPER = "paper"
 SOURCES = ("auto", "generated")
+FORMS = ("own", "beacon3d-grounding", "beacon3d-qa")
+JUDGE_MODEL = "gpt-4o-2024-08-06"  # Beacon3D's
+OF_JUDGE = ("model", "base_url", "config", "set", "offline", "ask_failed_again", "dry_run")
 N_SHOWN = 20
 MOST_CHARACTERS = 80
 
@@ -30,6 +34,7 @@ def add_parser(verbs: Any) -> None:
         (
             "su3d-bench questions make --scenes 'rooms/*' --per-kind 40 --leave-out disputed.csv --out queries.toml",
             "su3d-bench questions audit --scenes 'rooms/*' --n 200 --out audit",
+            "su3d-bench questions score metadata_scannet_qa.json --answers qa.json --judge --model gpt-4o-2024-08-06",
         ),
         call,
     )
@@ -64,6 +69,17 @@ def add_parser(verbs: Any) -> None:
     parser.add_argument(
         "--answers", type=Path, metavar="FILE", help="score: JSON with what a system answered, in Beacon3D's order"
     )
+    parser.add_argument(
+        "--form",
+        default="own",
+        metavar="|".join(FORMS),
+        help="make: own sets of queries, or Beacon3D's metadata_*.json of grounding or of answers in words (--out "
+        "FILE.json; --per-kind: objects a scene)",
+    )
+    parser.add_argument(
+        "--judge", action="store_true", help="score: a language model scores the answers that match no right one"
+    )
+    add_language_flags(parser, JUDGE_MODEL)
     add_table_format(parser)
 
 
@@ -72,6 +88,10 @@ def call(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"questions: unknown action '{arguments.action}'{suggest(arguments.action, ACTIONS)}")
     if arguments.answers is not None and arguments.action != "score":
         raise ConfigError("questions: --answers belongs to score")
+    if arguments.judge and arguments.action != "score":
+        raise ConfigError("questions: --judge belongs to score")
+    if not arguments.judge and (flag := next((flag for flag in OF_JUDGE if getattr(arguments, flag)), None)):
+        raise ConfigError(f"questions: --{flag.replace('_', '-')} belongs to --judge of score")
     calls = {"make": _make, "show": _show, "audit": _audit, "score": _score_answers}
     return calls[arguments.action](arguments)
 
@@ -88,11 +108,41 @@ def _make(arguments: argparse.Namespace) -> int:
     if arguments.source not in SOURCES:
         hint = suggest(arguments.source, SOURCES)
         raise ConfigError(f"questions make: unknown source '{arguments.source}'{hint}")
+    if arguments.form not in FORMS:
+        raise ConfigError(f"questions make: unknown form '{arguments.form}'{suggest(arguments.form, FORMS)}")
+    if arguments.form != FORMS[0]:
+        return _make_beacon3d(arguments)
     check_form(arguments.out)
     made = _made(arguments)
     write_questions(arguments.out, made)
     remark(f"{counted(len(made), 'question')}: {arguments.out}", quiet=arguments.quiet)
     answer_either(arguments, *_counts(made))
+    return EXIT_DONE
+
+
+def _make_beacon3d(arguments: argparse.Namespace) -> int:
+    """Write one of Beacon3D's metadata files over objects of the scenes."""
+    from su3d_bench.cli.datasets.check import chosen_scenes
+    from su3d_bench.questions.chains.made_questions import made_files
+    from su3d_bench.questions.truths import MIN_VERTICES, fullest_truth, scene_objects
+    from su3d_bench.store.atomic import write_json
+
+    if arguments.leave_out is not None or arguments.source != SOURCES[0]:
+        raise ConfigError("questions make: --leave-out and --source belong to --form own")
+    if arguments.out.suffix != ".json":
+        raise ConfigError(f"questions make: --form {arguments.form} is written as JSON; name --out FILE.json")
+    objects = {}
+    for dataset, scene in chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet):
+        if scene in objects:
+            raise ConfigError(f"questions make: two datasets have a scene '{scene}', and the form has scenes by name")
+        objects[scene] = scene_objects(dataset, scene, fullest_truth(dataset, scene), MIN_VERTICES)
+        remark(f"{dataset.name}/{scene}: {counted(len(objects[scene]), 'object')}", quiet=arguments.quiet)
+    files = made_files(objects, arguments.per_kind)
+    content = files[FORMS.index(arguments.form) - 1]
+    write_json(arguments.out, content)
+    n = sum(len(of_class) for of_scene in content.values() for of_class in of_scene.values())
+    line = f"{counted(n, 'object')} on {counted(len(content), 'scene')}: {arguments.out}"
+    answer_either(arguments, {"n_objects": n, "n_scenes": len(content), "out": str(arguments.out)}, line)
     return EXIT_DONE
 
 
@@ -220,10 +270,22 @@ def _score(arguments: argparse.Namespace) -> int:
 
 
 def _score_answers(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.chains.report import answered_json, answered_numbers, answered_table
+    from su3d_bench.questions.chains.report import answered_file, answered_json, answered_table, answers_to_questions
 
     if arguments.file is None or arguments.answers is None:
         raise ConfigError("questions score: needs a metadata_*.json of Beacon3D and --answers FILE")
-    kind, numbers = answered_numbers(Path(arguments.file), arguments.answers)
-    answer_tables(arguments, answered_json(kind, numbers), [answered_table(kind, numbers)])
+    asked = Path(arguments.file)
+    if not arguments.judge:
+        answered = answered_file(asked, arguments.answers)
+    else:
+        from su3d_bench.questions.chains.judge import judge_requests, judged
+        from su3d_bench.store.run_folder import RunFolder
+
+        folder = RunFolder(arguments.answers.with_name(f"{arguments.answers.stem}.judged"))
+        client, config = chat_client(arguments, folder, JUDGE_MODEL)
+        if arguments.dry_run:
+            requests = judge_requests(answers_to_questions(asked, arguments.answers), config)
+            return answer_estimate(arguments, client, list(requests.values()))
+        answered = answered_file(asked, arguments.answers, lambda replies: judged(replies, client, config))
+    answer_tables(arguments, answered_json(answered), [answered_table(answered)])
     return EXIT_DONE

@@ -21,7 +21,7 @@ from su3d_bench.metrics.questions import chains as counting
 from su3d_bench.metrics.questions.chains import ChainedText, Place
 from su3d_bench.questions.chains import answer_matching, answered, beacon3d_files, made
 from su3d_bench.questions.chains.answered import Number
-from su3d_bench.questions.chains.report import answered_numbers
+from su3d_bench.questions.chains.report import answered_file
 from su3d_bench.questions.files.datasets import read_foreign_queries
 from su3d_bench.questions.files.files import read_questions
 
@@ -45,7 +45,7 @@ def written(folder: Path, asked: object, answers: object) -> tuple[Path, Path]:
 
 
 def numbers(folder: Path, asked: object, answers: object) -> dict[str, Number]:
-    return {one.name: one for one in answered_numbers(*written(folder, asked, answers))[1]}
+    return {one.name: one for one in answered_file(*written(folder, asked, answers)).numbers}
 
 
 @pytest.mark.parametrize("index", range(len(PROBLEMS["grounding"])))
@@ -150,7 +150,7 @@ def test_what_is_wrong_with_a_file_is_one_line(
 
 def test_a_file_that_is_not_here_says_where_to_get_it(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"is missing; get Beacon3D's files by https://github.com/beacon-3d/beacon-3d"):
-        answered_numbers(tmp_path / "metadata_scannet_qa.json", tmp_path / "answers.json")
+        answered_file(tmp_path / "metadata_scannet_qa.json", tmp_path / "answers.json")
 
 
 @pytest.mark.parametrize(
@@ -165,7 +165,7 @@ def test_damaged_files_are_read_or_refused_in_one_line(asked: object, answers: o
 
         def read(damaged: bytes, path: Path = path) -> object:
             path.write_bytes(damaged)
-            return answered_numbers(*paths)
+            return answered_file(*paths)
 
         n_read, n_refused = outcomes(read, chain(truncations(whole), damages(whole, 500)), must_name=".json")
         assert n_read and n_refused > 200

@@ -37,9 +37,9 @@ def answer_nothing_to_pay(arguments: argparse.Namespace, who: str) -> int:
 PREFIX = ("perception", "language")
 
 
-def add_language_flags(parser: argparse.ArgumentParser) -> None:
+def add_language_flags(parser: argparse.ArgumentParser, default: str = "the paper's gpt-4-1106-preview") -> None:
     """``--model``, ``--base-url``, ``--config``, ``--set``, ``--offline``, ``--ask-failed-again``, ``--dry-run``."""
-    parser.add_argument("--model", metavar="NAME", help="language model (default: the paper's gpt-4-1106-preview)")
+    parser.add_argument("--model", metavar="NAME", help=f"language model (default: {default})")
     parser.add_argument(
         "--base-url", metavar="URL", help="OpenAI-compatible server (default: $OPENAI_BASE_URL, else OpenAI's)"
     )
@@ -52,10 +52,13 @@ def add_language_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dry-run", action="store_true", help="say what asking would cost, and ask nothing")
 
 
-def chat_client(arguments: argparse.Namespace, run: RunFolder) -> tuple[ChatClient, LanguageConfig]:
+def chat_client(
+    arguments: argparse.Namespace, run: RunFolder, text_model: str | None = None
+) -> tuple[ChatClient, LanguageConfig]:
     """The client whose replies are kept in the folder ``language`` of the run, and its settings.
 
-    Those of the file, then ``--set``, then the flags; keys of other sections are left to other verbs.
+    Those of the file, then ``--set``, then the flags; keys of other sections are left to other verbs. ``text_model``:
+    what is asked where none of them names a model.
     """
     from su3d_bench.core.config import Setting, Settings, read_assignments, read_file, resolve
     from su3d_bench.core.errors import ConfigError
@@ -70,7 +73,8 @@ def chat_client(arguments: argparse.Namespace, run: RunFolder) -> tuple[ChatClie
             raise ConfigError(f"{entry.source}: only perception.language.KEY=VALUE is of use here")
     flags = [("text_model", "--model", arguments.model), ("base_url", "--base-url", arguments.base_url)]
     given = tuple(Setting((*PREFIX, key), value, flag) for key, flag, value in flags if value is not None)
-    config = resolve(settings + assigned + Settings(given), PREFIX, LanguageConfig)
+    usual = () if text_model is None else (Setting((*PREFIX, "text_model"), text_model, "default"),)
+    config = resolve(Settings(usual) + settings + assigned + Settings(given), PREFIX, LanguageConfig)
     store = ReplyStore(run.path / "language")
     arguments.takes_up = True  # with every reply that is there
     return ChatClient(config, store, offline=arguments.offline, ask_failed_again=arguments.ask_failed_again), config

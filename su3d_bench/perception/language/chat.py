@@ -13,7 +13,7 @@ from pydantic import ConfigDict, Field
 from su3d_bench.core.digests import digest_bytes, digest_json
 from su3d_bench.core.types import UInt8Array
 
-Purpose = Literal["caption", "refine", "ask"]
+Purpose = Literal["caption", "refine", "ask", "judge"]
 CHARACTERS_A_TOKEN = 4  # OpenAI's rule of thumb for English
 MESSAGE_TOKENS = 8  # what the frame of a message costs, roughly
 
