@@ -1,8 +1,9 @@
 """A language model as judge of answers in words, in the manner of Beacon3D: a score from 1 to 5 for each.
 
-Asked are the answers that match no right one and bring no score of their own, each with the question and what is right,
-as ``LLMEvaluator`` of evaluate_qa.py in beacon-3d/beacon-3d at 9cd8f1f does. The first number of the reply is the score;
-one that is none from 1 to 5 leaves the answer open, where the original would stop or take it. The prompt is ours.
+Asked are the answers that match no right one and bring no score of their own, each with the question and what is
+right, as ``LLMEvaluator`` of evaluate_qa.py in beacon-3d/beacon-3d at 9cd8f1f does. The first number of the reply is
+the score; one that is none from 1 to 5 leaves the answer open, where the original would stop or take it. The prompt is
+ours.
 """
 
 from __future__ import annotations

@@ -100,7 +100,9 @@ def _question(one: MadeQuestion, *, is_told: bool) -> dict[str, Any]:
 
 def _drawn(thing: MapObject, fine: Sequence[ChainedText], objects: SceneMap) -> list[MadeQuestion]:
     """Three questions of different kinds as far as there are, by a digest of their texts; yes as often as no."""
-    every = [one for case in fine for one in _of_object(thing, case.text, objects) if not _gives_away(one, case.text)]
+    every = [
+        one for case in fine for one in questions_about(thing, case.text, objects) if not _gives_away(one, case.text)
+    ]
     turn = Counter[str]()
     ranked = []
     unwanted = {tag: ("Yes", "No")[_digest(f"{thing.id} {tag}")[-1] % 2] for tag in {one.tag for one in every}}
@@ -123,7 +125,7 @@ def _gives_away(one: MadeQuestion, text: str) -> bool:
     return bool(set(words(one.told)) & set(words(text)))
 
 
-def _of_object(thing: MapObject, text: str, objects: SceneMap) -> Iterator[MadeQuestion]:
+def questions_about(thing: MapObject, text: str, objects: SceneMap) -> Iterator[MadeQuestion]:
     """Every question that can be asked of an object under a text that means it alone."""
     it = f"the {text}" if len(text.split()) <= MOST_PLAIN else f"'the {text}'"
     colours = sorted(set(thing.caption.split()) & COLOURS)

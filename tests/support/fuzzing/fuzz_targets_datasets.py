@@ -86,13 +86,25 @@ def _beacon3d(kind: str) -> Make:
     def make(folder: Path) -> Read:
         from test_beacon3d import GROUNDING, QA, written
 
-        from su3d_bench.questions.chains.report import answered_numbers
+        from su3d_bench.questions.chains.report import answered_file
 
         answers = [{"correct": 1}, {"object_id": 3}] * 2 if kind == "grounding" else [{"pred": "red", "score": 2}] * 3
         paths = written(folder, GROUNDING if kind == "grounding" else QA, answers)
-        return lambda: answered_numbers(*paths)
+        return lambda: answered_file(*paths)
 
     return make
+
+
+def _joined_list(folder: Path) -> Read:
+    from su3d_bench.datasets.joined_lists import JoinedList
+
+    joined = JoinedList(".staged", folder / "objects.json", "scan", "scans")
+    for scan in ("living_0", "office_0"):
+        joined.stage(folder, [{"scan": scan, "objects": [{"label": "chair", "id": "1"}]}])
+        joined.join(folder, scan)
+    return lambda: every_one_of(
+        iter((lambda: joined.has("living_0"), lambda: joined.check_is_ours(("living_0", "office_0"))))
+    )
 
 
 def _aligned_scannet(folder: Path) -> Read:
@@ -390,6 +402,7 @@ TARGETS = (
     Target("scannet table", _scannet, ("*.tsv",), 0.15),
     Target("scannet facts", _aligned_scannet, (f"{SCAN}/scene0000_00.txt",), 0.15),
     Target("openscan attributes", _openscan, ("*.json",)),
+    Target("rows of all made scenes", _joined_list, ("objects.json",)),
     *(Target(f"beacon3d {kind}", _beacon3d(kind), ("*.json",)) for kind in ("grounding", "qa")),
     Target("sens", _sens("sens01_toy.sens"), ("a.sens",)),
     Target("sens raw", _sens("sens02_toy_raw.sens"), ("a.sens",)),
