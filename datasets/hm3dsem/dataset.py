@@ -141,7 +141,8 @@ class Hm3dSem:
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:
         if variant in self.further_truths.values():
             self._folder(scene)
-            return openlex3d.truth_below(self.root, LABELS_OF, scene, variant)
+            labelled: GroundTruth = openlex3d.truth_below(self.root, LABELS_OF, scene, variant)
+            return labelled
         if variant not in self.variants:
             hint = suggest(variant, self.variants)
             raise GroundTruthMissing(f"{self._where(scene)}: no ground truth '{variant}'{hint}")

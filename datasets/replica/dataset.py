@@ -176,7 +176,8 @@ class Replica:
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:
         self._folder(scene)
         if variant in self.further_truths.values():
-            return openlex3d.truth_below(self.root, self.name, scene, variant)
+            labelled: GroundTruth = openlex3d.truth_below(self.root, self.name, scene, variant)
+            return labelled
         match variant:
             case "mesh-vertices":
                 return vertex_truth(self._annotated_mesh(scene))

@@ -156,7 +156,8 @@ class ScanNetPP:
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:
         if variant in self.further_truths.values():
             self._folder(scene)
-            return openlex3d.truth_below(self.root, self.name, scene, variant)
+            labelled: GroundTruth = openlex3d.truth_below(self.root, self.name, scene, variant)
+            return labelled
         if variant not in self.variants:
             hint = suggest(variant, self.variants)
             raise GroundTruthMissing(f"{self._where(scene)}: no ground truth '{variant}'{hint}")

@@ -34,7 +34,6 @@ def add_parser(verbs: Any) -> None:
         (
             "su3d-bench questions make --scenes 'rooms/*' --per-kind 40 --leave-out disputed.csv --out queries.toml",
             "su3d-bench questions audit --scenes 'rooms/*' --n 200 --out audit",
-            "su3d-bench questions score metadata_scannet_qa.json --answers qa.json --judge --model gpt-4o-2024-08-06",
         ),
         call,
     )

@@ -43,10 +43,10 @@ class AxisEncoder:
     texts: tuple[str, ...]
     name: str = "axes"
     digest: str = "axes"
+    dim: int = 0
 
-    @property
-    def dim(self) -> int:
-        return len(self.texts)
+    def __post_init__(self) -> None:
+        self.dim = len(self.texts)
 
     def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:
         raise AssertionError("scoring looks at no image")
