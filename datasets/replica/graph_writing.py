@@ -15,7 +15,7 @@ import numpy as np
 
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.toml import parse_toml
-from su3d_bench.datasets.joined_lists import JoinedList
+from su3d_bench.datasets.recordings.joined_lists import JoinedList
 from su3d_bench.datasets.replica.folders import original_name
 from su3d_bench.datasets.replica.scene_graphs import CLASSES, FOLDER_NAMES, OBJECTS, RELATIONS, UNKNOWN
 from su3d_bench.datasets.writing import ScannedObject, write_shared_text

@@ -16,8 +16,8 @@ import numpy as np
 
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Float64Array, Frame
-from su3d_bench.datasets.joined_lists import JoinedList
 from su3d_bench.datasets.openscan import KEYS, RAW_NAME
+from su3d_bench.datasets.recordings.joined_lists import JoinedList
 from su3d_bench.datasets.rooms.attributes import attribute_words
 from su3d_bench.datasets.scannet.labels import TABLE_NAME
 from su3d_bench.datasets.scannet.sens.header import SensHeader

@@ -96,7 +96,7 @@ def _beacon3d(kind: str) -> Make:
 
 
 def _joined_list(folder: Path) -> Read:
-    from su3d_bench.datasets.joined_lists import JoinedList
+    from su3d_bench.datasets.recordings.joined_lists import JoinedList
 
     joined = JoinedList(".staged", folder / "objects.json", "scan", "scans")
     for scan in ("living_0", "office_0"):
