@@ -27,8 +27,7 @@ from typing import Any
 import numpy as np
 from measured import write_measured
 from numpy.typing import NDArray
-from tiny_encoders import noise_images, write_tiny_clip
-from tiny_models import DINO_PX, SAM_PX, blocks, tiny_dino, tiny_sam, tiny_tokenizer
+from tiny_models import DINO_PX, blocks, noise_images
 from torch_devices import TORCH_ON_CPU
 
 from su3d_bench.cli.main import main as command_line
@@ -45,6 +44,9 @@ from su3d_bench.perception.models.files import locate
 from su3d_bench.perception.models.loading import load_encoder
 from su3d_bench.perception.models.masks.grounding_dino import GroundingDino
 from su3d_bench.perception.models.masks.sam import Sam, TorchSam
+from su3d_bench.perception.models.stand_ins.detector import tiny_dino, tiny_tokenizer
+from su3d_bench.perception.models.stand_ins.encoders import write_tiny_clip
+from su3d_bench.perception.models.stand_ins.segmenter import IMAGE_PX, tiny_sam
 
 REPEATS = 5
 CLIP = "clip-vit-h-14"
@@ -185,7 +187,7 @@ def networks(folder: Path) -> Iterator[Comparison]:
         pixels = detector.pixels(rgb)
         return lambda: detector.answer(pixels, "cat. coffee table. lamp.")[:2]
 
-    yield Comparison(f"SAM ({SAM_PX} px) by torch, masks of 3 boxes", sam, 0.01, is_share=True)
+    yield Comparison(f"SAM ({IMAGE_PX} px) by torch, masks of 3 boxes", sam, 0.01, is_share=True)
     yield Comparison("GroundingDINO by torch, probabilities and boxes", dino, 1e-3)
 
 

@@ -33,7 +33,7 @@ from su3d_bench.fetching.record import (
     write_unpacked,
 )
 from su3d_bench.fetching.sources import Source, Sources
-from su3d_bench.perception.models.catalogue import MODELS, PROFILE_MODELS
+from su3d_bench.perception.models.catalogue import MODELS, PAPERS_ENCODERS, PROFILE_MODELS
 from su3d_bench.perception.models.files import locate
 from su3d_bench.store.atomic import make_folder, write_error
 from su3d_bench.store.unfinished import clear_unfinished, hold_folder
@@ -66,11 +66,12 @@ class Brought:
 
 
 def plan_models(sources: Sources, names: Sequence[str], profile: str | None, root: Path) -> list[Planned]:
-    """The models ``names`` and those of a profile, each with where it lies already."""
+    """The models ``names`` and those of a profile's experiments, each with where it lies already."""
     if profile is not None and profile not in PROFILE_MODELS:
         known = ", ".join(PROFILE_MODELS)
         raise ConfigError(f"fetch models --for {profile}: that profile loads none of these models; known: {known}")
     wanted = [*names, *(PROFILE_MODELS[profile] if profile is not None else ())]
+    wanted += PAPERS_ENCODERS if profile == "paper" else ()
     if not wanted:
         raise ConfigError("fetch models: name models, or the profile that needs them: --for paper")
     return [_planned_model(sources.named(name, "models"), root) for name in dict.fromkeys(wanted)]

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from su3d_bench.core.system.devices import require_installed
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.toml import parse_toml
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.perception.models.catalogue import FormName, model_entry
+from su3d_bench.perception.models.catalogue import PAPERS_ENCODERS, PROFILE_MODELS, FormName, model_entry
 from su3d_bench.perception.models.files import locate
 from su3d_bench.perception.models.front_end import DETECTOR, PACKAGES, TAGGER
 from su3d_bench.perception.profiles import PerceptionConfig
@@ -31,8 +32,8 @@ from su3d_bench.runs.planning.scenes import data_root, split_address
 from su3d_bench.store.atomic import is_file
 
 SIZES = Path(__file__).resolve().parent / "data_sizes.toml"
-FETCH_MODELS = "su3d-bench fetch models --for paper"
 PAPER = "paper"
+FETCHED_FOR_PAPER = (*PROFILE_MODELS[PAPER], *PAPERS_ENCODERS)
 CAN_DO_WITHOUT = (TAGGER,)  # without RAM++ a list of words names what is looked for
 MB = 1_000_000
 
@@ -228,16 +229,17 @@ def _models(run: AskedRun) -> Iterator[Need]:
 
 def _model(name: str, config: PerceptionConfig, *, is_required: bool) -> Need:
     entry = model_entry(name)
-    forms: tuple[FormName, ...] | None = ("onnx", "original") if name == TAGGER else None
+    forms: tuple[FormName, ...] | None = None
+    if name == TAGGER:  # its own checkpoint runs by its own package alone
+        forms = ("onnx", "original") if find_spec("ram") is not None else ("onnx",)
     place = config.models.paths.get(name), config.models.folder
     remark = "" if is_required else "without it the words of a list are looked for"
     try:
         files = locate(name, forms, path=place[0], folder=place[1])
     except ModelMissing:
         n_bytes = next(form.size_mb for form in entry.forms) * float(MB)
-        return Need(
-            "model", name, is_here=False, n_bytes=n_bytes, how=FETCH_MODELS, is_required=is_required, remark=remark
-        )
+        how = f"su3d-bench fetch models {'--for paper' if name in FETCHED_FOR_PAPER else name}"
+        return Need("model", name, is_here=False, n_bytes=n_bytes, how=how, is_required=is_required, remark=remark)
     return Need("model", name, is_here=True, n_bytes=0.0, remark=str(files.folder))
 
 

@@ -81,13 +81,16 @@ class Experiment(BaseModel):
 
 
 class Rehearsal(BaseModel):
-    """The same on rooms that the program makes: their names, options of them, and whose perception."""
+    """The same on rooms that the program makes: their names, options of them, and whose perception.
+
+    ``paper``: with tiny networks that stand in for the published ones.
+    """
 
     model_config = _STRICT
 
     rooms: Annotated[tuple[Word, ...], Field(min_length=1)] = ("bedroom0", "office0")
     settings: tuple[Word, ...] = ("n_frames=200", "width=320", "height=240")
-    profile: Literal["embedded", "oracle"] = "embedded"
+    profile: Literal["paper", "embedded", "oracle"] = "paper"
 
 
 class Recipe(BaseModel):

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import pytest
 from chat_server import Answered, Body, ChatServer, chat_server, error
-from tiny_encoders import needs_models
-from tiny_models import paper_words, write_models
+from tiny_models import needs_models, paper_words, write_models
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.maps import Instances

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from places import REAL_RECORDINGS, needs_recordings
-from tiny_models import blocks, frame_of, paper_words, tiny_dino, tiny_sam, write_models
+from tiny_models import blocks, frame_of, paper_words, write_models
 
 from su3d_bench.cli.main import main
 from su3d_bench.core import registry
@@ -24,6 +24,8 @@ from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.language.captioner import CropCaption
 from su3d_bench.perception.models.config import PaperConfig
 from su3d_bench.perception.models.masks.tagging import WORDS_CAVEAT
+from su3d_bench.perception.models.stand_ins.detector import tiny_dino
+from su3d_bench.perception.models.stand_ins.segmenter import tiny_sam
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, check_models, resolve_profile
 from su3d_bench.store.atomic import read_json
 from su3d_bench.store.predictions import read_prediction
@@ -210,8 +212,9 @@ def test_stand_ins_for_ram_are_said_beside_every_number(models: Path, tmp_path: 
 
 
 def test_the_profile_says_what_it_computes_otherwise_than_the_paper_and_nothing_else() -> None:
-    ram = SimpleNamespace(caveat=None)
-    encoder, captioner = SimpleNamespace(name="clip-vit-h-14"), SimpleNamespace(vision_model="gpt-4-vision-preview")
+    ram = SimpleNamespace(tagger=SimpleNamespace(caveat=None), stand_ins=())
+    encoder = SimpleNamespace(name="ViT-H-14/laion2b_s32b_b79k")  # as the encoder itself says
+    captioner = SimpleNamespace(vision_model="gpt-4-vision-preview")
     assert profile_paper.stand_ins(PaperConfig(), ram, encoder, captioner) == []  # type: ignore[arg-type]
     assert profile_paper.stand_ins(PaperConfig(), ram, encoder, None) == [
         "names and captions: the tagger's names and a template stand in for the paper's vision model"
@@ -219,11 +222,11 @@ def test_the_profile_says_what_it_computes_otherwise_than_the_paper_and_nothing_
     other = PaperConfig.model_validate(
         {"segmenter": "sam-vit-b", "grounded": {"boxes": {"box_threshold": 0.3}, "stop_words": ["room"]}}
     )
-    encoder.name, captioner.vision_model = "clip-vit-l-14", "some-model"
+    encoder.name, captioner.vision_model = "ViT-L-14/openai", "some-model"
     assert profile_paper.stand_ins(other, ram, encoder, captioner) == [  # type: ignore[arg-type]
         "masks: sam-vit-b stands in for the paper's sam-vit-h",
         "named masks: boxes.box_threshold, stop_words set otherwise than OpenSU3D's",
-        "features: clip-vit-l-14 stands in for the paper's clip-vit-h-14",
+        "features: ViT-L-14/openai stands in for the paper's clip-vit-h-14",
         "names and captions: some-model stands in for the paper's gpt-4-vision-preview",
     ]
 

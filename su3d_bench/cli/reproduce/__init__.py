@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import os
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
     from su3d_bench.reproducing.preflight import Preflight
     from su3d_bench.reproducing.recipe import Experiment, Recipe
 
+VARIABLES = ("SU3D_DATA", "SU3D_MODELS")  # where a rehearsal's own data and models lie
 OF_A_RUN = ("jobs", "limit", "solver", "offline", "executor", "ray_address", "gpus_per_job", "retries", "slurm")
 
 
@@ -42,7 +45,7 @@ def add_parser(verbs: Any) -> None:
         "--probe", action="store_true", help="first measure what updates cost here, a few of each method"
     )
     parser.add_argument(
-        "--rehearse", action="store_true", help="the same on rooms made in the same layouts, no weights"
+        "--rehearse", action="store_true", help="the same on rooms made in the same layouts, with tiny networks"
     )
     parser.add_argument("--rooms", nargs="+", metavar="ROOM", help="of a rehearsal (default: the recipe's)")
     parser.add_argument(
@@ -85,11 +88,11 @@ def call(arguments: argparse.Namespace) -> int:
     out = arguments.out or Path("reproduced") / (recipe.name + ("-rehearsal" if arguments.rehearse else ""))
     if not arguments.rehearse:
         return _reproduce(recipe, experiments, _asked(arguments), out, arguments)
-    from su3d_bench.cli.reproduce.rehearsal import rehearsed
+    from su3d_bench.cli.reproduce.rehearsal import places, rehearsed
     from su3d_bench.reproducing.probe import environment
 
     asked = rehearsed(recipe, experiments, _asked(arguments), out, arguments)
-    with environment(SU3D_DATA=str((out / "data").absolute())):
+    with environment(**places(out, asked)):
         return _reproduce(recipe, experiments, asked, out, arguments)
 
 
@@ -206,4 +209,6 @@ def _answer(
     bundle = arguments.bundle or out / "bundle.zip"
     write_bundle(bundle, recipe.name, recipe_bytes(arguments.recipe), folders, out)
     remark(f"bundle: {bundle}", quiet=arguments.quiet)
-    remark(f"next: su3d-bench report verify {bundle}", quiet=arguments.quiet)
+    names = [name for name in VARIABLES if arguments.rehearse and name in os.environ]
+    where = "".join(f"{name}={shlex.quote(os.environ[name])} " for name in names)
+    remark(f"next: {where}su3d-bench report verify {shlex.quote(str(bundle))}", quiet=arguments.quiet)

@@ -19,6 +19,8 @@ FormName = Literal["transformers", "open_clip", "original", "onnx"]
 
 HUB = "https://huggingface.co"
 ONNX_MANIFEST = "manifest.json"
+STAND_IN = " (stand-in)"  # ends the name of an encoder whose weights cannot be the published ones
+WEIGHTS_CAVEAT = "weights: tiny stand-ins of"
 _HUB_WEIGHTS = "model.safetensors | pytorch_model.bin"
 _CLIP_FILES = (_HUB_WEIGHTS, "config.json", "preprocessor_config.json", "tokenizer.json | vocab.json + merges.txt")
 _OPEN_CLIP_FILES = ("open_clip_model.safetensors | open_clip_pytorch_model.bin",)  # open_clip brings its own words
@@ -257,10 +259,12 @@ _ENTRIES = (
     ),
 )
 MODELS: Mapping[str, ModelEntry] = MappingProxyType({entry.name: entry for entry in _ENTRIES})
-# What a profile loads; profiles that are not named load no model of this table.
+# What a profile loads unasked; profiles that are not named load no model of this table.
 PROFILE_MODELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {"paper": ("clip-vit-h-14", "sam-vit-h", "grounding-dino", "ram-plus")}
 )
+# What the papers' experiments need beside it: OpenMask3D's set-up encodes with this.
+PAPERS_ENCODERS = ("clip-vit-l-14-336",)
 
 
 def model_entry(name: str, kind: Kind | None = None) -> ModelEntry:
@@ -273,5 +277,6 @@ def model_entry(name: str, kind: Kind | None = None) -> ModelEntry:
 
 
 def encoder_known_as(name: str | None) -> ModelEntry | None:
-    """The encoder that protocols and run records call ``name``."""
-    return next((entry for entry in _ENTRIES if entry.known_as == name and entry.kind == "encoder"), None)
+    """The encoder that protocols and run records call ``name``, or for which such a one stands in."""
+    known_as = (name or "").removesuffix(STAND_IN)
+    return next((entry for entry in _ENTRIES if entry.known_as == known_as and entry.kind == "encoder"), None)

@@ -21,12 +21,13 @@ from su3d_bench.core.errors import ConfigError, DataError, ModelMissing, Predict
 from su3d_bench.core.system.devices import require
 from su3d_bench.core.system.files import file_text, regular
 from su3d_bench.formats.torch_zip import check_stored
-from su3d_bench.perception.models.catalogue import FormName, ModelEntry, ModelForm, model_entry
+from su3d_bench.perception.models.catalogue import STAND_IN, FormName, ModelEntry, ModelForm, model_entry
 from su3d_bench.store.atomic import make_folder, read_json, write_json
 
 DEFAULT_FOLDER = "~/.cache/su3d-bench/models"
 DIGEST_FOLDER = "model-digests"
 LARGEST_SETTINGS = 2**24  # bytes; a tokenizer.json of 256,000 words has 2**23
+STAND_IN_SHARE = 0.1  # int8 would be a quarter of float32
 PICKLED = {".bin", ".pt", ".pth", ".ckpt"}
 # Beside the weights, what may move an answer.
 _SETTINGS = (
@@ -58,6 +59,22 @@ class ModelFiles:
         """SHA-256 by file name of the weights and of every file of settings beside them."""
         names = dict.fromkeys((self.weights.name, *_SETTINGS))
         return {name: file_sha256(self.folder / name) for name in names if (self.folder / name).is_file()}
+
+    @property
+    def is_stand_in(self) -> bool:
+        """Whether the weights take less than a tenth of the published ones': no copy of those, in whatever precision.
+
+        Nothing beside the weights says so, thus nothing that is left out or put there can hide it.
+        """
+        weights = [self.weights]
+        if self.form.form == "onnx":
+            weights = [path for path in self.folder.iterdir() if path.is_file()]
+        return sum(path.stat().st_size for path in weights) < STAND_IN_SHARE * self.form.size_mb * 1e6
+
+    @property
+    def known_as(self) -> str:
+        """What protocols and run records call an encoder of these weights."""
+        return self.entry.known_as + (STAND_IN if self.is_stand_in else "")
 
     def wrong_digests(self) -> list[str]:
         """A line for each file whose digest is not the published one."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import partial
 from importlib.util import find_spec
@@ -31,6 +32,7 @@ from su3d_bench.perception.models.pretrained import kept, load_grounding_dino, l
 
 PAPER_ENCODER, DETECTOR, TAGGER = "clip-vit-h-14", "grounding-dino", "ram-plus"
 PACKAGES = ("torch", "transformers")
+_FORM_OF_TAGGER: Mapping[str, FormName] = {RamTagger.name: "original", OnnxRamTagger.name: "onnx"}
 _SAM_FORMS: tuple[FormName, ...] = ("transformers", "original")
 
 
@@ -60,11 +62,16 @@ def load_networks(config: PaperConfig, models: ModelsConfig, encoder: Encoder, j
         def network() -> SamNetwork:
             return load_sam(sam, device, precision)
 
+    tagger = _tagger(config, models, encoder, device)
+    used = [sam, detector]
+    if (form := _FORM_OF_TAGGER.get(tagger.name)) is not None:
+        used.append(_locate(models, TAGGER, (form,)))
     return Networks(
-        _tagger(config, models, encoder, device),
+        tagger,
         lambda: load_grounding_dino(detector, device, precision),
         lambda: Sam(network()),
         content_key(*digests),
+        tuple(files.entry.name for files in used if files.is_stand_in),
     )
 
 

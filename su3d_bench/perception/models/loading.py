@@ -82,7 +82,7 @@ def _torch_encoder(
     else:
         spec = towers_transformers.read_spec(files, config.transform)
         tokeniser = _tokeniser_of(files, spec)
-    return FoundationEncoder(files.entry.known_as, spec, load_towers, tokeniser, identity, cache, device)
+    return FoundationEncoder(files.known_as, spec, load_towers, tokeniser, identity, cache, device)
 
 
 def _onnx_encoder(
@@ -100,9 +100,7 @@ def _onnx_encoder(
 
     load_towers = partial(_onnx_towers, files, provider, device_index, config.batch)
     device = CPU if provider == "cpu" else f"cuda:{device_index}"
-    return FoundationEncoder(
-        files.entry.known_as, spec, load_towers, _tokeniser_of(files, spec), identity, cache, device
-    )
+    return FoundationEncoder(files.known_as, spec, load_towers, _tokeniser_of(files, spec), identity, cache, device)
 
 
 # A worker makes a new encoder for each method and scene; the towers, gigabytes of them, are kept.

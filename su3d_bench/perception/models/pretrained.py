@@ -118,6 +118,49 @@ def sam_config(name: str) -> Any:
     return transformers.SamConfig(vision_config=tower)
 
 
+def small_sam_config(tensors: dict[str, Any]) -> Any:
+    """The configuration of a SAM that is smaller than the published ones, from its tensors' shapes, by SAM's names.
+
+    Raises ``DataError`` where tensors lack or do not go together; heads of the decoder are SAM's eight.
+    """
+    transformers = require_transformers("a small SAM")
+    try:
+        n_side, width = tensors["image_encoder.pos_embed"].shape[1], tensors["image_encoder.pos_embed"].shape[3]
+        patch_px = tensors["image_encoder.patch_embed.proj.weight"].shape[2]
+        blocks = [int(found[1]) for name in tensors if (found := re.match(r"image_encoder\.blocks\.(\d+)\.", name))]
+        sides = [
+            tensors[f"image_encoder.blocks.{index}.attn.rel_pos_h"].shape
+            for index in range(max(blocks, default=-1) + 1)
+        ]
+        hidden = tensors["prompt_encoder.point_embeddings.0.weight"].shape[1]
+        tower = {
+            "hidden_size": width,
+            "num_hidden_layers": len(sides),
+            "num_attention_heads": width // sides[0][1],
+            "mlp_dim": tensors["image_encoder.blocks.0.mlp.lin1.weight"].shape[0],
+            "image_size": n_side * patch_px,
+            "patch_size": patch_px,
+            "window_size": (min(side[0] for side in sides) + 1) // 2,
+            "global_attn_indexes": [index for index, side in enumerate(sides) if side[0] == 2 * n_side - 1],
+            "output_channels": hidden,
+            "num_pos_feats": hidden // 2,
+        }
+        prompts = {
+            "hidden_size": hidden,
+            "image_size": n_side * patch_px,
+            "patch_size": patch_px,
+            "mask_input_channels": tensors["prompt_encoder.mask_downscaling.3.weight"].shape[0],
+        }
+        decoder = {
+            "hidden_size": hidden,
+            "mlp_dim": tensors["mask_decoder.transformer.layers.0.mlp.lin1.weight"].shape[0],
+            "iou_head_hidden_dim": tensors["mask_decoder.iou_prediction_head.layers.0.weight"].shape[0],
+        }
+        return transformers.SamConfig(vision_config=tower, prompt_encoder_config=prompts, mask_decoder_config=decoder)
+    except (KeyError, IndexError, ValueError, ZeroDivisionError) as error:
+        raise DataError(f"is no checkpoint of a SAM: {bounded(error)}; fetch it anew") from error
+
+
 def fill_sam(model: Any, tensors: dict[str, Any], where: str) -> Any:
     """``model`` with the weights of an original checkpoint, every one of them; raises ``DataError``."""
     try:
@@ -130,7 +173,11 @@ def fill_sam(model: Any, tensors: dict[str, Any], where: str) -> Any:
 def _original_sam(files: ModelFiles) -> Any:
     transformers = require_transformers(f"segmenter '{files.entry.name}'")
     tensors = read_weights(files.weights)
-    return fill_sam(transformers.SamModel(sam_config(files.entry.name)), tensors, str(files.weights))
+    try:
+        config = small_sam_config(tensors) if files.is_stand_in else sam_config(files.entry.name)
+    except DataError as error:
+        raise DataError(f"{files.weights}: {error}") from error
+    return fill_sam(transformers.SamModel(config), tensors, str(files.weights))
 
 
 def _pretrained(files: ModelFiles, class_name: str) -> Any:

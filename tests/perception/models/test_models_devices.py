@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_encoders import needs_models
+from tiny_models import needs_models
 
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.system.devices import Batches, device_for, first_batch, precision_for

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_encoders import noise_images
+from tiny_models import noise_images
 
 from su3d_bench.core.errors import DataError, ModelMissing
 from su3d_bench.core.interfaces import Encoder

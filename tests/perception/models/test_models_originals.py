@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_encoders import N_TOKENS, needs_models, write_clip_tokenizer
-from tiny_models import blocks
+from tiny_models import blocks, needs_models
 
 from su3d_bench.core.types import BoolArray
 from su3d_bench.perception.crops import mask_boxes
@@ -32,6 +31,7 @@ from su3d_bench.perception.models.masks.grounded_sam import GROUNDED_MASKS, Grou
 from su3d_bench.perception.models.masks.grounding_dino import tag_of, tag_of_first_word
 from su3d_bench.perception.models.masks.sam import Prompts, Sam, as_shares_of_float32
 from su3d_bench.perception.models.masks.tagging import RAM_PX, ram_pixels
+from su3d_bench.perception.models.stand_ins.encoders import N_TOKENS, write_clip_tokenizer
 
 CASES: dict[str, Any] = json.loads((Path(__file__).parents[2] / "cases/front_end.json").read_text())
 

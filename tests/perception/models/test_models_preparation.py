@@ -8,17 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_encoders import (
-    IMAGE_SIZE,
-    N_TOKENS,
-    needs_models,
-    noise_images,
-    write_clip_tokenizer,
-)
+from tiny_models import needs_models, noise_images
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.perception.models.encoders.image_transform import CLIP_MEAN, CLIP_STD, ImageTransform, read_transform
 from su3d_bench.perception.models.encoders.text_tokens import canonical_text
+from su3d_bench.perception.models.stand_ins.encoders import IMAGE_SIZE, N_TOKENS, write_clip_tokenizer
 
 
 def test_the_window_of_the_centre_crop_is_rounded_as_each_library_does() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_models import SAM_PX, blocks, frame_of, tiny_sam
+from tiny_models import blocks, frame_of
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float32Array, UInt8Array
@@ -19,6 +19,7 @@ from su3d_bench.perception.models.masks.grounded_sam import Networks, SamRegions
 from su3d_bench.perception.models.masks.sam import Prompts, Sam, TorchSam
 from su3d_bench.perception.models.masks.tagging import WordTagger
 from su3d_bench.perception.models.pretrained import fill_sam, sam_config, sam_names
+from su3d_bench.perception.models.stand_ins.segmenter import IMAGE_PX, tiny_sam
 
 RGB = blocks(40, 60)
 BOXES = np.array([[5, 5, 30, 30], [0, 0, 60, 40], [22.5, 3.25, 41, 39]], np.float32)
@@ -32,8 +33,8 @@ def sam() -> Sam:
 def processor() -> Any:
     from transformers.models.sam.image_processing_pil_sam import SamImageProcessorPil
 
-    side = {"height": SAM_PX, "width": SAM_PX}
-    return SamImageProcessorPil(size={"longest_edge": SAM_PX}, pad_size=side)
+    side = {"height": IMAGE_PX, "width": IMAGE_PX}
+    return SamImageProcessorPil(size={"longest_edge": IMAGE_PX}, pad_size=side)
 
 
 @pytest.mark.parametrize("size", [(40, 60), (61, 37), (64, 64), (200, 130)])
@@ -41,7 +42,7 @@ def test_the_image_goes_in_as_transformers_prepares_it(size: tuple[int, int]) ->
     seen: list[Float32Array] = []
 
     class Looking:
-        image_px = SAM_PX
+        image_px = IMAGE_PX
 
         def embed(self, pixels: Float32Array) -> Any:
             seen.append(pixels)
@@ -65,7 +66,7 @@ def transformers_masks(multiple: bool, **prompt: Any) -> tuple[BoolArray, Float3
     images = processor()
     inputs = images(RGB, return_tensors="pt")
     asked = {
-        name: torch.from_numpy(_normalize_coordinates(SAM_PX, values, (40, 60), name == "input_boxes")).float()[None]
+        name: torch.from_numpy(_normalize_coordinates(IMAGE_PX, values, (40, 60), name == "input_boxes")).float()[None]
         for name, values in prompt.items()
     }
     with torch.inference_mode():
@@ -122,7 +123,7 @@ def test_prompts_are_halved_where_the_memory_runs_out_and_stay_so(sam: Sam) -> N
     class Short:
         """SAM on a device that holds two prompts."""
 
-        image_px = SAM_PX
+        image_px = IMAGE_PX
 
         def embed(self, pixels: Float32Array) -> Any:
             return sam.network.embed(pixels)
@@ -198,7 +199,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> ModelFiles:
 
 def test_the_exported_network_gives_the_masks_of_torch(sam: Sam, exported: ModelFiles) -> None:
     other = Sam(sam_onnx.load_onnx_sam(exported))
-    assert other.network.image_px == SAM_PX
+    assert other.network.image_px == IMAGE_PX
     mine, theirs = sam.look(RGB), other.look(RGB)
     for is_single in (False, True):
         a, scores = sam.from_boxes(mine, BOXES, is_single)

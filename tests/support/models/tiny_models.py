@@ -1,113 +1,30 @@
-"""Foundation models of small configurations with random weights, in memory and as model folders, for tests."""
+"""Images and words with which tests run the tiny networks of ``perception.models.stand_ins``."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pytest
 
 from su3d_bench.core.types import Frame, UInt8Array
+from su3d_bench.perception.models.stand_ins.detector import write_detector
+from su3d_bench.perception.models.stand_ins.segmenter import tiny_sam
 
-SAM_PX = 64
-DINO_PX = (48, 80)
-# Where transformers' GroundingDINO expects its marks, those of bert-base-uncased.
-_MARKS = {0: "[PAD]", 100: "[UNK]", 101: "[CLS]", 102: "[SEP]", 103: "[MASK]", 1012: ".", 1029: "?"}
-WORDS = (
-    "cat",
-    "dog",
-    "table",
-    "coffee",
-    "chair",
-    "lamp",
-    "sofa",
-    "book",
-    "##s",
-    "wall",
-    "floor",
-    "window",
-    "a",
-    "item",
+needs_models = pytest.mark.skipif(
+    find_spec("torch") is None or find_spec("transformers") is None,
+    reason="torch and transformers are not installed: pip install 'su3d-bench[models]'",
 )
-
-
-@cache
-def tiny_sam() -> Any:
-    """SAM with two layers, one of them global, and an image of 64 px."""
-    import torch
-    from transformers import SamConfig, SamModel
-
-    torch.manual_seed(1)
-    config = SamConfig(
-        vision_config={
-            "hidden_size": 16, "output_channels": 8, "num_hidden_layers": 2, "num_attention_heads": 2,
-            "image_size": SAM_PX, "patch_size": 8, "window_size": 3, "global_attn_indexes": [1], "num_pos_feats": 4,
-            "initializer_range": 0.05,
-        },
-        prompt_encoder_config={"hidden_size": 8, "image_size": SAM_PX, "patch_size": 8, "mask_input_channels": 4},
-        mask_decoder_config={"hidden_size": 8, "mlp_dim": 16, "num_attention_heads": 2, "iou_head_hidden_dim": 8},
-    )  # fmt: skip
-    model: Any = SamModel(config)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            # Weights that carry signals on; as initialised the network says the same of every image.
-            if parameter.dim() > 1:
-                parameter.normal_(0, 1.5 / parameter[0].numel() ** 0.5)
-    return model.eval()
-
-
-@cache
-def tiny_dino() -> Any:
-    """GroundingDINO with small towers, ten queries and texts of at most 32 tokens."""
-    import torch
-    from transformers import BertConfig, GroundingDinoConfig, GroundingDinoForObjectDetection, SwinConfig
-
-    torch.manual_seed(2)
-    tower: dict[str, Any] = {
-        "embed_dim": 8, "depths": [1, 1, 1, 1], "num_heads": [1, 1, 2, 2], "window_size": 4, "image_size": 64,
-        "out_features": ["stage2", "stage3", "stage4"],
-    }  # fmt: skip
-    config = GroundingDinoConfig(
-        backbone_config=SwinConfig(**tower),
-        text_config=BertConfig(
-            hidden_size=16, num_hidden_layers=1, num_attention_heads=2, intermediate_size=32, vocab_size=1100,
-            max_position_embeddings=64,
-        ),
-        num_queries=10, encoder_layers=1, decoder_layers=2, encoder_ffn_dim=32, decoder_ffn_dim=32, d_model=32,
-        encoder_attention_heads=4, decoder_attention_heads=4, encoder_n_points=2, decoder_n_points=2, max_text_len=32,
-    )  # fmt: skip
-    model: Any = GroundingDinoForObjectDetection(config)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter.add_(torch.randn_like(parameter) * 0.1)
-    return model.eval()
-
-
-def write_vocabulary(folder: Path) -> Path:
-    """``vocab.txt`` of the tiny tokenizer: bert's marks in their places, some words, and nothing else of use."""
-    words = {200 + k: word for k, word in enumerate(WORDS)} | _MARKS
-    lines = [words.get(k, f"[unused{k}]") for k in range(1030)]
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "vocab.txt"
-    path.write_text("\n".join(lines) + "\n")
-    return path
-
-
-def tiny_tokenizer(folder: Path) -> Any:
-    from transformers import BertTokenizer
-
-    return BertTokenizer(vocab=str(write_vocabulary(folder)))
+DINO_PX = (48, 80)
 
 
 def write_models(root: Path) -> Path:
-    """Folders of tiny SAM and GroundingDINO under the names that they are looked for."""
+    """Folders of tiny SAM and GroundingDINO in the hub's form under the names that they are looked for."""
     tiny_sam().save_pretrained(root / "sam-vit-h")
     (root / "sam-vit-h" / "preprocessor_config.json").write_text("{}")
-    tiny_dino().save_pretrained(root / "grounding-dino")
-    (root / "grounding-dino" / "preprocessor_config.json").write_text("{}")
-    tiny_tokenizer(root / "grounding-dino").save_pretrained(root / "grounding-dino")
+    write_detector(root / "grounding-dino")
     return root
 
 
@@ -136,3 +53,14 @@ def frame_of(rgb: UInt8Array, index: int = 0) -> Frame:
     """A frame that shows ``rgb`` on a wall 2 m away."""
     intrinsics = np.array([[100.0, 0, rgb.shape[1] / 2], [0, 100.0, rgb.shape[0] / 2], [0, 0, 1]])
     return Frame(index, 0.0, rgb, np.full(rgb.shape[:2], 2, np.float32), np.eye(4), intrinsics)
+
+
+def noise_images(n: int, seed: int = 0) -> list[UInt8Array]:
+    """RGB images of different sizes, one of them a single pixel high, in colours that differ."""
+    random = np.random.default_rng(seed)
+    sizes = [(1, 9), (50, 20), (33, 90), (64, 64), (120, 45)]
+    return [
+        random.integers(0, 256, (*sizes[k % len(sizes)], 3), dtype=np.uint8) // 2
+        + random.integers(0, 128, 3, dtype=np.uint8)
+        for k in range(n)
+    ]

@@ -69,12 +69,16 @@ GROUNDED_MASKS: Mapping[str, GroundedConfig] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Networks:
-    """What the segmenters run, read from disk when first asked for; ``digest`` moves with weights and precision."""
+    """What the segmenters run, read from disk when first asked for; ``digest`` moves with weights and precision.
+
+    ``stand_ins``: names of the models whose weights cannot be the published ones.
+    """
 
     tagger: Tagger
     load_detector: Callable[[], GroundingDino]
     load_sam: Callable[[], Sam]
     digest: str
+    stand_ins: tuple[str, ...] = ()
 
 
 class GroundedSam:
