@@ -25,14 +25,17 @@ def tracked() -> set[str]:
     return expected
 
 
+def built_wheel(folder: Path) -> Path:
+    """The project's wheel, built into ``folder``."""
+    words = [sys.executable, "-m", "build", "--wheel", "--outdir", str(folder), str(ROOT)]
+    subprocess.run(words, check=True, capture_output=True)
+    (wheel,) = folder.glob("*.whl")
+    return wheel
+
+
 def main() -> int:
-    with tempfile.TemporaryDirectory() as folder:
-        subprocess.run(
-            [sys.executable, "-m", "build", "--wheel", "--outdir", folder, str(ROOT)], check=True, capture_output=True
-        )
-        (wheel,) = Path(folder).glob("*.whl")
-        with zipfile.ZipFile(wheel) as archive:
-            held = {name for name in archive.namelist() if ".dist-info/" not in name}
+    with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(built_wheel(Path(folder))) as archive:
+        held = {name for name in archive.namelist() if ".dist-info/" not in name}
     expected = tracked()
     for name in sorted(expected - held):
         print(f"not in the wheel: {name}")
