@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from su3d_bench.cli.run import add_executor_flags
 from su3d_bench.cli.shared.answers import answer, answer_document, answer_json, formatted, remark, show, written
 from su3d_bench.cli.shared.flags import add_settings, add_table_format, add_verb
-from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, RunIncomplete, counted
+from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, RunIncomplete, counted, printable
 
 if TYPE_CHECKING:
     from su3d_bench.reproducing.asked import Asked, AskedRun
@@ -85,6 +85,7 @@ def call(arguments: argparse.Namespace) -> int:
     rehearsal = [name for name in ("rooms", "room_settings") if getattr(arguments, name)]
     if rehearsal and not arguments.rehearse:
         raise ConfigError(f"--{rehearsal[0].replace('_', '-')}: belongs to --rehearse; leave it out, or rehearse")
+    _check_device(arguments)
     out = arguments.out or Path("reproduced") / (recipe.name + ("-rehearsal" if arguments.rehearse else ""))
     if not arguments.rehearse:
         return _reproduce(recipe, experiments, _asked(arguments), out, arguments)
@@ -94,6 +95,19 @@ def call(arguments: argparse.Namespace) -> int:
     asked = rehearsed(recipe, experiments, _asked(arguments), out, arguments)
     with environment(**places(out, asked)):
         return _reproduce(recipe, experiments, asked, out, arguments)
+
+
+def _check_device(arguments: argparse.Namespace) -> None:
+    """Raise before anything is made or weighed where there is no such GPU; a cluster's machines have theirs."""
+    from su3d_bench.core.system.devices import DEVICE, EXPECTED_DEVICE, device_for
+    from su3d_bench.runs.planning.plan import ELSEWHERE
+
+    if arguments.device is None:
+        return
+    if DEVICE.fullmatch(arguments.device) is None:
+        raise ConfigError(f"--device {printable(arguments.device, 40)}: {EXPECTED_DEVICE}")
+    if not arguments.dry_run and arguments.executor not in ELSEWHERE:
+        device_for(arguments.device, 0)
 
 
 def _list_recipes(arguments: argparse.Namespace) -> int:

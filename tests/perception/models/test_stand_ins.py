@@ -1,4 +1,4 @@
-"""Tiny networks in the published files: each is read as the published one is, does its work, and is called what it is."""
+"""Tiny networks in the published files: each is read as the published one, works, and is called what it is."""
 
 from __future__ import annotations
 
