@@ -17,7 +17,7 @@ from su3d_bench.core.errors import ModelMissing, PredictionError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.evaluation.texts import encoder_for
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.perception.models.catalogue import MODELS
+from su3d_bench.perception.models.catalogue import MODELS, STAND_IN
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.loading import load_encoder
 from su3d_bench.perception.models.stand_ins.encoders import DIM, write_tiny_clip
@@ -178,7 +178,7 @@ def test_an_export_is_found_checked_and_run(found: Path, home: Path, capsys: pyt
     assert main(["models", "check", "clip-vit-b-32", "--json"]) == 0
     assert [row["form"] for row in json.loads(capsys.readouterr().out)] == ["transformers", "onnx"]
     assert main(["models", "warm", "clip-vit-b-32", "--set", "perception.models.runtime=onnx", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["what"] == "ViT-B-32/openai"
+    assert json.loads(capsys.readouterr().out)["what"] == "ViT-B-32/openai (stand-in)"
     (out / "text.onnx").write_bytes(b"")
     assert main(["models", "check", "clip-vit-b-32"]) == 1
     assert "text.onnx: is not the file that the manifest describes" in capsys.readouterr().out
@@ -190,7 +190,7 @@ def test_warm_tells_time_and_memory_and_the_digest_of_run_records(
 ) -> None:
     assert main(["models", "warm", "clip-vit-b-32"]) == 0
     out = capsys.readouterr().out
-    assert "ViT-B-32/openai: loaded and first run" in out
+    assert "ViT-B-32/openai (stand-in): loaded and first run" in out
     assert f"(process); digest {load_encoder(ModelsConfig(encoder='clip-vit-b-32')).digest[:12]}" in out
 
 
@@ -239,5 +239,5 @@ def test_an_evaluation_names_features_with_the_protocols_encoder_where_it_is_her
     shutil.copytree(tiny_clip, home / "models" / "clip-vit-h-14")
     encoder = encoder_for(rules, DIM, None, is_own=False)
     assert isinstance(encoder, Encoder)
-    assert encoder.name == rules.encoder
+    assert encoder.name == f"{rules.encoder}{STAND_IN}"
     assert "the features have 25 dimensions" in str(encoder_for(rules, 25, None, is_own=False))

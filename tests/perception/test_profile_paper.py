@@ -22,6 +22,7 @@ from su3d_bench.core.types import PerceptionNeeds, SceneInfo, UInt8Array
 from su3d_bench.perception import paper as profile_paper
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.language.captioner import CropCaption
+from su3d_bench.perception.models.catalogue import WEIGHTS_CAVEAT
 from su3d_bench.perception.models.config import PaperConfig
 from su3d_bench.perception.models.masks.tagging import WORDS_CAVEAT
 from su3d_bench.perception.models.stand_ins.detector import tiny_dino
@@ -208,7 +209,8 @@ def test_what_moves_the_answer_moves_the_digest(models: Path, tmp_path: Path) ->
 
 def test_stand_ins_for_ram_are_said_beside_every_number(models: Path, tmp_path: Path) -> None:
     caveat = built(config_of(models), tmp_path).caveat
-    assert caveat is not None and caveat.startswith(f"{WORDS_CAVEAT}; ")
+    assert caveat is not None
+    assert caveat.split("; ")[:2] == [f"{WEIGHTS_CAVEAT} sam-vit-h, grounding-dino", WORDS_CAVEAT.split("; ")[0]]
 
 
 def test_the_profile_says_what_it_computes_otherwise_than_the_paper_and_nothing_else() -> None:

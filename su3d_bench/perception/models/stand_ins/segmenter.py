@@ -14,8 +14,8 @@ from typing import Any
 
 from su3d_bench.core.system.devices import require_transformers
 
-IMAGE_PX, PATCH_PX = 128, 8
-WIDTH = 32  # of prompts and decoder; eight heads of two numbers in its attention from image to prompts
+IMAGE_PX, FILLING_PX, PATCH_PX = 64, 128, 8
+WIDTH = 32  # of its prompts and decoder; eight heads of two numbers in its attention from image to prompts
 _N_FREQUENCIES = WIDTH // 2
 # Channels of place. A quarter of a turn over half the image orders nearly all places; a whole one tells near from far,
 # but begins again, where the third is far.
@@ -55,32 +55,47 @@ _N_TESTS = 4  # a cell is inside where four comparisons hold
 
 @cache
 def tiny_sam() -> Any:
-    """``transformers``' SamModel of two layers, one of them global, and an image of 128 px."""
+    """``transformers``' SamModel of two layers, one of them global, and an image of 64 px; random throughout."""
+    decoder = {"hidden_size": 8, "mlp_dim": 16, "num_attention_heads": 2, "iou_head_hidden_dim": 8}
+    return _random_sam(IMAGE_PX, 8, decoder).eval()
+
+
+@cache
+def filling_sam() -> Any:
+    """The same with SAM's eight heads and an image of 128 px, whose masks fill boxes."""
+    import torch
+
+    model = _random_sam(FILLING_PX, WIDTH, {"hidden_size": WIDTH, "mlp_dim": 32, "iou_head_hidden_dim": 8})
+    with torch.no_grad():
+        _set_places(model)
+        _set_prompts(model)
+        _set_comparisons(model.mask_decoder.transformer.layers)
+        _set_masks(model.mask_decoder)
+    return model.eval()
+
+
+def _random_sam(image_px: int, width: int, decoder: dict[str, int]) -> Any:
     import torch
 
     transformers = require_transformers("a stand-in of SAM")
     torch.manual_seed(1)
     config = transformers.SamConfig(
         vision_config={
-            "hidden_size": 16, "output_channels": WIDTH, "num_hidden_layers": 2, "num_attention_heads": 2,
-            "image_size": IMAGE_PX, "patch_size": PATCH_PX, "window_size": 3, "global_attn_indexes": [1],
-            "num_pos_feats": _N_FREQUENCIES, "initializer_range": 0.05,
+            "hidden_size": 16, "output_channels": width, "num_hidden_layers": 2, "num_attention_heads": 2,
+            "image_size": image_px, "patch_size": PATCH_PX, "window_size": 3, "global_attn_indexes": [1],
+            "num_pos_feats": width // 2, "initializer_range": 0.05,
         },
         prompt_encoder_config={
-            "hidden_size": WIDTH, "image_size": IMAGE_PX, "patch_size": PATCH_PX, "mask_input_channels": 4,
+            "hidden_size": width, "image_size": image_px, "patch_size": PATCH_PX, "mask_input_channels": 4,
         },
-        mask_decoder_config={"hidden_size": WIDTH, "mlp_dim": 32, "iou_head_hidden_dim": 8},
+        mask_decoder_config=decoder,
     )  # fmt: skip
     model = transformers.SamModel(config)
     with torch.no_grad():
         for parameter in model.parameters():
             if parameter.dim() > 1:  # weights that carry signals on; as initialised all images look the same
                 parameter.normal_(0, 1.5 / parameter[0].numel() ** 0.5)
-        _set_places(model)
-        _set_prompts(model)
-        _set_comparisons(model.mask_decoder.transformer.layers)
-        _set_masks(model.mask_decoder)
-    return model.eval()
+    return model
 
 
 def _set_places(model: Any) -> None:
@@ -190,9 +205,9 @@ def original_names(tensors: dict[str, Any]) -> dict[str, Any]:
 
 
 def write_checkpoint(place: Path) -> Path:
-    """``tiny_sam`` as segment-anything publishes checkpoints: a torch file of tensors under the original's names."""
+    """``filling_sam`` as segment-anything publishes checkpoints: a torch file of tensors under the original's names."""
     import torch
 
     place.parent.mkdir(parents=True, exist_ok=True)
-    torch.save(original_names(tiny_sam().state_dict()), place)
+    torch.save(original_names(filling_sam().state_dict()), place)
     return place
