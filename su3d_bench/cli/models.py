@@ -56,13 +56,23 @@ def _add_export(actions: Any) -> None:
         "Write a model as ONNX files with a manifest, and tell how far ONNX Runtime is from torch.",
         (
             "su3d-bench models export clip-vit-h-14 --out models/clip-vit-h-14-onnx",
-            "su3d-bench models export siglip-base-224 --out siglip --json",
+            "su3d-bench models export ram-plus --checkout recognize-anything --environment ram-env --out ram-plus-onnx",
         ),
         call_export,
         uses_all_cores=True,
     )
     parser.add_argument("name", metavar="MODEL", help="short name, such as clip-vit-h-14")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder that the files go to")
+    parser.add_argument("--weights", type=Path, metavar="FILE", help="default: where models are looked for")
+    own = parser.add_argument_group("ram-plus, which its authors' own code exports")
+    own.add_argument("--checkout", type=Path, metavar="DIR", help="a clone of recognize-anything")
+    own.add_argument(
+        "--environment",
+        type=Path,
+        metavar="DIR",
+        help="folder of an environment for it, made with pip where there is none",
+    )
+    own.add_argument("--python", type=Path, metavar="PYTHON", help="the Python of an environment that you made")
     _add_settings(parser)
 
 
@@ -183,11 +193,13 @@ def _check_lines(row: dict[str, Any]) -> list[str]:
 
 def call_export(arguments: argparse.Namespace) -> int:
     from su3d_bench.perception.models.catalogue import model_entry
-    from su3d_bench.perception.models.onnx.export_model import export_model
+    from su3d_bench.perception.models.onnx.export_model import OwnCode, export_model
 
     config = perception_config(arguments).models
     entry = model_entry(arguments.name)
-    export = export_model(entry, arguments.out, path=config.paths.get(entry.name), folder=config.folder)
+    own = OwnCode(arguments.checkout, arguments.python, arguments.environment)
+    path = arguments.weights or config.paths.get(entry.name)
+    export = export_model(entry, arguments.out, path=path, folder=config.folder, own=own)
     value = {"folder": str(arguments.out), "files": export.files, "parity": [asdict(p) for p in export.parity]}
     lines = [f"{digest}  {arguments.out / name}" for name, digest in export.files.items()]
     lines += [

@@ -64,6 +64,12 @@ class ModelEntry:
         """What the weights alone take on the device, in MB; activations come on top."""
         return self.n_parameters_million * bytes_a_weight
 
+    @property
+    def fetched(self) -> ModelForm:
+        """The form that ``su3d-bench fetch models`` brings: a publisher's one file where it is read, else the hub's."""
+        originals = [form for form in self.forms if form.form == "original" and form.is_read]
+        return originals[0] if originals else self.forms[0]
+
     def form(self, name: FormName) -> ModelForm:
         """The form called ``name``; raises ``ConfigError`` where the model does not come in it."""
         for form in self.forms:
@@ -239,7 +245,7 @@ _ENTRIES = (
         "tagger",
         "RAM++ ram_plus_swin_large_14m: tags of an image",
         "Apache-2.0",
-        750,
+        330,  # of the network that runs; the published file holds more than it
         (
             _original(
                 "ram_plus_swin_large_14m.pth",
@@ -248,12 +254,12 @@ _ENTRIES = (
                 "497c178836ba66698ca226c7895317e6e800034be986452dbd2593298d50e87d",
                 "xinyu1205/recognize-anything-plus-model",
             ),
-            # What onnx/export.py of the package's open pull request 204 writes, beside the tag list of its ram/data.
+            # The manifest is none of the files: the script of recognize-anything's pull request 204 writes none.
             ModelForm(
                 "onnx",
                 ("ram_plus.onnx", "ram_tag_list.txt"),
-                "onnx/export.py of https://github.com/xinyu1205/recognize-anything/pull/204",
-                3010,
+                "su3d-bench models export ram-plus --checkout DIR --environment DIR --out DIR",
+                1370,
             ),
         ),
     ),

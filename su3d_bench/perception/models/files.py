@@ -79,7 +79,7 @@ class ModelFiles:
     def wrong_digests(self) -> list[str]:
         """A line for each file whose digest is not the published one."""
         digests = self.digests()
-        advice = f"fetch it anew from {self.form.source}"
+        advice = what_to_fetch(self.entry, (self.form,))
         return [
             f"{self.folder / name}: sha256 is {digests[name]}, published is {known}; {advice}"
             for name, known in self.form.sha256.items()
@@ -120,8 +120,8 @@ def locate(
         for candidate in _folders(entry, form, folder):
             if (weights := _weights(form, candidate)) is not None and not _lacking(form, candidate):
                 return ModelFiles(entry, form, candidate, weights)
-    place = models_folder(folder) / (f"{entry.name}-onnx" if wanted[0].form == "onnx" else entry.name)
-    raise ModelMissing(f"model '{entry.name}': not found; {_what_to_fetch(wanted[0])} into {place}, or set SU3D_MODELS")
+    place = models_folder(folder)
+    raise ModelMissing(f"model '{entry.name}': not found below {place}; {what_to_fetch(entry, wanted)}")
 
 
 def _at(entry: ModelEntry, forms: Sequence[ModelForm], path: Path) -> ModelFiles:
@@ -134,7 +134,7 @@ def _at(entry: ModelEntry, forms: Sequence[ModelForm], path: Path) -> ModelFiles
         known = " or ".join(name for form in forms for name in _names(form.files[0]))
         raise ConfigError(f"model '{entry.name}': {path} is no file that it is read from; name a folder with {known}")
     if not path.is_dir():
-        raise ModelMissing(f"model '{entry.name}': there is no {path}; mend the path or {_what_to_fetch(forms[0])}")
+        raise ModelMissing(f"model '{entry.name}': there is no {path}; mend the path, or {what_to_fetch(entry, forms)}")
     lacking = []
     for form in forms:
         weights = _weights(form, path)
@@ -142,7 +142,7 @@ def _at(entry: ModelEntry, forms: Sequence[ModelForm], path: Path) -> ModelFiles
             return ModelFiles(entry, form, path, weights)
         lacking.append(_lacking(form, path))
     nearest = min(lacking, key=len)
-    raise ModelMissing(f"model '{entry.name}': {path} lacks {', '.join(nearest)}; {_what_to_fetch(forms[0])}")
+    raise ModelMissing(f"model '{entry.name}': {path} lacks {', '.join(nearest)}; {what_to_fetch(entry, forms)}")
 
 
 def _folders(entry: ModelEntry, form: ModelForm, configured: Path | None) -> Iterator[Path]:
@@ -194,12 +194,14 @@ def _lacking(form: ModelForm, folder: Path) -> list[str]:
     ]
 
 
-def _what_to_fetch(form: ModelForm) -> str:
-    if form.form == "onnx":
-        return f"make it: {form.source}"
-    weights = " or ".join(_names(form.files[0]))
-    names = ", ".join([weights, *(_names(requirement)[0] for requirement in form.files[1:])])
-    return f"fetch {names} ({form.size_mb / 1000:.1f} GB) from {form.source}"
+def what_to_fetch(entry: ModelEntry, forms: Sequence[ModelForm]) -> str:
+    """What to do for one of ``forms`` of ``entry``: the command that brings or makes it, else its files and address."""
+    if entry.fetched in forms:
+        return f"run: su3d-bench fetch models {entry.name} ({entry.fetched.size_mb / 1000:.1f} GB)"
+    if forms[0].form == "onnx":
+        return f"run: {forms[0].source}"
+    names = ", ".join(_names(requirement)[0] for requirement in forms[0].files)
+    return f"put {names} of {forms[0].source} ({forms[0].size_mb / 1000:.1f} GB) there"
 
 
 def file_sha256(path: Path) -> str:
@@ -341,6 +343,6 @@ def load_pretrained(files: ModelFiles, model_class: Any, **more: Any) -> Any:
     if missing := sorted(info["missing_keys"]):
         raise DataError(
             f"{files.weights}: lacks {len(missing)} tensors, such as {missing[0][:80]}; it is no "
-            f"{files.entry.name}, fetch the folder anew from {files.form.source}"
+            f"{files.entry.name}; {what_to_fetch(files.entry, (files.form,))}"
         )
     return model

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import partial
 from importlib.util import find_spec
 
-from su3d_bench.core.errors import ConfigError, ModelMissing
+from su3d_bench.core.errors import ConfigError, DataError, ModelMissing
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.system.devices import device_for, precision_for, require, require_installed
 from su3d_bench.perception.cache import content_key
@@ -26,6 +26,7 @@ from su3d_bench.perception.models.masks.tagging import (
     WordTagger,
     load_ram,
     read_word_list,
+    wrong_tagger,
 )
 from su3d_bench.perception.models.onnx.session import Provider, open_session
 from su3d_bench.perception.models.pretrained import kept, load_grounding_dino, load_sam
@@ -124,6 +125,8 @@ def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, device:
     if config.tagger in ("ram-onnx", "auto"):
         with _passed_over(config.tagger):
             files = _locate(models, TAGGER, ("onnx",))
+            if wrong := wrong_tagger(files):
+                raise DataError(wrong[0])
             tags = read_word_list(files.folder / RAM_TAG_LIST)
             return OnnxRamTagger(partial(open_session, files.weights), tags, content_key(*files.digests().values()))
     return WordTagger(encoder, read_word_list(config.words), config.n_tags)

@@ -20,6 +20,7 @@ from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.encoders import towers_onnx, towers_transformers
 from su3d_bench.perception.models.files import PICKLED, ModelFiles, locate, read_settings, read_weights
 from su3d_bench.perception.models.masks import sam_onnx
+from su3d_bench.perception.models.masks.tagging import wrong_tagger
 from su3d_bench.perception.models.onnx.manifest import OnnxManifest, wrong_files
 
 WARM_TEXT = "a chair in a scene"
@@ -73,7 +74,7 @@ def problems_of(files: ModelFiles) -> list[str]:
 
 def _problems_of_export(files: ModelFiles) -> list[str]:
     if files.entry.kind == "tagger":
-        return []  # the package's own export has no manifest
+        return wrong_tagger(files)
     read = towers_onnx.read_manifest if files.entry.kind == "encoder" else sam_onnx.read_sam_manifest
     manifest: OnnxManifest = read(files.weights)
     wrong = wrong_files(manifest, files.folder)

@@ -16,11 +16,15 @@ from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.perception.cache import content_key
 from su3d_bench.perception.embedded.naming import PromptedWords, listed_words, vocabulary
+from su3d_bench.perception.models.catalogue import ONNX_MANIFEST
 from su3d_bench.perception.models.encoders.model_images import Resample, normalised, resized
-from su3d_bench.perception.models.files import ModelFiles, bounded, read_weights
+from su3d_bench.perception.models.files import ModelFiles, bounded, read_weights, what_to_fetch
+from su3d_bench.perception.models.onnx import ram_plus_program
+from su3d_bench.perception.models.onnx.manifest import OnnxManifest, wrong_files
+from su3d_bench.store.atomic import is_file
 
-RAM_PX = 384
-RAM_TAG_LIST = "ram_tag_list.txt"
+RAM_PX = ram_plus_program.IMAGE_PX
+RAM_MODEL, RAM_TAG_LIST = "ram_plus.onnx", "ram_tag_list.txt"
 WORDS_CAVEAT = "tags: RAM++ is not here; the words of a list that the encoder finds likeliest stand in for its tags"
 MAX_WORDS, MAX_WORD_LENGTH = 20_000, 100
 MAX_LIST_BYTES = 1 << 21
@@ -72,7 +76,10 @@ class RamTagger:
 
 
 class OnnxRamTagger:
-    """RAM++ as its pull request 204 exports it: ``image`` (1, 3, 384, 384) to ``tag`` (1, T), 1 where it holds."""
+    """RAM++ exported: ``image`` (1, 3, 384, 384) to ``tag`` (1, T), 1 where it holds, its first answer.
+
+    ``su3d-bench models export`` writes it so, and the script of recognize-anything's pull request 204.
+    """
 
     name = "ram-onnx"
     caveat: str | None = None
@@ -92,6 +99,29 @@ class OnnxRamTagger:
                 "tags; both must come from one version of the package"
             )
         return tuple(self._tag_list[index] for index in np.flatnonzero(is_there[0] > 0.5))
+
+
+class RamManifest(OnnxManifest):
+    """The manifest of an exported RAM++.
+
+    ``code``: SHA-256 of the authors' files by name; ``made_with``: versions of the packages that ran them;
+    ``n_undecided``: tags of the compared images whose probability is within the tolerance of their threshold.
+    """
+
+    FORMAT = "su3d-bench onnx tagger 1"
+    IS_OF = "a tagger"
+    REQUIRES = (RAM_MODEL, RAM_TAG_LIST)
+
+    n_tags: int
+    code: dict[str, str]
+    made_with: dict[str, str]
+    n_undecided: int
+
+
+def wrong_tagger(files: ModelFiles) -> list[str]:
+    """A line for each fault of an exported RAM++; one without a manifest, as others export it, has none to be found."""
+    path = files.folder / ONNX_MANIFEST
+    return wrong_files(RamManifest.read(path), files.folder) if is_file(path) else []
 
 
 class WordTagger:
@@ -169,8 +199,7 @@ def load_ram(files: ModelFiles, device: str) -> Any:
         models = require("ram.models", "tagger 'ram-plus'")
     except ModelMissing as error:
         raise ModelMissing(
-            "tagger 'ram-plus': its package is not installed (pip install "
-            "git+https://github.com/xinyu1205/recognize-anything.git); export it, or "
+            "tagger 'ram-plus': its package is not installed; run su3d-bench models export ram-plus, or "
             "set perception.paper.tagger to words"
         ) from error
     make_deterministic(device)
@@ -187,21 +216,8 @@ def load_ram(files: ModelFiles, device: str) -> Any:
 
 
 def fill_ram(model: Any, tensors: dict[str, Any], files: ModelFiles) -> None:
-    """Give ``model`` its weights under the names of the package's own loader; raises ``DataError`` where some lack."""
-    # Made by the model itself from its window size.
-    made = ("relative_position_index", "attn_mask")
-    kept = {
-        name.replace("vision_multi", "tagging_head"): tensor
-        for name, tensor in tensors.items()
-        if not any(part in name for part in made)
-    }
+    """Give ``model`` its weights; raises ``DataError`` where some lack or have another shape."""
     try:
-        missing = model.load_state_dict(kept, strict=False).missing_keys
-    except RuntimeError as error:
-        raise DataError(f"{files.weights}: does not fit RAM++ ({bounded(error)}); fetch it anew") from error
-    missing = [name for name in missing if not any(part in name for part in made)]
-    if missing:
-        raise DataError(
-            f"{files.weights}: lacks {len(missing)} tensors, such as {missing[0][:80]}; fetch it from "
-            f"{files.form.source}"
-        )
+        ram_plus_program.fill(model, tensors)
+    except ValueError as error:
+        raise DataError(f"{files.weights}: {bounded(error)}; {what_to_fetch(files.entry, (files.form,))}") from error

@@ -85,10 +85,10 @@ def export_onnx(
                 do_constant_folding=True,
                 dynamo=False,
             )
-        return _settle(draft, path)
+        return settle(draft, path)
 
 
-def _settle(draft: Path, path: Path) -> list[Path]:
+def settle(draft: Path, path: Path) -> list[Path]:
     """Move the exporter's files to where they belong, the many files of a large model's weights as one."""
     import onnx
 
