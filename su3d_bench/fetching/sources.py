@@ -101,10 +101,19 @@ class HubFiles(_Strict):
     read_at: Text
 
 
+class SceneCounts(_Strict):
+    """How many scenes and frames a source of recordings has in all."""
+
+    n_scenes: Annotated[int, Field(ge=1, le=1_000_000)]
+    n_frames: Annotated[int, Field(ge=1, le=MOST_BYTES)]
+    read_at: Text
+
+
 class Source(_Strict):
     """One thing that can be fetched: ``files`` or a repository of the ``hub``, from ``hosts`` alone.
 
-    ``about_bytes`` is a size that was told in round numbers; ``archive`` what the files are, one after another.
+    ``about_bytes`` is a size that was told in round numbers; ``archive`` what the files are, one after another;
+    ``scenes`` what recordings there are in it.
     """
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9-]{0,59}$")]
@@ -117,6 +126,7 @@ class Source(_Strict):
     about_read_at: Text | None = None
     files: tuple[RemoteFile, ...] = ()
     hub: HubFiles | None = None
+    scenes: SceneCounts | None = None
     endpoint: Text | None = None  # of the hub, where a mirror was named
 
     @model_validator(mode="after")

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,7 @@ from su3d_bench.core.config import Settings, read_assignments, resolve
 from su3d_bench.core.errors import GroundTruthMissing, ModelMissing, Su3dError
 from su3d_bench.core.interfaces import HasGroups
 from su3d_bench.core.system.devices import require_installed
-from su3d_bench.core.system.files import file_text
-from su3d_bench.core.toml import parse_toml
+from su3d_bench.fetching.sources import built_in
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.perception.models.catalogue import PAPERS_ENCODERS, PROFILE_MODELS, FormName, model_entry
 from su3d_bench.perception.models.files import locate
@@ -31,11 +29,11 @@ from su3d_bench.runs.planning.plan import named_method
 from su3d_bench.runs.planning.scenes import data_root, split_address
 from su3d_bench.store.atomic import is_file
 
-SIZES = Path(__file__).resolve().parent / "data_sizes.toml"
 PAPER = "paper"
 FETCHED_FOR_PAPER = (*PROFILE_MODELS[PAPER], *PAPERS_ENCODERS)
 CAN_DO_WITHOUT = (TAGGER,)  # without RAM++ a list of words names what is looked for
 MB = 1_000_000
+FRAMES = 1000  # of a scene of which neither the dataset nor the table of what can be fetched says how many
 
 
 @dataclass(frozen=True)
@@ -131,9 +129,23 @@ def _stride(run: AskedRun, method: str) -> int:
     return max(1, int(own.get(("stride",), default)))
 
 
-@cache
-def _sizes() -> Mapping[str, Mapping[str, Any]]:
-    return parse_toml(file_text(SIZES))
+@dataclass(frozen=True)
+class SceneSize:
+    """A scene of a dataset before it is here, on average: frames, bytes to be fetched, and the command that does it."""
+
+    n_frames: int = FRAMES
+    n_bytes: float | None = None
+    how: str = "see docs/datasets.md"
+
+
+def scene_size(dataset: str) -> SceneSize:
+    """What the table of what can be fetched says of the scenes of ``dataset``."""
+    for source in built_in().entries.values():
+        if source.group == dataset and source.scenes is not None:
+            counts, n_bytes = source.scenes, source.n_bytes
+            mean = None if n_bytes is None else n_bytes / counts.n_scenes
+            return SceneSize(round(counts.n_frames / counts.n_scenes), mean, f"su3d-bench fetch {source.group}")
+    return SceneSize()
 
 
 def _dataset(name: str) -> Any:
@@ -165,16 +177,14 @@ def _n_frames(dataset: str, scene: str) -> int:
     """As many as there are, or where the scene is not here, as its publisher says."""
     with suppress(Su3dError):
         return int(_dataset(dataset).info(scene, 1).n_frames)
-    return int(_sizes().get(dataset, {}).get("frames", 1000))
+    return scene_size(dataset).n_frames
 
 
 def _data(run: AskedRun) -> Iterator[Need]:
     """A need a scene, and one a truth that its protocols ask for."""
     dataset = _dataset(run.dataset)
     known = _known_scenes(dataset)
-    sizes = _sizes().get(run.dataset, {})
-    n_bytes = sizes["frames"] * sizes["bytes_a_frame"] if sizes else None
-    how = str(sizes.get("fetch", "see docs/datasets.md"))
+    size = scene_size(run.dataset)
     for scene in _scenes(run):
         address = f"{run.dataset}/{scene}"
         fault = "" if scene in known else f"not below {data_root()}"
@@ -183,9 +193,11 @@ def _data(run: AskedRun) -> Iterator[Need]:
                 dataset.info(scene, 1)
             except Su3dError as error:
                 fault = str(error)
-        yield Need("scene", address, not fault, 0.0 if not fault else n_bytes, how if fault else "", remark=fault)
+        yield Need(
+            "scene", address, not fault, 0.0 if not fault else size.n_bytes, size.how if fault else "", remark=fault
+        )
         if not fault:
-            yield from _truths(run, dataset, scene, how)
+            yield from _truths(run, dataset, scene, size.how)
 
 
 def _truths(run: AskedRun, dataset: Any, scene: str, how: str) -> Iterator[Need]:
@@ -228,7 +240,6 @@ def _models(run: AskedRun) -> Iterator[Need]:
 
 
 def _model(name: str, config: PerceptionConfig, *, is_required: bool) -> Need:
-    entry = model_entry(name)
     forms: tuple[FormName, ...] | None = None
     if name == TAGGER:  # its own checkpoint runs by its own package alone
         forms = ("onnx", "original") if find_spec("ram") is not None else ("onnx",)
@@ -237,7 +248,7 @@ def _model(name: str, config: PerceptionConfig, *, is_required: bool) -> Need:
     try:
         files = locate(name, forms, path=place[0], folder=place[1])
     except ModelMissing:
-        n_bytes = next(form.size_mb for form in entry.forms) * float(MB)
+        n_bytes = built_in().named(name, "models").n_bytes
         how = f"su3d-bench fetch models {'--for paper' if name in FETCHED_FOR_PAPER else name}"
         return Need("model", name, is_here=False, n_bytes=n_bytes, how=how, is_required=is_required, remark=remark)
     return Need("model", name, is_here=True, n_bytes=0.0, remark=str(files.folder))
