@@ -20,13 +20,13 @@ from su3d_bench.datasets.replica.checks import digest_of, original_problems, ren
 from su3d_bench.datasets.replica.cloud_truth import cloud_files, conceptgraphs_truth
 from su3d_bench.datasets.replica.folders import (
     CLOUDS_URL,
+    FETCH_FRAMES,
+    FETCH_MESHES,
     FUSED_CLOUD,
     HOW_TO_GET_LABELS,
     INSTANCE_FOLDERS,
-    ORIGINAL_URL,
     REFERENCE_CLOUD,
     RENDER_FOLDERS,
-    RENDER_URL,
     SEMANTIC_FOLDERS,
     SEMANTIC_LABEL_FOLDERS,
     RenderTree,
@@ -142,8 +142,8 @@ class Replica:
         folder, where = self._folder(scene), self._where(scene)
         if not self._is_rendered(scene):
             raise FramesMissing(
-                f"{where}: no frames; expected traj.txt and results/ of NICE-SLAM's render in {folder} ({RENDER_URL}); "
-                f"what is here can be looked at: su3d-bench datasets show {where}"
+                f"{where}: no frames; expected traj.txt and results/ of NICE-SLAM's render in {folder}: "
+                f"{FETCH_FRAMES}; what is here can be looked at: su3d-bench datasets show {where}"
             )
         camera = read_camera(self.tree.folder / "cam_params.json", where)
         poses = read_trajectory(folder / "traj.txt", where)
@@ -204,7 +204,7 @@ class Replica:
         if original is None or not (original / INFO_NAME).exists():
             raise GroundTruthMissing(
                 f"{self._where(scene)}: no boxes of objects; expected {original_name(scene)}/{INFO_NAME} of the "
-                f"original release ({ORIGINAL_URL}) in {self.root / 'replica_v1'}"
+                f"original release in {self.root / 'replica_v1'}: {FETCH_MESHES}"
             )
         return original / INFO_NAME
 
@@ -326,7 +326,7 @@ class Replica:
         if original is None:
             raise GroundTruthMissing(
                 f"{where}: no ground truth; expected {original_name(scene)}/{MESH_NAME} of the original release "
-                f"({ORIGINAL_URL}) in {self.root / 'replica_v1'}"
+                f"in {self.root / 'replica_v1'}: {FETCH_MESHES}"
             )
         for name in (MESH_NAME, INFO_NAME):
             if not (original / name).exists():

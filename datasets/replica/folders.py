@@ -51,8 +51,7 @@ REFERENCE_CLOUD = "rgb_cloud/pointclouds/pc_points.h5"  # in the scene of the re
 LABEL_PLACES = (*RENDER_FOLDERS, "opennerf/datasets", "datasets")
 INSTANCE_FOLDERS = ("ground_truth", "instance_gt", "instance_gt/validation", "replica_gt_instances")
 SEMANTIC_LABEL_FOLDERS = ("semantic_gt", "replica_gt_semantics")
-RENDER_URL = "https://cvg-data.inf.ethz.ch/nice-slam/data/Replica.zip"
-ORIGINAL_URL = "https://github.com/facebookresearch/Replica-Dataset"
+FETCH_FRAMES, FETCH_MESHES = "su3d-bench fetch replica frames", "su3d-bench fetch replica meshes"
 CLOUDS_URL = "https://github.com/concept-graphs/concept-graphs"  # its README has the link
 HOW_TO_GET_LABELS = {
     "openmask3d": "ask its authors (https://github.com/OpenMask3D/openmask3d/issues/1) or take the archive that "
@@ -154,7 +153,7 @@ def no_render_tree(root: Path) -> ScenesMissing:
     """What to say where no scene was found: where it was looked for and how to get data."""
     return ScenesMissing(
         f"replica: no scene in {root} or in its folder Replica (a scene is a folder such as room0 with traj.txt and "
-        f"results/); su3d-bench fetch replica brings them; or unpack {RENDER_URL} there, set SU3D_DATA to where it is, "
+        f"results/); {FETCH_FRAMES} brings them; set SU3D_DATA to where they are, "
         f"or make rooms in this layout: su3d-bench datasets make rooms --layout replica --out {root}"
     )
 

@@ -44,7 +44,7 @@ Place = Callable[[PurePosixPath], PurePosixPath | None]
 def members(archive: Path) -> list[tuple[str, int]]:
     """Name and size of every file in a zip archive."""
     with _reading(archive), opened(archive) as stream, zipfile.ZipFile(stream) as file:
-        return [(info.filename, info.file_size) for info in file.infolist() if not info.is_dir()]
+        return [(info.filename, info.file_size) for info in file.infolist() if not _is_folder(info)]
 
 
 def unpack_zip(archive: Path, folder: Path, goes_to: Place, watch: Watch) -> int:
@@ -53,8 +53,7 @@ def unpack_zip(archive: Path, folder: Path, goes_to: Place, watch: Watch) -> int
         allowance = allowance_of(file)
         wanted = []
         for info in file.infolist():
-            path = _plain(info.filename)
-            target = None if info.is_dir() else goes_to(path)
+            target = None if _is_folder(info) else goes_to(_plain(info.filename))
             if target is None:
                 continue
             mode = info.external_attr >> 16
@@ -107,9 +106,15 @@ def unpack_tar_gz(parts: Sequence[Path], folder: Path, goes_to: Place, watch: Wa
     return n_found
 
 
+def _is_folder(info: zipfile.ZipInfo) -> bool:
+    return info.filename.endswith("/")  # ``is_dir`` of Python 3.11 fails for a name without a character
+
+
 def _plain(name: str) -> PurePosixPath:
-    """A member's path within the archive; ``DataError`` where it leads out of any folder."""
+    """A member's path within the archive; ``DataError`` where it leads out of any folder, or is none."""
     path = PurePosixPath(name)
+    if not path.parts:
+        raise DataError("holds a file without a name")
     if path.is_absolute() or ".." in path.parts or "\\" in name or "\0" in name or name[1:2] == ":":
         raise DataError(f"'{printable(name, 120)}' leads out of the folder")
     return path

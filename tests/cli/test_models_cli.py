@@ -99,7 +99,7 @@ def test_the_list_says_where_a_model_lies(found: Path, capsys: pytest.CaptureFix
     assert rows["clip-vit-b-32"]["found"] == {"transformers": str(found)}
     assert rows["clip-vit-b-32"]["missing"] is None
     assert rows["clip-vit-b-32"]["memory_mb"] == {"float32": 604, "float16": 302}
-    assert "fetch model.safetensors" in rows["clip-vit-h-14"]["missing"]
+    assert "su3d-bench fetch models clip-vit-h-14" in rows["clip-vit-h-14"]["missing"]
 
 
 @needs_models
@@ -134,12 +134,12 @@ def test_check_finds_weights_that_are_cut_short(found: Path, capsys: pytest.Capt
     [
         (["models", "check"], "none of the models is here"),
         (["models", "check", "clip-h"], "unknown model 'clip-h'"),
-        (["models", "warm", "clip-vit-b-32"], "model 'clip-vit-b-32': not found; fetch model.safetensors"),
+        (["models", "warm", "clip-vit-b-32"], "run: su3d-bench fetch models clip-vit-b-32"),
         (["models", "warm", "clip-vit-b"], "unknown encoder 'clip-vit-b'; did you mean 'clip-vit-b-32'?"),
         (["models", "warm", "embedded", "--device", "gpu"], "device = 'gpu': expected cpu, cuda or cuda:N"),
         (["models", "warm", "embedded", "--profile", "paper"], "give an encoder or --profile, not both"),
         (["models", "warm", "--profile", "papper"], "unknown profile 'papper'; did you mean 'paper'?"),
-        (["models", "warm"], "not found; fetch"),
+        (["models", "warm"], "run: su3d-bench fetch models"),
         (["models", "list", "--set", "perception.models.folder"], "expected KEY=VALUE"),
         (["models", "list", "--set", "perception.models.foldr=x"], "did you mean 'folder'?"),
     ],
@@ -157,15 +157,16 @@ def test_export_without_weights_or_of_a_model_that_is_not_exported_is_one_line(
     home: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["models", "export", "clip-vit-h-14", "--out", str(home / "made")]) == 2
-    assert "not found; fetch model.safetensors" in capsys.readouterr().err
-    assert main(["models", "export", "ram-plus", "--out", str(home / "made")]) == 2
-    assert "'ram-plus' is not exported by this program; known: clip-vit-h-14" in capsys.readouterr().err
+    assert "run: su3d-bench fetch models clip-vit-h-14" in capsys.readouterr().err
+    assert main(["models", "export", "grounding-dino", "--out", str(home / "made")]) == 2
+    assert "'grounding-dino' is not exported by this program; known: clip-vit-h-14" in capsys.readouterr().err
     assert not (home / "made").exists()
 
 
 def test_a_named_model_that_is_missing_is_what_to_fetch(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["models", "check", "sam-vit-h"]) == 1
-    assert capsys.readouterr().out.startswith("model 'sam-vit-h': not found; fetch model.safetensors")
+    out = capsys.readouterr().out
+    assert out.startswith("model 'sam-vit-h': not found below") and "run: su3d-bench fetch models sam-vit-h" in out
 
 
 @needs_models

@@ -14,7 +14,7 @@ import pytest
 from bombs import MIB, Member, deflated, gzip_of, zip_of
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.fetching.archives import unpack_tar_gz, unpack_zip
+from su3d_bench.fetching.archives import members, unpack_tar_gz, unpack_zip
 
 LONG = "a" * 150 + "/" + "b" * 150
 
@@ -48,6 +48,23 @@ def tarred(place: Path, contents: dict[str, bytes], form: int = tarfile.GNU_FORM
             info.size, info.type, info.linkname = (len(content) if kind == b"0" else 0), kind, "/etc/passwd"
             archive.addfile(info, io.BytesIO(content))
     return place
+
+
+def test_a_file_without_a_name_is_refused(tmp_path: Path) -> None:
+    nameless = tmp_path / "a.zip"
+    nameless.write_bytes(zipped(tmp_path / "b.zip", {"x": b"1"}).read_bytes().replace(b"x", b"."))
+    with pytest.raises(DataError, match="holds a file without a name"):
+        unpack_zip(nameless, tmp_path / "out", of_room, silent)
+    with pytest.raises(DataError, match="holds a file without a name"):
+        unpack_tar_gz([tarred(tmp_path / "a.tar.gz", {".": b"1"})], tmp_path / "out", of_room, silent)
+
+
+def test_a_zip_archive_with_an_empty_name_is_listed(tmp_path: Path) -> None:
+    """Where ``zipfile.ZipInfo.is_dir`` of Python 3.11 fails."""
+    archive = tmp_path / "a.zip"
+    with zipfile.ZipFile(archive, "w") as file:
+        file.writestr(zipfile.ZipInfo(""), b"1")
+    assert members(archive) == [("", 1)]
 
 
 def test_wanted_members_of_a_zip_archive_come_and_no_others(tmp_path: Path) -> None:

@@ -4,16 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from su3d_bench.datasets.replica.folders import RENDER_URL
 from su3d_bench.fetching.sources import built_in, check_address
-from su3d_bench.perception.models.catalogue import MODELS, ModelForm
-
-
-def form_of(name: str) -> ModelForm:
-    """The form of a model that the table's entry is."""
-    source, forms = built_in().named(name, "models"), MODELS[name].forms
-    kind = "transformers" if source.hub is not None and name != "ram-plus" else "original"
-    return next(form for form in forms if form.form == kind)
+from su3d_bench.perception.models.catalogue import MODELS
 
 
 def test_every_model_can_be_fetched_and_nothing_else_is_called_one() -> None:
@@ -22,7 +14,7 @@ def test_every_model_can_be_fetched_and_nothing_else_is_called_one() -> None:
 
 @pytest.mark.parametrize("name", list(MODELS))
 def test_the_table_says_of_a_model_what_the_catalogue_says(name: str) -> None:
-    source, form = built_in().named(name), form_of(name)
+    source, form = built_in().named(name), MODELS[name].fetched
     assert source.licence.name == MODELS[name].licence
     assert source.n_bytes is not None and abs(source.n_bytes / 1e6 - form.size_mb) < 2
     if source.hub is not None:
@@ -34,8 +26,7 @@ def test_the_table_says_of_a_model_what_the_catalogue_says(name: str) -> None:
     assert stated == dict(form.sha256)
 
 
-def test_replica_comes_from_the_address_that_the_dataset_names() -> None:
-    assert built_in().named("replica-frames").files[0].address == RENDER_URL
+def test_replicas_release_is_all_of_its_parts() -> None:
     assert [file.n_bytes for file in built_in().named("replica-meshes").files] == [2_000_000_000] * 16 + [1_859_047_808]
 
 

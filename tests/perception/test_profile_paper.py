@@ -285,7 +285,7 @@ def test_without_models_one_line_says_what_to_fetch(no_models: Path) -> None:
     with pytest.raises(ModelMissing) as caught:
         built(config_of(no_models), no_models)
     line = str(caught.value)
-    assert "\n" not in line and "https://huggingface.co/facebook/sam-vit-huge" in line and "SU3D_MODELS" in line
+    assert "\n" not in line and "run: su3d-bench fetch models sam-vit-h" in line
     ram = PerceptionConfig.model_validate({"paper": {"tagger": "ram-onnx"}})
     assert ram.paper.tagger == "ram-onnx"
 
@@ -295,15 +295,15 @@ def test_the_command_line_says_it_too(no_models: Path, monkeypatch: pytest.Monke
     words = ["run", "--scenes", "rooms/living0", "--profile", "paper", "--limit", "1", "--out", "out", "--quiet"]
     assert main(words) == 2
     said = capsys.readouterr().err
-    assert said.startswith("su3d-bench: model 'clip-vit-h-14': not found; fetch") and len(said.splitlines()) == 1
+    assert said.startswith("su3d-bench: model 'clip-vit-h-14': not found below") and len(said.splitlines()) == 1
     assert not (no_models / "out").exists(), "no frame was read"
     assert main([*words, "--set", "perception.models.encoder=embedded"]) == 2
-    assert "model 'sam-vit-h': not found; fetch" in capsys.readouterr().err
+    assert "run: su3d-bench fetch models sam-vit-h" in capsys.readouterr().err
 
 
 def test_a_tagger_that_was_asked_for_is_looked_for_before_any_frame(models: Path, no_models: Path) -> None:
     check_models("paper", config_of(models))
-    with pytest.raises(ModelMissing, match=r"model 'ram-plus': not found; make it: onnx/export\.py"):
+    with pytest.raises(ModelMissing, match=r"model 'ram-plus': not found .*run: su3d-bench models export ram-plus"):
         check_models("paper", config_of(models, tagger="ram-onnx"))
     other = PerceptionConfig.model_validate({"models": {"folder": no_models, "encoder": "clip-vit-b-32"}})
     with pytest.raises(ModelMissing, match="model 'clip-vit-b-32': not found"):

@@ -53,7 +53,7 @@ def test_every_entry_is_complete() -> None:
         assert all(len(digest) == 64 for form in entry.forms for digest in form.sha256.values())
         assert all(form.architecture for form in entry.forms if form.form == "open_clip")
         # float32: four bytes a parameter, which is what the published files hold
-        published = entry.forms[0].size_mb
+        published = entry.forms[-1 if name == "ram-plus" else 0].size_mb  # of RAM++ the file holds more than runs
         assert abs(entry.memory_mb(4) - published) / published < 0.05, name
     assert {name for names in PROFILE_MODELS.values() for name in names} <= set(MODELS)
 
@@ -130,7 +130,7 @@ def test_an_original_checkpoint_may_lie_in_the_folder_of_models_itself(home: Pat
 
 def test_a_form_that_is_not_read_does_not_count_as_found(home: Path) -> None:
     fill(home / "models", ("groundingdino_swint_ogc.pth",))
-    with pytest.raises(ModelMissing, match=r"fetch model\.safetensors"):
+    with pytest.raises(ModelMissing, match="fetch models grounding-dino"):
         locate("grounding-dino")
     assert locate("grounding-dino", ("original",)).folder == home / "models"
 
@@ -142,10 +142,10 @@ def test_a_configured_path_is_used_and_nothing_beside_it(home: Path) -> None:
     assert locate("clip-vit-b-32", path=mine / "model.safetensors").folder == mine
     (mine / "config.json").unlink()
     with pytest.raises(
-        ModelMissing, match=r"mine lacks config\.json; fetch model\.safetensors or pytorch_model\.bin, config\.json"
+        ModelMissing, match=r"mine lacks config\.json; run: su3d-bench fetch models clip-vit-b-32 \(0\.6 GB\)"
     ):
         locate("clip-vit-b-32", path=mine)
-    with pytest.raises(ModelMissing, match=r"there is no .*absent; mend the path or fetch"):
+    with pytest.raises(ModelMissing, match=r"there is no .*absent; mend the path, or run: su3d-bench fetch"):
         locate("clip-vit-b-32", path=home / "absent")
     with pytest.raises(ConfigError, match=r"is no file that it is read from; name a folder with model\.safetensors"):
         locate("clip-vit-b-32", path=fill(home / "other", ("x.bin",)) / "x.bin")
@@ -153,15 +153,16 @@ def test_a_configured_path_is_used_and_nothing_beside_it(home: Path) -> None:
     assert locate("sam-vit-h", path=renamed).weights == renamed
 
 
-def test_a_missing_model_is_one_line_with_what_to_fetch_from_where_into_which_folder(home: Path) -> None:
+def test_a_missing_model_is_one_line_with_the_command_that_brings_it(home: Path) -> None:
     with pytest.raises(ModelMissing) as caught:
         locate("clip-vit-h-14")
     assert str(caught.value) == (
-        "model 'clip-vit-h-14': not found; fetch model.safetensors or pytorch_model.bin, config.json, "
-        "preprocessor_config.json, tokenizer.json (3.9 GB) from "
-        "https://huggingface.co/laion/CLIP-ViT-H-14-laion2B-s32B-b79K into "
-        f"{home / 'models' / 'clip-vit-h-14'}, or set SU3D_MODELS"
+        f"model 'clip-vit-h-14': not found below {home / 'models'}; run: su3d-bench fetch models clip-vit-h-14 (3.9 GB)"
     )
+    with pytest.raises(ModelMissing, match=r"put open_clip_model\.safetensors of https://huggingface\.co/laion/"):
+        locate("clip-vit-h-14", ("open_clip",))  # which is not fetched
+    with pytest.raises(ModelMissing, match="run: su3d-bench models export ram-plus --checkout DIR"):
+        locate("ram-plus", ("onnx",))
 
 
 def test_an_unknown_name_or_form_is_one_line() -> None:

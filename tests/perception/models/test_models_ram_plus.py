@@ -62,9 +62,9 @@ def test_the_tagger_names_what_is_above_each_tags_own_threshold(place: Path) -> 
     tagger = _tagger(PaperConfig(tagger="ram-onnx"), models, None, "cpu")  # type: ignore[arg-type]
     assert isinstance(tagger, OnnxRamTagger)
     session = tagger._session()
-    (probability,) = session.run(["probability"], {"image": made_images()[:1]})
+    (logit,) = session.run(["logit"], {"image": made_images()[:1]})
     _, other = session.run(None, {"image": made_images()[1:2]})
-    assert (probability != other).any(), "the image is looked at"
+    assert (logit != other).any(), "the image is looked at"
     tags = tagger.tags(RGB)
     assert "3D glasses" in tags and "lamp" not in tags, "thresholds of 0 and 1"
     assert main(["models", "check", "ram-plus", "--set", f"perception.models.folder={place / 'models'}"]) == 0
@@ -84,37 +84,38 @@ def test_an_export_whose_files_were_changed_is_not_run(place: Path, tmp_path: Pa
 class Session:
     """Answers as ONNX Runtime does for an exported RAM++, beside the truth by ``gap``."""
 
-    def __init__(self, probability: np.ndarray[Any, Any], gap: float = 0.0, wrong_tag: int | None = None) -> None:
-        self.rows = iter(probability.astype(np.float32))
+    def __init__(self, logit: np.ndarray[Any, Any], gap: float = 0.0, wrong_tag: int | None = None) -> None:
+        self.rows = iter(logit.astype(np.float32))
         self.gap, self.wrong_tag = gap, wrong_tag
 
     def run(self, names: list[str], fed: dict[str, Any]) -> list[np.ndarray[Any, Any]]:
         row = next(self.rows) + np.float32(self.gap)
-        tags = (row > np.float32(THRESHOLDS)).astype(np.float32)
+        tags = (1 / (1 + np.exp(-row)) > np.float32(THRESHOLDS)).astype(np.float32)
         if self.wrong_tag is not None:
             tags[self.wrong_tag] = 1 - tags[self.wrong_tag]
         return [tags[None], row[None]]
 
 
-PROBABILITY = np.array([[0.2, 0.9, 0.50005, 0.3, 0.9]], np.float32)
+TAG = np.array([[False, True, True, False, True]])
+LOGIT = np.array([[-1.4, 2.2, 0.0002, -0.8, 2.2]], np.float32)
 
 
 @pytest.mark.parametrize(
     ("gap", "wrong_tag", "said"),
     [
-        (2e-4, None, "differ between torch and ONNX Runtime by 2.00e-04; tolerance 1e-04"),
+        (2e-3, None, "differ between torch and ONNX Runtime by 2.00e-03; tolerance 1e-03"),
         (float("nan"), None, "by nan; tolerance"),
         (0.0, 1, "1 tags differ between torch and ONNX Runtime"),
     ],
 )
 def test_answers_beyond_the_tolerance_are_refused(gap: float, wrong_tag: int | None, said: str) -> None:
-    session = Session(PROBABILITY, gap, wrong_tag)
+    session = Session(LOGIT, gap, wrong_tag)
     with pytest.raises(CheckFailed, match=said):
-        compared(session, made_images()[:1], PROBABILITY, np.float32(THRESHOLDS))
+        compared(session, made_images()[:1], LOGIT, TAG, np.float32(THRESHOLDS))
 
 
 def test_a_last_bit_may_decide_a_tag_within_the_tolerance_of_its_threshold() -> None:
-    parity, n_undecided = compared(Session(PROBABILITY, 0.0, 2), made_images()[:1], PROBABILITY, np.float32(THRESHOLDS))
+    parity, n_undecided = compared(Session(LOGIT, 0.0, 2), made_images()[:1], LOGIT, TAG, np.float32(THRESHOLDS))
     assert parity.max_abs_difference == 0.0 and n_undecided == 1
 
 

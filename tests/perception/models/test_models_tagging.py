@@ -195,12 +195,14 @@ def test_weights_that_lack_a_part_of_ram_are_refused(ram_package: list[dict[str,
     import torch
 
     files = ram_files(tmp_path, {"vision_multi.weight": torch.zeros(2, 3)})
-    with pytest.raises(DataError, match=r"lacks 1 tensors, such as tagging_head\.bias; fetch it from https"):
+    with pytest.raises(DataError, match=r"lacks 1 tensors, such as tagging_head\.bias; run: su3d-bench fetch"):
         load_ram(files, "cpu")
 
 
 def test_without_the_package_ram_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ram", None)
     files = ram_files(tmp_path, {})
-    with pytest.raises(ModelMissing, match=r"its package is not installed .*set perception\.paper\.tagger to words"):
+    with pytest.raises(
+        ModelMissing, match=r"its package is not installed; run .* or set perception\.paper\.tagger to words"
+    ):
         load_ram(files, "cpu")

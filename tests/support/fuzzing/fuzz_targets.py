@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fuzz_targets_counts
 import fuzz_targets_datasets
+import fuzz_targets_fetching
 import fuzz_targets_perception
 import fuzz_targets_predictions
 import fuzz_targets_runs
@@ -13,6 +14,7 @@ TARGETS = {
     for one in (
         *fuzz_targets_counts.TARGETS,
         *fuzz_targets_datasets.TARGETS,
+        *fuzz_targets_fetching.TARGETS,
         *fuzz_targets_perception.TARGETS,
         *fuzz_targets_predictions.TARGETS,
         *fuzz_targets_runs.TARGETS,

@@ -105,7 +105,7 @@ class RamManifest(OnnxManifest):
     """The manifest of an exported RAM++.
 
     ``code``: SHA-256 of the authors' files by name; ``made_with``: versions of the packages that ran them;
-    ``n_undecided``: tags of the compared images whose probability is within the tolerance of their threshold.
+    ``n_undecided``: tags of the compared images that lie within the tolerance of their threshold.
     """
 
     FORMAT = "su3d-bench onnx tagger 1"

@@ -4,8 +4,8 @@
 
 ``su3d-bench models export ram-plus`` starts it where torch, transformers 4 and onnx are; of this program it imports
 nothing. FOLDER holds ``images.npz`` (``images``, float32, N x 3 x 384 x 384). It gets ``ram_plus.onnx``,
-``ram_tag_list.txt``, ``versions.json`` and ``answers.npz``: ``probability`` (N, T), what the authors' ``generate_tag``
-compared with ``threshold`` (T,). The last line on stderr says what went wrong.
+``ram_tag_list.txt``, ``versions.json`` and ``answers.npz``: ``logit`` (N, T) and ``tag`` (N, T), whether the
+authors' ``generate_tag`` names it, and ``threshold`` (T,). The last line on stderr says what went wrong.
 
 Of recognize-anything (read at 7cb804a) only the files are run that RAM++ with a Swin encoder needs. What they import
 and the network does not use once it is trained has a stand-in: timm's initialisation and drop path, SciPy's resizing
@@ -103,33 +103,34 @@ def fill(model: Any, tensors: Mapping[str, Any]) -> None:
         raise ValueError(f"lacks {len(missing)} tensors, such as {missing[0][:80]}")
 
 
-def own_answers(model: Any, images: Any) -> np.ndarray[Any, Any]:
-    """Probabilities (N, T) that the authors' ``generate_tag`` computes for ``images``, one image at a time.
+def own_answers(model: Any, images: Any) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """The last layer's output (N, T) in the authors' ``generate_tag`` for ``images``, and which tags (N, T) it names.
 
     Raises ``ValueError`` where the tags that it names are not those whose probability is above their threshold.
     """
     import torch
 
-    logits: list[Any] = []
-    hook = model.fc.register_forward_hook(lambda _module, _inputs, output: logits.append(output))
-    probabilities = []
+    seen: list[Any] = []
+    hook = model.fc.register_forward_hook(lambda _module, _inputs, output: seen.append(output))
+    logits, tags = [], []
     try:
         for image in images:
-            logits.clear()
+            seen.clear()
             with torch.inference_mode():
                 named = model.generate_tag(image[None])[0][0]
-            probability = torch.sigmoid(logits[0].reshape(-1))
-            above = (probability > model.class_threshold).numpy()
+            logit = seen[0].reshape(-1)
+            above = (torch.sigmoid(logit) > model.class_threshold).numpy()
             if named != " | ".join(np.asarray(model.tag_list)[above]):
                 raise ValueError("generate_tag names other tags than those above their thresholds: another version")
-            probabilities.append(probability.numpy())
+            logits.append(logit.numpy())
+            tags.append(above)
     finally:
         hook.remove()
-    return np.stack(probabilities)
+    return np.stack(logits), np.stack(tags)
 
 
 def module_to_export(model: Any) -> Any:
-    """``image`` (1, 3, 384, 384) to ``tag`` (1, T), 1 where it holds, and its ``probability`` (1, T), by ``model``.
+    """``image`` (1, 3, 384, 384) to ``tag`` (1, T), 1 where it holds, and ``logit`` (1, T), by ``model``.
 
     Each class has D descriptions, whose features are weighted by how much they look like the image; this product is
     formed class by class, so that the table of features stands in the file once.
@@ -160,8 +161,8 @@ def module_to_export(model: Any) -> Any:
                 return_dict=False,
                 mode="tagging",
             )[0]
-            probability = torch.sigmoid(self.model.fc(found)[..., 0])
-            return (probability > self.threshold).to(probability.dtype), probability
+            logit = self.model.fc(found)[..., 0]
+            return (torch.sigmoid(logit) > self.threshold).to(logit.dtype), logit
 
     return Tagging().eval()
 
@@ -176,7 +177,7 @@ def export(model: Any, image: Any, path: Path, opset: int) -> None:
             (image,),
             str(path),
             input_names=["image"],
-            output_names=["tag", "probability"],
+            output_names=["tag", "logit"],
             opset_version=opset,
             do_constant_folding=True,
             dynamo=False,
@@ -202,8 +203,8 @@ def export_all(checkout: Path, weights: Path, folder: Path, opset: int) -> None:
     fill(model, read_tensors(weights))
     with np.load(folder / "images.npz", allow_pickle=False) as archive:
         images = torch.from_numpy(archive["images"])
-    threshold = model.class_threshold.numpy()
-    np.savez(folder / "answers.npz", probability=own_answers(model, images), threshold=threshold)
+    logit, tag = own_answers(model, images)
+    np.savez(folder / "answers.npz", logit=logit, tag=tag, threshold=model.class_threshold.numpy())
     export(model, images[:1], folder / "ram_plus.onnx", opset)
     tags = "".join(f"{tag}\n" for tag in model.tag_list)
     (folder / "ram_tag_list.txt").write_text(tags, encoding="utf-8")
