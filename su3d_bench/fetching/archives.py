@@ -75,9 +75,9 @@ def unpack_zip(archive: Path, folder: Path, goes_to: Place, watch: Watch) -> int
 
 def unpack_tar_gz(parts: Sequence[Path], folder: Path, goes_to: Place, watch: Watch) -> int:
     """As ``unpack_zip``, of a packed tar archive in ``parts``, which are read one after another as one stream."""
-    n_packed = sum(part.stat().st_size for part in parts)
     n_found, done = 0, set[PurePosixPath]()
     with _reading(parts[0]), ExitStack() as stack:
+        n_packed = sum(part.stat().st_size for part in parts)
         packed = stack.enter_context(io.BufferedReader(_Joined(parts, watch, n_packed), PIECE))  # type: ignore[type-var]
         unpacked = gzip.GzipFile(fileobj=packed, mode="rb")
         stack.callback(unpacked.close)

@@ -110,7 +110,7 @@ def work_of(run: AskedRun) -> Work:
     """How many updates each scene and method of a run will have."""
     limit = int(dict(run.values).get("limit") or 0)
     n_updates: dict[tuple[str, str], int] = {}
-    scenes = list(_scenes(run))
+    scenes = list(scene_names(run.dataset, run.scenes))
     for method in run.methods:
         stride = _stride(run, method)
         for scene in scenes:
@@ -159,14 +159,14 @@ def _known_scenes(dataset: Any) -> tuple[str, ...]:
         return ()
 
 
-def _scenes(run: AskedRun) -> Iterator[str]:
-    """The scenes that a run names; a group's members, and what of a pattern is here."""
+def scene_names(dataset_name: str, addresses: Sequence[str]) -> Iterator[str]:
+    """The scenes that ``addresses`` of a dataset name; a group's members, and what of a pattern is here."""
     import fnmatch
 
-    dataset = _dataset(run.dataset)
-    for address in run.scenes:
+    dataset = _dataset(dataset_name)
+    groups = dataset.groups() if isinstance(dataset, HasGroups) else {}
+    for address in addresses:
         _, name = split_address(address)
-        groups = dataset.groups() if isinstance(dataset, HasGroups) else {}
         if any(character in name for character in "*?["):
             yield from (scene for scene in _known_scenes(dataset) if fnmatch.fnmatchcase(scene, name))
         else:
@@ -185,7 +185,7 @@ def _data(run: AskedRun) -> Iterator[Need]:
     dataset = _dataset(run.dataset)
     known = _known_scenes(dataset)
     size = scene_size(run.dataset)
-    for scene in _scenes(run):
+    for scene in scene_names(run.dataset, run.scenes):
         address = f"{run.dataset}/{scene}"
         fault = "" if scene in known else f"not below {data_root()}"
         if not fault:

@@ -58,6 +58,13 @@ def add_parser(verbs: Any) -> None:
         metavar="METHOD=DIR",
         help="of methods that are none here, as evaluate takes",
     )
+    parser.add_argument(
+        "--text-features",
+        nargs="+",
+        default=[],
+        metavar="METHOD=FILE",
+        help="what the encoder of its predictions makes of texts, as evaluate --text-features",
+    )
     parser.add_argument("--profile", help="whose perception (default: the recipe's)")
     parser.add_argument("--encoder", help="of all runs, such as embedded (default: the recipe's)")
     parser.add_argument("--device", help="cpu, cuda or cuda:1 (default: cpu)")
@@ -133,11 +140,11 @@ def _reproduce(
     recipe: Recipe, experiments: Sequence[Experiment], asked: Asked, out: Path, arguments: argparse.Namespace
 ) -> int:
     from su3d_bench.reproducing.asked import asked_runs
-    from su3d_bench.reproducing.predictions import named_predictions
+    from su3d_bench.reproducing.predictions import evaluate_predictions, named_predictions
     from su3d_bench.reproducing.preflight import preflight
 
     runs = asked_runs(recipe, experiments, asked)
-    named = named_predictions(experiments, arguments.predictions)
+    named = named_predictions(experiments, arguments.predictions, arguments.text_features)
     known = preflight(runs, out)
     if not known.missing and arguments.probe:
         _probe(runs, out, arguments)
@@ -154,10 +161,9 @@ def _reproduce(
             f"reproduce {recipe.name}: {first.kind} {first.name} is missing{more}{how}; --dry-run lists all, "
             "--rehearse does without"
         )
+    folders = evaluate_predictions(named, experiments, asked, out)  # first: it takes minutes, the runs hours
     failures = [failure for run in runs for failure in _carry_out(run, out, arguments)]
-    from su3d_bench.reproducing.predictions import evaluate_predictions
-
-    folders = [run.folder(out) for run in runs] + evaluate_predictions(named, experiments, asked, out)
+    folders = [run.folder(out) for run in runs] + folders
     _answer(recipe, experiments, folders, out, arguments)
     if failures:
         raise RunIncomplete(f"reproduce {recipe.name}: {counted(len(failures), 'scene')} failed; {failures[0]}")

@@ -90,7 +90,7 @@ class Session:
 
     def run(self, names: list[str], fed: dict[str, Any]) -> list[np.ndarray[Any, Any]]:
         row = next(self.rows) + np.float32(self.gap)
-        tags = (1 / (1 + np.exp(-row)) > np.float32(THRESHOLDS)).astype(np.float32)
+        tags = (1 / (1 + np.exp(-row)) > np.array(THRESHOLDS, np.float32)).astype(np.float32)
         if self.wrong_tag is not None:
             tags[self.wrong_tag] = 1 - tags[self.wrong_tag]
         return [tags[None], row[None]]
@@ -111,11 +111,13 @@ LOGIT = np.array([[-1.4, 2.2, 0.0002, -0.8, 2.2]], np.float32)
 def test_answers_beyond_the_tolerance_are_refused(gap: float, wrong_tag: int | None, said: str) -> None:
     session = Session(LOGIT, gap, wrong_tag)
     with pytest.raises(CheckFailed, match=said):
-        compared(session, made_images()[:1], LOGIT, TAG, np.float32(THRESHOLDS))
+        compared(session, made_images()[:1], LOGIT, TAG, np.array(THRESHOLDS, np.float32))
 
 
 def test_a_last_bit_may_decide_a_tag_within_the_tolerance_of_its_threshold() -> None:
-    parity, n_undecided = compared(Session(LOGIT, 0.0, 2), made_images()[:1], LOGIT, TAG, np.float32(THRESHOLDS))
+    parity, n_undecided = compared(
+        Session(LOGIT, 0.0, 2), made_images()[:1], LOGIT, TAG, np.array(THRESHOLDS, np.float32)
+    )
     assert parity.max_abs_difference == 0.0 and n_undecided == 1
 
 

@@ -1,0 +1,82 @@
+"""Predictions of a method that is none here, in the files that its program writes, put into its row of the table."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cloud_files import write_hovsg
+
+from su3d_bench.cli.main import main
+from su3d_bench.core.config import Settings
+from su3d_bench.core.errors import ConfigError
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.reproducing.predictions import Given, named_predictions
+from su3d_bench.reproducing.recipe import load_recipe
+from su3d_bench.runs.parts import build_dataset, part_of
+
+ROOM = ["--rooms", "bedroom0", "--room-settings", "n_frames=20", "width=160", "height=120", "mesh_spacing_m=0.1"]
+WORDS = ["reproduce", "hovsg", "--rehearse", *ROOM, "--jobs", "1", "--limit", "1", "--quiet"]
+
+
+def test_maps_of_hovsg_fill_its_row_and_those_of_scenes_beside_do_not_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+    out, maps = tmp_path / "out", tmp_path / "maps"
+    maps.mkdir()
+    named = ["--predictions", f"HOV-SG={maps}", "--text-features", f"HOV-SG={tmp_path / 'texts.npz'}"]
+    np.savez(tmp_path / "texts.npz", names=np.array(["chair"]), features=np.eye(1, 3))
+    assert main([*WORDS, "--out", str(out), *named]) == 2  # the rooms are there now
+    assert "maps: " in capsys.readouterr().err and not (out / "runs/replica").exists(), "before any run"
+
+    rules = load_protocol("replica-hovsg")
+    dataset = build_dataset(part_of("dataset", "replica", Settings()), out / "data")
+    truth = dataset.ground_truth("bedroom0", rules.ground_truth)
+    ids = [one.id for one in rules.classes if (truth.semantic == one.id).any()]
+    clouds = {k: truth.points[truth.semantic == one] for k, one in enumerate(ids)}
+    texts = list(dict.fromkeys(text for one in rules.classes for text in rules.texts_of(one.name)))
+    features = np.eye(len(texts), 1024, dtype=np.float32)
+    np.savez(tmp_path / "texts.npz", names=np.array(texts), features=features, encoder=np.array("made"))
+    names = {one.id: one.name for one in rules.classes}
+    rows = np.stack([features[texts.index(rules.texts_of(names[one])[0])] for one in ids])
+    for scene in ("bedroom0", "bedroom1"):
+        (maps / scene).mkdir()
+        write_hovsg(maps / scene, clouds, rows)
+
+    assert main([*WORDS, "--out", str(out), *named]) == 2
+    assert "no ground truth for the predicted scene 'bedroom1'" in capsys.readouterr().err
+    (maps / "bedroom1").rename(tmp_path / "elsewhere")
+    assert main([*WORDS, "--out", str(out), *named]) == 0
+    cells = json.loads((out / "compared.json").read_text())["cells"]
+    own = [cell for cell in cells if cell["method"] == "HOV-SG"]
+    assert own and all(cell["measured"] is not None and cell["measured"] > 90 for cell in own), "the truth itself"
+    assert (out / "bundle.zip").is_file()
+
+
+@pytest.mark.parametrize(
+    ("predictions", "features", "said"),
+    [
+        (["HOV-SG"], [], "--predictions HOV-SG: expected METHOD=DIR"),
+        (["HOVSG={}"], [], "this recipe takes none of 'HOVSG'; did you mean 'HOV-SG'?"),
+        (["HOV-SG={}/none"], [], "--predictions HOV-SG: there is no .*none"),
+        (["HOV-SG={}", "HOV-SG={}"], [], "'HOV-SG' is given twice"),
+        (["HOV-SG={}", "OVO-mapping={}/../{name}"], [], "was given for HOV-SG; each method has a folder of its own"),
+        ([], ["HOV-SG={}"], "--text-features: this recipe takes none of 'HOV-SG'; name its --predictions too"),
+        (["HOV-SG={}"], ["HOV-SG={}/none.npz"], "--text-features HOV-SG: there is no .*none.npz"),
+    ],
+)
+def test_what_predictions_cannot_be_taken_is_one_line(
+    predictions: list[str], features: list[str], said: str, tmp_path: Path
+) -> None:
+    filled = [[text.format(tmp_path, name=tmp_path.name) for text in texts] for texts in (predictions, features)]
+    with pytest.raises(ConfigError, match=said):
+        named_predictions(load_recipe("ovo").experiments, *filled)
+
+
+def test_each_method_has_its_folder_and_the_texts_of_its_encoder(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    given = named_predictions(load_recipe("ovo").experiments, [f"HOV-SG={tmp_path}", f"OpenNeRF={tmp_path / 'a'}"])
+    assert given == {"HOV-SG": Given(tmp_path), "OpenNeRF": Given(tmp_path / "a")}
