@@ -21,7 +21,7 @@ ROOM = ["--rooms", "bedroom0", "--room-settings", "n_frames=20", "width=160", "h
 WORDS = ["reproduce", "hovsg", "--rehearse", *ROOM, "--jobs", "1", "--limit", "1", "--quiet"]
 
 
-def test_maps_of_hovsg_fill_its_row_and_those_of_scenes_beside_do_not_count(
+def test_maps_of_hovsg_fill_its_row_and_a_scene_of_another_name_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))

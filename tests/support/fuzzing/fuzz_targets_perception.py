@@ -88,6 +88,18 @@ def _model_settings(name: str, of: Callable[[Any], tuple[Any, Callable[[Path], o
     return make
 
 
+def _tagger_manifest(folder: Path) -> Read:
+    from su3d_bench.perception.models.masks.tagging import RAM_MODEL, RAM_TAG_LIST, RamManifest
+
+    digests = {RAM_MODEL: "0" * 64, RAM_TAG_LIST: "1" * 64}
+    parity = {"output": "logit", "n_values": 15, "max_abs_difference": 1e-6, "min_cosine": 1.0}
+    content = {"format": RamManifest.FORMAT, "name": "ram-plus", "files": digests, "source": {"form": "original"}}
+    content |= {"opset": 17, "parity": [parity], "n_tags": 5, "code": {"ram/models/bert.py": "2" * 64}}
+    path = folder / "manifest.json"
+    path.write_text(json.dumps({**content, "made_with": {"torch": "2.13.0"}, "n_undecided": 0}))
+    return lambda: RamManifest.read(path)
+
+
 def _kept_replies(folder: Path) -> Read:
     from test_language_client import ask
 
@@ -180,6 +192,7 @@ TARGETS = (
         _model_settings("preprocessor_config.json", lambda one: (one.PREPROCESSOR, one.encoder_spec)),
         ("preprocessor_config.json",),
     ),
+    Target("tagger manifest", _tagger_manifest, ("*",)),
     Target("kept replies", _kept_replies, ("language/*.json",)),
     Target("refined names", _refined_names, ("**/*.json",)),
     Target("completion", _completion, ("answer.json",)),
