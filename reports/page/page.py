@@ -52,11 +52,14 @@ def page_html(
     )
 
 
-def rendered(folder: Path, script: str, **values: Any) -> str:
-    """The template of ``folder`` with its style: nothing loads, goes out or runs but what stands in it, by digest."""
+def rendered(folder: Path, script: str, *, begins_with: str = "", **values: Any) -> str:
+    """The template of ``folder`` with its style: nothing loads, goes out or runs but what stands in it, by digest.
+
+    ``begins_with``: what stands before the style of the folder, such as that of another page.
+    """
     from jinja2 import Environment
 
-    style = _file(folder / STYLE)
+    style = begins_with + _file(folder / STYLE)
     policy = (
         f"default-src 'none'; script-src '{_digest(script)}'; style-src '{_digest(style)}'; img-src data:; "
         "base-uri 'none'; form-action 'none'"

@@ -69,6 +69,11 @@ class Entry:
     def scenes(self) -> tuple[str, ...]:
         return tuple(scene for scene, _ in self.data)
 
+    @property
+    def ranking(self) -> tuple[str, str, tuple[str, ...]]:
+        """What rows of one ranking share: two people may call their own rules alike, so the rules' digest too."""
+        return self.protocol, self.digest, self.scenes
+
 
 @dataclass(frozen=True)
 class Refused:
@@ -101,7 +106,7 @@ def leaderboard(folder: Path, protocols: Sequence[str] = (), *, with_ranks: bool
         except Su3dError as error:
             refused.append(Refused(name, "run", printable(str(error), 300)))
             continue
-        for each in _entries(name, run, protocols):
+        for each in entries_of(name, run, protocols):
             (entries if isinstance(each, Entry) else refused).append(each)  # type: ignore[arg-type]
     if not entries and not refused:
         raise ConfigError(
@@ -109,13 +114,12 @@ def leaderboard(folder: Path, protocols: Sequence[str] = (), *, with_ranks: bool
             "of predictions made elsewhere"
         )
     boards: list[tuple[Entry, ...]] = []
-    # Two people may call their own rules alike: a ranking is of one set of rules.
-    for key in dict.fromkeys((entry.protocol, entry.digest, entry.scenes) for entry in entries):
-        ranked_together = [entry for entry in entries if (entry.protocol, entry.digest, entry.scenes) == key]
+    for key in dict.fromkeys(entry.ranking for entry in entries):
+        ranked_together = [entry for entry in entries if entry.ranking == key]
         alike, others = _of_same_data(ranked_together)
         alike, unlike = _of_as_many_labels(alike)
         others += unlike
-        board = tuple(sorted(alike, key=_rank))
+        board = in_order(alike)
         boards.append(ranked(board) if with_ranks else board)
         refused += others
     return Leaderboard(tuple(boards), tuple(refused))
@@ -138,7 +142,8 @@ def runs_below(folder: Path) -> Iterator[Path]:
             yield Path(path)
 
 
-def _entries(name: str, run: FinishedRun, protocols: Sequence[str]) -> Iterator[Entry | Refused]:
+def entries_of(name: str, run: FinishedRun, protocols: Sequence[str] = ()) -> Iterator[Entry | Refused]:
+    """Each number of ``run``, called ``name``, that may stand in a ranking, or why not; of ``protocols`` or all."""
     for (method, protocol), record in run.results.items():
         if protocols and protocol not in protocols:
             continue
@@ -218,6 +223,11 @@ def _of_as_many_labels(entries: Sequence[Entry]) -> tuple[list[Entry], list[Refu
         if entry.labels != common
     ]
     return [entry for entry in entries if entry.is_ceiling or entry.labels == common], others
+
+
+def in_order(entries: Sequence[Entry]) -> tuple[Entry, ...]:
+    """The best by the first headline metric first; what was told the truth last."""
+    return tuple(sorted(entries, key=_rank))
 
 
 def _rank(entry: Entry) -> tuple[bool, float, str, str]:

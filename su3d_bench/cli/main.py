@@ -35,6 +35,7 @@ VERBS = (
     "reproduce",
     "attribute",
     "report",
+    "registry",
     "runs",
     "sheets",
     "query",

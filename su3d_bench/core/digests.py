@@ -20,7 +20,7 @@ from su3d_bench.core.system.files import file_bytes, file_text, opened
 
 PACKAGE_ROOT = Path(__file__).resolve().parents[1]
 # What shows numbers and moves none; everything else of the package counts, in whatever folder it stands.
-ONLY_SHOWN = ("analysis", "api", "cli", "fetching", "reports", "sheets")
+ONLY_SHOWN = ("analysis", "api", "cli", "fetching", "reports", "reproducing", "sheets")
 # No part of the program: what Python and file managers leave, texts for people, what type checkers read.
 NO_CODE = ("__pycache__", ".", ".pyc", ".md", "py.typed")
 NUMERIC_PACKAGES = ("numpy", "scipy", "scikit-learn", "opencv-python-headless", "onnxruntime", "open3d", "numba")

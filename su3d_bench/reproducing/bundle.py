@@ -1,4 +1,4 @@
-"""A reproduction as one archive: the recipe, predictions, records and counts of its runs, and their SHA-256.
+"""Runs as one archive: their predictions, records and counts with SHA-256; of a reproduction its recipe and tables too.
 
 A zip without compression, its members in the order of their names, with one date and one mode: the same folder gives
 the same bytes on every machine. What is in a prediction is compressed already.
@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 import stat
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO, Annotated, Literal
@@ -33,6 +34,7 @@ DATE = (1980, 1, 1, 0, 0, 0)  # the first that a zip can have
 MODE = (stat.S_IFREG | 0o644) << 16
 MOST_MEMBERS = 200_000
 MOST_MANIFEST = 64 << 20
+MOST_OF_A_REMARK = 400  # characters
 PIECE = 1 << 20
 _OF_A_JOB = re.compile(r"(prediction|anytime-[0-9.e+-]+)(\.npz|\.features\.npy)|anytime-[0-9.e+-]+-counts\.npz"
                        r"|counts\.npz|updates\.csv|log\.txt|done\.json|refined_names\.json")  # fmt: skip
@@ -50,7 +52,11 @@ class Entry(BaseModel):
 
 
 class Manifest(BaseModel):
-    """What a bundle holds: ``runs`` are the folders of its runs."""
+    """What a bundle holds: ``runs`` are the folders of its runs.
+
+    ``recipe`` is empty where no recipe asked for them; ``trained_on``: what their weights were trained on, as whoever
+    made the bundle says.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -59,20 +65,47 @@ class Manifest(BaseModel):
     recipe: str
     runs: tuple[str, ...]
     files: dict[str, Entry]
+    trained_on: Annotated[str, Field(max_length=MOST_OF_A_REMARK)] = ""
 
 
 def write_bundle(place: Path, recipe: str, recipe_file: bytes, runs: Sequence[Path], out: Path) -> None:
-    """The archive of ``runs`` and of what ``out`` holds beside them at ``place``, whole or not at all."""
-    sources: dict[str, Path] = {name: out / name for name in (COMPARED, TABLES) if is_file(out / name)}
+    """The archive of the ``runs`` of a recipe and of what ``out`` holds beside them at ``place``, whole or not at all."""
+    beside = {name: out / name for name in (COMPARED, TABLES) if is_file(out / name)}
+    _write(place, runs, beside, {"recipe": recipe}, recipe_file)
+
+
+def bundle_runs(place: Path, runs: Sequence[Path], trained_on: str = "") -> None:
+    """The archive of any finished ``runs`` at ``place``; a ``StoreError`` where two of their folders share a name."""
+    whole = [Path(os.path.abspath(folder)) for folder in runs]
+    names = [folder.name for folder in whole]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise StoreError(f"two runs are called '{printable(twice, 100)}'; rename one of their folders")
+    bad = next((name for name in names if not is_safe(name)), None)
+    if bad is not None:
+        raise StoreError(f"'{printable(bad, 100)}': a run of this name is on no other system; rename its folder")
+    said = {"trained_on": printable(trained_on, MOST_OF_A_REMARK)} if trained_on else {}
+    _write(place, whole, {}, {"recipe": "", **said})
+
+
+def _write(
+    place: Path,
+    runs: Sequence[Path],
+    beside: Mapping[str, Path],
+    about: Mapping[str, str],
+    recipe_file: bytes | None = None,
+) -> None:
+    sources = dict(beside)
     names = [f"{RUNS}/{folder.name}" for folder in runs]
     for folder, name in zip(runs, names, strict=True):
         sources |= {f"{name}/{file.relative_to(folder).as_posix()}": file for file in _files_of(folder)}
     entries = {name: {"n_bytes": file.stat().st_size, "sha256": digest_file(file)} for name, file in sources.items()}
-    entries[RECIPE] = {"n_bytes": len(recipe_file), "sha256": digest_bytes(recipe_file)}
+    if recipe_file is not None:
+        entries[RECIPE] = {"n_bytes": len(recipe_file), "sha256": digest_bytes(recipe_file)}
     manifest = {
         "schema": 1,
         "program": f"su3d-bench {__version__}",
-        "recipe": recipe,
+        **about,
         "runs": sorted(names),
         "files": dict(sorted(entries.items())),
     }
@@ -80,7 +113,7 @@ def write_bundle(place: Path, recipe: str, recipe_file: bytes, runs: Sequence[Pa
     with replacing(place) as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
         archive.writestr(_member(MANIFEST), escaped_json(manifest, indent=1) + "\n")
         for name in sorted(entries):
-            if name == RECIPE:
+            if name == RECIPE and recipe_file is not None:
                 archive.writestr(_member(name), recipe_file)
             else:
                 _add(archive, name, sources[name], str(entries[name]["sha256"]))
@@ -130,8 +163,8 @@ class Unpacked:
         return tuple(self.folder / name for name in self.manifest.runs)
 
 
-def unpack(bundle: Path, into: Path) -> Unpacked:
-    """The files of ``bundle`` in the empty folder ``into``.
+def unpack(bundle: Path, into: Path, keep: Callable[[str], bool] = lambda name: True) -> Unpacked:
+    """The files of ``bundle`` in the empty folder ``into``; ``keep``: those that are written, all are looked at.
 
     A ``StoreError`` where it is no bundle, a name leads out of the folder, a file is not the one of the manifest, is
     missing or beside it, or it would unpack to more than it is.
@@ -144,7 +177,7 @@ def unpack(bundle: Path, into: Path) -> Unpacked:
             manifest = _manifest(member_bytes(archive, members[MANIFEST], allowance), where)
             _refuse_others(members, manifest, where)
             for name, entry in manifest.files.items():
-                _unpack_one(archive, members[name], entry, into, allowance, where)
+                _unpack_one(archive, members[name], entry, into if keep(name) else None, allowance, where)
     except (zipfile.BadZipFile, UnpackingError, EOFError, NotImplementedError) as error:
         raise StoreError(f"{where}: is no bundle, or damaged: {printable(str(error), 160)}") from error
     except OSError as error:
@@ -166,7 +199,7 @@ def _members(archive: zipfile.ZipFile, where: str) -> dict[str, zipfile.ZipInfo]
             raise StoreError(f"{where}: holds '{printable(name, 120)}' twice; not unpacked")
         members[name.casefold()] = info
     if MANIFEST not in members or members[MANIFEST].file_size > MOST_MANIFEST:
-        raise StoreError(f"{where}: has no {MANIFEST} of a bundle; make one with su3d-bench reproduce")
+        raise StoreError(f"{where}: has no {MANIFEST} of a bundle; make one with su3d-bench report bundle RUN")
     return {info.filename: info for info in members.values()}
 
 
@@ -212,23 +245,29 @@ def _one(names: Sequence[str]) -> str:
 
 
 def _unpack_one(
-    archive: zipfile.ZipFile, info: zipfile.ZipInfo, entry: Entry, into: Path, allowance: Allowance, where: str
+    archive: zipfile.ZipFile, info: zipfile.ZipInfo, entry: Entry, into: Path | None, allowance: Allowance, where: str
 ) -> None:
+    """``into`` None: the member is held against its entry and not written."""
     if info.file_size != entry.n_bytes:
         said = f"has {info.file_size} bytes, its manifest says {entry.n_bytes}"
         raise StoreError(f"{where}: {printable(info.filename, 120)} {said}")
     check_member(info, allowance)
-    place = into / info.filename
-    make_folder(place.parent)
-    with archive.open(info) as member, place.open("xb") as out:
-        digest = _copy(member, out)
+    if into is None:
+        with archive.open(info) as member:
+            digest = _copy(member, None)
+    else:
+        place = into / info.filename
+        make_folder(place.parent)
+        with archive.open(info) as member, place.open("xb") as out:
+            digest = _copy(member, out)
     if digest != entry.sha256:
         raise StoreError(f"{where}: {printable(info.filename, 120)} is not the file of its manifest (other SHA-256)")
 
 
-def _copy(source: IO[bytes], out: IO[bytes]) -> str:
+def _copy(source: IO[bytes], out: IO[bytes] | None) -> str:
     digest = hashlib.sha256()
     while piece := source.read(PIECE):
         digest.update(piece)
-        out.write(piece)
+        if out is not None:
+            out.write(piece)
     return digest.hexdigest()

@@ -143,7 +143,7 @@ def _one(array: NDArray[Any], k: int) -> str:
 
 def _of_maps(run: FinishedRun, folder: Path) -> Iterator[tuple[str, str, dict[str, SceneScore]]]:
     """The scores of the maps of a run that was made here or elsewhere by this program."""
-    _refuse_own_code(run)
+    refuse_own_code(run)
     encoder = encoder_of(run.folder)
     for job in _jobs(run, folder):
         run.dataset(job.scene)  # raises where the data here are others
@@ -167,7 +167,7 @@ def _jobs(run: FinishedRun, folder: Path) -> Sequence[SceneJob]:
     return [replace(job, folder=run.folder.path) for job in plan.jobs if job.scene in wanted]
 
 
-def _refuse_own_code(run: FinishedRun) -> None:
+def refuse_own_code(run: FinishedRun) -> None:
     """A ``StoreError`` where scoring would load a file of code that the bundle names."""
     asked = {name: run.settings.get((name,), ()) for name in ("methods", "scenes", "protocols")}
     for name, texts in asked.items():
@@ -178,11 +178,18 @@ def _refuse_own_code(run: FinishedRun) -> None:
                 raise StoreError(f"names somebody's own '{printable(str(text), 80)}', which a bundle does not bring")
 
 
+def refuse_own_truth(run: FinishedRun) -> None:
+    """A ``StoreError`` where predictions were held against files of ground truth in place of a dataset."""
+    truth = run.record.ground_truth
+    if run.record.predictions and (truth is None or truth.dataset is None):
+        raise StoreError("was scored against files of ground truth, which a bundle does not bring; use --dataset")
+
+
 def _of_predictions(run: FinishedRun) -> Iterator[tuple[str, str, dict[str, SceneScore]]]:
     """The scores of predictions that were made elsewhere, from the maps that the run kept of them."""
+    refuse_own_truth(run)
     truth = run.record.ground_truth
-    if truth is None or truth.dataset is None:
-        raise StoreError("was scored against files of ground truth, which a bundle does not bring")
+    assert truth is not None
     for one in run.record.predictions:
         request = Request(
             tuple(run.folder.job(scene, one.method).path for scene in run.scenes),

@@ -15,13 +15,13 @@ from su3d_bench.cli.main import main
 
 ASKED = {
     "": {"run", "report", "datasets", "cache"},
-    "re": {"report", "refine", "reproduce"},
-    "report ": {"tables", "timing", "html", "samples", "rerun", "leaderboard", "verify"},
+    "re": {"report", "refine", "reproduce", "registry"},
+    "report ": {"tables", "timing", "html", "samples", "rerun", "leaderboard", "bundle", "verify"},
     "report tables --form": {"--format"},
     "report tables runs/demo --format ": {"text", "markdown", "latex", "csv", "html"},
     "report tables --table II ": {"I", "II", "III", "IV", "V", "reasoning"},
     "sheets make x --kind retr": {"retrieval"},
-    "new ": {"method", "dataset", "protocol"},
+    "new ": {"method", "dataset", "protocol", "registry"},
     "new dataset ": set[str](),
     "protocols ": {"list", "show", "diff"},
     "run --out ": set[str](),

@@ -122,6 +122,17 @@ function dataTable({ caption, columns, rows, filter, tall, sortBy, descending, o
   return box;
 }
 
+function noteList(lines, most = 6) {
+  if (!lines.length) return null;
+  const list = (some) => h('ul', { class: 'notes' }, some.map((line) => h('li', null, line)));
+  return [
+    list(lines.slice(0, most)),
+    lines.length > most
+      ? h('details', null, h('summary', null, `${lines.length - most} more remarks`), list(lines.slice(most)))
+      : null,
+  ];
+}
+
 function whisker(value, interval, ceiling) {
   // 0 to 100 %: a dot at the value, a line over its interval, a tick at the truth's score.
   const width = 104, x = (v) => 2 + Math.min(1, Math.max(0, v)) * (width - 4);

@@ -89,17 +89,6 @@ function notesOf(rows) {
   return [...new Set(lines)];
 }
 
-function noteList(lines, most = 6) {
-  if (!lines.length) return null;
-  const list = (some) => h('ul', { class: 'notes' }, some.map((line) => h('li', null, line)));
-  return [
-    list(lines.slice(0, most)),
-    lines.length > most
-      ? h('details', null, h('summary', null, `${lines.length - most} more remarks`), list(lines.slice(most)))
-      : null,
-  ];
-}
-
 function valueCell(metric, value, interval, ceiling) {
   return [
     metricText(metric, value),

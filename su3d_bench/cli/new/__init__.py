@@ -1,4 +1,4 @@
-"""``su3d-bench new``: a method, a dataset or a protocol of one's own that runs as it stands."""
+"""``su3d-bench new``: a method, a dataset, a protocol or a registry of one's own that runs as it stands."""
 
 from __future__ import annotations
 
@@ -12,11 +12,21 @@ from su3d_bench.cli.shared.flags import add_verb
 from su3d_bench.core.errors import EXIT_DONE, ConfigError
 
 SUFFIX = {"method": ".py", "dataset": ".py", "protocol": ".toml"}
+REGISTRY = "registry"
+# Where each file of a registry's template goes; an empty folder is none for git, so that bundles has a file of its own.
+REGISTRY_FILES = {
+    "README.md": "README.md",
+    "requirements.txt": "requirements.txt",
+    "gitignore.txt": ".gitignore",
+    "workflow.yml": ".github/workflows/registry.yml",
+}
+KEPT = "bundles/.gitkeep"
 # What to type next; {at} is how the file is named to the command line.
 NEXT = {
     "method": ("methods check {at}", "run --scenes rooms/living0 --methods {at}"),
     "dataset": ("datasets check '{at}/*'", "run --scenes '{at}/*' --profile oracle"),
     "protocol": ("protocols show {at}", "run --scenes rooms/living0 --protocols {at}"),
+    REGISTRY: ("registry add BUNDLE --to {at}", "registry build {at} --out site"),
 }
 
 
@@ -24,12 +34,14 @@ def add_parser(verbs: Any) -> None:
     parser = add_verb(
         verbs,
         "new",
-        "Write a method, a dataset or a protocol that runs as it stands, to begin from.",
-        ("su3d-bench new method my_method.py", "su3d-bench new dataset data/my_rooms.py"),
+        "Write a method, a dataset, a protocol or a registry of results that runs as it stands, to begin from.",
+        ("su3d-bench new method my_method.py", "su3d-bench new registry my-registry"),
         call,
     )
-    parser.add_argument("what", choices=tuple(SUFFIX))
-    parser.add_argument("file", type=Path, metavar="FILE", help="to write; its name becomes the name in it")
+    parser.add_argument("what", choices=(*SUFFIX, REGISTRY))
+    parser.add_argument(
+        "file", type=Path, metavar="FILE", help="to write; its name becomes the name in it. Of a registry a folder"
+    )
 
 
 def call(arguments: argparse.Namespace) -> int:
@@ -37,6 +49,8 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.core.system.files import file_text
 
     what, file = arguments.what, arguments.file
+    if what == REGISTRY:
+        return _new_registry(file, arguments)
     if file.suffix != SUFFIX[what]:
         raise ConfigError(f"new {what}: {file} must end in {SUFFIX[what]}, such as my_{what}{SUFFIX[what]}")
     words = re.findall(r"[A-Za-z0-9]+", file.stem)
@@ -52,4 +66,29 @@ def call(arguments: argparse.Namespace) -> int:
     commands = [f"su3d-bench {command.format(at=at)}" for command in NEXT[what]]
     lines = (f"{file}; then:", *(f"  {command}" for command in commands))
     answer_either(arguments, {"file": str(file), "next": commands}, *lines)
+    return EXIT_DONE
+
+
+def _new_registry(folder: Path, arguments: argparse.Namespace) -> int:
+    """A repository whose CI scores the bundles of pull requests anew and publishes the site."""
+    import os
+    import shlex
+
+    from su3d_bench import __version__
+    from su3d_bench.cli.shared.answers import written
+    from su3d_bench.core.system.files import file_text
+
+    name = Path(os.path.abspath(folder)).name
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", name):
+        raise ConfigError(f"new registry: '{name}' is no name for a repository; such as: my-registry")
+    taken = next((path for path in map(folder.joinpath, (*REGISTRY_FILES.values(), KEPT)) if os.path.lexists(path)), None)
+    if taken is not None or (os.path.lexists(folder) and not folder.is_dir()):
+        raise ConfigError(f"new registry: {taken or folder} is there already; name another folder, nothing is overwritten")
+    for source, place in REGISTRY_FILES.items():
+        text = file_text(Path(__file__).parent / "my_registry" / source)
+        written(folder / place, text.replace("my-registry", name).replace("VERSION", __version__))
+    written(folder / KEPT, "")
+    commands = [f"su3d-bench {command.format(at=shlex.quote(str(folder)))}" for command in NEXT[REGISTRY]]
+    lines = (f"{folder}: a repository for git; then:", *(f"  {command}" for command in commands))
+    answer_either(arguments, {"file": str(folder), "next": commands}, *lines)
     return EXIT_DONE

@@ -5,6 +5,7 @@ from __future__ import annotations
 from types import ModuleType
 from typing import Any
 
+from su3d_bench.cli.report import bundle as report_bundle
 from su3d_bench.cli.report import html as report_html
 from su3d_bench.cli.report import leaderboard as report_leaderboard
 from su3d_bench.cli.report import rerun as report_rerun
@@ -22,6 +23,7 @@ SUB_VERBS: tuple[ModuleType, ...] = (
     report_samples,
     report_rerun,
     report_leaderboard,
+    report_bundle,
     report_verify,
 )
 

@@ -62,6 +62,7 @@ class EmbeddedEncoder:
 
     name = "su3d-embedded"
     dim = DIM
+    trained_on = "rooms that the program rendered, other ones than the built-in"
     # questions/generator.py asks for "cushion on a sofa"; captions.py tells of "cushion on sofa", of the same relations
     relative_remark = (
         "relation words and the pattern of these queries are those of the captions that the embedded encoder was "

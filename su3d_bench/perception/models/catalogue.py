@@ -49,6 +49,7 @@ class ModelEntry:
     """One model: ``n_parameters_million`` rules the memory that it takes; ``forms`` in the order they are tried.
 
     ``known_as``: architecture and training in open_clip's words, which protocols and run records use for encoders.
+    ``trained_on``: the data of its training, as its publisher names them.
     """
 
     name: str
@@ -59,6 +60,7 @@ class ModelEntry:
     forms: tuple[ModelForm, ...]
     remark: str = ""
     known_as: str = ""
+    trained_on: str = ""
 
     def memory_mb(self, bytes_a_weight: int) -> int:
         """What the weights alone take on the device, in MB; activations come on top."""
@@ -99,6 +101,10 @@ def _exported(name: str, size_mb: int) -> ModelForm:
     return ModelForm("onnx", (ONNX_MANIFEST,), f"su3d-bench models export {name} --out DIR", size_mb)
 
 
+# On what each was trained, with where that was read.
+_WIT = "400 million image-text pairs of the internet, not published"  # section 2.2 of CLIP's paper, arXiv 2103.00020
+_WEBLI = "English image-text pairs of WebLI, not published"  # the models' cards on the hub
+_SA_1B = "SA-1B"  # facebookresearch/segment-anything at dca509fe, README.md: 11 million images, 1.1 billion masks
 _TORCHSCRIPT = "OpenAI's own .pt file is a TorchScript archive, which holds code and is not loaded"
 _SAM_SOURCE = "https://dl.fbaipublicfiles.com/segment_anything"
 _SAM_FILES = (_HUB_WEIGHTS, "config.json", "preprocessor_config.json")
@@ -113,13 +119,17 @@ def _openai_clip(
         _open_clip(f"{architecture}-quickgelu", f"timm/{timm}.openai", size_mb),
         _exported(name, size_mb + 1),
     )
-    return ModelEntry(name, "encoder", summary, "MIT", n_million, forms, _TORCHSCRIPT, f"{architecture}/openai")
+    known_as = f"{architecture}/openai"
+    return ModelEntry(name, "encoder", summary, "MIT", n_million, forms, _TORCHSCRIPT, known_as, _WIT)
 
 
 def _siglip(name: str, summary: str, n_million: int, size_mb: int, repository: str, architecture: str) -> ModelEntry:
     hub = _hub(f"google/{repository}", size_mb, (*_CLIP_FILES[:3], "tokenizer.json"))
     forms = (hub, _exported(name, size_mb + 1))
-    return ModelEntry(name, "encoder", summary, "Apache-2.0", n_million, forms, known_as=f"{architecture}/webli")
+    known_as = f"{architecture}/webli"
+    return ModelEntry(
+        name, "encoder", summary, "Apache-2.0", n_million, forms, known_as=known_as, trained_on=_WEBLI
+    )
 
 
 def _sam(
@@ -133,7 +143,7 @@ def _sam(
         _exported(name, exported_mb),
     )
     summary = f"Segment Anything, ViT-{letter.upper()}{use}"
-    return ModelEntry(name, "segmenter", summary, "Apache-2.0", n_million, forms)
+    return ModelEntry(name, "segmenter", summary, "Apache-2.0", n_million, forms, trained_on=_SA_1B)
 
 
 _ENTRIES = (
@@ -155,6 +165,7 @@ _ENTRIES = (
             _exported("clip-vit-h-14", 3948),
         ),
         known_as="ViT-H-14/laion2b_s32b_b79k",
+        trained_on="LAION-2B, English",  # mlfoundations/open_clip at 89fb801f, docs/PRETRAINED.md
     ),
     _openai_clip(
         "clip-vit-l-14",
@@ -239,6 +250,7 @@ _ENTRIES = (
             ),
         ),
         "the original .pth is not loaded; the hub's form holds the same weights",
+        trained_on="Objects365, GoldG, Cap4M",  # IDEA-Research/GroundingDINO at 856dde20, README.md
     ),
     ModelEntry(
         "ram-plus",
@@ -262,6 +274,8 @@ _ENTRIES = (
                 1370,
             ),
         ),
+        # xinyu1205/recognize-anything at 7cb804a8, README.md
+        trained_on="COCO, Visual Genome, SBU, CC3M, CC12M",
     ),
 )
 MODELS: Mapping[str, ModelEntry] = MappingProxyType({entry.name: entry for entry in _ENTRIES})

@@ -14,6 +14,7 @@ from looks import DESKTOP
 from made_sheets import made
 from painted import WordEncoder, colour_perception
 from places import SCENES
+from registry_bundles import painted_bundle
 
 from su3d_bench.cli.main import main
 from su3d_bench.reports.pictures.items import png_bytes
@@ -105,6 +106,33 @@ def page_of_audit(folder: Path) -> Path:
     return folder / "index.html"
 
 
+def site_of_registry(folder: Path) -> Path:
+    """``registry build``: two bundles, of which one says what its weights were trained on; one site for all its pages."""
+    registry, site = folder.parent / "registry", folder.parent / "registry-site"
+    if not site.exists():
+        registry.mkdir()
+        painted_bundle(registry, "ann", ["@drop=1", "@noise_m=0.3"], said=f"{LONG} {STRUCK}")
+        painted_bundle(registry, "bob", [""], scenes="ab")
+        words = ["--out", str(site), "--bundles-at", "https://example.org/bundles", "--quiet"]
+        assert main(["registry", "build", str(registry), *words]) == 0
+    return site
+
+
+def page_of_registry(folder: Path) -> Path:
+    """The first page of the site."""
+    return site_of_registry(folder) / "index.html"
+
+
+def page_of_method(folder: Path) -> Path:
+    """The page of a method of the site."""
+    return min((site_of_registry(folder) / "methods").iterdir())
+
+
+def page_of_scene(folder: Path) -> Path:
+    """The page of a scene of the site."""
+    return min((site_of_registry(folder) / "scenes").iterdir())
+
+
 PAGES: Mapping[str, Callable[[Path], Path]] = {
     "page of runs": page_of_runs,
     "tables": page_of_tables,
@@ -112,6 +140,9 @@ PAGES: Mapping[str, Callable[[Path], Path]] = {
     "sheet of retrieval": page_of_retrieval,
     "second looks": page_of_second_looks,
     "audit": page_of_audit,
+    "registry": page_of_registry,
+    "method of a registry": page_of_method,
+    "scene of a registry": page_of_scene,
 }
 # The files of the program that begin a page, and the pages above that come out of each.
 WRITERS = {
@@ -120,4 +151,5 @@ WRITERS = {
     "reports/sheet/page.html.j2": ("sheet of annotation", "sheet of retrieval"),
     "reports/sheet/second_looks.py": ("second looks",),
     "reports/sheet/audit_page.py": ("audit",),
+    "reports/registry/page.html.j2": ("registry", "method of a registry", "scene of a registry"),
 }

@@ -1,0 +1,219 @@
+// The pages of a registry: all rankings with filters, one method, one scene. DATA is what
+// su3d_bench/reproducing/registry/site.py gathers.
+
+const DATA = JSON.parse(byId('data').textContent);
+const ROOT = DATA.kind === 'index' ? '' : '../';
+const main = byId('main');
+
+function section(id, title, ...content) {
+  const made = h('section', { class: 'part', id, 'aria-labelledby': `${id}-title` },
+    h('h2', { id: `${id}-title` }, title), content);
+  main.append(made);
+  return made;
+}
+const toSection = (id, title) => byId('nav').append(h('a', { href: `#${id}` }, title));
+const intro = (...content) => h('p', { class: 'intro' }, content);
+const link = (page, text) => h('a', { href: ROOT + page }, text);
+const links = (entries) => h('ul', { class: 'links' }, entries.map((one) => h('li', null, one)));
+const hash = (text) => h('span', { class: 'hash' }, text);
+const seconds = (value) => (isNumber(value) ? `${Number(value.toPrecision(2))} s` : '–');
+const megabytes = (bytes) => `${(bytes / 1e6).toLocaleString('en-US', { maximumFractionDigits: 1 })} MB`;
+const datasetsOf = (board) => board.datasets.join(', ');
+const scenesText = (board) => `${plural(board.scenes.length, 'scene')} of ${datasetsOf(board)}`;
+// Without the numbers by which processors of one name are told apart; a method's page has them.
+const shortHardware = (row) => row.hardware.replace(/ \(cpu family[^)]*\)/, '');
+const ranksText = (row) => (!row.ranks ? '–'
+  : row.ranks[0] === row.ranks[1] ? String(row.ranks[0]) : `${row.ranks[0]} to ${row.ranks[1]}`);
+
+function bundleText({ bundle }) {
+  const name = bundle.address ? h('a', { href: bundle.address, rel: 'noreferrer' }, bundle.file) : bundle.file;
+  return [name, ` (${megabytes(bundle.n_bytes)}) SHA-256 `, hash(bundle.sha256)];
+}
+
+function valueCell(metric, value, interval) {
+  return [metricText(metric, value),
+    interval ? h('small', null, ` [${metricText(metric, interval[0])}, ${metricText(metric, interval[1])}]`) : null,
+    isCount(metric) ? null : whisker(value, interval)];
+}
+
+// The highest of what competes, where not all are equal.
+function bestOf(rows, value) {
+  const numbers = rows.filter((row) => !row.is_ceiling).map(value).filter(isNumber), most = Math.max(...numbers);
+  return numbers.some((one) => one < most) ? most : null;
+}
+
+const words = (label, value, more = {}) => ({ label, value, words: true, ...more });
+
+function headlineColumns(board, valueOf, withIntervals) {
+  return board.headline.map((metric, k) => {
+    const best = bestOf(board.rows, (row) => valueOf(row, k));
+    return { label: metric, num: true, value: (row) => valueOf(row, k),
+      best: (row) => best !== null && !row.is_ceiling && valueOf(row, k) === best,
+      show: (row) => valueCell(metric, valueOf(row, k), withIntervals ? row.intervals[k] : null) };
+  });
+}
+
+// As dataTable, whose columns of words may be wide and break.
+function table(caption, columns, rows) {
+  const made = dataTable({ caption, columns, rows });
+  const mark = () => made.querySelectorAll('tbody tr').forEach((line) => columns.forEach((column, k) => {
+    if (column.words) line.children[k].classList.add('words');
+  }));
+  mark();
+  made.addEventListener('click', mark);
+  return made;
+}
+
+function boardTable(board, rows) {
+  const metrics = headlineColumns(board, (row, k) => row.values[k], true);
+  return table(`${scenesText(board)}; per cent with the 95 % interval over scenes, the best bold`, [
+    { label: 'Method', value: (row) => row.method, show: (row) => link(row.page, row.method) },
+    { label: 'Rank', title: 'From which rank to which it may go, with 95 % for all rows together', num: true,
+      value: (row) => (row.ranks ? row.ranks[0] + row.ranks[1] / 1e3 : null), show: ranksText },
+    ...metrics,
+    { label: 'Frame', title: 'Median seconds a frame that was looked at; in brackets without perception', num: true,
+      value: (row) => row.update_s,
+      show: (row) => [seconds(row.update_s), isNumber(row.map_s) ? h('small', null, ` (${seconds(row.map_s)})`) : null] },
+    words('Hardware', (row) => shortHardware(row)),
+    words('Weights trained on', (row) => row.trained_on),
+    { label: 'Profile', value: (row) => row.profile },
+    words('Command and bundle', (row) => row.bundle.file, { show: (row) => h('details', null,
+      h('summary', { 'aria-label': `${row.bundle.file}: command and SHA-256 of ${row.method}` }, row.bundle.file),
+      h('code', null, row.command), bundleText(row)) }),
+  ], rows);
+}
+
+function boardIntro(board) {
+  const pages = new Map((DATA.scenes || []).map((one) => [one.name, one.page]));
+  return [intro(`Version ${board.version}: ${board.summary}. Rules `, hash(board.digest.slice(0, 16)), '.'),
+    pages.size ? h('details', null, h('summary', null, plural(board.scenes.length, 'scene')),
+      links(board.scenes.map((scene) => link(pages.get(scene), scene)))) : null];
+}
+
+const notes = (lines) => (lines.length ? h('ul', { class: 'notes' }, lines.map((line) => h('li', null, line))) : null);
+const facts = (pairs) => h('dl', null, pairs.filter(([, value]) => value).flatMap(([name, value]) =>
+  [h('dt', null, name), h('dd', null, value)]));
+
+// --- all rankings
+
+const FILTERS = [
+  ['Protocol', (row, board) => board.protocol], ['Dataset', (row, board) => datasetsOf(board)],
+  ['Profile', (row) => row.profile], ['Hardware', shortHardware],
+];
+
+function indexPage() {
+  const all = DATA.boards.flatMap((board) => board.rows.map((row) => [row, board]));
+  const fact = (n, what) => h('li', null, h('b', null, String(n)), ` ${what}${n === 1 ? '' : 's'}`);
+  main.append(h('ul', { class: 'facts' }, fact(all.length, 'row'), fact(DATA.methods.length, 'method'),
+    fact(new Set(DATA.boards.map((board) => board.protocol)).size, 'protocol'), fact(DATA.scenes.length, 'scene'),
+    fact(DATA.n_bundles, 'bundle')));
+  if (!all.length) { main.append(h('p', { class: 'note' }, 'No row stands in this registry.')); leftOut(); return; }
+  const state = FILTERS.map(() => '');
+  let text = '';
+  const fields = FILTERS.map(([name, of], k) => {
+    const values = [...new Set(all.map(([row, board]) => of(row, board)))].sort(compareValues);
+    const field = select(name, [['', 'all'], ...values.map((one) => [one, one])], '', (value) => { state[k] = value; draw(); });
+    field.hidden = values.length < 2;
+    return field;
+  });
+  const typed = h('input', { type: 'search', id: freshId('filter'), placeholder: 'any text', autocomplete: 'off',
+    oninput: () => { text = typed.value.trim().toLowerCase(); draw(); } });
+  const count = h('span', { class: 'count', role: 'status' });
+  main.append(h('div', { class: 'toolbar', role: 'search', 'aria-label': 'Filters' }, fields,
+    h('div', { class: 'field' }, h('label', { for: typed.id }, 'Filter rows'), typed), count));
+  const places = DATA.boards.map((board, k) => {
+    const place = h('div');
+    const made = section(`board-${k}`, board.protocol, boardIntro(board), place, notes(board.notes));
+    made.classList.add('board');
+    return { made, place };
+  });
+  const says = (row, board) => [board.protocol, board.summary, ...board.scenes, row.method, row.hardware, row.trained_on,
+    row.profile, row.encoder, row.command, row.bundle.file, row.bundle.sha256, row.caveat].join('\n').toLowerCase();
+  function draw() {
+    let n = 0;
+    DATA.boards.forEach((board, k) => {
+      const rows = board.rows.filter((row) => FILTERS.every(([, of], j) => !state[j] || of(row, board) === state[j])
+        && (!text || says(row, board).includes(text)));
+      n += rows.length;
+      places[k].made.hidden = !rows.length;
+      places[k].place.replaceChildren(boardTable(board, rows));
+    });
+    count.textContent = `${n === all.length ? '' : `${n} of `}${plural(all.length, 'row')}`;
+  }
+  draw();
+  section('methods', 'Methods', links(DATA.methods.map((one) =>
+    [link(one.page, one.name), ` ${plural(one.n_rows, 'row')}`])));
+  section('scenes', 'Scenes', links(DATA.scenes.map((one) => link(one.page, one.name))));
+  toSection('methods', 'Methods');
+  toSection('scenes', 'Scenes');
+  leftOut();
+}
+
+function leftOut() {
+  if (!DATA.left_out.length) return;
+  section('left-out', 'Left out', intro('What lies in the registry and stands in no ranking.'),
+    notes(DATA.left_out.map((one) => `${one.run}, ${one.what}: ${one.reason}`)));
+  toSection('left-out', 'Left out');
+}
+
+// --- one method
+
+function methodPage() {
+  main.append(intro(`${DATA.registry}: ${plural(DATA.boards.length, 'ranking')}.`));
+  DATA.boards.forEach((board, k) => board.rows.forEach((row) => {
+    const id = `board-${k}`;
+    const values = board.headline.map((metric, j) => h('li', null, `${metric} `, h('b', null, metricText(metric, row.values[j])),
+      row.intervals[j] ? ` [${row.intervals[j].map((end) => metricText(metric, end)).join(', ')}]` : null));
+    const rank = row.ranks ? h('li', null, 'rank ', h('b', null, ranksText(row)), ` of ${board.n_rows}`) : null;
+    section(id, board.protocol,
+      intro(`Version ${board.version}: ${board.summary}. ${scenesText(board)}.`),
+      h('ul', { class: 'facts' }, values, rank), notes([...(row.caveat ? [row.caveat] : []), ...row.warnings]),
+      facts([
+        ['Seconds a frame', isNumber(row.update_s)
+          ? `${seconds(row.update_s)}, ${seconds(row.map_s)} without perception: the median of ${plural(row.n_updates, 'frame')}`
+            + ' but the first of each scene' : 'not measured'],
+        ['Hardware', row.hardware], ['Profile', row.profile], ['Encoder', row.encoder],
+        ['Weights trained on', row.trained_on], ['Settings', row.changed.join(', ')],
+        ['Command', h('code', null, row.command)], ['Bundle', bundleText(row)],
+        ['Made by', `${row.bundle.program}, code ${row.code}${row.commit ? `, commit ${row.commit}` : ''}`
+          + `${row.bundle.recipe ? `, recipe ${row.bundle.recipe}` : ''}, run ${row.run}`],
+        ['Rules', hash(board.digest)],
+      ]),
+      row.weights.some((one) => Object.keys(one.files).length) ? h('details', null, h('summary', null, 'Files of weights'),
+        facts(row.weights.flatMap((one) => Object.entries(one.files).map(([file, sha]) => [`${one.model} ${file}`, hash(sha)]))))
+        : null,
+      scenesTable(board, row));
+    toSection(id, board.protocol);
+  }));
+}
+
+function scenesTable(board, row) {
+  const rows = Object.entries(row.of_scenes).map(([scene, values]) => ({ scene, values }));
+  return table('Each scene alone, in per cent', [
+    { label: 'Scene', value: (one) => one.scene, show: (one) => link(DATA.scene_pages[one.scene], one.scene) },
+    ...board.headline.map((metric, k) => ({ label: metric, num: true, value: (one) => one.values[k],
+      show: (one) => valueCell(metric, one.values[k]) })),
+  ], rows);
+}
+
+// --- one scene
+
+function scenePage() {
+  main.append(intro('Each method on this scene alone. One scene tells little: a ranking is of all scenes together. Data ',
+    hash(DATA.digest), '.'));
+  DATA.boards.forEach((board, k) => {
+    const id = `board-${k}`, valueOf = (row, j) => row.of_scenes[DATA.name][j];
+    section(id, board.protocol, intro(`Version ${board.version}: ${board.summary}. Ranked over ${scenesText(board)}.`),
+      table('This scene alone, in per cent; the best is bold', [
+        { label: 'Method', value: (row) => row.method, show: (row) => link(row.page, row.method) },
+        ...headlineColumns(board, valueOf, false),
+        { label: 'Rank over all scenes', num: true, value: (row) => (row.ranks ? row.ranks[0] + row.ranks[1] / 1e3 : null),
+          show: ranksText },
+        { label: 'Profile', value: (row) => row.profile },
+        words('Bundle', (row) => row.bundle.file),
+      ], board.rows));
+    toSection(id, board.protocol);
+  });
+}
+
+({ index: indexPage, method: methodPage, scene: scenePage })[DATA.kind]();

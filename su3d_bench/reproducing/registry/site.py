@@ -1,0 +1,246 @@
+"""A registry as a static site: one page of all rankings, one a method and one a scene, and all of it as JSON."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from su3d_bench.core.errors import ConfigError, StoreError, printable, shown, some
+from su3d_bench.metrics.protocols.files import protocol_names
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.reports.registry.page import PAGE, page_html, page_name
+from su3d_bench.reports.tables.model import (
+    NOT_MEASURED,
+    Cell,
+    Prose,
+    Table,
+    TableRow,
+    confidence_notes,
+    few_scenes,
+    is_count,
+    with_interval,
+)
+from su3d_bench.reproducing.registry.folder import SUFFIX, Registry
+from su3d_bench.reproducing.registry.rows import Row
+from su3d_bench.store.atomic import is_file, make_folder, read_json, remove_file, write_json, write_text
+
+INDEX, DATA = "index.html", "registry.json"
+METHODS, SCENES = "methods", "scenes"
+SCHEMA = 1
+KIND = "su3d-bench registry"  # by which an earlier site is known
+MOST_OF_AN_ADDRESS = 500
+TITLE = "Registry of results"
+
+
+def write_site(registry: Registry, out: Path, title: str = TITLE, bundles_at: str | None = None) -> list[Path]:
+    """The pages of ``registry`` in the folder ``out``, in the place of an earlier site; what was written, by name.
+
+    ``bundles_at``: the https address below which the bundles lie; None: they are named and not linked. A ``ConfigError``
+    where ``out`` holds something else.
+    """
+    earlier = _earlier_pages(out)
+    address = _checked_address(bundles_at)
+    value = _value(registry, title, address)
+    pages = {INDEX: page_html("index", title, _index(value), [_plain_tables(registry)])}
+    for method in value["methods"]:
+        data = _method_page(value, method["name"])
+        pages[method["page"]] = page_html("method", method["name"], {**data, "registry": title})
+    for scene in value["scenes"]:
+        data = _scene_page(value, scene)
+        pages[scene["page"]] = page_html("scene", scene["name"], {**data, "registry": title})
+    for folder in ("", METHODS, SCENES):
+        make_folder(out / folder)
+    for name, text in pages.items():
+        write_text(out / name, text)
+    write_json(out / DATA, {"kind": KIND, "schema": SCHEMA, "pages": sorted(pages), **value})
+    for name in earlier - set(pages):
+        remove_file(out / name)
+    return [out / name for name in (*pages, DATA)]
+
+
+def _earlier_pages(out: Path) -> set[str]:
+    """The pages of the site that ``out`` holds already."""
+    if not os.path.lexists(out):
+        return set()
+    if not out.is_dir():
+        raise ConfigError(f"{shown(out)}: is no folder; name another with --out")
+    if not any(out.iterdir()):
+        return set()
+    value = read_json(out / DATA) if is_file(out / DATA) else None
+    pages = value.get("pages") if isinstance(value, dict) and value.get("kind") == KIND else None
+    if not isinstance(pages, list):
+        raise ConfigError(f"{shown(out)}: holds something that is no site of a registry; name an empty folder with --out")
+    return {name for name in pages if isinstance(name, str) and _is_page(name)}
+
+
+def _is_page(name: str) -> bool:
+    folder, _, file = name.rpartition("/")
+    return folder in ("", METHODS, SCENES) and PAGE.fullmatch(file) is not None
+
+
+def _checked_address(text: str | None) -> str | None:
+    if text is None:
+        return None
+    if not text.startswith("https://") or len(text) > MOST_OF_AN_ADDRESS or printable(text, 10_000) != text:
+        raise ConfigError(f"--bundles-at '{printable(text, 100)}': expected an address that begins with https://")
+    return text.rstrip("/") + "/"
+
+
+def _page(folder: str, name: str) -> str:
+    return f"{folder}/{page_name(name)}.html"
+
+
+def _value(registry: Registry, title: str, address: str | None) -> dict[str, Any]:
+    """All of the site as plain values; links lead from the root of the site."""
+    boards = [_board(board, address) for board in registry.boards]
+    rows = registry.rows
+    digests = {scene: digest for row in rows for scene, digest in row.entry.data}
+    return {
+        "title": title,
+        "n_bundles": registry.n_bundles,
+        "boards": boards,
+        "methods": [
+            {"name": name, "page": _page(METHODS, name), "n_rows": sum(row.entry.method == name for row in rows)}
+            for name in sorted({row.entry.method for row in rows})
+        ],
+        "scenes": [
+            {"name": name, "page": _page(SCENES, name), "digest": digest} for name, digest in sorted(digests.items())
+        ],
+        "left_out": [vars(one) for one in registry.refused],
+    }
+
+
+def _board(board: Sequence[Row], address: str | None) -> dict[str, Any]:
+    first = board[0].entry
+    known = load_protocol(first.protocol) if first.protocol in protocol_names() else None
+    return {
+        "protocol": first.protocol,
+        "version": first.version,
+        "digest": first.digest,
+        "summary": "somebody's own" if known is None else known.summary,
+        "scenes": list(first.scenes),
+        "datasets": sorted({scene.partition("/")[0] for scene in first.scenes}),
+        "headline": list(first.headline),
+        "notes": list(_notes(board)),
+        "rows": [_row(row, address) for row in board],
+    }
+
+
+def _notes(board: Sequence[Row]) -> Iterator[str]:
+    """What must stand beneath a ranking."""
+    first = board[0].entry
+    rivals = [row for row in board if not row.entry.is_ceiling]
+    yield from confidence_notes({f"{row.entry.method} of {row.bundle.name}": row.entry.confidences for row in rivals})
+    yield from dict.fromkeys(f"labels: {row.entry.labels}" for row in rivals if row.entry.labels)
+    encoders = dict.fromkeys(row.encoder for row in rivals if row.encoder)
+    if len(encoders) > 1:
+        yield f"features of several encoders, which the protocol leaves open: {some(list(encoders), 6)}"
+    if any(row.entry.ranks for row in board):
+        yield (
+            f"rank: from which to which a row may go by {first.headline[0]}, with 95 % for all rows together: sign-flip "
+            "tests of all pairs, of their means over scenes, corrected by Holm"
+        )
+    elif len(rivals) > 1:
+        yield f"no ranks: {len(rivals)} rows are more than are tested in pairs"
+    if rough := few_scenes(len(first.scenes)):
+        yield rough
+    if len(rivals) < len(board):
+        yield "rows that were told the truth stand last and compete with none"
+
+
+def _row(row: Row, address: str | None) -> dict[str, Any]:
+    entry = row.entry
+    file = f"{row.bundle.name}{SUFFIX}"
+    return {
+        "method": entry.method,
+        "page": _page(METHODS, entry.method),
+        "values": list(entry.values),
+        "intervals": [None if one is None else list(one) for one in entry.intervals],
+        "ranks": None if entry.ranks is None else list(entry.ranks),
+        "is_ceiling": entry.is_ceiling,
+        "of_scenes": {scene: list(values) for scene, values in row.of_scenes},
+        "update_s": row.update_s,
+        "map_s": row.map_s,
+        "n_updates": row.n_updates,
+        "hardware": row.hardware,
+        "profile": entry.profile,
+        "encoder": row.encoder,
+        "trained_on": row.trained_on,
+        "weights": [
+            {"model": one.model, "trained_on": one.trained_on, "files": dict(one.files)} for one in row.weights
+        ],
+        "command": row.command,
+        "changed": list(row.changed),
+        "caveat": row.caveat,
+        "warnings": list(row.warnings),
+        "code": row.code,
+        "commit": row.commit,
+        "run": entry.run,
+        "bundle": {
+            **{key: getattr(row.bundle, key) for key in ("sha256", "n_bytes", "program", "recipe")},
+            "file": file,
+            "address": None if address is None else address + file,
+        },
+    }
+
+
+def _index(value: Mapping[str, Any]) -> dict[str, Any]:
+    """What the first page needs: all but the numbers of single scenes."""
+    boards = [
+        {**board, "rows": [{k: v for k, v in row.items() if k != "of_scenes"} for row in board["rows"]]}
+        for board in value["boards"]
+    ]
+    return {**value, "boards": boards}
+
+
+def _method_page(value: Mapping[str, Any], method: str) -> dict[str, Any]:
+    boards = [
+        {**board, "n_rows": len(board["rows"]), "rows": [row for row in board["rows"] if row["method"] == method]}
+        for board in value["boards"]
+    ]
+    pages = {scene["name"]: scene["page"] for scene in value["scenes"]}
+    return {"name": method, "boards": [board for board in boards if board["rows"]], "scene_pages": pages}
+
+
+def _scene_page(value: Mapping[str, Any], scene: Mapping[str, Any]) -> dict[str, Any]:
+    name = scene["name"]
+    boards = []
+    for board in value["boards"]:
+        if name in board["scenes"]:
+            rows = [{**row, "of_scenes": {name: row["of_scenes"][name]}} for row in board["rows"]]
+            boards.append({**board, "rows": rows})
+    return {"name": name, "digest": scene["digest"], "boards": boards}
+
+
+def _plain_tables(registry: Registry) -> Table | Prose:
+    """What the first page shows where no script runs."""
+    rows = [
+        TableRow(
+            row.entry.method,
+            (
+                Cell(row.entry.protocol),
+                Cell(_headline(row)),
+                Cell(NOT_MEASURED if row.entry.ranks is None else " to ".join(map(str, row.entry.ranks))),
+                Cell(str(len(row.entry.scenes))),
+                Cell(NOT_MEASURED if row.update_s is None else f"{row.update_s:.3g}"),
+                Cell(row.hardware),
+                Cell(row.trained_on),
+                Cell(f"{row.bundle.name}{SUFFIX} {row.bundle.sha256}"),
+            ),
+            group=row.entry.protocol,
+        )
+        for row in registry.rows
+    ]
+    if not rows:
+        return Prose(("No row stands in this registry.",))
+    columns = ("protocol", "values", "rank", "scenes", "s a frame", "hardware", "weights trained on", "bundle")
+    return Table("registry", "All rows, in per cent.", "method", columns, tuple(rows), ())
+
+
+def _headline(row: Row) -> str:
+    return ", ".join(
+        f"{name} {value:g}" if is_count(name) and value is not None else f"{name} {with_interval(value, interval)}"
+        for name, value, interval in zip(row.entry.headline, row.entry.values, row.entry.intervals, strict=True)
+    )

@@ -1,0 +1,174 @@
+"""What comes into a registry was scored anew; what was tampered with is refused though all of its digests are right."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from registry_bundles import ROOM, Files, flip_labels, read_bundle, rewrite_bundle, room_bundle
+
+from su3d_bench.cli.main import build_parser, main
+from su3d_bench.reproducing.registry.rows import rows_of_bundle
+
+yaml = pytest.importorskip("yaml", reason="PyYAML comes with transformers and ray")
+RUN = "runs/room"
+JOB = f"{RUN}/scenes/{ROOM.replace('/', '.')}/opensu3d"
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    folder = tmp_path_factory.mktemp("room")
+    made = room_bundle(folder, data=folder / "data")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SU3D_DATA", str(folder / "data"))
+        patch.setenv("SU3D_CACHE", str(folder / "cache"))
+        yield made
+
+
+def test_a_bundle_that_holds_comes_in_to_the_last_bit_once(
+    bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["registry", "add", str(bundle), "--to", str(tmp_path)]
+    assert main([*words, "--name", "opensu3d", "--json"]) == 0
+    (found,) = json.loads(capsys.readouterr().out)["bundles"]
+    assert found["is_added"] and found["is_to_the_bit"] and (found["n_rows"], found["n_scores"]) == (4, 4)
+    assert (tmp_path / "bundles" / "opensu3d.zip").read_bytes() == bundle.read_bytes()
+    assert main(words) == 1
+    assert "is there already as opensu3d.zip" in capsys.readouterr().out
+
+
+def test_its_rows_name_the_command_that_makes_them_and_what_the_weights_were_trained_on(bundle: Path) -> None:
+    rows, _ = rows_of_bundle(bundle)
+    by_method = {row.entry.method: row for row in rows}
+    assert by_method["oracle"].trained_on == "none: it was told the truth"
+    row = by_method["opensu3d"]
+    assert "profile oracle: none: masks of the ground truth" in row.trained_on
+    assert "su3d-embedded: rooms that the program rendered" in row.trained_on
+    asked = build_parser().parse_args(row.command.split()[1:])
+    assert (asked.scenes, asked.methods, asked.profile, asked.stride) == ([ROOM], ["opensu3d"], "oracle", 2)
+    assert "rooms.n_frames=8" in asked.set
+
+
+def other_rules(files: Files) -> None:
+    record = json.loads(files[f"{RUN}/run.json"])
+    record["protocols"][0]["digest"] = "0" * 64
+    files[f"{RUN}/run.json"] = json.dumps(record).encode()
+
+
+def other_data(files: Files) -> None:
+    record = json.loads(files[f"{RUN}/run.json"])
+    record["data_digests"][ROOM] = "0" * 64
+    files[f"{RUN}/run.json"] = json.dumps(record).encode()
+
+
+def higher_number(files: Files) -> None:
+    record = json.loads(files[f"{RUN}/metrics.json"])
+    result = record["results"][0]
+    result["result"]["metrics"][result["headline"][0]] = 0.987
+    files[f"{RUN}/metrics.json"] = json.dumps(record).encode()
+
+
+@pytest.mark.parametrize(
+    ("tamper", "says"),
+    [
+        (lambda files: flip_labels(files, JOB), "by opensu3d: its counts are not those of its map"),
+        (other_rules, "are not those that scored it"),
+        (other_data, "its data are not those of the run"),
+        (higher_number, "metrics.json does not follow from the counts"),
+    ],
+)
+def test_a_tampered_bundle_is_refused_with_its_reason(
+    bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], tamper: Callable[[Files], None], says: str
+) -> None:
+    files, manifest = read_bundle(bundle)
+    tamper(files)
+    rewrite_bundle(tmp_path / "t.zip", files, manifest)
+    assert main(["registry", "add", str(tmp_path / "t.zip"), "--to", str(tmp_path)]) == 1
+    assert f"t.zip: refused: " in (said := capsys.readouterr().out) and says in said
+    assert not (tmp_path / "bundles").exists()
+
+
+def test_a_file_that_is_not_the_manifests_is_refused_unread(
+    bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = bundle.read_bytes()
+    at = content.rindex(b'"n_workers"')
+    (tmp_path / "t.zip").write_bytes(content[:at] + b'"m_workers"' + content[at + 11 :])
+    assert main(["registry", "add", str(tmp_path / "t.zip"), "--to", str(tmp_path)]) == 2
+    assert "t.zip: " in capsys.readouterr().err
+
+
+@pytest.fixture
+def repository(tmp_path: Path) -> Path:
+    folder = tmp_path / "my-results"
+    assert main(["new", "registry", str(folder)]) == 0
+    git(folder, "init", "--quiet", "--initial-branch", "main")
+    commit(folder)
+    return folder
+
+
+def git(folder: Path, *words: str) -> str:
+    who = ["-c", "user.name=a", "-c", "user.email=a@example.org"]
+    done = subprocess.run(["git", *who, *words], cwd=folder, capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+def commit(folder: Path) -> None:
+    git(folder, "add", "--all")
+    git(folder, "commit", "--quiet", "--message", "more")
+
+
+def test_the_workflow_has_least_permissions_pinned_actions_and_no_secret(repository: Path) -> None:
+    text = (repository / ".github/workflows/registry.yml").read_text()
+    workflow = yaml.safe_load(text)
+    assert set(workflow[True]) == {"pull_request", "push"}, "YAML takes 'on' for true"
+    assert workflow["permissions"] == {} and workflow["jobs"]["check"]["permissions"] == {"contents": "read"}
+    assert workflow["jobs"]["publish"]["if"] == "github.event_name == 'push'"
+    assert "secrets." not in text and "pull_request_target" not in text
+    steps = [step for job in workflow["jobs"].values() for step in job["steps"]]
+    assert all(len(step["uses"].partition("@")[2].split()[0]) == 40 for step in steps if "uses" in step)
+    assert not any("${{" in step["run"] for step in steps if "run" in step), "no value is text of a script"
+    (checkout,) = (step for step in steps if "checkout" in step.get("uses", ""))
+    assert checkout["with"]["persist-credentials"] is False
+    assert not any("uses" in step and "checkout" in step["uses"] for step in workflow["jobs"]["publish"]["steps"])
+    assert (repository / "requirements.txt").read_text().startswith("su3d-bench==0")
+
+
+def test_the_workflows_commands_score_a_pull_request_and_build_the_site_as_they_stand(
+    repository: Path, bundle: Path, tmp_path: Path
+) -> None:
+    base = git(repository, "rev-parse", "HEAD")
+    shutil.copy(bundle, repository / "bundles" / "a name'; touch struck;.zip")
+    commit(repository)
+    workflow = yaml.safe_load((repository / ".github/workflows/registry.yml").read_text())
+    scripts = [step["run"] for step in workflow["jobs"]["check"]["steps"] if "run" in step]
+    installing = [script for script in scripts if "install" in script]
+    assert installing[1:] == ["python -m pip install --requirement requirements.txt"]
+    program = tmp_path / "bin" / "su3d-bench"
+    program.parent.mkdir()
+    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m su3d_bench "$@"\n')
+    program.chmod(0o755)
+    path = f"{program.parent}:{os.environ['PATH']}"
+    environment = {**os.environ, "BASE": base, "RUNNER_TEMP": str(tmp_path / "temp"), "PATH": path}
+    (tmp_path / "temp").mkdir()
+    said = ""
+    for script in scripts:
+        if script not in installing:
+            words = ["bash", "--noprofile", "--norc", "-eo", "pipefail", "-c", script]
+            done = subprocess.run(words, cwd=repository, env=environment, capture_output=True, text=True, check=False)
+            assert done.returncode == 0, done.stderr
+            said += done.stdout
+    assert "4 rows; 4 scores made anew, to the last bit" in said
+    assert (tmp_path / "temp" / "site" / "index.html").is_file()
+    assert not (repository / "struck").exists()
+
+
+def test_a_registry_overwrites_nothing(repository: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["new", "registry", str(repository)]) == 2
+    assert "README.md is there already; name another folder, nothing is overwritten" in capsys.readouterr().err

@@ -1,0 +1,87 @@
+"""Bundles for registries: of painted scenes, which are soon made, and of a small room, which can be scored anew."""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from painted import colour_perception
+from places import SCENES
+
+from su3d_bench.cli.main import main
+from su3d_bench.core.digests import digest_bytes
+from su3d_bench.reproducing.bundle import bundle_runs
+from su3d_bench.runs import scene as scene_run
+
+PAINTED = f"{SCENES}/painted.py"
+ROOM = "rooms/bathroom0"
+SMALL = ("rooms.n_frames=8", "rooms.width=160", "rooms.height=120", "rooms.mesh_spacing_m=0.1")
+PROTOCOLS = ("rooms-semantic", "rooms-instance")
+Files = dict[str, bytes]
+
+
+def painted_bundle(
+    folder: Path, name: str, methods: Sequence[str], scenes: str = "abc", more: Sequence[str] = (), said: str = ""
+) -> Path:
+    """``folder/name.zip``: a run of variants of the painted collector; it names code of its own, so no verifier takes it."""
+    words = ["run", "--scenes", *(f"{PAINTED}:Painted/{scene}" for scene in scenes), "--no-pictures", "--jobs", "1"]
+    words += ["--methods", *(f"{PAINTED}:Collector{method}" for method in methods), "--protocols", *PROTOCOLS, *more]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", colour_perception)
+        assert main([*words, "--quiet", "--out", str(folder / "runs" / name)]) == 0
+    bundle_runs(folder / f"{name}.zip", [folder / "runs" / name], said)
+    return folder / f"{name}.zip"
+
+
+def room_bundle(folder: Path, *, data: Path) -> Path:
+    """A bundle that holds: two methods on one small room under two protocols, perception by the truth."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SU3D_DATA", str(data))
+        patch.setenv("SU3D_CACHE", str(folder / "cache"))
+        words = ["run", "--scenes", ROOM, "--methods", "opensu3d", "oracle", "--protocols", *PROTOCOLS, "--set", *SMALL]
+        words += ["--profile", "oracle", "--no-pictures", "--jobs", "1", "--quiet", "--stride", "2"]
+        assert main([*words, "--out", str(folder / "room")]) == 0
+        assert main(["report", "bundle", str(folder / "room"), "--out", str(folder / "room.zip"), "--quiet"]) == 0
+    return folder / "room.zip"
+
+
+def read_bundle(bundle: Path) -> tuple[Files, dict[str, object]]:
+    """The files of a bundle and its manifest."""
+    with zipfile.ZipFile(bundle) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    return files, json.loads(files.pop("manifest.json"))
+
+
+def rewrite_bundle(place: Path, files: Files, manifest: Mapping[str, object]) -> Path:
+    """A bundle all of whose digests are right."""
+    entries = {name: {"n_bytes": len(content), "sha256": digest_bytes(content)} for name, content in files.items()}
+    place.parent.mkdir(parents=True, exist_ok=True)
+    with zipfile.ZipFile(place, "w") as archive:
+        archive.writestr("manifest.json", json.dumps({**manifest, "files": entries}))
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return place
+
+
+def flip_labels(files: Files, job: str) -> None:
+    """Instances of the map of ``job`` change their names and features; the job's seal is made to fit."""
+    arrays = dict(np.load(io.BytesIO(files[f"{job}/prediction.npz"])))
+    for name in {"features", "names", "view_names"} & arrays.keys():
+        arrays[name] = arrays[name][::-1].copy()
+    content = io.BytesIO()
+    np.savez(content, **arrays)
+    files[f"{job}/prediction.npz"] = content.getvalue()
+    done = json.loads(files[f"{job}/done.json"])
+    done["steps"]["predict"]["files"]["prediction.npz"] = digest_bytes(content.getvalue())
+    files[f"{job}/done.json"] = json.dumps(done).encode()
+
+
+def edit_record(files: Files, name: str, old: str, new: str) -> None:
+    """Every ``old`` in the text of a record becomes ``new``; at least one is there."""
+    assert old.encode() in files[name], (old, name)
+    files[name] = files[name].replace(old.encode(), new.encode())
