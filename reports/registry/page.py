@@ -1,4 +1,4 @@
-"""The pages of a registry of results: each one file that loads nothing, every text of a bundle data and never markup."""
+"""The pages of a registry of results: each one file that loads nothing, a bundle's texts data and never markup."""
 
 from __future__ import annotations
 

@@ -12,6 +12,7 @@ import os
 import re
 import stat
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -69,7 +70,7 @@ class Manifest(BaseModel):
 
 
 def write_bundle(place: Path, recipe: str, recipe_file: bytes, runs: Sequence[Path], out: Path) -> None:
-    """The archive of the ``runs`` of a recipe and of what ``out`` holds beside them at ``place``, whole or not at all."""
+    """The archive at ``place`` of the ``runs`` of a recipe and of what ``out`` holds beside them, whole or not."""
     beside = {name: out / name for name in (COMPARED, TABLES) if is_file(out / name)}
     _write(place, runs, beside, {"recipe": recipe}, recipe_file)
 
@@ -178,7 +179,7 @@ def unpack(bundle: Path, into: Path, keep: Callable[[str], bool] = lambda name: 
             _refuse_others(members, manifest, where)
             for name, entry in manifest.files.items():
                 _unpack_one(archive, members[name], entry, into if keep(name) else None, allowance, where)
-    except (zipfile.BadZipFile, UnpackingError, EOFError, NotImplementedError) as error:
+    except (zipfile.BadZipFile, UnpackingError, EOFError, NotImplementedError, zlib.error) as error:
         raise StoreError(f"{where}: is no bundle, or damaged: {printable(str(error), 160)}") from error
     except OSError as error:
         raise StoreError(f"{where}: cannot be unpacked: {error.strerror or error}") from error
@@ -198,7 +199,8 @@ def _members(archive: zipfile.ZipFile, where: str) -> dict[str, zipfile.ZipInfo]
         if name.casefold() in members:
             raise StoreError(f"{where}: holds '{printable(name, 120)}' twice; not unpacked")
         members[name.casefold()] = info
-    if MANIFEST not in members or members[MANIFEST].file_size > MOST_MANIFEST:
+    manifest = members.get(MANIFEST)
+    if manifest is None or manifest.filename != MANIFEST or manifest.file_size > MOST_MANIFEST:
         raise StoreError(f"{where}: has no {MANIFEST} of a bundle; make one with su3d-bench report bundle RUN")
     return {info.filename: info for info in members.values()}
 

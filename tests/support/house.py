@@ -56,7 +56,7 @@ PURPOSE = {
     "evaluation": "predictions made elsewhere to numbers",
     "sheets": "what people judge: made, answered, scored",
     "analysis": "finished runs compared, gated, ranked, taken apart",
-    "reproducing": "a paper's experiments as recipes: what they need, their runs, measured beside printed, the archive",
+    "reproducing": "a paper's experiments as recipes: needs, runs, reported beside measured, archives; registries",
     "api": "what a program or a notebook calls: runs and predictions to tables of pandas",
     "cli": "a thin module a verb",
 }

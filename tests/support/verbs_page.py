@@ -47,6 +47,10 @@ MORE = {
     "report html": "One page that works offline: tables that sort, confusion, errors, timing, every map in 3D.",
     "report rerun": "A recording a scene with frames, masks, maps, truth and the map's growth, for rerun's "
     "viewer: [running/rerun.md](running/rerun.md).",
+    "report bundle": "Anybody scores it anew by `report verify`; a registry takes it in.",
+    "registry add": "By the rule of `report verify`; rows that mix rules, data, encoders or names are refused: "
+    "[running/registry.md](running/registry.md).",
+    "registry build": "Rankings with intervals of values and ranks, a page a method and a scene, from the disk.",
     "check": "The gate for CI: [running/ci-gate.md](running/ci-gate.md), `action.yml`.",
     "ask": "By the built-in solver or a language model: [reasoning.md](questions/reasoning.md).",
     "questions": "From the ground truth of any dataset; `--protocols rooms-retrieval` scores maps by such. "

@@ -81,9 +81,13 @@ def _new_registry(folder: Path, arguments: argparse.Namespace) -> int:
     name = Path(os.path.abspath(folder)).name
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", name):
         raise ConfigError(f"new registry: '{name}' is no name for a repository; such as: my-registry")
-    taken = next((path for path in map(folder.joinpath, (*REGISTRY_FILES.values(), KEPT)) if os.path.lexists(path)), None)
+    taken = next(
+        (path for path in map(folder.joinpath, (*REGISTRY_FILES.values(), KEPT)) if os.path.lexists(path)), None
+    )
     if taken is not None or (os.path.lexists(folder) and not folder.is_dir()):
-        raise ConfigError(f"new registry: {taken or folder} is there already; name another folder, nothing is overwritten")
+        raise ConfigError(
+            f"new registry: {taken or folder} is there already; name another folder, nothing is overwritten"
+        )
     for source, place in REGISTRY_FILES.items():
         text = file_text(Path(__file__).parent / "my_registry" / source)
         written(folder / place, text.replace("my-registry", name).replace("VERSION", __version__))

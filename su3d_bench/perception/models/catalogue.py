@@ -127,9 +127,7 @@ def _siglip(name: str, summary: str, n_million: int, size_mb: int, repository: s
     hub = _hub(f"google/{repository}", size_mb, (*_CLIP_FILES[:3], "tokenizer.json"))
     forms = (hub, _exported(name, size_mb + 1))
     known_as = f"{architecture}/webli"
-    return ModelEntry(
-        name, "encoder", summary, "Apache-2.0", n_million, forms, known_as=known_as, trained_on=_WEBLI
-    )
+    return ModelEntry(name, "encoder", summary, "Apache-2.0", n_million, forms, known_as=known_as, trained_on=_WEBLI)
 
 
 def _sam(

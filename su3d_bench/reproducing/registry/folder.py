@@ -64,7 +64,9 @@ def read_registry(folder: Path) -> Registry:
     """
     files = bundle_files(folder)
     if not files and not (folder / BUNDLES).is_dir():
-        raise ConfigError(f"{shown(folder)}: holds no bundle; bring one in with: su3d-bench registry add BUNDLE --to DIR")
+        raise ConfigError(
+            f"{shown(folder)}: holds no bundle; bring one in with: su3d-bench registry add BUNDLE --to DIR"
+        )
     rows: list[Row] = []
     refused: list[Refused] = []
     for file in files:
@@ -116,8 +118,8 @@ def add_bundle(file: Path, registry: Path, name: str | None = None) -> Added:
     """Take ``file`` into ``registry`` after it was scored anew, or say why not.
 
     It is refused where its numbers are not what its maps give by the rule of ``verify_bundle``, where a row of it can
-    stand in no ranking, or does not go with the rows that are there. One that lies in the registry already, as in a pull
-    request, is held against all others and stays. A ``StoreError`` or ``DataError`` where it is no bundle, a
+    stand in no ranking, or does not go with the rows that are there. One that lies in the registry already, as in a
+    pull request, is held against all others and stays. A ``StoreError`` or ``DataError`` where it is no bundle, a
     ``ConfigError`` where ``name`` is none or the registry holds a damaged bundle.
     """
     others = [one for one in bundle_files(registry) if not _is_same_file(one, file)]
@@ -182,7 +184,9 @@ def _place(registry: Path, file: Path, rows: Sequence[Row], name: str | None) ->
         name = file.name[: -len(SUFFIX)] if file.name.lower().endswith(SUFFIX) else file.name
         if name == _ANY and rows:
             first = rows[0]
-            name = f"{first.bundle.recipe or re.sub('[^A-Za-z0-9._-]+', '-', first.entry.run)}-{first.bundle.sha256[:8]}"
+            name = (
+                f"{first.bundle.recipe or re.sub('[^A-Za-z0-9._-]+', '-', first.entry.run)}-{first.bundle.sha256[:8]}"
+            )
     if not _NAME.fullmatch(name):
         raise ConfigError(
             f"'{printable(name, 100)}' cannot be the name of a bundle: letters, digits, '.', '_' and '-' alone; choose "

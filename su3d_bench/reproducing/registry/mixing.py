@@ -20,7 +20,9 @@ N_DIGITS = 12  # of a digest, in a message
 def why_not_beside(row: Row, held: Sequence[Row]) -> str | None:
     """Why ``row`` cannot stand in a registry that holds the rows ``held``, with what to do; None where it can."""
     for other in held:
-        fault = _rules(row, other) or _data(row, other) or _encoder(row, other) or _name(row, other) or _labels(row, other)
+        fault = (
+            _rules(row, other) or _data(row, other) or _encoder(row, other) or _name(row, other) or _labels(row, other)
+        )
         if fault is not None:
             return f"{row.what}: {fault}"
     return None

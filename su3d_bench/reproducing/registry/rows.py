@@ -187,7 +187,9 @@ def _weights(run: FinishedRun, encoder: str | None, profile: str | None) -> Iter
     named = [EmbeddedEncoder.name] if "embedded" in parts else []
     named += [encoder] if known is None and encoder is not None else [known.name] if known is not None else []
     for model in dict.fromkeys([*run.record.models, *named]):
-        files = tuple((printable(name, 120), printable(sha, 80)) for name, sha in run.record.models.get(model, {}).items())
+        files = tuple(
+            (printable(name, 120), printable(sha, 80)) for name, sha in run.record.models.get(model, {}).items()
+        )
         if model == EmbeddedEncoder.name:
             yield Weights(model, EmbeddedEncoder.trained_on)
         else:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.core.errors import ConfigError, StoreError, printable, shown, some
+from su3d_bench.core.errors import ConfigError, printable, shown, some
 from su3d_bench.metrics.protocols.files import protocol_names
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.reports.registry.page import PAGE, page_html, page_name
@@ -25,6 +25,7 @@ from su3d_bench.reports.tables.model import (
 from su3d_bench.reproducing.registry.folder import SUFFIX, Registry
 from su3d_bench.reproducing.registry.rows import Row
 from su3d_bench.store.atomic import is_file, make_folder, read_json, remove_file, write_json, write_text
+from su3d_bench.store.unfinished import is_unfinished
 
 INDEX, DATA = "index.html", "registry.json"
 METHODS, SCENES = "methods", "scenes"
@@ -37,8 +38,8 @@ TITLE = "Registry of results"
 def write_site(registry: Registry, out: Path, title: str = TITLE, bundles_at: str | None = None) -> list[Path]:
     """The pages of ``registry`` in the folder ``out``, in the place of an earlier site; what was written, by name.
 
-    ``bundles_at``: the https address below which the bundles lie; None: they are named and not linked. A ``ConfigError``
-    where ``out`` holds something else.
+    ``bundles_at``: the https address below which the bundles lie; None: they are named and not linked. A
+    ``ConfigError`` where ``out`` holds something else.
     """
     earlier = _earlier_pages(out)
     address = _checked_address(bundles_at)
@@ -52,11 +53,14 @@ def write_site(registry: Registry, out: Path, title: str = TITLE, bundles_at: st
         pages[scene["page"]] = page_html("scene", scene["name"], {**data, "registry": title})
     for folder in ("", METHODS, SCENES):
         make_folder(out / folder)
+    # first of all, so that the site is known for one however this ends
+    write_json(out / DATA, {"kind": KIND, "schema": SCHEMA, "pages": sorted({*pages, *earlier}), **value})
     for name, text in pages.items():
         write_text(out / name, text)
-    write_json(out / DATA, {"kind": KIND, "schema": SCHEMA, "pages": sorted(pages), **value})
     for name in earlier - set(pages):
         remove_file(out / name)
+    if earlier - set(pages):
+        write_json(out / DATA, {"kind": KIND, "schema": SCHEMA, "pages": sorted(pages), **value})
     return [out / name for name in (*pages, DATA)]
 
 
@@ -66,12 +70,14 @@ def _earlier_pages(out: Path) -> set[str]:
         return set()
     if not out.is_dir():
         raise ConfigError(f"{shown(out)}: is no folder; name another with --out")
-    if not any(out.iterdir()):
+    if all(is_unfinished(name) for _, _, names in os.walk(out) for name in names):
         return set()
     value = read_json(out / DATA) if is_file(out / DATA) else None
     pages = value.get("pages") if isinstance(value, dict) and value.get("kind") == KIND else None
     if not isinstance(pages, list):
-        raise ConfigError(f"{shown(out)}: holds something that is no site of a registry; name an empty folder with --out")
+        raise ConfigError(
+            f"{shown(out)}: holds something that is no site of a registry; name an empty folder with --out"
+        )
     return {name for name in pages if isinstance(name, str) and _is_page(name)}
 
 
@@ -139,8 +145,8 @@ def _notes(board: Sequence[Row]) -> Iterator[str]:
         yield f"features of several encoders, which the protocol leaves open: {some(list(encoders), 6)}"
     if any(row.entry.ranks for row in board):
         yield (
-            f"rank: from which to which a row may go by {first.headline[0]}, with 95 % for all rows together: sign-flip "
-            "tests of all pairs, of their means over scenes, corrected by Holm"
+            f"rank: from which to which a row may go by {first.headline[0]}, with 95 % for all rows together: sign-"
+            "flip tests of all pairs, of their means over scenes, corrected by Holm"
         )
     elif len(rivals) > 1:
         yield f"no ranks: {len(rivals)} rows are more than are tested in pairs"

@@ -145,6 +145,47 @@ def _counts(folder: Path) -> Read:
     return lambda: unpack_scores(path.read_bytes() if path.is_file() else b"")
 
 
+def _bundle(folder: Path) -> Read:
+    """A bundle as it comes from somebody: what a registry reads of it, and what verifies it."""
+    from su3d_bench.reproducing.bundle import bundle_runs
+    from su3d_bench.reproducing.registry.rows import rows_of_bundle
+    from su3d_bench.reproducing.verifying import verify_bundle
+
+    place = folder / "a.zip"
+    bundle_runs(place, [_made_run()])
+    reads = itertools.cycle([partial(rows_of_bundle, place), partial(verify_bundle, place)])
+    return lambda: next(reads)()
+
+
+def _registry(folder: Path) -> Read:
+    """A registry of one bundle that is put together of its parts, all of its digests right, and the site of it."""
+    from registry_bundles import read_bundle, rewrite_bundle
+
+    from su3d_bench.reproducing.bundle import bundle_runs
+    from su3d_bench.reproducing.registry.folder import read_registry
+    from su3d_bench.reproducing.registry.site import write_site
+    from su3d_bench.reproducing.verifying import verify_bundle
+
+    bundle_runs(folder / "a.zip", [_made_run()])
+    files, manifest = read_bundle(folder / "a.zip")
+    (folder / "a.zip").unlink()
+    names = [name for name in files if name.endswith(("json", "toml", "counts.npz", "updates.csv"))]
+    for name in names:
+        (folder / "parts" / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / "parts" / name).write_bytes(files[name])
+    place = folder / "registry" / "bundles" / "a.zip"
+
+    def read() -> None:
+        parts = {name: folder / "parts" / name for name in names}
+        held = {name: path.read_bytes() for name, path in parts.items() if path.is_file()}
+        kept = {name: content for name, content in files.items() if name not in parts or name in held}
+        rewrite_bundle(place, {**kept, **held}, manifest)
+        write_site(read_registry(folder / "registry"), folder / "site")
+        verify_bundle(place)
+
+    return read
+
+
 def _paper(folder: Path) -> Read:
     run, paper = copied_run(folder), folder / "paper.tex"
     called(["report", "tables", str(run), "--format", "latex", "--out", str(paper)])
@@ -369,6 +410,8 @@ TARGETS = (
     Target("run verbs", _verbs, (f"{RUN}/*.json", f"{RUN}/run.toml", f"{JOB}/*", "reference.json"), 0.05),
     Target("run resumed", _resumed, (f"{RUN}/**/*",), 0.02),
     Target("run packed counts", _counts, ("counts.npz",)),
+    Target("bundle", _bundle, ("a.zip",), 0.15),
+    Target("registry", _registry, ("parts/**/*",), 0.05),
     Target("paper", _paper, ("paper.tex",), 0.15),
     Target("answers.csv", _answers("ann.csv"), ("ann.csv",)),
     Target("answers.xlsx", _answers("bob.xlsx"), ("bob.xlsx",), 0.3),

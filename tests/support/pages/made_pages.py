@@ -107,7 +107,7 @@ def page_of_audit(folder: Path) -> Path:
 
 
 def site_of_registry(folder: Path) -> Path:
-    """``registry build``: two bundles, of which one says what its weights were trained on; one site for all its pages."""
+    """``registry build``: two bundles, of which one says what its weights were trained on; one site for all pages."""
     registry, site = folder.parent / "registry", folder.parent / "registry-site"
     if not site.exists():
         registry.mkdir()

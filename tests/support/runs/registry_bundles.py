@@ -28,7 +28,7 @@ Files = dict[str, bytes]
 def painted_bundle(
     folder: Path, name: str, methods: Sequence[str], scenes: str = "abc", more: Sequence[str] = (), said: str = ""
 ) -> Path:
-    """``folder/name.zip``: a run of variants of the painted collector; it names code of its own, so no verifier takes it."""
+    """``folder/name.zip``: variants of the painted collector; it names code of its own, so no verifier takes it."""
     words = ["run", "--scenes", *(f"{PAINTED}:Painted/{scene}" for scene in scenes), "--no-pictures", "--jobs", "1"]
     words += ["--methods", *(f"{PAINTED}:Collector{method}" for method in methods), "--protocols", *PROTOCOLS, *more]
     with pytest.MonkeyPatch.context() as patch:

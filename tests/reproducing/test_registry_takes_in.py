@@ -90,7 +90,7 @@ def test_a_tampered_bundle_is_refused_with_its_reason(
     tamper(files)
     rewrite_bundle(tmp_path / "t.zip", files, manifest)
     assert main(["registry", "add", str(tmp_path / "t.zip"), "--to", str(tmp_path)]) == 1
-    assert f"t.zip: refused: " in (said := capsys.readouterr().out) and says in said
+    assert "t.zip: refused: " in (said := capsys.readouterr().out) and says in said
     assert not (tmp_path / "bundles").exists()
 
 

@@ -92,7 +92,10 @@ def other_data(files: Files) -> None:
     ("change", "says"),
     [
         (other_data, "its data of painted/a have the digest 000000000000, those of collector@drop=1 in ann.zip "),
-        (lambda files: None, "that name is taken by collector@drop=1 in ann.zip over the same scenes; give the variant"),
+        (
+            lambda files: None,
+            "that name is taken by collector@drop=1 in ann.zip over the same scenes; give the variant",
+        ),
     ],
 )
 def test_rows_that_mix_data_or_name_a_method_twice_are_refused(
@@ -129,7 +132,9 @@ def test_features_of_two_encoders_do_not_mix_where_the_protocol_names_one(regist
     entry = replace(rows[0].entry, protocol="replica-openmask3d", method="other")
     one, other = replace(rows[0], entry=entry, encoder="ViT-L-14-336/openai"), replace(rows[1], encoder="su3d-embedded")
     other = replace(other, entry=replace(entry, method="mine"))
-    assert "its features are of the encoder su3d-embedded, those of other in ann.zip of" in (why_not_beside(other, [one]) or "")
+    assert "its features are of the encoder su3d-embedded, those of other in ann.zip of" in (
+        why_not_beside(other, [one]) or ""
+    )
     assert why_not_beside(replace(other, encoder=None), [one]) is None, "it names its instances itself"
     free = [replace(row, entry=replace(row.entry, protocol="rooms-instance")) for row in (other, one)]
     assert why_not_beside(free[0], free[1:]) is None, "a protocol that names none leaves it open"
