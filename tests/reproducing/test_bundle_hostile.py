@@ -54,6 +54,24 @@ def test_a_name_that_stands_twice_is_refused(tmp_path: Path, other: str) -> None
         unpack(tmp_path / "b.zip", tmp_path / "into")
 
 
+def test_a_manifest_of_another_case_is_none(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "b.zip", "w") as archive:
+        archive.writestr("Manifest.json", "{}")
+    with pytest.raises(StoreError, match=r"has no manifest\.json of a bundle"):
+        unpack(tmp_path / "b.zip", tmp_path / "into")
+
+
+def test_a_member_whose_compression_is_damaged_is_one_line(tmp_path: Path) -> None:
+    place = tmp_path / "b.zip"
+    with zipfile.ZipFile(place, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("manifest.json", json.dumps({"schema": 1, "program": "x" * 500, "runs": []}))
+    content = bytearray(place.read_bytes())
+    content[30 + len("manifest.json") : 50 + len("manifest.json")] = b"\xff" * 20
+    place.write_bytes(content)
+    with pytest.raises(StoreError, match="is no bundle, or damaged"):
+        unpack(place, tmp_path / "into")
+
+
 def test_what_would_unpack_to_far_more_than_it_is_is_refused(tmp_path: Path) -> None:
     zeros = bytes(200 << 20)
     entries = {"a": {"n_bytes": len(zeros), "sha256": digest_bytes(zeros)}}

@@ -37,7 +37,7 @@ def test_a_bundle_that_holds_comes_in_to_the_last_bit_once(
     words = ["registry", "add", str(bundle), "--to", str(tmp_path)]
     assert main([*words, "--name", "opensu3d", "--json"]) == 0
     (found,) = json.loads(capsys.readouterr().out)["bundles"]
-    assert found["is_added"] and found["is_to_the_bit"] and (found["n_rows"], found["n_scores"]) == (4, 4)
+    assert found["is_added"] and found["is_to_the_bit"] and (found["n_rows"], found["n_scores"]) == (5, 5)
     assert (tmp_path / "bundles" / "opensu3d.zip").read_bytes() == bundle.read_bytes()
     assert main(words) == 1
     assert "is there already as opensu3d.zip" in capsys.readouterr().out
@@ -164,7 +164,7 @@ def test_the_workflows_commands_score_a_pull_request_and_build_the_site_as_they_
             done = subprocess.run(words, cwd=repository, env=environment, capture_output=True, text=True, check=False)
             assert done.returncode == 0, done.stderr
             said += done.stdout
-    assert "4 rows; 4 scores made anew, to the last bit" in said
+    assert "5 rows; 5 scores made anew, to the last bit" in said
     assert (tmp_path / "temp" / "site" / "index.html").is_file()
     assert not (repository / "struck").exists()
 

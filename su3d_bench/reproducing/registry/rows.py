@@ -130,9 +130,16 @@ def _rows(unpacked: Unpacked, bundle: BundleFacts) -> Iterator[Row | Refused]:
         name = printable(place.name, 120)
         try:
             run = read_run(place)
+            # what a protocol does not score, such as the instances of dense features, is no row and no fault
+            unscored = {
+                f"{printable(method, 80)} / {printable(protocol, 80)}"
+                for (method, protocol), record in run.results.items()
+                if record.result is None and not record.failed
+            }
             for entry in entries_of(name, run):
                 if isinstance(entry, Refused):
-                    yield entry
+                    if entry.what not in unscored:
+                        yield entry
                 elif (entry.method, entry.protocol) in run.results and is_plain(entry.method):
                     yield _row(run, entry, unpacked, bundle)
                 else:

@@ -39,11 +39,23 @@ def painted_bundle(
 
 
 def room_bundle(folder: Path, *, data: Path) -> Path:
-    """A bundle that holds: two methods on one small room under two protocols, perception by the truth."""
+    """A bundle that holds: three methods on one small room, perception by the truth; one has no instances to score."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SU3D_DATA", str(data))
         patch.setenv("SU3D_CACHE", str(folder / "cache"))
-        words = ["run", "--scenes", ROOM, "--methods", "opensu3d", "oracle", "--protocols", *PROTOCOLS, "--set", *SMALL]
+        words = [
+            "run",
+            "--scenes",
+            ROOM,
+            "--methods",
+            "opensu3d",
+            "conceptfusion",
+            "oracle",
+            "--protocols",
+            *PROTOCOLS,
+            "--set",
+            *SMALL,
+        ]
         words += ["--profile", "oracle", "--no-pictures", "--jobs", "1", "--quiet", "--stride", "2"]
         assert main([*words, "--out", str(folder / "room")]) == 0
         assert main(["report", "bundle", str(folder / "room"), "--out", str(folder / "room.zip"), "--quiet"]) == 0
