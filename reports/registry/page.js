@@ -164,7 +164,7 @@ function methodPage() {
     const id = `board-${k}`;
     const values = board.headline.map((metric, j) => h('li', null, `${metric} `, h('b', null, metricText(metric, row.values[j])),
       row.intervals[j] ? ` [${row.intervals[j].map((end) => metricText(metric, end)).join(', ')}]` : null));
-    const rank = row.ranks ? h('li', null, 'rank ', h('b', null, ranksText(row)), ` of ${board.n_rows}`) : null;
+    const rank = row.ranks ? h('li', null, 'rank ', h('b', null, ranksText(row)), ` of ${board.n_ranked}`) : null;
     section(id, board.protocol,
       intro(`Version ${board.version}: ${board.summary}. ${scenesText(board)}.`),
       h('ul', { class: 'facts' }, values, rank), notes([...(row.caveat ? [row.caveat] : []), ...row.warnings]),

@@ -203,7 +203,11 @@ def _index(value: Mapping[str, Any]) -> dict[str, Any]:
 
 def _method_page(value: Mapping[str, Any], method: str) -> dict[str, Any]:
     boards = [
-        {**board, "n_rows": len(board["rows"]), "rows": [row for row in board["rows"] if row["method"] == method]}
+        {
+            **board,
+            "n_ranked": sum(row["ranks"] is not None for row in board["rows"]),
+            "rows": [row for row in board["rows"] if row["method"] == method],
+        }
         for board in value["boards"]
     ]
     pages = {scene["name"]: scene["page"] for scene in value["scenes"]}
