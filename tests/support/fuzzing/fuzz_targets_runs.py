@@ -153,8 +153,9 @@ def _bundle(folder: Path) -> Read:
 
     place = folder / "a.zip"
     bundle_runs(place, [_made_run()])
-    reads = itertools.cycle([partial(rows_of_bundle, place), partial(verify_bundle, place)])
-    return lambda: next(reads)()
+    reads: list[Read] = [partial(rows_of_bundle, place), partial(verify_bundle, place)]
+    turns = itertools.cycle(reads)
+    return lambda: next(turns)()
 
 
 def _registry(folder: Path) -> Read:
