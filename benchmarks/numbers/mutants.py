@@ -56,7 +56,7 @@ GUARDS: dict[str, tuple[str, ...]] = {
     "metrics/instance/": (*_CURVES, *_SCORES),
     "metrics/semantic/": ("test_metrics_semantic", "test_metrics_undefined", "test_metrics_hovsg", *_SCORES),
     "metrics/semantic/panoptic_quality.py": ("test_panoptic_protocol",),
-    "metrics/semantic/panoptic_score.py": ("test_panoptic_protocol",),
+    "metrics/semantic/panoptic_score.py": ("test_panoptic_protocol", "test_panoptic_labelled_points"),
     "metrics/semantic/top_k.py": ("test_metrics_scannetpp",),
     "metrics/relations/": ("test_relation_protocol",),
     "metrics/labels.py": ("evaluation/test_labels_counted",),
