@@ -121,11 +121,14 @@ def serve_rooms(server: FileServer, place: Place) -> list[dict[str, Any]]:
     rc, _, err = place.run("datasets", "make", "rooms", "--layout", "replica", "--out", made, *ROOM)
     assert rc == 0, err
     frames, mesh = made / "Replica/bedroom0", made / "replica_v1/bedroom_0"
+    scan = made / "Replica/bedroom0_mesh.ply"
     for scene in SCENES:
         shutil.copytree(frames, frames.parent / scene)
+        shutil.copy(scan, scan.parent / f"{scene}_mesh.ply")
         shutil.copytree(mesh, mesh.parent / f"{scene[:-1]}_{scene[-1]}")
     shutil.rmtree(frames)
     shutil.rmtree(mesh)
+    scan.unlink()
     return serve_replica(server, made)
 
 

@@ -58,7 +58,7 @@ def test_a_dry_run_names_every_fact_and_contacts_nobody(
     assert f"{server.url}/{SAM}" in out and "licence MIT: https://example.org/licence" in out
     code, out, _ = called(["fetch", "models", "--for", "paper", "--dry-run", "--json"], capsys)
     rows = {row["name"]: row for row in json.loads(out)}
-    assert list(rows) == ["clip-vit-h-14", "sam-vit-h", "grounding-dino", "ram-plus"]
+    assert list(rows) == ["clip-vit-h-14", "sam-vit-h", "grounding-dino", "ram-plus", "clip-vit-l-14-336"]
     assert all(row["licence"]["read_at"] and row["n_bytes"] and row["addresses"] for row in rows.values())
     assert called(["fetch", "replica", "--dry-run"], capsys)[0] == 0
     assert called(["fetch", "scannet", "--dry-run"], capsys)[0] == 0

@@ -218,7 +218,7 @@ def test_the_profile_says_what_it_computes_otherwise_than_the_paper_and_nothing_
     encoder = SimpleNamespace(name="ViT-H-14/laion2b_s32b_b79k")  # as the encoder itself says
     captioner = SimpleNamespace(vision_model="gpt-4-vision-preview")
     assert profile_paper.stand_ins(PaperConfig(), ram, encoder, captioner) == []  # type: ignore[arg-type]
-    assert profile_paper.stand_ins(PaperConfig(), ram, encoder, None) == [
+    assert profile_paper.stand_ins(PaperConfig(), ram, encoder, None) == [  # type: ignore[arg-type]
         "names and captions: the tagger's names and a template stand in for the paper's vision model"
     ]
     other = PaperConfig.model_validate(
