@@ -217,7 +217,8 @@ def _truths(run: AskedRun, dataset: Any, scene: str, how: str) -> Iterator[Need]
         left = [other for other in variants if other not in missing]
         remark = f"{why}; without it {', '.join(variants[variant])} scores nothing"
         name = f"{run.dataset}/{scene}: {variant}"
-        yield Need("truth", name, is_here=False, how=how, is_required=not left, remark=remark)
+        brings = how if "su3d-bench fetch" in why else ""  # labels of others are not among what is fetched
+        yield Need("truth", name, is_here=False, how=brings, is_required=not left, remark=remark)
 
 
 def _models(run: AskedRun) -> Iterator[Need]:

@@ -156,10 +156,10 @@ def _reproduce(
     if known.missing:
         first = known.missing[0]
         more = f" and {len(known.missing) - 1} more" if len(known.missing) > 1 else ""
-        how = f"; get it with: {first.how}" if first.how else ""
+        how = f"; get it with: {first.how}" if first.how else f"; {first.remark}" if first.remark else ""
+        ends = "" if arguments.rehearse else ", --rehearse does without"
         raise ConfigError(
-            f"reproduce {recipe.name}: {first.kind} {first.name} is missing{more}{how}; --dry-run lists all, "
-            "--rehearse does without"
+            f"reproduce {recipe.name}: {first.kind} {first.name} is missing{more}{how}; --dry-run lists all{ends}"
         )
     folders = evaluate_predictions(named, experiments, asked, out)  # first: it takes minutes, the runs hours
     failures = [failure for run in runs for failure in _carry_out(run, out, arguments)]

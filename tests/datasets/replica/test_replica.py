@@ -119,7 +119,9 @@ def test_the_original_is_found_in_the_usual_places(tmp_path: Path, folder: str) 
 
 
 def test_without_data_the_error_says_how_to_get_it(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"no scene in .*Replica\.zip.*datasets make rooms --layout replica --out"):
+    with pytest.raises(
+        DataError, match=r"no scene in .*fetch replica frames brings them.*datasets make rooms --layout replica --out"
+    ):
         Replica(tmp_path).scenes()
 
 
