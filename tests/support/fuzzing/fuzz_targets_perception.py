@@ -93,7 +93,12 @@ def _tagger_manifest(folder: Path) -> Read:
 
     digests = {RAM_MODEL: "0" * 64, RAM_TAG_LIST: "1" * 64}
     parity = {"output": "logit", "n_values": 15, "max_abs_difference": 1e-6, "min_cosine": 1.0}
-    content = {"format": RamManifest.FORMAT, "name": "ram-plus", "files": digests, "source": {"form": "original"}}
+    content: dict[str, Any] = {
+        "format": RamManifest.FORMAT,
+        "name": "ram-plus",
+        "files": digests,
+        "source": {"form": "original"},
+    }
     content |= {"opset": 17, "parity": [parity], "n_tags": 5, "code": {"ram/models/bert.py": "2" * 64}}
     path = folder / "manifest.json"
     path.write_text(json.dumps({**content, "made_with": {"torch": "2.13.0"}, "n_undecided": 0}))
