@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_models_cli import needs_models
+from tiny_models import needs_models
 from tiny_ram_plus import TAGS, THRESHOLDS, tiny_tensors, write_checkout
 
 from su3d_bench.cli.main import main
