@@ -25,6 +25,7 @@ from su3d_bench.reproducing.recipe import Experiment
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 _NAMES = ("name", "version", "summary", "original", "headline", "not_comparable_with", "datasets", "by_default")
+_ENCODER = ("perception", "models", "encoder")
 _EVERY = re.compile(r"every (\d+)(?:st|nd|rd|th)")
 MOST_RULES = 4
 
@@ -79,6 +80,23 @@ class Results:
     @cached_property
     def measured(self) -> Sequence[Measured]:
         return measured_results(self.folders)
+
+    def of(self, experiment: Experiment) -> Results:
+        """The runs that an experiment looks at: those of its encoder and stride, and predictions made elsewhere.
+
+        All where none is, for then others were asked for in place of the recipe's.
+        """
+        made = {name: run.settings for name, run in self.runs.items() if _ENCODER in run.settings}
+        wanted = experiment.encoder, experiment.stride
+        others = {name for name, said in made.items() if (said[_ENCODER], said.get(("stride",), 0)) != wanted}
+        if len(others) in (0, len(made)):
+            return self
+        folders = tuple(folder for folder in self.folders if str(folder) not in others)
+        return self._parts.setdefault(folders, Results(folders))
+
+    @cached_property
+    def _parts(self) -> dict[tuple[Path, ...], Results]:
+        return {}
 
 
 def compared(experiment: Experiment, results: Results) -> list[Compared]:
@@ -305,13 +323,14 @@ def _shown(cell: Compared | None) -> tuple[str, str, str]:
 
 def compared_all(experiments: Sequence[Experiment], results: Results) -> dict[str, list[Compared]]:
     """The cells of every experiment that has printed figures."""
-    return {one.name: compared(one, results) for one in experiments if one.figures}
+    return {one.name: compared(one, results.of(one)) for one in experiments if one.figures}
 
 
 def tables_of(experiment: Experiment, results: Results) -> list[Table]:
     """The paper's own table of an experiment, as ``report tables --table`` makes it; none where it has none."""
     if experiment.table is None:
         return []
+    results = results.of(experiment)
     mine = [row for row in results.measured if row.protocol in experiment.protocols]
     methods = [name for name in methods_of(experiment) if any(row.method == name for row in mine)]
     folders = [folder for folder in results.folders if any(row.run == str(folder) for row in mine)]

@@ -23,7 +23,7 @@ def draw_queries(experiments: Sequence[Experiment], results: Results, out: Path,
     for experiment in experiments:
         if not experiment.queries:
             continue
-        for run in results.runs.values():
+        for run in results.of(experiment).runs.values():
             if experiment.queries and set(methods_of(experiment)) <= set(run.methods):
                 yield from _of_run(experiment, run, out / experiment.name, device)
                 break

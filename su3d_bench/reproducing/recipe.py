@@ -89,7 +89,7 @@ class Rehearsal(BaseModel):
     model_config = _STRICT
 
     rooms: Annotated[tuple[Word, ...], Field(min_length=1)] = ("bedroom0", "office0")
-    settings: tuple[Word, ...] = ("n_frames=200", "width=320", "height=240")
+    settings: tuple[Word, ...] = ("n_frames=100", "width=240", "height=180")
     profile: Literal["paper", "embedded", "oracle"] = "paper"
 
 
@@ -116,12 +116,13 @@ class Recipe(BaseModel):
         return self
 
     def chosen(self, names: Sequence[str]) -> tuple[Experiment, ...]:
-        """The experiments of these names, all where none is named; a ``ConfigError`` for an unknown one."""
-        known = {one.name: one for one in self.experiments}
+        """The experiments of these names, all where none is named, each with its encoder; a ``ConfigError`` for an
+        unknown one."""
+        known = {one.name: one.model_copy(update={"encoder": one.encoder or self.encoder}) for one in self.experiments}
         for name in names:
             if name not in known:
                 raise ConfigError(f"recipe '{self.name}' has no table '{printable(name, 60)}'{suggest(name, known)}")
-        return tuple(known[name] for name in dict.fromkeys(names)) if names else self.experiments
+        return tuple(known[name] for name in dict.fromkeys(names or known))
 
 
 def recipe_names() -> tuple[str, ...]:

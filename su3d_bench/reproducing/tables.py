@@ -101,7 +101,7 @@ def result_tables(
         if cells.get(experiment.name):
             tables.append(comparison_table(experiment, cells[experiment.name]))
         if experiment.timing:
-            tables += _timing(experiment, results)
+            tables += _timing(experiment, results.of(experiment))
     return tables
 
 
