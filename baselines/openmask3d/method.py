@@ -68,6 +68,8 @@ class OpenMask3D:
         "which exports do not hold; no figure of the paper has been reproduced",
     )
 
+    needs_surface = True  # its proposals lie on the scan's mesh
+
     def __init__(self, config: OpenMask3DConfig | None = None) -> None:
         self.config = config or self.Config()
         self.finish_costs: dict[str, float | int] = {}  # frames read again and views looked at by the last ``finish``

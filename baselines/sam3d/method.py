@@ -131,6 +131,11 @@ class SAM3D:
         return PerceptionNeeds(masks="class-agnostic", automatic="sam")
 
     @property
+    def needs_surface(self) -> bool:
+        """The ensemble alone asks for the scan's segments."""
+        return self.config.ensemble
+
+    @property
     def caveat(self) -> str:
         """The original has neither features nor scores, and ends on the vertices of ScanNet's meshes."""
         return (

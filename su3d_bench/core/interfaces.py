@@ -313,6 +313,13 @@ class TakesTools(Protocol):
 
 
 @runtime_checkable
+class NeedsSurface(Protocol):
+    """Whether it cannot do without the scan's mesh, as it is set."""
+
+    needs_surface: bool
+
+
+@runtime_checkable
 class TakesTruth(Method, Protocol):
     """Is told the ground truth, and is a ceiling."""
 
@@ -416,6 +423,7 @@ ABILITIES = {
         WarmsUp,
         TakesDevice,
         TakesTools,
+        NeedsSurface,
         TakesTruth,
         CountsPoints,
         CountsInstances,

@@ -14,7 +14,7 @@ from typing import Any
 from su3d_bench.core import registry
 from su3d_bench.core.config import Settings, read_assignments, resolve
 from su3d_bench.core.errors import GroundTruthMissing, ModelMissing, Su3dError
-from su3d_bench.core.interfaces import HasGroups
+from su3d_bench.core.interfaces import HasGroups, NeedsSurface
 from su3d_bench.core.system.devices import require_installed
 from su3d_bench.fetching.sources import built_in
 from su3d_bench.metrics.protocols.loading import load_protocol
@@ -24,8 +24,9 @@ from su3d_bench.perception.models.front_end import DETECTOR, PACKAGES, TAGGER
 from su3d_bench.perception.profiles import PerceptionConfig
 from su3d_bench.reproducing.asked import AskedRun
 from su3d_bench.reproducing.costs import FILE, NAME, Estimate, UnitCosts, Work, calibrated_ms, estimated, read_costs
-from su3d_bench.runs.parts import build_dataset, part_of
-from su3d_bench.runs.planning.plan import named_method
+from su3d_bench.runs.feeding import surface_of
+from su3d_bench.runs.parts import build_dataset, build_method, part_of
+from su3d_bench.runs.planning.plan import method_part, named_method
 from su3d_bench.runs.planning.scenes import data_root, split_address
 from su3d_bench.store.atomic import is_file
 
@@ -38,7 +39,7 @@ FRAMES = 1000  # of a scene of which neither the dataset nor the table of what c
 
 @dataclass(frozen=True)
 class Need:
-    """One thing that runs need: ``kind`` is package, model, scene, truth, disk, memory or GPU memory.
+    """One thing that runs need: ``kind`` is package, model, scene, mesh, truth, disk, memory or GPU memory.
 
     ``n_bytes``: what is to be fetched or has to be free, None where nobody says. ``is_required`` false: the run does
     without it, and ``remark`` says how.
@@ -197,7 +198,23 @@ def _data(run: AskedRun) -> Iterator[Need]:
             "scene", address, not fault, 0.0 if not fault else size.n_bytes, size.how if fault else "", remark=fault
         )
         if not fault:
+            yield from _surface(run, dataset, scene, size.how)
             yield from _truths(run, dataset, scene, size.how)
+
+
+def _surface(run: AskedRun, dataset: Any, scene: str, how: str) -> Iterator[Need]:
+    """The scan's mesh, where it is missing and a method cannot do without."""
+    named = [named_method(text) for text in run.methods]
+    settings = read_assignments(run.settings, tuple({*run.methods, *(one.base for one in named)}), (run.dataset,))
+    methods = [build_method(method_part(one, settings)) for one in named]
+    asking = [method.name for method in methods if isinstance(method, NeedsSurface) and method.needs_surface]
+    if not asking:
+        return
+    try:
+        surface_of(dataset, scene)
+    except Su3dError as error:
+        remark = f"{error}; {', '.join(dict.fromkeys(asking))} cannot do without"
+        yield Need("mesh", f"{run.dataset}/{scene}: the scan's mesh", is_here=False, how=how, remark=remark)
 
 
 def _truths(run: AskedRun, dataset: Any, scene: str, how: str) -> Iterator[Need]:

@@ -18,6 +18,7 @@ from su3d_bench.analysis.recomputed import damaged_files, rules_of_run, why_not_
 from su3d_bench.core import registry
 from su3d_bench.core.config import MOVES_NO_NUMBER, Setting, Settings
 from su3d_bench.core.errors import StoreError, Su3dError, counted, printable
+from su3d_bench.core.system.devices import device_for
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.system.timing import processor_digest
 from su3d_bench.evaluation.evaluate import evaluate
@@ -144,7 +145,7 @@ def _one(array: NDArray[Any], k: int) -> str:
 def _of_maps(run: FinishedRun, folder: Path) -> Iterator[tuple[str, str, dict[str, SceneScore]]]:
     """The scores of the maps of a run that was made here or elsewhere by this program."""
     refuse_own_code(run)
-    encoder = encoder_of(run.folder)
+    encoder = encoder_of(run.folder, device_of(run))
     for job in _jobs(run, folder):
         run.dataset(job.scene)  # raises where the data here are others
         for part in job.methods:
@@ -165,6 +166,14 @@ def _jobs(run: FinishedRun, folder: Path) -> Sequence[SceneJob]:
     if missing:
         raise StoreError(f"{counted(len(missing), 'scene')} of the run not here, such as {printable(min(missing), 80)}")
     return [replace(job, folder=run.folder.path) for job in plan.jobs if job.scene in wanted]
+
+
+def device_of(run: FinishedRun) -> str:
+    """Where the run encoded texts, for other bits come of another device; the CPU where there is none such here."""
+    try:
+        return device_for(str(run.settings.get(("perception", "models", "device"), "cpu")), 0)
+    except Su3dError:
+        return "cpu"
 
 
 def refuse_own_code(run: FinishedRun) -> None:

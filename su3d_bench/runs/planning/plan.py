@@ -204,7 +204,7 @@ def make_plan(
     if config.executor not in ELSEWHERE:
         device_for(perception.models.device, 0)  # raises where there is no such GPU
     parts = _Parts(
-        tuple(_method_part(method, settings) for method in methods.values()),
+        tuple(method_part(method, settings) for method in methods.values()),
         {target: part_of("dataset", target, settings) for target in datasets.values()},
         None if CEILING_METHOD in methods else part_of("method", CEILING_METHOD, settings),
         perception.model_dump_json(),
@@ -287,7 +287,7 @@ class _Parts:
     protocols: dict[str, tuple[str, ...]]
 
 
-def _method_part(method: NamedMethod, settings: Settings) -> Part:
+def method_part(method: NamedMethod, settings: Settings) -> Part:
     """A method with the settings of its base, then those of its variant, then those under its own full name."""
     path = "method", method.name
     base, own = (
