@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import os
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
+
+from check_wheel import bring_kernels, built_wheel
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = {page.stem: page for page in sorted((ROOT / "docs" / "tutorials").glob("*.md"))}
@@ -62,34 +63,16 @@ def not_printed(shown: str, printed: str) -> list[str]:
 
 def install(place: Path) -> dict[str, str]:
     """The environment in which ``su3d-bench`` is the wheel's, unpacked in ``place``."""
-    wheels = place / "wheel"
-    build = [sys.executable, "-m", "build", "--wheel", "--outdir", str(wheels), str(ROOT)]
-    subprocess.run(build, check=True, capture_output=True)
-    (wheel,) = wheels.glob("*.whl")
+    wheel = built_wheel(place / "wheel")
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--disable-pip-version-check"]
     subprocess.run([*pip, "--target", str(place / "installed"), str(wheel)], check=True)
-    bring_kernels(ROOT / "su3d_bench", place / "installed" / "su3d_bench")
+    bring_kernels(place / "installed" / "su3d_bench")
     path = os.pathsep.join([str(place / "installed/bin"), str(Path(sys.executable).parent), os.environ["PATH"]])
     environment = os.environ | {"PYTHONPATH": str(place / "installed"), "PATH": path}
     where = [sys.executable, "-c", "import su3d_bench; print(su3d_bench.__file__)"]
     found = subprocess.run(where, cwd=place, env=environment, check=True, capture_output=True, text=True).stdout
     assert found.startswith(str(place / "installed")), f"not the wheel's: {found}"
     return environment
-
-
-def bring_kernels(here: Path, installed: Path) -> None:
-    """Numba's compiled kernels go with sources that are the same: to compile them again takes a minute.
-
-    Numba takes what it kept for a source of the same size and time.
-    """
-    for source in installed.rglob("*.py"):
-        original = here / source.relative_to(installed)
-        kept = [*original.parent.glob(f"__pycache__/{original.stem}.*.nb[ic]")]
-        if kept and original.read_bytes() == source.read_bytes():
-            shutil.copystat(original, source)
-            (source.parent / "__pycache__").mkdir(exist_ok=True)
-            for file in kept:
-                shutil.copy2(file, source.parent / "__pycache__")
 
 
 def follow(page: str, folder: Path, environment: Mapping[str, str]) -> list[str]:

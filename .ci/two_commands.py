@@ -24,7 +24,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests" / "support" / "files"))
 
-from check_wheel import built_wheel  # noqa: E402
+from check_wheel import bring_kernels, built_wheel  # noqa: E402
 from file_server import FileServer, Served, file_server, serve_repository  # noqa: E402
 from published import entry, serve_file, serve_model, serve_replica, write_table  # noqa: E402
 
@@ -89,6 +89,7 @@ def installed(folder: Path) -> Place:
     words = ["-m", "pip", "--python", str(python), "--quiet", "install", "--no-deps", "--no-index", str(wheel)]
     subprocess.run([sys.executable, *words], check=True)
     (packages,) = (folder / "venv/lib").glob("python*/site-packages")
+    bring_kernels(packages / "su3d_bench")
     # A folder that a .pth file names is searched; the .pth files in it, that of the project's sources, are not read.
     (packages / "beside.pth").write_text(sysconfig.get_path("purelib") + "\n")
     for name in ("home", "elsewhere"):

@@ -97,6 +97,11 @@ def opened_runs(runs_page: Path, tmp_path_factory: pytest.TempPathFactory) -> It
         yield found
 
 
+def pytest_xdist_auto_num_workers() -> int:
+    """One more than cores: tests wait for processes, browsers and servers."""
+    return len(os.sched_getaffinity(0)) + 1
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_cmdline_main(config: pytest.Config) -> None:
     """Where several processes share the work, each takes whole files: what the tests of a file share is made once."""

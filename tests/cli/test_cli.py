@@ -176,7 +176,7 @@ def test_a_protocol_shows_every_rule(capsys: pytest.CaptureFixture[str]) -> None
         ),
         (
             ["report", "runs/demo"],
-            "report: unknown action 'runs/demo'; known: tables, timing, html, samples, rerun, leaderboard, verify; ",
+            "report: unknown action 'runs/demo'; known: tables, timing, html, samples, rerun, leaderboard, bundle, ",
         ),
         (
             ["report", "tables", "r", "--table", "VI"],

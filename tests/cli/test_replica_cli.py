@@ -42,7 +42,10 @@ def test_list_tells_datasets_places_and_scenes_and_how_to_get_what_is_not_here(
     assert main(["datasets", "list", "replica"]) == 0
     text = capsys.readouterr().out
     assert f"looked for in: {tmp_path / 'data' / 'Replica'}" in text
-    assert "Replica.zip there, set SU3D_DATA to where it is, or make rooms in this layout" in text
+    assert (
+        "su3d-bench fetch replica frames brings them; set SU3D_DATA to where they are, or make rooms in this layout"
+        in text
+    )
 
 
 def test_list_tells_the_state_of_each_scene(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import shutil
@@ -14,7 +13,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pytest
 from tiny_models import needs_models
 
@@ -97,19 +95,6 @@ def test_another_process_in_another_folder_scores_the_bundle_to_the_same_bits(
 Files = dict[str, bytes]
 
 
-def flip_a_label(files: Files) -> None:
-    """Two instances of a map change their names and features."""
-    arrays = dict(np.load(io.BytesIO(files[f"{JOB}/prediction.npz"])))
-    for name in ("features", "names", "view_names"):
-        arrays[name] = arrays[name][::-1].copy()
-    content = io.BytesIO()
-    np.savez(content, **arrays)
-    files[f"{JOB}/prediction.npz"] = content.getvalue()
-    done = json.loads(files[f"{JOB}/done.json"])
-    done["steps"]["predict"]["files"]["prediction.npz"] = digest_bytes(content.getvalue())
-    files[f"{JOB}/done.json"] = json.dumps(done).encode()
-
-
 def name_other_rules(files: Files) -> None:
     record = json.loads(files["runs/replica/run.json"])
     record["protocols"][0]["digest"] = "0" * 64
@@ -134,10 +119,10 @@ def bring_code(files: Files) -> None:
     files["runs/replica/run.toml"] = text.encode()
 
 
+# A flipped label is refused in the tests of the registry: in a random network's map it moves no count.
 @pytest.mark.parametrize(
     ("tamper", "says"),
     [
-        (flip_a_label, "replica/bedroom0 by opensu3d: its counts are not those of its map"),
         (name_other_rules, "are not those that scored it"),
         (raise_a_number, "metrics.json does not follow from the counts"),
         (raise_a_cell, "measured is 98.7, the runs give"),

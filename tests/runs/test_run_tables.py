@@ -102,7 +102,7 @@ def test_no_protocol_is_said() -> None:
 
 def test_made_rooms_in_anothers_layout_are_said_to_be_such() -> None:
     method: Any = SimpleNamespace(needs=PerceptionNeeds(masks="grounded"), caveat=None)
-    perception: Any = SimpleNamespace(caveat=None)
+    perception: Any = SimpleNamespace(caveat=None, encoder=SimpleNamespace(name="embedded"))
     scene = SceneInfo("replica", "office0", 1, 1, "rendered-rooms")
     said = caveat_of(method, perception, scene)
     assert said == "made rooms in the layout of replica, not its scenes"

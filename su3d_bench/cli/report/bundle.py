@@ -25,7 +25,7 @@ def add_parser(actions: Any) -> None:
         call,
     )
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders of finished runs")
-    parser.add_argument("--out", type=Path, metavar="FILE.zip", help="the archive (default: the first run's name.zip)")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="the archive (default: the first run's name.zip)")
     parser.add_argument("--trained-on", metavar="TEXT", default="", help="the data of your weights, for a registry")
 
 
