@@ -206,14 +206,14 @@ def _surface(run: AskedRun, dataset: Any, scene: str, how: str) -> Iterator[Need
     """The scan's mesh, where it is missing and a method cannot do without."""
     named = [named_method(text) for text in run.methods]
     settings = read_assignments(run.settings, tuple({*run.methods, *(one.base for one in named)}), (run.dataset,))
-    methods = [build_method(method_part(one, settings)) for one in named]
-    asking = [method.name for method in methods if isinstance(method, NeedsSurface) and method.needs_surface]
+    methods = {one.name: build_method(method_part(one, settings)) for one in named}
+    asking = [name for name, method in methods.items() if isinstance(method, NeedsSurface) and method.needs_surface]
     if not asking:
         return
     try:
         surface_of(dataset, scene)
     except Su3dError as error:
-        remark = f"{error}; {', '.join(dict.fromkeys(asking))} cannot do without"
+        remark = f"{error}; {', '.join(asking)} cannot do without"
         yield Need("mesh", f"{run.dataset}/{scene}: the scan's mesh", is_here=False, how=how, remark=remark)
 
 
