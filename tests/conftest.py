@@ -107,3 +107,4 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
     """Where several processes share the work, each takes whole files: what the tests of a file share is made once."""
     if getattr(config.option, "numprocesses", None) and config.option.dist == "no":
         config.option.dist = "loadfile"
+        config.option.loadscopereorder = False  # files of few tests, which may be slow ones, would come last
