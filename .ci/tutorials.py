@@ -20,7 +20,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))  # a test runs this by its path
 
-from check_wheel import bring_kernels, built_wheel  # noqa: E402
+from check_wheel import bring_kernels, built_wheel
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = {page.stem: page for page in sorted((ROOT / "docs" / "tutorials").glob("*.md"))}
