@@ -63,7 +63,7 @@ _ELSEWHERE = {
     "Scores": "api.results",
     "Su3dError": "core.errors",
     "Timer": "core.system.timing",
-    "back_project": "numerics.geometry",
+    "back_project": "core.geometry",
     "combine": "metrics.scoring",
     "evaluate": "api.making",
     "list_datasets": "api.lists",
