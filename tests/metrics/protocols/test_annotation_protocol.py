@@ -15,8 +15,14 @@ from su3d_bench.core.maps import Instances, Partition
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.instance.score import Covered
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.metrics.questions.score import REFINED_BY, judge_merging, labels_n, said_by
-from su3d_bench.metrics.questions.truths import AnnotationTruth, RefinedNames
+from su3d_bench.metrics.questions.score import (
+    REFINED_BY,
+    AnnotationTruth,
+    RefinedNames,
+    judge_merging,
+    labels_n,
+    said_by,
+)
 from su3d_bench.metrics.scoring import metric_of, score_scene
 from su3d_bench.questions.refining.refined_names import (
     FILE_NAME,

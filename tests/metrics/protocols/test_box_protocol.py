@@ -15,8 +15,7 @@ from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float64Array, GroundTruth, LabelSet, ObjectBoxes, OrientedBox
 from su3d_bench.datasets.replica.boxes import box_truth
 from su3d_bench.metrics.fitness import ContentFacts, TruthFacts, why_not_content, why_not_truth
-from su3d_bench.metrics.instance.box_counts import THRESHOLDS, BoxCounts, count_boxes
-from su3d_bench.metrics.instance.box_overlap import box_iou, shared_volume, smallest_box
+from su3d_bench.metrics.instance.boxes import THRESHOLDS, BoxCounts, box_iou, count_boxes, shared_volume, smallest_box
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol, read_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules

@@ -21,10 +21,8 @@ from places import CASES, ROOT
 from su3d_bench.api.lists import list_protocols
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.metrics.protocols import originals as module
-from su3d_bench.metrics.protocols.files import protocol_names, rules_file
-from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.metrics.protocols.originals import original_of
+from su3d_bench.metrics.protocols import loading as module
+from su3d_bench.metrics.protocols.loading import load_protocol, original_of, protocol_names, rules_file
 from su3d_bench.metrics.scoring import combine
 
 WHOLE = """

@@ -20,9 +20,8 @@ from su3d_bench.core.errors import ConfigError, DataError
 from su3d_bench.core.maps import Masks
 from su3d_bench.metrics.protocols.loading import load_protocol, read_protocol
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, score_scene, unpack_scores
-from su3d_bench.metrics.semantic import panoptic_quality as panoptic
-from su3d_bench.metrics.semantic.panoptic_quality import PanopticCounts, Rule, Segments
-from su3d_bench.metrics.semantic.panoptic_score import count_segments
+from su3d_bench.metrics.semantic import panoptic
+from su3d_bench.metrics.semantic.panoptic import PanopticCounts, Rule, Segments, count_segments
 
 RULES = load_protocol("rooms-panoptic")
 KITTI = load_protocol("scannet-panoptic-oneformer3d")

@@ -19,9 +19,8 @@ from su3d_bench.core.errors import ConfigError, DataError, PredictionError
 from su3d_bench.core.types import Float32Array, GroundTruth, LabelSet, UInt8Array
 from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.metrics.protocols.loading import load_protocol, read_protocol
-from su3d_bench.metrics.questions.presence import relevancies
-from su3d_bench.metrics.questions.presence_counts import MEASURES, SAMPLINGS, PresenceCounts, measured
-from su3d_bench.metrics.questions.truths import AskedThing, PresenceTruth
+from su3d_bench.metrics.questions.presence import MEASURES, SAMPLINGS, PresenceCounts, measured, relevancies
+from su3d_bench.metrics.questions.score import AskedThing, PresenceTruth
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, plain_json, score_scene, unpack_scores
 from su3d_bench.questions.absent.presence import absent_names, counted_rooms, drawn, presence_questions
 from su3d_bench.questions.known_objects import is_called, known_objects, plain_name

@@ -9,8 +9,15 @@ import pytest
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.metrics.protocols.files import HEADING, protocol_names, read_remarks, remarks_of, rules_file
-from su3d_bench.metrics.protocols.loading import load_protocol, not_comparable_with
+from su3d_bench.metrics.protocols.loading import (
+    HEADING,
+    load_protocol,
+    not_comparable_with,
+    protocol_names,
+    read_remarks,
+    remarks_of,
+    rules_file,
+)
 
 
 def edited(tmp_path: Path, base: str, old: str, new: str) -> str:

@@ -24,8 +24,7 @@ from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.metrics.protocols.kinds import GEOMETRIC
 from su3d_bench.metrics.protocols.loading import load_protocol, read_protocol
 from su3d_bench.metrics.protocols.model import ClassEntry
-from su3d_bench.metrics.relations.counts import RelationCounts
-from su3d_bench.metrics.relations.graphs import geometric_edges
+from su3d_bench.metrics.relations import RelationCounts, geometric_edges
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, plain_json, score_scene, unpack_scores
 from su3d_bench.numerics.relations import RELATIONS
 from su3d_bench.predictions.formats import recognise

@@ -17,12 +17,19 @@ from su3d_bench.core.maps import Partition
 from su3d_bench.evaluation.scoring import facts_of, score_on_objects
 from su3d_bench.metrics.fitness import why_not_content, why_not_scorable
 from su3d_bench.metrics.instance.score import covered_objects
-from su3d_bench.metrics.protocols.files import rules_file
-from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for, read_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for, read_protocol, rules_file
 from su3d_bench.metrics.questions import shares
-from su3d_bench.metrics.questions.score import are_objects_right, first_instances, is_answer_right
+from su3d_bench.metrics.questions.score import (
+    AskedText,
+    GivenAnswer,
+    ReasoningTruth,
+    RetrievalTruth,
+    TrueAnswer,
+    are_objects_right,
+    first_instances,
+    is_answer_right,
+)
 from su3d_bench.metrics.questions.shares import ShareCounts
-from su3d_bench.metrics.questions.truths import AskedText, GivenAnswer, ReasoningTruth, RetrievalTruth, TrueAnswer
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, plain_json, score_scene, unpack_scores
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.predictions.base import vertex_masks
