@@ -133,15 +133,6 @@ def test_what_cannot_be_encoded_is_one_line(words: list[str], message: str, caps
     assert not list(Path().glob("texts*"))
 
 
-def test_flags_of_the_texts_stand_with_names_alone(capsys: pytest.CaptureFixture[str]) -> None:
-    for words, message in (
-        (["--names"], "--names belongs to show NAME"),
-        (["show", "query-ap", "--queries", "q.txt"], "--queries belongs to show NAME --names"),
-    ):
-        assert main(["protocols", *words]) == 2
-        assert message in capsys.readouterr().err
-
-
 def test_a_file_of_a_run_stays_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
     place = Path("run/scenes/rooms.living0/opensu3d/prediction.npz")
     place.parent.mkdir(parents=True)

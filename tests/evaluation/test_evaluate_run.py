@@ -126,9 +126,9 @@ def test_predictions_in_two_formats_go_through_every_verb_with_the_same_numbers(
         )
     )
     assert ranking["ranking"][0]["id"] == 1
-    planned = json.loads(answered(capsys, "plan", RUN, "--protocol", "rooms-instance", "--json"))
+    planned = json.loads(answered(capsys, "report", "power", RUN, "--protocol", "rooms-instance", "--json"))
     assert planned["remarks"] == [f"mine: {MINE}", f"theirs: {THEIRS}"]
-    answered(capsys, "export", RUN, "--method", "mine", "--to", "openlex3d", "--out", "clouds")
+    answered(capsys, "runs", "export", RUN, "--method", "mine", "--to", "openlex3d", "--out", "clouds")
     assert files_of(RUN) == before
     again = ["evaluate", f"{RUN}/scenes/painted.a/mine", "--dataset", PAINTED, *PROTOCOLS[:2], "--json", "again.json"]
     assert main([*again, "--quiet"]) == 0

@@ -252,9 +252,9 @@ def test_scenes_that_are_there_stay_as_they_are(
     own = tmp_path / "data/Replica/room0/traj.txt"
     own.parent.mkdir(parents=True)
     own.write_text("mine")
-    code, _, err = called([*replica[:2], "frames", *replica[2:]], capsys)
+    code, _, err = called([*replica[:3], "frames", *replica[3:]], capsys)
     assert code == 0 and own.read_text() == "mine" and "room0 was there already and is left as it is" in err
-    assert called([*replica[:2], "frame", *replica[2:]], capsys)[0] == 2
+    assert called([*replica[:3], "frame", *replica[3:]], capsys)[0] == 2
 
 
 SCRIPT = """
