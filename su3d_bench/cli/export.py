@@ -1,4 +1,4 @@
-"""``su3d-bench export``: predictions as the files that other evaluators take."""
+"""``su3d-bench runs export``: predictions as the files that other evaluators take."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ TARGETS = ("openlex3d", "scannet", "scannetpp", "opensun3d")
 QUERY_RULES = "opensun3d-queries"
 
 
-def add_parser(verbs: Any) -> None:
+def add_parser(actions: Any) -> None:
     parser = add_verb(
-        verbs,
+        actions,
         "export",
         "Write predictions, our own or another program's, as the files that another evaluator takes.",
         (
-            "su3d-bench export runs/my-run --to openlex3d --method opensu3d --out exported/opensu3d",
-            "su3d-bench export results/open3dis --to scannet --scenes 'replica/*' --out exported/open3dis",
+            "su3d-bench runs export runs/my-run --to openlex3d --method opensu3d --out exported/opensu3d",
+            "su3d-bench runs export results/open3dis --to scannet --scenes 'replica/*' --out exported/open3dis",
         ),
         call,
     )

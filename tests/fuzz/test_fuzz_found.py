@@ -148,7 +148,7 @@ def test_what_an_error_quotes_can_be_shown_on_a_terminal() -> None:
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["methods", "opensu3d", ""], "su3d-bench: methods: unknown argument ''"),
+        (["methods", "show", "opensu3d", ""], "su3d-bench: methods show: unknown argument ''"),
         (["report", "a\"b'c"], "su3d-bench: report: unknown"),
         (["sheets", "make", "--kind", "'", "--out", "x", "y"], "su3d-bench: sheets make: unknown --kind"),
         (["\x1b[31m"], r"su3d-bench: unknown verb '\x1b[31m'"),

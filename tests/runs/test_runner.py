@@ -256,7 +256,10 @@ def test_scenes_whose_names_differ_in_a_slash_have_a_map_each(capsys: pytest.Cap
     assert main(twins) == 0
     capsys.readouterr()
     assert (
-        main(["export", "out", "--to", "scannet", "--scenes", "twins/a/b", "--method", "collector", "--out", "x"]) == 2
+        main(
+            ["runs", "export", "out", "--to", "scannet", "--scenes", "twins/a/b", "--method", "collector", "--out", "x"]
+        )
+        == 2
     )
     assert "scene 'a/b': cannot be the name of a file" in capsys.readouterr().err
 
@@ -264,7 +267,7 @@ def test_scenes_whose_names_differ_in_a_slash_have_a_map_each(capsys: pytest.Cap
 def test_a_scene_is_exported_under_its_own_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "--scenes", f"{SCENES}/twins.py:Twins/a_b", *words()[3:]]) == 0
     capsys.readouterr()
-    assert main(["export", "out", "--to", "openlex3d", "--method", "collector", "--out", "x"]) == 0
+    assert main(["runs", "export", "out", "--to", "openlex3d", "--method", "collector", "--out", "x"]) == 0
     assert [path.name for path in Path("x/twins").iterdir()] == ["a_b"]
 
 

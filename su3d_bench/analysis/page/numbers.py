@@ -28,8 +28,8 @@ MOST_PAIRS = 40  # pairs of methods that are compared: all of nine methods, and 
 MOST_JOBS = 500
 MOST_MAPS = 16  # of a page of more jobs: two scenes under eight methods
 LEFT_OUT = (
-    "what each job's own files say is left out: errors (su3d-bench attribute), confusions, times (report timing), "
-    f"comparisons (compare) and all maps but those of the first scenes, at most {MOST_MAPS}"
+    "what each job's own files say is left out: errors (su3d-bench report attribution), confusions, times (report "
+    f"timing), comparisons (compare) and all maps but those of the first scenes, at most {MOST_MAPS}"
 )
 # Of a record of results: what the page says elsewhere, or not at all.
 NOT_SHOWN = ("encoder_digest", "anytime")

@@ -93,7 +93,7 @@ def add_parser(actions: Any) -> None:
         "--solver",
         choices=("built-in", "llm"),
         default="built-in",
-        help="who answers in reasoning sheets: geometry alone (default), or a language model, as in su3d-bench ask",
+        help="who answers in reasoning sheets: geometry alone (default), or a language model, as in query ask",
     )
     add_language_flags(parser)
 

@@ -101,11 +101,11 @@ def _verbs(folder: Path) -> Read:
             ["report", "leaderboard", str(folder / "runs")],
             ["compare", f"{run}:collector", f"{run}:collector@drop=1", "--per-class"],
             ["check", str(run), "--against", str(folder / "reference.json")],
-            ["attribute", str(run), "--method", "collector"],
+            ["report", "attribution", str(run), "--method", "collector"],
             ["report", "html", str(run), "--out", str(folder / "page.html")],
-            ["export", str(run), "--to", "openlex3d", "--method", "collector", "--out", str(folder / "out")],
+            ["runs", "export", str(run), "--to", "openlex3d", "--method", "collector", "--out", str(folder / "out")],
             [*_command(run), "--dry-run"],
-            ["refine", str(run), "--method", "collector"],
+            ["runs", "refine", str(run), "--method", "collector"],
             ["datasets", "check", f"{SCENES}/painted.py:Painted/a"],
         ]
     )
