@@ -19,10 +19,10 @@ from stat import S_ISREG
 from typing import IO, Any, Self
 
 from su3d_bench.core.errors import DataError, StoreError, printable
+from su3d_bench.core.files.atomic import replacing, write_error
+from su3d_bench.core.files.unpacking import Allowance, UnpackingError, allowance_of, check_member
 from su3d_bench.core.system.files import opened
 from su3d_bench.fetching.download import Watch
-from su3d_bench.store.atomic import replacing, write_error
-from su3d_bench.store.unpacking import Allowance, UnpackingError, allowance_of, check_member
 
 PIECE = 1 << 20
 MAX_HEADER_BYTES = 1 << 20  # of the long name or extended header before a member of a tar archive
