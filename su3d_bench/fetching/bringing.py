@@ -17,12 +17,9 @@ from pathlib import Path, PurePosixPath
 from pydantic import TypeAdapter, ValidationError
 
 from su3d_bench.core.errors import ConfigError, DataError, ModelMissing, StoreError
-<<<<<<< HEAD
-from su3d_bench.core.system.files import file_bytes
-=======
-from su3d_bench.core.files.atomic import make_folder, write_error
+from su3d_bench.core.files.atomic import make_folder, write_error, write_json
 from su3d_bench.core.files.locks import clear_unfinished, hold_folder
->>>>>>> main
+from su3d_bench.core.system.files import file_bytes
 from su3d_bench.datasets.replica.folders import (
     OFFICIAL_SCENES,
     ORIGINAL_FILES,
@@ -35,11 +32,6 @@ from su3d_bench.fetching.hub import hub_files
 from su3d_bench.fetching.sources import Source, Sources
 from su3d_bench.perception.models.catalogue import MODELS, PAPERS_ENCODERS, PROFILE_MODELS
 from su3d_bench.perception.models.files import locate
-<<<<<<< HEAD
-from su3d_bench.core.files.atomic import make_folder, write_error, write_json
-from su3d_bench.core.files.locks import clear_unfinished, hold_folder
-=======
->>>>>>> main
 
 RENDER, ORIGINAL = "Replica", "replica_v1"  # folders of the two trees, as the archives' own names have them
 FETCHED, UNPACKED = ".fetched", "unpacked"

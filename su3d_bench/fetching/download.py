@@ -17,22 +17,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-<<<<<<< HEAD
 from su3d_bench.core.errors import DataError, printable
+from su3d_bench.core.files.atomic import write_error, write_text
 from su3d_bench.core.system.files import file_text, opened
 from su3d_bench.fetching.sources import MOST_BYTES, check_address
-from su3d_bench.core.files.atomic import write_error, write_text
-=======
-from su3d_bench.core.errors import DataError, StoreError, printable
-from su3d_bench.core.files.atomic import read_json, write_error, write_json
-from su3d_bench.core.files.locks import SHARED, beside, own_file
-from su3d_bench.fetching.checksums import Stated, checked
-from su3d_bench.fetching.http import TIMEOUT_S, Answer, Broken, Stale, Validator, ask
-from su3d_bench.fetching.sources import MOST_BYTES
-
-PIECE = 1 << 18
-MOST_STARTS_ANEW = 2  # of one file in one command: a server that changes it each time is given up
->>>>>>> main
 
 PIECE = 1 << 20
 MAX_REDIRECTS = 5
