@@ -462,7 +462,7 @@ def variance_range(variance: Variance) -> tuple[Variance, Variance]:
 
 @dataclass(frozen=True)
 class Share:
-    """Of one step on the way from one value to another: its share, the ``least`` and the ``most`` that it adds anywhere.
+    """Of one step from one value to another: its share, the ``least`` and the ``most`` that it adds anywhere.
 
     What a step adds depends on those before it; its share is the mean over the orders of the steps (Shapley 1953, "A
     value for n-person games"). ``standard_error``: what drawing orders leaves open, 0 where every order was taken.
