@@ -10,7 +10,7 @@ from typing import Any
 
 from su3d_bench.core import registry
 from su3d_bench.core.config import flatten
-from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_json, package_versions, source_digest
+from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_file, digest_json, package_versions
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.interfaces import HasCaveat, HasInputs, HasOwnPerception, Method, ReadsMadeRooms
 from su3d_bench.core.types import SceneInfo
@@ -119,7 +119,7 @@ def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
 
 def own_code(target: str) -> str | None:
     """A key of the file of somebody's own dataset or method, which is no part of the program's code."""
-    return source_digest(Path(target.rpartition(":")[0]))[:16] if ".py:" in target else None
+    return digest_file(Path(target.rpartition(":")[0]))[:16] if ".py:" in target else None
 
 
 def refuse_other_run(folder: JobFolder, key: Mapping[str, str], known_later: Sequence[str] = ()) -> None:

@@ -28,7 +28,7 @@ from su3d_bench.core.errors import (
     Su3dError,
 )
 from su3d_bench.core.files.atomic import is_file, read_arrays, read_json
-from su3d_bench.core.system.damage import DAMAGE
+from su3d_bench.core.files.unpacking import DAMAGE
 from su3d_bench.formats.numpy_files import read_npy
 from su3d_bench.metrics.protocols.loading import load_protocol, read_protocol
 from su3d_bench.metrics.scoring import combine, unpack_scores

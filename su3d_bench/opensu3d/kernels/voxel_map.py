@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from su3d_bench.core.compiled import njit
-from su3d_bench.numerics.cells import ABSENT, slot_of
+from su3d_bench.numerics.clusters import ABSENT, slot_of
 
 VOXELS = 512  # of a block
 UNKNOWN = -2
