@@ -299,13 +299,6 @@ class WarmsUp(Protocol):
 
 
 @runtime_checkable
-class TakesDevice(Protocol):
-    """May compute with torch; called before all else with ``cpu`` or a device of torch such as ``cuda:0``."""
-
-    def receive_device(self, device: str) -> None: ...
-
-
-@runtime_checkable
 class TakesTools(Protocol):
     """Works on the whole scene; called before ``start``."""
 
@@ -421,7 +414,6 @@ ABILITIES = {
         HasShortNames,
         IsSystem,
         WarmsUp,
-        TakesDevice,
         TakesTools,
         NeedsSurface,
         TakesTruth,

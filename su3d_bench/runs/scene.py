@@ -22,14 +22,12 @@ from su3d_bench.core.interfaces import (
     Method,
     RendersFrames,
     SceneTools,
-    TakesDevice,
     TakesTools,
     TakesTruth,
     WarmsUp,
 )
 from su3d_bench.core.maps import Prediction, Proposals
 from su3d_bench.core.printing import one_line
-from su3d_bench.core.system.devices import device_for
 from su3d_bench.core.system.timing import MethodClock, device_memory_bytes, peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, ObjectBoxes, SceneInfo
 from su3d_bench.metrics.fitness import why_not_scorable
@@ -79,12 +77,10 @@ def run_scene(job: SceneJob, report: Report) -> tuple[MethodOutcome, ...]:
 
 
 @cache
-def _warm_up(part: Part, device: str) -> None:
+def _warm_up(part: Part) -> None:
     """Once a process for each method and its settings, where it asks for it."""
     scratch: Method = build_method(part)
     if isinstance(scratch, WarmsUp) and scratch.warms_up:
-        if isinstance(scratch, TakesDevice):
-            scratch.receive_device(device)
         warm_up(scratch)
 
 
@@ -276,10 +272,6 @@ class _Scene:
         if method.needs.frames:
             frames = self.dataset.frames(self.job.scene_name, info.stride)
             n = min(len(frames), self.job.limit or len(frames))
-        device = device_for(self.perception_config.models.device, self.job.index)
-        if isinstance(method, TakesDevice):
-            with clock.running("start"):
-                method.receive_device(device)
         if isinstance(method, TakesTools):
             tools = self._tools(method, perception, frames, n, clock)
             with clock.running("start"):
@@ -291,7 +283,7 @@ class _Scene:
             with clock.running("start"):
                 method.receive_truth(truth)
         self.says(part, "compiling the method")
-        _warm_up(part, device)
+        _warm_up(part)
         self.says(part, self.opening)
         start_memory_watch()
         feeding = Feeding(

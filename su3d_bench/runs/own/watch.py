@@ -40,7 +40,6 @@ OF_DATASETS: dict[str, Kinds] = {
     "queries": (Sequence,),
 }
 OF_METHODS: dict[str, Kinds] = {
-    "receive_device": (),
     "receive_tools": (),
     "receive_truth": (),
     "start": (),
