@@ -19,9 +19,6 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from su3d_bench.core.types import Float64Array
 from su3d_bench.opensu3d.voxel_map import VoxelMap
 
-if TYPE_CHECKING:
-    pass
-
 EPS = 0.02
 SIZES = [100_000, 500_000, 1_000_000, 5_000_000]
 N_FRAME = 204_000

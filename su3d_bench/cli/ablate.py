@@ -38,7 +38,7 @@ def add_parser(verbs: Any) -> None:
 
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.core import registry
-    from su3d_bench.runs.planning.ablation import ablation_rows, write_rows
+    from su3d_bench.runs.ablation import ablation_rows, write_rows
 
     rows = ablation_rows(arguments.method, arguments.vary, is_grid=arguments.grid)
     own_name = str(registry.load("method", arguments.method).name)

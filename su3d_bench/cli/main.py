@@ -109,7 +109,7 @@ def _exit_code(words: Sequence[str]) -> int:
     arguments = argparse.Namespace()
     try:
         arguments = build_parser(words[0] if words else None).parse_args(words)
-        from su3d_bench.runs.executors.local import limit_threads  # late: --help does without what it imports
+        from su3d_bench.runs.executors import limit_threads  # late: --help does without what it imports
 
         _refuse_records(arguments)
         if not arguments.uses_all_cores:

@@ -47,7 +47,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def _check(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.own.trial import try_method
+    from su3d_bench.runs.trial import try_method
 
     if arguments.tried is None:
         raise ConfigError("methods check: name the method, such as my_method.py:MyMethod")

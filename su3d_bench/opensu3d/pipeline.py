@@ -14,11 +14,18 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Detections, Frame, Int32Array, Int64Array, PerceptionNeeds, SceneInfo
-from su3d_bench.opensu3d.association import assign_ids, count_overlaps, overlap_ratios
 from su3d_bench.opensu3d.config import SCHEMES, OpenSU3DConfig, crop_levels
 from su3d_bench.opensu3d.frame_cloud import NO_DETECTION, FrameCloud, frame_cloud
 from su3d_bench.opensu3d.postprocess import CONFIDENCES, IDS, segments_of, to_instances
-from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View, record_of
+from su3d_bench.opensu3d.tracking import (
+    ImageRecord,
+    TrackingTable,
+    View,
+    assign_ids,
+    count_overlaps,
+    overlap_ratios,
+    record_of,
+)
 from su3d_bench.opensu3d.voxel_map import NO_INSTANCE, VoxelMap
 from su3d_bench.store.scratch import Scratch
 

@@ -22,7 +22,7 @@ from su3d_bench.core.system.devices import device_for
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.system.timing import processor_digest
 from su3d_bench.evaluation.evaluate import evaluate
-from su3d_bench.evaluation.request import Request
+from su3d_bench.evaluation.result import Request
 from su3d_bench.metrics.scoring import SceneScore, pack_scores
 from su3d_bench.reproducing.bundle import COMPARED, RECIPE, Unpacked, unpack
 from su3d_bench.reproducing.differences import Results, compared_all
@@ -30,7 +30,7 @@ from su3d_bench.reproducing.recipe import parse_recipe
 from su3d_bench.reproducing.tables import compared_json
 from su3d_bench.runs.finished import FinishedRun, encoder_of, read_run
 from su3d_bench.runs.job import SceneJob
-from su3d_bench.runs.planning.plan import make_plan
+from su3d_bench.runs.plan import make_plan
 from su3d_bench.runs.scene import scores_again
 from su3d_bench.store.atomic import is_file, read_arrays, read_json
 from su3d_bench.store.scratch import TemporaryFolder

@@ -9,8 +9,16 @@ from typing import Any
 
 from su3d_bench.core.types import SceneInfo
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
-from su3d_bench.runs.job import JobInputs, MethodOutcome, SceneJob, config_key, stride_of
-from su3d_bench.runs.parts import Part, build_dataset, build_method
+from su3d_bench.runs.job import (
+    JobInputs,
+    MethodOutcome,
+    Part,
+    SceneJob,
+    build_dataset,
+    build_method,
+    config_key,
+    stride_of,
+)
 from su3d_bench.store.records import SealRecord
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 

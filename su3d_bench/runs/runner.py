@@ -28,16 +28,14 @@ from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import EVERY_SCENE, SceneScore, combine, combined_metrics, plain_json, unpack_scores
 from su3d_bench.perception.profiles import PerceptionConfig
 from su3d_bench.reports.tables.found import Found, Unscored, not_scored_lines
-from su3d_bench.runs.executors.choose import ELSEWHERE, reached, run_units
-from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
+from su3d_bench.runs.executors import ELSEWHERE, SCENE_DONE, Event, Report, reached, run_units
+from su3d_bench.runs.existing import differences, kept_jobs, replaced_jobs, sealed
 from su3d_bench.runs.finished import record_of_rules
 from su3d_bench.runs.found import found_in
 from su3d_bench.runs.job import MethodOutcome, SceneJob
-from su3d_bench.runs.planning.held import differences, kept_jobs, replaced_jobs, sealed
-from su3d_bench.runs.planning.plan import Plan
-from su3d_bench.runs.planning.poses import judged
-from su3d_bench.runs.planning.scenes import cache_root
-from su3d_bench.runs.remote.scene import (
+from su3d_bench.runs.plan import Plan
+from su3d_bench.runs.poses import judged
+from su3d_bench.runs.remote_scene import (
     DistantJob,
     failed_distant,
     fetch_results,
@@ -47,6 +45,7 @@ from su3d_bench.runs.remote.scene import (
 )
 from su3d_bench.runs.resume import FinishedScenes
 from su3d_bench.runs.scene import failed_outcomes, run_scene
+from su3d_bench.runs.scenes import cache_root
 from su3d_bench.store.atomic import is_file, read_json, remove_file, write_json, write_text
 from su3d_bench.store.records import (
     FailureRecord,

@@ -42,8 +42,8 @@ from su3d_bench.questions.refining.refined_names import refined_names
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.reports.pictures.maps import draw_scene
 from su3d_bench.reports.tables.found import Unscored, not_scored_lines
-from su3d_bench.runs.executors.local import Event, Report
-from su3d_bench.runs.feeding import (
+from su3d_bench.runs.executors import Event, Report
+from su3d_bench.runs.frame_loop import (
     N_AHEAD,
     Feeding,
     FirstFrames,
@@ -54,9 +54,19 @@ from su3d_bench.runs.feeding import (
     true_proposals,
     warm_up,
 )
-from su3d_bench.runs.job import JobInputs, MethodOutcome, SceneJob, config_key, refuse_other_run, stride_of
-from su3d_bench.runs.parts import Part, as_told, build_dataset, build_method
-from su3d_bench.runs.planning.poses import REMARK, PosesContradicted, judged
+from su3d_bench.runs.job import (
+    JobInputs,
+    MethodOutcome,
+    Part,
+    SceneJob,
+    as_told,
+    build_dataset,
+    build_method,
+    config_key,
+    refuse_other_run,
+    stride_of,
+)
+from su3d_bench.runs.poses import REMARK, PosesContradicted, judged
 from su3d_bench.store.atomic import write_bytes, write_text
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.run_folder import JobFolder, RunFolder

@@ -30,7 +30,7 @@ from su3d_bench.datasets.recordings.meshes import read_surface
 from su3d_bench.datasets.rgbd.dataset import Rgbd
 from su3d_bench.predictions.base import VertexLabels, vertex_masks
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.runs.feeding import no_detections
+from su3d_bench.runs.frame_loop import no_detections
 
 
 def test_the_exported_folder_reads_back_as_the_frames_that_went_in(tmp_path: Path) -> None:

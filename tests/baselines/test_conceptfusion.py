@@ -11,9 +11,15 @@ import pytest
 from box_room import SIZE, write_box_room
 from scannet_scan import SCAN, write_recording
 
-from su3d_bench.baselines.conceptfusion.feature_table import FeatureTable
-from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig, ConceptFusionSam
-from su3d_bench.baselines.conceptfusion.pixel_features import mixed_features, mixing_weights, paint
+from su3d_bench.baselines.conceptfusion.method import (
+    ConceptFusion,
+    ConceptFusionConfig,
+    ConceptFusionSam,
+    mixed_features,
+    mixing_weights,
+    paint,
+)
+from su3d_bench.baselines.conceptfusion.point_fusion import FeatureTable
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, Float32Array, Frame, SceneInfo

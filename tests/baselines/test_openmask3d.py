@@ -13,18 +13,18 @@ from prediction_files import write_openyolo3d
 from proposals_by_hand import made_proposals
 from pydantic import ValidationError
 
-from su3d_bench.baselines.openmask3d.features import FeatureMeans, crop_boxes, prompted_mask
 from su3d_bench.baselines.openmask3d.method import (
+    FeatureMeans,
+    MaskViews,
     OpenMask3D,
     OpenMask3DConfig,
     OpenMask3DSegment3D,
     OpenMask3DSegment3DConfig,
-)
-from su3d_bench.baselines.openmask3d.views import (
-    MaskViews,
     as_openmask3d,
     count_pixels,
+    crop_boxes,
     pixels_of_mask,
+    prompted_mask,
     swapped_intrinsics,
     visible_pixels,
 )
@@ -36,7 +36,7 @@ from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, Int64Array, SceneInfo, Surface
 from su3d_bench.metrics.matching.labelling import most_similar
 from su3d_bench.perception.regions import region_under
-from su3d_bench.runs.feeding import no_detections
+from su3d_bench.runs.frame_loop import no_detections
 
 WIDTH, HEIGHT, FOCAL = 12, 8, 10.0
 INTRINSICS = np.array([[FOCAL, 0, 0], [0, FOCAL, 0], [0, 0, 1]])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from box_room import INTRINSICS, images, pose
 
-from su3d_bench.baselines.conceptfusion.pixel_features import picked
+from su3d_bench.baselines.conceptfusion.method import picked
 from su3d_bench.baselines.conceptfusion.point_fusion import ABSENT, PointFusion, View, alpha, normals_of, view_of
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Frame

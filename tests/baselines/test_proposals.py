@@ -13,22 +13,22 @@ from proposals_by_hand import made_proposals
 from pydantic import ValidationError
 from test_mesh_segments import sheet
 
-from su3d_bench.baselines.openmask3d.components import (
-    density_clusters,
-    linked_within,
-    split_into_parts,
-    voted_by_segments,
-)
-from su3d_bench.baselines.openmask3d.proposal_files import digest_of_folder, read_proposals
-from su3d_bench.baselines.openmask3d.proposals import ProposalConfig, make_proposals
-from su3d_bench.baselines.openmask3d.segment_tree import SegmentTree, contacts_of, is_within, merge_cost, merge_tree
-from su3d_bench.baselines.openmask3d.surface_proposals import (
+from su3d_bench.baselines.openmask3d.proposals import (
     NodeChoice,
+    ProposalConfig,
     chosen_nodes,
     contrast,
+    density_clusters,
+    digest_of_folder,
+    linked_within,
+    make_proposals,
+    read_proposals,
     segments_of,
+    split_into_parts,
     surface_proposals,
+    voted_by_segments,
 )
+from su3d_bench.baselines.openmask3d.segment_tree import SegmentTree, contacts_of, is_within, merge_cost, merge_tree
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.interfaces import SceneTools
 from su3d_bench.core.maps import Proposals

@@ -16,8 +16,8 @@ from scored_room import ROOM
 
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.maps import Masks
+from su3d_bench.evaluation.text_truth import read_values
 from su3d_bench.evaluation.texts import read_text_features
-from su3d_bench.evaluation.truth import read_values
 from su3d_bench.metrics.matching import checks
 from su3d_bench.metrics.matching.checks import check_cloud, mask_facts
 

@@ -14,13 +14,12 @@ from evaluated_text import CHAIR, TABLE, document, numbers, scene, write_truth
 from painted import WordEncoder
 from prediction_files import write_maskclustering, write_scannet_text
 
-import su3d_bench.evaluation.scoring
+import su3d_bench.evaluation.evaluate
 from su3d_bench.analysis.leaderboard import leaderboard
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import Instances, Masks
-from su3d_bench.evaluation.request import Request
-from su3d_bench.evaluation.scoring import Scoring
+from su3d_bench.evaluation.evaluate import Scoring
 from su3d_bench.metrics import labels
 from su3d_bench.metrics.fitness import ContentFacts, why_not_content, why_not_scorable
 from su3d_bench.metrics.labels import labels_counted, under_several_labels
@@ -191,11 +190,10 @@ def test_archives_of_pairs_are_told_too(tmp_path: Path) -> None:
 
 def test_scenes_with_one_label_beside_scenes_with_five_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     rules = load_protocol("openlex3d-topn")
-    scoring = Scoring(Request(()))
-    scoring._truths = cast("SceneTruths", SimpleNamespace(has_points=True))
-    scoring.tally.enter(rules)
+    truths = cast("SceneTruths", SimpleNamespace(has_points=True, why_not=lambda *_, **__: None))
+    scoring = Scoring(truths, [rules.name], None, file_confidences=False)
     monkeypatch.setattr(scoring, "_score_content", lambda *_: None)
-    monkeypatch.setattr(su3d_bench.evaluation.scoring, "encoder_for", lambda *_, **__: WordEncoder())
+    monkeypatch.setattr(su3d_bench.evaluation.evaluate, "encoder_for", lambda *_, **__: WordEncoder())
     points = np.zeros((4, 3), np.float32)
     ranked = Instances.of(points, [[0, 1], [2]], features=np.ones((2, 4)))
     named = Instances.of(points, [[0, 1], [2]], labels=["chair", "lamp"], features=np.ones((2, 4)))

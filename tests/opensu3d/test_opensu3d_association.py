@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from su3d_bench.opensu3d.association import Overlaps, assign_ids, count_overlaps, overlap_ratios
 from su3d_bench.opensu3d.config import OverlapRule
+from su3d_bench.opensu3d.tracking import Overlaps, assign_ids, count_overlaps, overlap_ratios
 
 
 def overlaps_of(best: list[int], shared: list[int], n_frame: list[int]) -> Overlaps:

@@ -7,8 +7,8 @@ import pytest
 from pydantic import ValidationError
 
 from su3d_bench.opensu3d.config import Fusion, OpenSU3DConfig, Scheme
-from su3d_bench.opensu3d.feature_fusion import fuse_scales, fuse_views
 from su3d_bench.opensu3d.postprocess import caption_of
+from su3d_bench.opensu3d.tracking import fuse_scales, fuse_views
 
 CROPS = np.array([[[0.6, 0.8], [1.0, 0.0], [0.0, 1.0]]])  # one region, crops at ratios 0.8, 1.0, 1.2
 

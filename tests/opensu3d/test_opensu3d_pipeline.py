@@ -17,7 +17,7 @@ from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, Float32Array, Frame, SceneInfo
 from su3d_bench.opensu3d.config import Density, OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
-from su3d_bench.runs.feeding import Feeding, ReadAhead
+from su3d_bench.runs.frame_loop import Feeding, ReadAhead
 
 SCENE = SceneInfo("made", "wall", 4, 1, "rendered-rooms")
 WIDTH, HEIGHT, FOCAL = 160, 120, 120.0

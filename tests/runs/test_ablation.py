@@ -12,7 +12,7 @@ from places import SCENES
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, StoreError
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.runs.planning.ablation import ablation_rows, read_rows
+from su3d_bench.runs.ablation import ablation_rows, read_rows
 
 PAINTED = f"{SCENES}/painted.py"
 

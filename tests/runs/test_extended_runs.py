@@ -13,10 +13,10 @@ from painted import colour_perception
 from places import SCENES
 
 from su3d_bench.cli.main import main
-from su3d_bench.runs import feeding as scene_feeding
+from su3d_bench.runs import frame_loop as scene_feeding
 from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.runs.planning.ablation import read_rows
+from su3d_bench.runs.ablation import read_rows
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 PAINTED = f"{SCENES}/painted.py:Painted"

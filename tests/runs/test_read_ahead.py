@@ -9,7 +9,7 @@ from waiting import wait_until
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Frame
-from su3d_bench.runs.feeding import ReadAhead
+from su3d_bench.runs.frame_loop import ReadAhead
 
 N_FRAMES = 40
 

@@ -16,7 +16,7 @@ from painted_runs import PAINTED, in_process, job, metrics, run, words
 from places import SCENES
 
 from su3d_bench.cli.main import main
-from su3d_bench.runs import feeding as scene_feeding
+from su3d_bench.runs import frame_loop as scene_feeding
 from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import scene as scene_run
 

@@ -6,7 +6,7 @@ import pytest
 
 from su3d_bench.core import registry
 from su3d_bench.core.interfaces import TakesTools, WarmsUp
-from su3d_bench.runs.feeding import warm_up
+from su3d_bench.runs.frame_loop import warm_up
 
 WARMED = [name for name in registry.METHODS if isinstance(registry.load("method", name), WarmsUp)]
 

@@ -103,7 +103,7 @@ def _gpus(tried: Mapping[str, Loaded]) -> Iterator[Check]:
 
 def _folders() -> Iterator[Check]:
     from su3d_bench.cli.datasets.list import data_root
-    from su3d_bench.runs.planning.scenes import cache_root
+    from su3d_bench.runs.scenes import cache_root
     from su3d_bench.store.caches import KINDS, cache_entries, size_text
     from su3d_bench.store.scratch import scratch_folder
 

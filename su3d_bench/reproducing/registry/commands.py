@@ -8,8 +8,8 @@ from typing import Any
 
 from su3d_bench.core.config import DEFAULT_SOURCE, MOVES_NO_NUMBER, KeyPath, RunConfig, toml_value
 from su3d_bench.core.errors import printable
+from su3d_bench.runs.existing import held_run
 from su3d_bench.runs.finished import FinishedRun
-from su3d_bench.runs.planning.held import held_run
 
 UNKNOWN = "not known: run.toml is not whole"
 MOST_CHARACTERS = 2000

@@ -22,8 +22,8 @@ from conceptgraphs_scene import (
 from painted import colour_perception
 from places import SCENES
 
-from su3d_bench.baselines.conceptgraphs.config import MappingConfig
 from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs
+from su3d_bench.baselines.conceptgraphs.objects import MappingConfig
 from su3d_bench.cli.main import main
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.opensu3d.config import Density, OpenSU3DConfig

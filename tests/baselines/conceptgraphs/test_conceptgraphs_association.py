@@ -9,7 +9,7 @@ import pytest
 from conceptgraphs_scene import QUIET, an_object, at_cosine, axis, block
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
-from su3d_bench.baselines.conceptgraphs.association import (
+from su3d_bench.baselines.conceptgraphs.map import (
     NEW_OBJECT,
     assign,
     box_iou,
@@ -18,22 +18,20 @@ from su3d_bench.baselines.conceptgraphs.association import (
     semantic_similarity,
     total_similarity,
 )
-from su3d_bench.baselines.conceptgraphs.boxes import (
+from su3d_bench.baselines.conceptgraphs.objects import (
     Extents,
+    MapObject,
     are_coplanar,
     axis_aligned_iou,
+    denoised,
     extents_of_boxes,
     grown,
-    oriented_iou,
-)
-from su3d_bench.baselines.conceptgraphs.clouds import voxel_average
-from su3d_bench.baselines.conceptgraphs.objects import (
-    MapObject,
-    denoised,
     merge_overlapping,
     merged,
+    oriented_iou,
     overlap_ratios,
     seen_enough,
+    voxel_average,
 )
 from su3d_bench.core.types import OrientedBox
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from conceptgraphs_scene import SCENE, Plate, at_cosine, axis, contents, look, mapped
 
-from su3d_bench.baselines.conceptgraphs.config import MappingConfig
 from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs, ConceptGraphsDetector, DetectorConfig
+from su3d_bench.baselines.conceptgraphs.objects import MappingConfig
 from su3d_bench.core import registry
 from su3d_bench.core.system.timing import Timer
 

@@ -10,10 +10,18 @@ import pytest
 from conceptgraphs_scene import DIMENSION, HEIGHT, QUIET, SCENE, WIDTH, Plate, block, look
 from perception_fakes import CountingEncoder, still_life
 
-from su3d_bench.baselines.conceptgraphs.clouds import bounding_box, density_clusters, largest_cluster, voxel_average
-from su3d_bench.baselines.conceptgraphs.config import MappingConfig
 from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs
-from su3d_bench.baselines.conceptgraphs.regions import LiftedRegion, kept_regions, lift, subtract_contained
+from su3d_bench.baselines.conceptgraphs.objects import (
+    LiftedRegion,
+    MappingConfig,
+    bounding_box,
+    density_clusters,
+    kept_regions,
+    largest_cluster,
+    lift,
+    subtract_contained,
+    voxel_average,
+)
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections

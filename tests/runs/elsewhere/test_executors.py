@@ -12,8 +12,8 @@ import psutil
 import pytest
 
 from su3d_bench.core.errors import StoreError
-from su3d_bench.runs.executors import ray
-from su3d_bench.runs.executors.local import ENDING_S, ONE_THREAD, Event, Report, run_inline, run_processes
+from su3d_bench.runs import clusters
+from su3d_bench.runs.executors import ENDING_S, ONE_THREAD, Event, Report, run_inline, run_processes
 
 
 def work(unit: str, report: Report) -> str:
@@ -62,7 +62,7 @@ WATCHED = """
 import signal
 from multiprocessing import util
 from operator import is_not
-from su3d_bench.runs.executors.local import run_processes
+from su3d_bench.runs.executors import run_processes
 
 spawn = util.spawnv_passfds
 
@@ -152,4 +152,4 @@ def test_a_task_of_ray_that_is_asked_to_end_says_so_and_is_no_failure() -> None:
         os.kill(os.getpid(), signal.SIGTERM)
         signal.pause()
 
-    assert ray._on_node(work, "a", {}) == (ray.ENDED, "SIGTERM")
+    assert clusters._on_node(work, "a", {}) == (clusters.ENDED, "SIGTERM")

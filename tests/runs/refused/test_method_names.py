@@ -13,7 +13,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.config import Settings
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.runs.planning.plan import make_plan, named_method
+from su3d_bench.runs.plan import make_plan, named_method
 
 PAINTED = f"{SCENES}/painted.py"
 

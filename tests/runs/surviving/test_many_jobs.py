@@ -23,7 +23,7 @@ from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import runner
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.runs.executors.choose import run_units
+from su3d_bench.runs.executors import run_units
 from su3d_bench.runs.finished import read_run
 from su3d_bench.store import atomic
 from su3d_bench.store import run_folder as store

@@ -28,7 +28,6 @@ from su3d_bench.core.errors import StoreError
 from su3d_bench.metrics.scoring import score_scene
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.runs import job as scene_job
-from su3d_bench.runs import parts
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.atomic import filling, npz_bytes, read_npz
 from su3d_bench.store.run_folder import RunFolder
@@ -95,7 +94,7 @@ def test_the_log_of_a_finished_job_outlives_the_loss_of_a_later_worker() -> None
     assert run(scenes="a") == 0
     before = (job() / "log.txt").read_bytes()
     planned = scene_job.SceneJob(
-        "painted/a", parts.Part("", "painted", "{}"), (parts.Part("", "dense", "{}"),), None,
+        "painted/a", scene_job.Part("", "painted", "{}"), (scene_job.Part("", "dense", "{}"),), None,
         (), "embedded", "{}", 0, 0, 0, False, (), Path("out"), Path(), Path(),
     )  # fmt: skip
     (outcome,) = scene_run.failed_outcomes(planned, "the worker was killed")

@@ -12,11 +12,10 @@ from test_clusters import COLLECTOR, PAINTED, assert_equal_runs, deterministic_f
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, StoreError
-from su3d_bench.runs import feeding as scene_feeding
+from su3d_bench.runs import frame_loop as scene_feeding
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.runs.planning.scenes import data_root
-from su3d_bench.runs.remote.data import files_of_scenes
-from su3d_bench.runs.remote.folder import RemoteFolder
+from su3d_bench.runs.remote_store import RemoteFolder, files_of_scenes
+from su3d_bench.runs.scenes import data_root
 
 URL = "memory://bucket/runs/one"
 TWO = ("--scenes", f"{PAINTED}/[ad]", "--jobs", "1")

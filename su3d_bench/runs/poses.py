@@ -16,8 +16,7 @@ from dataclasses import dataclass, replace
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import RendersFrames, SaysUp
 from su3d_bench.datasets.recordings.pose_convention import judge_scene
-from su3d_bench.runs.job import SceneJob
-from su3d_bench.runs.parts import build_dataset, build_method
+from su3d_bench.runs.job import SceneJob, build_dataset, build_method
 from su3d_bench.store.run_folder import RunFolder
 
 ALL_THE_SAME = "--accept-poses runs it all the same"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +23,7 @@ from su3d_bench.core.config import (
     flatten,
     parse_value,
     read_assignments,
+    read_file,
     resolve,
 )
 from su3d_bench.core.digests import code_digest, digest_json
@@ -34,10 +35,8 @@ from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.protocols.files import protocol_names
 from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
-from su3d_bench.runs.executors.choose import ELSEWHERE, check_execution
-from su3d_bench.runs.job import FIELDS_KNOWN_LATER, SceneJob, config_key, own_code, refuse_other_run
-from su3d_bench.runs.parts import Part, build_method, options_model, part_of
-from su3d_bench.runs.planning.held import (
+from su3d_bench.runs.executors import ELSEWHERE, check_execution
+from su3d_bench.runs.existing import (
     HeldRun,
     Into,
     Request,
@@ -47,17 +46,43 @@ from su3d_bench.runs.planning.held import (
     remembered,
     replaced_jobs,
 )
-from su3d_bench.runs.planning.scenes import (
+from su3d_bench.runs.job import (
+    FIELDS_KNOWN_LATER,
+    Part,
+    SceneJob,
+    build_method,
+    config_key,
+    options_model,
+    own_code,
+    part_of,
+    refuse_other_run,
+)
+from su3d_bench.runs.remote_scene import fetch_state, mirror_of
+from su3d_bench.runs.remote_store import DataPlace, RemoteData, data_place, is_url
+from su3d_bench.runs.scenes import (
     cache_root,
     data_root,
     dataset_targets,
     expand_scenes,
     looks_like_scene,
 )
-from su3d_bench.runs.remote.data import DataPlace, RemoteData, data_place
-from su3d_bench.runs.remote.folder import is_url
-from su3d_bench.runs.remote.scene import fetch_state, mirror_of
 from su3d_bench.store.run_folder import RunFolder, scene_of_folder
+
+
+def asked_settings(
+    values: Mapping[str, Any], *, device: str | None, config: Path | None, source_of: Callable[[str], str]
+) -> Settings:
+    """The settings of the file ``config``, then those of ``values``, which win; None stands for what was not asked.
+
+    ``values`` are by key of a run, ``source_of`` says of a key where it was asked, which begins an error's line.
+    """
+    settings = Settings() if config is None else read_file(config)
+    given: list[tuple[KeyPath, Any]] = [((name,), value) for name, value in values.items()]
+    given.append((("perception", "models", "device"), device))
+    return settings + Settings(
+        tuple(Setting(path, value, source_of(path[-1])) for path, value in given if value is not None)
+    )
+
 
 MOST_NAMED = 4  # scenes and methods whose maps go
 MOST_CHARACTERS = 120  # the name is a folder's name too
