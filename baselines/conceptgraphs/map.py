@@ -1,7 +1,7 @@
 """ConceptGraphs' map of objects, frame by frame: which detection joins which object; what its two variants share.
 
-Source: concept-graphs at commit 5c4da70, ``conceptgraph/slam/cfslam_pipeline_batch.py``, ``conceptgraph/slam/mapping.py``
-and ``compute_overlap_matrix_2set``.
+Source: concept-graphs at commit 5c4da70, ``conceptgraph/slam/cfslam_pipeline_batch.py``,
+``conceptgraph/slam/mapping.py`` and ``compute_overlap_matrix_2set``.
 """
 
 from __future__ import annotations

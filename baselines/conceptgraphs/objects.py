@@ -1,8 +1,8 @@
 """The objects of ConceptGraphs' map: their clouds and boxes, merging two, denoising, dropping what was seen too rarely.
 
 Objects never change: a merge makes a new one, so that a map can be finished midway.
-Source: concept-graphs at commit 5c4da70, ``conceptgraph/slam/utils.py``, whose geometry is Open3D's (from the regions of
-an image to clouds: ``filter_gobs``, ``gobs_to_detection_list``), and ``conceptgraph/utils/ious.py``
+Source: concept-graphs at commit 5c4da70, ``conceptgraph/slam/utils.py``, whose geometry is Open3D's (from the regions
+of an image to clouds: ``filter_gobs``, ``gobs_to_detection_list``), and ``conceptgraph/utils/ious.py``
 (``mask_subtract_contained``; overlaps of boxes, for which it asks PyTorch3D's ``box3d_overlap``). The hyper-parameters
 are those of ``configs/slam_pipeline/base.yaml`` and of the README's commands for the SAM-only variant; options that
 these commands leave off and that change the method (``use_contain_number``, other similarities) are left out.
@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from su3d_bench.core.geometry import back_project, valid_depth
 from su3d_bench.core.types import BoolArray, Detections, Float32Array, Float64Array, Frame, Int64Array, OrientedBox
-from su3d_bench.numerics.geometry import back_project, valid_depth
 
 Metres = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1)]

@@ -7,8 +7,9 @@ need is imported where they are opened: texts are scored before that would be th
 from __future__ import annotations
 
 import fnmatch
+import re
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.files.scratch import Scratch
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Detections, Frame, Int32Array, Int64Array, PerceptionNeeds, SceneInfo
@@ -27,7 +28,6 @@ from su3d_bench.opensu3d.tracking import (
     record_of,
 )
 from su3d_bench.opensu3d.voxel_map import NO_INSTANCE, VoxelMap
-from su3d_bench.store.scratch import Scratch
 
 logger = logging.getLogger(__name__)
 logger.setLevel(logging.INFO)  # what is left out goes to the log of its scene

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.errors import DataError, Su3dError
+from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.metrics.protocols.loading import load_protocol
@@ -20,7 +21,6 @@ from su3d_bench.runs.existing import kept_jobs
 from su3d_bench.runs.job import Part, SceneJob, build_dataset, build_method, stride_of
 from su3d_bench.runs.plan import Plan
 from su3d_bench.runs.runner import RunResult
-from su3d_bench.store.atomic import is_file
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.records import read_updates
 from su3d_bench.store.run_folder import JobFolder

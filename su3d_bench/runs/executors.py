@@ -24,10 +24,10 @@ from typing import Any, TypeVar
 
 from su3d_bench.core.config import RunConfig, parse_value
 from su3d_bench.core.errors import ConfigError, Su3dError
+from su3d_bench.core.files.scratch import TemporaryFolder
 from su3d_bench.core.printing import doors
 from su3d_bench.core.system.endings import Ended, ending_in_order
 from su3d_bench.store.run_folder import refuse_links
-from su3d_bench.store.scratch import TemporaryFolder
 
 ENDING_S = 20.0  # for a worker without a parent to let go of what it holds; Slurm ends what it asked to end after 30 s
 # For a worker whose parent was asked to end. One that loads a library or searches a tree hears of nothing meanwhile; it

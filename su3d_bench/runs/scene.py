@@ -16,6 +16,7 @@ from functools import cache, cached_property, partial
 from typing import Any
 
 from su3d_bench.core.errors import GroundTruthMissing, StoreError, counted, error_line
+from su3d_bench.core.files.atomic import write_bytes, write_text
 from su3d_bench.core.interfaces import (
     Closes,
     Encoder,
@@ -67,7 +68,6 @@ from su3d_bench.runs.job import (
     stride_of,
 )
 from su3d_bench.runs.poses import REMARK, PosesContradicted, judged
-from su3d_bench.store.atomic import write_bytes, write_text
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 

@@ -8,8 +8,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.core.digests import package_digest
+from su3d_bench.core.geometry import back_project
 from su3d_bench.core.types import Float32Array, Frame, InstanceMesh, Int32Array, ObjectBoxes, Regions
-from su3d_bench.numerics.geometry import back_project
 from su3d_bench.numerics.open3d_core import compiled_open3d
 from su3d_bench.perception.cache import CACHE_SOURCES, array_digest, content_key
 from su3d_bench.perception.crops import mask_boxes
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 # What moves the regions: their key follows it.
 SOURCES = (
     "core/types.py",
-    "numerics/geometry.py",
+    "core/geometry.py",
     "numerics/open3d_core.py",
     "perception/oracle/noise.py",
     "perception/oracle/segmenter.py",

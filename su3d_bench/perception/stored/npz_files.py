@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.files.atomic import make_folder, read_arrays, replacing
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.system.damage import DAMAGE
 from su3d_bench.core.types import Detections, Float32Array, Frame, Regions, SceneInfo
 from su3d_bench.perception.stored.source import StoredFrame, check_masks
-from su3d_bench.store.atomic import make_folder, read_arrays, replacing
 
 _REQUIRED = ("image_size", "masks", "boxes", "scores", "names")
 _FEATURES = ("crop_ratios", "crop_features", "global_feature", "encoder")

@@ -23,9 +23,9 @@ from su3d_bench.baselines.conceptgraphs.objects import (
     voxel_average,
 )
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.geometry import back_project
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections
-from su3d_bench.numerics.geometry import back_project
 from su3d_bench.perception.profiles import PerceptionConfig, build_perception
 
 RNG = np.random.default_rng(3)

@@ -23,7 +23,7 @@ SOURCES = (
     "perception/embedded/segmenter",
     "numerics/cells.py",
     "numerics/clusters.py",
-    "numerics/compiled.py",
+    "core/compiled.py",
     *CACHE_SOURCES,
 )
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import CheckFailed, DataError, StoreError
+from su3d_bench.core.files.atomic import make_folder
 from su3d_bench.core.system.devices import CPU
 from su3d_bench.core.types import Float32Array, Int64Array
 from su3d_bench.perception.models.encoders import towers_transformers
@@ -24,7 +25,6 @@ from su3d_bench.perception.models.files import ModelFiles, bounded
 from su3d_bench.perception.models.onnx.export import as_module, compare_outputs, export_onnx
 from su3d_bench.perception.models.onnx.manifest import OnnxManifest, wrong_files
 from su3d_bench.perception.models.onnx.session import Provider, open_session
-from su3d_bench.store.atomic import make_folder
 
 IMAGE_FILE, TEXT_FILE = "image.onnx", "text.onnx"
 TOKENIZER_FILES = ("tokenizer.json", "tokenizer_config.json", "special_tokens_map.json", "vocab.json", "merges.txt")

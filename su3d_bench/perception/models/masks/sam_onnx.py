@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import CheckFailed, DataError
+from su3d_bench.core.files.atomic import make_folder
 from su3d_bench.core.types import Float32Array, Int64Array
 from su3d_bench.perception.models.files import ModelFiles
 from su3d_bench.perception.models.masks.sam import Prompts
@@ -19,7 +20,6 @@ from su3d_bench.perception.models.onnx.export import Parity, as_module, export_o
 from su3d_bench.perception.models.onnx.manifest import OnnxManifest, wrong_files
 from su3d_bench.perception.models.onnx.session import Provider, open_session
 from su3d_bench.perception.models.pretrained import load_sam
-from su3d_bench.store.atomic import make_folder
 
 ENCODER_FILE, DECODER_FILE = "encoder.onnx", "decoder.onnx"
 # Labels of points in the exported decoder, those of the original's own export: 0 background, 1 object, and these.

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import StoreError
-from su3d_bench.store.atomic import make_folder
-from su3d_bench.store.unfinished import bring_to_disk, unfinished_folder
+from su3d_bench.core.files.atomic import make_folder
+from su3d_bench.core.files.locks import bring_to_disk, unfinished_folder
 
 # 17 has LayerNormalization as one operator; newer ones bring nothing that our towers use.
 OPSET = 17

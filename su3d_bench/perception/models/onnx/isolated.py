@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from su3d_bench.core.errors import CheckFailed, ConfigError, printable, shown
-from su3d_bench.store.atomic import is_file, make_folder, read_json, write_error, write_json
-from su3d_bench.store.unfinished import unfinished_folder
+from su3d_bench.core.files.atomic import is_file, make_folder, read_json, write_error, write_json
+from su3d_bench.core.files.locks import unfinished_folder
 
 # What recognize-anything's network of RAM++ needs: transformers 5 has lost functions that it imports. These versions
 # have wheels for Python 3.11 and 3.12, and it was run with them.

@@ -11,10 +11,10 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.files.atomic import write_json
 from su3d_bench.perception.models.catalogue import ONNX_MANIFEST
 from su3d_bench.perception.models.files import ModelFiles, bounded, file_sha256, read_settings
 from su3d_bench.perception.models.onnx.export import OPSET, Parity
-from su3d_bench.store.atomic import write_json
 
 
 class OnnxManifest(BaseModel):

@@ -9,6 +9,8 @@ import numpy as np
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import CheckFailed, ConfigError, shown
+from su3d_bench.core.files.atomic import is_file, make_folder, read_json, read_npz, write_npz, write_text
+from su3d_bench.core.files.locks import unfinished_folder
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import BoolArray, Float32Array
 from su3d_bench.perception.models.files import ModelFiles, read_weights
@@ -17,8 +19,6 @@ from su3d_bench.perception.models.onnx import ram_plus_program
 from su3d_bench.perception.models.onnx.export import OPSET, Parity, compare_outputs, settle
 from su3d_bench.perception.models.onnx.isolated import run_program
 from su3d_bench.perception.models.onnx.session import open_session
-from su3d_bench.store.atomic import is_file, make_folder, read_json, read_npz, write_npz, write_text
-from su3d_bench.store.unfinished import unfinished_folder
 
 REPOSITORY = "https://github.com/xinyu1205/recognize-anything"
 # What of a checkout makes the network; recognize-anything 7cb804a.
