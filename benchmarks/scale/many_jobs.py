@@ -34,7 +34,7 @@ from su3d_bench.metrics.scoring import SceneScore, pack_scores, unpack_scores
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
 from su3d_bench.runs.plan import Plan, make_plan
 from su3d_bench.runs.resume import FinishedScenes
-from su3d_bench.runs.runner import summarise
+from su3d_bench.runs.summary import summarise
 from su3d_bench.store.run_folder import RunFolder
 
 N_FRAMES = 20

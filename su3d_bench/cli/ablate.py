@@ -51,9 +51,7 @@ def call(arguments: argparse.Namespace) -> int:
         return show_plan(plan, arguments)
     code = carry_out(plan, arguments)
     if code == EXIT_DONE:
-        from su3d_bench.runs.runner import publish
-
         write_rows(plan.folder.path, rows, joins=arguments.extend)
-        publish(plan)
+        plan.place.publish()
         remark(f"table: su3d-bench report tables {plan.folder.path} --table I", quiet=arguments.quiet or arguments.json)
     return code

@@ -175,7 +175,7 @@ def _answer_result(result: RunResult, arguments: argparse.Namespace) -> None:
     for line in result.remarks:
         remark(line, quiet=arguments.quiet)
     plan = result.plan
-    place = plan.folder.path if plan.store is None else f"{plan.store} (its small files: {plan.folder.path})"
+    place = plan.place.name if plan.place.url is None else f"{plan.place.url} (its small files: {plan.folder.path})"
     remark(f"run folder: {place}", quiet=arguments.quiet)
     if not arguments.quiet:
         _say_what_is_next(result)

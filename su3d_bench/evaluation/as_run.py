@@ -44,7 +44,7 @@ from su3d_bench.predictions.scenes import Source
 from su3d_bench.runs.existing import sealed
 from su3d_bench.runs.finished import made_elsewhere
 from su3d_bench.runs.plan import check_folder_name
-from su3d_bench.runs.runner import BY_THE_METHOD, confidences_of
+from su3d_bench.runs.summary import BY_THE_METHOD, confidences_of
 from su3d_bench.store.records import (
     GitRecord,
     MetricsRecord,

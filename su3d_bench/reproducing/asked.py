@@ -19,7 +19,7 @@ from su3d_bench.runs.ablation import ablation_rows, write_rows
 from su3d_bench.runs.executors import Report
 from su3d_bench.runs.existing import Into
 from su3d_bench.runs.plan import Plan, asked_settings, make_plan, named_method
-from su3d_bench.runs.runner import RunResult, publish, run_plan
+from su3d_bench.runs.runner import RunResult, run_plan
 from su3d_bench.runs.scenes import split_address
 
 RUNS = "runs"
@@ -172,5 +172,5 @@ def carry_out(run: AskedRun, plan: Plan, report: Report) -> RunResult:
     result = run_plan(plan, report)
     if run.rows and result.is_complete:
         write_rows(plan.folder.path, run.rows, joins=True)
-        publish(plan)
+        plan.place.publish()
     return result

@@ -17,7 +17,6 @@ from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, unpack_scores
-from su3d_bench.runs.existing import kept_jobs
 from su3d_bench.runs.job import Part, SceneJob, build_dataset, build_method, stride_of
 from su3d_bench.runs.plan import Plan
 from su3d_bench.runs.runner import RunResult
@@ -52,23 +51,23 @@ def estimate(plan: Plan) -> list[JobEstimate]:
     roots = {job.dataset: job.data_root for job in plan.jobs}
     datasets = {part: build_dataset(part, root) for part, root in roots.items()}
     needs_frames = {part: bool(build_method(part).needs.frames) for part in plan.jobs[0].methods}
-    kept = kept_jobs(plan.folder, plan.jobs) if plan.into == "replace" else None
+    going = {job.path for job in plan.removes}
     return [
-        _of_job(plan, job, part, update_s[part.name], datasets[job.dataset] if needs_frames[part] else None, kept)
+        _of_job(plan, job, part, update_s[part.name], datasets[job.dataset] if needs_frames[part] else None, going)
         for job in plan.jobs
         for part in job.methods
     ]
 
 
 def _of_job(
-    plan: Plan, job: SceneJob, part: Part, measured: float | None, dataset: Any, kept: Collection[Path] | None
+    plan: Plan, job: SceneJob, part: Part, measured: float | None, dataset: Any, going: Collection[Path]
 ) -> JobEstimate:
     """``measured``: seconds an update; ``dataset`` None where the method looks at no frame.
 
-    ``kept``: the folders of jobs that stay where the plan replaces a run.
+    ``going``: the folders of jobs that the plan removes.
     """
     folder = plan.folder.job(job.scene, part.name)
-    is_done = {"predict", "score"} <= set(folder.seals()) and (kept is None or folder.path in kept)
+    is_done = {"predict", "score"} <= set(folder.seals()) and folder.path not in going
     n_updates, remark = 0, None
     if dataset is not None:
         try:
@@ -108,7 +107,7 @@ def pictures_of(result: RunResult) -> list[Path]:
 def next_commands(result: RunResult) -> list[str]:
     """Commands for what comes next, each of which works on this run; none for one that is not complete or lies in a
     store."""
-    if not result.is_complete or result.plan.store is not None:
+    if not result.is_complete or result.plan.place.url is not None:
         return []
     run = str(result.plan.folder.path)
     commands = [["report", "html", run, "--out", f"{run}/page.html"]]

@@ -120,6 +120,11 @@ class SceneJob:
     doubts: tuple[str, ...] | None = None
 
     @property
+    def parts(self) -> tuple[Part, ...]:
+        """All methods, that of the ceiling last."""
+        return self.methods if self.ceiling is None else (*self.methods, self.ceiling)
+
+    @property
     def scene_name(self) -> str:
         """The scene as its dataset calls it."""
         return self.scene.removeprefix(f"{self.dataset.name}/")

@@ -82,8 +82,7 @@ def run_scene(job: SceneJob, report: Report) -> tuple[MethodOutcome, ...]:
         except PosesContradicted as error:
             return failed_outcomes(job, str(error).removeprefix(f"{job.scene}: "))
     scene = _Scene(job, report)
-    parts = job.methods if job.ceiling is None else (*job.methods, job.ceiling)
-    return tuple(_guarded(scene, part) for part in parts)
+    return tuple(_guarded(scene, part) for part in job.parts)
 
 
 @cache

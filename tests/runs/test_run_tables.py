@@ -10,7 +10,7 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.reports.tables import warnings
 from su3d_bench.reports.tables.run import headline, markdown_table
 from su3d_bench.runs.job import caveat_of
-from su3d_bench.runs.runner import confidences_of
+from su3d_bench.runs.summary import confidences_of
 from su3d_bench.store.records import NumbersRecord
 
 
