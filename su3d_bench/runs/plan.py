@@ -42,6 +42,7 @@ from su3d_bench.runs.existing import (
     Into,
     Request,
     Start,
+    differences,
     existing_run,
     extended,
     refuse_other_request,
@@ -294,7 +295,9 @@ def _started(plan: Plan, into: Into) -> Plan:
                 refuse_other_run(folder, keys.of(job, part), FIELDS_KNOWN_LATER)
     if into == "replace":
         removes = tuple(replaced_jobs(plan.folder, plan.jobs))
-        return replace(plan, start="replaced", removes=removes, notes=(*plan.notes, *_what_goes(plan, removes)))
+        if removes or (existing is not None and differences(existing, plan.request)):
+            return replace(plan, start="replaced", removes=removes, notes=(*plan.notes, *_what_goes(plan, removes)))
+        # else the run that replaced another is resumed
     if existing is not None and into == "extend":
         plan = replace(plan, settings=remembered(plan.settings, existing))
     return replace(plan, start="begun" if existing is None or not existing.is_finished else "kept")

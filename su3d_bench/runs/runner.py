@@ -107,8 +107,6 @@ def _refuse_what_came_meanwhile(plan: Plan) -> None:
 def _remove_replaced(plan: Plan) -> None:
     """What stands in the folder goes, but the maps that the new request asks for as they are. The records go last but
     the request, so that a command that is killed here begins again where it was."""
-    if not plan.removes and (plan.existing is None or not differences(plan.existing, plan.request)):
-        return  # the run that replaced another is resumed
     for name in ("metrics.json", "ablation.json"):
         remove_file(plan.folder.path / name)
     plan.place.publish()
