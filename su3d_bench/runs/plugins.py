@@ -39,9 +39,18 @@ FORMS: dict[str, type] = {
     **dict.fromkeys(("indices", "views", "instance", "semantic", "every_semantic"), np.int32),
     **dict.fromkeys(("triangles", "instance_of_triangle", "segments"), np.int32),
 }
+# Arrays that a truth or mesh must have: kind of values, and what a row is.
+ARRAYS: dict[type, dict[str, tuple[str, tuple[int, ...]]]] = {
+    GroundTruth: {"points": ("f", (3,)), "semantic": ("i", ()), "instance": ("i", ())},
+    Surface: {"vertices": ("f", (3,)), "triangles": ("i", (3,))},
+    InstanceMesh: {"vertices": ("f", (3,)), "triangles": ("i", (3,)), "instance_of_triangle": ("i", ())},
+}
 ELEMENTS: dict[str, type] = {"scenes": str, "files": Path, "places": Path, "problems": str}
 TEXTS = ("labels", "names", "captions", "view_names")
 MOST_INT32 = np.iinfo(np.int32).max
+
+
+# ---- what is wrong with values of the right type: their dataclasses check shapes that must agree
 
 
 def fault_of(found: Any) -> str | None:
@@ -50,13 +59,15 @@ def fault_of(found: Any) -> str | None:
         case SceneInfo():
             return _fault_of_info(found)
         case Frame():
-            return _fault_of_frame(found)
+            depth = found.depth_m
+            is_metres = not depth.size or (depth.min() >= 0 and depth.max() < np.inf)  # NaN is neither
+            return None if is_metres else (
+                "depth holds values that are negative or not finite; metres are expected, and 0 where there is none"
+            )  # fmt: skip
         case GroundTruth():
-            return _fault_of_truth(found)
-        case InstanceMesh():
-            return _fault_of_mesh(found)
-        case Surface():
-            return _fault_of_surface(found)
+            return _fault_of_arrays(found) or _fault_of_truth(found)
+        case InstanceMesh() | Surface():
+            return _fault_of_arrays(found) or _fault_of_mesh(found)
         case PerceptionNeeds():
             return _fault_of_needs(found)
         case Instances() | Partition() | DenseFeatures():
@@ -70,8 +81,8 @@ def fault_of_list(name: str, found: Sequence[Any]) -> str | None:
     for k in range(len(found)):
         if not isinstance(found[k], kind):
             return f"entry {k} is {found[k]!r}, a {type(found[k]).__name__}; a {kind.__name__} is expected"
-    twice = len(set(found)) != len(found) if kind is str and name == "scenes" else False
-    return f"one of the {len(found)} names stands there twice" if twice else None
+    is_twice = name == "scenes" and len(set(found)) != len(found)
+    return f"one of the {len(found)} names stands there twice" if is_twice else None
 
 
 def in_stored_form(found: Any) -> Any:
@@ -83,20 +94,22 @@ def in_stored_form(found: Any) -> Any:
         value = getattr(found, name)
         if isinstance(value, list) and name in TEXTS:
             changed[name] = tuple(value)
-        if isinstance(found, DenseFeatures) and name == "features":
-            continue  # as large as it may be, and in half precision
-        if isinstance(value, np.ndarray) and name in FORMS and _is_of_kind(value, np.dtype(FORMS[name])):
+        is_large = isinstance(found, DenseFeatures) and name == "features"  # stays in half precision
+        if (
+            isinstance(value, np.ndarray)
+            and not is_large
+            and _can_become(value, np.dtype(FORMS.get(name, value.dtype)))
+        ):
             changed[name] = value.astype(FORMS[name])
     return replace(found, **changed) if changed else found
 
 
-def _is_of_kind(value: NDArray[Any], form: np.dtype[Any]) -> bool:
+def _can_become(value: NDArray[Any], form: np.dtype[Any]) -> bool:
     """Whether ``value`` is of another type than ``form`` that holds nothing which ``form`` cannot hold but digits."""
     if value.dtype == form or value.dtype.kind not in ("iu" if form.kind == "i" else "f"):
         return False
-    if form.kind == "f" or not value.size:
-        return True
-    return bool(np.iinfo(form).min <= value.min() and value.max() <= np.iinfo(form).max)
+    is_small = form.kind == "f" or not value.size
+    return is_small or bool(np.iinfo(form).min <= value.min() and value.max() <= np.iinfo(form).max)
 
 
 def _fault_of_info(info: SceneInfo) -> str | None:
@@ -109,23 +122,26 @@ def _fault_of_info(info: SceneInfo) -> str | None:
     return None
 
 
-def _fault_of_frame(frame: Frame) -> str | None:
-    depth = frame.depth_m
-    if depth.size and not (depth.min() >= 0 and depth.max() < np.inf):  # NaN is neither
-        return "depth holds values that are negative or not finite; metres are expected, and 0 where there is none"
+def _fault_of_arrays(found: GroundTruth | InstanceMesh | Surface) -> str | None:
+    for name, (kind, row) in ARRAYS[type(found)].items():
+        value, wanted = getattr(found, name), "floats" if kind == "f" else "integers"
+        if not isinstance(value, np.ndarray):
+            return f"{name} is a {type(value).__name__}; an array of {wanted} is expected"
+        if value.dtype.kind not in ("iu" if kind == "i" else kind):
+            return f"{name} is an array of {value.dtype.name}, not of {wanted}"
+        if value.ndim != 1 + len(row) or value.shape[1:] != row:
+            return f"{name} is {value.shape}; {('N', *row)} is expected"
+        if kind == "f" and not np.isfinite(value).all():
+            return f"{name} holds values that are not finite"
+        is_id = name.startswith("instance")
+        if is_id and value.size and not 0 <= value.min() <= value.max() <= MOST_INT32:
+            return f"{name} holds {value.min()} to {value.max()}; ids lie from 0 to {MOST_INT32}, 0 where there is none"
+    if not isinstance(found, Surface) and not isinstance(found.labels, LabelSet):
+        return f"labels is a {type(found.labels).__name__}; a LabelSet is expected"
     return None
 
 
 def _fault_of_truth(truth: GroundTruth) -> str | None:
-    if fault := _fault_of_fields(truth, {"points": "f", "semantic": "i", "instance": "i"}):
-        return fault
-    if fault := _fault_of_type("labels", truth.labels, LabelSet):
-        return fault
-    if not np.isfinite(truth.points).all():
-        return "points holds values that are not finite"
-    known = np.maximum(truth.semantic, 0)  # below it is -1 alone, for points that are left out
-    if (fault := _fault_of_range("instance", truth.instance)) or (fault := _fault_of_range("semantic", known)):
-        return fault
     every = truth.every_semantic
     if every is not None and every.dtype.kind != "i":
         return f"every_semantic is {every.dtype}; whole numbers are expected"
@@ -136,91 +152,45 @@ def _fault_of_truth(truth: GroundTruth) -> str | None:
     return None
 
 
-def _fault_of_mesh(mesh: InstanceMesh) -> str | None:
-    if fault := _fault_of_surface(mesh) or _fault_of_fields(mesh, {"instance_of_triangle": "i"}):
-        return fault
-    if mesh.instance_of_triangle.shape != (len(mesh.triangles),):
-        return f"instance_of_triangle is {mesh.instance_of_triangle.shape} for {len(mesh.triangles)} triangles"
-    if fault := _fault_of_range("instance_of_triangle", mesh.instance_of_triangle):
-        return fault
-    for name, kind in (("labels", LabelSet), ("class_of_instance", Mapping)):
-        if fault := _fault_of_type(name, getattr(mesh, name), kind):
-            return fault
+def _fault_of_mesh(mesh: InstanceMesh | Surface) -> str | None:
+    corners = mesh.triangles
+    if corners.size and not 0 <= corners.min() <= corners.max() < len(mesh.vertices):
+        return f"triangles holds {corners.min()} to {corners.max()}, there are {len(mesh.vertices)} vertices"
+    if isinstance(mesh, Surface):
+        return None
+    if len(mesh.instance_of_triangle) != len(corners):
+        return f"instance_of_triangle is {mesh.instance_of_triangle.shape} for {len(corners)} triangles"
+    if not isinstance(mesh.class_of_instance, Mapping):
+        return f"class_of_instance is a {type(mesh.class_of_instance).__name__}; a Mapping is expected"
     for instance in np.unique(mesh.instance_of_triangle[mesh.instance_of_triangle > 0]).tolist():
-        if mesh.class_of_instance.get(instance) not in mesh.labels.ids:
-            known = mesh.class_of_instance.get(instance, "no class")
+        known = mesh.class_of_instance.get(instance, "no class")
+        if known not in mesh.labels.ids:
             return f"class_of_instance has {known} for instance {instance}; a class id of its labels is expected"
     return None
 
 
-def _fault_of_surface(mesh: InstanceMesh | Surface) -> str | None:
-    if fault := _fault_of_fields(mesh, {"vertices": "f", "triangles": "i"}):
-        return fault
-    for name in ("vertices", "triangles"):
-        shape = getattr(mesh, name).shape
-        if len(shape) != 2 or shape[1] != 3:
-            return f"{name} is {shape}; ({name[0].upper()}, 3) is expected"
-    if not np.isfinite(mesh.vertices).all():
-        return "vertices holds values that are not finite"
-    corners = mesh.triangles
-    if corners.size and not 0 <= corners.min() <= corners.max() < len(mesh.vertices):
-        return f"triangles holds {corners.min()} to {corners.max()}, there are {len(mesh.vertices)} vertices"
-    return None
-
-
-def _fault_of_range(name: str, ids: NDArray[Any]) -> str | None:
-    if ids.size and not 0 <= ids.min() <= ids.max() <= MOST_INT32:
-        return f"{name} holds {ids.min()} to {ids.max()}; ids lie from 0 to {MOST_INT32}, 0 where there is none"
-    return None
-
-
-def _fault_of_type(name: str, value: Any, kind: type) -> str | None:
-    return None if isinstance(value, kind) else f"{name} is a {type(value).__name__}; a {kind.__name__} is expected"
-
-
-def _fault_of_fields(found: Any, kinds: Mapping[str, str]) -> str | None:
-    """Which field is no array of floats (``f``) or integers (``i``)."""
-    for name, kind in kinds.items():
-        value = getattr(found, name)
-        wanted = "floats" if kind == "f" else "integers"
-        if not isinstance(value, np.ndarray):
-            return f"{name} is a {type(value).__name__}; an array of {wanted} is expected"
-        if value.dtype.kind not in ("iu" if kind == "i" else kind):
-            return f"{name} is an array of {value.dtype.name}, not of {wanted}"
-    return None
-
-
 def _fault_of_prediction(prediction: Instances | Partition | DenseFeatures) -> str | None:
-    for name in (field.name for field in fields(prediction)):
-        value = getattr(prediction, name)
-        if value is not None and name not in TEXTS and not isinstance(value, np.ndarray):
-            return f"'{name}' is a {type(value).__name__}; an array is expected"
-    if fault := array_fault(prediction_arrays(prediction)):
-        return fault
-    if fault := value_fault(prediction):
+    if fault := array_fault(prediction_arrays(prediction)) or value_fault(prediction):
         return fault
     features = None if isinstance(prediction, DenseFeatures) else prediction.features
     if features is not None and not np.isfinite(features).all():
         row = int(np.flatnonzero(~np.isfinite(features).all(axis=1))[0])
         return f"'features' has values that are NaN or infinite, first in row {row}"
-    return _fault_of_masks(prediction) if isinstance(prediction, Instances) else None
-
-
-def _fault_of_masks(instances: Instances) -> str | None:
-    k = len(instances)
+    if not isinstance(prediction, Instances):
+        return None
+    k = len(prediction)
     for name in ("boxes", "centroids"):
-        if len(getattr(instances, name)) != k:
-            return f"'{name}' has {len(getattr(instances, name))} rows for {k} instances"
-    if len(instances.ids) not in (0, k):
-        return f"'ids' has {len(instances.ids)} for {k} instances"
-    steps = np.diff(instances.indices.astype(np.int64))
-    is_inside = np.diff(instances.owners) == 0
-    if (is_inside & (steps <= 0)).any():
-        first = int(np.flatnonzero(is_inside & (steps <= 0))[0])
-        return f"the mask of instance {instances.owner_at(first)} is not ascending, or holds a point twice"
-    views = Masks(instances.view_indptr, instances.views[:, 0])
+        if len(getattr(prediction, name)) != k:
+            return f"'{name}' has {len(getattr(prediction, name))} rows for {k} instances"
+    if len(prediction.ids) not in (0, k):
+        return f"'ids' has {len(prediction.ids)} for {k} instances"
+    falls = (np.diff(prediction.owners) == 0) & (np.diff(prediction.indices.astype(np.int64)) <= 0)
+    if falls.any():
+        owner = prediction.owner_at(int(np.flatnonzero(falls)[0]))
+        return f"the mask of instance {owner} is not ascending, or holds a point twice"
+    views = Masks(prediction.view_indptr, prediction.views[:, 0])
     if len(views) != k or not views.is_whole:
-        return f"'view_indptr' does not describe {len(instances.views)} views of {k} instances"
+        return f"'view_indptr' does not describe {len(prediction.views)} views of {k} instances"
     return None
 
 
@@ -233,6 +203,8 @@ def _fault_of_needs(needs: PerceptionNeeds) -> str | None:
     )
     return None if is_ratios else f"crop_ratios is {needs.crop_ratios!r}; a tuple of numbers above 0 is expected"
 
+
+# ---- where user-defined datasets and methods answer
 
 Kinds = tuple[type, ...]
 # What each of their functions must give; nothing is asked of what is handed nothing back. A sequence has a length and

@@ -28,34 +28,6 @@ def test_a_device_chooses_the_labels_of_the_cpu_where_classes_are_equally_near_t
     np.testing.assert_array_equal(most_similar(features, one, device), np.zeros(len(features)))
 
 
-@needs_torch
-def test_a_block_in_which_every_choice_is_clear_is_not_computed_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(_: object) -> None:
-        raise AssertionError
-
-    text, features = np.eye(4), np.eye(4)[[2, 0, 3]]
-    expected = most_similar(features, text)
-    monkeypatch.setattr(
-        "su3d_bench.metrics.matching.labelling._normalised", lambda rows: rows if len(rows) == 4 else refuse(rows)
-    )
-    assert most_similar(features, text, TORCH_ON_CPU).tolist() == expected.tolist() == [2, 0, 3]
-    with pytest.raises(AssertionError):  # a tie is
-        most_similar(np.ones((3, 4)), text, TORCH_ON_CPU)
-
-
-@needs_torch
-def test_a_choice_as_clear_as_the_gap_is_sure_and_one_less_clear_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    from su3d_bench.metrics.matching import kernels
-
-    directions = kernels.directions_on(TORCH_ON_CPU, np.eye(3))  # cosines of 1 and 0
-    monkeypatch.setattr(kernels, "SURE_GAP", 1.0)
-    chosen = kernels.sure_most_similar(directions, directions)
-    assert chosen is not None
-    assert chosen.tolist() == [0, 1, 2]
-    monkeypatch.setattr(kernels, "SURE_GAP", np.nextafter(1.0, 2.0))
-    assert kernels.sure_most_similar(directions, directions) is None
-
-
 @on_each_device
 def test_cosines_of_a_device_are_those_of_the_cpu(device: str) -> None:
     rng = np.random.default_rng(1)
@@ -76,13 +48,6 @@ def test_the_embedded_encoder_gives_the_features_of_the_cpu_on_a_device(device: 
     tolerance = 1e-5 if device == TORCH_ON_CPU else 1e-4  # a GPU's convolutions are by other algorithms
     np.testing.assert_allclose(there.encode_images(images), here.encode_images(images), rtol=0, atol=tolerance)
     np.testing.assert_allclose(there.encode_texts(texts), here.encode_texts(texts), rtol=0, atol=tolerance)
-
-
-def test_features_made_on_a_gpu_have_a_digest_of_their_own_and_the_space_of_the_cpu() -> None:
-    here, there = EmbeddedEncoder(), EmbeddedEncoder(device="cuda:1")
-    assert here.digest != there.digest == EmbeddedEncoder(device="cuda:0").digest
-    assert here.is_same_space(there.digest) and there.is_same_space(here.digest)
-    assert not here.is_same_space("0" * 64)
 
 
 @needs_torch

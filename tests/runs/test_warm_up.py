@@ -11,17 +11,6 @@ from su3d_bench.runs.frame_loop import warm_up
 WARMED = [name for name in registry.METHODS if isinstance(registry.load("method", name), WarmsUp)]
 
 
-def test_the_methods_that_fuse_frames_ask_for_it() -> None:
-    assert WARMED == [
-        "opensu3d",
-        "conceptfusion",
-        "conceptfusion-sam",
-        "conceptgraphs",
-        "conceptgraphs-detector",
-        "sam3d",
-    ]
-
-
 @pytest.mark.parametrize("name", WARMED)
 def test_a_made_up_frame_goes_through_every_step(name: str) -> None:
     # Keeps the map. A class of its own: what ``isinstance`` has said of the method's own class would be remembered.
