@@ -15,10 +15,8 @@ from made_programs import MASKS, SCENE, SURFACE, fed, frames, method, program, r
 from painted import ColourPerception, colour_perception
 from places import SCENES
 
-from su3d_bench.baselines.command.frames import FrameFolder
-from su3d_bench.baselines.command.method import Command, CommandConfig
-from su3d_bench.baselines.command.placeholders import check_placeholders
-from su3d_bench.baselines.command.prediction import class_names
+from su3d_bench.baselines.command.folders import FrameFolder, class_names
+from su3d_bench.baselines.command.method import Command, CommandConfig, check_placeholders
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import Instances

@@ -178,7 +178,7 @@ def _command_output(folder: Path) -> Read:
     from prediction_files import TOY, write_openyolo3d
     from test_proposals import flat
 
-    from su3d_bench.baselines.command.prediction import as_prediction, read_output
+    from su3d_bench.baselines.command.folders import as_prediction, read_output
 
     write_openyolo3d(folder, TOY)
     n = TOY["masks"].shape[1]
