@@ -74,8 +74,8 @@ def check_placeholders(command: str | Sequence[str], *, is_shell: bool) -> None:
             raise ValueError(f"'{{{unknown[0]}}}' stands for nothing; known: {{{'}, {'.join(PLACEHOLDERS)}}}")
         if not BESIDE.fullmatch(PLACEHOLDER.sub("", word)) or _is_code(words, k):
             raise ValueError(
-CODE_OPTION = re.compile(r"-[A-Za-z]*[ceEpr]|--(eval|command|print|execute)=?")  # a program follows
-                f"environment variable {variable_of(names[0])} there"
+                f"'{{{names[0]}}}' stands within what a program may read as code; make it a word of its own, or use "
+                f"the environment variable {variable_of(names[0])} there"
             )
 
 

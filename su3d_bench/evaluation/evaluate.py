@@ -39,8 +39,7 @@ from su3d_bench.metrics.fitness import (
     why_not_numbers,
 )
 from su3d_bench.metrics.labels import labels_counted, under_several_labels
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
 from su3d_bench.predictions.own_runs import OwnRuns

@@ -19,7 +19,7 @@ from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth
-from su3d_bench.metrics.semantic.panoptic_score import told_truth
+from su3d_bench.metrics.semantic.panoptic import told_truth
 from su3d_bench.perception.models.catalogue import STAND_IN, WEIGHTS_CAVEAT
 from su3d_bench.perception.profiles import Perception, PerceptionConfig
 from su3d_bench.questions.reasoning.language_solver import answers_digest
