@@ -68,7 +68,7 @@ def call_list(arguments: argparse.Namespace) -> int:
 
 
 def call_clear(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.planning.scenes import cache_root
+    from su3d_bench.runs.scenes import cache_root
     from su3d_bench.store.caches import KINDS, cache_entries, clear_cache, size_text
 
     days = arguments.older_than
@@ -105,7 +105,7 @@ def _chosen(names: list[str], kinds: dict[str, CacheKind]) -> list[CacheKind]:
 
 def _kept() -> tuple[Path, list[dict[str, Any]]]:
     """The cache folder and what it holds of each kind."""
-    from su3d_bench.runs.planning.scenes import cache_root
+    from su3d_bench.runs.scenes import cache_root
     from su3d_bench.store.caches import KINDS, cache_entries
 
     root = cache_root()

@@ -176,7 +176,7 @@ def _maps_of_run(path: Path) -> dict[str, list[Path]]:
 
 def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> list[Source]:
     """The sources that a pattern matches, all without patterns; a scene without a dataset takes that of its pattern."""
-    from su3d_bench.runs.planning.scenes import split_address
+    from su3d_bench.runs.scenes import split_address
 
     if not patterns:
         return list(sources)
@@ -199,7 +199,7 @@ def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> li
 def _names(addresses: Sequence[str], *, is_flat: bool) -> list[str]:
     """The name of each scene's files: its address, or in a flat folder its last part, which must tell scenes apart."""
     from su3d_bench.predictions.export import file_name
-    from su3d_bench.runs.planning.scenes import split_address
+    from su3d_bench.runs.scenes import split_address
 
     names = []
     for address in addresses:

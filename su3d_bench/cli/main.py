@@ -103,13 +103,8 @@ def _exit_code(words: Sequence[str]) -> int:
     """What ``words`` ask for, done; whatever goes wrong is one line on stderr, with ``--debug`` below its traceback."""
     arguments = argparse.Namespace()
     try:
-        parser = build_parser(words[0] if words else None)
-        if "_ARGCOMPLETE" in os.environ:  # a shell asks what may follow; see su3d-bench dev completion
-            complete(parser)
-        arguments = parser.parse_args(words)
-        if "call" not in arguments:  # a verb with several sub-verbs, given alone
-            arguments = parser.parse_args([*words, "list"])
-        from su3d_bench.runs.executors.local import limit_threads  # late: --help does without what it imports
+        arguments = build_parser(words[0] if words else None).parse_args(words)
+        from su3d_bench.runs.executors import limit_threads  # late: --help does without what it imports
 
         _refuse_records(arguments)
         if not arguments.uses_all_cores:

@@ -63,8 +63,8 @@ def call_list(arguments: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-def call_check(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.own.trial import try_method
+def _check(arguments: argparse.Namespace) -> int:
+    from su3d_bench.runs.trial import try_method
 
     trial = try_method(arguments.name)
     made = f"{trial.kind} of {counted(trial.n_points, 'point')}"

@@ -25,10 +25,10 @@ from su3d_bench.perception.models.front_end import DETECTOR, PACKAGES, TAGGER
 from su3d_bench.perception.profiles import PerceptionConfig
 from su3d_bench.reproducing.asked import AskedRun
 from su3d_bench.reproducing.costs import FILE, NAME, Estimate, UnitCosts, Work, calibrated_ms, estimated, read_costs
-from su3d_bench.runs.feeding import surface_of
-from su3d_bench.runs.parts import build_dataset, build_method, part_of
-from su3d_bench.runs.planning.plan import method_part, named_method
-from su3d_bench.runs.planning.scenes import data_root, split_address
+from su3d_bench.runs.frame_loop import surface_of
+from su3d_bench.runs.job import build_dataset, build_method, part_of
+from su3d_bench.runs.plan import method_part, named_method
+from su3d_bench.runs.scenes import data_root, split_address
 
 PAPER = "paper"
 FETCHED_FOR_PAPER = (*PROFILE_MODELS[PAPER], *PAPERS_ENCODERS)

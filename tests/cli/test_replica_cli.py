@@ -13,7 +13,7 @@ import pytest
 from su3d_bench.cli.datasets import list as datasets
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.datasets.replica.dataset import Replica
-from su3d_bench.runs.planning.scenes import data_root
+from su3d_bench.runs.scenes import data_root
 
 SMALL = ["--set", "n_frames=3", "--set", "rooms.width=64", "--set", "height=48", "--set", "mesh_spacing_m=0.15"]
 MAKE = ["datasets", "make", "rooms", "--scenes", "bathroom0", *SMALL, "--jobs", "1"]

@@ -19,7 +19,7 @@ from su3d_bench.metrics.semantic.confusion import SemanticCounts, concatenate
 from su3d_bench.reports.page.numbers import confusion_cells, series_of, summary_data
 from su3d_bench.reports.tables.found import Found, Unscored, not_scored_lines
 from su3d_bench.runs.finished import FinishedRun, read_update_times
-from su3d_bench.runs.found import found_in, without_score
+from su3d_bench.runs.summary import found_in, without_score
 from su3d_bench.store.records import ResultRecord, plain
 
 MOST_PAIRS = 40  # pairs of methods that are compared: all of nine methods, and a few seconds

@@ -27,6 +27,6 @@ def add_parser(actions: Any) -> None:
 
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.fetching.bringing import plan_replica
-    from su3d_bench.runs.planning.scenes import data_root
+    from su3d_bench.runs.scenes import data_root
 
     return fetch_planned(arguments, plan_replica(sources_of(arguments), arguments.parts, data_root()))

@@ -48,7 +48,7 @@ def add_parser(actions: Any) -> None:
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.fetching.scannet import fetch_by_script, fetch_from, how_to_sign, plan_scans
     from su3d_bench.fetching.sources import built_in
-    from su3d_bench.runs.planning.scenes import data_root
+    from su3d_bench.runs.scenes import data_root
 
     source, root = built_in().named("scannet"), data_root()
     scans = plan_scans(arguments.scans, root)

@@ -96,7 +96,7 @@ def check_scene_first(verb: str, scene: str, text: str) -> None:
     import shlex
 
     from su3d_bench.core.errors import ConfigError
-    from su3d_bench.runs.planning.scenes import looks_like_scene
+    from su3d_bench.runs.scenes import looks_like_scene
 
     if not looks_like_scene(scene) and looks_like_scene(text):
         command = shlex.join(["su3d-bench", *verb.split(), text, scene])

@@ -293,7 +293,7 @@ def _drawn(
 ) -> dict[SheetKind, list[bytes]]:
     """The pictures of all drafts."""
     from su3d_bench.cli.shared.bars import progress
-    from su3d_bench.runs.executors.local import Event
+    from su3d_bench.runs.executors import Event
     from su3d_bench.sheets.making.drawing import draw_all
 
     flat = [draft for of_kind in drafts.values() for draft in of_kind]

@@ -7,27 +7,25 @@ after them: a job that was sent in part has no seal, or one that its files do no
 from __future__ import annotations
 
 import os
-import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.errors import StoreError
-from su3d_bench.core.files.atomic import make_folder, write_bytes
+from su3d_bench.core.files.atomic import make_folder
 from su3d_bench.core.files.locks import is_unfinished
 from su3d_bench.core.files.scratch import TemporaryFolder
-from su3d_bench.runs.executors.local import Report
+from su3d_bench.runs.executors import ELSEWHERE, Report
 from su3d_bench.runs.job import MethodOutcome, SceneJob
-from su3d_bench.runs.planning.scenes import cache_root as own_cache_root
-from su3d_bench.runs.remote.folder import RemoteFolder
+from su3d_bench.runs.plan import Plan
+from su3d_bench.runs.remote_store import RemoteFolder
+from su3d_bench.runs.run_place import SEAL
 from su3d_bench.runs.scene import failed_outcomes, run_scene
-from su3d_bench.store.run_folder import JOBS, RECORDS, RunFolder
+from su3d_bench.runs.scenes import cache_root as own_cache_root
+from su3d_bench.store.run_folder import RunFolder
 
-SEAL = "done.json"
 REPLIES = "language"  # of language models, which the scenes of a run share
-LARGE = ("prediction.npz", ".features.npy", ".png")  # ends of names that no table or comparison reads
 
 
 @dataclass(frozen=True)
@@ -101,50 +99,18 @@ def failed_distant(distant: DistantJob, reason: str) -> tuple[MethodOutcome, ...
     return outcomes
 
 
-def mirror_of(url: str, cache_root: Path) -> Path:
-    """Where this machine keeps the small files of the run folder at ``url``."""
-    return cache_root / "runs" / f"{url.rstrip('/').rpartition('/')[2]}-{digest_bytes(url.rstrip('/').encode())[:8]}"
-
-
-def fetch_state(url: str, mirror: Path) -> None:
-    """Make ``mirror`` hold the records and seals of the store and no others, so that a plan meets what is there."""
-    store = RemoteFolder(url)
-    names = [name for name in store.files() if name in RECORDS or re.fullmatch(rf"{JOBS}/[^/]+/[^/]+/{SEAL}", name)]
-    if not names and not mirror.exists():
-        return
-    with RunFolder(mirror).locked():
-        for path in (*mirror.glob(f"{JOBS}/*/*/{SEAL}"), *(mirror / name for name in RECORDS)):
-            path.unlink(missing_ok=True)
-        _write(mirror, store, names)
-
-
-def remove_jobs(url: str, mirror: Path, kept: Collection[Path]) -> None:
-    """Remove from the store all jobs but those whose folders in ``mirror`` are ``kept``, first their seals."""
-    store = RemoteFolder(url)
-    going = [name for name in store.files(JOBS) if mirror.joinpath(*Path(name).parts[:3]) not in kept]
-    store.remove(sorted(going, key=lambda name: (not name.endswith(f"/{SEAL}"), name)))
-
-
-def fetch_results(url: str, mirror: Path) -> None:
-    """Bring every file of the run's jobs that aggregation, tables and comparisons read."""
-    store = RemoteFolder(url)
-    _write(mirror, store, [name for name in store.files("scenes") if not _is_large(name)])
-
-
-def _is_large(name: str) -> bool:
-    file = name.rpartition("/")[2]
-    is_early_map = file.startswith("anytime-") and not file.endswith("-counts.npz")
-    return is_early_map or file.endswith(LARGE)
-
-
-def _write(mirror: Path, store: RemoteFolder, names: Sequence[str]) -> None:
-    for name, content in store.read(names):
-        make_folder((mirror / name).parent)
-        write_bytes(mirror / name, content)
-
-
-def send_records(url: str, mirror: Path) -> None:
-    """Bring the run's own records in the store up to those of ``mirror``."""
-    store = RemoteFolder(url)
-    store.remove(name for name in RECORDS if not (mirror / name).is_file())
-    store.send(mirror, [name for name in RECORDS if (mirror / name).is_file()])
+def distant_jobs(plan: Plan) -> list[DistantJob]:
+    """The jobs of a plan whose workers, data or run folder are elsewhere."""
+    has_own_cache = plan.config.executor in ELSEWHERE and "SU3D_CACHE" not in os.environ
+    url, files = (None, {}) if plan.data is None else (plan.data.url, plan.data.files)
+    return [
+        DistantJob(
+            job=replace(job, folder=job.folder.absolute()),
+            here=Path.cwd(),
+            store=plan.place.url,
+            data=url,
+            files=files.get(job.scene, {}),
+            cache_root=None if has_own_cache else own_cache_root(),
+        )
+        for job in plan.jobs
+    ]

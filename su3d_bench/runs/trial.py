@@ -1,6 +1,4 @@
-"""Somebody's own method tried on two frames of a built-in room, with perfect masks, as a run goes about it; somebody's
-own dataset asked for everything once, and for two frames.
-"""
+"""A user-defined method tried on two frames of a built-in room, a user-defined dataset asked for everything once."""
 
 from __future__ import annotations
 
@@ -15,8 +13,8 @@ from su3d_bench.core.errors import ConfigError, DataError, PlugInError
 from su3d_bench.core.maps import DenseFeatures
 from su3d_bench.datasets.checks_of_frames import check_frames, facts_of
 from su3d_bench.metrics.metric import n_predictions
-from su3d_bench.runs.own.watch import is_ours, place_of
-from su3d_bench.runs.planning.plan import make_plan
+from su3d_bench.runs.plan import make_plan
+from su3d_bench.runs.plugins import is_ours, place_of
 from su3d_bench.runs.runner import run_plan
 from su3d_bench.store.predictions import read_prediction
 

@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import RendersFrames, SaysUp
+from su3d_bench.core.registry import DATASETS
 from su3d_bench.datasets.recordings.pose_convention import judge_scene
-from su3d_bench.runs.job import SceneJob
-from su3d_bench.runs.parts import build_dataset, build_method
+from su3d_bench.runs.job import SceneJob, build_dataset, build_method
 from su3d_bench.store.run_folder import RunFolder
 
 ALL_THE_SAME = "--accept-poses runs it all the same"
@@ -46,6 +46,13 @@ def judged(jobs: Sequence[SceneJob]) -> tuple[SceneJob, ...]:
         others = f" (and {len(wrong) - 1} more of {len(jobs)} scenes)" if len(wrong) > 1 else ""
         raise PosesContradicted(f"{wrong[0]}{others}; {ALL_THE_SAME}")
     return tuple(replace(job, doubts=said.lines) for job, said in pairs)
+
+
+def judged_where_read_here(jobs: Sequence[SceneJob]) -> tuple[SceneJob, ...]:
+    """The jobs, judged where the program itself reads the data: a user-defined reader may end the process that it runs
+    in, so that the scene's worker looks at these."""
+    known = {job.scene: job for job in judged([job for job in jobs if job.dataset.target in DATASETS])}
+    return tuple(known.get(job.scene, job) for job in jobs)
 
 
 def _remarks(job: SceneJob) -> _Remarks:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,6 +23,7 @@ from su3d_bench.core.config import (
     flatten,
     parse_value,
     read_assignments,
+    read_file,
     resolve,
 )
 from su3d_bench.core.digests import code_digest, digest_json
@@ -33,30 +34,55 @@ from su3d_bench.core.system.devices import device_for
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names, protocols_for
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
-from su3d_bench.runs.executors.choose import ELSEWHERE, check_execution
-from su3d_bench.runs.job import FIELDS_KNOWN_LATER, SceneJob, config_key, own_code, refuse_other_run
-from su3d_bench.runs.parts import Part, build_method, options_model, part_of
-from su3d_bench.runs.planning.held import (
-    HeldRun,
+from su3d_bench.runs.executors import ELSEWHERE, check_execution
+from su3d_bench.runs.existing import (
+    ConfigKeys,
+    ExistingRun,
     Into,
     Request,
+    Start,
+    differences,
+    existing_run,
     extended,
-    held_run,
     refuse_other_request,
     remembered,
     replaced_jobs,
 )
-from su3d_bench.runs.planning.scenes import (
+from su3d_bench.runs.job import (
+    FIELDS_KNOWN_LATER,
+    Part,
+    SceneJob,
+    options_model,
+    own_code,
+    part_of,
+    refuse_other_run,
+)
+from su3d_bench.runs.remote_store import DataPlace, RemoteData, data_place, is_url
+from su3d_bench.runs.run_place import LocalRun, RunPlace, StoredRun
+from su3d_bench.runs.scenes import (
     cache_root,
     data_root,
     dataset_targets,
     expand_scenes,
     looks_like_scene,
 )
-from su3d_bench.runs.remote.data import DataPlace, RemoteData, data_place
-from su3d_bench.runs.remote.folder import is_url
-from su3d_bench.runs.remote.scene import fetch_state, mirror_of
-from su3d_bench.store.run_folder import RunFolder, scene_of_folder
+from su3d_bench.store.run_folder import JobFolder, RunFolder, scene_of_folder
+
+
+def asked_settings(
+    values: Mapping[str, Any], *, device: str | None, config: Path | None, source_of: Callable[[str], str]
+) -> Settings:
+    """The settings of the file ``config``, then those of ``values``, which win; None stands for what was not asked.
+
+    ``values`` are by key of a run, ``source_of`` says of a key where it was asked, which begins an error's line.
+    """
+    settings = Settings() if config is None else read_file(config)
+    given: list[tuple[KeyPath, Any]] = [((name,), value) for name, value in values.items()]
+    given.append((("perception", "models", "device"), device))
+    return settings + Settings(
+        tuple(Setting(path, value, source_of(path[-1])) for path, value in given if value is not None)
+    )
+
 
 MOST_NAMED = 4  # scenes and methods whose maps go
 MOST_CHARACTERS = 120  # the name is a folder's name too
@@ -121,20 +147,30 @@ def _assigned(text: str, variant: str) -> Mapping[str, Any]:
 class Plan:
     """What a run will do: one job a scene; ``notes`` are remarks for whoever asked.
 
-    ``store``: URL of the run folder where it is in a store; ``folder`` then holds its small files. ``held``: the run
-    that the folder held when the plan was made, which this one resumes, or does ``into``.
+    ``existing``: the run that the folder held when the plan was made. ``start`` says what becomes of it: it is none, or
+    unfinished, and the records *begin*; it is *kept* until new records take its place; or it is *replaced*, for which
+    the jobs in ``removes`` go.
     """
 
     config: RunConfig
     settings: Settings
-    folder: RunFolder
+    place: RunPlace
     jobs: tuple[SceneJob, ...]
     n_workers: int
     notes: tuple[str, ...]
-    store: str | None = None
     data: RemoteData | None = None
-    held: HeldRun | None = None
-    into: Into = "own"
+    existing: ExistingRun | None = None
+    start: Start = "begun"
+    removes: tuple[JobFolder, ...] = ()
+
+    @property
+    def folder(self) -> RunFolder:
+        return self.place.folder
+
+    @property
+    def is_distant(self) -> bool:
+        """Whether workers share no more than a disk or a store with this process."""
+        return self.config.executor in ELSEWHERE or self.place.url is not None or self.data is not None
 
     @property
     def values(self) -> list[tuple[KeyPath, Any]]:
@@ -178,13 +214,13 @@ def make_plan(
     URL of a store. A folder that holds a run of another request is refused, or extended or replaced where ``into`` says
     so.
     """
-    store = out if isinstance(out, str) else None
-    held = None if out is None else _held(out)
     if into != "own" and out is None:
         raise ConfigError(f"--{into}: say which run with --out, such as --out runs/demo")
+    place = None if out is None else _place(out)
+    existing = None if place is None else existing_run(place.folder.path)
     check_keys(settings)
     if into == "extend":
-        settings = extended(settings, held, str(out))
+        settings = extended(settings, existing, str(out))
     config = resolve(settings, (), RunConfig)
     check_execution(config)
     if config.profile not in PROFILES:
@@ -213,48 +249,67 @@ def make_plan(
         raise ConfigError(
             "--solver llm: answers the questions of reasoning protocols; add such as --protocols rooms-reasoning"
         )
-    folder = _folder(out, config, parts)
-    held = held_run(folder) if out is None else held
-    if store is None:
-        RunFolder(folder).refuse_other_content()
+    if place is None:
+        place = LocalRun(RunFolder(Path("runs") / _run_name(config, parts)))
+        existing = existing_run(place.folder.path)
+    if place.url is None:
+        place.folder.refuse_other_content()
     named = os.environ.get("SU3D_DATA") or ""
-    with data_place(named) if is_url(named) else nullcontext(DataPlace(data_root())) as place:
-        chosen, notes = expand_scenes(config.scenes, parts.datasets, place.root)
-        data = place.needed({parts.datasets[target] for target, _ in chosen})
+    with data_place(named) if is_url(named) else nullcontext(DataPlace(data_root())) as data_root_here:
+        chosen, notes = expand_scenes(config.scenes, parts.datasets, data_root_here.root)
+        data = data_root_here.needed({parts.datasets[target] for target, _ in chosen})
     jobs = tuple(
-        replace(_scene_job(config, parts, folder, place.root, target, scene), index=index, replaces=into == "replace")
+        replace(
+            _scene_job(config, parts, place.folder.path, data_root_here.root, target, scene),
+            index=index,
+            replaces=into == "replace",
+        )
         for index, (target, scene) in enumerate(chosen)
     )
     n_here = len(jobs) if config.executor in ELSEWHERE else os.cpu_count() or 1
     n_workers = min(config.jobs or n_here, len(jobs))
     notes += tuple(_notes_on_protocols(parts.protocols, config.protocols))
-    plan = Plan(config, settings, RunFolder(folder), jobs, n_workers, notes, store, data, held, into)
+    plan = Plan(config, settings, place, jobs, n_workers, notes, data, existing)
     try:
-        if held is not None:
-            refuse_other_request(held, plan.request, into, str(store or folder))
-            plan = replace(plan, settings=remembered(settings, held) if into == "extend" else settings)
-        _refuse_other_runs(plan)
-        return replace(plan, notes=(*notes, *_what_goes(plan))) if into == "replace" else plan
+        return _started(plan, into)
     except StoreError as error:
-        raise StoreError(str(error).replace(str(folder), str(store or folder))) from error
+        raise StoreError(str(error).replace(str(place.folder.path), place.name)) from error
 
 
-def _held(out: Path | str) -> HeldRun | None:
-    if isinstance(out, Path):
-        return held_run(out)
-    mirror = mirror_of(out, cache_root())
-    fetch_state(out, mirror)
-    return held_run(mirror)
+def _place(out: Path | str) -> RunPlace:
+    return LocalRun(RunFolder(out)) if isinstance(out, Path) else StoredRun.opened(out, cache_root())
 
 
-def _what_goes(plan: Plan) -> list[str]:
-    going = [job.path.parts[-2:] for job in replaced_jobs(plan.folder, plan.jobs)]
-    if not going:
+def _started(plan: Plan, into: Into) -> Plan:
+    """``plan`` with what becomes of the run in its folder; a ``StoreError`` where that is another one."""
+    existing = plan.existing
+    if existing is not None:
+        refuse_other_request(existing, plan.request, into, plan.place.name)
+    keys = ConfigKeys()
+    for job in plan.jobs:
+        for part in job.methods:
+            folder = plan.folder.job(job.scene, part.name)
+            folder.refuse_links()
+            if into != "replace":
+                refuse_other_run(folder, keys.of(job, part), FIELDS_KNOWN_LATER)
+    if into == "replace":
+        removes = tuple(replaced_jobs(plan.folder, plan.jobs))
+        if removes or (existing is not None and differences(existing, plan.request)):
+            return replace(plan, start="replaced", removes=removes, notes=(*plan.notes, *_what_goes(plan, removes)))
+        # else the run that replaced another is resumed
+    if existing is not None and into == "extend":
+        plan = replace(plan, settings=remembered(plan.settings, existing))
+    return replace(plan, start="begun" if existing is None or not existing.is_finished else "kept")
+
+
+def _what_goes(plan: Plan, removes: Sequence[JobFolder]) -> list[str]:
+    if not removes:
         return []
+    going = [job.path.parts[-2:] for job in removes]
     scenes, methods = (list(dict.fromkeys(names)) for names in zip(*going, strict=True))
     which = f"{some([scene_of_folder(name) for name in scenes], MOST_NAMED)} by {some(methods, MOST_NAMED)}"
     n_all = len(plan.folder.jobs())
-    return [f"--replace: {len(going)} of the {counted(n_all, 'map')} in {plan.store or plan.folder.path} go: {which}"]
+    return [f"--replace: {len(removes)} of the {counted(n_all, 'map')} in {plan.place.name} go: {which}"]
 
 
 def _check_one_a_name(flag: str, named: Iterable[tuple[str, Any]]) -> None:
@@ -371,12 +426,6 @@ def asks_questions(protocols: Sequence[str]) -> bool:
     return any(load_protocol(name).answers is not None for name in protocols)
 
 
-def _folder(out: Path | str | None, config: RunConfig, parts: _Parts) -> Path:
-    if isinstance(out, str):
-        return mirror_of(out, cache_root())
-    return out or Path("runs") / _run_name(config, parts)
-
-
 def _run_name(config: RunConfig, parts: _Parts) -> str:
     request = config.model_dump(mode="json", exclude=set(MOVES_NO_NUMBER))
     options = [part.options for part in (*parts.methods, *parts.datasets.values())]
@@ -406,16 +455,3 @@ def _scene_job(config: RunConfig, parts: _Parts, folder: Path, root: Path, targe
         accepts_poses=config.accept_poses,
         solver=config.solver,
     )
-
-
-def _refuse_other_runs(plan: Plan) -> None:
-    keys: dict[tuple[Part, Part], dict[str, str]] = {}  # the same for all scenes of a dataset
-    for job in plan.jobs:
-        for part in job.methods:
-            if (job.dataset, part) not in keys:
-                keys[job.dataset, part] = config_key(job, part, build_method(part))
-            folder = plan.folder.job(job.scene, part.name)
-            folder.refuse_links()
-            if plan.into == "replace":
-                continue
-            refuse_other_run(folder, keys[job.dataset, part], FIELDS_KNOWN_LATER)

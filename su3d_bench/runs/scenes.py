@@ -14,8 +14,8 @@ from su3d_bench.core import registry
 from su3d_bench.core.config import Settings
 from su3d_bench.core.errors import ConfigError, DataError, Su3dError, printable, suggest
 from su3d_bench.core.interfaces import Dataset, HasGroups
-from su3d_bench.runs.parts import Part, build_dataset, part_of
-from su3d_bench.runs.remote.folder import is_url
+from su3d_bench.runs.job import Part, build_dataset, part_of
+from su3d_bench.runs.remote_store import is_url
 
 DATA_ROOT = "~/.cache/su3d-bench/data"
 CACHE_ROOT = "~/.cache/su3d-bench/cache"

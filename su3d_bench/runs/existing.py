@@ -19,12 +19,12 @@ from su3d_bench.core.errors import ConfigError, StoreError, counted, printable, 
 from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.questions.reasoning.language_solver import MOVES_ANSWERS
-from su3d_bench.runs.job import FIELDS_KNOWN_LATER, INSTEAD, NOT_IN_KEY, SceneJob, config_key
-from su3d_bench.runs.parts import build_method
+from su3d_bench.runs.job import FIELDS_KNOWN_LATER, INSTEAD, NOT_IN_KEY, Part, SceneJob, build_method, config_key
 from su3d_bench.store.records import RequestRecord, read_record
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
-Into = Literal["own", "extend", "replace"]  # what a request does with a folder that holds a run
+Into = Literal["own", "extend", "replace"]  # what a request wants of a folder that holds a run
+Start = Literal["begun", "kept", "replaced"]  # what a plan does with it, see ``Plan``
 JOINED = ("scenes", "methods", "protocols")
 OF_THIS_CALL = MOVES_NO_NUMBER - {"pictures", "accept_poses"}  # where scenes run, which an extension does not inherit
 FINISHED = ("complete", "incomplete")
@@ -43,7 +43,7 @@ class Request:
 
 
 @dataclass(frozen=True)
-class HeldRun:
+class ExistingRun:
     """The run in a folder: what ``run.json`` says, None where it is not there, and the settings of its ``run.toml``.
 
     ``content`` is ``run.toml`` as it lies there; ``is_known`` says whether it is whole. ``remarks`` say where each
@@ -83,28 +83,28 @@ def sealed(text: str) -> str:
     return f"{text}{SEAL}{digest_bytes(text.encode())}\n"
 
 
-def held_run(folder: Path) -> HeldRun | None:
+def existing_run(folder: Path) -> ExistingRun | None:
     """The run in ``folder``; None where there is none. Of a ``run.toml`` that is not whole nothing is believed."""
     record = None
     if is_file(folder / "run.json"):
         with suppress(StoreError):  # what stands in run.toml counts then
             record = read_record(RequestRecord, folder / "run.json", shown(folder))
     if not is_file(folder / "run.toml"):
-        return None if record is None else HeldRun(folder, None, record)
+        return None if record is None else ExistingRun(folder, None, record)
     content = file_bytes(folder / "run.toml")
     text, seal, digest = content.rpartition(SEAL.encode())
     if not seal or digest != f"{digest_bytes(text)}\n".encode():
-        return HeldRun(folder, content, record)
+        return ExistingRun(folder, content, record)
     settings = read_file(folder / "run.toml")
     lines = text.decode().splitlines()
     numbers = {entry.path: int(entry.source.rpartition(":")[2]) for entry in settings.entries}
     remarks = {
         path: lines[n - 1].rpartition("  # ")[2].strip() for path, n in numbers.items() if "  # " in lines[n - 1]
     }
-    return HeldRun(folder, content, record, True, settings, remarks)
+    return ExistingRun(folder, content, record, True, settings, remarks)
 
 
-def extended(asked: Settings, held: HeldRun | None, where: str) -> Settings:
+def extended(asked: Settings, held: ExistingRun | None, where: str) -> Settings:
     """What ``held`` was asked for and what is asked for now; ``where`` is the run's folder, or its URL."""
     if held is None or not held.is_known:
         raise ConfigError(
@@ -123,7 +123,7 @@ def extended(asked: Settings, held: HeldRun | None, where: str) -> Settings:
     return Settings((*old, *new, *joined))
 
 
-def remembered(settings: Settings, held: HeldRun) -> Settings:
+def remembered(settings: Settings, held: ExistingRun) -> Settings:
     """``settings`` of an extension, those of the run before with the remarks that they had."""
     own = {id(entry) for entry in held.settings.entries}
     return Settings(
@@ -142,7 +142,7 @@ class Difference:
     can_join: bool = False
 
 
-def differences(held: HeldRun, now: Request) -> list[Difference]:
+def differences(held: ExistingRun, now: Request) -> list[Difference]:
     """In what the request of the run in a folder differs from ``now``; none where the same command was given again."""
     found: list[Difference] = []
     if held.record is None and not held.is_known:
@@ -171,7 +171,7 @@ def _some(noun: str, names: Sequence[str]) -> str:
     return f"{noun if len(names) == 1 else noun + 's'} {shown_names}{more} {'is' if len(names) == 1 else 'are'}"
 
 
-def _changed_values(held: HeldRun, now: Request) -> list[str]:
+def _changed_values(held: ExistingRun, now: Request) -> list[str]:
     """``seed was 0, now 1`` of every value that both requests have and that moves numbers."""
     old, new = held.values, now.values
     parts = {path[:2] for path in old if len(path) > 2} & {path[:2] for path in new if len(path) > 2}
@@ -198,7 +198,7 @@ def _counts(path: KeyPath, values: Mapping[KeyPath, Any]) -> bool:
     return not ".".join(path).startswith(NOT_IN_KEY)
 
 
-def _is_same(path: KeyPath, before: Any, after: Any, held: HeldRun) -> bool:
+def _is_same(path: KeyPath, before: Any, after: Any, held: ExistingRun) -> bool:
     if path == ("anytime",):
         return sorted(set(before or ())) == sorted(set(after or ()))
     if path == ("profile",) and "auto" in (before, after):  # which came out as the one that is named
@@ -221,7 +221,7 @@ def _stride(values: Mapping[KeyPath, Any], method: str) -> Any:
     return values.get(("stride",)) or values.get(("method", method, "stride"), 1)
 
 
-def refuse_other_request(held: HeldRun, now: Request, into: Into, where: str) -> None:
+def refuse_other_request(held: ExistingRun, now: Request, into: Into, where: str) -> None:
     """A ``StoreError`` that says how the run at ``where`` differs from ``now``, with the choices that there are."""
     found = differences(held, now)
     if into == "extend":  # what is new is what it is for
@@ -242,23 +242,32 @@ def choices(*, can_join: bool) -> str:
     return join + INSTEAD
 
 
-def kept_jobs(folder: RunFolder, jobs: Sequence[SceneJob]) -> set[Path]:
+class ConfigKeys:
+    """What of the keys of predictions is known before any data is read; the same for all scenes of a dataset."""
+
+    def __init__(self) -> None:
+        self._keys: dict[tuple[Part, Part], dict[str, str]] = {}
+
+    def of(self, job: SceneJob, part: Part) -> dict[str, str]:
+        if (job.dataset, part) not in self._keys:
+            self._keys[job.dataset, part] = config_key(job, part, build_method(part))
+        return self._keys[job.dataset, part]
+
+
+def _kept_jobs(folder: RunFolder, jobs: Sequence[SceneJob]) -> set[Path]:
     """Folders of jobs in a run that is replaced whose maps are those of ``jobs``, as far as the request tells."""
-    keys: dict[Any, dict[str, str]] = {}
-    kept = set()
-    for job in jobs:
-        for part in job.methods if job.ceiling is None else (*job.methods, job.ceiling):
-            if (job.dataset, part) not in keys:
-                keys[job.dataset, part] = config_key(job, part, build_method(part))
-            place = folder.job(job.scene, part.name)
-            if place.changed_field("predict", keys[job.dataset, part], known_later=FIELDS_KNOWN_LATER) is None:
-                kept.add(place.path)
-    return kept
+    keys = ConfigKeys()
+    places = [(folder.job(job.scene, part.name), keys.of(job, part)) for job in jobs for part in job.parts]
+    return {
+        place.path
+        for place, key in places
+        if place.changed_field("predict", key, known_later=FIELDS_KNOWN_LATER) is None
+    }
 
 
 def replaced_jobs(folder: RunFolder, jobs: Sequence[SceneJob]) -> list[JobFolder]:
     """The jobs in ``folder`` that go where ``jobs`` replace its run; ``StoreError`` where files of others would go."""
-    kept = kept_jobs(folder, jobs)
+    kept = _kept_jobs(folder, jobs)
     going = [job for job in folder.jobs() if job.path not in kept]
     names = {job.path.relative_to(folder.path).as_posix() for job in going}
     for stranger in folder.strangers():

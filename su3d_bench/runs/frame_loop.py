@@ -39,8 +39,8 @@ from su3d_bench.core.types import (
     Surface,
 )
 from su3d_bench.perception.profiles import Perception
-from su3d_bench.runs.executors.local import Event, Report
-from su3d_bench.runs.own.watch import told
+from su3d_bench.runs.executors import Event, Report
+from su3d_bench.runs.plugins import told
 from su3d_bench.store.predictions import write_prediction
 from su3d_bench.store.records import updates_text
 
