@@ -12,7 +12,6 @@ from places import ROOT
 from verbs_page import MORE, PAGE, page
 
 from su3d_bench.baselines.command.method import PLACEHOLDERS, variable_of
-from su3d_bench.cli.completion import verbs_of
 from su3d_bench.cli.main import build_parser
 
 ENVIRONMENT = ROOT / "docs" / "running" / "environment.md"
