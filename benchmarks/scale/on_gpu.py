@@ -25,9 +25,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from export_onnx import export_encoder
 from measured import write_measured
 from numpy.typing import NDArray
-from tiny_models import DINO_PX, blocks, noise_images
+from tiny_models import DINO_PX, IMAGE_PX, blocks, noise_images, tiny_dino, tiny_sam, tiny_tokenizer, write_tiny_clip
 from torch_devices import TORCH_ON_CPU
 
 from su3d_bench.cli.main import main as command_line
@@ -39,14 +40,10 @@ from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.perception.models.config import ModelsConfig
-from su3d_bench.perception.models.encoders.towers_onnx import export_encoder
 from su3d_bench.perception.models.files import locate
 from su3d_bench.perception.models.loading import load_encoder
 from su3d_bench.perception.models.masks.grounding_dino import GroundingDino
 from su3d_bench.perception.models.masks.sam import Sam, TorchSam
-from su3d_bench.perception.models.stand_ins.detector import tiny_dino, tiny_tokenizer
-from su3d_bench.perception.models.stand_ins.encoders import write_tiny_clip
-from su3d_bench.perception.models.stand_ins.segmenter import IMAGE_PX, tiny_sam
 
 REPEATS = 5
 CLIP = "clip-vit-h-14"

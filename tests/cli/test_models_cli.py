@@ -11,6 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from tiny_models import DIM, write_tiny_clip
 
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.core.errors import ModelMissing, PredictionError
@@ -20,7 +21,6 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.perception.models.catalogue import MODELS, STAND_IN
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.loading import load_encoder
-from su3d_bench.perception.models.stand_ins.encoders import DIM, write_tiny_clip
 from su3d_bench.runs.finished import encoder_of
 from su3d_bench.store.run_folder import RunFolder
 

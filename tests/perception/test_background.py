@@ -9,7 +9,7 @@ from __future__ import annotations
 import pytest
 
 from su3d_bench.opensu3d.config import OpenSU3DConfig
-from su3d_bench.perception.background import is_background
+from su3d_bench.perception.detections import is_background
 
 NAMES = OpenSU3DConfig().background_names
 

@@ -18,7 +18,7 @@ from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Float32Array, Frame, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.crops import crop_window
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
-from su3d_bench.perception.stored.gsa_files import GsaFiles
+from su3d_bench.perception.stored_masks import GsaFiles
 
 SCENE = SceneInfo("replica", "room0", n_frames=1, stride=1, image_domain="camera")
 PATTERN = "{scene}/gsa_detections_none/frame{index}.pkl.gz"

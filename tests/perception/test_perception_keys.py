@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from su3d_bench.core.digests import PACKAGE_ROOT
+from su3d_bench.perception import oracle as oracle_segmenter
 from su3d_bench.perception import regions
-from su3d_bench.perception.embedded.segmenter import segmenter as rgbd_segmenter
-from su3d_bench.perception.oracle import segmenter as oracle_segmenter
+from su3d_bench.perception.embedded import segmenter as rgbd_segmenter
 
 KEYED = {
     "perception/regions.py": regions.SOURCES,

@@ -13,8 +13,7 @@ from su3d_bench.baselines.oracle import Oracle
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Frame, GroundTruth, Int32Array, LabelSet, PerceptionNeeds, SceneInfo
-from su3d_bench.perception.oracle.noise import OracleNoise, disturb
-from su3d_bench.perception.oracle.segmenter import MeshProjector, OracleConfig, OracleSegmenter
+from su3d_bench.perception.oracle import MeshProjector, OracleConfig, OracleNoise, OracleSegmenter, disturb
 from su3d_bench.perception.profiles import PerceptionConfig, build_perception
 
 SCENE = SceneInfo("rooms", "living0", n_frames=1, stride=1, image_domain="rendered-rooms")

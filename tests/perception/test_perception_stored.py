@@ -13,8 +13,7 @@ from su3d_bench.core.errors import ConfigError, DataError
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
-from su3d_bench.perception.stored.npz_files import read_stored, stored_path, write_stored
-from su3d_bench.perception.stored.source import StoredConfig
+from su3d_bench.perception.stored import StoredConfig, read_stored, stored_path, write_stored
 
 SCENE = SceneInfo("replica", "room0", n_frames=1, stride=1, image_domain="camera")
 

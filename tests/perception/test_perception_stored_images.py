@@ -18,8 +18,8 @@ from su3d_bench.core.errors import ConfigError, DataError
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import PerceptionNeeds, SceneInfo
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
-from su3d_bench.perception.stored.label_images import LabelImages, read_names
-from su3d_bench.perception.stored.source import StoredConfig
+from su3d_bench.perception.stored import StoredConfig
+from su3d_bench.perception.stored_masks import LabelImages, read_names
 
 SCENE = SceneInfo("rgbd", "desk", n_frames=1, stride=1, image_domain="camera")
 PATTERN = "frame-{index}.segm.png"

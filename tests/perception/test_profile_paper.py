@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from places import REAL_RECORDINGS, needs_recordings
-from tiny_models import blocks, frame_of, paper_words, write_models
+from tiny_models import blocks, frame_of, paper_words, tiny_dino, tiny_sam, write_models
 
 from su3d_bench.cli.main import main
 from su3d_bench.core import registry
@@ -25,8 +25,6 @@ from su3d_bench.perception.language.captioner import CropCaption
 from su3d_bench.perception.models.catalogue import WEIGHTS_CAVEAT
 from su3d_bench.perception.models.config import PaperConfig
 from su3d_bench.perception.models.masks.tagging import WORDS_CAVEAT
-from su3d_bench.perception.models.stand_ins.detector import tiny_dino
-from su3d_bench.perception.models.stand_ins.segmenter import tiny_sam
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, check_models, resolve_profile
 from su3d_bench.store.atomic import read_json
 from su3d_bench.store.predictions import read_prediction
@@ -181,7 +179,7 @@ def test_the_same_frame_gives_the_same_bytes_from_models_and_from_the_cache(mode
 def test_a_cached_frame_needs_no_network(models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = config_of(models)
     first = built(config, tmp_path).detect(FRAME, PerceptionNeeds(), Timer())
-    from su3d_bench.perception.models import front_end
+    from su3d_bench.perception.models import loading as front_end
 
     def refuse(*_: Any) -> Any:
         raise AssertionError("a network was loaded")
@@ -234,7 +232,7 @@ def test_the_profile_says_what_it_computes_otherwise_than_the_paper_and_nothing_
 
 
 def test_a_vision_model_gives_names_and_captions_where_it_is_asked_for(models: Path, tmp_path: Path) -> None:
-    from su3d_bench.perception.models.front_end import load_networks
+    from su3d_bench.perception.models.loading import load_networks
     from su3d_bench.perception.paper import PaperPerception
 
     class Describing:

@@ -7,7 +7,7 @@ import pytest
 from perception_fakes import still_life
 
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, Int32Array, Regions, UInt8Array
-from su3d_bench.perception.embedded.segmenter.segmenter import RgbdSegmenter, SegmenterConfig
+from su3d_bench.perception.embedded.segmenter import RgbdSegmenter, SegmenterConfig
 
 K: Float64Array = np.array([[260.0, 0, 159.5], [0, 260.0, 119.5], [0, 0, 1]])
 WIDTH, HEIGHT = 320, 240

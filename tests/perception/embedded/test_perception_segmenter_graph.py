@@ -7,8 +7,8 @@ import pytest
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from su3d_bench.perception.embedded.segmenter.graph import border_pairs
-from su3d_bench.perception.embedded.segmenter.kernels import connected, sum_rows
+from su3d_bench.perception.embedded.kernels import connected, sum_rows
+from su3d_bench.perception.embedded.surface_graph import border_pairs
 
 
 @pytest.mark.parametrize(("n", "n_links"), [(1, 0), (5, 0), (40, 12), (40, 60), (300, 900)])

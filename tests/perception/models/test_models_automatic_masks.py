@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_models import blocks
+from tiny_models import blocks, tiny_sam
 
 from su3d_bench.core.types import BoolArray, Float32Array
 from su3d_bench.perception.models.masks.automatic_masks import (
@@ -21,7 +21,6 @@ from su3d_bench.perception.models.masks.automatic_masks import (
     without_small_parts,
 )
 from su3d_bench.perception.models.masks.sam import Prompts, Sam, TorchSam
-from su3d_bench.perception.models.stand_ins.segmenter import tiny_sam
 
 
 def mask_of(rows: str) -> BoolArray:

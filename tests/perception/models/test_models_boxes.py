@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.types import Float32Array
-from su3d_bench.perception.models.encoders.model_images import (
+from su3d_bench.perception.models.encoders.images import (
     normalised,
     resized,
     size_with_longest_side,
     size_with_shortest_side,
 )
-from su3d_bench.perception.models.masks.box_suppression import box_overlaps, corners_of, suppress
+from su3d_bench.perception.models.masks.grounding_dino import box_overlaps, corners_of, suppress
 
 
 def boxes_of(*rows: tuple[float, ...]) -> Float32Array:

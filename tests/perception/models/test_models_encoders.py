@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_models import needs_models, noise_images
+from tiny_models import DIM, needs_models, noise_images, write_tiny_clip, write_tiny_siglip
 
 from su3d_bench.core.errors import ConfigError, DataError, ModelMissing
 from su3d_bench.core.interfaces import Encoder
@@ -20,10 +20,9 @@ from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.encoders import towers_transformers
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec, FoundationEncoder, unit_rows
-from su3d_bench.perception.models.encoders.image_transform import ImageTransform
+from su3d_bench.perception.models.encoders.images import ImageTransform
 from su3d_bench.perception.models.files import ModelFiles, read_weights
 from su3d_bench.perception.models.loading import load_encoder
-from su3d_bench.perception.models.stand_ins.encoders import DIM, write_tiny_clip, write_tiny_siglip
 
 TEXTS = ("chair", "a red cup on the table", "chair", "zebra")
 RAW = EncoderSpec(3, 4, 10, "clip", None, ImageTransform(4))

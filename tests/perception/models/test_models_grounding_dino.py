@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_models import DINO_PX, blocks
+from tiny_models import DINO_PX, blocks, tiny_dino, tiny_tokenizer
 
 from su3d_bench.core.types import Float32Array
 from su3d_bench.perception.models.masks.grounding_dino import (
@@ -19,7 +19,6 @@ from su3d_bench.perception.models.masks.grounding_dino import (
     tag_of,
     text_prompt,
 )
-from su3d_bench.perception.models.stand_ins.detector import tiny_dino, tiny_tokenizer
 
 RGB = blocks(40, 60)
 TAGS = ("cat", "coffee table", "sofa")

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_models import noise_images
+from tiny_models import noise_images, write_tiny_clip, write_tiny_siglip
 
 from su3d_bench.core.errors import CheckFailed, ConfigError, DataError, ModelMissing
 from su3d_bench.perception.models.config import ModelsConfig
@@ -23,10 +23,9 @@ from su3d_bench.perception.models.encoders.towers_onnx import (
 )
 from su3d_bench.perception.models.files import locate
 from su3d_bench.perception.models.loading import load_encoder
+from su3d_bench.perception.models.onnx import Provider, open_session
 from su3d_bench.perception.models.onnx import export as onnx_export
 from su3d_bench.perception.models.onnx.export import Parity, compare_outputs, export_onnx, measure_parity
-from su3d_bench.perception.models.onnx.session import Provider, open_session
-from su3d_bench.perception.models.stand_ins.encoders import write_tiny_clip, write_tiny_siglip
 
 pytestmark = pytest.mark.skipif(
     any(find_spec(name) is None for name in ("torch", "transformers", "onnx")),

@@ -16,7 +16,7 @@ from tiny_models import noise_images
 from su3d_bench.core.errors import DataError, ModelMissing
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.perception.models.config import ModelsConfig
-from su3d_bench.perception.models.encoders.image_transform import ImageTransform
+from su3d_bench.perception.models.encoders.images import ImageTransform
 from su3d_bench.perception.models.loading import load_encoder
 
 pytestmark = pytest.mark.skipif(

@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_models import needs_models, noise_images
+from tiny_models import IMAGE_SIZE, N_TOKENS, needs_models, noise_images, write_clip_tokenizer
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.perception.models.encoders.image_transform import CLIP_MEAN, CLIP_STD, ImageTransform, read_transform
-from su3d_bench.perception.models.encoders.text_tokens import canonical_text
-from su3d_bench.perception.models.stand_ins.encoders import IMAGE_SIZE, N_TOKENS, write_clip_tokenizer
+from su3d_bench.perception.models.encoders.images import CLIP_MEAN, CLIP_STD, ImageTransform, read_transform
+from su3d_bench.perception.models.encoders.texts import canonical_text
 
 
 def test_the_window_of_the_centre_crop_is_rounded_as_each_library_does() -> None:
@@ -128,7 +127,7 @@ def test_siglip_texts_lose_capitals_and_punctuation() -> None:
 
 @needs_models
 def test_long_texts_are_cut_and_keep_their_end(tmp_path: Path) -> None:
-    from su3d_bench.perception.models.encoders.text_tokens import read_tokeniser
+    from su3d_bench.perception.models.encoders.texts import read_tokeniser
 
     write_clip_tokenizer(tmp_path)
     words = json.loads((tmp_path / "vocab.json").read_text())
@@ -142,7 +141,7 @@ def test_long_texts_are_cut_and_keep_their_end(tmp_path: Path) -> None:
 
 @needs_models
 def test_a_tokenizer_of_another_model_is_refused(tmp_path: Path) -> None:
-    from su3d_bench.perception.models.encoders.text_tokens import read_tokeniser
+    from su3d_bench.perception.models.encoders.texts import read_tokeniser
 
     write_clip_tokenizer(tmp_path)
     with pytest.raises(DataError, match="the text tower knows 20 words"):

@@ -16,7 +16,7 @@ from tiny_ram_plus import TAGS, THRESHOLDS, tiny_tensors, write_checkout
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import CheckFailed, ConfigError, DataError
 from su3d_bench.perception.models.config import ModelsConfig, PaperConfig
-from su3d_bench.perception.models.front_end import _tagger
+from su3d_bench.perception.models.loading import _tagger
 from su3d_bench.perception.models.masks.tagging import OnnxRamTagger
 from su3d_bench.perception.models.onnx.isolated import NOTE, made_environment
 from su3d_bench.perception.models.onnx.ram_plus import LARGEST_DIFFERENCE, compared, made_images

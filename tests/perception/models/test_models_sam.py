@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_models import blocks, frame_of
+from tiny_models import IMAGE_PX, blocks, frame_of, tiny_sam
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float32Array, UInt8Array
@@ -16,10 +16,8 @@ from su3d_bench.perception.models.catalogue import model_entry
 from su3d_bench.perception.models.files import ModelFiles
 from su3d_bench.perception.models.masks import sam_onnx
 from su3d_bench.perception.models.masks.grounded_sam import Networks, SamRegions
-from su3d_bench.perception.models.masks.sam import Prompts, Sam, TorchSam
+from su3d_bench.perception.models.masks.sam import Prompts, Sam, TorchSam, fill_sam, sam_config, sam_names
 from su3d_bench.perception.models.masks.tagging import WordTagger
-from su3d_bench.perception.models.pretrained import fill_sam, sam_config, sam_names
-from su3d_bench.perception.models.stand_ins.segmenter import IMAGE_PX, tiny_sam
 
 RGB = blocks(40, 60)
 BOXES = np.array([[5, 5, 30, 30], [0, 0, 60, 40], [22.5, 3.25, 41, 39]], np.float32)

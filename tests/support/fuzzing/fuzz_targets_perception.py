@@ -15,7 +15,7 @@ from fuzzing import Make, Read, Target, every_one_of
 def _gsa(folder: Path) -> Read:
     from test_perception_gsa import FRAME, PATTERN, SCENE, detections, write
 
-    from su3d_bench.perception.stored.gsa_files import GsaFiles
+    from su3d_bench.perception.stored_masks import GsaFiles
 
     write(folder, detections())
     return lambda: GsaFiles(folder, PATTERN, SCENE).frame(FRAME)
@@ -25,7 +25,7 @@ def _gsa_inside(folder: Path) -> Read:
     """The same with the gzip left whole."""
     from test_perception_gsa import FRAME, PATTERN, SCENE, detections, write
 
-    from su3d_bench.perception.stored.gsa_files import GsaFiles
+    from su3d_bench.perception.stored_masks import GsaFiles
 
     path, plain = write(folder, {}), folder / "plain.pkl"
     plain.write_bytes(pickle.dumps(detections(), 4))
@@ -41,7 +41,7 @@ def _stored(folder: Path) -> Read:
     from perception_fakes import CountingEncoder, still_life
     from test_perception_stored import written
 
-    from su3d_bench.perception.stored.npz_files import read_stored
+    from su3d_bench.perception.stored import read_stored
 
     path, encoder = written(folder, with_features=True), CountingEncoder()
     return lambda: read_stored(path, still_life(40), encoder)
@@ -51,7 +51,7 @@ def _label_images(folder: Path) -> Read:
     from perception_fakes import still_life
     from test_perception_stored_images import PATTERN, SCENE, write_image
 
-    from su3d_bench.perception.stored.label_images import LabelImages
+    from su3d_bench.perception.stored_masks import LabelImages
 
     write_image(folder)
     return lambda: LabelImages(folder, PATTERN, None, SCENE).regions(still_life(40))
@@ -59,7 +59,7 @@ def _label_images(folder: Path) -> Read:
 
 def _names(name: str) -> Make:
     def make(folder: Path) -> Read:
-        from su3d_bench.perception.stored.label_images import read_names
+        from su3d_bench.perception.stored_masks import read_names
 
         table = {"48": "book", "132": "box of things"}
         lines = "".join(f'{key} = "{text}"\n' for key, text in table.items())

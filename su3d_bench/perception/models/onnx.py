@@ -1,12 +1,15 @@
-"""Sessions of ONNX Runtime on a chosen provider, set up to give the same answer every time."""
+"""Models exported to ONNX: their ``manifest.json``, and sessions that give the same answer every time."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from su3d_bench.core.errors import DataError, ModelMissing
-from su3d_bench.perception.models.files import bounded
+from su3d_bench.perception.models.files import bounded, file_sha256, read_settings
 
 Provider = Literal["cpu", "cuda", "tensorrt"]
 PROVIDERS: dict[Provider, str] = {
@@ -14,6 +17,48 @@ PROVIDERS: dict[Provider, str] = {
     "cuda": "CUDAExecutionProvider",
     "tensorrt": "TensorrtExecutionProvider",
 }
+
+
+class OnnxManifest(BaseModel):
+    """What is read of every manifest: ``files`` name -> SHA-256; ``tools/export_onnx.py`` writes more beside it.
+
+    Of each kind: ``FORMAT`` of its file, and the files that it ``REQUIRES``.
+    """
+
+    model_config = ConfigDict(strict=True, frozen=True)
+    FORMAT: ClassVar[str]
+    REQUIRES: ClassVar[tuple[str, ...]]
+
+    name: str
+    files: dict[str, str]
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """The manifest at ``path``; raises ``DataError`` for anything else, and where a required file is not named."""
+        content = read_settings(path)
+        layout = content.get("format")
+        if layout != cls.FORMAT:
+            raise DataError(f"{path}: format is {str(layout)[:60]!r}; expected {cls.FORMAT!r}; export it again")
+        try:
+            manifest = cls.model_validate_json(json.dumps(content))
+        except ValidationError as error:
+            raise DataError(f"{path}: is no manifest of an exported model ({bounded(error, 120)})") from error
+        if any(Path(name).name != name for name in manifest.files) or not {*cls.REQUIRES} <= set(manifest.files):
+            needed = " and ".join(cls.REQUIRES)
+            raise DataError(f"{path}: files must be names inside the folder, {needed} among them; export it again")
+        return manifest
+
+
+def wrong_files(manifest: OnnxManifest, folder: Path) -> list[str]:
+    """A line for each file of the exported model in ``folder`` that is missing or not the one that was written."""
+    wrong = []
+    for name, digest in manifest.files.items():
+        path = folder / name
+        if not path.is_file():
+            wrong.append(f"{path}: is missing; export it again")
+        elif file_sha256(path) != digest:
+            wrong.append(f"{path}: is not the file that the manifest describes; export it again")
+    return wrong
 
 
 def open_session(path: Path, provider: Provider = "cpu", device_index: int = 0, n_threads: int = 1) -> Any:
@@ -31,7 +76,7 @@ def open_session(path: Path, provider: Provider = "cpu", device_index: int = 0, 
             f"provider '{provider}': this onnxruntime has {known} alone; pip install onnxruntime-gpu in its place"
         )
     if not path.is_file():
-        raise ModelMissing(f"{path}: there is no such file; export the model with su3d-bench models export")
+        raise ModelMissing(f"{path}: there is no such file; export the model with tools/export_onnx.py")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = n_threads
     options.inter_op_num_threads = 1
@@ -41,7 +86,7 @@ def open_session(path: Path, provider: Provider = "cpu", device_index: int = 0, 
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=_chain(provider, device_index))
     except _refusals() as error:
-        raise DataError(f"{path}: ONNX Runtime cannot load it: {bounded(error)}; export it anew") from error
+        raise DataError(f"{path}: ONNX Runtime cannot load it: {bounded(error)}; export it again") from error
     used = session.get_providers()
     if PROVIDERS[provider] not in used:
         # ONNX Runtime falls back to the CPU where a provider's own libraries do not load

@@ -1,8 +1,8 @@
-"""From a crop of any size to the pixels that an encoder was trained on.
+"""Images as foundation models take them: encoders by their own recipe, segmenter, detector and tagger by one.
 
-Two conventions exist for the same recipe. ``original`` is what open_clip and OpenAI's CLIP do, through torchvision on
-PIL images; ``transformers`` is what that library's PIL image processors do. They differ in the centre crop alone:
-where the surplus is 3, 7, 11 ... pixels, the windows lie one pixel apart.
+Two conventions exist for the recipe of an encoder. ``original`` is what open_clip and OpenAI's CLIP do, through
+torchvision on PIL images; ``transformers`` is what that library's PIL image processors do. They differ in the centre
+crop alone: where the surplus is 3, 7, 11 ... pixels, the windows lie one pixel apart.
 """
 
 from __future__ import annotations
@@ -10,17 +10,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeGuard
+from typing import Annotated, Any, Literal, TypeGuard
 
 import numpy as np
-from pydantic import ConfigDict
+from pydantic import ConfigDict, Field
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, UInt8Array
-from su3d_bench.perception.models.files import read_settings
+from su3d_bench.perception.models.files import checked, read_settings
 
 Convention = Literal["original", "transformers"]
 Triple = tuple[float, float, float]
+# Of a mean or a deviation; real ones lie between 0 and 255.
+Mean = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+Deviation = Annotated[float, Field(gt=0, le=1e6, allow_inf_nan=False)]
 
 # OpenAI's CLIP, clip.py, and everything that was trained after it.
 CLIP_MEAN: Triple = (0.48145466, 0.4578275, 0.40821073)
@@ -28,7 +31,6 @@ CLIP_STD: Triple = (0.26862954, 0.26130258, 0.27577711)
 BICUBIC = 3  # PIL.Image.Resampling.BICUBIC, and ``resample`` in transformers' files
 TRANSFORM_VERSION = "1"
 LARGEST_SIZE = 2048
-LARGEST_VALUE = 1e6  # of a mean or a deviation; real ones lie between 0 and 255
 
 
 @dataclass(frozen=True)
@@ -41,11 +43,11 @@ class ImageTransform:
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
-    size: int
+    size: Annotated[int, Field(ge=1, le=LARGEST_SIZE)]
     fit: Literal["shortest", "squash"] = "shortest"
-    mean: Triple = CLIP_MEAN
-    std: Triple = CLIP_STD
-    resample: int = BICUBIC
+    mean: tuple[Mean, Mean, Mean] = CLIP_MEAN
+    std: tuple[Deviation, Deviation, Deviation] = CLIP_STD
+    resample: Annotated[int, Field(ge=0, le=5)] = BICUBIC
     convention: Convention = "original"
 
     def settings(self) -> dict[str, Any]:
@@ -101,12 +103,9 @@ def read_transform(path: Path, convention: Convention) -> ImageTransform:
     if not isinstance(factor, float | int) or not 0 <= factor <= 1 or abs(factor - 1 / 255) > 1e-9:
         raise DataError(f"{path}: rescale_factor is {str(factor)[:40]}; expected 1/255")
     fit, size = _size(path, content)
-    resample = content.get("resample", BICUBIC)
-    if resample not in range(6):
-        raise DataError(f"{path}: resample is {str(resample)[:40]}; expected a number of PIL's filters, 0 to 5")
-    return ImageTransform(
-        size, fit, _triple(path, content, "image_mean"), _triple(path, content, "image_std"), resample, convention
-    )
+    read = {"mean": content.get("image_mean"), "std": content.get("image_std")}
+    read |= {"resample": content.get("resample", BICUBIC), "convention": convention}
+    return checked(ImageTransform, {"fit": fit, "size": size, **read}, path)
 
 
 def _size(path: Path, content: Mapping[str, Any]) -> tuple[Literal["shortest", "squash"], int]:
@@ -135,12 +134,64 @@ def _is_size(value: Any) -> TypeGuard[int]:
     return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= LARGEST_SIZE
 
 
-def _triple(path: Path, content: Mapping[str, Any], key: str) -> Triple:
-    values: Any = content.get(key)
-    is_triple = isinstance(values, list) and len(values) == 3
-    # The bound comes first: an integer of any length is compared, but not made a float.
-    if is_triple and all(isinstance(value, float | int) and abs(value) <= LARGEST_VALUE for value in values):
-        red, green, blue = (float(value) for value in values)
-        if key == "image_mean" or min(red, green, blue) > 0:
-            return red, green, blue
-    raise DataError(f"{path}: {key} is {str(values)[:80]}; expected three numbers, those of a deviation above 0")
+# ImageNet's mean and standard deviation of red, green and blue in 0..1, which all three models were trained with.
+MEAN = (0.485, 0.456, 0.406)
+STD = (0.229, 0.224, 0.225)
+# The same in 0..255 as SAM has them (segment-anything dca509f, build_sam.py).
+MEAN_OF_BYTES = (123.675, 116.28, 103.53)
+STD_OF_BYTES = (58.395, 57.12, 57.375)
+Resample = Literal["bilinear", "bicubic"]
+
+
+def resized(rgb: UInt8Array, height: int, width: int, resample: Resample = "bilinear") -> UInt8Array:
+    """``rgb`` (h, w, 3) at another size, with Pillow's antialiasing: the originals' transform."""
+    from PIL import Image
+
+    if rgb.shape[:2] == (height, width):
+        return rgb
+    return np.asarray(Image.fromarray(rgb).resize((width, height), Image.Resampling[resample.upper()]))
+
+
+def normalised(rgb: UInt8Array) -> Float32Array:
+    """``rgb`` (h, w, 3) as channels first (3, h, w) float32 with ImageNet's mean taken off, in its deviations.
+
+    Divided by 255 first, as torchvision's ToTensor and Normalize do: the detector's and the tagger's order.
+    """
+    return _standardised(rgb.astype(np.float32) / np.float32(255), MEAN, STD)
+
+
+def normalised_bytes(rgb: UInt8Array) -> Float32Array:
+    """The same without the division by 255, SAM's order (``Sam.preprocess``): other last bits."""
+    return _standardised(rgb.astype(np.float32), MEAN_OF_BYTES, STD_OF_BYTES)
+
+
+def _standardised(
+    values: Float32Array, mean: tuple[float, float, float], std: tuple[float, float, float]
+) -> Float32Array:
+    standard = (values - np.array(mean, np.float32)) / np.array(std, np.float32)
+    return np.ascontiguousarray(standard.transpose(2, 0, 1))
+
+
+def size_with_longest_side(height: int, width: int, longest_px: int) -> tuple[int, int]:
+    """Height and width at which the longer side is ``longest_px``, each rounded, halves upwards: SAM's rule."""
+    scale = longest_px * 1.0 / max(height, width)
+    return int(height * scale + 0.5), int(width * scale + 0.5)
+
+
+def size_with_shortest_side(height: int, width: int, shortest_px: int, longest_px: int) -> tuple[int, int]:
+    """Height and width with the shorter side at ``shortest_px``, or less where the longer would pass ``longest_px``.
+
+    GroundingDINO's rule (856dde2, datasets/transforms.py, ``resize``): the shorter side is rounded first and the longer
+    one follows from it, cut to whole pixels. Where ``longest_px`` binds, transformers' longer side is off from that by
+    up to half a pixel times the sides' ratio.
+
+    >>> size_with_shortest_side(680, 1200, 800, 1333)
+    (755, 1332)
+    """
+    short, long = min(height, width), max(height, width)
+    if long / short * shortest_px > longest_px:
+        shortest_px = round(longest_px * float(short) / long)
+    if short == shortest_px:
+        return height, width
+    other = int(shortest_px * long / short)
+    return (other, shortest_px) if width < height else (shortest_px, other)

@@ -13,20 +13,20 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
-
-from su3d_bench.core.types import Float32Array, Int64Array, UInt8Array
-from su3d_bench.perception.embedded.captions import (
+from training_captions import (
     Caption,
+    TruthTable,
     class_caption,
     draw_caption,
     fixed_captions,
     room_caption,
     wrong_relation,
 )
+from training_crops import CropSet
+
+from su3d_bench.core.types import Float32Array, Int64Array, UInt8Array
 from su3d_bench.perception.embedded.text import PADDING, token_ids
 from su3d_bench.perception.embedded.torch_towers import ImageTower, TextTower
-from su3d_bench.perception.embedded.training.crops import CropSet
-from su3d_bench.perception.embedded.training.targets import TruthTable
 
 logger = logging.getLogger(__name__)
 

@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from training_captions import CropTruth, Neighbour
 
 from su3d_bench.core import registry
 from su3d_bench.core.system.files import file_text, regular
 from su3d_bench.core.types import Float32Array, Frame, Int32Array, Int64Array, Regions, UInt8Array
 from su3d_bench.perception.crops import crop_window, mask_boxes
-from su3d_bench.perception.embedded.captions import CropTruth, Neighbour
 from su3d_bench.perception.embedded.encoder import IMAGE_SIZE, log_size, shrink
-from su3d_bench.perception.embedded.segmenter.segmenter import RgbdSegmenter, SegmenterConfig
+from su3d_bench.perception.embedded.segmenter import RgbdSegmenter, SegmenterConfig
 
 KINDS = ("living", "bedroom", "kitchen", "office", "bathroom", "studio")
 FIRST_TRAINING_NUMBER = 10000

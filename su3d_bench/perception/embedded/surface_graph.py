@@ -114,7 +114,7 @@ class Graph:
 
 
 def _sum_by(label: IndexArray, values: Float64Array, n: int) -> Float64Array:
-    from su3d_bench.perception.embedded.segmenter.kernels import sum_rows
+    from su3d_bench.perception.embedded.kernels import sum_rows
 
     if values.ndim == 1:
         return np.asarray(np.bincount(label, values, n), np.float64)
@@ -124,7 +124,7 @@ def _sum_by(label: IndexArray, values: Float64Array, n: int) -> Float64Array:
 
 def contract(graph: Graph, pairs: tuple[IndexArray, IndexArray]) -> Graph:
     """The graph with the two pieces of each pair joined, chains included."""
-    from su3d_bench.perception.embedded.segmenter.kernels import connected
+    from su3d_bench.perception.embedded.kernels import connected
 
     label, n_joined = connected(*pairs, len(graph.pieces))
     pieces, borders = graph.pieces.joined(label, n_joined), graph.borders
