@@ -14,8 +14,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from su3d_bench.core.geometry import RIGID_TOLERANCE
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, ObjectBoxes
-from su3d_bench.numerics.geometry import RIGID_TOLERANCE
 
 Severity = Literal["error", "warning", "note"]
 DEPTH_STEP = 4  # statistics look at every 4th row and column

@@ -17,12 +17,12 @@ from typing import Any, Protocol
 
 from su3d_bench.core.digests import digest_json
 from su3d_bench.core.errors import StoreError
+from su3d_bench.core.files.atomic import make_folder, write_bytes, write_json, write_text
+from su3d_bench.core.files.locks import clear_unfinished
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int32Array, UInt8Array
 from su3d_bench.datasets.recordings.joined_lists import JoinedList
 from su3d_bench.datasets.recordings.made_rooms import MARKER, read_marker
-from su3d_bench.store.atomic import make_folder, write_bytes, write_json, write_text
-from su3d_bench.store.unfinished import clear_unfinished
 
 FRAMES_PER_SECOND = 30.0
 

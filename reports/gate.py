@@ -10,9 +10,9 @@ from xml.etree import ElementTree
 
 from su3d_bench.core.errors import counted, printable, some
 from su3d_bench.core.printing import one_line
+from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, text_table
 from su3d_bench.reports.tables import formats as tables
 from su3d_bench.reports.tables.formats import markup_free
-from su3d_bench.reports.tables.model import NOT_MEASURED, Prose, Table, text_table
 
 
 @dataclass(frozen=True)

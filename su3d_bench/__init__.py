@@ -8,20 +8,21 @@ import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from su3d_bench.core.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from su3d_bench.api.lists import list_datasets, list_methods, list_protocols
     from su3d_bench.api.making import evaluate, run
     from su3d_bench.api.results import Comparison, Run, Scores, load_run
     from su3d_bench.core.errors import Su3dError
+    from su3d_bench.core.geometry import back_project
     from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition
     from su3d_bench.core.system.timing import Timer
     from su3d_bench.core.types import Detections, Frame, GroundTruth, InstanceMesh, LabelSet, PerceptionNeeds, SceneInfo
     from su3d_bench.metrics.protocols.loading import load_protocol
     from su3d_bench.metrics.scoring import combine, score_scene
-    from su3d_bench.numerics.geometry import back_project
     from su3d_bench.store.predictions import read_prediction
 
-__version__ = "0.1.0"
 __all__ = [
     "Comparison",
     "DenseFeatures",
@@ -62,7 +63,7 @@ _ELSEWHERE = {
     "Scores": "api.results",
     "Su3dError": "core.errors",
     "Timer": "core.system.timing",
-    "back_project": "numerics.geometry",
+    "back_project": "core.geometry",
     "combine": "metrics.scoring",
     "evaluate": "api.making",
     "list_datasets": "api.lists",

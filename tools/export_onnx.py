@@ -27,6 +27,8 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import CheckFailed, ConfigError, StoreError, Su3dError, printable, shown
+from su3d_bench.core.files.atomic import is_file, make_folder, read_json, read_npz, write_json, write_npz, write_text
+from su3d_bench.core.files.locks import bring_to_disk, unfinished_folder
 from su3d_bench.core.system.devices import CPU
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import BoolArray, Float32Array, Int64Array
@@ -46,8 +48,6 @@ from su3d_bench.perception.models.masks.sam import (
 )
 from su3d_bench.perception.models.masks.tagging import RAM_MODEL, RAM_TAG_LIST, RamManifest, ram_pixels, read_word_list
 from su3d_bench.perception.models.onnx import OnnxManifest, open_session
-from su3d_bench.store.atomic import is_file, make_folder, read_json, read_npz, write_json, write_npz, write_text
-from su3d_bench.store.unfinished import bring_to_disk, unfinished_folder
 
 # 17 has LayerNormalization as one operator; newer ones bring nothing that our towers use.
 OPSET = 17

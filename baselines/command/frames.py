@@ -10,8 +10,8 @@ import numpy as np
 
 from su3d_bench.core.config import write_toml
 from su3d_bench.core.errors import DataError, printable
+from su3d_bench.core.files.atomic import make_folder, write_bytes, write_text
 from su3d_bench.core.types import Float64Array, Frame, SceneInfo, Surface
-from su3d_bench.store.atomic import make_folder, write_bytes, write_text
 
 LAYOUT_VERSION = 1
 MILLIMETRES = 1000.0

@@ -26,11 +26,11 @@ from su3d_bench.baselines.command.prediction import as_prediction, class_names, 
 from su3d_bench.baselines.command.process import ContainerWatch, Finished, Leaving, TreeWatch, run_program
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError, printable
+from su3d_bench.core.files.atomic import is_file
+from su3d_bench.core.files.scratch import TemporaryFolder
 from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, SceneInfo, Surface
-from su3d_bench.store.atomic import is_file
-from su3d_bench.store.scratch import TemporaryFolder
 
 logger = logging.getLogger(__name__)
 logger.setLevel(logging.INFO)  # what a program prints goes to the log of its scene

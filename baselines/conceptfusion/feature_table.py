@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import StoreError
+from su3d_bench.core.files.scratch import release_pages, scratch_folder
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array
-from su3d_bench.store.scratch import release_pages, scratch_folder
 
 Place = Literal["memory", "disk"]
 HalfArray = NDArray[np.float16]

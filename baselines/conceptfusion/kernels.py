@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from su3d_bench.numerics.compiled import njit
+from su3d_bench.core.compiled import njit
 
 ABSENT = -1
 # find_active_map_points: a projection may lie this far out of the outermost pixel centres.

@@ -12,8 +12,8 @@ import numpy as np
 
 from su3d_bench.baselines.conceptfusion.feature_table import with_room
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.geometry import valid_depth
 from su3d_bench.core.types import BoolArray, Float64Array, Frame, Int64Array
-from su3d_bench.numerics.geometry import valid_depth
 
 LEAST_ALPHA, MOST_ALPHA = 1e-7, 1.01  # get_alpha
 ABSENT = -1

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from su3d_bench.baselines.conceptgraphs.clouds import bounding_box, largest_cluster, voxel_average
 from su3d_bench.baselines.conceptgraphs.config import MappingConfig
+from su3d_bench.core.geometry import back_project, valid_depth
 from su3d_bench.core.types import BoolArray, Detections, Float32Array, Float64Array, Frame, OrientedBox
-from su3d_bench.numerics.geometry import back_project, valid_depth
 
 LEAST_MASK_AREA = 10  # pixels, whatever the configuration says
 LEAST_POINTS = 5  # likewise

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
+from su3d_bench.core.compiled import njit
 from su3d_bench.numerics.clusters import root_of
-from su3d_bench.numerics.compiled import njit
 
 ONE = np.float32(1.0)
 ZERO = np.float32(0.0)

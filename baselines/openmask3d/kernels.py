@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from su3d_bench.numerics.compiled import njit
+from su3d_bench.core.compiled import njit
 
 
 @njit(cache=True)

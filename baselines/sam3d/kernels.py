@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from su3d_bench.numerics.compiled import njit
+from su3d_bench.core.compiled import njit
 
 # A cell is looked into although it lies this much beyond what was found: float32 distances are rounded.
 SLACK = 1.0 + 1e-5

@@ -29,6 +29,7 @@ from su3d_bench.baselines.sam3d.overlap import (
     without_small_groups,
 )
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.geometry import back_project, valid_depth
 from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.system.timing import Timer
@@ -44,7 +45,6 @@ from su3d_bench.core.types import (
     Surface,
 )
 from su3d_bench.metrics.matching.nearest import masks_of_partition, select
-from su3d_bench.numerics.geometry import back_project, valid_depth
 
 logger = logging.getLogger(__name__)
 Metres = Annotated[float, Field(gt=0, allow_inf_nan=False)]

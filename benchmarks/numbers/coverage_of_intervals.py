@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.types import Float64Array, Int64Array
+from su3d_bench.core.types import Float64Array, Int64Array, Interval
 from su3d_bench.metrics.instance import resampling
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.instance.resampling import resampled_ap
@@ -32,7 +32,6 @@ from su3d_bench.numerics.statistics import (
     DIFFERENCE,
     LEAST_ITEMS,
     SHARE,
-    Interval,
     jackknife_interval,
     leave_one_out,
     mean_interval,

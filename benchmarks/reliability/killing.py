@@ -144,7 +144,7 @@ def clear_leftovers(folder: Path, known: Collection[str], tally: Tally) -> None:
 
 def cut_power(roots: Sequence[Path], moments: random.Random) -> int:
     """Spoil the files of the last second as an unlucky file system would; how many were."""
-    from su3d_bench.store.unfinished import beside
+    from su3d_bench.core.files.locks import beside
 
     since = time.time_ns() - LAST_SECOND_NS
     spoilt = 0

@@ -27,6 +27,7 @@ from pydantic import BaseModel, ConfigDict
 from su3d_bench.cli.main import main as su3d_bench
 from su3d_bench.core.config import Setting, Settings
 from su3d_bench.core.digests import digest_bytes
+from su3d_bench.core.files.atomic import make_folder
 from su3d_bench.core.types import ImageDomain, SceneInfo
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.scoring import SceneScore, pack_scores, unpack_scores
@@ -34,7 +35,6 @@ from su3d_bench.metrics.semantic.confusion import SemanticCounts
 from su3d_bench.runs.planning.plan import Plan, make_plan
 from su3d_bench.runs.resume import FinishedScenes
 from su3d_bench.runs.runner import summarise
-from su3d_bench.store.atomic import make_folder
 from su3d_bench.store.run_folder import RunFolder
 
 N_FRAMES = 20

@@ -23,10 +23,10 @@ from su3d_bench.datasets.recordings.recorded_frames import (
     left_out,
     numbers,
     pinhole,
-    read_text,
     reading,
 )
 from su3d_bench.formats.images import Size, decode_colour, decode_depth, read_bytes, sized
+from su3d_bench.formats.text_files import read_text
 
 Images = Literal["lowres", "wide"]
 LOWRES, WIDE, DEPTH, FINE_DEPTH, CONFIDENCE = "lowres_wide", "wide", "lowres_depth", "highres_depth", "confidence"

@@ -9,7 +9,8 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array, Int64Array
-from su3d_bench.datasets.recordings.recorded_frames import numbers, read_text
+from su3d_bench.datasets.recordings.recorded_frames import numbers
+from su3d_bench.formats.text_files import read_text
 
 N_COLUMNS = 7  # time, the axis of the rotation times its angle, translation: DATA.md of apple/ARKitScenes at 7283761
 MOST_ROTATION = 1e3  # rad; half a turn is all that a writer needs

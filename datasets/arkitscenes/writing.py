@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.files.atomic import make_folder, write_text
 from su3d_bench.core.types import Float64Array, Frame
 from su3d_bench.datasets.arkitscenes.challenge import (
     LISTS_FOLDER,
@@ -38,7 +39,6 @@ from su3d_bench.datasets.scannetpp.writing import categories
 from su3d_bench.datasets.writing import FRAMES_PER_SECOND, Layout, Scan, ScannedDataset, ScannedObject, SceneTarget
 from su3d_bench.formats.images import depth_in_units, list_column, png_bytes, triangles_of
 from su3d_bench.formats.ply import Column, PlyElement, write_ply
-from su3d_bench.store.atomic import make_folder, write_text
 
 LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
 WIDTH = 256  # of lowres_wide and lowres_depth: raw/README.md of apple/ARKitScenes at 7283761

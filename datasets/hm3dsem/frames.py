@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.geometry import are_rigid
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.hm3dsem.folders import COLOUR, DEPTH, POSE
 from su3d_bench.datasets.recordings.exported_frames import (
@@ -31,7 +32,6 @@ from su3d_bench.datasets.recordings.recorded_frames import (
     pinhole,
 )
 from su3d_bench.formats.images import Size
-from su3d_bench.numerics.geometry import are_rigid
 
 UNITS_PER_METRE = 1000.0  # habitat_utils.py: save_obs
 FRAMES_PER_SECOND = 30.0  # ours: walks have no times

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from su3d_bench.core.files.atomic import make_folder, write_json, write_text
 from su3d_bench.core.places import UP
 from su3d_bench.core.types import Float64Array, Frame, Int64Array, UInt8Array
 from su3d_bench.datasets.hm3dsem.categories import category_of, room_category, scene_name
@@ -26,7 +27,6 @@ from su3d_bench.datasets.writing import Layout, ScannedDataset, ScannedObject, S
 from su3d_bench.formats.images import depth_in_units, png_bytes
 from su3d_bench.formats.ply import Column, PlyElement, write_ply
 from su3d_bench.metrics.graphs.overlaps import voxel_ids, voxel_means
-from su3d_bench.store.atomic import make_folder, write_json, write_text
 
 LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
 CLOUD_VOXEL_M, ROOM_VOXEL_M = 0.02, 0.05  # create_hm3dsem_walks_gt.py

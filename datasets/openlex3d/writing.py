@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from su3d_bench.core.files.atomic import make_folder, write_bytes, write_json
 from su3d_bench.core.types import Float32Array, Float64Array, Int64Array
 from su3d_bench.datasets.hm3dsem.categories import category_of
 from su3d_bench.datasets.openlex3d.labels import CATEGORIES_NAME, LEVELS, PROMPTS_NAME, VISIBLE_NAME, queries_name
@@ -32,7 +33,6 @@ from su3d_bench.formats.pcd import write_pcd_points
 from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels, bare
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.numerics.relations import Relations
-from su3d_bench.store.atomic import make_folder, write_bytes, write_json
 
 STAGED = ".openlex3d"
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)

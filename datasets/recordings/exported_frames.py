@@ -18,9 +18,10 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array, UInt8Array
-from su3d_bench.datasets.recordings.recorded_frames import read_text, square
+from su3d_bench.datasets.recordings.recorded_frames import square
 from su3d_bench.datasets.recordings.source import SensorPair
 from su3d_bench.formats.images import Size, UInt16Array, decode_colour, decode_depth, image_size, read_bytes, sized
+from su3d_bench.formats.text_files import read_text
 
 FRAMES_PER_SECOND = 30.0  # of ScanNet's recordings; the exports have no times
 EXPORT_AGAIN = "export the recording again"

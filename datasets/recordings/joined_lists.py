@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.errors import StoreError, printable
+from su3d_bench.core.files.atomic import json_text, remove_file, write_json, write_text
 from su3d_bench.core.system.files import file_text
-from su3d_bench.store.atomic import json_text, remove_file, write_json, write_text
 
 
 @dataclass(frozen=True)

@@ -5,14 +5,12 @@ frames that are read from one colour and one depth file each.
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from threading import Lock
-from typing import Any
 
 import numpy as np
 
@@ -21,29 +19,12 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, UInt8Array
 from su3d_bench.formats.images import UInt16Array, decode_colour, decode_depth, read_bytes
 
-MAX_TEXT_BYTES = 64 << 20  # a trajectory of 100 poses a second for an hour has 30 MB
 MAX_NAME_LENGTH = 255  # of one part of a path, in every file system of today
 N_DEPTH_VALUES = 1 << 16
 LARGEST_DEPTH_VALUE = N_DEPTH_VALUES - 1
 # How much of the range below the largest value must be empty: in millimetres 6.6 m, in Replica's unit 1 m.
 STANDS_APART = 0.1
 logger = logging.getLogger(__name__)
-
-
-def read_text(path: Path, where: str, advice: str = "copy the file again") -> str:
-    """The text of a file; ``where`` names it and begins each message."""
-    try:
-        return read_bytes(path, where, advice, MAX_TEXT_BYTES).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{where}: not a text file, byte {error.start} is not UTF-8; {advice}") from error
-
-
-def parsed_json(content: bytes | str, where: str) -> Any:
-    """What a JSON file holds."""
-    try:
-        return json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{where}: not JSON ({error}); copy the file again") from error
 
 
 @contextmanager

@@ -14,9 +14,9 @@ from typing import Literal
 import numpy as np
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.geometry import are_rigid
 from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
 from su3d_bench.datasets.recordings.source import SensorPair
-from su3d_bench.numerics.geometry import are_rigid
 
 Grid = Literal["depth", "colour"]
 SAME_RAY_PX = 0.01  # two images whose pixels differ by less in their rays are taken as one; text files keep six digits

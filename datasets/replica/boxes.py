@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.core.geometry import rotations_of
 from su3d_bench.core.types import Float64Array, GroundTruth, ObjectBoxes, OrientedBox
 from su3d_bench.datasets.replica.folders import replica_label_set
 from su3d_bench.datasets.replica.mesh_truth import (
@@ -26,7 +27,6 @@ from su3d_bench.datasets.replica.mesh_truth import (
     shown,
     whole_number,
 )
-from su3d_bench.numerics.geometry import rotations_of
 
 SLACK_M = 0.05
 SPACING_M = 0.05  # of the points on the sides of boxes

@@ -23,11 +23,11 @@ from su3d_bench.datasets.recordings.recorded_frames import (
     RecordedFrames,
     Recording,
     depth_m_of_values,
-    parsed_json,
 )
 from su3d_bench.datasets.replica.mesh_truth import shown
 from su3d_bench.formats.images import UInt16Array
 from su3d_bench.formats.poses import poses_of_lines
+from su3d_bench.formats.text_files import parsed_json
 
 CAMERA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
 FRAMES_PER_SECOND = 30.0  # the release has no timestamps

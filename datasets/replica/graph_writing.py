@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from su3d_bench.core.files.atomic import json_text, make_folder
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.toml import parse_toml
 from su3d_bench.datasets.recordings.joined_lists import JoinedList
@@ -21,7 +22,6 @@ from su3d_bench.datasets.replica.scene_graphs import CLASSES, FOLDER_NAMES, OBJE
 from su3d_bench.datasets.writing import ScannedObject, write_shared_text
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.numerics.relations import Relations
-from su3d_bench.store.atomic import json_text, make_folder
 
 PROTOCOL = "replica-relations"  # which lists the classes and the predicates in their order
 PREDICATE_OF = {"on": "on", "under": "under", "in": "in", "above": "above", "next to": "near"}

@@ -20,10 +20,10 @@ import numpy as np
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, GroundTruth, InstanceMesh, Int32Array, Int64Array
 from su3d_bench.datasets.recordings.meshes import face_corners, fans, scalar_column, vertex_positions
-from su3d_bench.datasets.recordings.recorded_frames import parsed_json
 from su3d_bench.datasets.replica.folders import replica_label_set
 from su3d_bench.formats.images import read_bytes
 from su3d_bench.formats.ply import ListColumn, read_ply
+from su3d_bench.formats.text_files import parsed_json
 
 MESH_NAME = "habitat/mesh_semantic.ply"
 INFO_NAME = "habitat/info_semantic.json"

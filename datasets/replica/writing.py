@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.files.atomic import json_text, make_folder, write_json, write_text
 from su3d_bench.core.types import Float64Array, Frame
 from su3d_bench.datasets.openlex3d import writing as openlex3d
 from su3d_bench.datasets.openlex3d.labels import CATEGORIES_NAME
@@ -26,7 +27,6 @@ from su3d_bench.formats.images import (
     triangles_of,
 )
 from su3d_bench.formats.ply import Column, PlyElement, write_ply
-from su3d_bench.store.atomic import json_text, make_folder, write_json, write_text
 
 LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
 DEPTH_SCALE = 6553.5  # of NICE-SLAM's render: 65535 is 10 m

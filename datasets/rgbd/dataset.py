@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, field_validator
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing, ScenesMissing, printable, suggest
+from su3d_bench.core.geometry import turn_to_z
 from su3d_bench.core.types import (
     Float32Array,
     Float64Array,
@@ -49,7 +50,6 @@ from su3d_bench.datasets.rgbd.files import (
     read_pose,
     read_trajectory_file,
 )
-from su3d_bench.numerics.geometry import turn_to_z
 
 logger = logging.getLogger(__name__)
 OTHER = {"camera_to_world": "world_to_camera", "world_to_camera": "camera_to_world"}

@@ -13,7 +13,7 @@ from su3d_bench.core.config import Setting, Settings, flatten, resolve
 from su3d_bench.core.errors import ConfigError, DataError, suggest
 from su3d_bench.core.toml import parse_toml
 from su3d_bench.core.types import UpAxis
-from su3d_bench.datasets.recordings.recorded_frames import read_text
+from su3d_bench.formats.text_files import read_text
 
 FILE_NAME = "rgbd.toml"
 INDEX = "{index}"

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.geometry import are_rigid, turn_to_z
 from su3d_bench.core.types import Float64Array
-from su3d_bench.datasets.recordings.recorded_frames import Folder, numbers, parsed_json, pinhole, read_text, square
+from su3d_bench.datasets.recordings.recorded_frames import Folder, numbers, pinhole, square
 from su3d_bench.datasets.rgbd.description import INDEX, RgbdDescription
 from su3d_bench.datasets.tum.timed_poses import quaternion_poses, rows_of, seconds, unit_quaternion
-from su3d_bench.numerics.geometry import are_rigid, turn_to_z
+from su3d_bench.formats.text_files import parsed_json, read_text
 
 MAX_NUMBER = 2**31 - 1  # maps keep the numbers of frames in 32 bits; time stamps in names do not fit
 MAX_DISTANCE_M = 1e6  # of a camera from the origin

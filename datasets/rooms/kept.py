@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.files.atomic import filling, read_arrays
 from su3d_bench.core.system.damage import DAMAGE
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.rooms.rendering.mesh import RoomMesh
 from su3d_bench.datasets.rooms.scan import RoomScan
-from su3d_bench.store.atomic import filling, read_arrays
 
 Arrays = dict[str, Any]
 # Of every array of a mesh: its type, and its shape by what it counts; a number stands for itself.

@@ -17,8 +17,8 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Int64Array
-from su3d_bench.datasets.recordings.recorded_frames import parsed_json
 from su3d_bench.formats.images import read_bytes
+from su3d_bench.formats.text_files import parsed_json
 
 PREFIX = "scannet."  # before scene ids and file names of the second release, not of the first
 MAX_SEGMENT_ID = 2**32 - 1

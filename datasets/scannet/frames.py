@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.geometry import are_rigid
 from su3d_bench.core.types import BoolArray, Float64Array, Frame, Int64Array
 from su3d_bench.datasets.recordings.recorded_frames import StoredDepth, depth_m_of_values
 from su3d_bench.datasets.recordings.registration import Registration
 from su3d_bench.datasets.recordings.source import RgbdSource
-from su3d_bench.numerics.geometry import are_rigid
 
 
 @dataclass(frozen=True)

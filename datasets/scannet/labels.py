@@ -17,7 +17,7 @@ from pathlib import Path
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import LabelSet
-from su3d_bench.datasets.recordings.recorded_frames import read_text
+from su3d_bench.formats.text_files import read_text
 
 LABEL_SPACE = "scannet"
 TABLE_NAME = "scannetv2-labels.combined.tsv"

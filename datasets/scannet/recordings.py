@@ -33,11 +33,12 @@ from su3d_bench.datasets.recordings.exported_frames import (
     read_matrix,
     read_size,
 )
-from su3d_bench.datasets.recordings.recorded_frames import numbers, read_text, reading, square
+from su3d_bench.datasets.recordings.recorded_frames import numbers, reading, square
 from su3d_bench.datasets.recordings.source import RgbdSource, SensorPair
 from su3d_bench.datasets.scannet.sens.header import MAX_HEADER_BYTES, header_bytes, parse_header
 from su3d_bench.datasets.scannet.sens.read import SensSource
 from su3d_bench.formats.images import Size
+from su3d_bench.formats.text_files import read_text
 
 SourceKind = Literal["auto", "sens", "python", "cpp"]
 DEPTH_SHIFT = 1000.0  # of every recording of ScanNet; the Python reader does not export it

@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.core.geometry import are_rigid
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, InstanceMesh, Int32Array, Int64Array, Surface
 from su3d_bench.datasets.recordings.meshes import face_corners, vertex_positions
-from su3d_bench.datasets.recordings.recorded_frames import read_text
 from su3d_bench.datasets.scannet.annotations import (
     AnnotatedObject,
     aggregation_name,
@@ -42,7 +42,7 @@ from su3d_bench.datasets.scannet.labels import (
     raw_label_set,
 )
 from su3d_bench.formats.ply import ListColumn, read_ply
-from su3d_bench.numerics.geometry import are_rigid
+from su3d_bench.formats.text_files import read_text
 
 ALIGNMENT = "axisAlignment"  # in the facts of a scan, ``<scan>.txt``
 SAME_PLACE_M = 1e-3  # both files hold one mesh; text formats round its coordinates

@@ -16,8 +16,8 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Int64Array
-from su3d_bench.datasets.recordings.recorded_frames import parsed_json, read_text
 from su3d_bench.formats.images import read_bytes
+from su3d_bench.formats.text_files import parsed_json, read_text
 
 MESH_NAME = "mesh_aligned_0.05.ply"
 MASK_NAME = "mesh_aligned_0.05_mask.txt"

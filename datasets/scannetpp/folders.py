@@ -14,8 +14,8 @@ from pathlib import Path
 
 from su3d_bench.core.errors import DataError, ScenesMissing
 from su3d_bench.datasets.recordings.places import scenes_in
-from su3d_bench.datasets.recordings.recorded_frames import read_text
 from su3d_bench.datasets.scannetpp.labels import BENCHMARK_FOLDER, LIST_NAMES
+from su3d_bench.formats.text_files import read_text
 
 BASES = ("", "scannetpp", "ScanNetPP", "ScanNet++", "scannetpp_v2", "scannetpp_v1", "scannetpp/v2", "scannetpp/v1")
 PLACES = tuple(f"{base}/data" if base else "data" for base in BASES)

@@ -17,7 +17,8 @@ from pathlib import Path
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import LabelSet
-from su3d_bench.datasets.recordings.recorded_frames import numbers, read_text
+from su3d_bench.datasets.recordings.recorded_frames import numbers
+from su3d_bench.formats.text_files import read_text
 
 LABEL_SPACE = "scannetpp"
 BENCHMARK_FOLDER = "metadata/semantic_benchmark"

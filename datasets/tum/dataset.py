@@ -35,9 +35,9 @@ from su3d_bench.datasets.recordings.recorded_frames import (
     left_out,
     numbers,
     pinhole,
-    read_text,
 )
 from su3d_bench.datasets.tum.timed_poses import pose_at, read_trajectory, rows_of, seconds
+from su3d_bench.formats.text_files import read_text
 
 logger = logging.getLogger(__name__)
 READER_VERSION = 2  # raise it whenever the same files come out as other frames

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from su3d_bench.core.files.atomic import make_folder, write_json, write_text
 from su3d_bench.core.types import Frame
 from su3d_bench.datasets.recordings.made_rooms import MARKER
 from su3d_bench.datasets.writing import FRAMES_PER_SECOND, Layout, ScannedDataset, SceneTarget
 from su3d_bench.formats.images import depth_in_units, png_bytes
-from su3d_bench.store.atomic import make_folder, write_json, write_text
 
 LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
 UNITS_PER_METRE = 5000.0  # the benchmark's page "file formats"

@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from su3d_bench.core.geometry import voxel_coordinates
 from su3d_bench.core.maps import DenseFeatures, Prediction
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array, UInt8Array
 from su3d_bench.metrics.matching.nearest import Candidates, first_rows
-from su3d_bench.numerics.geometry import voxel_coordinates
 from su3d_bench.reports.pictures.maps import map_cloud
 
 LEAST_SPACING_M = 0.015  # of the drawn points; a finer one shows nothing more on a screen

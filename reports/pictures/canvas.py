@@ -6,8 +6,8 @@ import io
 from pathlib import Path
 from typing import Any
 
+from su3d_bench.core.files.atomic import make_folder, write_bytes
 from su3d_bench.core.types import UInt8Array
-from su3d_bench.store.atomic import make_folder, write_bytes
 
 DPI = 100
 DARK, GREY = "#222222", "#666666"

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from su3d_bench.core.errors import ConfigError, printable
+from su3d_bench.core.files.atomic import make_folder, write_bytes
 from su3d_bench.core.types import UInt8Array
 from su3d_bench.reports.pictures.canvas import Canvas, drawable, figure_bytes, hex_of, paper
 from su3d_bench.reports.pictures.items import Tag
-from su3d_bench.store.atomic import make_folder, write_bytes
 
 FORMATS = ("pdf", "png", "svg")
 CELL_WIDTH_IN, TITLE_IN, ROW_IN, LEGEND_IN, GAP_IN = 2.4, 0.28, 0.26, 0.42, 0.08

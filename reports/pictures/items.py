@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import printable
+from su3d_bench.core.geometry import back_project, valid_depth
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, Int64Array, UInt8Array
-from su3d_bench.numerics.geometry import back_project, valid_depth
 from su3d_bench.reports.pictures.canvas import drawable
 from su3d_bench.reports.pictures.render import BACKGROUND
 

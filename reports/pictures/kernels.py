@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.numerics.compiled import njit
+from su3d_bench.core.compiled import njit
 
 
 @njit(cache=True)

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import printable
+from su3d_bench.core.files.atomic import make_folder
+from su3d_bench.core.geometry import voxel_coordinates
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, Int64Array, UInt8Array
-from su3d_bench.numerics.geometry import voxel_coordinates
 from su3d_bench.reports.pictures.canvas import DARK, GREY, Canvas, hex_of, paper
 from su3d_bench.reports.pictures.colours import (
     NO_INSTANCE,
@@ -32,7 +33,6 @@ from su3d_bench.reports.pictures.render import (
     room_bounds,
     view_cameras,
 )
-from su3d_bench.store.atomic import make_folder
 
 VIEW_WIDTH, VIEW_HEIGHT = 640, 560
 DRAWN_SPACING_M = 0.015  # one point a cell of this size is drawn

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing
+from su3d_bench.core.geometry import back_project, turn_to_z, valid_depth
 from su3d_bench.core.interfaces import Dataset, SaysUp
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, GroundTruth, UInt8Array, WorldUp
-from su3d_bench.numerics.geometry import back_project, turn_to_z, valid_depth
 
 CAMERAS = 48  # enough for the shape of a walk
 SHOWN_FRAMES = 6

@@ -9,10 +9,10 @@ from typing import Any, Literal
 
 from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.system.files import file_text
+from su3d_bench.formats.tables.table import Prose, Table
 from su3d_bench.reports.page import page as page_of_runs
 from su3d_bench.reports.page.page import embedded_json, rendered
 from su3d_bench.reports.tables.formats import html_tables
-from su3d_bench.reports.tables.model import Prose, Table
 
 HERE = Path(__file__).parent
 MOST_OF_A_NAME = 80

@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 from urllib.parse import quote
 
-from su3d_bench.reports.tables.formats import csv_lines, safe
+from su3d_bench.formats.tables.csv_text import csv_lines
+from su3d_bench.reports.tables.formats import safe
 
 COLUMNS = ("item_id", "question", "reason", "answers", "truth", "scene", "methods", "text", "pictures")
 STYLE = (

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from su3d_bench.core.errors import ConfigError, counted
+from su3d_bench.formats.tables.table import Cell, Table, TableRow, signed
 from su3d_bench.numerics.statistics import holm, sign_flip_test
-from su3d_bench.reports.tables.model import Cell, Measured, Table, TableRow, signed
+from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.papers.paper import (
     LAYOUTS,
     LEVEL,

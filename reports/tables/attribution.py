@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from su3d_bench.core.errors import counted
-from su3d_bench.reports.tables.model import Prose, Table, percent, signed, text_table
+from su3d_bench.formats.tables.table import Prose, Table, percent, signed, text_table
 
 MEANINGS: dict[str, dict[str, str]] = {
     "instance": {

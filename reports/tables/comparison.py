@@ -6,16 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from su3d_bench.core.errors import counted
-from su3d_bench.reports.tables.model import (
-    NOT_MEASURED,
-    Prose,
-    Table,
-    bracketed,
-    few_scenes,
-    percent,
-    signed,
-    text_table,
-)
+from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, bracketed, percent, signed, text_table
+from su3d_bench.reports.tables.model import few_scenes
 
 HEADER = ["p", "p of all", "smallest p", "better / equal / worse", "A", "B", "B - A", "mean over scenes"]
 SEEDS = "SD of seeds, A / B"

@@ -6,15 +6,8 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from su3d_bench.core.errors import counted, printable, some
-from su3d_bench.reports.tables.model import (
-    NOT_MEASURED,
-    Prose,
-    Table,
-    few_scenes,
-    percent,
-    text_table,
-    with_interval,
-)
+from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, percent, text_table, with_interval
+from su3d_bench.reports.tables.model import few_scenes
 from su3d_bench.reports.tables.run import run_tables
 from su3d_bench.reports.tables.warnings import summed
 

@@ -6,18 +6,17 @@ LaTeX.
 
 from __future__ import annotations
 
-import csv
 import html
-import io
 import re
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from itertools import zip_longest
 from typing import Any
 
 from su3d_bench.core.errors import printable
-from su3d_bench.reports.tables.model import Cell, Prose, Table, blocks_of
+from su3d_bench.formats.tables.csv_text import MOST_OF_A_CELL, csv_lines
+from su3d_bench.formats.tables.table import Cell, Prose, Table, blocks_of
 from su3d_bench.reports.tables.papers.latex import latex
 
 CSV_COLUMNS = (
@@ -39,11 +38,6 @@ CSV_COLUMNS = (
     "unit",
     "mark",
 )
-# A spreadsheet takes what begins so for a formula (OWASP, "CSV Injection"); an apostrophe before it makes it text.
-FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r", "\uff1d", "\uff0b", "\uff0d", "\uff20")
-# Where the semicolon parts cells, as in half of Europe, one begins behind it.
-_CELL_WITHIN = re.compile(r"(?<=;)(?=[=+\-@])")
-_CELL_MENDED = re.compile(r"(?<=;)'(?=[=+\-@])")
 # What CommonMark takes for markup wherever it stands; links need two of the brackets beside each other, and of names
 # with underscores only the outer ones are emphasis.
 _MARKUP = re.compile(
@@ -51,7 +45,6 @@ _MARKUP = re.compile(
 )
 _ENTITY = re.compile(r"&(?=#?\w+;)")
 _BLOCK = re.compile(r"^(?:[-+](?=\s)|[#>]|\d{1,9}(?=[.)](?:\s|$)))")
-MOST_OF_A_CELL = 2000
 TITLE = "su3d-bench tables"
 MOST_ON_A_LINE = 28  # characters of a cell
 MOST_OF_A_NOTE = 7_000  # characters: it may name every scene of a data set
@@ -204,40 +197,6 @@ def _rows(table: Table) -> Iterator[Mapping[str, Any]]:
 
 def _note_rows(table: str, lines: Sequence[str]) -> Iterator[Mapping[str, Any]]:
     return ({"table": table, "kind": "note", "text": line} for line in lines)
-
-
-def csv_lines(rows: Iterable[Iterable[object]]) -> str:
-    """Rows of cells as CSV, each cell ``harmless``."""
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(map(harmless, row) for row in rows)
-    return text.getvalue()
-
-
-def harmless(value: object) -> object:
-    """A cell on one line that no spreadsheet takes for a formula.
-
-    >>> harmless("=1+1"), harmless("-"), harmless(-1)
-    ("'=1+1", '-', -1)
-    """
-    if not isinstance(value, str):
-        return value
-    return no_formula(printable(value, MOST_OF_A_CELL))
-
-
-def no_formula(text: str) -> str:
-    """``text`` as a spreadsheet takes it for text; ``meant`` gives it back."""
-    apart = _CELL_WITHIN.sub("'", text)
-    return f"'{apart}" if apart.startswith(FORMULA_STARTS) and apart != "-" else apart
-
-
-def meant(cell: str) -> str:
-    """What ``no_formula`` was given.
-
-    >>> meant("'=1+1"), meant("'chair'")
-    ('=1+1', "'chair'")
-    """
-    text = cell[1:] if cell[:1] == "'" and cell[1:2] in FORMULA_STARTS else cell
-    return _CELL_MENDED.sub("", text)
 
 
 def html_page(parts: Sequence[Table | Prose]) -> str:

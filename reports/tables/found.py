@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from su3d_bench.core.english import is_countable, plural
 from su3d_bench.core.errors import counted
-from su3d_bench.reports.tables.model import NOT_MEASURED, Table, text_table
+from su3d_bench.formats.tables.table import NOT_MEASURED, Table, text_table
 
 MOST_NAMES = 8  # of a scene that are shown; the rest is counted
 UNNAMED = "without a name"

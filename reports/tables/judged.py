@@ -7,20 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from su3d_bench.core.errors import ConfigError, counted, printable
+from su3d_bench.formats.tables.table import NOT_MEASURED, Cell, Table, TableRow, bracketed, percent, signed, text_table
 from su3d_bench.metrics.questions.score import ANSWERED_BY, REFINED_BY, said_by
 from su3d_bench.numerics.statistics import ALPHA, holm
-from su3d_bench.reports.tables.model import (
-    BY_PEOPLE,
-    NOT_MEASURED,
-    Cell,
-    Measured,
-    Table,
-    TableRow,
-    bracketed,
-    percent,
-    signed,
-    text_table,
-)
+from su3d_bench.reports.tables.model import BY_PEOPLE, Measured
 from su3d_bench.reports.tables.papers.paper import PAPER_SCENES, Shown, other_setup, protocol_table, reported_rows
 from su3d_bench.reports.tables.papers.published import Figure, PaperTable, figures_of
 

@@ -6,15 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from su3d_bench.core.errors import counted
-from su3d_bench.reports.tables.model import (
-    NOT_MEASURED,
-    Prose,
-    Table,
-    bracketed,
-    few_scenes,
-    signed,
-    text_table,
-)
+from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, bracketed, signed, text_table
+from su3d_bench.reports.tables.model import few_scenes
 
 
 def plan_tables(plan: Mapping[str, Any]) -> list[Table | Prose]:

@@ -7,8 +7,8 @@ from typing import Any
 
 from su3d_bench.core.config import toml_value
 from su3d_bench.core.errors import counted, printable
+from su3d_bench.formats.tables.table import Prose, Table, percent, signed, text_table
 from su3d_bench.metrics.protocols.mixtures import UNMOVED
-from su3d_bench.reports.tables.model import Prose, Table, percent, signed, text_table
 
 MOST_OF_A_RULE = 60  # characters
 SUM = "points that a rule adds, the mean over all orders in which rules can be changed; they sum to the difference"

@@ -6,21 +6,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from su3d_bench.core.errors import counted, some
+from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, percent, text_table, with_interval
 from su3d_bench.reports.tables.formats import markdown
 from su3d_bench.reports.tables.found import Found, found_table
-from su3d_bench.reports.tables.model import (
-    NOT_MEASURED,
-    Prose,
-    Table,
-    confidence_notes,
-    few_scenes,
-    is_ceiling,
-    label_count_notes,
-    label_notes,
-    percent,
-    text_table,
-    with_interval,
-)
+from su3d_bench.reports.tables.model import confidence_notes, few_scenes, is_ceiling, label_count_notes, label_notes
 from su3d_bench.reports.tables.warnings import summed
 
 # What stands below the methods: the prefix of a metric's name, and what the row is called.

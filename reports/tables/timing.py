@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from su3d_bench.core.errors import counted
+from su3d_bench.formats.tables.csv_text import csv_lines
+from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, percent, text_table
 from su3d_bench.metrics.costs import MethodSummary, StageSummary
 from su3d_bench.numerics.statistics import Growth
-from su3d_bench.reports.tables.formats import csv_lines
-from su3d_bench.reports.tables.model import NOT_MEASURED, Prose, Table, percent, text_table
 
 MIB = 2**20
 CACHE = "cache"

@@ -24,20 +24,12 @@ from su3d_bench.analysis.sides import (
     settings_that_differ,
 )
 from su3d_bench.core.errors import ConfigError, counted, printable
-from su3d_bench.core.types import Float64Array
+from su3d_bench.core.types import Float64Array, Interval
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.score import ANSWERED_BY, REFINED_BY, RELATIVE, said_by
 from su3d_bench.metrics.scoring import plain_json
-from su3d_bench.numerics.statistics import (
-    ALPHA,
-    DIFFERENCE,
-    Interval,
-    SignFlipTest,
-    holm,
-    jackknife_interval,
-    sign_flip_test,
-)
+from su3d_bench.numerics.statistics import ALPHA, DIFFERENCE, SignFlipTest, holm, jackknife_interval, sign_flip_test
 
 SCHEMA = 2
 

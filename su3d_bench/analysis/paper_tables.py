@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from su3d_bench.analysis.tables import is_scores
+from su3d_bench.formats.tables.table import Table
 from su3d_bench.reports.tables.ablation import ablation_table
 from su3d_bench.reports.tables.judged import JUDGED, judged_table
-from su3d_bench.reports.tables.model import Measured, Table
+from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.papers.paper import Shown, paper_table
 from su3d_bench.reports.tables.papers.published import PaperTable
 from su3d_bench.runs.planning.ablation import read_rows

@@ -8,11 +8,11 @@ from typing import Any
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, Su3dError, printable
+from su3d_bench.core.files.atomic import is_file
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import ProtocolResult, SceneScore, combine
 from su3d_bench.predictions.own_runs import read_stored
 from su3d_bench.runs.finished import FinishedRun
-from su3d_bench.store.atomic import is_file
 from su3d_bench.store.predictions import features_beside
 from su3d_bench.store.records import ROUNDING, NumbersRecord, plain
 from su3d_bench.store.run_folder import JobFolder

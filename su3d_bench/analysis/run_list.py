@@ -11,11 +11,11 @@ from pathlib import Path
 
 from su3d_bench.analysis.leaderboard import runs_below
 from su3d_bench.core.errors import StoreError, counted, printable, shown, some
-from su3d_bench.reports.tables.model import Cell, Table, TableRow, percent
-from su3d_bench.store.atomic import is_file
+from su3d_bench.core.files.atomic import is_file
+from su3d_bench.core.files.locks import is_held
+from su3d_bench.formats.tables.table import Cell, Table, TableRow, percent
 from su3d_bench.store.records import MetricsRecord, RequestRecord, read_record
 from su3d_bench.store.run_folder import MARKS, RunFolder
-from su3d_bench.store.unfinished import is_held
 
 MOST_NAMED = 3  # methods of a run, or protocols of a method
 DAMAGED = "run.json is damaged"

@@ -10,21 +10,22 @@ from pathlib import Path
 
 from su3d_bench.analysis.sides import Side, refuse_unlike
 from su3d_bench.core.errors import ConfigError, Su3dError, counted, printable, reading, suggest
+from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
+from su3d_bench.formats.tables.table import Origin, Table, is_count
 from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.scoring import ProtocolResult, combine
 from su3d_bench.numerics.statistics import SignFlipTest
 from su3d_bench.reports.tables.found import found_table
 from su3d_bench.reports.tables.judged import WHO_DID
-from su3d_bench.reports.tables.model import BY_PEOPLE, Measured, Origin, Table, is_count
+from su3d_bench.reports.tables.model import BY_PEOPLE, Measured
 from su3d_bench.reports.tables.papers.latex import PrintedCell, printed_cells
 from su3d_bench.reports.tables.timing import AnytimePoint
 from su3d_bench.runs.finished import FinishedRun, is_numbers_alone, read_run
 from su3d_bench.runs.found import found_in, without_score
 from su3d_bench.sheets.judging.scores import FILE as SCORES_FILE
 from su3d_bench.sheets.judging.scores import LABEL_METRICS, ScoreCell, Scores, read_scores
-from su3d_bench.store.atomic import is_file
 from su3d_bench.store.records import NumbersRecord, ResultRecord
 
 MOST_SOURCE_BYTES, MOST_SOURCES = 1 << 24, 500  # of a paper's LaTeX

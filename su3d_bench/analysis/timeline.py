@@ -13,6 +13,7 @@ from su3d_bench.analysis.page.instances import fed_frames, frames_of
 from su3d_bench.analysis.page.maps import Spaces, shown_classes, shown_rules
 from su3d_bench.analysis.page.scene_data import SceneData
 from su3d_bench.core.errors import StoreError, Su3dError, counted, printable
+from su3d_bench.core.geometry import back_project, valid_depth
 from su3d_bench.core.interfaces import HasSketches
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, GroundTruth, Int64Array
@@ -20,7 +21,6 @@ from su3d_bench.metrics.matching.labelling import class_index_of_ids
 from su3d_bench.metrics.matching.nearest import nearest
 from su3d_bench.metrics.metric import n_predictions
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.numerics.geometry import back_project, valid_depth
 from su3d_bench.reports.page.maps import Cloud, point_owners, thinned
 from su3d_bench.reports.pictures.colours import NO_INSTANCE, Colour, class_colours, instance_colours
 from su3d_bench.reports.pictures.render import CUT_BELOW_TOP_M, ROOM_HEIGHT_M, room_bounds

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import pandas
 
     from su3d_bench.core.maps import Prediction
-    from su3d_bench.reports.tables.model import Prose, Table
+    from su3d_bench.formats.tables.table import Prose, Table
     from su3d_bench.runs.finished import FinishedRun
     from su3d_bench.store.records import MetricsRecord
 
@@ -117,7 +117,7 @@ class Scores(Shown):
         return f"Scores: {some(list(methods), MOST_NAMED)} under {some(list(protocols), MOST_NAMED)}"
 
     def _parts(self) -> Sequence[Table | Prose]:
-        from su3d_bench.reports.tables.model import Prose
+        from su3d_bench.formats.tables.table import Prose
         from su3d_bench.reports.tables.run import run_tables
         from su3d_bench.store.records import plain
 

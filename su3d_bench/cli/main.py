@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 
-from su3d_bench import __version__
 from su3d_bench.cli.parser import Parser
 from su3d_bench.cli.shared.answers import remark
 from su3d_bench.core.errors import (
@@ -23,6 +22,7 @@ from su3d_bench.core.errors import (
 )
 from su3d_bench.core.printing import doors
 from su3d_bench.core.system.endings import Ended, ending_in_order
+from su3d_bench.core.version import __version__
 
 # Modules of this folder with ``add_parser(verbs)``, in the order of the help.
 VERBS = (

@@ -122,9 +122,9 @@ def _make(arguments: argparse.Namespace) -> int:
 def _make_beacon3d(arguments: argparse.Namespace) -> int:
     """Write one of Beacon3D's metadata files over objects of the scenes."""
     from su3d_bench.cli.datasets.check import chosen_scenes
+    from su3d_bench.core.files.atomic import write_json
     from su3d_bench.questions.chains.made_questions import made_files
     from su3d_bench.questions.truths import MIN_VERTICES, fullest_truth, scene_objects
-    from su3d_bench.store.atomic import write_json
 
     if arguments.leave_out is not None or arguments.source != SOURCES[0]:
         raise ConfigError("questions make: --leave-out and --source belong to --form own")

@@ -115,7 +115,7 @@ def _jobs(arguments: argparse.Namespace) -> dict[str, JobFolder]:
 def _scenes(run: RunFolder) -> list[str]:
     """The scenes that the run was asked for."""
     from su3d_bench.core.errors import printable
-    from su3d_bench.store.atomic import read_json
+    from su3d_bench.core.files.atomic import read_json
     from su3d_bench.store.records import RequestRecord, checked
 
     scenes: tuple[str, ...] = ()

@@ -51,10 +51,10 @@ def add_queries(parser: argparse.ArgumentParser) -> None:
 
 def call_make(arguments: argparse.Namespace) -> int:
     from su3d_bench.cli.models import perception_config
+    from su3d_bench.core.files.atomic import make_folder, write_npz
     from su3d_bench.evaluation.texts import distinct_texts, named_texts, text_arrays
     from su3d_bench.metrics.protocols.loading import load_protocol
     from su3d_bench.perception.models.loading import load_encoder
-    from su3d_bench.store.atomic import make_folder, write_npz
     from su3d_bench.store.run_folder import refuse_records
 
     out: Path = arguments.out

@@ -26,6 +26,7 @@ IntArray = NDArray[np.integer[Any]]
 FloatArray = NDArray[np.floating[Any]]
 
 ImageDomain = Literal["rendered-rooms", "camera"]
+Interval = tuple[float, float]
 UpAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
 
 

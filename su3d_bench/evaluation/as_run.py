@@ -17,6 +17,17 @@ import numpy as np
 from su3d_bench.core.config import write_toml
 from su3d_bench.core.digests import code_digest, digest_file, digest_json, git_state, package_versions
 from su3d_bench.core.errors import ConfigError, StoreError, printable, shown
+from su3d_bench.core.files.atomic import (
+    is_file,
+    json_text,
+    make_folder,
+    read_json,
+    write_bytes,
+    write_error,
+    write_json,
+    write_text,
+)
+from su3d_bench.core.files.locks import become, unfinished_folder
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.timing import hardware_line, processor_digest
@@ -35,16 +46,6 @@ from su3d_bench.runs.finished import made_elsewhere
 from su3d_bench.runs.planning.held import sealed
 from su3d_bench.runs.planning.plan import check_folder_name
 from su3d_bench.runs.runner import BY_THE_METHOD, confidences_of
-from su3d_bench.store.atomic import (
-    is_file,
-    json_text,
-    make_folder,
-    read_json,
-    write_bytes,
-    write_error,
-    write_json,
-    write_text,
-)
 from su3d_bench.store.records import (
     GitRecord,
     MetricsRecord,
@@ -60,7 +61,6 @@ from su3d_bench.store.records import (
     updates_text,
 )
 from su3d_bench.store.run_folder import RunFolder
-from su3d_bench.store.unfinished import become, unfinished_folder
 
 OF_FILES = "those of the files"
 AGAINST_THE_RULE = "those of the files, where the protocol has 1 for every mask"

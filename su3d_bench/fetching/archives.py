@@ -18,10 +18,10 @@ from stat import S_ISDIR, S_ISREG
 from typing import IO
 
 from su3d_bench.core.errors import DataError, StoreError, printable
+from su3d_bench.core.files.atomic import replacing, write_error
+from su3d_bench.core.files.unpacking import Allowance, UnpackingError, allowance_of, check_member
 from su3d_bench.core.system.files import opened
 from su3d_bench.fetching.download import Watch
-from su3d_bench.store.atomic import replacing, write_error
-from su3d_bench.store.unpacking import Allowance, UnpackingError, allowance_of, check_member
 
 PIECE = 1 << 20
 BLOCK = 512

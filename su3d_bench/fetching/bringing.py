@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
 from su3d_bench.core.errors import ConfigError, DataError, ModelMissing, StoreError
+from su3d_bench.core.files.atomic import make_folder, write_error
+from su3d_bench.core.files.locks import clear_unfinished, hold_folder
 from su3d_bench.datasets.replica.folders import (
     OFFICIAL_SCENES,
     ORIGINAL_FILES,
@@ -35,8 +37,6 @@ from su3d_bench.fetching.record import (
 from su3d_bench.fetching.sources import Source, Sources
 from su3d_bench.perception.models.catalogue import MODELS, PAPERS_ENCODERS, PROFILE_MODELS
 from su3d_bench.perception.models.files import locate
-from su3d_bench.store.atomic import make_folder, write_error
-from su3d_bench.store.unfinished import clear_unfinished, hold_folder
 
 RENDER, ORIGINAL = "Replica", "replica_v1"  # folders of the two trees, as the archives' own names have them
 UNPACKED = "unpacked"

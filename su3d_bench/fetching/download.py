@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import IO, Any
 
 from su3d_bench.core.errors import DataError, StoreError, printable
+from su3d_bench.core.files.atomic import read_json, write_error, write_json
+from su3d_bench.core.files.locks import SHARED, beside, own_file
 from su3d_bench.fetching.checksums import Stated, checked
 from su3d_bench.fetching.http import TIMEOUT_S, Answer, Broken, Stale, Validator, ask
 from su3d_bench.fetching.sources import MOST_BYTES
-from su3d_bench.store.atomic import read_json, write_error, write_json
-from su3d_bench.store.unfinished import SHARED, beside, own_file
 
 PIECE = 1 << 18
 MOST_STARTS_ANEW = 2  # of one file in one command: a server that changes it each time is given up

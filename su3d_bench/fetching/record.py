@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.errors import StoreError
-from su3d_bench.store.atomic import read_json, write_json
+from su3d_bench.core.files.atomic import read_json, write_json
 
 STATE = ".fetched"  # below the folder of models or of data: what is under way, and the record
 RECORD = "record.json"

@@ -19,6 +19,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from su3d_bench.core.errors import ConfigError, DataError, StoreError, printable, suggest
+from su3d_bench.core.files.atomic import make_folder, write_error
 from su3d_bench.datasets.scannet.folders import PAPER_SCENES, SCAN_NAME, SPLITS, find_scans, split_scenes
 from su3d_bench.datasets.scannet.labels import TABLE_NAME
 from su3d_bench.fetching.bringing import Brought, Planned, bring_file
@@ -26,7 +27,6 @@ from su3d_bench.fetching.checksums import sha256_of
 from su3d_bench.fetching.download import Patience, Wanted, Watch
 from su3d_bench.fetching.record import Arrived, write_arrival
 from su3d_bench.fetching.sources import Source, check_address
-from su3d_bench.store.atomic import make_folder, write_error
 
 RECORDING = ".sens"
 TEST_SUFFIXES = (".txt", "_vh_clean_2.ply", RECORDING)

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, reading
+from su3d_bench.core.files.unpacking import Allowance
 from su3d_bench.core.system.files import regular
 from su3d_bench.core.types import Float32Array, Int32Array
-from su3d_bench.store.unpacking import Allowance
 
 FloatArray = NDArray[np.floating[Any]]
 BLOCK_BYTES = 16 << 20

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, printable, reading, shown
+from su3d_bench.core.files.unpacking import Allowance, UnpackingError, allowance_of, member_bytes
 from su3d_bench.core.system.files import file_bytes, opened
 from su3d_bench.formats.pickles.pickle_constructors import MOST_DIMENSIONS, SIMPLE_TYPE, RefusedError, check_texts
 from su3d_bench.formats.pickles.pickles import read_pickle
-from su3d_bench.store.unpacking import Allowance, UnpackingError, allowance_of, member_bytes
 
 # What zipfile raises on a damaged archive; RuntimeError is its answer to a compression that it does not know.
 ZIP_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError, struct.error)

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, printable, reading
+from su3d_bench.core.files.atomic import write_bytes
+from su3d_bench.core.files.unpacking import Allowance, UnpackingError
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
-from su3d_bench.store.atomic import write_bytes
-from su3d_bench.store.unpacking import Allowance, UnpackingError
 
 MOST_HEADER_BYTES = 1 << 16  # headers have some hundred
 MOST_FIELDS, MOST_VALUES = 256, 1 << 16  # of a point; histograms of features have some hundred values

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from su3d_bench.numerics.compiled import njit
+from su3d_bench.core.compiled import njit
 
 compiled: Any = njit(cache=True)
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, reading
+from su3d_bench.core.files.atomic import write_bytes
 from su3d_bench.core.system.files import file_bytes, opened
 from su3d_bench.core.types import Int64Array
 from su3d_bench.formats.ply_parts import (
@@ -32,7 +33,6 @@ from su3d_bench.formats.ply_parts import (
     clip,
     read_header,
 )
-from su3d_bench.store.atomic import write_bytes
 
 AnyArray = NDArray[Any]
 FIRST_BYTES = 1 << 20

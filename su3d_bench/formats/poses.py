@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.geometry import are_rigid
 from su3d_bench.core.system.files import opened_text
 from su3d_bench.core.types import Float32Array, Float64Array
-from su3d_bench.numerics.geometry import are_rigid
 
 MAX_LINE = 4096  # characters of a pose; 16 numbers have about 400
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, reading, shown
+from su3d_bench.core.files.unpacking import Allowance, allowance_of
 from su3d_bench.core.system.files import opened
 from su3d_bench.formats.numpy_files import opened_zip, read_member
 from su3d_bench.formats.pickles.pickle_constructors import (
@@ -30,7 +31,6 @@ from su3d_bench.formats.pickles.pickle_constructors import (
     named,
 )
 from su3d_bench.formats.pickles.pickles import read_pickle
-from su3d_bench.store.unpacking import Allowance, allowance_of
 
 Kind = Literal["tensor", "sparse", "array", "dict", "tuple", "other"]
 ZIP_START = b"PK\x03\x04"

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, PredictionError, printable
+from su3d_bench.core.files.atomic import read_arrays
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.core.system.damage import DAMAGE
@@ -41,7 +42,6 @@ from su3d_bench.metrics.semantic.panoptic_score import PanopticMetric
 from su3d_bench.metrics.semantic.score import SemanticMetric
 from su3d_bench.metrics.semantic.top_k import TopKMetric
 from su3d_bench.numerics.statistics import jackknife_interval, leave_one_out
-from su3d_bench.store.atomic import read_arrays
 
 __all__ = [
     "EVERY_SCENE",

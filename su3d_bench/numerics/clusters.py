@@ -12,9 +12,9 @@ import math
 
 import numpy as np
 
+from su3d_bench.core.compiled import njit
 from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.numerics.cells import ABSENT, slot_of
-from su3d_bench.numerics.compiled import njit
 
 NOISE = -1
 # Of 5x5x5 cells around one, the nearest first; a point within eps lies in one of them.

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.core.types import Float64Array
-from su3d_bench.numerics.statistics import ALPHA, DIFFERENCE, LEVEL, NO_SPREAD, Interval, t_quantile
+from su3d_bench.core.types import Float64Array, Interval
+from su3d_bench.numerics.statistics import ALPHA, DIFFERENCE, LEVEL, NO_SPREAD, t_quantile
 
 POWER = 0.8
 MOST_SCENES = 100_000  # more are not looked for

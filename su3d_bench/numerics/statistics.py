@@ -9,7 +9,7 @@ from itertools import combinations
 
 import numpy as np
 
-from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
+from su3d_bench.core.types import BoolArray, Float64Array, Int64Array, Interval
 
 LEVEL = 0.95
 ALPHA = 0.05  # a two-sided p below it is called a difference
@@ -25,7 +25,6 @@ FLAT_EXPONENT = 0.1  # at most 7 % more for a size twice as large: what a reader
 MIN_FIT = 8
 LEAST_SPREAD = 1e-9  # of a resample's sizes, over that of all: below it a slope would be made of rounding
 SHARE, DIFFERENCE = (0.0, 1.0), (-1.0, 1.0)  # between which a fraction lies, and a difference of two
-Interval = tuple[float, float]
 
 
 def _group_of_scene(n_scenes: int) -> Int64Array:

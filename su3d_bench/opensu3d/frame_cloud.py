@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from su3d_bench.core.geometry import ray_parts, valid_depth
 from su3d_bench.core.types import BoolArray, Float64Array, Frame, Int32Array, Int64Array
-from su3d_bench.numerics.geometry import ray_parts, valid_depth
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 
 NO_DETECTION = -1

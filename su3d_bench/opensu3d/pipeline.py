@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.files.scratch import Scratch
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.system.devices import CPU
@@ -21,7 +22,6 @@ from su3d_bench.opensu3d.frame_cloud import NO_DETECTION, FrameCloud, frame_clou
 from su3d_bench.opensu3d.postprocess import CONFIDENCES, IDS, segments_of, to_instances
 from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View, record_of
 from su3d_bench.opensu3d.voxel_map import NO_INSTANCE, VoxelMap
-from su3d_bench.store.scratch import Scratch
 
 if TYPE_CHECKING:
     from su3d_bench.opensu3d.kernels.voxel_map_torch import DeviceVoxelMap

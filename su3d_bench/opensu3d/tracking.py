@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.files.scratch import Scratch, StoredRows
 from su3d_bench.core.types import Detections, Float64Array, Int32Array, Int64Array
 from su3d_bench.opensu3d.config import Fusion
 from su3d_bench.opensu3d.feature_fusion import fuse_scales
-from su3d_bench.store.scratch import Scratch, StoredRows
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,17 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import StoreError
+from su3d_bench.core.files.atomic import filling, read_arrays
 from su3d_bench.core.system.damage import DAMAGE
 from su3d_bench.core.types import BoolArray, Float64Array, Frame, UInt8Array
 from su3d_bench.perception.crops import mask_boxes
-from su3d_bench.store.atomic import filling, read_arrays
 
 Arrays = dict[str, NDArray[Any]]
 
-# What moves an entry on its way into the cache and out of it: keys of what is kept there follow it.
-CACHE_SOURCES = (
-    "perception/cache.py", "perception/crops.py", "store/atomic.py", "store/unfinished.py", "store/unpacking.py",
-)  # fmt: skip
+# The code that can move what is kept: keys follow it.
+CODE = ("core", "numerics", "perception")
 # Moves every key: raise it when the format of an entry changes.
 CACHE_VERSION = "1"
 _CHECKSUM = "checksum"

@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.core.digests import package_digest
 from su3d_bench.core.english import with_article
+from su3d_bench.core.geometry import back_project
 from su3d_bench.core.interfaces import Encoder, RegionPerception, StageTimer
 from su3d_bench.core.types import (
     BoolArray,
@@ -24,9 +25,8 @@ from su3d_bench.core.types import (
     Regions,
     UInt8Array,
 )
-from su3d_bench.numerics.geometry import back_project
 from su3d_bench.numerics.open3d_core import compiled_open3d
-from su3d_bench.perception.cache import CACHE_SOURCES, FrameCache, array_digest, content_key
+from su3d_bench.perception.cache import CODE, FrameCache, array_digest, content_key
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.detections import Assembler
 from su3d_bench.perception.regions import RegionsOnDemand, cached_regions, region_under
@@ -129,16 +129,6 @@ def _flip(names: list[str], known: list[str], probability: float, generator: np.
 
 if TYPE_CHECKING:
     import open3d
-
-
-# What moves the regions: their key follows it.
-SOURCES = (
-    "core/types.py",
-    "numerics/geometry.py",
-    "numerics/open3d_core.py",
-    "perception/oracle.py",
-    *CACHE_SOURCES,
-)
 
 
 class OracleConfig(BaseModel):
@@ -264,7 +254,7 @@ class OracleSegmenter:
         self.digest = content_key(
             "oracle",
             config.model_dump_json(),
-            package_digest(*SOURCES),
+            package_digest(*CODE),
             digest,
             *truth.labels.names,
             *names,

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, model_validator
 
 from su3d_bench.core.errors import ConfigError, DataError
+from su3d_bench.core.files.atomic import make_folder, read_arrays, replacing
 from su3d_bench.core.interfaces import Encoder, RegionPerception, StageTimer
 from su3d_bench.core.system.damage import DAMAGE
 from su3d_bench.core.system.files import file_bytes
@@ -35,7 +36,6 @@ from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.detections import Assembler, captioned_by_colour
 from su3d_bench.perception.embedded.naming import Namer
 from su3d_bench.perception.regions import RegionsOnDemand
-from su3d_bench.store.atomic import make_folder, read_arrays, replacing
 
 INDEX = "{index}"
 MOST_REGIONS = 2_000  # of one image; SAM gives some hundred

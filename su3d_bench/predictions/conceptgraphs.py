@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError, printable, shown
+from su3d_bench.core.files.unpacking import Allowance, UnpackingError
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float32Array
 from su3d_bench.formats.arrays import MOST_MASKS, checked_points, kind_of, without_nonfinite
 from su3d_bench.formats.pickles.pickles import read_pickle_file
 from su3d_bench.predictions.base import ONES, Reader, ScenePrediction, first_found, instances_of, named_once
-from su3d_bench.store.unpacking import Allowance, UnpackingError
 
 SUFFIX = ".pkl.gz"
 POST = f"_post{SUFFIX}"

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, StoreError, printable
+from su3d_bench.core.files.atomic import make_folder, write_text
+from su3d_bench.core.files.locks import become, unfinished_folder
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, Int64Array
@@ -29,8 +31,6 @@ from su3d_bench.metrics.semantic.top_k import ranked_at
 from su3d_bench.predictions.base import Content, Numbering, VertexLabels, VertexMasks
 from su3d_bench.predictions.openlex3d import CLOUD, EMBEDDINGS, INDEX
 from su3d_bench.predictions.scannet_text import MASK_OF_RUNS
-from su3d_bench.store.atomic import make_folder, write_text
-from su3d_bench.store.unfinished import become, unfinished_folder
 
 MASKS_FOLDER = "pred_mask"
 RUNS_FOLDER = "predicted_masks"  # as ScanNet++'s own writer and the OpenSUN3D challenge call it

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, printable, shown
+from su3d_bench.core.files.atomic import write_npz
 from su3d_bench.core.maps import DenseFeatures, Prediction
 from su3d_bench.core.system.files import regular
 from su3d_bench.formats.arrays import kind_of
 from su3d_bench.formats.numpy_files import npy_header_of, npz_names, read_npz
 from su3d_bench.predictions.base import Content, Numbering, Reader, ScenePrediction, VertexLabels, VertexMasks
-from su3d_bench.store.atomic import write_npz
 from su3d_bench.store.predictions import (
     OVER_VERTICES,
     features_beside,

@@ -10,6 +10,7 @@ from typing import Any
 from su3d_bench.core import registry
 from su3d_bench.core.config import Settings
 from su3d_bench.core.errors import ConfigError, printable
+from su3d_bench.core.files.atomic import is_file
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.reports.tables.ablation import SweepRow
@@ -21,7 +22,6 @@ from su3d_bench.runs.planning.held import Into
 from su3d_bench.runs.planning.plan import Plan, make_plan, named_method
 from su3d_bench.runs.planning.scenes import split_address
 from su3d_bench.runs.runner import RunResult, publish, run_plan
-from su3d_bench.store.atomic import is_file
 
 RUNS = "runs"
 

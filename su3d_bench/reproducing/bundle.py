@@ -20,14 +20,14 @@ from typing import IO, Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from su3d_bench import __version__
 from su3d_bench.core.digests import digest_bytes, digest_file
 from su3d_bench.core.errors import StoreError, counted, printable, shown
+from su3d_bench.core.files.atomic import is_file, make_folder, replacing
+from su3d_bench.core.files.unpacking import Allowance, UnpackingError, allowance_of, check_member, member_bytes
 from su3d_bench.core.printing import escaped_json
 from su3d_bench.core.system.files import opened, regular
-from su3d_bench.store.atomic import is_file, make_folder, replacing
+from su3d_bench.core.version import __version__
 from su3d_bench.store.run_folder import RECORDS, RunFolder
-from su3d_bench.store.unpacking import Allowance, UnpackingError, allowance_of, check_member, member_bytes
 
 MANIFEST, RECIPE, COMPARED, TABLES = "manifest.json", "recipe.toml", "compared.json", "tables.md"
 RUNS = "runs"

@@ -12,12 +12,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from su3d_bench.core.config import toml_value
 from su3d_bench.core.errors import ConfigError, printable, reading
+from su3d_bench.core.files.atomic import write_text
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.system.timing import calibration_ms, hardware_line
 from su3d_bench.core.toml import parse_toml
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
-from su3d_bench.store.atomic import write_text
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 FILE = Path(__file__).resolve().parent / "unit_costs.toml"

@@ -14,9 +14,10 @@ from su3d_bench.analysis.tables import choose, measured_results
 from su3d_bench.core import registry
 from su3d_bench.core.config import toml_value
 from su3d_bench.core.errors import ConfigError, counted, printable, some
+from su3d_bench.formats.tables.table import Cell, Table, TableRow
 from su3d_bench.metrics.protocols.files import protocol_names
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.reports.tables.model import Cell, Measured, Table, TableRow
+from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.papers.paper import PAPER_PROFILE, PAPER_SCENES, Shown
 from su3d_bench.reports.tables.papers.published import OPEN, Figure
 from su3d_bench.reproducing.asked import method_of_row, methods_of

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from su3d_bench.core.files.atomic import is_file, make_folder
 from su3d_bench.core.maps import Instances
 from su3d_bench.questions.retrieval import rank
 from su3d_bench.reports.pictures.maps import draw_heat_map
@@ -12,7 +13,6 @@ from su3d_bench.reproducing.asked import methods_of
 from su3d_bench.reproducing.differences import Results
 from su3d_bench.reproducing.recipe import Experiment
 from su3d_bench.runs.finished import FinishedRun, encoder_of
-from su3d_bench.store.atomic import is_file, make_folder
 from su3d_bench.store.predictions import read_prediction
 
 SHOWN = 5  # instances that are listed beneath a picture

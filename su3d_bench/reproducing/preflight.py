@@ -14,6 +14,7 @@ from typing import Any
 from su3d_bench.core import registry
 from su3d_bench.core.config import Settings, read_assignments, resolve
 from su3d_bench.core.errors import GroundTruthMissing, ModelMissing, Su3dError
+from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.interfaces import HasGroups, NeedsSurface
 from su3d_bench.core.system.devices import require_installed
 from su3d_bench.fetching.sources import built_in
@@ -28,7 +29,6 @@ from su3d_bench.runs.feeding import surface_of
 from su3d_bench.runs.parts import build_dataset, build_method, part_of
 from su3d_bench.runs.planning.plan import method_part, named_method
 from su3d_bench.runs.planning.scenes import data_root, split_address
-from su3d_bench.store.atomic import is_file
 
 PAPER = "paper"
 FETCHED_FOR_PAPER = (*PROFILE_MODELS[PAPER], *PAPERS_ENCODERS)

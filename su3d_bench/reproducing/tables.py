@@ -7,8 +7,8 @@ from dataclasses import asdict
 from typing import Any
 
 from su3d_bench.core.errors import counted
+from su3d_bench.formats.tables.table import Prose, Table, text_table
 from su3d_bench.metrics.costs import summarise
-from su3d_bench.reports.tables.model import Prose, Table, text_table
 from su3d_bench.reports.tables.timing import timing_tables
 from su3d_bench.reproducing.asked import methods_of
 from su3d_bench.reproducing.differences import Compared, Results, comparison_table, tables_of

@@ -18,6 +18,8 @@ from su3d_bench.analysis.recomputed import damaged_files, rules_of_run, why_not_
 from su3d_bench.core import registry
 from su3d_bench.core.config import MOVES_NO_NUMBER, Setting, Settings
 from su3d_bench.core.errors import StoreError, Su3dError, counted, printable
+from su3d_bench.core.files.atomic import is_file, read_arrays, read_json
+from su3d_bench.core.files.scratch import TemporaryFolder
 from su3d_bench.core.system.devices import device_for
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.system.timing import processor_digest
@@ -32,8 +34,6 @@ from su3d_bench.runs.finished import FinishedRun, encoder_of, read_run
 from su3d_bench.runs.job import SceneJob
 from su3d_bench.runs.planning.plan import make_plan
 from su3d_bench.runs.scene import scores_again
-from su3d_bench.store.atomic import is_file, read_arrays, read_json
-from su3d_bench.store.scratch import TemporaryFolder
 
 TOLERANCE = 1e-9  # of a value on another machine
 OF_THE_VERIFIER = {"profile": "embedded", "executor": "auto", "offline": True, "pictures": False, "accept_poses": True}

@@ -27,6 +27,7 @@ from su3d_bench.core.errors import (
     some,
     suggest,
 )
+from su3d_bench.core.files.atomic import is_file, read_json
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
@@ -45,7 +46,6 @@ from su3d_bench.runs.planning.scenes import (
     looks_like_scene,
     nearest_scene,
 )
-from su3d_bench.store.atomic import is_file, read_json
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.records import (
     CostsRecord,

@@ -9,12 +9,12 @@ from contextlib import suppress
 from pathlib import Path
 
 from su3d_bench.core.errors import Su3dError
+from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, unpack_scores
 from su3d_bench.runs.runner import RunResult
-from su3d_bench.store.atomic import is_file
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.run_folder import JobFolder
 

@@ -18,6 +18,8 @@ from typing import Any
 from su3d_bench.core.config import KeyPath, write_toml
 from su3d_bench.core.digests import code_digest, git_state, package_versions
 from su3d_bench.core.errors import StoreError
+from su3d_bench.core.files.atomic import is_file, read_json, remove_file, write_json, write_text
+from su3d_bench.core.files.scratch import remove_abandoned
 from su3d_bench.core.registry import CEILING_METHOD, DATASETS
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.system.timing import hardware_line, processor_digest
@@ -47,7 +49,6 @@ from su3d_bench.runs.remote.scene import (
 )
 from su3d_bench.runs.resume import FinishedScenes
 from su3d_bench.runs.scene import failed_outcomes, run_scene
-from su3d_bench.store.atomic import is_file, read_json, remove_file, write_json, write_text
 from su3d_bench.store.records import (
     FailureRecord,
     GitRecord,
@@ -60,7 +61,6 @@ from su3d_bench.store.records import (
     plain,
 )
 from su3d_bench.store.run_folder import JobFolder
-from su3d_bench.store.scratch import remove_abandoned
 
 Scores = Mapping[tuple[str, str], SceneScore]
 BY_THE_METHOD = "computed by the method"

@@ -16,6 +16,7 @@ from functools import cache, cached_property, partial
 from typing import Any
 
 from su3d_bench.core.errors import GroundTruthMissing, StoreError, counted, error_line
+from su3d_bench.core.files.atomic import write_bytes, write_text
 from su3d_bench.core.interfaces import (
     Closes,
     Encoder,
@@ -59,7 +60,6 @@ from su3d_bench.runs.feeding import (
 from su3d_bench.runs.job import JobInputs, MethodOutcome, SceneJob, config_key, refuse_other_run, stride_of
 from su3d_bench.runs.parts import Part, as_told, build_dataset, build_method
 from su3d_bench.runs.planning.poses import REMARK, PosesContradicted, judged
-from su3d_bench.store.atomic import write_bytes, write_text
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 

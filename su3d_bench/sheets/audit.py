@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import StoreError, printable
+from su3d_bench.core.files.atomic import make_folder, remove_file, write_bytes, write_text
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array, UInt8Array
+from su3d_bench.formats.tables.csv_text import csv_lines
 from su3d_bench.questions.audit import AuditedQuestion, Things
 from su3d_bench.questions.reasoning.scene_map import MapObject
 from su3d_bench.questions.sight import looked_at
@@ -18,11 +20,9 @@ from su3d_bench.questions.truths import fullest_truth
 from su3d_bench.reports.pictures.items import owners_in_frame, png_bytes
 from su3d_bench.reports.pictures.tiles import Line, Mark, Photo, Plan, Shade, Tile, contact_sheet, picture_strip
 from su3d_bench.reports.sheet.audit_page import audit_page
-from su3d_bench.reports.tables.formats import csv_lines
 from su3d_bench.sheets.judging.answers import MOST_CHARACTERS
 from su3d_bench.sheets.judging.audit_scores import COLUMNS, FILE, read_verdicts
 from su3d_bench.sheets.making.shown_room import at_full_size
-from su3d_bench.store.atomic import make_folder, remove_file, write_bytes, write_text
 
 PER_SHEET = 12
 PICTURES = "pictures"  # folder of the photographs that the page shows

@@ -15,8 +15,8 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from su3d_bench.core.digests import digest_json
 from su3d_bench.core.errors import DataError, printable, reading
+from su3d_bench.core.files.atomic import write_json
 from su3d_bench.core.system.files import file_bytes
-from su3d_bench.store.atomic import write_json
 
 SCHEMA = 1
 SHEET_FILE, KEY_FILE = "sheet.json", "key.json"

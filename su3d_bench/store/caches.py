@@ -15,8 +15,8 @@ from pathlib import Path
 
 from su3d_bench.core.digests import PACKAGE_ROOT
 from su3d_bench.core.errors import shown
-from su3d_bench.store.atomic import write_error
-from su3d_bench.store.unfinished import hold_folder
+from su3d_bench.core.files.atomic import write_error
+from su3d_bench.core.files.locks import hold_folder
 
 MEGABYTE, GIGABYTE = 10**6, 10**9
 LARGE_BYTES = 20 * GIGABYTE  # of kept perception: a thousand scenes of 150 frames, and a tenth of a common disk

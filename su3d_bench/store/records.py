@@ -17,9 +17,9 @@ import numpy as np
 from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
 from su3d_bench.core.errors import DataError, StoreError, printable
+from su3d_bench.core.files.atomic import read_json
 from su3d_bench.core.system.files import opened_text
 from su3d_bench.core.types import Float64Array
-from su3d_bench.store.atomic import read_json
 
 SCHEMA = 1
 MOST_UPDATES = 10_000_000

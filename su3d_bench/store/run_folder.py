@@ -20,10 +20,10 @@ from pydantic import ValidationError
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import StoreError, shown
-from su3d_bench.store.atomic import make_folder, read_json, write_error, write_json
+from su3d_bench.core.files.atomic import make_folder, read_json, write_error, write_json
+from su3d_bench.core.files.locks import LOCK_FILE, beside, clear_unfinished, hold_folder, is_unfinished
 from su3d_bench.store.predictions import features_beside
 from su3d_bench.store.records import SCHEMA, SealRecord, checked, plain
-from su3d_bench.store.unfinished import LOCK_FILE, beside, clear_unfinished, hold_folder, is_unfinished
 
 JOBS = "scenes"
 WRITTEN_BY_ALL = ("language", "language/images")  # where all jobs of a run write; a job clears its own folders

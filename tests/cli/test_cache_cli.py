@@ -10,6 +10,7 @@ import pytest
 
 from su3d_bench.cli.cache import KIND_NAMES
 from su3d_bench.cli.main import main
+from su3d_bench.core.files.atomic import write_bytes, write_json
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.language.chat import ChatRequest, Reply
 from su3d_bench.perception.language.reply_store import ReplyStore
@@ -17,7 +18,6 @@ from su3d_bench.perception.models.files import file_sha256
 from su3d_bench.perception.profiles import REPLIES
 from su3d_bench.runs.remote.scene import mirror_of
 from su3d_bench.store import caches
-from su3d_bench.store.atomic import write_bytes, write_json
 from su3d_bench.store.run_folder import RunFolder
 
 FOREIGN = ("perception/notes.txt", "perception/ab/mine.npz", "mine/0.npz", "runs/mine/scenes/x", "replies/mine.txt")

@@ -13,11 +13,11 @@ from scipy.spatial import cKDTree
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.config import write_toml
+from su3d_bench.core.geometry import back_project
 from su3d_bench.core.maps import Instances
 from su3d_bench.datasets.recordings.pose_convention import judge_scene
 from su3d_bench.datasets.rgbd.dataset import Rgbd
 from su3d_bench.datasets.tum.dataset import Tum
-from su3d_bench.numerics.geometry import back_project
 from su3d_bench.store.predictions import read_prediction
 
 pytestmark = needs_recordings

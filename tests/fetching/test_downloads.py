@@ -16,9 +16,9 @@ import pytest
 from file_server import FileServer, Served, file_server
 
 from su3d_bench.core.errors import DataError, StoreError
+from su3d_bench.core.files.locks import SHARED, beside, own_file
 from su3d_bench.fetching.checksums import Stated
 from su3d_bench.fetching.download import Patience, Wanted, bring
-from su3d_bench.store.unfinished import SHARED, beside, own_file
 
 CONTENT = np.random.default_rng(0).bytes(900_000)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()

@@ -15,8 +15,8 @@ from published import entry, serve_file, serve_model, serve_replica, write_table
 from scannet_scans import write_scan
 
 from su3d_bench.cli.main import main
+from su3d_bench.core.files.locks import SHARED, beside
 from su3d_bench.fetching.scannet import SUFFIXES
-from su3d_bench.store.unfinished import SHARED, beside
 
 SAM = "sam_vit_h_4b8939.pth"
 SCAN = "scene0000_00"

@@ -23,6 +23,8 @@ from damage import lacked_memory
 from memory import bounded_addresses, peak_bytes, reset_peak
 
 from su3d_bench.core.errors import DataError, PredictionError, StoreError, Su3dError
+from su3d_bench.core.files.atomic import read_arrays
+from su3d_bench.core.files.unpacking import FREE_BYTES, MOST_RATIO, Allowance, UnpackingError
 from su3d_bench.core.system.damage import DAMAGE
 from su3d_bench.evaluation.texts import read_text_features
 from su3d_bench.formats.arrays import MOST_MEMBERS, column_members, run_members
@@ -31,14 +33,12 @@ from su3d_bench.formats.images import decode_colour, decode_depth
 from su3d_bench.formats.numpy_files import read_npz
 from su3d_bench.formats.pcd import read_pcd_points
 from su3d_bench.formats.pickles.pickles import read_pickle_file
-from su3d_bench.formats.tables.separated import separated_rows
+from su3d_bench.formats.tables.csv_text import separated_rows
 from su3d_bench.formats.torch_zip import read_torch
 from su3d_bench.metrics.scoring import unpack_scores
 from su3d_bench.predictions.formats import READERS
 from su3d_bench.questions.files.queries import read_query_file
-from su3d_bench.store.atomic import read_arrays
 from su3d_bench.store.predictions import prediction_arrays, prediction_from_arrays, read_prediction
-from su3d_bench.store.unpacking import FREE_BYTES, MOST_RATIO, Allowance, UnpackingError
 
 MOST_GROWN = 320 * MIB
 LARGEST_BOMB = 4 * MIB

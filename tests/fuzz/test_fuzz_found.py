@@ -27,6 +27,7 @@ from su3d_bench.core.errors import (
     StoreError,
     Su3dError,
 )
+from su3d_bench.core.files.atomic import is_file, read_arrays, read_json
 from su3d_bench.core.system.damage import DAMAGE
 from su3d_bench.formats.numpy_files import read_npy
 from su3d_bench.metrics.protocols.loading import load_protocol, read_protocol
@@ -34,7 +35,6 @@ from su3d_bench.metrics.scoring import combine, unpack_scores
 from su3d_bench.questions.files.queries import read_query_file
 from su3d_bench.runs.finished import read_run
 from su3d_bench.runs.planning.estimate import recent_update_s
-from su3d_bench.store.atomic import is_file, read_arrays, read_json
 from su3d_bench.store.predictions import read_prediction
 
 DEEP, LONG = "[" * 100_000, "1" * 5000

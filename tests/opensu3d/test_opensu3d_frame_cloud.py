@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.geometry import back_project, valid_depth
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame
-from su3d_bench.numerics.geometry import back_project, valid_depth
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.frame_cloud import NO_DETECTION, frame_cloud
 

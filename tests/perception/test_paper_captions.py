@@ -13,9 +13,9 @@ from chat_server import Answered, Body, ChatServer, chat_server, error
 from tiny_models import needs_models, paper_words, write_models
 
 from su3d_bench.cli.main import main
+from su3d_bench.core.files.atomic import read_json
 from su3d_bench.core.maps import Instances
 from su3d_bench.perception.language.captioner import DESCRIBE
-from su3d_bench.store.atomic import read_json
 from su3d_bench.store.predictions import read_prediction
 
 pytestmark = needs_models

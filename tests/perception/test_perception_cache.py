@@ -10,11 +10,11 @@ import pytest
 from perception_fakes import CountingEncoder, still_life
 
 from su3d_bench.core.errors import StoreError
+from su3d_bench.core.files.atomic import read_arrays
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.cache import FrameCache, content_key, pack_masks, unpack_masks
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
-from su3d_bench.store.atomic import read_arrays
 
 SCENE = SceneInfo("rooms", "living0", n_frames=1, stride=1, image_domain="rendered-rooms")
 

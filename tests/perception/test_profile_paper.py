@@ -16,6 +16,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.core import registry
 from su3d_bench.core.config import write_toml
 from su3d_bench.core.errors import ConfigError, ModelMissing
+from su3d_bench.core.files.atomic import read_json
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import PerceptionNeeds, SceneInfo, UInt8Array
@@ -26,7 +27,6 @@ from su3d_bench.perception.models.catalogue import WEIGHTS_CAVEAT
 from su3d_bench.perception.models.config import PaperConfig
 from su3d_bench.perception.models.masks.tagging import WORDS_CAVEAT
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, check_models, resolve_profile
-from su3d_bench.store.atomic import read_json
 from su3d_bench.store.predictions import read_prediction
 
 SCENE = SceneInfo("rgbd", "wall", 1, 1, "camera")

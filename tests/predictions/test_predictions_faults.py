@@ -29,9 +29,9 @@ from prediction_files import (
 )
 
 from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.files.atomic import write_npz
 from su3d_bench.core.maps import DenseFeatures, Partition
 from su3d_bench.predictions.formats import READERS
-from su3d_bench.store.atomic import write_npz
 from su3d_bench.store.predictions import prediction_arrays, write_prediction
 
 # ---- what is wrong in a text list

@@ -19,9 +19,9 @@ from places import CASES
 from same_values import assert_same
 
 from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.files import unpacking
 from su3d_bench.formats.numpy_files import read_npy, read_npz
 from su3d_bench.formats.torch_zip import SparseTensor, read_torch, torch_kind
-from su3d_bench.store import unpacking
 
 FILES = CASES / "torch_files"  # written by torch 2.13.0
 MASKS = np.arange(36).reshape(12, 3) % 5 < 2

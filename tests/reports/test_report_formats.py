@@ -17,18 +17,10 @@ from hypothesis import strategies as st
 from measured_rows import measured, measured_instances
 
 from su3d_bench.core.errors import printable
+from su3d_bench.formats.tables.csv_text import FORMULA_STARTS, meant, no_formula
+from su3d_bench.formats.tables.table import Cell, Origin, Prose, Table, TableRow, text_table
 from su3d_bench.reports.tables.ablation import SweepRow, ablation_table
-from su3d_bench.reports.tables.formats import (
-    FORMATS,
-    FORMULA_STARTS,
-    csv_text,
-    html_page,
-    markdown,
-    meant,
-    no_formula,
-    plain,
-)
-from su3d_bench.reports.tables.model import Cell, Origin, Prose, Table, TableRow, text_table
+from su3d_bench.reports.tables.formats import FORMATS, csv_text, html_page, markdown, plain
 from su3d_bench.reports.tables.papers.latex import escape, latex, origin_comment, printed_cells
 from su3d_bench.reports.tables.papers.paper import Shown, paper_table, protocol_table
 from su3d_bench.reports.tables.papers.published import Figure

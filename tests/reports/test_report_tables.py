@@ -11,9 +11,10 @@ import pytest
 from measured_rows import SCENES, measured, measured_instances
 
 from su3d_bench.core.errors import ConfigError
+from su3d_bench.formats.tables.table import Table
 from su3d_bench.reports.tables.ablation import SweepRow, ablation_table
 from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
-from su3d_bench.reports.tables.model import Measured, Table
+from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.papers.latex import latex
 from su3d_bench.reports.tables.papers.paper import (
     Shown,

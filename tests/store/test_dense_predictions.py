@@ -23,6 +23,8 @@ from su3d_bench.baselines.conceptfusion.feature_table import FeatureTable
 from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError, StoreError
+from su3d_bench.core.files.atomic import npz_bytes
+from su3d_bench.core.files.scratch import scratch_folder
 from su3d_bench.core.maps import DenseFeatures, Partition
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, Frame, SceneInfo
@@ -31,10 +33,8 @@ from su3d_bench.metrics.semantic.score import has_feature
 from su3d_bench.predictions.own_runs import OwnRuns
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.store import predictions
-from su3d_bench.store.atomic import npz_bytes
 from su3d_bench.store.predictions import features_beside, read_prediction, write_prediction
 from su3d_bench.store.run_folder import RunFolder
-from su3d_bench.store.scratch import scratch_folder
 
 POINTS = np.arange(12, dtype=np.float32).reshape(4, 3)
 ROWS = np.arange(20, dtype=np.float16).reshape(4, 5)

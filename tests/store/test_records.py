@@ -11,8 +11,8 @@ import pytest
 from places import ROOT
 
 from su3d_bench.core.errors import DataError, StoreError
+from su3d_bench.core.files.atomic import write_json
 from su3d_bench.store import records
-from su3d_bench.store.atomic import write_json
 from su3d_bench.store.records import (
     CostsRecord,
     MetricsRecord,

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import StoreError
-from su3d_bench.store.scratch import Scratch
+from su3d_bench.core.files.scratch import Scratch
 
 
 @pytest.mark.parametrize("most_in_memory_bytes", [1 << 20, 1])

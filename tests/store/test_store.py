@@ -17,8 +17,8 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, StoreError
+from su3d_bench.core.files.atomic import npz_bytes, read_json, read_npz, write_bytes, write_json, write_npz
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
-from su3d_bench.store.atomic import npz_bytes, read_json, read_npz, write_bytes, write_json, write_npz
 from su3d_bench.store.predictions import read_prediction, write_prediction
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 

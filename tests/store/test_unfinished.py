@@ -17,11 +17,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from su3d_bench.core.errors import StoreError
+from su3d_bench.core.files.atomic import make_folder, replacing, write_text
+from su3d_bench.core.files.locks import clear_unfinished, is_unfinished, unfinished_folder
 from su3d_bench.perception.language.chat import ChatRequest
 from su3d_bench.perception.language.reply_store import ReplyStore
-from su3d_bench.store.atomic import make_folder, replacing, write_text
 from su3d_bench.store.run_folder import RunFolder, folder_of_scene, scene_of_folder
-from su3d_bench.store.unfinished import clear_unfinished, is_unfinished, unfinished_folder
 
 LEFT = ".page.html.0123456789ab.unfinished"
 WRITERS = {
@@ -35,7 +35,7 @@ WRITERS = {
 def writer(kind: str, place: Path) -> Iterator[subprocess.Popen[str]]:
     """A process that is in the midst of writing."""
     code = (
-        "import sys; from pathlib import Path\nfrom su3d_bench.store.atomic import filling, replacing\n"
+        "import sys; from pathlib import Path\nfrom su3d_bench.core.files.atomic import filling, replacing\n"
         "from su3d_bench.predictions.export import whole_folder\nplace = Path(sys.argv[1])\n"
         f"def wait():\n print('writing', flush=True); sys.stdin.read()\n{WRITERS[kind]}"
     )

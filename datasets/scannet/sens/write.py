@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from su3d_bench.core.files.atomic import replacing
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.scannet.sens.header import COUNT, SensHeader, header_bytes
 from su3d_bench.datasets.scannet.sens.read import FRAME_RECORD, MOTION_RECORD
-from su3d_bench.store.atomic import replacing
 
 
 @dataclass(frozen=True)

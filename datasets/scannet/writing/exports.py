@@ -11,12 +11,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from su3d_bench.core.files.atomic import make_folder, write_text
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Float64Array, Frame
 from su3d_bench.datasets.scannet.writing.layout import DEPTH_SHIFT, SENSOR_NAME, ScannetLayout, intrinsics_4x4, size_of
 from su3d_bench.datasets.writing import ScannedDataset, SceneTarget
 from su3d_bench.formats.images import UInt16Array, depth_in_units, jpeg_bytes, png_bytes
-from su3d_bench.store.atomic import make_folder, write_text
 
 INFO = "_info.txt"
 

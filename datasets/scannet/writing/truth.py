@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from su3d_bench.core.files.atomic import make_folder, write_text
 from su3d_bench.core.types import Float64Array, Int64Array, UInt8Array
 from su3d_bench.datasets.scannet.annotations import aggregation_name, segments_name
 from su3d_bench.datasets.scannet.truth import labels_name, mesh_name, meta_name
@@ -19,7 +20,6 @@ from su3d_bench.datasets.scannet.writing.categories import categories, nyu40_col
 from su3d_bench.datasets.writing import Scan, ScannedDataset, ScannedObject
 from su3d_bench.formats.images import list_column, triangles_of
 from su3d_bench.formats.ply import Column, PlyElement, write_ply
-from su3d_bench.store.atomic import make_folder, write_text
 
 MIN_COSINE = 0.9  # faces that meet at more than 26 degrees belong to two segments
 

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from su3d_bench.core.files.atomic import make_folder, replacing, write_text
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int64Array
 from su3d_bench.datasets.openlex3d import writing as openlex3d
@@ -39,7 +40,6 @@ from su3d_bench.datasets.writing import (
 )
 from su3d_bench.formats.images import JPEG_QUALITY, depth_in_units, jpeg_bytes, list_column, triangles_of
 from su3d_bench.formats.ply import Column, PlyElement, write_ply
-from su3d_bench.store.atomic import make_folder, replacing, write_text
 
 LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
 SCENES_FOLDER = "data"

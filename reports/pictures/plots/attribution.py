@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from su3d_bench.formats.tables.table import signed
 from su3d_bench.reports.pictures.canvas import Canvas, drawable
 from su3d_bench.reports.tables.attribution import LEFT, n_text
-from su3d_bench.reports.tables.model import signed
 
 PANEL_WIDTH, ROW_HEIGHT, PANEL_EXTRA = 4.6, 0.34, 1.25  # inches
 # Grey and hatches tell bars apart on a printer without colours.

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from su3d_bench.formats.tables.table import signed
 from su3d_bench.reports.pictures.canvas import Canvas, drawable
-from su3d_bench.reports.tables.model import signed
 
 PANEL_WIDTH, ROW_HEIGHT, NAMES_WIDTH, EXTRA = 4.4, 0.42, 3.2, 1.5  # inches
 ENDS, UP, DOWN = "#555555", "#2f6f4f", "#a4432f"  # hatches tell up and down apart without colours

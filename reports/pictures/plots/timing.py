@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from su3d_bench.core.errors import printable
+from su3d_bench.core.files.atomic import write_bytes
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.costs import MAP, UpdateTimes, pooled
 from su3d_bench.numerics.statistics import growth_exponent
 from su3d_bench.reports.pictures.canvas import figure_bytes
 from su3d_bench.reports.tables.timing import AnytimePoint
-from su3d_bench.store.atomic import write_bytes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,7 +11,7 @@ from typing import Any
 from urllib.parse import quote, unquote
 
 from su3d_bench.core.errors import printable
-from su3d_bench.reports.tables.model import Cell, Origin, Prose, Table, TableRow, blocks_of
+from su3d_bench.formats.tables.table import Cell, Origin, Prose, Table, TableRow, blocks_of
 
 HEADER = "% made by su3d-bench report tables; needs \\usepackage{booktabs}; su3d-bench report verify checks it"
 _ESCAPES = {

@@ -9,25 +9,22 @@ from functools import partial
 import numpy as np
 
 from su3d_bench.core.errors import ConfigError, counted, printable, some, suggest
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.metrics.questions.score import RELATIVE, said_by
-from su3d_bench.numerics.statistics import SignFlipTest, holm, sign_flip_test
-from su3d_bench.reports.tables.model import (
+from su3d_bench.formats.tables.table import (
     NOT_MEASURED,
     Cell,
-    Measured,
     Origin,
     Table,
     TableRow,
     Unit,
     bracketed,
-    confidence_notes,
-    few_scenes,
     is_count,
-    label_notes,
     percent,
 )
+from su3d_bench.metrics.protocols.files import protocol_names
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.questions.score import RELATIVE, said_by
+from su3d_bench.numerics.statistics import SignFlipTest, holm, sign_flip_test
+from su3d_bench.reports.tables.model import Measured, confidence_notes, few_scenes, label_notes
 from su3d_bench.reports.tables.papers.published import Figure, PaperTable, figures_of
 
 LEVEL = 0.05

@@ -20,10 +20,10 @@ from su3d_bench.analysis.page.maps import MapOfRun, PageMap, PageScene, Spaces, 
 from su3d_bench.analysis.page.numbers import are_all_read, is_scored, page_numbers, scored_maps
 from su3d_bench.analysis.page.scene_data import SceneData
 from su3d_bench.core.errors import DataError, Su3dError, printable
+from su3d_bench.core.files.atomic import is_file
 from su3d_bench.metrics.attribution.arrays import LookedAt
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report, run_inline, run_processes
 from su3d_bench.runs.finished import FinishedRun, read_run
-from su3d_bench.store.atomic import is_file
 
 QUERIES = (
     "somewhere to sit",

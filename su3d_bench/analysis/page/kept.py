@@ -25,12 +25,12 @@ from su3d_bench.core.digests import (
     package_versions,
 )
 from su3d_bench.core.errors import StoreError, Su3dError
+from su3d_bench.core.files.atomic import filling
+from su3d_bench.core.files.locks import is_unfinished
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.runs.finished import FinishedRun
-from su3d_bench.store.atomic import filling
 from su3d_bench.store.predictions import features_beside
 from su3d_bench.store.run_folder import refuse_links
-from su3d_bench.store.unfinished import is_unfinished
 
 FOLDER = Path(".cache", "page")
 MOST_BYTES = 1 << 28  # of a piece; one of a scene under fifty methods has a tenth of it

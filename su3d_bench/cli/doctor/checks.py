@@ -103,9 +103,9 @@ def _gpus(tried: Mapping[str, Loaded]) -> Iterator[Check]:
 
 def _folders() -> Iterator[Check]:
     from su3d_bench.cli.datasets.list import data_root
+    from su3d_bench.core.files.scratch import scratch_folder
     from su3d_bench.runs.planning.scenes import cache_root
     from su3d_bench.store.caches import KINDS, cache_entries, size_text
-    from su3d_bench.store.scratch import scratch_folder
 
     named = os.environ.get("SU3D_DATA") or ""
     if "://" in named:
@@ -121,8 +121,8 @@ def _folders() -> Iterator[Check]:
 
 def _folder(what: str, folder: Path, setting: str) -> Check:
     """Whether files can be written, locked and have room where ``folder`` is or would be."""
+    from su3d_bench.core.files.locks import NO_LOCKS, hold_folder
     from su3d_bench.store.caches import size_text
-    from su3d_bench.store.unfinished import NO_LOCKS, hold_folder
 
     existing = next((place for place in (folder, *folder.parents) if place.exists()), Path("/"))
     where = shown(folder) if existing == folder else f"{shown(folder)} (to be made)"

@@ -74,9 +74,9 @@ def _new_registry(folder: Path, arguments: argparse.Namespace) -> int:
     import os
     import shlex
 
-    from su3d_bench import __version__
     from su3d_bench.cli.shared.answers import written
     from su3d_bench.core.system.files import file_text
+    from su3d_bench.core.version import __version__
 
     name = Path(os.path.abspath(folder)).name
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", name):

@@ -54,9 +54,9 @@ def call(arguments: argparse.Namespace) -> int:
 
 def _list(arguments: argparse.Namespace) -> int:
     from su3d_bench.analysis.samples import Chosen, samples
+    from su3d_bench.core.files.atomic import make_folder, write_bytes
     from su3d_bench.reports.tables.samples import csv_of, parquet_of
     from su3d_bench.runs.finished import read_run
-    from su3d_bench.store.atomic import make_folder, write_bytes
 
     is_named = arguments.out is not None and arguments.out.suffix == ".parquet"
     form = arguments.format or ("parquet" if is_named else "csv")

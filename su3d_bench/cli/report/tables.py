@@ -12,7 +12,7 @@ from su3d_bench.cli.shared.flags import add_table_format, add_verb
 from su3d_bench.core.errors import EXIT_DONE
 
 if TYPE_CHECKING:
-    from su3d_bench.reports.tables.model import Table
+    from su3d_bench.formats.tables.table import Table
 
 NAME = "tables"
 PAPER_TABLES = ("I", "II", "III", "IV", "V", "reasoning")

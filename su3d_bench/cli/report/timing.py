@@ -75,8 +75,8 @@ def call(arguments: argparse.Namespace) -> int:
 def _write(
     arguments: argparse.Namespace, files: dict[str, str], times: list[list[UpdateTimes]], anytime: list[Any]
 ) -> None:
+    from su3d_bench.core.files.atomic import make_folder, write_text
     from su3d_bench.reports.pictures.plots.timing import draw_timing
-    from su3d_bench.store.atomic import make_folder, write_text
 
     show()  # the plots take longer than the tables
     make_folder(arguments.out)

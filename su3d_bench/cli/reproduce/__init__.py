@@ -208,12 +208,12 @@ def _answer(
     recipe: Recipe, experiments: Sequence[Experiment], folders: Sequence[Path], out: Path, arguments: argparse.Namespace
 ) -> None:
     """The tables on stdout and in ``tables.md``, every cell in ``compared.json``, pictures, and the archive."""
+    from su3d_bench.core.files.atomic import write_json
     from su3d_bench.reproducing.bundle import write_bundle
     from su3d_bench.reproducing.differences import Results, compared_all
     from su3d_bench.reproducing.pictures import draw_queries
     from su3d_bench.reproducing.recipe import recipe_bytes
     from su3d_bench.reproducing.tables import compared_json, result_tables
-    from su3d_bench.store.atomic import write_json
 
     results = Results(tuple(folders))
     cells = compared_all(experiments, results)

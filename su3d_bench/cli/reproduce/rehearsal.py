@@ -10,11 +10,11 @@ from pathlib import Path
 from su3d_bench.cli.datasets.make import dataset_part, make_files
 from su3d_bench.cli.shared.answers import remark
 from su3d_bench.core.errors import ConfigError, some
+from su3d_bench.core.files.atomic import make_folder
 from su3d_bench.datasets.layouts import LAYOUTS
 from su3d_bench.reproducing.asked import Asked
 from su3d_bench.reproducing.recipe import Experiment, Recipe
 from su3d_bench.runs.planning.scenes import split_address
-from su3d_bench.store.atomic import make_folder
 from su3d_bench.store.run_folder import RunFolder
 
 EMBEDDED = "embedded"

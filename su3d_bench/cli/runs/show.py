@@ -33,7 +33,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.analysis.run_list import run_entry, size_bytes
     from su3d_bench.core.config import DEFAULT_SOURCE
     from su3d_bench.core.errors import StoreError, printable, printable_json
-    from su3d_bench.reports.tables.model import percent
+    from su3d_bench.formats.tables.table import percent
     from su3d_bench.runs.planning.held import held_run
 
     entry = run_entry(arguments.run)

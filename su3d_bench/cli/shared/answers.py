@@ -16,7 +16,7 @@ from su3d_bench.core.printing import Door, escaped_json, one_line, terminal_widt
 from su3d_bench.core.system.files import file_text
 
 if TYPE_CHECKING:
-    from su3d_bench.reports.tables.model import Prose, Table
+    from su3d_bench.formats.tables.table import Prose, Table
 
 MOST_UNSEEN = 8  # words that are named
 
@@ -129,7 +129,7 @@ def answer_commands(lines: Sequence[str]) -> None:
 
 def written(path: Path, text: str) -> Path:
     """Write ``text`` to a file that a flag named, with its folder; its path."""
-    from su3d_bench.store.atomic import make_folder, write_text
+    from su3d_bench.core.files.atomic import make_folder, write_text
     from su3d_bench.store.run_folder import refuse_records
 
     refuse_records(path)

@@ -58,8 +58,8 @@ def add_parser(actions: Any) -> None:
 def call(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
+    from su3d_bench.formats.tables.table import Prose
     from su3d_bench.reports.tables.judged import sheet_tables
-    from su3d_bench.reports.tables.model import Prose
     from su3d_bench.sheets.items import KEY_FILE, read_key, read_sheet
     from su3d_bench.sheets.judging.answers import check_answers, check_key, read_answers
     from su3d_bench.sheets.judging.scores import score
@@ -135,12 +135,12 @@ def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
     import os
     from dataclasses import asdict
 
+    from su3d_bench.core.files.atomic import make_folder, write_text
     from su3d_bench.reports.sheet.second_looks import second_looks_csv, second_looks_page
     from su3d_bench.reports.tables.formats import FORMATS
     from su3d_bench.reports.tables.judged import sheet_tables
     from su3d_bench.sheets.items import PICTURES
     from su3d_bench.sheets.judging.scores import write_scores
-    from su3d_bench.store.atomic import make_folder, write_text
 
     make_folder(folder)
     content = asdict(scores)

@@ -10,6 +10,7 @@ import struct
 from collections.abc import Callable, Iterable
 from typing import BinaryIO
 
+from su3d_bench.core.files.unpacking import Allowance
 from su3d_bench.formats.pickles.pickle_constructors import (
     Budget,
     Constructors,
@@ -20,7 +21,6 @@ from su3d_bench.formats.pickles.pickle_constructors import (
     Unbuilt,
     clip,
 )
-from su3d_bench.store.unpacking import Allowance
 
 NEWEST_PROTOCOL = 5
 # A map of ConceptGraphs takes less than a million, 100 for a detection of a kilobyte or more; each may make an object.

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import BinaryIO, cast
 
 from su3d_bench.core.errors import PredictionError, printable, reading
+from su3d_bench.core.files.unpacking import UnpackingError
 from su3d_bench.core.system.files import opened
 from su3d_bench.formats.pickles.pickle_constructors import CONSTRUCTORS, Constructors, Forgotten, Inert, RefusedError
 from su3d_bench.formats.pickles.pickle_machine import PickleMachine
-from su3d_bench.store.unpacking import UnpackingError
 
 __all__ = ["Forgotten", "Inert", "read_pickle", "read_pickle_file"]
 

@@ -20,8 +20,8 @@ from typing import Any
 from xml.parsers import expat
 
 from su3d_bench.core.errors import DataError, printable
-from su3d_bench.formats.tables.separated import MOST_ROWS
-from su3d_bench.store.unpacking import ENCRYPTED, METHODS, PIECE
+from su3d_bench.core.files.unpacking import ENCRYPTED, METHODS, PIECE
+from su3d_bench.formats.tables.csv_text import MOST_ROWS
 
 MOST_XML_BYTES = 32 << 20  # of all parts that are parsed together: some ten thousand answers and more
 MOST_CELLS = 2_000_000  # of all worksheets, and of the texts that they share

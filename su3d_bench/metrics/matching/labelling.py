@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.files.scratch import row_blocks
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Prediction
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array
 from su3d_bench.metrics.matching.remembered import remembered
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.store.scratch import row_blocks
 
 CPU = "cpu"
 _BLOCK_ROWS = 8192  # 34 MB of float64 at 512 dimensions, whatever the size of the map

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from su3d_bench.core.geometry import voxel_coordinates
 from su3d_bench.core.maps import Instances, Masks, Partition, starts_of
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, IntArray
 from su3d_bench.metrics.matching.remembered import is_remembering, remembered
-from su3d_bench.numerics.geometry import voxel_coordinates
 
 Points = Float32Array | Float64Array
 

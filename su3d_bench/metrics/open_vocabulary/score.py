@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.files.scratch import release_pages
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition, Prediction
 from su3d_bench.core.types import Float32Array, Float64Array, Int64Array
@@ -23,7 +24,6 @@ from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.score import has_feature
-from su3d_bench.store.scratch import release_pages
 
 _NOT_KNOWN = "what the truth itself would score is not known"
 NO_CEILING = (

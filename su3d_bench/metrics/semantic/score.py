@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from su3d_bench.core.files.scratch import row_blocks
+from su3d_bench.core.geometry import voxel_coordinates
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Partition, Prediction
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array
@@ -23,9 +25,7 @@ from su3d_bench.metrics.metric import Metric, Pooled, SceneScore, Values, presen
 from su3d_bench.metrics.protocols.model import ClassEntry, ProtocolRules
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, SemanticMetrics
-from su3d_bench.numerics.geometry import voxel_coordinates
 from su3d_bench.numerics.statistics import nan_mean
-from su3d_bench.store.scratch import row_blocks
 
 GROUP_COLUMNS = {"mAcc": "recall", "mIoU": "IoU"}  # what a group of classes is called by, and what it averages
 

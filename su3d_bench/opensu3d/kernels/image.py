@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from su3d_bench.core.compiled import njit
 from su3d_bench.numerics.cells import ABSENT, slot_of
-from su3d_bench.numerics.compiled import njit
 
 LABEL_SHIFT = 40  # a view spans fewer voxels than 2**39, at any voxel that a depth image can fill
 OWNED, BACKGROUND, DROPPED = 0, 1, 2  # what the pixels of a ring become

@@ -12,8 +12,8 @@ import math
 
 import numpy as np
 
+from su3d_bench.core.compiled import njit
 from su3d_bench.numerics.cells import ABSENT, slot_of
-from su3d_bench.numerics.compiled import njit
 
 VOXELS = 512  # of a block
 UNKNOWN = -2

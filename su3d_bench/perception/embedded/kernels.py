@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from su3d_bench.core.compiled import njit
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 from su3d_bench.numerics.clusters import root_of
-from su3d_bench.numerics.compiled import njit
 
 
 @njit(cache=True)

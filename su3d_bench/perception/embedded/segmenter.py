@@ -17,7 +17,7 @@ from su3d_bench.core.types import (
     Regions,
     UInt8Array,
 )
-from su3d_bench.perception.cache import CACHE_SOURCES, content_key
+from su3d_bench.perception.cache import CODE, content_key
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.embedded.join_rules import SegmenterConfig, join_objects, region_quality, take_out_structure
 from su3d_bench.perception.embedded.surface_graph import Graph, Pieces, measure_borders
@@ -133,19 +133,6 @@ def _planes(
     return np.asarray(kernels.double_planes(planes, disparity, x, y), np.float32)
 
 
-# What moves the regions: their key follows it.
-SOURCES = (
-    "perception/embedded/join_rules.py",
-    "perception/embedded/kernels.py",
-    "perception/embedded/segmenter.py",
-    "perception/embedded/surface_graph.py",
-    "numerics/cells.py",
-    "numerics/clusters.py",
-    "numerics/compiled.py",
-    *CACHE_SOURCES,
-)
-
-
 class RgbdSegmenter:
     """Regions of any RGB-D frame: whole ``objects`` without floor, walls and ceiling; or ``parts`` of everything."""
 
@@ -157,7 +144,7 @@ class RgbdSegmenter:
             weights = weights.model_copy(update={"bias": weights.bias - config.parts_caution})
         self._config = config.model_copy(update={"join": weights})
         self._level = level
-        self.digest = content_key("rgbd", level, config.model_dump_json(), package_digest(*SOURCES))
+        self.digest = content_key("rgbd", level, config.model_dump_json(), package_digest(*CODE))
 
     def segment(self, frame: Frame) -> Regions:
         """Masks that do not overlap, largest first."""

@@ -17,11 +17,11 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from su3d_bench.core.digests import digest_json
+from su3d_bench.core.files.atomic import json_text, make_folder, write_bytes, write_error, write_text
+from su3d_bench.core.files.locks import hold_folder
 from su3d_bench.core.system.files import file_text
 from su3d_bench.perception.language.chat import ChatRequest, Reply
-from su3d_bench.store.atomic import json_text, make_folder, write_bytes, write_error, write_text
 from su3d_bench.store.run_folder import refuse_links
-from su3d_bench.store.unfinished import hold_folder
 
 SCHEMA = 1
 IMAGES = "images"

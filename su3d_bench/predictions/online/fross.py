@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, printable, shown
+from su3d_bench.core.files.unpacking import Allowance, UnpackingError
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float64Array
 from su3d_bench.formats.arrays import MOST_MASKS, checked_points, kind_of
@@ -24,7 +25,6 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.relations.graphs import last_best
 from su3d_bench.predictions.base import ONES, Reader, ScenePrediction, first_found, instances_of
-from su3d_bench.store.unpacking import Allowance, UnpackingError
 
 START, SUFFIX = "predictions_", ".pkl"
 LISTS = "replica-relations"  # the protocol with the lists by which numbers are named

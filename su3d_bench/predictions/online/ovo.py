@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError, shown
+from su3d_bench.core.files.unpacking import Allowance, UnpackingError
 from su3d_bench.core.maps import Partition
 from su3d_bench.core.types import Float32Array, Int32Array, Int64Array
 from su3d_bench.formats.arrays import MOST_MASKS, checked_points, kind_of, without_nonfinite
 from su3d_bench.formats.torch_stream import read_torch_of_either_form
 from su3d_bench.predictions.base import SceneFolders, ScenePrediction
-from su3d_bench.store.unpacking import Allowance, UnpackingError
 
 MAP = "ovo_map.ckpt"
 POINTS = ("map_params", "gaussian_params")  # the second in maps of before; its own loader takes both

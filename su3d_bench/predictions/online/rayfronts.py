@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, shown
+from su3d_bench.core.files.unpacking import Allowance, UnpackingError
 from su3d_bench.core.maps import DenseFeatures
 from su3d_bench.formats.arrays import checked_points, half_rows, kind_of
 from su3d_bench.formats.torch_zip import read_torch
 from su3d_bench.predictions.base import ScenePrediction, first_found, named_once
 from su3d_bench.predictions.mask_archives import TorchFiles
-from su3d_bench.store.unpacking import Allowance, UnpackingError
 
 MAP = "map.pt"
 N_COLOURS, N_COUNTS = 3, 1  # columns before and behind the features of a voxel

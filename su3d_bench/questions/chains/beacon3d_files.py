@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.errors import DataError, printable
-from su3d_bench.datasets.recordings.recorded_frames import parsed_json
 from su3d_bench.formats.images import read_bytes
+from su3d_bench.formats.text_files import parsed_json
 from su3d_bench.metrics.questions.chains import CHAINS_EACH, ChainedText, Place
 from su3d_bench.questions.files.queries import MOST_OBJECTS_ID, is_text
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.errors import ConfigError, DataError, counted, printable
+from su3d_bench.formats.tables.table import Cell, Table, TableRow, percent
 from su3d_bench.questions.chains.answered import Number, answer_numbers, grounding_numbers
 from su3d_bench.questions.chains.beacon3d_files import (
     PAGE,
@@ -20,7 +21,6 @@ from su3d_bench.questions.chains.beacon3d_files import (
     read_replies,
 )
 from su3d_bench.questions.chains.judge import Judged, Key
-from su3d_bench.reports.tables.model import Cell, Table, TableRow, percent
 
 NO_JUDGE = (
     "where two numbers stand, answers wait for a judge: the least and the most that one can make of them; name a "

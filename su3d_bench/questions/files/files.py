@@ -14,13 +14,13 @@ from typing import Any
 
 from su3d_bench.core.config import toml_value
 from su3d_bench.core.errors import DataError, printable
+from su3d_bench.core.files.atomic import make_folder, write_text
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.toml import parse_toml
+from su3d_bench.formats.tables.csv_text import no_formula
 from su3d_bench.questions.files.datasets import is_foreign, read_foreign
 from su3d_bench.questions.files.queries import COLUMNS, MORE_COLUMNS, read_query_rows
 from su3d_bench.questions.model import ALL_KINDS, KINDS, REASONING, Question, new_question
-from su3d_bench.reports.tables.formats import no_formula
-from su3d_bench.store.atomic import make_folder, write_text
 
 PAPER = Path(__file__).parent / "paper_queries.toml"
 PAGE = "opensu3d.github.io"

@@ -7,8 +7,8 @@ import re
 from pathlib import Path
 
 from su3d_bench.core.errors import DataError, printable
-from su3d_bench.datasets.recordings.recorded_frames import read_text
-from su3d_bench.formats.tables.separated import separated_rows
+from su3d_bench.formats.tables.csv_text import separated_rows
+from su3d_bench.formats.text_files import read_text
 from su3d_bench.questions.files.queries import MOST_BYTES
 
 COLUMN = "question_id"  # others are for the reader alone

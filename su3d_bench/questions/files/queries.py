@@ -19,11 +19,10 @@ import numpy as np
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.toml import parse_toml
 from su3d_bench.core.types import Float64Array, GroundTruth
-from su3d_bench.datasets.recordings.recorded_frames import read_text
-from su3d_bench.formats.tables.separated import separated_rows
+from su3d_bench.formats.tables.csv_text import meant, separated_rows
+from su3d_bench.formats.text_files import read_text
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
 from su3d_bench.questions.files.groups import ClassOfName, grouped_by_truth, scanrefer_groups
-from su3d_bench.reports.tables.formats import meant
 
 COLUMNS = ("scene", "text", "objects")
 MORE_COLUMNS = ("kind", "source")  # may be there, in any order behind the others

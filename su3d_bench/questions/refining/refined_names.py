@@ -11,12 +11,12 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import StoreError
+from su3d_bench.core.files.atomic import read_json, write_json
 from su3d_bench.core.maps import Instances
 from su3d_bench.metrics.questions.truths import RefinedNames
 from su3d_bench.questions.refining.refinement import RefinedName, TopNames
 from su3d_bench.questions.truths import voted_names
 from su3d_bench.questions.undesired import FilterConfig, undesired
-from su3d_bench.store.atomic import read_json, write_json
 from su3d_bench.store.run_folder import JobFolder
 
 log = logging.getLogger(__name__)

@@ -11,12 +11,12 @@ from pathlib import Path
 from su3d_bench.analysis.leaderboard import Entry, Refused, in_order, ranked
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, counted, printable, reading, shown
+from su3d_bench.core.files.atomic import make_folder, replacing
 from su3d_bench.core.system.files import opened
 from su3d_bench.reproducing.bundle import PIECE
 from su3d_bench.reproducing.registry.mixing import why_not_beside
 from su3d_bench.reproducing.registry.rows import Row, rows_of_bundle
 from su3d_bench.reproducing.verifying import verify_bundle
-from su3d_bench.store.atomic import make_folder, replacing
 
 BUNDLES = "bundles"
 SUFFIX = ".zip"

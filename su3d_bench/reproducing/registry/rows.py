@@ -9,6 +9,7 @@ from pathlib import Path
 from su3d_bench.analysis.leaderboard import Entry, Refused, entries_of
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError, StoreError, Su3dError, printable, reading, shown
+from su3d_bench.core.files.scratch import TemporaryFolder
 from su3d_bench.core.system.files import opened
 from su3d_bench.metrics.costs import MAP, TOTAL, WARM_UP, summarise
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
@@ -17,7 +18,6 @@ from su3d_bench.reproducing.bundle import MANIFEST, RUNS, Unpacked, unpack
 from su3d_bench.reproducing.registry.commands import command_of
 from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
 from su3d_bench.store.run_folder import JOBS, RECORDS
-from su3d_bench.store.scratch import TemporaryFolder
 
 NOT_SAID = "not said"
 TOLD_THE_TRUTH = "none: it was told the truth"

@@ -9,9 +9,9 @@ from typing import Any
 
 from su3d_bench.core.config import RunConfig, parse_value
 from su3d_bench.core.errors import ConfigError
+from su3d_bench.core.files.scratch import TemporaryFolder
 from su3d_bench.runs.executors.local import Outcome, Report, Unit, Work, run_inline, run_processes
 from su3d_bench.store.run_folder import refuse_links
-from su3d_bench.store.scratch import TemporaryFolder
 
 # The options of executors on other machines; a value other than the default is refused elsewhere.
 USED_BY = {

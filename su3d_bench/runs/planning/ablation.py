@@ -15,9 +15,9 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from su3d_bench.core import registry
 from su3d_bench.core.config import parse_value, toml_value
 from su3d_bench.core.errors import ConfigError, StoreError, suggest
+from su3d_bench.core.files.atomic import read_json, write_json
 from su3d_bench.core.interfaces import HasShortNames
 from su3d_bench.reports.tables.ablation import SweepRow
-from su3d_bench.store.atomic import read_json, write_json
 
 FILE = "ablation.json"
 MOST_VARIANTS = 1000

@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from su3d_bench.core.errors import ConfigError
+from su3d_bench.core.files.atomic import make_folder
+from su3d_bench.core.files.scratch import TemporaryFolder
 from su3d_bench.runs.parts import Part, build_dataset
 from su3d_bench.runs.remote.folder import RemoteFolder
-from su3d_bench.store.atomic import make_folder
-from su3d_bench.store.scratch import TemporaryFolder
 
 MOST_SHARED_BYTES = 1 << 26  # label tables and camera files; the largest has 1 MB
 

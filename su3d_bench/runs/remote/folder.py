@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError, printable
-from su3d_bench.store.atomic import make_folder, replacing
+from su3d_bench.core.files.atomic import make_folder, replacing
 
 AT_ONCE = 256  # small files that one request to the driver asks for; it fetches them side by side
 BUCKETS = ("s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "oss")  # have no folders, and to make one makes a bucket

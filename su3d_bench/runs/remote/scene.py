@@ -15,15 +15,15 @@ from pathlib import Path
 
 from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.errors import StoreError
+from su3d_bench.core.files.atomic import make_folder, write_bytes
+from su3d_bench.core.files.locks import is_unfinished
+from su3d_bench.core.files.scratch import TemporaryFolder
 from su3d_bench.runs.executors.local import Report
 from su3d_bench.runs.job import MethodOutcome, SceneJob
 from su3d_bench.runs.planning.scenes import cache_root as own_cache_root
 from su3d_bench.runs.remote.folder import RemoteFolder
 from su3d_bench.runs.scene import failed_outcomes, run_scene
-from su3d_bench.store.atomic import make_folder, write_bytes
 from su3d_bench.store.run_folder import JOBS, RECORDS, RunFolder
-from su3d_bench.store.scratch import TemporaryFolder
-from su3d_bench.store.unfinished import is_unfinished
 
 SEAL = "done.json"
 REPLIES = "language"  # of language models, which the scenes of a run share

@@ -8,8 +8,8 @@ from itertools import combinations
 
 import numpy as np
 
-from su3d_bench.core.types import Float64Array, Int64Array
-from su3d_bench.numerics.statistics import DIFFERENCE, LEAST_ITEMS, Interval, jackknife_interval, leave_one_out
+from su3d_bench.core.types import Float64Array, Int64Array, Interval
+from su3d_bench.numerics.statistics import DIFFERENCE, LEAST_ITEMS, jackknife_interval, leave_one_out
 
 Ratings = Mapping[str, Mapping[str, str]]  # item -> annotator -> answer
 

@@ -14,10 +14,9 @@ from pathlib import Path
 
 from su3d_bench.core.errors import DataError, nearest, printable, reading, suggest
 from su3d_bench.core.system.files import file_bytes
-from su3d_bench.formats.tables.separated import separated_rows
+from su3d_bench.formats.tables.csv_text import meant, separated_rows
 from su3d_bench.formats.tables.workbooks import read_workbook
 from su3d_bench.questions.model import KINDS
-from su3d_bench.reports.tables.formats import meant
 from su3d_bench.sheets.items import ANSWER_COLUMNS, ASKS, Key, KeyItem, Sheet, SheetItem
 
 MOST_BYTES = 256 << 20  # of one file: a workbook holds its pictures

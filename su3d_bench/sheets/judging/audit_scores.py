@@ -9,8 +9,8 @@ from typing import Any
 
 from su3d_bench.core.errors import DataError, printable, reading, suggest
 from su3d_bench.core.system.files import file_bytes
+from su3d_bench.formats.tables.table import Cell, Table, TableRow, bracketed, percent
 from su3d_bench.numerics.statistics import share_interval
-from su3d_bench.reports.tables.model import Cell, Table, TableRow, bracketed, percent
 from su3d_bench.sheets.items import ARGUABLE, RIGHT, VERDICTS, WRONG
 from su3d_bench.sheets.judging.answers import MOST_TEXT_BYTES, cell_text, csv_rows
 

@@ -16,15 +16,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from su3d_bench.core.errors import DataError, printable
-from su3d_bench.core.types import Float64Array, Int64Array
-from su3d_bench.numerics.statistics import (
-    DIFFERENCE,
-    LEAST_ITEMS,
-    Interval,
-    mean_interval,
-    share_interval,
-    sign_flip_test,
-)
+from su3d_bench.core.files.atomic import write_json
+from su3d_bench.core.types import Float64Array, Int64Array, Interval
+from su3d_bench.numerics.statistics import DIFFERENCE, LEAST_ITEMS, mean_interval, share_interval, sign_flip_test
 from su3d_bench.questions.model import ALL_KINDS
 from su3d_bench.sheets.items import (
     ARGUABLE,
@@ -41,7 +35,6 @@ from su3d_bench.sheets.items import (
 from su3d_bench.sheets.judging.agreement import Agreement, agreement, cohen_kappa
 from su3d_bench.sheets.judging.answers import LABELS, Judgement
 from su3d_bench.sheets.judging.verdicts import WHOLE, whole_verdicts
-from su3d_bench.store.atomic import write_json
 
 if TYPE_CHECKING:
     import pandas

@@ -6,8 +6,8 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
+from su3d_bench.formats.tables.csv_text import csv_lines
 from su3d_bench.questions.files.left_out import COLUMN
-from su3d_bench.reports.tables.formats import csv_lines
 from su3d_bench.sheets.items import VERDICTS, Key
 from su3d_bench.sheets.judging.answers import Judgement
 

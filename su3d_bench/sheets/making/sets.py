@@ -12,9 +12,10 @@ import numpy as np
 
 from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.errors import ConfigError, DataError, printable
+from su3d_bench.core.files.atomic import is_file, make_folder, write_bytes, write_text
 from su3d_bench.core.system.files import file_bytes
+from su3d_bench.formats.tables.csv_text import csv_lines
 from su3d_bench.reports.sheet.page import page_html
-from su3d_bench.reports.tables.formats import csv_lines
 from su3d_bench.sheets.items import (
     ANSWER_COLUMNS,
     ASKS,
@@ -36,7 +37,6 @@ from su3d_bench.sheets.items import (
 from su3d_bench.sheets.making.drafts import Draft
 from su3d_bench.sheets.making.guide import guide_of
 from su3d_bench.sheets.making.workbook import workbook_bytes
-from su3d_bench.store.atomic import is_file, make_folder, write_bytes, write_text
 
 MOST_ANNOTATORS = 100
 PAGE, WORKBOOK, TABLE = "sheet.html", "sheet.xlsx", "sheet.csv"

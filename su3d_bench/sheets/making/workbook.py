@@ -10,9 +10,9 @@ from datetime import UTC, datetime
 from typing import Any
 
 from su3d_bench.core.errors import ModelMissing, printable
+from su3d_bench.core.files.atomic import ZIP_EPOCH
 from su3d_bench.sheets.items import AnnotatorShare, Sheet
 from su3d_bench.sheets.making.guide import GUIDE, guide_of
-from su3d_bench.store.atomic import ZIP_EPOCH
 
 # The columns of an answers file stand among these; what nobody needs to see is hidden.
 COLUMNS = ("item_id", "picture", "text", "asked", "answer", "question", "sheet_id", "annotator", "check")

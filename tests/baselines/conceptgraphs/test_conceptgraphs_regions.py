@@ -15,9 +15,9 @@ from su3d_bench.baselines.conceptgraphs.config import MappingConfig
 from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs
 from su3d_bench.baselines.conceptgraphs.regions import LiftedRegion, kept_regions, lift, subtract_contained
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.geometry import back_project
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections
-from su3d_bench.numerics.geometry import back_project
 from su3d_bench.perception.profiles import PerceptionConfig, build_perception
 
 RNG = np.random.default_rng(3)

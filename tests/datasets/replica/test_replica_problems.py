@@ -14,9 +14,9 @@ import pytest
 from damage import N_DAMAGES, damages, outcomes, truncations
 from replica_scene import QUADS, TWO_OBJECTS, info_table, write_original, write_render
 
+from su3d_bench.core import geometry
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.datasets.replica.dataset import Replica
-from su3d_bench.numerics import geometry
 
 Change = Callable[[Path], object]
 

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from scipy.spatial import cKDTree
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.core.geometry import back_project
 from su3d_bench.core.maps import Instances
 from su3d_bench.datasets.openscan import label_set
 from su3d_bench.datasets.rooms.attributes import attribute_of_object
@@ -22,7 +23,6 @@ from su3d_bench.datasets.rooms.rendering.mesh import RoomMesh
 from su3d_bench.datasets.rooms.scan import RoomScan
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
-from su3d_bench.numerics.geometry import back_project
 
 SMALL = Rooms.Options(width=96, height=72, n_frames=80, mesh_spacing_m=0.03)
 SCENE = "bathroom7"

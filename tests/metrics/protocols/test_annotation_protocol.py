@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scored_room import NAMES, instances, room, truth_as_prediction
 
+from su3d_bench.core.files.atomic import write_bytes
 from su3d_bench.core.maps import Instances, Partition
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.instance.score import Covered
@@ -27,7 +28,6 @@ from su3d_bench.questions.refining.refined_names import (
 from su3d_bench.questions.refining.refinement import RefinedName, TopNames
 from su3d_bench.questions.truths import Refine, question_truth, voted_names
 from su3d_bench.questions.undesired import FilterConfig
-from su3d_bench.store.atomic import write_bytes
 from su3d_bench.store.run_folder import JobFolder
 
 RULES = load_protocol("rooms-annotation")

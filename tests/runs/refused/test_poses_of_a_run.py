@@ -13,9 +13,9 @@ import pytest
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.config import Setting, Settings, write_toml
+from su3d_bench.core.geometry import turn_to_z
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.recordings import pose_convention
-from su3d_bench.numerics.geometry import turn_to_z
 from su3d_bench.runs.planning import poses
 from su3d_bench.runs.planning.plan import make_plan
 from su3d_bench.runs.scene import run_scene

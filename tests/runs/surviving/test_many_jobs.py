@@ -15,6 +15,7 @@ from su3d_bench.analysis.page import numbers as page_sources
 from su3d_bench.analysis.page.contents import Wishes, page_contents
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.files import atomic
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import resampling
 from su3d_bench.metrics.scoring import pack_scores, unpack_scores
@@ -25,7 +26,6 @@ from su3d_bench.runs import runner
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.executors.choose import run_units
 from su3d_bench.runs.finished import read_run
-from su3d_bench.store import atomic
 from su3d_bench.store import run_folder as store
 
 WORDS = ["run", "--scenes", f"{SCENES}/painted.py:Painted/*", "--methods", f"{SCENES}/painted.py:Collector"]

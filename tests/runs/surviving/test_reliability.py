@@ -25,14 +25,14 @@ from places import ROOT, SCENES
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import StoreError
+from su3d_bench.core.files.atomic import filling, npz_bytes, read_npz
+from su3d_bench.core.files.scratch import TemporaryFolder
 from su3d_bench.metrics.scoring import score_scene
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.runs import job as scene_job
 from su3d_bench.runs import parts
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.store.atomic import filling, npz_bytes, read_npz
 from su3d_bench.store.run_folder import RunFolder
-from su3d_bench.store.scratch import TemporaryFolder
 
 SUBJECT = f"{SCENES}/kill_subject.py"
 SETTINGS = ("--set", "painted.n_frames=3", "--protocols", "rooms-semantic", "--no-pictures", "--jobs", "1", "--quiet")
@@ -318,7 +318,7 @@ def test_the_temporary_folder_of_a_killed_process_goes_when_the_next_is_made(
 def abandoned(folder: Path) -> Path:
     """The temporary folder of a process that was killed."""
     code = (
-        "import os, signal; from su3d_bench.store.scratch import TemporaryFolder\n"
+        "import os, signal; from su3d_bench.core.files.scratch import TemporaryFolder\n"
         "folder = TemporaryFolder('su3d-test-'); (folder.path / 'large').write_text('x')\n"
         "os.kill(os.getpid(), signal.SIGKILL)"
     )
@@ -330,7 +330,7 @@ def abandoned(folder: Path) -> Path:
 KERNEL = """
 import sys
 from pathlib import Path
-from su3d_bench.numerics.compiled import njit
+from su3d_bench.core.compiled import njit
 
 @njit(cache=True)
 def double(x):
@@ -357,7 +357,7 @@ def test_a_compiled_kernel_whose_kept_form_is_damaged_is_compiled_again(tmp_path
 
 
 def test_a_compiled_kernel_is_compiled_again_when_a_function_that_it_imports_has_changed(tmp_path: Path) -> None:
-    head = "from su3d_bench.numerics.compiled import njit\n"
+    head = "from su3d_bench.core.compiled import njit\n"
     inner = head + "@njit(cache=True)\ndef factor():\n    return {}\n"
     middle = head + "from inner import factor\n@njit(cache=True)\ndef scaled(x):\n    return x * factor()\n"
     outer = head + "from middle import scaled\n@njit(cache=True)\ndef more(x):\n    return scaled(x) + 1\n"

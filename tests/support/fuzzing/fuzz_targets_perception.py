@@ -169,7 +169,7 @@ def _refined_names(folder: Path) -> Read:
 def _kept_files(folder: Path) -> Read:
     from test_store import small_map
 
-    from su3d_bench.store.atomic import read_json, read_npz, write_npz
+    from su3d_bench.core.files.atomic import read_json, read_npz, write_npz
     from su3d_bench.store.predictions import prediction_arrays
 
     write_npz(folder / "a.npz", prediction_arrays(small_map()))

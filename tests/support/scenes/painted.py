@@ -19,6 +19,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.core.geometry import back_project
 from su3d_bench.core.interfaces import StageTimer
 from su3d_bench.core.maps import Instances, Prediction
 from su3d_bench.core.types import (
@@ -32,7 +33,6 @@ from su3d_bench.core.types import (
     SceneInfo,
     UInt8Array,
 )
-from su3d_bench.numerics.geometry import back_project
 
 HEIGHT, WIDTH = 24, 32
 INTRINSICS = np.array([[30.0, 0, 15.5], [0, 30.0, 11.5], [0, 0, 1]])

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from su3d_bench.core.errors import DataError, ModelMissing
+from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.system.devices import make_deterministic, require
 from su3d_bench.core.system.files import file_text
@@ -20,7 +21,6 @@ from su3d_bench.perception.models.catalogue import ONNX_MANIFEST
 from su3d_bench.perception.models.encoders.images import Resample, normalised, resized
 from su3d_bench.perception.models.files import ModelFiles, bounded, read_weights, what_to_fetch
 from su3d_bench.perception.models.onnx import OnnxManifest, wrong_files
-from su3d_bench.store.atomic import is_file
 
 RAM_PX = 384
 RAM_MODEL, RAM_TAG_LIST = "ram_plus.onnx", "ram_tag_list.txt"

@@ -25,11 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import StoreError, reading
+from su3d_bench.core.files.locks import SHARED, beside, clear_unfinished, new_file, own_file
+from su3d_bench.core.files.unpacking import Allowance, allowance_of, check_member, member_bytes
 from su3d_bench.core.printing import escaped_json
 from su3d_bench.core.system.damage import DAMAGE
 from su3d_bench.core.system.files import file_text, opened
-from su3d_bench.store.unfinished import SHARED, beside, clear_unfinished, new_file, own_file
-from su3d_bench.store.unpacking import Allowance, allowance_of, check_member, member_bytes
 
 MAGIC_1_0 = b"\x93NUMPY\x01\x00"
 SMALL_BYTES = 1 << 16  # of an array that is read whole before its header is looked at

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import StoreError
-from su3d_bench.store.unfinished import held_folder, remove_unheld
+from su3d_bench.core.files.locks import held_folder, remove_unheld
 
 MOST_IN_MEMORY_BYTES = 1 << 26  # a hundredth of a small machine's memory; most scenes never reach it
 
