@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from chat_server import Answered, Body, chat_server, error, quick_config
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scored_room import instances
@@ -17,10 +16,8 @@ from su3d_bench.core.errors import PredictionError, StoreError
 from su3d_bench.core.maps import Instances
 from su3d_bench.perception.language.captioner import Captioner
 from su3d_bench.perception.language.chat import ChatRequest, Reply
-from su3d_bench.perception.language.client import ChatClient
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.perception.language.parsing import Described, answered, chosen_name, described
-from su3d_bench.perception.language.reply_store import ReplyStore
 from su3d_bench.questions.refining.refined_names import read_records, records_of, write_records
 from su3d_bench.questions.refining.refinement import ModelRefiner, TopNames, top_names, vote
 from su3d_bench.questions.undesired import FilterConfig
@@ -60,8 +57,6 @@ class Spoken:
         ("1. Cushion - a soft, red pillow", "cushion", "a soft, red pillow"),
         ("I'm sorry for the blur. `chair':`a chair'", "chair", "a chair"),
         ("chair", "chair", ""),
-        ("This is a wooden nightstand with a lamp on top.", "wooden nightstand",
-         "This is a wooden nightstand with a lamp on top."),
     ],
 )  # fmt: skip
 def test_a_name_and_a_description_are_read_out_of_any_form(text: str, name: str, caption: str) -> None:
@@ -128,7 +123,7 @@ def test_ids_of_parts_of_objects_are_understood_whole() -> None:
     assert digits is not None and digits.object_ids == ()
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(st.text(alphabet=st.sampled_from("ab:'\"`{}[]\n,.*# 1é\x00"), max_size=60))
 def test_no_answer_breaks_a_parser(text: str) -> None:
     for found in (described(text), chosen_name(text, NAMES), answered(text, (1,))):
@@ -175,39 +170,6 @@ def test_a_name_without_a_description_gets_the_simple_caption() -> None:
     assert (
         Captioner(Spoken("umbrella"), LanguageConfig()).captions([crop], ["x"])[0].caption == "an umbrella in a scene"
     )
-
-
-def test_a_run_over_a_bad_server_ends_complete_and_asks_nothing_twice(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("openai", reason="the models extra is not installed")
-    monkeypatch.setenv("SU3D_TEST_KEY", "sk-test-0123456789abcdef")
-    n_of: dict[str, int] = {}
-
-    def answer(body: Body) -> Answered:
-        url = body["messages"][0]["content"][1]["image_url"]["url"]
-        n_of[url] = n_of.get(url, 0) + 1
-        first, kind = n_of[url] == 1, sorted(n_of).index(url) % 6
-        troubles = [error(429, retry_after="0.01"), error(500), Answered(raw=b"{"), Answered(wait_s=30)]
-        if first and kind < 4:
-            return troubles[kind]
-        return Answered("I'm sorry, I can't help with that." if kind == 4 else "`lamp':`A lamp.'")
-
-    crops = [np.full((4, 4, 3), 9 * k, np.uint8) for k in range(12)]
-    with chat_server() as server:
-        server.answer = answer
-        config = quick_config(server, total_timeout_s=0.4)
-
-        def run() -> list[tuple[str, str]]:
-            captioner = Captioner(ChatClient(config, ReplyStore(tmp_path)), config)
-            return [(one.name, one.caption) for one in captioner.captions(crops, ["thing"] * 12)]
-
-        captions, n_asked = run(), server.n_asked
-        assert len(captions) == 12
-        assert {name for name, _ in captions} <= {"lamp", "thing"}
-        assert 12 <= n_asked <= 24
-        assert run() == captions
-        assert server.n_asked == n_asked
 
 
 def seen() -> Instances:

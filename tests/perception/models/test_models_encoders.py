@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_models import DIM, needs_models, noise_images, write_tiny_clip, write_tiny_siglip
+from tiny_models import CLIP_DIM, needs_models, noise_images, write_tiny_clip, write_tiny_siglip
 
 from su3d_bench.core.errors import ConfigError, DataError, ModelMissing
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import Float32Array, Int64Array
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.models.config import ModelsConfig
-from su3d_bench.perception.models.encoders import towers_transformers
+from su3d_bench.perception.models.encoders import towers
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec, FoundationEncoder, unit_rows
 from su3d_bench.perception.models.encoders.images import ImageTransform
 from su3d_bench.perception.models.files import ModelFiles, read_weights
@@ -97,7 +97,7 @@ def test_the_older_form_of_weights_gives_the_same_features(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A product of matrices rounds by where its factors lie in memory, and one of the two forms is mapped from its file.
-    load_model = towers_transformers.load_model
+    load_model = towers.load_transformers
 
     def aligned(files: ModelFiles) -> Any:
         model = load_model(files)
@@ -105,7 +105,7 @@ def test_the_older_form_of_weights_gives_the_same_features(
             weights.data = weights.data.clone()
         return model
 
-    monkeypatch.setattr(towers_transformers, "load_model", aligned)
+    monkeypatch.setattr(towers, "load_transformers", aligned)
     write_tiny_clip(tmp_path / "clip-vit-h-14", weights="pytorch_model.bin")
     older, newer = load_encoder(config(tmp_path)), load_encoder(config(folder))
     assert np.array_equal(older.encode_images(noise_images(2)), newer.encode_images(noise_images(2)))
@@ -308,4 +308,4 @@ def test_without_transformers_one_line_names_the_extra(folder: Path, monkeypatch
 
 @needs_models
 def test_the_space_of_the_tiny_encoder_is_known_without_its_weights(folder: Path) -> None:
-    assert load_encoder(config(folder)).dim == DIM
+    assert load_encoder(config(folder)).dim == CLIP_DIM

@@ -108,7 +108,7 @@ def test_features_are_those_of_the_weights_in_the_file(tmp_path: Path, made: lis
         texts = torch.nn.functional.normalize(model.encode_text(_tokens(["a chair", "b"])), dim=1).numpy()
     assert np.allclose(encoder.encode_images(noise_images(3)), images, atol=1e-6)
     assert np.allclose(encoder.encode_texts(["a chair", "b"]), texts, atol=1e-6)
-    assert (made, encoder.dim, encoder.name) == (["ViT-H-14"], DIM, "ViT-H-14/laion2b_s32b_b79k (stand-in)")
+    assert (made, encoder.dim, encoder.name) == (["ViT-H-14"], DIM, "ViT-H-14/laion2b_s32b_b79k")
 
 
 def test_openais_weights_are_run_with_the_activation_they_were_trained_with(tmp_path: Path, made: list[str]) -> None:

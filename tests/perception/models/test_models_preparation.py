@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_models import IMAGE_SIZE, N_TOKENS, needs_models, noise_images, write_clip_tokenizer
+from tiny_models import CLIP_PX, N_TOKENS, needs_models, noise_images, write_clip_tokenizer
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.perception.models.encoders.images import CLIP_MEAN, CLIP_STD, ImageTransform, read_transform
@@ -46,9 +46,9 @@ def test_squash_stretches_both_sides_and_crops_nothing() -> None:
 def test_clip_images_are_prepared_as_transformers_prepares_them_to_the_bit() -> None:
     from transformers.models.clip.image_processing_pil_clip import CLIPImageProcessorPil
 
-    side = {"height": IMAGE_SIZE, "width": IMAGE_SIZE}
-    theirs = CLIPImageProcessorPil(size={"shortest_edge": IMAGE_SIZE}, crop_size=side)
-    ours = ImageTransform(IMAGE_SIZE, convention="transformers")
+    side = {"height": CLIP_PX, "width": CLIP_PX}
+    theirs = CLIPImageProcessorPil(size={"shortest_edge": CLIP_PX}, crop_size=side)
+    ours = ImageTransform(CLIP_PX, convention="transformers")
     random = np.random.default_rng(5)
     for _ in range(40):
         image = random.integers(0, 256, (*random.integers(1, 90, 2), 3), dtype=np.uint8)
@@ -60,8 +60,8 @@ def test_clip_images_are_prepared_as_transformers_prepares_them_to_the_bit() -> 
 def test_siglip_images_are_prepared_as_transformers_prepares_them_to_the_bit() -> None:
     from transformers.models.siglip.image_processing_pil_siglip import SiglipImageProcessorPil
 
-    theirs = SiglipImageProcessorPil(size={"height": IMAGE_SIZE, "width": IMAGE_SIZE})
-    ours = ImageTransform(IMAGE_SIZE, "squash", (0.5,) * 3, (0.5,) * 3, convention="transformers")
+    theirs = SiglipImageProcessorPil(size={"height": CLIP_PX, "width": CLIP_PX})
+    ours = ImageTransform(CLIP_PX, "squash", (0.5,) * 3, (0.5,) * 3, convention="transformers")
     for image in noise_images(5):
         answer = theirs(images=[image], return_tensors="np", input_data_format="channels_last")["pixel_values"]
         assert np.array_equal(ours.pixels([image]), answer), image.shape
@@ -75,8 +75,8 @@ def test_dividing_by_255_and_multiplying_by_its_inverse_give_the_same_float32() 
 
 def test_the_two_conventions_agree_where_the_windows_do() -> None:
     images = [image for image in noise_images(5) if image.shape[0] == image.shape[1]]
-    other = ImageTransform(IMAGE_SIZE, convention="transformers")
-    assert np.array_equal(ImageTransform(IMAGE_SIZE).pixels(images), other.pixels(images))
+    other = ImageTransform(CLIP_PX, convention="transformers")
+    assert np.array_equal(ImageTransform(CLIP_PX).pixels(images), other.pixels(images))
 
 
 def test_a_processor_file_of_either_age_gives_the_transform(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_models import IMAGE_PX, blocks, frame_of, tiny_sam
+from tiny_models import SAM_PX, blocks, frame_of, tiny_sam
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float32Array, UInt8Array
@@ -31,8 +31,8 @@ def sam() -> Sam:
 def processor() -> Any:
     from transformers.models.sam.image_processing_pil_sam import SamImageProcessorPil
 
-    side = {"height": IMAGE_PX, "width": IMAGE_PX}
-    return SamImageProcessorPil(size={"longest_edge": IMAGE_PX}, pad_size=side)
+    side = {"height": SAM_PX, "width": SAM_PX}
+    return SamImageProcessorPil(size={"longest_edge": SAM_PX}, pad_size=side)
 
 
 @pytest.mark.parametrize("size", [(40, 60), (61, 37), (64, 64), (200, 130)])
@@ -40,7 +40,7 @@ def test_the_image_goes_in_as_transformers_prepares_it(size: tuple[int, int]) ->
     seen: list[Float32Array] = []
 
     class Looking:
-        image_px = IMAGE_PX
+        image_px = SAM_PX
 
         def embed(self, pixels: Float32Array) -> Any:
             seen.append(pixels)
@@ -64,7 +64,7 @@ def transformers_masks(multiple: bool, **prompt: Any) -> tuple[BoolArray, Float3
     images = processor()
     inputs = images(RGB, return_tensors="pt")
     asked = {
-        name: torch.from_numpy(_normalize_coordinates(IMAGE_PX, values, (40, 60), name == "input_boxes")).float()[None]
+        name: torch.from_numpy(_normalize_coordinates(SAM_PX, values, (40, 60), name == "input_boxes")).float()[None]
         for name, values in prompt.items()
     }
     with torch.inference_mode():
@@ -121,7 +121,7 @@ def test_prompts_are_halved_where_the_memory_runs_out_and_stay_so(sam: Sam) -> N
     class Short:
         """SAM on a device that holds two prompts."""
 
-        image_px = IMAGE_PX
+        image_px = SAM_PX
 
         def embed(self, pixels: Float32Array) -> Any:
             return sam.network.embed(pixels)
@@ -197,7 +197,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> ModelFiles:
 
 def test_the_exported_network_gives_the_masks_of_torch(sam: Sam, exported: ModelFiles) -> None:
     other = Sam(sam_onnx.load_onnx_sam(exported))
-    assert other.network.image_px == IMAGE_PX
+    assert other.network.image_px == SAM_PX
     mine, theirs = sam.look(RGB), other.look(RGB)
     for is_single in (False, True):
         a, scores = sam.from_boxes(mine, BOXES, is_single)

@@ -123,9 +123,8 @@ def _completion(folder: Path) -> Read:
     from chat_server import KEY
     from test_language_client import ask
 
+    from su3d_bench.perception.language.client import Server, _Failed
     from su3d_bench.perception.language.config import LanguageConfig
-    from su3d_bench.perception.language.key_cleaning import Secret
-    from su3d_bench.perception.language.transport import GiveUp, Transport, TryAgain
 
     content = {
         "model": "made",
@@ -134,16 +133,16 @@ def _completion(folder: Path) -> Read:
     }
     path = folder / "answer.json"
     path.write_text(json.dumps(content))
-    transport, request = Transport(LanguageConfig()), ask("What is that?")
-    transport._secret = Secret(KEY)
+    server, request = Server(LanguageConfig()), ask("What is that?")
+    server._key = KEY
 
     def read() -> object:
-        text = path.read_bytes().decode("utf-8", "replace") if path.is_file() else ""
+        content = path.read_bytes() if path.is_file() else b""
         try:
-            said: object = transport._reply(request, text, ())
-        except (TryAgain, GiveUp) as failed:
-            said = failed  # the client asks again
-        if KEY.lower() in f"{said!r} {said}".lower():
+            said: object = server._reply(request, content, ())
+        except _Failed as failed:
+            said = failed
+        if KEY in f"{said!r} {said}":
             raise AssertionError(f"the key is kept: {said}")
         return said
 
