@@ -128,13 +128,6 @@ def test_their_features_count_where_the_run_has_the_encoder_and_the_crops_that_m
     assert unpadded.crop_features[:, 0].argmax(axis=1).tolist() == [7, 7]
 
 
-def test_the_digest_moves_with_the_files(tmp_path: Path) -> None:
-    write(tmp_path, detections())
-    before = perception(tmp_path, CountingEncoder()).digest
-    write(tmp_path, detections(confidence=np.array([0.96, 1, 0.9])))
-    assert perception(tmp_path, CountingEncoder()).digest != before
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -202,13 +195,3 @@ def test_a_file_that_asks_for_code_is_refused(tmp_path: Path) -> None:
     write(tmp_path, [1, 2])
     with pytest.raises(DataError, match="holds a list"):
         GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)
-
-
-def test_a_file_cut_short_is_one_line(tmp_path: Path) -> None:
-    small = detections(image_crops=[])
-    path = write(tmp_path, small)
-    content = path.read_bytes()
-    for cut in (0, 1, 10, len(content) // 2, len(content) - 1):
-        path.write_bytes(content[:cut])
-        with pytest.raises((DataError, PredictionError)):
-            GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from perception_fakes import CountingEncoder, still_life
 
-from su3d_bench.core.errors import ConfigError, DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
@@ -47,10 +47,6 @@ def perception(folder: Path, encoder: CountingEncoder, tmp_path: Path) -> Percep
     return build_perception("stored", config, scene=SCENE, cache_root=tmp_path, mesh=None, encoder=encoder)
 
 
-def test_the_file_of_a_frame_is_named_after_dataset_scene_and_index(tmp_path: Path) -> None:
-    assert stored_path(tmp_path, "replica", "room0", 40) == tmp_path / "replica.room0" / "frame000040.npz"
-
-
 def test_detections_come_back_as_they_were_written(tmp_path: Path) -> None:
     written(tmp_path, with_features=True)
     encoder = CountingEncoder()
@@ -86,16 +82,6 @@ def test_captions_default_to_the_template_and_background_is_left_out(tmp_path: P
     found = perception(tmp_path, CountingEncoder(), tmp_path).detect(still_life(40), needs, Timer())
     assert found.captions == ("an indoor-plant in a scene",)
     assert found.rows is not None and found.rows.tolist() == [1] and found.row_of(0) == 1
-
-
-def test_the_digest_moves_with_the_files(tmp_path: Path) -> None:
-    path = written(tmp_path, with_features=False)
-    before = perception(tmp_path, CountingEncoder(), tmp_path).digest
-    assert perception(tmp_path, CountingEncoder(), tmp_path).digest == before
-    arrays = dict(np.load(path))
-    arrays["scores"] = arrays["scores"] / 2
-    np.savez(path, allow_pickle=False, **arrays)
-    assert perception(tmp_path, CountingEncoder(), tmp_path).digest != before
 
 
 BAD: list[tuple[dict[str, Any], str]] = [
@@ -161,10 +147,3 @@ def test_pickled_objects_are_refused(tmp_path: Path) -> None:
     np.savez(path, **{**arrays, "names": np.array(["chair", None], object)})
     with pytest.raises(DataError, match="is not an npz file of plain arrays"):
         read_stored(path, still_life(40), CountingEncoder())
-
-
-def test_the_stored_profile_without_a_folder_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"perception\.stored\.folder is not set"):
-        build_perception(
-            "stored", PerceptionConfig(), scene=SCENE, cache_root=tmp_path, mesh=None, encoder=CountingEncoder()
-        )

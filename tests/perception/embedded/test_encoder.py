@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +13,6 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.errors import DataError, ModelMissing
-from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import UInt8Array
 from su3d_bench.perception.embedded import encoder as embedded_encoder
 from su3d_bench.perception.embedded.encoder import (
@@ -43,10 +41,6 @@ def images() -> list[UInt8Array]:
     return [rng.integers(0, 256, (*size, 3), dtype=np.uint8) for size in sizes]
 
 
-def test_it_is_an_encoder(encoder: EmbeddedEncoder) -> None:
-    assert isinstance(encoder, Encoder)
-
-
 def test_features_are_unit_float32_of_the_documented_shape(encoder: EmbeddedEncoder, images: list[UInt8Array]) -> None:
     for features, n in ((encoder.encode_images(images), len(images)), (encoder.encode_texts(TEXTS), len(TEXTS))):
         assert features.shape == (n, DIM)
@@ -63,13 +57,6 @@ def test_a_feature_does_not_depend_on_its_batch(encoder: EmbeddedEncoder, images
     assert np.array_equal(encoder.encode_images(images[::-1])[::-1], together)
     texts = encoder.encode_texts(TEXTS)
     assert np.array_equal(np.concatenate([encoder.encode_texts([text]) for text in TEXTS]), texts)
-
-
-def test_another_session_gives_the_same_bits(encoder: EmbeddedEncoder, images: list[UInt8Array]) -> None:
-    other = EmbeddedEncoder()
-    assert np.array_equal(other.encode_images(images), encoder.encode_images(images))
-    assert np.array_equal(other.encode_texts(TEXTS), encoder.encode_texts(TEXTS))
-    assert other.digest == encoder.digest
 
 
 def test_apparent_size_is_kept(encoder: EmbeddedEncoder) -> None:
@@ -108,14 +95,6 @@ def test_a_wrong_image_is_an_error(encoder: EmbeddedEncoder) -> None:
         encoder.encode_images([np.zeros((4, 4), np.uint8)])
     with pytest.raises(DataError, match="not empty"):
         encoder.encode_images([np.zeros((0, 4, 3), np.uint8)])
-
-
-def test_digest_moves_with_either_tower(encoder: EmbeddedEncoder, tmp_path: Path) -> None:
-    for name in (IMAGE_FILE, TEXT_FILE):
-        shutil.copy(FOLDER / name, tmp_path / name)
-    assert EmbeddedEncoder(tmp_path).digest == encoder.digest
-    shutil.copy(FOLDER / TEXT_FILE, tmp_path / IMAGE_FILE)
-    assert EmbeddedEncoder(tmp_path).digest != encoder.digest
 
 
 def test_model_card_describes_the_shipped_files(encoder: EmbeddedEncoder) -> None:

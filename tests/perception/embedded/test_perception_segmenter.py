@@ -85,16 +85,6 @@ def test_a_box_of_the_table_s_colour_is_found_by_shape() -> None:
     assert best_iou(objects(frame), ids == LEFT) > 0.8
 
 
-def test_a_box_on_a_box_is_a_region_of_its_own() -> None:
-    boxes: dict[int, Box] = {
-        LEFT: ((-0.25, 0.6, 0.0), (0.25, 1.0, 0.15)),
-        RIGHT: ((-0.08, 0.72, 0.15), (0.08, 0.88, 0.25)),
-    }
-    frame, ids = view(boxes, {TABLE: GREY, LEFT: RED, RIGHT: BLUE})
-    regions = objects(frame)
-    assert best_iou(regions, ids == LEFT) > 0.85 and best_iou(regions, ids == RIGHT) > 0.85
-
-
 def test_coplanar_regions_are_told_apart_by_colour() -> None:
     frame = still_life()
     picture = np.zeros(frame.depth_m.shape, bool)
@@ -107,16 +97,6 @@ def test_the_wall_is_no_object_but_a_part() -> None:
     wall = (frame.depth_m == 3.0) & (frame.rgb[..., 0] == 205)
     assert best_iou(objects(frame), wall) < 0.1
     assert best_iou(RgbdSegmenter(SegmenterConfig(), "parts").segment(frame), wall) > 0.9
-
-
-def test_a_region_of_ten_by_ten_pixels_is_kept() -> None:
-    frame = still_life()
-    patch = np.s_[95:105, 20:30]
-    frame.rgb[patch] = 240, 200, 40
-    frame.depth_m[patch] = 2.95
-    truth = np.zeros(frame.depth_m.shape, bool)
-    truth[patch] = True
-    assert best_iou(objects(frame, min_region_px=60), truth) > 0.6
 
 
 def test_a_small_patch_flush_with_the_wall_is_its_pattern_and_a_large_one_an_object() -> None:
@@ -163,36 +143,8 @@ def test_masks_do_not_overlap_boxes_fit_and_scores_are_shares() -> None:
             assert (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1) == (x0, y0, x1, y1)
 
 
-def test_the_same_frame_gives_the_same_bytes() -> None:
-    frame, _ = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE})
-    first, second = objects(frame), objects(frame)
-    assert first.masks.tobytes() == second.masks.tobytes() and first.scores.tobytes() == second.scores.tobytes()
-
-
 def test_wide_frames_are_segmented_at_a_fraction_of_their_size() -> None:
     frame, ids = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE})
     regions = objects(frame, max_width=160, min_region_px=60)
     assert regions.masks.shape[1:] == (HEIGHT, WIDTH)
     assert best_iou(regions, ids == LEFT) > 0.8
-
-
-def test_sizes_that_no_fraction_divides_are_covered() -> None:
-    frame, _ = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE})
-    odd = Frame(0, 0.0, frame.rgb[:239, :317].copy(), frame.depth_m[:239, :317].copy(), np.eye(4), K)
-    parts = RgbdSegmenter(SegmenterConfig(max_width=160, min_region_px=1), "parts").segment(odd)
-    assert parts.masks.any(axis=0).all()
-
-
-def test_parameters_and_level_move_the_digest() -> None:
-    configs = [SegmenterConfig(), SegmenterConfig(min_region_px=99)]
-    digests = {RgbdSegmenter(c, level).digest for c in configs for level in ("objects", "parts")}
-    assert len(digests) == 4
-
-
-def test_coarser_parameters_give_fewer_regions() -> None:
-    frame, _ = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE}, noise=40)
-    fine, coarse = (
-        RgbdSegmenter(SegmenterConfig(min_region_px=20, superpixel_scale=scale, parts_caution=caution), "parts")
-        for scale, caution in ((2, 9), (60, 0))
-    )
-    assert len(fine.segment(frame).boxes) > len(coarse.segment(frame).boxes)

@@ -21,7 +21,7 @@ from su3d_bench.perception.language.parsing import Described, answered, chosen_n
 from su3d_bench.questions.refining.refined_names import read_records, records_of, write_records
 from su3d_bench.questions.refining.refinement import ModelRefiner, TopNames, top_names, vote
 from su3d_bench.questions.undesired import FilterConfig
-from su3d_bench.store.predictions import prediction_arrays, prediction_from_arrays, write_prediction
+from su3d_bench.store.predictions import write_prediction
 from su3d_bench.store.run_folder import JobFolder
 
 NAMES = ("white sofa", "sofa", "couch", "trash can", "indoor-plant")
@@ -165,13 +165,6 @@ def test_where_the_model_refuses_the_tagger_s_name_stands(
     assert [record.getMessage().partition("was: ")[2] for record in caplog.records] == [reason]
 
 
-def test_a_name_without_a_description_gets_the_simple_caption() -> None:
-    crop = np.zeros((8, 8, 3), np.uint8)
-    assert (
-        Captioner(Spoken("umbrella"), LanguageConfig()).captions([crop], ["x"])[0].caption == "an umbrella in a scene"
-    )
-
-
 def seen() -> Instances:
     """Two instances: one seen as a sofa once and as a couch twice, one never named."""
     made = instances(np.zeros((2, 3), np.float32), [np.array([0]), np.array([1])], None)
@@ -210,19 +203,6 @@ def test_the_model_refines_with_the_paper_s_prompt_and_n_stays_where_it_does_not
     assert len(model.requests) == 1
     refused = ModelRefiner(Spoken("I'm sorry, I can't."), LanguageConfig()).refine(top_names(seen(), 3))[0]
     assert (refused.name, refused.source, refused.reason) == ("sofa", "label", "the model refused")
-
-
-def test_a_map_keeps_the_names_of_its_views_on_disk() -> None:
-    back = prediction_from_arrays(prediction_arrays(seen()), "here")
-    assert isinstance(back, Instances)
-    assert back.view_names == seen().view_names
-    assert back.view_scores is not None
-    assert back.view_scores.tolist() == [0.5, 0.9, 0.5, 0.1, 0.8]
-    without = prediction_arrays(replace(seen(), view_names=None, view_scores=None))
-    assert "view_names" not in without
-    assert prediction_from_arrays(without, "here").view_names is None  # type: ignore[union-attr]
-    with pytest.raises(PredictionError, match="5 views and 1 names"):
-        replace(seen(), view_names=("sofa",))
 
 
 def test_labels_n_prime_belong_to_one_map(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 from tiny_models import CLIP_PX, N_TOKENS, needs_models, noise_images, write_clip_tokenizer
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.perception.models.encoders.images import CLIP_MEAN, CLIP_STD, ImageTransform, read_transform
+from su3d_bench.perception.models.encoders.images import ImageTransform, read_transform
 from su3d_bench.perception.models.encoders.texts import canonical_text
 
 
@@ -24,22 +24,6 @@ def test_the_window_of_the_centre_crop_is_rounded_as_each_library_does() -> None
     other = ImageTransform(4, convention="transformers", **plain).pixels([image])  # type: ignore[arg-type]
     assert np.array_equal(np.rint(original[0, 0, 0] * 255), [20, 30, 40, 50])
     assert np.array_equal(np.rint(other[0, 0, 0] * 255), [10, 20, 30, 40])
-
-
-def test_pixels_are_divided_by_255_then_normalised_in_float32() -> None:
-    image = np.full((4, 4, 3), 200, np.uint8)
-    expected = (np.float32(200) / np.float32(255) - np.float32(CLIP_MEAN[1])) / np.float32(CLIP_STD[1])
-    pixels = ImageTransform(4).pixels([image])
-    assert pixels.dtype == np.float32
-    assert (pixels[0, 1] == expected).all()
-
-
-def test_squash_stretches_both_sides_and_crops_nothing() -> None:
-    image = np.zeros((8, 32, 3), np.uint8)
-    image[:, :16] = 255
-    pixels = ImageTransform(8, "squash", (0.5,) * 3, (0.5,) * 3).pixels([image])
-    assert (pixels[0, 0, :, :3] == 1).all()
-    assert (pixels[0, 0, :, 5:] == -1).all()
 
 
 @needs_models
@@ -67,18 +51,6 @@ def test_siglip_images_are_prepared_as_transformers_prepares_them_to_the_bit() -
         assert np.array_equal(ours.pixels([image]), answer), image.shape
 
 
-def test_dividing_by_255_and_multiplying_by_its_inverse_give_the_same_float32() -> None:
-    values = np.arange(256, dtype=np.uint8)
-    multiplied = (values.astype(np.float64) * (1 / 255)).astype(np.float32)
-    assert np.array_equal(values.astype(np.float32) / np.float32(255), multiplied)
-
-
-def test_the_two_conventions_agree_where_the_windows_do() -> None:
-    images = [image for image in noise_images(5) if image.shape[0] == image.shape[1]]
-    other = ImageTransform(CLIP_PX, convention="transformers")
-    assert np.array_equal(ImageTransform(CLIP_PX).pixels(images), other.pixels(images))
-
-
 def test_a_processor_file_of_either_age_gives_the_transform(tmp_path: Path) -> None:
     path = tmp_path / "preprocessor_config.json"
     usual = {"image_mean": [0.1, 0.2, 0.3], "image_std": [1, 2, 3], "resample": 3}
@@ -100,12 +72,12 @@ def test_a_processor_file_of_either_age_gives_the_transform(tmp_path: Path) -> N
         ({"size": {"longest_edge": 9}}, "expected a shortest edge"),
         ({"crop_size": 100}, "expected a shortest edge"),
         ({"size": 10**9, "crop_size": 10**9}, "expected a shortest edge"),
-        ({"image_std": [0, 1, 1]}, "above 0"),
-        ({"image_mean": ["a", 1, 1]}, "expected three numbers"),
-        ({"image_mean": [10**400, 1, 1]}, "expected three numbers"),
-        ({"image_std": [1, float("nan"), 1]}, "expected three numbers"),
+        ({"image_std": [0, 1, 1]}, r"std\.0 is 0"),
+        ({"image_mean": ["a", 1, 1]}, r"mean\.0 is a"),
+        ({"image_mean": [10**400, 1, 1]}, r"mean\.0 is "),
+        ({"image_std": [1, float("nan"), 1]}, r"std\.1 is nan"),
         ({"rescale_factor": 10**400}, "rescale_factor is 1000"),
-        ({"resample": "cubic"}, "0 to 5"),
+        ({"resample": "cubic"}, "resample is cubic"),
     ],
 )
 def test_a_processor_file_that_asks_for_another_recipe_is_refused(

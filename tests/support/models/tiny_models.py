@@ -318,3 +318,103 @@ def write_tagger(folder: Path, tags: Sequence[str], seed: int = 0) -> Path:
     (folder / RAM_FILE).write_bytes(model.SerializeToString())
     (folder / RAM_TAG_LIST).write_text("\n".join(tags) + "\n")
     return folder
+
+
+# ---- RAM++ before it is exported: files by the names and with the interface of recognize-anything, all ours
+
+TINY_TAGS = ("armchair", "bed", "café table", "lamp", "3D glasses")
+_THRESHOLDS = (0.5, 0.5, 0.5, 1.0, 0.0)  # one that nothing reaches, one that everything does
+_RAM_PLUS = """
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy import interpolate
+from timm.models.layers import DropPath, to_2tuple, trunc_normal_
+from torch import nn
+
+from .vit import VisionTransformer
+
+
+def lines(name):
+    return (Path(__file__).parents[1] / "data" / f"{name}.txt").read_text(encoding="utf-8").splitlines()
+
+
+class Head(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.asks = nn.Linear(8, 8)
+
+    def forward(self, encoder_embeds, encoder_hidden_states, encoder_attention_mask, return_dict, mode):
+        likeness = self.asks(encoder_embeds) @ encoder_hidden_states.transpose(1, 2)
+        return (encoder_embeds + torch.softmax(likeness, dim=-1) @ encoder_hidden_states,)
+
+
+class Seeing(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.parts, self.drop = nn.Conv2d(3, 6, to_2tuple(96), 96), DropPath(0.9)
+
+    def forward(self, image):
+        parts = self.drop(self.parts(image).flatten(2).transpose(1, 2))
+        return torch.cat([parts.mean(dim=1, keepdim=True), parts], dim=1)
+
+
+class Network(nn.Module):
+    def __init__(self):
+        super().__init__()
+        assert len(init_tokenizer("bert-base-uncased")) == 30524
+        self.visual_encoder, self.image_proj = Seeing(), nn.Linear(6, 8)
+        self.tag_list = np.array(lines("ram_tag_list"))
+        self.class_threshold = torch.tensor([float(line) for line in lines("ram_tag_list_threshold")])
+        self.label_embed = nn.Parameter(torch.zeros(3 * len(self.tag_list), 8))
+        self.reweight_scale = nn.Parameter(torch.ones([]))
+        self.wordvec_proj, self.tagging_head, self.fc = nn.Linear(8, 8), Head(), nn.Linear(8, 1)
+        self.register_buffer("relative_position_index", torch.arange(4))
+
+    def generate_tag(self, image):
+        seen = self.image_proj(self.visual_encoder(image))
+        whole = seen[:, 0] / seen[:, 0].norm(dim=-1, keepdim=True)
+        likeness = (self.reweight_scale.exp() * whole @ self.label_embed.t()).view(len(self.tag_list), -1)
+        table = self.label_embed.view(len(self.tag_list), -1, 8)
+        labels = (torch.softmax(likeness, dim=1)[..., None] * table).sum(dim=1)
+        found = self.tagging_head(torch.relu(self.wordvec_proj(labels))[None], seen, None, False, "tagging")
+        holds = (torch.sigmoid(self.fc(found[0]).squeeze(-1)) > self.class_threshold)[0].numpy()
+        return [" | ".join(self.tag_list[holds])], [""]
+
+
+def ram_plus(pretrained="", image_size=0, vit=""):
+    return Network()
+"""
+
+
+def write_ram_checkout(folder: Path) -> Path:
+    """A checkout in ``folder`` around a network of a few hundred weights; the file of its weights.
+
+    The head has its older name there, and a buffer is of another window, as in the published file.
+    """
+    import torch
+
+    names = ["models/bert.py", "models/swin_transformer.py", "models/utils.py", "configs/q2l_config.json"]
+    files = dict.fromkeys([*names, "configs/swin/config_swinL_384.json", "data/ram_tag_list_chinese.txt"], "")
+    files["models/__init__.py"] = files["__init__.py"] = "raise ImportError('needs torchvision')"
+    files["models/ram_plus.py"] = _RAM_PLUS
+    files["data/ram_tag_list.txt"] = "\n".join(TINY_TAGS)
+    files["data/ram_tag_list_threshold.txt"] = "\n".join(map(str, _THRESHOLDS))
+    for name, text in files.items():
+        place = folder / "ram" / name
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_text(text, encoding="utf-8")
+    random = torch.Generator().manual_seed(3)
+    shapes = {
+        "visual_encoder.parts.weight": (6, 3, 96, 96), "visual_encoder.parts.bias": (6,), "image_proj.weight": (8, 6),
+        "image_proj.bias": (8,), "label_embed": (15, 8), "reweight_scale": (), "wordvec_proj.weight": (8, 8),
+        "wordvec_proj.bias": (8,), "vision_multi.asks.weight": (8, 8), "vision_multi.asks.bias": (8,),
+        "fc.weight": (1, 8), "fc.bias": (1,),
+    }  # fmt: skip
+    drawn = {name: torch.randn(shape, generator=random) for name, shape in shapes.items()}
+    drawn["visual_encoder.parts.weight"] /= 100
+    drawn["fc.weight"] /= 50  # a sigmoid of less than float32 holds is another with every runtime
+    weights = folder / "ram_plus_swin_large_14m.pth"
+    torch.save({"model": {**drawn, "layers.0.attn.relative_position_index": torch.arange(9)}, "epoch": 4}, weights)
+    return weights
