@@ -28,7 +28,7 @@ import numpy as np
 from export_onnx import export_encoder
 from measured import write_measured
 from numpy.typing import NDArray
-from tiny_models import DINO_PX, IMAGE_PX, blocks, noise_images, tiny_dino, tiny_sam, tiny_tokenizer, write_tiny_clip
+from tiny_models import DINO_PX, SAM_PX, blocks, noise_images, tiny_dino, tiny_sam, tiny_tokenizer, write_tiny_clip
 from torch_devices import TORCH_ON_CPU
 
 from su3d_bench.cli.main import main as command_line
@@ -184,7 +184,7 @@ def networks(folder: Path) -> Iterator[Comparison]:
         pixels = detector.pixels(rgb)
         return lambda: detector.answer(pixels, "cat. coffee table. lamp.")[:2]
 
-    yield Comparison(f"SAM ({IMAGE_PX} px) by torch, masks of 3 boxes", sam, 0.01, is_share=True)
+    yield Comparison(f"SAM ({SAM_PX} px) by torch, masks of 3 boxes", sam, 0.01, is_share=True)
     yield Comparison("GroundingDINO by torch, probabilities and boxes", dino, 1e-3)
 
 

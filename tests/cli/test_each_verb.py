@@ -79,7 +79,6 @@ CASES: dict[str, tuple[list[str], int, str]] = {
     "methods": (["opensu3d"], 0, "opensu3d"),
     "models list": ([], 0, "clip-vit-h-14"),
     "models check": (["clip-vit-h-14"], 1, "clip-vit-h-14"),
-    "models export": (["clip-vit-h-14", "--out", "exported"], 2, "clip-vit-h-14"),
     "models warm": (["--profile", "embedded"], 0, ""),
     "fetch models": (["sam-vit-h", "--dry-run"], 0, "sam_vit_h_4b8939.pth"),
     "fetch replica": (["frames", "--dry-run"], 0, "Replica.zip"),

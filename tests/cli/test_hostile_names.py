@@ -82,7 +82,6 @@ CASES: dict[str, list[list[str]]] = {
     "methods": [["hostile.py:Loud"], ["hostile.py:Loud", "--json"]],
     "models list": [["--set", f"perception.models.folder={HOSTILE}"]],
     "models check": [[HOSTILE]],
-    "models export": [[HOSTILE, "--out", "out/model"]],
     "models warm": [["--profile", HOSTILE]],
     "fetch models": [[HOSTILE], ["sam-vit-h", "--mirror", f"sam-vit-h={HOSTILE}"], ["sam-vit-h", "--accept", HOSTILE]],
     "fetch replica": [[HOSTILE], ["--dry-run", "--sources", HOSTILE]],

@@ -25,7 +25,8 @@ ENCODER = {
     "files": {"image.onnx": "0" * 64, "text.onnx": "1" * 64},
 }  # fmt: skip
 SEGMENTER = {
-    "format": SamManifest.FORMAT, "name": "sam-vit-h", "image_px": 64, "files": {"encoder.onnx": "0" * 64, "decoder.onnx": "1" * 64},
+    "format": SamManifest.FORMAT, "name": "sam-vit-h", "image_px": 64,
+    "files": {"encoder.onnx": "0" * 64, "decoder.onnx": "1" * 64},
 }  # fmt: skip
 CONFIG = {
     "model_type": "siglip", "vision_config": {"image_size": 32, "patch_size": 8, "hidden_size": 32},
@@ -87,5 +88,5 @@ def test_damaged_settings_are_read_or_refused_in_one_line(
     whole = json.dumps(content).encode()
     assert outcomes(reading, iter([whole]), must_name="") == (1, 0)
     for copies in (damages(whole, 40), values_replaced(content)):
-        n_read, n_refused = outcomes(reading, copies, must_name=str(tmp_path))
+        _, n_refused = outcomes(reading, copies, must_name=str(tmp_path))
         assert n_refused > 10

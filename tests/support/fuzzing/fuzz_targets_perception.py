@@ -176,10 +176,12 @@ TARGETS = (
     Target("names.toml", _names("names.toml"), ("names.toml",)),
     Target("names.json", _names("names.json"), ("names.json",)),
     Target("word list", _words, ("words.txt",)),
-    Target("encoder manifest", _model_settings("manifest.json", lambda one: (one.ENCODER, one.read_manifest)), ("*",)),
     Target(
-        "sam manifest", _model_settings("manifest.json", lambda one: (one.SEGMENTER, one.read_sam_manifest)), ("*",)
+        "encoder manifest",
+        _model_settings("manifest.json", lambda one: (one.ENCODER, one.EncoderManifest.read)),
+        ("*",),
     ),
+    Target("sam manifest", _model_settings("manifest.json", lambda one: (one.SEGMENTER, one.SamManifest.read)), ("*",)),
     Target(
         "model config", _model_settings("config.json", lambda one: (one.CONFIG, one.encoder_spec)), ("config.json",)
     ),

@@ -34,6 +34,15 @@ def write_models(root: Path) -> Path:
     return root
 
 
+def write_fetched(root: Path) -> Path:
+    """Tiny networks in the folders of the models that are fetched for the papers, RAM++ as its export."""
+    write_models(root)
+    for name, seed in (("clip-vit-h-14", 14), ("clip-vit-l-14-336", 336)):
+        write_tiny_clip(root / name, seed, n_tokens=77)  # as published, so that no text is cut
+    write_tagger(root / "ram-plus-onnx", [word for word in DINO_WORDS if word.isalpha() and len(word) > 1])
+    return root
+
+
 def paper_words(models: Path, out: Path, scene: str, settings: Sequence[str] = (), *words: str) -> list[str]:
     """``su3d-bench run --profile paper`` on the models of ``write_models``, over two small images of a scene."""
     lenient = [f"models.folder={models}", "models.encoder=embedded", "paper.n_tags=6"]
