@@ -51,12 +51,6 @@ def test_the_pose_moves_the_masks() -> None:
     assert np.array_equal(image, np.roll(expected_square(), -10, axis=1))
 
 
-def test_a_surface_that_the_sensor_did_not_see_gives_no_pixel() -> None:
-    projector = MeshProjector(quad_mesh(SQUARE, WALL, instance=[1, 2]), OracleConfig(fill_px=0))
-    image = projector.instance_image(flat_frame(2.0))
-    assert not (image == 1).any() and (image[20:50, 30:70] == 0).all() and (image == 2).sum() == 120 * 160 - 1200
-
-
 @pytest.mark.parametrize(("offset_m", "is_kept"), [(0.04, True), (0.06, False)])
 def test_depth_may_differ_by_less_than_the_tolerance(offset_m: float, is_kept: bool) -> None:
     projector = MeshProjector(quad_mesh(WALL, instance=[2]), OracleConfig(depth_tolerance_m=0.05))
@@ -117,15 +111,6 @@ def test_features_are_those_of_the_class_names_at_every_ratio(tmp_path: Path) ->
     assert np.allclose(found.global_feature, mean / np.linalg.norm(mean), atol=1e-6)
     assert encoder.n_images == 0
     assert perception.caveat is not None and "ground truth" in perception.caveat
-
-
-def test_cached_oracle_regions_keep_their_names(tmp_path: Path) -> None:
-    mesh = quad_mesh(SQUARE, WALL, instance=[1, 3])
-    for _ in range(2):
-        perception = build_perception(
-            "oracle", PerceptionConfig(), scene=SCENE, cache_root=tmp_path, mesh=mesh, encoder=CountingEncoder()
-        )
-        assert perception.detect(square_frame(), PerceptionNeeds(), Timer()).names == ("chair", "cup")
 
 
 def noisy(index: int = 0, **values: float) -> tuple[list[np.typing.NDArray[np.bool_]], list[str]]:

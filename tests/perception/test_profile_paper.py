@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from places import REAL_RECORDINGS, needs_recordings
 from tiny_models import blocks, frame_of, paper_words, write_models
 
 from su3d_bench.cli.main import main
 from su3d_bench.core import registry
-from su3d_bench.core.config import write_toml
-from su3d_bench.core.errors import ConfigError, ModelMissing
+from su3d_bench.core.errors import ModelMissing
 from su3d_bench.core.files.atomic import read_json
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.system.timing import Timer
@@ -82,19 +79,6 @@ def test_named_regions_come_with_features_of_their_crops(models: Path, tmp_path:
     np.testing.assert_array_equal(found.boxes[:, [1, 3]], [[row[0], row[-1] + 1] for row in rows])
 
 
-def test_a_method_gets_the_settings_of_its_own_program(models: Path, tmp_path: Path) -> None:
-    perception = built(config_of(models), tmp_path)
-    strict = perception.detect(FRAME, PerceptionNeeds(masks="class-agnostic", automatic="conceptgraphs"), Timer())
-    assert len(strict) == 0, "random masks are not stable"
-    tags = perception.detect(FRAME, PerceptionNeeds(grounding="conceptgraphs"), Timer())
-    known = {"other item", "wall", "floor", "ceiling", *config_words()}
-    assert set(tags.names) <= known
-    whole = perception.detect(FRAME, PerceptionNeeds(grounding="conceptgraphs-whole-tags"), Timer())
-    assert len(whole) <= len(tags) and set(whole.names) <= known
-    with pytest.raises(ConfigError, match=r"class-agnostic masks 'conceptgraph', there are none; did you mean"):
-        perception.detect(FRAME, PerceptionNeeds(masks="class-agnostic", automatic="conceptgraph"), Timer())
-
-
 @pytest.mark.parametrize(
     ("method", "asked"),
     [
@@ -137,12 +121,6 @@ def test_each_methods_published_mask_settings_reach_the_models(
     assert {key: found["boxes"][key] for key in inner} == inner
 
 
-def config_words() -> tuple[str, ...]:
-    from su3d_bench.perception.embedded.naming import vocabulary
-
-    return vocabulary()
-
-
 def test_the_same_frame_gives_the_same_bytes_from_models_and_from_the_cache(models: Path, tmp_path: Path) -> None:
     config, needs = config_of(models), PerceptionNeeds()
     uncached = config.model_copy(update={"cache": False})
@@ -151,20 +129,6 @@ def test_the_same_frame_gives_the_same_bytes_from_models_and_from_the_cache(mode
         for name in ("masks", "boxes", "scores", "crop_features", "global_feature"):
             assert getattr(answer, name).tobytes() == getattr(answers[0], name).tobytes(), name
         assert answer.names == answers[0].names
-
-
-def test_a_cached_frame_needs_no_network(models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = config_of(models)
-    first = built(config, tmp_path).detect(FRAME, PerceptionNeeds(), Timer())
-    from su3d_bench.perception.models import loading
-
-    def refuse(*_: Any) -> Any:
-        raise AssertionError("a network was loaded")
-
-    monkeypatch.setattr(loading, "load_sam", refuse)
-    monkeypatch.setattr(loading, "load_grounding_dino", refuse)
-    again = built(config, tmp_path).detect(FRAME, PerceptionNeeds(), Timer())
-    assert again.masks.tobytes() == first.masks.tobytes()
 
 
 def test_the_profile_says_what_it_computes_otherwise_than_the_paper_and_nothing_else() -> None:
@@ -231,23 +195,3 @@ def test_a_room_runs_end_to_end(
         sealed = read_json(next((tmp_path / "out").glob(f"scenes/*/{method}/done.json")))
         assert {"packages.torch", "packages.transformers"} <= sealed["steps"]["predict"]["key"].keys()
     assert "RAM++ is not here" in str(read_json(tmp_path / "out" / "metrics.json"))
-
-
-@needs_recordings
-def test_real_frames_run_end_to_end(models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = tmp_path / "data" / "rgbd" / "chair"
-    folder.mkdir(parents=True)
-    keys = {
-        "folder": os.path.relpath(REAL_RECORDINGS.resolve() / "open3d_rgbd", folder),
-        "colour": "color/{index}.jpg",
-        "depth": "depth/{index}.png",
-        "trajectory": "trajectory.log",
-        "intrinsics_file": "camera_primesense.json",
-        "depth_unit_m": 1e-3,
-    }
-    (folder / "rgbd.toml").write_text(write_toml([((key,), value, "") for key, value in keys.items()]))
-    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
-    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
-    assert main(paper_words(models, tmp_path / "out", "rgbd/chair", (), "--stride", "1")) == 0
-    found = read_prediction(next((tmp_path / "out").glob("scenes/*/opensu3d/prediction.npz")))
-    assert isinstance(found, Instances) and len(found) > 0

@@ -97,13 +97,6 @@ def test_safetensors_are_preferred_and_two_files_of_words_serve_for_one(home: Pa
         locate("clip-vit-b-32")
 
 
-def test_a_form_that_is_not_read_does_not_count_as_found(home: Path) -> None:
-    fill(home / "models", ("groundingdino_swint_ogc.pth",))
-    with pytest.raises(ModelMissing, match="fetch models grounding-dino"):
-        locate("grounding-dino")
-    assert locate("grounding-dino", ("original",)).folder == home / "models"
-
-
 def test_a_configured_path_is_used_and_nothing_beside_it(home: Path) -> None:
     fill(home / "models" / "clip-vit-b-32")
     mine = fill(home / "mine")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import pickle
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +12,14 @@ import numpy as np
 import pytest
 from tiny_models import needs_models, noise_images, write_tiny_clip, write_tiny_siglip
 
-from su3d_bench.core.errors import ConfigError, DataError, ModelMissing
+from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import Float32Array, Int64Array
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.models.config import ModelsConfig
-from su3d_bench.perception.models.encoders import towers
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec, FoundationEncoder, unit_rows
 from su3d_bench.perception.models.encoders.images import ImageTransform
-from su3d_bench.perception.models.files import ModelFiles, read_weights
+from su3d_bench.perception.models.files import read_weights
 from su3d_bench.perception.models.loading import load_encoder
 
 TEXTS = ("chair", "a red cup on the table", "chair", "zebra")
@@ -81,25 +79,6 @@ def test_a_feature_does_not_depend_on_the_rest_of_its_batch(folder: Path, name: 
     assert np.abs(batched - together).max() < 1e-5
     assert encoder.encode_images([]).shape == (0, encoder.dim)
     assert encoder.encode_texts([]).shape == (0, encoder.dim)
-
-
-@needs_models
-def test_the_older_form_of_weights_gives_the_same_features(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # A product of matrices rounds by where its factors lie in memory, and one of the two forms is mapped from its file.
-    load_model = towers.load_transformers
-
-    def aligned(files: ModelFiles) -> Any:
-        model = load_model(files)
-        for weights in model.parameters():
-            weights.data = weights.data.clone()
-        return model
-
-    monkeypatch.setattr(towers, "load_transformers", aligned)
-    write_tiny_clip(tmp_path / "clip-vit-h-14", weights="pytorch_model.bin")
-    older, newer = load_encoder(config(tmp_path)), load_encoder(config(folder))
-    assert np.array_equal(older.encode_images(noise_images(2)), newer.encode_images(noise_images(2)))
 
 
 @needs_models
@@ -226,31 +205,3 @@ def test_a_configuration_without_sense_is_refused_before_anything_is_made(
     (target / "config.json").write_text(json.dumps(content | change))
     with pytest.raises(DataError, match=said):
         load_encoder(config(tmp_path))
-
-
-@needs_models
-def test_a_damaged_tokenizer_is_one_line(folder: Path, tmp_path: Path) -> None:
-    for name, file in (("clip-vit-h-14", "vocab.json"), ("siglip-base-224", "tokenizer.json")):
-        target = tmp_path / name
-        shutil.copytree(folder / name, target)
-        (target / file).write_text("{}")
-        with pytest.raises(DataError, match="tokenizer"):
-            load_encoder(config(tmp_path, name)).encode_texts(["chair"])
-
-
-def test_a_setting_that_would_do_nothing_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="the embedded encoder has its own"):
-        load_encoder(ModelsConfig(runtime="onnx"))
-    with pytest.raises(ValueError, match="provider belongs to runtime"):
-        ModelsConfig(provider="cpu")
-    with pytest.raises(ValueError, match="does not run on device"):
-        ModelsConfig(runtime="onnx", provider="cuda")
-    with pytest.raises(ValueError, match="exported encoders are float32"):
-        ModelsConfig(runtime="onnx", precision="float16")
-
-
-@needs_models
-def test_without_transformers_one_line_names_the_extra(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(ModelMissing, match=r"needs the package 'transformers': pip install 'su3d-bench\[models\]'"):
-        load_encoder(config(folder))

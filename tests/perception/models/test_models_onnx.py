@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from tiny_models import SAM_PX, TINY_TAGS, blocks, noise_images, tiny_sam, write_ram_checkout, write_tiny_clip
+from tiny_models import SAM_PX, blocks, noise_images, tiny_sam, write_tiny_clip
 
 from su3d_bench.core.errors import ConfigError, DataError, ModelMissing
-from su3d_bench.perception.models.config import ModelsConfig, PaperConfig
+from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.encoders.towers import EncoderManifest
 from su3d_bench.perception.models.files import locate
-from su3d_bench.perception.models.loading import _tagger, load_encoder
+from su3d_bench.perception.models.loading import load_encoder
 from su3d_bench.perception.models.masks.sam import Prompts, Sam, TorchSam, load_onnx_sam
-from su3d_bench.perception.models.masks.tagging import OnnxRamTagger
 from su3d_bench.perception.models.onnx import Provider, open_session
 
 if any(find_spec(name) is None for name in ("torch", "transformers", "onnx")):
@@ -132,24 +130,6 @@ def test_the_folder_of_another_encoder_and_one_that_was_not_exported_are_one_lin
         load_encoder(other)
     with pytest.raises(ModelMissing, match=r"python tools/export_onnx\.py clip-vit-b-32 --out"):
         load_encoder(ModelsConfig(encoder="clip-vit-b-32", folder=folder, runtime="onnx"))
-
-
-def test_ram_plus_is_exported_by_its_authors_code_and_tags_by_each_tags_threshold(tmp_path: Path) -> None:
-    weights = write_ram_checkout(tmp_path / "checkout")
-    words = ["ram-plus", "--weights", str(weights), "--checkout", str(tmp_path / "checkout"), "--python"]
-    out = tmp_path / "ram-plus-onnx"
-    assert export_onnx.main([*words, sys.executable, "--out", str(out)]) == 0
-    assert {file.name for file in out.iterdir()} == {"ram_plus.onnx", "ram_tag_list.txt", "manifest.json"}
-    tagger = _tagger(PaperConfig(tagger="ram-onnx"), ModelsConfig(folder=tmp_path), None, "cpu")  # type: ignore[arg-type]
-    assert isinstance(tagger, OnnxRamTagger)
-    tags = tagger.tags(blocks(60, 80))
-    assert "3D glasses" in tags and "lamp" not in tags, "thresholds of 0 and 1"
-    (out / "ram_tag_list.txt").write_text("\n".join(reversed(TINY_TAGS)))
-    with pytest.raises(DataError, match=r"ram_tag_list\.txt: is not the file that the manifest describes"):
-        _tagger(PaperConfig(tagger="ram-onnx"), ModelsConfig(folder=tmp_path), None, "cpu")  # type: ignore[arg-type]
-    weights.write_bytes(b"PK")
-    assert export_onnx.main([*words, sys.executable, "--out", str(tmp_path / "again")]) == 2
-    assert not any((tmp_path / "again").glob("*"))
 
 
 def test_a_provider_that_is_not_here_and_a_damaged_file_are_one_line(folder: Path, tmp_path: Path) -> None:

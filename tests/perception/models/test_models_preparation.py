@@ -70,13 +70,9 @@ def test_a_processor_file_of_either_age_gives_the_transform(tmp_path: Path) -> N
         ({"do_normalize": False}, "do_normalize is False"),
         ({"rescale_factor": 1}, "rescale_factor is 1"),
         ({"size": {"longest_edge": 9}}, "expected a shortest edge"),
-        ({"crop_size": 100}, "expected a shortest edge"),
-        ({"size": 10**9, "crop_size": 10**9}, "expected a shortest edge"),
         ({"image_std": [0, 1, 1]}, r"std\.0 is 0"),
-        ({"image_mean": ["a", 1, 1]}, r"mean\.0 is a"),
         ({"image_mean": [10**400, 1, 1]}, r"mean\.0 is "),
         ({"image_std": [1, float("nan"), 1]}, r"std\.1 is nan"),
-        ({"rescale_factor": 10**400}, "rescale_factor is 1000"),
         ({"resample": "cubic"}, "resample is cubic"),
     ],
 )

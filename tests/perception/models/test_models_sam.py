@@ -93,50 +93,6 @@ def test_single_masks_of_boxes_and_of_points_are_those_of_transformers(sam: Sam)
     assert (mask != theirs[0, 0]).mean() < 1e-3
 
 
-def test_the_same_batch_gives_the_same_bytes_and_another_batch_nearly_the_same_logits(sam: Sam) -> None:
-    image = sam.look(RGB)
-    random = np.random.default_rng(0)
-    points = random.uniform(0, 40, (12, 1, 2)).astype(np.float32)
-    labels = np.ones((12, 1), np.int64)
-    whole, scores = sam.decode(image, Prompts(points, labels), is_single=False)
-    again, _ = sam.decode(image, Prompts(points, labels), is_single=False)
-    assert whole.numpy().tobytes() == again.numpy().tobytes()
-    for k in range(12):
-        one, score = sam.decode(image, Prompts(points[k : k + 1], labels[:1]), is_single=False)
-        np.testing.assert_allclose(one[0].numpy(), whole[k].numpy(), atol=1e-3)
-        np.testing.assert_allclose(score[0].numpy(), scores[k].numpy(), atol=1e-3)
-    masks = [Sam(sam.network, batch).from_boxes(image, BOXES, is_single=False)[0] for batch in (1, 2, 64)]
-    assert (masks[0] != masks[2]).mean() < 1e-3
-    assert (masks[1] != masks[2]).mean() < 1e-3
-
-
-def test_prompts_are_halved_where_the_memory_runs_out_and_stay_so(sam: Sam) -> None:
-    import torch
-
-    asked = []
-
-    class Short:
-        """SAM on a device that holds two prompts."""
-
-        image_px = SAM_PX
-
-        def embed(self, pixels: Float32Array) -> Any:
-            return sam.network.embed(pixels)
-
-        def decode(self, embedding: Any, prompts: Prompts, is_single: bool) -> tuple[Any, Any]:
-            asked.append(len(prompts))
-            if len(prompts) > 2:
-                raise torch.OutOfMemoryError("CUDA out of memory")
-            return sam.network.decode(embedding, prompts, is_single)
-
-    short, boxes = Sam(Short()), np.concatenate([BOXES, BOXES[:2]])
-    masks, scores = short.from_boxes(short.look(RGB), boxes, is_single=False)
-    theirs, predicted = Sam(sam.network, 2).from_boxes(sam.look(RGB), boxes, is_single=False)
-    assert masks.tobytes() == theirs.tobytes() and scores.tobytes() == predicted.tobytes()
-    short.from_boxes(short.look(RGB), boxes, is_single=False)
-    assert asked == [5, 2, 2, 1, 2, 2, 1]
-
-
 def test_regions_on_demand_look_at_each_frame_once() -> None:
     looks: list[UInt8Array] = []
 

@@ -78,7 +78,7 @@ def _words(folder: Path) -> Read:
 
 def _model_settings(name: str, of: Callable[[Any], tuple[Any, Callable[[Path], object]]]) -> Make:
     def make(folder: Path) -> Read:
-        import test_models_damage as settings
+        import model_settings as settings
 
         content, read = of(settings)
         path = folder / name

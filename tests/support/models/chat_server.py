@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -137,9 +136,3 @@ def quick_config(server: ChatServer | None = None, **changes: Any) -> LanguageCo
         "max_failures_in_a_row": 50,
     }
     return LanguageConfig(**(values | changes))
-
-
-def seconds_of(call: Callable[[], Any]) -> float:
-    start = time.monotonic()
-    call()
-    return time.monotonic() - start
