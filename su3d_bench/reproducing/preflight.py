@@ -21,7 +21,7 @@ from su3d_bench.fetching.sources import built_in
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.perception.models.catalogue import PAPERS_ENCODERS, PROFILE_MODELS, FormName, model_entry
 from su3d_bench.perception.models.files import locate
-from su3d_bench.perception.models.front_end import DETECTOR, PACKAGES, TAGGER
+from su3d_bench.perception.models.loading import DETECTOR, PACKAGES, TAGGER
 from su3d_bench.perception.profiles import PerceptionConfig
 from su3d_bench.reproducing.asked import AskedRun
 from su3d_bench.reproducing.costs import FILE, NAME, Estimate, UnitCosts, Work, calibrated_ms, estimated, read_costs
