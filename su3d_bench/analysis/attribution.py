@@ -24,9 +24,9 @@ from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.attribution.arrays import EXPLAINED, LookedAt, MendedScene
 from su3d_bench.metrics.attribution.singles import SingleError
 from su3d_bench.metrics.fitness import why_not_scorable
-from su3d_bench.metrics.metric import Counts
+from su3d_bench.metrics.metric import Counts, SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.scoring import SceneScore, metric_of, plain_json
+from su3d_bench.metrics.scoring import metric_of, plain_json
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 SCHEMA = 1

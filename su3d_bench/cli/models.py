@@ -7,7 +7,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.fetch import models as fetch_models
 from su3d_bench.cli.shared.answers import answer, answer_either, answer_json, remark
 from su3d_bench.cli.shared.flags import add_group, add_settings, add_verb
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError

@@ -15,8 +15,7 @@ from su3d_bench.core import registry
 from su3d_bench.core.config import toml_value
 from su3d_bench.core.errors import ConfigError, counted, printable, some
 from su3d_bench.formats.tables.table import Cell, Table, TableRow
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.papers.paper import PAPER_PROFILE, PAPER_SCENES, Shown
 from su3d_bench.reports.tables.papers.published import OPEN, Figure

@@ -17,6 +17,9 @@ from su3d_bench.core.maps import Prediction
 from su3d_bench.core.types import GroundTruth, LabelSet, SceneInfo
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.scoring import Truth
+from su3d_bench.metrics.semantic.panoptic import told_truth
 from su3d_bench.perception.profiles import Perception, PerceptionConfig
 from su3d_bench.questions.reasoning.language_solver import answers_digest
 from su3d_bench.questions.refining.refined_names import refined_digest

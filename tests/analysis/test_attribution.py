@@ -12,8 +12,14 @@ from hypothesis import strategies as st
 from su3d_bench.core.maps import Masks
 from su3d_bench.core.types import Int32Array, Int64Array
 from su3d_bench.metrics.attribution import masks as attribution
-from su3d_bench.metrics.attribution.masks import KINDS, LabelledMasks, ScoringRules, mend_scene, with_true_labels
-from su3d_bench.metrics.attribution.overlaps import Overlaps, measure_overlaps, true_instances
+from su3d_bench.metrics.attribution.masks import KINDS, mend_scene, with_true_labels
+from su3d_bench.metrics.attribution.overlaps import (
+    LabelledMasks,
+    Overlaps,
+    ScoringRules,
+    measure_overlaps,
+    true_instances,
+)
 from su3d_bench.metrics.instance import average_precision as instance_ap
 
 SIZE = 200  # points an instance

@@ -22,8 +22,9 @@ from su3d_bench.analysis.comparison import Difference, _some, compare, form_diff
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, StoreError
 from su3d_bench.core.types import Float64Array
+from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.metrics.scoring import SceneScore, metric_of, pack_scores
+from su3d_bench.metrics.scoring import metric_of, pack_scores
 from su3d_bench.numerics.statistics import SignFlipTest, sign_flip_test
 from su3d_bench.reports.tables.comparison import comparison_tables
 from su3d_bench.reports.tables.formats import markdown
