@@ -13,10 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.analysis.side_numbers import Numbers, OverScenes, SideNumbers, class_numbers, headline_numbers
 from su3d_bench.analysis.sides import (
+    Numbers,
+    OverScenes,
     Side,
+    SideNumbers,
     check_shapes,
+    class_numbers,
+    headline_numbers,
     pair_methods,
     parse_side,
     protocols_in_both,

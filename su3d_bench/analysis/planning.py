@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.analysis.side_numbers import OverScenes, SideNumbers
 from su3d_bench.analysis.sides import (
+    OverScenes,
     Side,
+    SideNumbers,
     check_shapes,
     protocols_in_both,
     refuse_other_requests,

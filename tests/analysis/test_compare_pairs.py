@@ -12,8 +12,7 @@ from painted import colour_perception
 from places import SCENES
 
 from su3d_bench.analysis.comparison import Comparison, compare
-from su3d_bench.analysis.side_numbers import SideNumbers
-from su3d_bench.analysis.sides import Side
+from su3d_bench.analysis.sides import Side, SideNumbers
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
 from su3d_bench.metrics.metric import SceneScore

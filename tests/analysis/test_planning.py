@@ -14,7 +14,7 @@ from painted import colour_perception
 from places import SCENES
 from scored_room import noisy_scores
 
-import su3d_bench.analysis.side_numbers
+import su3d_bench.analysis.sides
 from su3d_bench.analysis.comparison import compare
 from su3d_bench.analysis.planning import plan
 from su3d_bench.cli.main import main
@@ -233,4 +233,4 @@ def test_a_folder_with_a_comma_in_its_name_is_one_run() -> None:
 
 
 def test_the_examples_in_the_docstrings_run() -> None:
-    assert doctest.testmod(su3d_bench.analysis.side_numbers).failed == 0
+    assert doctest.testmod(su3d_bench.analysis.sides).failed == 0

@@ -13,8 +13,7 @@ from registry_bundles import Files, edit_record, painted_bundle, read_bundle, re
 
 from su3d_bench.cli.main import main
 from su3d_bench.metrics.protocols.loading import read_rules
-from su3d_bench.reproducing.registry.folder import read_registry
-from su3d_bench.reproducing.registry.mixing import why_not_beside
+from su3d_bench.reproducing.registry.folder import read_registry, why_not_beside
 from su3d_bench.reproducing.registry.rows import Weights, rows_of_bundle
 
 STRUCK = "<img src=x onerror=window.struck=1></script><script>window.struck=1</script>"

@@ -13,7 +13,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.config import Settings
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.reproducing.predictions import Given, named_predictions
+from su3d_bench.reproducing.asked import Given, named_predictions
 from su3d_bench.reproducing.recipe import load_recipe
 from su3d_bench.runs.parts import build_dataset, part_of
 

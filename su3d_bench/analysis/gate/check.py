@@ -7,15 +7,18 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Literal
 
-from su3d_bench.analysis.gate.costs import busy_remark, cost_findings, cost_numbers, why_no_cost
 from su3d_bench.analysis.gate.reference import (
     SCHEMA,
     MethodResult,
     Reference,
     Value,
     Values,
+    busy_remark,
+    cost_findings,
+    cost_numbers,
     differing_keys,
     settings_of,
+    why_no_cost,
     wrong_files,
 )
 from su3d_bench.core.english import plural

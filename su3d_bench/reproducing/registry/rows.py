@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import shlex
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from su3d_bench.analysis.leaderboard import Entry, Refused, entries_of
+from su3d_bench.core.config import DEFAULT_SOURCE, MOVES_NO_NUMBER, KeyPath, RunConfig, toml_value
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError, StoreError, Su3dError, printable, reading, shown
 from su3d_bench.core.files.scratch import TemporaryFolder
@@ -15,9 +18,61 @@ from su3d_bench.metrics.costs import MAP, TOTAL, WARM_UP, summarise
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.perception.models.catalogue import MODELS, encoder_known_as
 from su3d_bench.reproducing.bundle import MANIFEST, RUNS, Unpacked, unpack
-from su3d_bench.reproducing.registry.commands import command_of
 from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
+from su3d_bench.runs.planning.held import held_run
 from su3d_bench.store.run_folder import JOBS, RECORDS
+
+UNKNOWN = "not known: run.toml is not whole"
+MOST_CHARACTERS = 2000
+
+
+def command_of(run: FinishedRun, method: str) -> str:
+    """A line for a shell that does what gave the rows of ``method``: ``run`` of it alone, or ``evaluate``.
+
+    What moves no number is left out, and so is what nobody asked for.
+    """
+    if method in run.made_elsewhere:
+        return printable(_evaluation(run, method), MOST_CHARACTERS)
+    held = held_run(run.folder.path)
+    if held is None or not held.is_known:
+        return UNKNOWN
+    asked = {path: value for path, value in held.values.items() if held.remarks.get(path) != DEFAULT_SOURCE}
+    words = ["su3d-bench", "run", *_flags(asked, run, method), *_settings(asked, method)]
+    return printable(shlex.join(words), MOST_CHARACTERS)
+
+
+def _flags(asked: Mapping[KeyPath, Any], run: FinishedRun, method: str) -> Iterator[str]:
+    scenes = asked.get(("scenes",)) or run.scenes
+    yield from ("--scenes", *map(str, scenes), "--methods", method)
+    for name in RunConfig.model_fields:
+        value = asked.get((name,))
+        if name in ("scenes", "methods") or name in MOVES_NO_NUMBER or value is None:
+            continue
+        yield f"--{name.replace('_', '-')}"
+        yield from map(str, value) if isinstance(value, list | tuple) else (str(value),)
+
+
+def _settings(asked: Mapping[KeyPath, Any], method: str) -> Iterator[str]:
+    """``--set`` of what was asked of this method, the datasets and perception; a variant's name says its own."""
+    base = method.partition("@")[0]
+    pairs = []
+    for path, value in asked.items():
+        if len(path) > 2 and path[0] in ("method", "dataset"):
+            if path[0] == "dataset" or (path[1] == base == method):
+                pairs.append(f"{'.'.join(path[1:])}={toml_value(value)}")
+        elif len(path) > 1 and path[0] == "perception":
+            pairs.append(f"{'.'.join(path)}={toml_value(value)}")
+    if pairs:
+        yield from ("--set", *pairs)
+
+
+def _evaluation(run: FinishedRun, method: str) -> str:
+    record, truth = run.made_elsewhere[method], run.record.ground_truth
+    words = ["su3d-bench", "evaluate", *record.paths]
+    if truth is not None and truth.dataset is not None:
+        words += ["--dataset", truth.dataset]
+    return shlex.join([*words, "--protocols", *run.protocols])
+
 
 NOT_SAID = "not said"
 TOLD_THE_TRUTH = "none: it was told the truth"

@@ -13,7 +13,7 @@ from su3d_bench.core.files.locks import is_unfinished
 from su3d_bench.formats.tables.table import NOT_MEASURED, Cell, Prose, Table, TableRow, is_count, with_interval
 from su3d_bench.metrics.protocols.files import protocol_names
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.reports.registry.page import PAGE, page_html, page_name
+from su3d_bench.reports.page.page import PAGE, page_name, registry_page_html
 from su3d_bench.reports.tables.model import confidence_notes, few_scenes
 from su3d_bench.reproducing.registry.folder import SUFFIX, Registry
 from su3d_bench.reproducing.registry.rows import Row
@@ -35,13 +35,13 @@ def write_site(registry: Registry, out: Path, title: str = TITLE, bundles_at: st
     earlier = _earlier_pages(out)
     address = _checked_address(bundles_at)
     value = _value(registry, title, address)
-    pages = {INDEX: page_html("index", title, _index(value), [_plain_tables(registry)])}
+    pages = {INDEX: registry_page_html("index", title, _index(value), [_plain_tables(registry)])}
     for method in value["methods"]:
         data = _method_page(value, method["name"])
-        pages[method["page"]] = page_html("method", method["name"], {**data, "registry": title})
+        pages[method["page"]] = registry_page_html("method", method["name"], {**data, "registry": title})
     for scene in value["scenes"]:
         data = _scene_page(value, scene)
-        pages[scene["page"]] = page_html("scene", scene["name"], {**data, "registry": title})
+        pages[scene["page"]] = registry_page_html("scene", scene["name"], {**data, "registry": title})
     for folder in ("", METHODS, SCENES):
         make_folder(out / folder)
     # first of all, so that the site is known for one however this ends

@@ -13,8 +13,16 @@ from painted import DELAY_S, colour_perception
 from places import SCENES
 
 from su3d_bench.analysis.gate.check import check
-from su3d_bench.analysis.gate.costs import LEAST_SHARE, MOST, Cost, cost_findings, method_cost
-from su3d_bench.analysis.gate.reference import Reference, learn, read_reference
+from su3d_bench.analysis.gate.reference import (
+    LEAST_SHARE,
+    MOST,
+    Cost,
+    Reference,
+    cost_findings,
+    learn,
+    method_cost,
+    read_reference,
+)
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.system.timing import MethodClock
@@ -119,8 +127,8 @@ def dearer(limit: float = 1.5, **parts: float) -> list[str]:
         methods = ("m",)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("su3d_bench.analysis.gate.costs.why_no_cost", lambda run, method: None)
-        patch.setattr("su3d_bench.analysis.gate.costs.method_cost", lambda *_: COST.model_copy(update=parts))
+        patch.setattr("su3d_bench.analysis.gate.reference.why_no_cost", lambda run, method: None)
+        patch.setattr("su3d_bench.analysis.gate.reference.method_cost", lambda *_: COST.model_copy(update=parts))
         found: list[Finding] = list(cost_findings(Run(), {"m": COST}, 1.0, limit, is_judged=True))  # type: ignore[arg-type]
     return [one.where.partition("cost of ")[2] for one in found]
 

@@ -16,12 +16,11 @@ from painted import WordEncoder, colour_perception
 from places import SCENES
 
 from su3d_bench.analysis.page import gallery
-from su3d_bench.analysis.page.gallery import photos_of_each
+from su3d_bench.analysis.page.gallery import PHOTO, PREDICTED, SeenError, error_photo, photos_of_each, seen_mask
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import FramesMissing
 from su3d_bench.core.types import Frame
 from su3d_bench.formats.images import decode_colour
-from su3d_bench.reports.page.photos import PHOTO, PREDICTED, SeenError, error_photo, seen_mask
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
 
