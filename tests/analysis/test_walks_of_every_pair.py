@@ -20,7 +20,7 @@ from replica_clouds import first_pose, write_clouds
 from scanned_stage import write_scene
 
 from su3d_bench.analysis import rules_walk
-from su3d_bench.analysis.inputs import Inputs
+from su3d_bench.analysis.matched import Inputs
 from su3d_bench.analysis.rules_walk import KINDS, Walker
 from su3d_bench.cli.main import main
 from su3d_bench.core import registry

@@ -20,7 +20,7 @@ from su3d_bench.analysis.page import contents
 from su3d_bench.analysis.page.errors import packed, unpacked
 from su3d_bench.analysis.page.kept import FOLDER, MOST_OF_EACH
 from su3d_bench.analysis.page.maps import PageScene, page_scene
-from su3d_bench.analysis.page.scene_data import SceneData
+from su3d_bench.analysis.page.scene import SceneData
 from su3d_bench.cli.main import EXIT_INTERRUPTED, main
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import PredictionError

@@ -21,8 +21,7 @@ from painted_runs import COLLECTOR, painted_page, painted_run
 
 from su3d_bench.analysis.page import instances as page_instances
 from su3d_bench.analysis.page import maps as page_maps
-from su3d_bench.analysis.page.instances import MOST_STEPS, Growth
-from su3d_bench.analysis.page.truths import same_objects
+from su3d_bench.analysis.page.scene import MOST_STEPS, Growth, same_objects
 from su3d_bench.cli.main import main
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks
 from su3d_bench.core.types import GroundTruth, LabelSet

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.analysis.attribution import Explained
-from su3d_bench.analysis.page.instances import fed_frames
-from su3d_bench.analysis.page.scene_data import SKETCH_WIDTH, SceneData
+from su3d_bench.analysis.matched import Explained
+from su3d_bench.analysis.page.scene import SKETCH_WIDTH, SceneData, fed_frames
 from su3d_bench.core.errors import Su3dError, printable
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, UInt8Array
 from su3d_bench.metrics.attribution.arrays import LookedAt
@@ -224,7 +223,7 @@ class GalleryOfScene:
         self._fed += fed_frames(explained.run, self._scene, explained.method)
         for protocol, scene in looked_at.items():
             n, errors = explained.errors(self._scene, protocol, scene, MOST_ERRORS)
-            metrics = explained.headline(protocol)
+            metrics = tuple(explained.rules(protocol).headline)
             ids = explained.instance_ids(self._scene)
             cards = tuple(_card(error, scene, metrics, ids) for error in errors)
             rules, method = explained.run.rules(protocol), printable(explained.method, 200)

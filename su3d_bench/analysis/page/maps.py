@@ -13,13 +13,19 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from su3d_bench.analysis.inputs import Inputs
-from su3d_bench.analysis.page.instances import Growth, fed_frames, frames_of, growth_of, instance_data
-from su3d_bench.analysis.page.scene_data import MOST_LOOKED_AT, SKETCH_WIDTH, SceneData
-from su3d_bench.analysis.page.truths import (
+from su3d_bench.analysis.matched import Inputs
+from su3d_bench.analysis.page.scene import (
+    MOST_LOOKED_AT,
+    SKETCH_WIDTH,
     Beside,
+    Growth,
+    SceneData,
     Seen,
     ShownTruths,
+    fed_frames,
+    frames_of,
+    growth_of,
+    instance_data,
     instances_of,
     judged_objects,
     same_objects,
