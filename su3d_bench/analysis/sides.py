@@ -231,6 +231,25 @@ class SideNumbers:
             self._scores[key] = side.run.scores(side.method)
         return self._scores[key]
 
+    def over_common(self, protocol: str, sides: Sequence[Side]) -> list[OverScenes]:
+        """Of each of ``sides`` the numbers over the scenes that all have.
+
+        None for no scene; a ``ConfigError`` where one cannot be compared with the first.
+        """
+        scores = [self.scores(side).get(protocol, {}) for side in sides]
+        common = [scene for scene in scores[0] if all(scene in of_side for of_side in scores)]
+        for side in sides[1:]:
+            refuse_unlike(sides[0], side, protocol, common)
+        if not common:
+            return []
+        rules = sides[0].run.rules(protocol)
+        found = []
+        for side, of_side in zip(sides, scores, strict=True):
+            own = {scene: of_side[scene] for scene in common}
+            check_shapes(rules, side, own)
+            found.append(self.over_scenes(rules, side, own))
+        return found
+
     def over_scenes(self, rules: ProtocolRules, side: Side, scores: Mapping[str, SceneScore]) -> OverScenes:
         """The numbers over the scenes of ``scores``, and without each of them."""
         key = side.run.folder.path, side.method, rules.name, tuple(scores)

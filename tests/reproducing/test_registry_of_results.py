@@ -39,12 +39,12 @@ def registry(made: Path, tmp_path: Path) -> Path:
 def test_rows_of_several_bundles_stand_in_one_ranking_a_protocol_the_best_first(registry: Path) -> None:
     found = read_registry(registry)
     assert found.refused == () and found.n_bundles == 2
-    assert [board[0].entry.protocol for board in found.boards] == ["rooms-instance", "rooms-semantic"]
+    assert [board[0].protocol for board in found.boards] == ["rooms-instance", "rooms-semantic"]
     for board in found.boards:
-        values = [row.entry.values[0] or 0.0 for row in board]
+        values = [row.values[0] or 0.0 for row in board]
         assert values == sorted(values, reverse=True)
         assert {row.bundle.name for row in board} == {"ann", "bob"}
-        assert all(row.entry.ranks is not None for row in board)
+        assert all(row.ranks is not None for row in board)
 
 
 def test_a_row_says_its_command_times_weights_and_digests(registry: Path) -> None:
@@ -54,7 +54,7 @@ def test_a_row_says_its_command_times_weights_and_digests(registry: Path) -> Non
     assert row.command.startswith("su3d-bench run --scenes ") and "--methods collector@drop=1" in row.command
     assert row.said_trained_on.startswith("my own photos") and row.trained_on == row.said_trained_on
     assert row.n_updates > 0 and row.update_s is not None and row.map_s is not None and row.map_s <= row.update_s
-    assert [scene for scene, _ in row.of_scenes] == list(row.entry.scenes)
+    assert [scene for scene, _ in row.values_of_scenes] == list(row.scenes)
 
 
 @pytest.mark.parametrize(
@@ -128,14 +128,14 @@ def test_rules_of_another_digest_under_the_same_name_do_not_mix(registry: Path, 
 
 def test_features_of_two_encoders_do_not_mix_where_the_protocol_names_one(registry: Path) -> None:
     rows, _ = rows_of_bundle(registry / "bundles" / "ann.zip")
-    entry = replace(rows[0].entry, protocol="replica-openmask3d", method="other")
+    entry = replace(rows[0], protocol="replica-openmask3d", method="other")
     one, other = replace(rows[0], entry=entry, encoder="ViT-L-14-336/openai"), replace(rows[1], encoder="su3d-embedded")
     other = replace(other, entry=replace(entry, method="mine"))
     assert "its features are of the encoder su3d-embedded, those of other in ann.zip of" in (
         why_not_beside(other, [one]) or ""
     )
     assert why_not_beside(replace(other, encoder=None), [one]) is None, "it names its instances itself"
-    free = [replace(row, entry=replace(row.entry, protocol="rooms-instance")) for row in (other, one)]
+    free = [replace(row, protocol="rooms-instance") for row in (other, one)]
     assert why_not_beside(free[0], free[1:]) is None, "a protocol that names none leaves it open"
     weights = [(Weights("clip-vit-l-14-336", "", (("model.safetensors", sha * 64),)),) for sha in "ab"]
     same = replace(other, encoder=one.encoder, weights=weights[0])

@@ -45,7 +45,7 @@ def test_a_bundle_that_holds_comes_in_to_the_last_bit_once(
 
 def test_its_rows_name_the_command_that_makes_them_and_what_the_weights_were_trained_on(bundle: Path) -> None:
     rows, _ = rows_of_bundle(bundle)
-    by_method = {row.entry.method: row for row in rows}
+    by_method = {row.method: row for row in rows}
     assert by_method["oracle"].trained_on == "none: it was told the truth"
     row = by_method["opensu3d"]
     assert "profile oracle: none: masks of the ground truth" in row.trained_on

@@ -164,7 +164,7 @@ def busy_remark(run: FinishedRun, calibration_ms: float | None) -> str | None:
     )
 
 
-SCHEMA: Literal[2] = 2  # 1 had the cost of an update alone, from the stages that a method named itself
+SCHEMA: Literal[2] = 2
 SPREADS = 2.0  # a value may leave the taught ones by this many times their range: 2 of 50 unchanged repeats would at 1
 ACROSS_MACHINES = 0.02  # 2 points: what ONNX Runtime's and BLAS's kernels of other processors may move a headline value
 COST_LIMIT = 1.3  # a method may cost so many times the reference's; `python benchmarks gate_repeats` has the scatter
@@ -222,10 +222,10 @@ class Reference(_Model):
     """What a run is held against; ``costs``: of each method, over the calibrating piece of work.
 
     ``processor``: a digest of the processor's kind; byte-equality is promised on one kind alone. ``calibration_ms``:
-    of that piece of work. Of a file of schema 1 the costs are passed over: they were of a part of the updates alone.
+    of that piece of work.
     """
 
-    schema_version: Literal[1, 2] = 1
+    schema_version: Literal[2]
     hardware: str
     processor: str
     n_runs: int = Field(ge=1)
@@ -238,13 +238,6 @@ class Reference(_Model):
     results: tuple[MethodResult, ...] = Field(min_length=1)
     costs: dict[str, Cost]
     calibration_ms: float | None = Field(default=None, gt=0, allow_inf_nan=False)
-
-    @model_validator(mode="before")
-    @classmethod
-    def _without_costs_of_schema_1(cls, value: Any) -> Any:
-        if isinstance(value, dict) and value.get("schema_version", 1) == 1:
-            return {**value, "costs": {}, "calibration_ms": None}
-        return value
 
     @model_validator(mode="after")
     def _agrees_with_itself(self) -> Self:

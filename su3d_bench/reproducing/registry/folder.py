@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from su3d_bench.analysis.leaderboard import Entry, Refused, in_order, ranked
+from su3d_bench.analysis.leaderboard import Refused, in_order, ranked
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, counted, printable, reading, shown
 from su3d_bench.core.files.atomic import make_folder, replacing
@@ -34,7 +34,7 @@ def why_not_beside(row: Row, held: Sequence[Row]) -> str | None:
 
 
 def _rules(row: Row, other: Row) -> str | None:
-    mine, theirs = row.entry, other.entry
+    mine, theirs = row, other
     if mine.protocol != theirs.protocol or (mine.version, mine.digest) == (theirs.version, theirs.digest):
         return None
     return (
@@ -44,8 +44,8 @@ def _rules(row: Row, other: Row) -> str | None:
 
 
 def _data(row: Row, other: Row) -> str | None:
-    theirs = dict(other.entry.data)
-    for scene, digest in row.entry.data:
+    theirs = dict(other.data)
+    for scene, digest in row.data:
         if theirs.get(scene, digest) != digest:
             return (
                 f"its data of {scene} have the digest {digest[:N_DIGITS]}, those of {_where(other)} "
@@ -56,9 +56,9 @@ def _data(row: Row, other: Row) -> str | None:
 
 def _encoder(row: Row, other: Row) -> str | None:
     """Features are compared with those of texts: under a protocol that names an encoder, of one encoder alone."""
-    if row.entry.protocol != other.entry.protocol or None in (row.encoder, other.encoder):
+    if row.protocol != other.protocol or None in (row.encoder, other.encoder):
         return None
-    if not _names_encoder(row.entry.protocol):
+    if not _names_encoder(row.protocol):
         return None
     if row.encoder != other.encoder:
         return (
@@ -87,23 +87,23 @@ def _names_encoder(protocol: str) -> bool:
 
 
 def _name(row: Row, other: Row) -> str | None:
-    if row.entry.ranking != other.entry.ranking or row.entry.method.casefold() != other.entry.method.casefold():
+    if row.ranking != other.ranking or row.method.casefold() != other.method.casefold():
         return None
     return (
         f"that name is taken by {_where(other)} over the same scenes; give the variant its own name, such as "
-        f"{row.entry.method.partition('@')[0]}@KEY=VALUE, or remove the other bundle first"
+        f"{row.method.partition('@')[0]}@KEY=VALUE, or remove the other bundle first"
     )
 
 
 def _labels(row: Row, other: Row) -> str | None:
-    mine, theirs = row.entry, other.entry
+    mine, theirs = row, other
     if mine.ranking != theirs.ranking or mine.is_ceiling or theirs.is_ceiling or mine.labels == theirs.labels:
         return None
     return f"is of {mine.labels}, {_where(other)} of {theirs.labels}; score it with as many labels"
 
 
 def _where(row: Row) -> str:
-    return f"{row.entry.method} in {row.bundle.name}.zip"
+    return f"{row.method} in {row.bundle.name}.zip"
 
 
 BUNDLES = "bundles"
@@ -180,14 +180,9 @@ def _read(file: Path) -> tuple[list[Row], list[Refused]]:
 
 def _boards(rows: Sequence[Row]) -> Iterator[tuple[Row, ...]]:
     """The rankings by protocol, those of the most scenes first."""
-    rankings = sorted({row.entry.ranking for row in rows}, key=lambda key: (key[0], -len(key[2]), key))
+    rankings = sorted({row.ranking for row in rows}, key=lambda key: (key[0], -len(key[2]), key))
     for ranking in rankings:
-        mine = {id(row.entry): row for row in rows if row.entry.ranking == ranking}
-        entries: tuple[Entry, ...] = in_order([row.entry for row in mine.values()])
-        with_ranks = ranked(entries)
-        yield tuple(
-            replace(mine[id(entry)], entry=with_rank) for entry, with_rank in zip(entries, with_ranks, strict=True)
-        )
+        yield ranked(in_order([row for row in rows if row.ranking == ranking]))
 
 
 @dataclass(frozen=True)
@@ -272,9 +267,7 @@ def _place(registry: Path, file: Path, rows: Sequence[Row], name: str | None) ->
         name = file.name[: -len(SUFFIX)] if file.name.lower().endswith(SUFFIX) else file.name
         if name == _ANY and rows:
             first = rows[0]
-            name = (
-                f"{first.bundle.recipe or re.sub('[^A-Za-z0-9._-]+', '-', first.entry.run)}-{first.bundle.sha256[:8]}"
-            )
+            name = f"{first.bundle.recipe or re.sub('[^A-Za-z0-9._-]+', '-', first.run)}-{first.bundle.sha256[:8]}"
     if not _NAME.fullmatch(name):
         raise ConfigError(
             f"'{printable(name, 100)}' cannot be the name of a bundle: letters, digits, '.', '_' and '-' alone; choose "

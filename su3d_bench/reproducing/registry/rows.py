@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.analysis.leaderboard import Entry, Refused, entries_of
+from su3d_bench.analysis.leaderboard import RankingRow, Refused, entries_of
 from su3d_bench.core.config import DEFAULT_SOURCE, MOVES_NO_NUMBER, KeyPath, RunConfig, toml_value
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError, StoreError, Su3dError, printable, reading, shown
@@ -101,18 +101,17 @@ class Weights:
     files: tuple[tuple[str, str], ...] = ()
 
 
-@dataclass(frozen=True)
-class Row:
+@dataclass(frozen=True, kw_only=True)
+class Row(RankingRow):
     """A method of a run under a protocol.
 
     ``update_s`` and ``map_s``: the median over its frames after the first ones of a scene, with perception and without;
     None where no frame was timed. ``encoder``: whose features named the instances, None where the method did.
-    ``of_scenes``: scene -> a value for each headline metric.
+    ``values_of_scenes``: scene -> a value for each headline metric.
     """
 
     bundle: BundleFacts
-    entry: Entry
-    of_scenes: tuple[tuple[str, tuple[float | None, ...]], ...]
+    values_of_scenes: tuple[tuple[str, tuple[float | None, ...]], ...]
     update_s: float | None
     map_s: float | None
     n_updates: int
@@ -129,13 +128,13 @@ class Row:
 
     @property
     def what(self) -> str:
-        return f"{self.entry.method} / {self.entry.protocol}"
+        return f"{self.method} / {self.protocol}"
 
     @property
     def trained_on(self) -> str:
         """What all weights were trained on, in a line."""
         known = [f"{one.model}: {one.trained_on}" for one in self.weights]
-        return self.said_trained_on or "; ".join(known) or (TOLD_THE_TRUTH if self.entry.is_ceiling else NOT_SAID)
+        return self.said_trained_on or "; ".join(known) or (TOLD_THE_TRUTH if self.is_ceiling else NOT_SAID)
 
 
 def rows_of_bundle(file: Path) -> tuple[list[Row], list[Refused]]:
@@ -208,7 +207,7 @@ def is_plain(name: str) -> bool:
     return printable(name, 120) == name and name.strip(". ") != "" and "/" not in name
 
 
-def _row(run: FinishedRun, entry: Entry, unpacked: Unpacked, bundle: BundleFacts) -> Row:
+def _row(run: FinishedRun, entry: RankingRow, unpacked: Unpacked, bundle: BundleFacts) -> Row:
     record = run.results[entry.method, entry.protocol]
     assert record.result is not None  # or it were no entry
     times = read_update_times(run, entry.method)
@@ -216,9 +215,9 @@ def _row(run: FinishedRun, entry: Entry, unpacked: Unpacked, bundle: BundleFacts
     per_scene = record.result.per_scene
     is_elsewhere = entry.method in run.made_elsewhere
     return Row(
+        **vars(entry),
         bundle=bundle,
-        entry=entry,
-        of_scenes=tuple(
+        values_of_scenes=tuple(
             (scene, tuple(per_scene[scene].get(metric) for metric in entry.headline)) for scene in entry.scenes
         ),
         update_s=_seconds(stages[TOTAL].p50) if stages else None,
