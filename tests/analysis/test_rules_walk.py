@@ -11,7 +11,7 @@ import pytest
 from painted import WordEncoder, colour_perception
 from places import SCENES
 
-from su3d_bench.analysis.rules_walk import Walker, rules_apart
+from su3d_bench.analysis.rules_walk import Walker
 from su3d_bench.cli.main import main
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.runs import finished
@@ -75,12 +75,6 @@ def test_scenes_side_by_side_give_the_same(made: Path) -> None:
     assert walker.walk(jobs=2) == walker.walk(jobs=1)
 
 
-def test_protocols_without_a_prediction_are_only_compared() -> None:
-    apart = rules_apart(load_protocol("rooms-semantic"), load_protocol("replica-hovsg"))
-    assert apart.walk is None
-    assert {one.rule for one in apart.differing} >= {"metric", "transfer.neighbours", "aggregate"}
-
-
 def test_the_command_prints_draws_and_answers_in_json(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -116,9 +110,3 @@ def test_what_cannot_be_walked_is_one_line(
     assert main(["protocols", "diff", *(word.format(run=made) for word in words)]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
-
-
-@pytest.mark.parametrize("words", [["list", "a"], ["show", "rooms-semantic", "rooms-instance"], ["show", "--out", "x"]])
-def test_what_belongs_to_diff_is_refused_elsewhere(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["protocols", *words]) == 2
-    assert capsys.readouterr().err.count("\n") == 1

@@ -67,20 +67,12 @@ def other_data(files: Files) -> None:
     files[f"{RUN}/run.json"] = json.dumps(record).encode()
 
 
-def higher_number(files: Files) -> None:
-    record = json.loads(files[f"{RUN}/metrics.json"])
-    result = record["results"][0]
-    result["result"]["metrics"][result["headline"][0]] = 0.987
-    files[f"{RUN}/metrics.json"] = json.dumps(record).encode()
-
-
 @pytest.mark.parametrize(
     ("tamper", "says"),
     [
         (lambda files: flip_labels(files, JOB), "by opensu3d: its counts are not those of its map"),
         (other_rules, "are not those that scored it"),
         (other_data, "its data are not those of the run"),
-        (higher_number, "metrics.json does not follow from the counts"),
     ],
 )
 def test_a_tampered_bundle_is_refused_with_its_reason(
@@ -92,16 +84,6 @@ def test_a_tampered_bundle_is_refused_with_its_reason(
     assert main(["registry", "add", str(tmp_path / "t.zip"), "--to", str(tmp_path)]) == 1
     assert "t.zip: refused: " in (said := capsys.readouterr().out) and says in said
     assert not (tmp_path / "bundles").exists()
-
-
-def test_a_file_that_is_not_the_manifests_is_refused_unread(
-    bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    content = bundle.read_bytes()
-    at = content.rindex(b'"n_workers"')
-    (tmp_path / "t.zip").write_bytes(content[:at] + b'"m_workers"' + content[at + 11 :])
-    assert main(["registry", "add", str(tmp_path / "t.zip"), "--to", str(tmp_path)]) == 2
-    assert "t.zip: " in capsys.readouterr().err
 
 
 @pytest.fixture
@@ -167,8 +149,3 @@ def test_the_workflows_commands_score_a_pull_request_and_build_the_site_as_they_
     assert "5 rows; 5 scores made anew, to the last bit" in said
     assert (tmp_path / "temp" / "site" / "index.html").is_file()
     assert not (repository / "struck").exists()
-
-
-def test_a_registry_overwrites_nothing(repository: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["new", "registry", str(repository)]) == 2
-    assert "README.md is there already; name another folder, nothing is overwritten" in capsys.readouterr().err

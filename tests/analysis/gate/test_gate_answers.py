@@ -8,22 +8,13 @@ from typing import Any
 from xml.etree import ElementTree
 
 import pytest
-from gated_runs import edit, in_metrics, lowered, results_in
+from gated_runs import edit, lowered, results_in
 
 from su3d_bench.analysis.gate.check import check
 from su3d_bench.analysis.gate.reference import Reference
 from su3d_bench.cli.main import main
 from su3d_bench.reports.gate import Finding, Verdict, github_lines, junit_xml, markdown, plain_lines
 from su3d_bench.runs.finished import read_run
-
-
-@pytest.mark.parametrize(("long", "shown"), [("x" * 40, "x" * 40), ("x" * 41, "x" * 12 + "...")])
-def test_what_has_more_than_forty_characters_is_shown_by_its_first(
-    long: str, shown: str, gated_copy: Path, gate_reference: Reference
-) -> None:
-    in_metrics(lambda m: m["results"][0].update(profile=long))(gated_copy)
-    (finding,) = check(read_run(gated_copy), gate_reference).findings
-    assert finding.text.endswith(f", now {shown}")
 
 
 def test_the_command_fails_with_one_and_writes_what_a_pull_request_needs(
@@ -107,31 +98,3 @@ def test_scenes_that_are_missing_come_first_and_what_follows_from_them_is_counte
         f"FAIL over other scenes: {n_explained} differences follow from scenes that the run or the reference alone has"
     )
     assert len(lines) < 12
-
-
-def test_many_differences_of_a_kind_are_one_line_with_their_number_and_the_farthest() -> None:
-    findings = tuple(
-        Finding(
-            "regression",
-            f"m / p / class c{n} / AP",
-            "is worse than the reference",
-            0.5,
-            0.4 - n / 100,
-            group="m / p / classes",
-        )
-        for n in range(6)
-    )
-    (line,) = plain_lines(Verdict("run", findings, 1, ()))[1:]
-    assert line == (
-        "FAIL m / p / classes: 6 values, each of which is worse than the reference; the farthest is class c5 / AP "
-        "(50.0 -> 35.0)"
-    )
-    lost = tuple(Finding("missing", f"s{n}", "the run does not have this scene", group="scenes") for n in range(10))
-    (line,) = plain_lines(Verdict("run", lost, 1, ()))[1:]
-    assert line == "FAIL scenes: the run does not have this scene (10: s0, s1, s2, s3, s4, s5, s6, s7 and 2 more)"
-
-
-def test_two_processors_of_one_name_are_not_named_twice(gated_copy: Path, gate_reference: Reference) -> None:
-    edit(gated_copy / "run.json", lambda r: r.update(processor="other"))
-    (remark,) = [line for line in check(read_run(gated_copy), gate_reference).remarks if "processor" in line]
-    assert remark.count(gate_reference.hardware) == 1 and "of the same name" in remark
