@@ -83,7 +83,7 @@ def page_name(name: str) -> str:
     """What a page about ``name`` is called on disk, without suffix; no two names have one, whatever the system.
 
     >>> page_name("opensu3d"), page_name("rooms/living0"), page_name("Rooms/living0")
-    ('opensu3d', 'rooms-living0-0eb10b42', 'rooms-living0-6c4eb6f5')
+    ('opensu3d', 'rooms-living0-75a7be8c', 'rooms-living0-07d100aa')
     """
     plain = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:MOST_OF_A_NAME]
     if plain == name and not _ENDS_WITH_DIGITS.search(name):
