@@ -112,40 +112,12 @@ def test_mending_the_one_error_gives_a_perfect_score(kind: str) -> None:
     assert instance_ap.combine([mended.all]).ap == 1
 
 
-def test_a_merge_across_classes_is_a_merge_and_no_wrong_label() -> None:
-    masks, classes, scores = perfect()
-    masks[2:4], classes[2:4], scores[2:4] = [np.concatenate([masks[2], masks[3]])], [4], [0.9]
-    gain, n = gains(masks, classes, scores)
-    assert n["merged"] == 1
-    assert sum(n.values()) == 1
-    assert gain["merged"] > 0
-
-
 def test_a_merged_mask_with_the_label_of_none_is_not_mended_by_cutting() -> None:
     masks, classes, scores = perfect()
     masks[0:2], classes[0:2], scores[0:2] = [np.concatenate([masks[0], masks[1]])], [5], [0.9]
     gain, n = gains(masks, classes, scores)
     assert set(n.values()) == {0}
     assert set(gain.values()) == {0.0}
-
-
-def test_what_is_wrong_in_mask_and_label_is_left_over() -> None:
-    masks, classes, scores = perfect()
-    masks[5], classes[5] = np.concatenate([points(5, 0.45), np.arange(1200, 1220, dtype=np.int32)]), 3
-    gain, n = gains(masks, classes, scores)
-    assert set(n.values()) == {0}
-    assert set(gain.values()) == {0.0}
-    assert instance_ap.combine([mend_scene(truth(), labelled(masks, classes, scores), RULES).all]).ap50 < 1
-
-
-def test_what_a_merged_mask_has_outside_goes_with_the_instance_of_most_of_its_points() -> None:
-    masks, classes, scores = perfect()
-    both = np.concatenate([points(0), points(1), np.arange(1200, 1260, dtype=np.int32)])
-    mended = mend_scene(truth(), labelled([both, *masks[2:]], [3, *classes[2:]], [0.9, *scores[2:]]), RULES)
-    after = instance_ap.combine([mended.alone["merged"]])
-    assert mended.n["merged"] == 1
-    assert after.ap50 == 1
-    assert after.ap < 1  # 200 of 260 points: no match above an IoU of 0.77
 
 
 def test_a_mask_is_a_part_where_it_raises_the_iou_and_a_duplicate_where_half_of_it_is_known() -> None:
@@ -157,17 +129,6 @@ def test_a_mask_is_a_part_where_it_raises_the_iou_and_a_duplicate_where_half_of_
     overlaps = overlaps_of(truth(), labelled([first, with_new, half_known, better], [3] * 4, [0.9] * 4), RULES)
     assert overlaps.parts[0].parts == (0, 3)
     assert overlaps.parts[0].duplicates == (2,)
-
-
-def test_instances_and_masks_count_from_the_minimum_size_on() -> None:
-    values = np.repeat([3001, 3002, 4001], [100, 99, 100])
-    masks = [np.arange(100), np.arange(99), np.arange(1)]
-    overlaps = overlaps_of(values, labelled([m.astype(np.int32) for m in masks], [3] * 3, [0.9] * 3), RULES)
-    assert [members.tolist() for members in overlaps.members] == [list(range(100)), list(range(199, 299))]
-    assert overlaps.is_large.tolist() == [True, False, False]
-    assert overlaps.inside[:, 0].tolist() == [1.0, 1.0, 1.0]
-    point = LabelledMasks(Masks.of_sets([np.zeros(1, np.int32)]), np.array([3]), np.ones(1))
-    assert overlaps_of(np.array([3001, 3002]), point, ScoringRules((3,), 1)).iou.tolist() == [[1.0, 0.0]]
 
 
 SPLITS = {
@@ -226,14 +187,6 @@ def test_a_missed_instance_is_added_with_the_highest_confidence_of_the_scene() -
     assert confidences(mended.alone["missed"]) == [0.1, 0.2, 0.5]
     of_nothing = mend_scene(truth(), labelled([], [], []), RULES)
     assert confidences(of_nothing.alone["missed"]) == [1.0, 1.0, 1.0]
-
-
-def test_without_classes_no_label_is_wrong() -> None:
-    values = np.where(truth() > 0, 1000 + truth() % 1000, 0)
-    masks, _, scores = with_error("mislabelled")
-    mended = mend_scene(values, labelled(masks, [1] * len(masks), scores), ScoringRules((1,)))
-    assert set(mended.n.values()) == {0}
-    assert instance_ap.combine([mended.as_is]).ap == 1
 
 
 @st.composite

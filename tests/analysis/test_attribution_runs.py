@@ -141,17 +141,6 @@ def test_the_right_mask_under_a_wrong_name_is_a_wrong_label() -> None:
     assert causes(instances(room().points, masks, names)) == {"label": 150}
 
 
-def test_true_labels_name_every_mask_by_its_own_points() -> None:
-    masks, names = whole()
-    masks[3], masks[4] = np.sort(np.concatenate([masks[3], masks[4][:40]])), masks[4][40:]
-    names[3] = names[0] = "sofa"
-    found = scored_points(ROOM_RULES, room(), instances(room().points, masks, names), ENCODER)
-    mended = mend_points(found.points, found.is_counted)
-    assert mended.with_true_labels is not None
-    confusion = mended.with_true_labels.confusion
-    assert confusion.sum() - np.trace(confusion) == 40
-
-
 def row_of_points(*rows: tuple[int, int, int, float, bool]) -> LabelledPoints:
     """Points by true class, object, mask, distance to the mask and whether they are scored; all are called 0."""
     true_class, objects, mask, distance_m, is_scored = (np.array(column) for column in zip(*rows, strict=True))
@@ -184,27 +173,6 @@ def test_geometry_is_missing_beyond_five_centimetres_and_goes_before_all_else() 
     found = replace(wrong, map_distance_m=np.array([0.05, 0.051, 0.05, 0.051]))
     names = [CAUSES[cause] for cause in causes_of(found).tolist()]
     assert names == ["label", "geometry", "background", "geometry"]
-
-
-def test_where_neighbours_vote_the_mask_is_that_of_most_of_them() -> None:
-    rules = load_protocol("replica-hovsg")
-    assert rules.transfer.neighbours > 1
-    truth = replace(room(), variant=rules.ground_truth)
-    found = scored_points(rules, truth, truth_as_prediction(truth, with_labels=True), ENCODER).points
-    scored = found.is_scored & (truth.instance > 0)
-    assert scored.any()
-    assert (found.mask[scored] == truth.instance[scored] - 1).all()
-
-
-def test_what_has_no_instance_is_one_object_a_class_and_none_of_the_others() -> None:
-    truth = room()
-    without = np.isin(truth.instance, [1, 4, 8])  # the wall, the table, here of the fifth class, and the backpack
-    classes = np.where(truth.instance == 4, truth.labels.ids[4], truth.semantic).astype(np.int32)
-    truth = replace(truth, instance=np.where(without, 0, truth.instance).astype(np.int32), semantic=classes)
-    found = scored_points(ROOM_RULES, truth, truth_as_prediction(truth, with_labels=True), ENCODER).points
-    of_object = found.object_id[: 150 * len(NAMES)].reshape(len(NAMES), 150)  # the room's objects one after another
-    assert (of_object == of_object[:, :1]).all()
-    assert len(np.unique(of_object)) == len(NAMES)
 
 
 # the run

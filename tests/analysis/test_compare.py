@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 import json
 import shutil
 from collections.abc import Callable
@@ -16,8 +15,6 @@ from painted import colour_perception
 from places import SCENES
 from scored_room import noisy_scores
 
-import su3d_bench.analysis.comparison
-import su3d_bench.reports.tables.model
 from su3d_bench.analysis.comparison import Difference, compare, form_difference
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, StoreError
@@ -202,21 +199,6 @@ def test_partial_and_incomplete_runs_are_marked() -> None:
     assert found.protocols[0].scenes == ("painted/a", "painted/c")
 
 
-def test_settings_that_differ_are_named() -> None:
-    assert "settings that differ: method.collector.drop 0 and 1" in compare("a", "b").remarks
-    assert compare("b", "few").remarks == ()
-    assert compare("a", "variants").remarks == ()  # of the variant, which is not compared, nothing is said
-    copy_as("a", "odd", "run.toml", lambda text: "method = 3\n" + text.replace("[method.collector]", "[other]"))
-    assert "method.collector.drop 0 and not set" in compare("a", "odd").remarks[0]
-
-
-def test_two_methods_of_one_run_are_compared() -> None:
-    found = compare("b:collector", "b:oracle")
-    assert (found.protocols[0].left, found.protocols[0].right) == ("collector", "oracle")
-    assert found.protocols[1].metrics["AP"].right == 1.0
-    assert "b:oracle is the truth itself, no system" in found.remarks
-
-
 REFUSED = [
     (
         ("a", "other-data"),
@@ -274,8 +256,3 @@ def test_the_command_prints_tables_or_json(capsys: pytest.CaptureFixture[str]) -
     assert "values of classes that no scene changes are left out" in text
     assert main(["compare", "a", "b", "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == compare("a", "b").to_json()
-
-
-def test_the_examples_in_the_docstrings_run() -> None:
-    assert doctest.testmod(su3d_bench.reports.tables.model).failed == 0
-    assert doctest.testmod(su3d_bench.analysis.comparison).failed == 0

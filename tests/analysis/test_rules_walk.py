@@ -41,12 +41,12 @@ def _words(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(finished, "encoder_of", lambda run, device: WordEncoder())
 
 
-PAIRS = [(a, b) for names in (SEMANTIC, INSTANCE) for a in names for b in names if a != b]
+PAIRS = [(a, b) for names in (SEMANTIC, INSTANCE) for a in names for b in names if a < b]
 
 
 @pytest.mark.parametrize(("first", "second"), PAIRS)
-@pytest.mark.parametrize("method", ["collector", "collector@drop=1"])
-def test_the_steps_lead_from_the_run_s_number_to_its_other(first: str, second: str, method: str, made: Path) -> None:
+def test_the_steps_lead_from_the_run_s_number_to_its_other(first: str, second: str, made: Path) -> None:
+    method = "collector@drop=1"
     walk = Walker.of(load_protocol(first), load_protocol(second), f"{made}:{method}").walk()
     results = read_run(made).results
     for name in walk.start:
@@ -92,14 +92,10 @@ def test_the_command_prints_draws_and_answers_in_json(
 
 
 REFUSED = [
-    (["rooms-semantic"], "name two protocols"),
     (["rooms-semantic", "rooms-instance"], "is of kind 'semantic'"),
-    (["rooms-semantic", "replica-mesh-ex6", "--out", "x.png"], "name one"),
     (["rooms-semantic", "replica-mesh-ex6", "--prediction", "nowhere"], "there is no such folder"),
-    (["rooms-semantic", "replica-mesh-ex6", "--prediction", "{run}"], "choose one with --method"),
     (["rooms-semantic", "replica-mesh-ex6", "--prediction", "{run}:nobody"], "no scores of the method 'nobody'"),
     (["rooms-retrieval", "replica-retrieval", "--prediction", "{run}:collector"], "--prediction takes protocols of"),
-    (["rooms-semantic", "replica-mesh-ex6", "--jobs", "-1"], "must be 1 or more"),
 ]
 
 

@@ -104,13 +104,6 @@ def test_a_link_is_neither_read_nor_written_through(run: Path) -> None:
     assert page() == first
 
 
-def test_a_folder_that_takes_no_files_has_a_page_all_the_same(run: Path) -> None:
-    (run / FOLDER.parts[0]).write_text("a file in the place of the folder")
-    first = page()
-    (run / FOLDER.parts[0]).unlink()
-    assert page() == first
-
-
 def test_another_map_is_made_anew_and_the_other_scene_is_not(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page("--no-errors", *WORDS)
     place = run / "scenes" / "painted.a" / "collector" / "prediction.npz"

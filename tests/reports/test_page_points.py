@@ -15,7 +15,6 @@ from su3d_bench.reports.page import maps as html_map
 from su3d_bench.reports.page.maps import (
     NO_TRUTH_NEAR,
     NOT_SCORED,
-    box_in_view,
     index_plane,
     nearest_classes,
     nearest_colours,
@@ -98,10 +97,3 @@ def test_a_point_that_no_frame_saw_is_grey() -> None:
     assert found is not None
     assert found.tolist() == [[10, 20, 30], [128, 128, 128]]
     assert nearest_colours(seen, Candidates(seen[:0]), colours[:0]) is None
-
-
-def test_a_box_in_a_view_is_where_the_points_project() -> None:
-    intrinsics = np.array([[100.0, 0, 50], [0, 100.0, 40], [0, 0, 1]])
-    points = np.array([[0, 0, 2], [0.5, 0.4, 2], [0, 0, -1], [9, 0, 2]], np.float32)
-    assert box_in_view(points, np.eye(4), intrinsics, 100, 80) == [0.5, 0.5, 0.75, 0.75]
-    assert box_in_view(points[2:], np.eye(4), intrinsics, 100, 80) is None

@@ -23,7 +23,6 @@ from su3d_bench.analysis.page import maps as page_maps
 from su3d_bench.analysis.page import numbers as page_numbers
 from su3d_bench.analysis.page import scene as page_scene
 from su3d_bench.analysis.page.scene import same_objects
-from su3d_bench.cli.main import main
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks
 from su3d_bench.core.types import GroundTruth, LabelSet
 from su3d_bench.reports.page import maps as html_map
@@ -205,19 +204,6 @@ def test_a_mask_is_an_object_of_the_truth_where_they_share_more_than_half() -> N
     assert found == {2: lamp, 3: chair, 4: chair}  # half is not more than half
 
 
-def test_missed_objects_are_as_many_as_the_errors_of_that_name(run: Path, page: str) -> None:
-    errors = {one["method"]: one["protocols"] for one in data_of(page)["errors"]}
-    counted: dict[str, int] = {}
-    for k, listed in enumerate(data_of(page)["maps"]):
-        about, _ = unpacked(elements(page).content[f"map-{k}"])
-        counted[listed["method"]] = counted.get(listed["method"], 0) + len(about["beside"]["missed"])
-    said = {
-        method: next(one["causes"]["missed"]["n"] for one in protocols if one["protocol"] == "rooms-instance")
-        for method, protocols in errors.items()
-    }
-    assert counted == said
-
-
 def test_an_instance_is_born_at_the_update_of_its_first_view(run: Path, page: str) -> None:
     about, _ = unpacked(elements(page).content["map-0"])
     stored = read_prediction(run / "scenes" / "painted.a" / "collector" / "prediction.npz")
@@ -227,17 +213,6 @@ def test_an_instance_is_born_at_the_update_of_its_first_view(run: Path, page: st
     assert about["growth"]["held"][-1] == len(stored)
     first = [stored.views[stored.view_indptr[k] : stored.view_indptr[k + 1], 0].min() for k in range(len(stored))]
     assert [one["born"] for one in about["instances"]] == first
-
-
-def test_similarities_are_those_of_the_asked_texts(run: Path, tmp_path: Path) -> None:
-    text = painted_page(run, tmp_path / "page.html", "--queries", "chair", "table", "--no-errors")
-    about, _ = unpacked(elements(text).content["map-0"])
-    assert about["queries"] == ["chair", "table"]
-    stored = read_prediction(run / "scenes" / "painted.a" / "collector" / "prediction.npz")
-    assert stored.features is not None
-    features = stored.features / np.linalg.norm(stored.features, axis=1, keepdims=True)
-    expected = features.astype(np.float64) @ WordEncoder().encode_texts(["chair", "table"]).T
-    assert np.abs(np.array([one["similarity"] for one in about["instances"]]) / 1000 - expected).max() <= 0.0006
 
 
 def test_dense_features_have_a_class_a_point_and_no_instance(run: Path, tmp_path: Path) -> None:
@@ -276,31 +251,6 @@ def test_what_cannot_be_shown_is_a_reason_on_the_page(run: Path, tmp_path: Path)
     _, planes = unpacked(elements(text).content["map-0"])
     assert "colour" not in planes
     assert "truth" not in planes
-
-
-@pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (["{missing}"], "holds no run.json"),
-        (["{run}", "--most-megabytes", "0"], "--most-megabytes 0: must be above 0"),
-    ],
-)
-def test_a_wrong_request_is_one_line(
-    run: Path, tmp_path: Path, words: list[str], expected: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    asked = [word.format(missing=tmp_path / "none", run=run) for word in words]
-    assert main(["report", "html", *asked, "--out", str(tmp_path / "page.html")]) != 0
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert expected in lines[-1]
-    assert not (tmp_path / "page.html").exists()
-
-
-def test_a_page_answers_in_json(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = painted_page(run, tmp_path / "page.html", "--json", "--no-errors", "--title", "A <b> title")
-    told = json.loads(capsys.readouterr().out)
-    assert told["n_bytes"] == len(text.encode())
-    assert told["n_maps"] == 4
-    assert elements(text).content["title"] == "A <b> title"
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ import pytest
 from registry_bundles import Files, edit_record, painted_bundle, read_bundle, rewrite_bundle
 
 from su3d_bench.cli.main import main
-from su3d_bench.metrics.protocols.loading import read_rules
 from su3d_bench.reproducing.registry.folder import read_registry, why_not_beside
 from su3d_bench.reproducing.registry.rows import Weights, rows_of_bundle
 
@@ -106,24 +105,6 @@ def test_rows_that_mix_data_or_name_a_method_twice_are_refused(
     assert main(["registry", "add", str(bundle), "--to", str(registry)]) == 1
     assert "dan.zip: refused: " in (said := capsys.readouterr().out) and says in said
     assert sorted(path.stem for path in (registry / "bundles").iterdir()) == ["ann", "bob"]
-
-
-def test_rules_of_another_digest_under_the_same_name_do_not_mix(registry: Path, tmp_path: Path) -> None:
-    """Somebody's own protocol, of which two people have two states."""
-    rules = tmp_path / "mine.toml"
-    assert main(["new", "protocol", str(rules)]) == 0
-    eve = painted_bundle(tmp_path, "eve", ["@drop=2"], scenes="a", more=["--protocols", str(rules)])
-    files, manifest = read_bundle(eve)
-    record = json.loads(files["runs/eve/run.json"])
-    (own,) = (one for one in record["protocols"] if one["name"] == "mine")
-    own["rules"]["min_region_size"] = 60
-    own["digest"] = read_rules(own["rules"], "fay").digest
-    files["runs/eve/run.json"] = json.dumps(record).encode()
-    shutil.copy(eve, registry / "bundles")
-    rewrite_bundle(registry / "bundles" / "fay.zip", files, manifest)
-    refused = [one for one in read_registry(registry).refused if one.what.endswith("/ mine")]
-    assert [one.run for one in refused] == ["fay"] and "its protocol is version 1, digest " in refused[0].reason
-    assert "that of collector@drop=2 in eve.zip" in refused[0].reason and "score it again" in refused[0].reason
 
 
 def test_features_of_two_encoders_do_not_mix_where_the_protocol_names_one(registry: Path) -> None:

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from gated_runs import (
     counted_otherwise,
+    edit,
     in_metrics,
     in_record,
     lowered,
+    results_in,
     sealed,
     setting,
     slower,
@@ -21,7 +27,12 @@ from gated_runs import (
     without_calibration,
 )
 
+from su3d_bench.analysis.gate.check import HIGHER_IS_BETTER, check, compared
+from su3d_bench.analysis.gate.reference import Reference, Value, learn, read_reference
 from su3d_bench.cli.main import main
+from su3d_bench.core.errors import ConfigError
+from su3d_bench.reports.gate import Finding, Verdict, github_lines, junit_xml, markdown, plain_lines
+from su3d_bench.runs.finished import read_run
 
 
 def file_of(gated_copy: Path, name: str) -> Path:
@@ -149,3 +160,199 @@ def test_a_busy_machine_excuses_a_cost_up_to_twice_and_it_is_said(
     assert "the calibrating work took 15 ms, 3.0 times the reference's" in capsys.readouterr().err
     timed(gated_copy, [106.0] * 6, 150.0, calibration_ms=15.0)
     assert main(["check", str(gated_copy), "--against", str(gate_reference_file)]) == 1
+
+
+def test_the_command_fails_with_one_and_writes_what_a_pull_request_needs(
+    gated_copy: Path, gate_reference_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["check", str(gated_copy), "--against", str(gate_reference_file)]) == 0
+    lowered("metrics", "mAcc")(gated_copy)
+    capsys.readouterr()
+    words = ["check", str(gated_copy), "--against", str(gate_reference_file), "--github"]
+    assert main([*words, "--markdown", str(tmp_path / "c.md"), "--junit", str(tmp_path / "j.xml")]) == 1
+    shown = capsys.readouterr().out
+    assert shown.startswith("failed: 2 differences from") and "::error title=su3d-bench::" in shown
+    assert "| FAIL | collector / rooms-semantic / mAcc |" in (tmp_path / "c.md").read_text()
+    suite = ElementTree.parse(tmp_path / "j.xml").getroot()
+    assert suite.get("failures") == "2" and len(suite.findall("testcase/failure")) == 2
+    assert main([*words, "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["passed"] is False
+
+
+HOSTILE = "<script>|`$(x)`\n::error::\x00" + "é" * 400
+
+
+def test_a_hostile_name_does_no_harm() -> None:
+    verdict = Verdict("run", (Finding("changed", HOSTILE, HOSTILE),), 1, (HOSTILE,))
+    assert "<script>" not in markdown(verdict).replace("\\<script\\>", "")
+    ElementTree.fromstring(junit_xml(verdict))
+    lines = "\n".join(github_lines(verdict)).split("\n")
+    assert len(lines) == 2 and all(line.startswith("::") and " title=su3d-bench::" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    "words", [[], ["a"], ["a", "b", "--against", "r"], ["--learn", "a"], ["a", "--against", "r", "--cost-limit", "2"]]
+)
+def test_a_request_that_is_neither_check_nor_learn_is_one_line(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["check", *words]) == 2
+    assert capsys.readouterr().err.startswith("su3d-bench: check: ")
+
+
+def test_scenes_that_are_missing_come_first_and_what_follows_from_them_is_counted(
+    gated_copy: Path, gate_reference: Reference
+) -> None:
+    (gone,) = list(gate_reference.data_digests)[:1]
+    edit(gated_copy / "run.json", lambda r: r.update(scenes=[s for s in r["scenes"] if s != gone]))
+    edit(gated_copy / "run.json", lambda r: r["data_digests"].pop(gone))
+
+    def without(metrics: Any) -> None:
+        metrics["scenes"].remove(gone)
+        for result in metrics["results"]:
+            result["n_planned"] -= 1
+            result["result"]["scenes"].remove(gone)
+            result["result"]["per_scene"].pop(gone)
+            result["result"]["n_scenes"] -= 1
+            for row in (result["result"]["metrics"], *result["result"]["per_class"].values()):
+                row.update({name: 0.25 for name, value in row.items() if isinstance(value, float)})
+
+    edit(gated_copy / "metrics.json", without)
+    verdict = check(read_run(gated_copy), gate_reference)
+    lines = plain_lines(verdict)
+    n_explained = sum(one.is_explained for one in verdict.findings)
+    assert f"{n_explained} of them because of other scenes" in lines[0] and n_explained > 20
+    assert lines[1] == f"FAIL {gone}: the run does not have this scene"
+    assert lines[-1] == (
+        f"FAIL over other scenes: {n_explained} differences follow from scenes that the run or the reference alone has"
+    )
+    assert len(lines) < 12
+
+
+def test_a_run_without_numbers_teaches_nothing(gated_copy: Path, gated: Path) -> None:
+    in_metrics(lambda m: m["results"][1].update(result=None))(gated_copy)
+    with pytest.raises(ConfigError, match="collector under rooms-instance: was not scored; learn from runs with num"):
+        learn([read_run(gated), read_run(gated_copy)])
+
+
+def test_a_run_that_timed_nothing_teaches_no_cost(gated_copy: Path, gated: Path, gate_reference: Reference) -> None:
+    without_calibration(gated_copy)
+    taught = learn([read_run(gated), read_run(gated_copy)])
+    assert taught.costs == gate_reference.costs != {}
+    assert taught.calibration_ms == gate_reference.calibration_ms
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[" * 100_000])
+def test_a_damaged_reference_is_one_line(
+    text: str, gated_copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "bad.json").write_text(text)
+    assert main(["check", str(gated_copy), "--against", str(tmp_path / "bad.json")]) == 2
+    error = capsys.readouterr().err
+    assert "check --learn" in error and error.count("\n") == 1
+
+
+def test_a_reference_survives_its_file(gate_reference: Reference, tmp_path: Path) -> None:
+    (tmp_path / "r.json").write_text(
+        json.dumps(
+            gate_reference.model_dump(
+                mode="json",
+            )
+        )
+    )
+    assert read_reference(tmp_path / "r.json") == gate_reference
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "is_read"),
+    [
+        ("n_runs", 0, False), ("across_machines", 1.0, True), ("across_machines", 1.01, False),
+        ("cost_limit", 1.0, False), ("results", [], False), ("schema_version", 3, False),
+    ],
+)  # fmt: skip
+def test_a_reference_outside_its_limits_is_none(
+    key: str, value: object, is_read: bool, gate_reference: Reference, tmp_path: Path
+) -> None:
+    gated = gate_reference.model_dump(mode="json")
+    gated["results"] = gated["results"][:1]
+    (tmp_path / "r.json").write_text(json.dumps(gated | {key: value}))
+    if is_read:
+        assert getattr(read_reference(tmp_path / "r.json"), key) == value
+    else:
+        with pytest.raises(ConfigError, match="is no reference of this version"):
+            read_reference(tmp_path / "r.json")
+
+
+def test_what_is_better_is_said_and_passes(gated_copy: Path, gated: Path) -> None:
+    verdict = check(read_run(gated), learn([read_run(counted_otherwise(gated_copy))]))
+    assert verdict.is_passed
+    assert {one.kind for one in verdict.findings} == {"better"}
+    assert f"{len(verdict.findings)} better" in plain_lines(verdict)[0]
+
+
+def test_the_tolerance_is_twice_the_spread_of_the_taught_runs(gated_copy: Path, gated: Path, tmp_path: Path) -> None:
+    first, second = (read_run(path) for path in (gated, counted_otherwise(gated_copy, 4)))
+    values = [results_in(one).metrics["mAcc"] for one in (first, second)]
+    taught = learn([first, second])
+    gate_reference_file = taught.results[0].metrics["mAcc"]
+    assert gate_reference_file.value == pytest.approx(np.mean(values))
+    assert gate_reference_file.tolerance == pytest.approx(2 * (values[0] - values[1]))
+    for n_points, is_passed in ((9, True), (11, False)):  # 2 less than the mean of the two, and 8 more at most
+        shutil.copytree(gated, tmp_path / str(n_points))
+        verdict = check(read_run(counted_otherwise(tmp_path / str(n_points), n_points)), taught)
+        assert verdict.is_passed == is_passed, verdict.findings
+
+
+def findings_of(
+    gated_copy: Path, name: str, measured: float, value: Value, across: float | None = None
+) -> list[Finding]:
+    """What is said where a run measured this of a headline value of which no scene and class is known."""
+    numbers = replace(results_in(read_run(gated_copy)), metrics={name: measured}, per_scene={}, per_class={})
+    first = learn([read_run(gated_copy)]).results[0]
+    expected = first.model_copy(update={"metrics": {name: value}, "scenes": {}, "classes": {}})
+    return list(compared("m / p", expected, numbers, across))
+
+
+def test_a_value_that_differs_by_just_the_tolerance_passes_and_by_a_bit_more_fails(gated: Path) -> None:
+    taught = Value(value=0.75, tolerance=0.25)
+    for value, n_findings in ((0.5, 0), (1.0, 0), (np.nextafter(0.5, 0), 1)):
+        assert len(findings_of(gated, "mAcc", float(value), taught)) == n_findings
+
+
+@pytest.mark.parametrize("value", [0.25, 0.75])
+def test_a_value_without_a_better_direction_may_move_in_neither(value: float, gated: Path) -> None:
+    assert "over-merged" not in HIGHER_IS_BETTER
+    found = findings_of(gated, "over-merged", value, Value(value=0.5))
+    assert [(one.kind, one.text, one.is_failure) for one in found] == [
+        ("regression", "differs from the reference", True)
+    ]
+    found = findings_of(gated, "mAcc", value, Value(value=0.5))
+    assert [one.kind for one in found] == ["better" if value > 0.5 else "regression"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("jobs = 1", "jobs = 2"), ("cache = true", "cache = false"), ("/b", "/[b]"), (":Collector", ":Collectors"),
+        ('"rooms-semantic", ', ""),
+    ],
+)  # fmt: skip
+def test_how_a_run_was_asked_for_and_what_moves_no_number_may_differ(
+    old: str, new: str, gated_copy: Path, gate_reference: Reference
+) -> None:
+    setting(old, new)(gated_copy)
+    assert check(read_run(gated_copy), gate_reference).findings == ()
+    assert learn([read_run(gated_copy)]).settings == gate_reference.settings
+
+
+def test_on_another_processor_headline_values_have_a_stated_tolerance(
+    gated_copy: Path, gate_reference: Reference
+) -> None:
+    slower(3.0)(counted_otherwise(gated_copy, 4))
+    assert not check(read_run(gated_copy), gate_reference).is_passed
+    edit(gated_copy / "run.json", lambda r: r.update(processor="other"))
+    verdict = check(read_run(gated_copy), gate_reference)
+    assert verdict.is_passed, verdict.findings
+    assert "another processor" in verdict.remarks[0] and "within 2 points" in verdict.remarks[0]
+    counted_otherwise(gated_copy, 40)
+    assert not check(read_run(gated_copy), gate_reference).is_passed

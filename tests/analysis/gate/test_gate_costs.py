@@ -170,14 +170,3 @@ def test_a_reference_that_holds_nothing_or_the_impossible_is_none(
     (tmp_path / "r.json").write_text(json.dumps(value))
     with pytest.raises(ConfigError, match=rf"is no reference of this version: .*{said}"):
         read_reference(tmp_path / "r.json")
-
-
-def test_a_method_and_a_protocol_that_the_reference_does_not_know_are_named(
-    tmp_path: Path, reference: Reference
-) -> None:
-    words = ["--methods", f"{PAINTED}:Delayed", f"{PAINTED}:Collector"]
-    words += ["--protocols", "rooms-semantic", "rooms-instance"]
-    verdict = check(read_run(made_in(tmp_path / "run", *words)), reference)
-    changed = [one for one in verdict.failures if one.kind != "cost" and one.where != "settings"]
-    assert changed == []
-    assert "the reference does not know, so that nothing holds: collector, rooms-instance" in verdict.remarks

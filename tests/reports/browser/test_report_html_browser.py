@@ -60,21 +60,6 @@ def test_a_filter_leaves_the_rows_that_hold_its_text(browser: Chromium) -> None:
     assert column(browser, "classes", 0) == everything
 
 
-def test_one_choice_of_protocol_and_its_metric_change_all_tables(browser: Chromium) -> None:
-    assert options(browser, "scenes", "Protocol") == ["rooms-semantic", "rooms-instance"]
-    choose(browser, "scenes", "Protocol", "rooms-instance")
-    assert options(browser, "scenes", "Metric")[:3] == ["AP", "AP50", "AP25"]
-    assert options(browser, "classes", "Column")[:3] == ["AP", "AP50", "AP25"]
-    assert "missed" in text_of(browser, "#errors tbody")
-    before = text_of(browser, "#scenes caption")
-    choose(browser, "scenes", "Metric", "AP25")
-    assert text_of(browser, "#scenes caption") != before
-    choose(browser, "errors", "Metric", "AP50")
-    assert "AP50" in text_of(browser, "#errors caption")
-    choose(browser, "scenes", "Protocol", "rooms-semantic")
-    assert "geometry" in text_of(browser, "#errors tbody")
-
-
 def test_swapping_the_sides_turns_the_sign(browser: Chromium) -> None:
     sides = options(browser, "compare", "A")
     choose(browser, "compare", "A", next(one for one in sides if "noise" not in one and "one" in one))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from places import SCENES
 
 from su3d_bench.analysis.page.gallery import PHOTO, PREDICTED, SeenError, error_photo
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import FramesMissing
 from su3d_bench.core.types import Frame
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
@@ -102,27 +101,6 @@ def test_the_points_of_all_cards_are_the_wrong_points(page: Path) -> None:
                 assert sum(card["n_points"] for card in own) == told["n"]
 
 
-def test_a_photo_that_cannot_be_taken_is_a_reason_and_is_not_kept(
-    run: Path, page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def missing(self: Any, scene: str, stride: int) -> Any:
-        raise FramesMissing(f"painted/{scene}: has no frames \x1b[31m")
-
-    before = page.read_text()
-    for piece in (run / ".cache" / "page").iterdir():
-        piece.unlink()
-    (dataset,) = {type(one) for one in [finished_run.read_run(run).dataset("painted/a")]}
-    with monkeypatch.context() as patch:
-        patch.setattr(dataset, "frames", missing)
-        text = made(run, tmp_path / "page.html", "--no-maps")
-        assert {card["why"] for card in cards(text) if "no frames" in card["why"]} == {
-            "painted/a: has no frames \\x1b[31m",
-            "painted/b: has no frames \\x1b[31m",
-        }
-        assert all(one["photos"] == [] for one in galleries(text))
-    assert galleries(made(run, tmp_path / "page.html", "--no-maps")) == galleries(before)
-
-
 def plane_seen(n_pixels: int = 40) -> Frame:
     """A wall two metres before a camera that looks along z."""
     depth = np.full((n_pixels, n_pixels), 2.0, np.float32)
@@ -191,25 +169,12 @@ def shown(browser: Chromium, what: str = "") -> list[str]:
     return found
 
 
-def status(browser: Chromium) -> str:
-    return str(browser.run("document.querySelector('#gallery .count').textContent"))
-
-
 def costs(browser: Chromium) -> list[float]:
     return [float(text.replace("\N{MINUS SIGN}", "-")) for text in shown(browser, ".cost b")]
 
 
 def click(browser: Chromium, selector: str) -> None:
     browser.run(f"document.querySelector({json.dumps(selector)}).click()")
-
-
-def is_hidden(browser: Chromium, text: str) -> bool:
-    return bool(
-        browser.run(
-            "[...document.querySelectorAll('#gallery button')].find((one) => one.textContent.startsWith("
-            f"{json.dumps(text)})).hidden"
-        )
-    )
 
 
 @needs_browser
@@ -223,57 +188,6 @@ def test_cards_are_sorted_by_the_cost_in_the_chosen_metric(anew: Chromium) -> No
     anew.run(f"{photo}.scrollIntoView()")
     anew.until(f"{photo}.complete && {photo}.naturalWidth === {PHOTO[0]}")
     assert "Frame" in str(anew.run(f"{photo}.alt"))
-
-
-@needs_browser
-@pytest.mark.parametrize("label", ["Kind", "Class, true or called"])
-def test_each_filter_leaves_those_that_it_names_and_all_come_back(anew: Chromium, label: str, page: Path) -> None:
-    found = [card for card in cards(page.read_text()) if card["protocol"] == "rooms-instance"]
-
-    def holds(card: dict[str, Any], text: str) -> bool:
-        both = [*card["true"], *card["called"]]
-        of: dict[str, Sequence[str]] = {
-            "Method": [card["method"]], "Scene": [card["scene"]], "Kind": [card["kind"]],
-            "Class, true or called": both, "Called": card["called"],
-        }  # fmt: skip
-        return text in of[label]
-
-    names = options(anew, label)[1:]
-    assert names
-    for name in names:
-        choose(anew, label, name)
-        n = sum(holds(card, name) for card in found)
-        assert f" of {n} error" in status(anew)
-        assert len(shown(anew)) == min(n, 24) > 0
-    anew.run("[...document.querySelectorAll('#gallery button')].find((one) => one.textContent === 'Show all').click()")
-    assert f" of {len(found)} error" in status(anew)
-    assert chosen(anew, label) == options(anew, label)[0]
-
-
-@needs_browser
-@pytest.mark.parametrize("part", ["classes", "confusion"])
-def test_a_row_a_cell_and_a_bar_lead_to_their_errors_and_back(anew: Chromium, part: str) -> None:
-    if part == "confusion":
-        choose(anew, "Protocol", "rooms-semantic")
-        field = "[...document.querySelectorAll('#confusion select')][1]"
-        anew.run(f"{{ const field = {field}; field.selectedIndex = 1; field.dispatchEvent(new Event('change')); }}")
-    way = f"#{part} .confusion .to-gallery" if part == "confusion" else f"#{part} .to-gallery"
-    wish = json.loads(str(anew.run(f"document.querySelector({json.dumps(way)}).dataset.to")))
-    anew.run(f"document.querySelector({json.dumps(way)}).focus()")
-    anew.call("Input.dispatchKeyEvent", {"type": "keyDown", "key": "Enter", "code": "Enter", "text": "\r"})
-    anew.call("Input.dispatchKeyEvent", {"type": "keyUp", "key": "Enter", "code": "Enter"})
-    anew.until("document.activeElement.textContent.startsWith('Back to')")
-    assert chosen(anew, "Protocol") == wish["protocol"]
-    labels = {"scene": "Scene", "kind": "Kind", "name": "Class, true or called", "called": "Called"}
-    for key, label in labels.items():
-        assert chosen(anew, label) == wish.get(key, options(anew, label)[0])
-    assert len(shown(anew)) > 0
-    top = anew.run("document.getElementById('gallery').getBoundingClientRect().top")
-    assert abs(top) < 120
-    anew.run("document.activeElement.click()")
-    assert anew.run("document.activeElement.dataset.to && JSON.parse(document.activeElement.dataset.to)") == wish
-    assert anew.run(f"document.activeElement.closest('section').id === {json.dumps(part)}")
-    assert is_hidden(anew, "Back")
 
 
 @needs_browser

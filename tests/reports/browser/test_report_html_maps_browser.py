@@ -78,24 +78,6 @@ def test_the_mouse_turns_moves_zooms_and_picks(browser: Chromium) -> None:
     assert browser.run("document.querySelectorAll('#maps tr[aria-selected=true]').length") == 1
 
 
-def test_an_instance_shows_its_name_class_scores_and_view(browser: Chromium) -> None:
-    open_maps(browser)
-    press(browser, "#maps canvas", "Escape", "n")
-    first = text_of(browser, "#maps .detail h3")
-    shown = text_of(browser, "#maps .detail")
-    for what in ("Class (rooms-semantic)", "Truth there", "Score", "Points", "Seen in", "Most like", "Frame"):
-        assert what in shown
-    browser.until("document.querySelector('#maps .detail img').naturalWidth > 0")
-    press(browser, "#maps canvas", "n")
-    assert text_of(browser, "#maps .detail h3") != first
-    press(browser, "#maps canvas", "p")
-    assert text_of(browser, "#maps .detail h3") == first
-    press(browser, "#maps canvas", "Escape")
-    assert browser.run("document.querySelector('#maps .detail h3') === null")
-    press(browser, "#maps .side tbody tr", "Enter")
-    assert text_of(browser, "#maps .detail h3") == column(browser, "maps", 0)[0]
-
-
 def test_without_webgl_the_page_says_so_and_keeps_its_numbers(
     runs_page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
