@@ -38,8 +38,7 @@ from su3d_bench.core.files.atomic import filling
 from su3d_bench.core.files.locks import is_unfinished
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.metrics.attribution.arrays import EXPLAINED, MendedScene
-from su3d_bench.metrics.attribution.masks import Mended
-from su3d_bench.metrics.attribution.points import MendedPoints
+from su3d_bench.metrics.attribution.masks import Mended, MendedPoints
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.matching.nearest import COVERAGE_RADII_M
 from su3d_bench.metrics.metric import Counts, SceneScore

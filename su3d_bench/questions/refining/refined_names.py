@@ -13,7 +13,7 @@ from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.files.atomic import read_json, write_json
 from su3d_bench.core.maps import Instances
-from su3d_bench.metrics.questions.truths import RefinedNames
+from su3d_bench.metrics.questions.score import RefinedNames
 from su3d_bench.questions.refining.refinement import RefinedName, TopNames
 from su3d_bench.questions.truths import voted_names
 from su3d_bench.questions.undesired import FilterConfig, undesired

@@ -13,8 +13,7 @@ from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, counted, printable, reading, shown
 from su3d_bench.core.files.atomic import make_folder, replacing
 from su3d_bench.core.system.files import opened
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.reproducing.bundle import PIECE
 from su3d_bench.reproducing.registry.rows import Row, rows_of_bundle
 from su3d_bench.reproducing.verifying import verify_bundle
