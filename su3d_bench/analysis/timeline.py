@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
 
 import numpy as np
 
 from su3d_bench.analysis.page.maps import Spaces, shown_classes, shown_rules
-from su3d_bench.analysis.page.scene import SceneData, fed_frames, frames_of
-from su3d_bench.core.errors import StoreError, Su3dError, counted, printable
+from su3d_bench.analysis.page.scene import SceneData, SceneReader, fed_frames, frames_of
+from su3d_bench.core.errors import StoreError, counted, printable
 from su3d_bench.core.geometry import back_project, valid_depth
 from su3d_bench.core.interfaces import HasSketches
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
@@ -178,15 +177,15 @@ class SceneTimeline:
     def __init__(self, run: FinishedRun, scene: str, methods: Sequence[str], stride: int, spaces: Spaces) -> None:
         self._run, self.scene, self._methods, self._stride = run, scene, methods, stride
         self._spaces = spaces
-        self._data = SceneData(scene)
-        self.remarks: list[str] = []
+        self._reader = SceneReader(run, scene, SceneData(scene))
+        self.remarks = self._reader.remarks
         self.n_frames = self.n_maps = 0
 
     def write(self, recording: Recording, tell: Tell = lambda n_done, n: None) -> None:
         """All of it into ``recording`` in the order of time; ``tell`` hears how many frames are done."""
         frames = self._frames()
         rules = shown_rules(self._run)
-        truth = None if rules is None else self._truth(rules)
+        truth = None if rules is None else self._reader.truth(rules)
         shown_truth = None if truth is None or rules is None else owned_of_truth(rules, truth)
         maps = self._maps(rules, truth)
         self.n_maps = len(maps)
@@ -219,30 +218,11 @@ class SceneTimeline:
             growth.end()
         recording.close(self._about())
 
-    def _had(self, what: str, make: Callable[[], Any]) -> Any:
-        """What ``make`` gives; None and a remark where it cannot be had."""
-        try:
-            return make()
-        except Su3dError as error:
-            line = printable(f"{what}: {error}")
-            if line not in self.remarks:
-                self.remarks.append(line)
-            return None
-
-    @cached_property
-    def _dataset(self) -> Any:
-        return self._had("no frames and no truth", lambda: self._run.dataset(self.scene))
-
-    @cached_property
-    def _sequence(self) -> Sequence[Frame]:
-        if self._dataset is None:
-            return ()
-        return self._had("no frames", lambda: self._data.sequence(self._dataset)) or ()
-
     def _frames(self) -> list[int]:
         """The frames that are shown: of those that the methods were given, else of all."""
         fed = {index for method in self._methods for index in fed_frames(self._run, self.scene, method)}
-        there = sorted(index for index in fed if 0 <= index < len(self._sequence)) or range(len(self._sequence))
+        n_frames = len(self._reader.sequence)
+        there = sorted(index for index in fed if 0 <= index < n_frames) or range(n_frames)
         if self._stride:
             return list(there[:: self._stride])
         return [there[place] for place in evenly(len(there), MOST_FRAMES)] if len(there) else []
@@ -251,25 +231,19 @@ class SceneTimeline:
         name = self.scene.partition("/")[2]
 
         def read() -> Frame:
-            if isinstance(self._dataset, HasSketches):
-                return self._dataset.sketch(name, index, MOST_WIDTH)
-            return smaller(self._sequence[index], MOST_WIDTH)
+            if isinstance(self._reader.dataset, HasSketches):
+                return self._reader.dataset.sketch(name, index, MOST_WIDTH)
+            return smaller(self._reader.sequence[index], MOST_WIDTH)
 
-        frame: Frame | None = self._had("a frame is left out", read)
+        frame: Frame | None = self._reader.had("a frame is left out", read)
         return frame
-
-    def _truth(self, rules: ProtocolRules) -> GroundTruth | None:
-        if self._dataset is None:
-            return None
-        truth: GroundTruth | None = self._had("no truth", lambda: self._data.truth(self._dataset, rules.ground_truth))
-        return truth
 
     def _maps(self, rules: ProtocolRules | None, truth: GroundTruth | None) -> dict[str, tuple[Owned, Sequence[int]]]:
         """Each method's map, and the first frame in which each of its instances was seen, 0 where nobody knows."""
         maps: dict[str, tuple[Owned, Sequence[int]]] = {}
         for method in self._methods:
             file = self._run.folder.job(self.scene, method).prediction
-            prediction = self._had(f"no map of {printable(method, 80)}", partial(read_prediction, file))
+            prediction = self._reader.had(f"no map of {printable(method, 80)}", partial(read_prediction, file))
             if prediction is not None:
                 n = 0 if isinstance(prediction, DenseFeatures) else n_predictions(prediction)
                 is_known = isinstance(prediction, Instances)
@@ -285,7 +259,7 @@ class SceneTimeline:
         labels: tuple[str, ...] = ()
         if rules is not None:
             of_truth = None if truth is None else class_index_of_ids(rules, truth.semantic)
-            classes = self._had(
+            classes = self._reader.had(
                 "no classes", lambda: shown_classes(self._run, rules, prediction, of_truth, cloud, self._spaces)
             )
             if classes is not None:
@@ -296,7 +270,7 @@ class SceneTimeline:
     def _curves(self, method: str) -> dict[int, dict[str, float]]:
         """Frame -> curve -> value, of what the updates of a method say."""
         file = self._run.folder.job(self.scene, method).updates
-        columns = self._had(f"no growth of {printable(method, 80)}", lambda: read_updates(file, file.name)) or {}
+        columns = self._reader.had(f"no growth of {printable(method, 80)}", lambda: read_updates(file, file.name)) or {}
         known = {column: curve for column, curve in COLUMNS.items() if column in columns}
         frames = columns.get("frame", ())
         return {

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from su3d_bench.metrics.attribution.overlaps import Overlaps
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.instance.scene_counts import intersections
 from su3d_bench.metrics.matching.nearest import Candidates
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.reports.page.maps import (
     box_in_view,
     colour_plane,
@@ -33,6 +34,7 @@ from su3d_bench.reports.pictures.scene_look import spread
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.records import read_updates
 
+Had = TypeVar("Had")
 MOST_VIEWS = 12  # frames of an instance that are named
 MOST_CAPTION = 240  # characters
 MOST_STEPS = 500  # of a growth: more than a slider has pixels
@@ -184,6 +186,41 @@ class SceneData:
         n_frames = len(self.sequence(dataset))
         known = sorted({index for index in fed if 0 <= index < n_frames}) or range(n_frames)
         return [known[place] for place in spread(len(known), MOST_LOOKED_AT)]
+
+
+class SceneReader:
+    """The data of one scene of a run, as far as they are here; ``remarks``: what could not be had, each once."""
+
+    def __init__(self, run: FinishedRun, scene: str, data: SceneData) -> None:
+        self._run, self._scene, self.data = run, scene, data
+        self.remarks: list[str] = []
+
+    def had(self, what: str, make: Callable[[], Had]) -> Had | None:
+        """What ``make`` gives; None and a remark where it cannot be had."""
+        try:
+            return make()
+        except Su3dError as error:
+            line = printable(f"{what}: {error}")
+            if line not in self.remarks:
+                self.remarks.append(line)
+            return None
+
+    @cached_property
+    def dataset(self) -> Any:
+        """The dataset where its data are those of the run, else None."""
+        return self.had("no frames, colours and truth", lambda: self._run.dataset(self._scene))
+
+    @cached_property
+    def sequence(self) -> Sequence[Frame]:
+        """Every frame, in order; none where they cannot be had."""
+        if self.dataset is None:
+            return ()
+        return self.had("no frames", lambda: self.data.sequence(self.dataset)) or ()
+
+    def truth(self, rules: ProtocolRules) -> GroundTruth | None:
+        if self.dataset is None:
+            return None
+        return self.had("no ground truth", lambda: self.data.truth(self.dataset, rules.ground_truth))
 
 
 Seen = tuple[Candidates, UInt8Array]  # points (n, 3) m that frames saw and their colours (n, 3)
