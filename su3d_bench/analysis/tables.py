@@ -25,9 +25,9 @@ from su3d_bench.reports.tables.papers.latex import PrintedCell, printed_cells
 from su3d_bench.reports.tables.papers.paper import Shown, paper_table
 from su3d_bench.reports.tables.papers.published import PaperTable
 from su3d_bench.reports.tables.timing import AnytimePoint
+from su3d_bench.runs.ablation import read_rows
 from su3d_bench.runs.finished import FinishedRun, is_numbers_alone, read_run
-from su3d_bench.runs.found import found_in, without_score
-from su3d_bench.runs.planning.ablation import read_rows
+from su3d_bench.runs.summary import found_in, without_score
 from su3d_bench.sheets.judging.scores import FILE as SCORES_FILE
 from su3d_bench.sheets.judging.scores import LABEL_METRICS, ScoreCell, Scores, read_scores
 from su3d_bench.store.records import NumbersRecord, ResultRecord

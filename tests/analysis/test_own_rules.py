@@ -44,7 +44,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 VERBS = {
-    "attribute": ["attribute", "{first}", "--method", "collector"],
+    "attribute": ["report", "attribution", "{first}", "--method", "collector"],
     "compare": ["compare", "{first}:collector", "{second}:collector@drop=1", "--per-class"],
     "page": ["report", "html", "{first}", "--out", "{out}/page.html"],
     "learn": ["check", "--learn", "{first}", "{second}", "--out", "{out}/reference.json"],

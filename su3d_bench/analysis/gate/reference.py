@@ -14,13 +14,13 @@ from typing import Any, Literal, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from su3d_bench.analysis.recomputed import damaged_files, why_not_counted
 from su3d_bench.core.config import MOVES_NO_NUMBER
 from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, counted, printable
 from su3d_bench.core.files.atomic import read_json
 from su3d_bench.metrics.costs import MAP, WARM_UP, UpdateTimes
 from su3d_bench.reports.gate import Compared, Finding
 from su3d_bench.runs.finished import FinishedRun, read_update_times
+from su3d_bench.runs.verify import damaged_files, why_not_counted
 from su3d_bench.store.records import ROUNDING, ResultRecord, impossible_value
 
 # Where the calibrating work itself takes so many times the reference's on the same kind of processor, others used it,

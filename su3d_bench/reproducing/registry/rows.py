@@ -18,8 +18,8 @@ from su3d_bench.metrics.costs import MAP, TOTAL, WARM_UP, summarise
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.perception.models.catalogue import MODELS, encoder_known_as
 from su3d_bench.reproducing.bundle import MANIFEST, RUNS, Unpacked, unpack
+from su3d_bench.runs.existing import existing_run
 from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
-from su3d_bench.runs.planning.held import held_run
 from su3d_bench.store.run_folder import JOBS, RECORDS
 
 UNKNOWN = "not known: run.toml is not whole"
@@ -33,7 +33,7 @@ def command_of(run: FinishedRun, method: str) -> str:
     """
     if method in run.made_elsewhere:
         return printable(_evaluation(run, method), MOST_CHARACTERS)
-    held = held_run(run.folder.path)
+    held = existing_run(run.folder.path)
     if held is None or not held.is_known:
         return UNKNOWN
     asked = {path: value for path, value in held.values.items() if held.remarks.get(path) != DEFAULT_SOURCE}
