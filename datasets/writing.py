@@ -21,7 +21,7 @@ from su3d_bench.core.files.atomic import make_folder, write_bytes, write_json, w
 from su3d_bench.core.files.locks import clear_unfinished
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int32Array, UInt8Array
-from su3d_bench.datasets.recordings.made_rooms import MARKER, read_marker
+from su3d_bench.datasets.recordings.file_dataset import MARKER, read_marker
 
 FRAMES_PER_SECOND = 30.0
 

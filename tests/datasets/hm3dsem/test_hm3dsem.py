@@ -63,7 +63,7 @@ def test_scenes_groups_and_a_word_on_each(walk: Path, tmp_path: Path) -> None:
     assert dataset.up(SCENE).axis == "y" and list(dataset.problems(SCENE)) == []
     with pytest.raises(DataError, match=rf"^hm3dsem: no scene 'x'; .*{SCENE}"):
         dataset.info("x", 1)
-    with pytest.raises(ScenesMissing, match="datasets make rooms --layout hm3dsem"):
+    with pytest.raises(ScenesMissing, match="generate them with HOV-SG's tools"):
         Hm3dSem(tmp_path / "nowhere").scenes()
 
 
