@@ -11,7 +11,7 @@ from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import SceneScore, metric_of
-from su3d_bench.questions.files.queries import VARIANT as QUERY_OBJECTS
+from su3d_bench.questions.query_files import VARIANT as QUERY_OBJECTS
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 # They move no number of a common scene.

@@ -96,7 +96,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def _make(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.files.files import check_form, write_questions
+    from su3d_bench.questions.question_files import check_form, write_questions
 
     if arguments.file is not None:
         raise ConfigError("questions make: takes no file; name it with --out")
@@ -123,7 +123,7 @@ def _make_beacon3d(arguments: argparse.Namespace) -> int:
     """Write one of Beacon3D's metadata files over objects of the scenes."""
     from su3d_bench.cli.datasets.check import chosen_scenes
     from su3d_bench.core.files.atomic import write_json
-    from su3d_bench.questions.chains.made_questions import made_files
+    from su3d_bench.questions.chains import made_files
     from su3d_bench.questions.truths import MIN_VERTICES, fullest_truth, scene_objects
 
     if arguments.leave_out is not None or arguments.source != SOURCES[0]:
@@ -147,8 +147,8 @@ def _make_beacon3d(arguments: argparse.Namespace) -> int:
 
 def _made(arguments: argparse.Namespace) -> list[Question]:
     from su3d_bench.cli.datasets.check import chosen_scenes
-    from su3d_bench.questions.files.left_out import read_left_out
     from su3d_bench.questions.generator import chosen
+    from su3d_bench.questions.query_files import read_left_out
     from su3d_bench.questions.truths import questions_of
 
     left_out = frozenset[str]() if arguments.leave_out is None else read_left_out(arguments.leave_out)
@@ -164,7 +164,7 @@ def _made(arguments: argparse.Namespace) -> list[Question]:
 
 
 def _show(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.files.files import paper_queries, read_questions
+    from su3d_bench.questions.question_files import paper_queries, read_questions
 
     if arguments.file is None:
         raise ConfigError("questions show: name a file, or 'paper' for the queries that the paper's page shows")
@@ -269,7 +269,7 @@ def _score(arguments: argparse.Namespace) -> int:
 
 
 def _score_answers(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.chains.report import answered_file, answered_json, answered_table, answers_to_questions
+    from su3d_bench.questions.beacon3d import answered_file, answered_json, answered_table, answers_to_questions
 
     if arguments.file is None or arguments.answers is None:
         raise ConfigError("questions score: needs a metadata_*.json of Beacon3D and --answers FILE")
@@ -277,7 +277,7 @@ def _score_answers(arguments: argparse.Namespace) -> int:
     if not arguments.judge:
         answered = answered_file(asked, arguments.answers)
     else:
-        from su3d_bench.questions.chains.judge import judge_requests, judged
+        from su3d_bench.questions.beacon3d import judge_requests, judged
         from su3d_bench.store.run_folder import RunFolder
 
         folder = RunFolder(arguments.answers.with_name(f"{arguments.answers.stem}.judged"))

@@ -17,8 +17,8 @@ from su3d_bench.core.types import SceneInfo
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.perception.models.catalogue import STAND_IN, WEIGHTS_CAVEAT
 from su3d_bench.perception.profiles import Perception, PerceptionConfig
-from su3d_bench.questions.reasoning.language_solver import answers_digest
-from su3d_bench.questions.refining.refined_names import refined_digest
+from su3d_bench.questions.language_solver import answers_digest
+from su3d_bench.questions.refining import refined_digest
 from su3d_bench.runs.own.watch import told
 from su3d_bench.runs.parts import Part
 from su3d_bench.store.records import SealRecord

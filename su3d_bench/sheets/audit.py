@@ -14,7 +14,7 @@ from su3d_bench.core.files.atomic import make_folder, remove_file, write_bytes, 
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array, UInt8Array
 from su3d_bench.formats.tables.csv_text import csv_lines
 from su3d_bench.questions.audit import AuditedQuestion, Things
-from su3d_bench.questions.reasoning.scene_map import MapObject
+from su3d_bench.questions.scene_map import MapObject
 from su3d_bench.questions.sight import looked_at
 from su3d_bench.questions.truths import fullest_truth
 from su3d_bench.reports.pictures.items import owners_in_frame, png_bytes

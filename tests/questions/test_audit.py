@@ -22,7 +22,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, DataError, StoreError
 from su3d_bench.questions.audit import AuditedQuestion, audited_questions, of_kinds, sample
 from su3d_bench.questions.model import MADE_KINDS, Question, new_question
-from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
+from su3d_bench.questions.scene_map import MapObject, SceneMap
 from su3d_bench.reports.pictures.items import png_bytes
 from su3d_bench.reports.pictures.tiles import Line, Mark, Photo, Tile, contact_sheet, picture_strip
 from su3d_bench.sheets.audit import BLUE, GREEN, ORANGE, make_audit

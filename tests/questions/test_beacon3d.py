@@ -19,11 +19,12 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
 from su3d_bench.metrics.questions import chains as counting
 from su3d_bench.metrics.questions.chains import ChainedText, Place
-from su3d_bench.questions.chains import answer_matching, answered, beacon3d_files, made
-from su3d_bench.questions.chains.answered import Number
-from su3d_bench.questions.chains.report import answered_file
-from su3d_bench.questions.files.datasets import read_foreign_queries
-from su3d_bench.questions.files.files import read_questions
+from su3d_bench.questions import beacon3d as answer_matching
+from su3d_bench.questions import beacon3d as answered
+from su3d_bench.questions import beacon3d as beacon3d_files
+from su3d_bench.questions import chains as made
+from su3d_bench.questions.beacon3d import Number, answered_file
+from su3d_bench.questions.question_files import read_foreign_queries, read_questions
 
 PROBLEMS = json.loads((CASES / "beacon3d01_answers.json").read_text())
 FINE = {"text": "The large box", "obj_id": ["27"], "tag": "class-geometry"}

@@ -18,13 +18,19 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.perception.language.chat import ChatRequest
 from su3d_bench.perception.language.chat import Reply as ModelReply
 from su3d_bench.perception.language.config import LanguageConfig
+from su3d_bench.questions import beacon3d as judge
+from su3d_bench.questions import chains as made_questions
 from su3d_bench.questions import truths
-from su3d_bench.questions.chains import judge, made_questions
-from su3d_bench.questions.chains.answered import answer_numbers
-from su3d_bench.questions.chains.beacon3d_files import chains_of, questions_of_objects, read_replies
-from su3d_bench.questions.chains.judge import judged, score_of
-from su3d_bench.questions.chains.made_questions import made_files, metadata_of, questions_about
-from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
+from su3d_bench.questions.beacon3d import (
+    answer_numbers,
+    chains_of,
+    judged,
+    questions_of_objects,
+    read_replies,
+    score_of,
+)
+from su3d_bench.questions.chains import made_files, metadata_of, questions_about
+from su3d_bench.questions.scene_map import MapObject, SceneMap
 
 PROBLEMS = json.loads((CASES / "beacon3d01_answers.json").read_text())["qa"]
 QUICK = ("backoff_s=0.001", "max_retries=1", "total_timeout_s=1.0", "max_failures_in_a_row=50")

@@ -9,9 +9,19 @@ import numpy as np
 import pytest
 
 from su3d_bench.questions.generator import generate
-from su3d_bench.questions.looks import BUILDS, SHAPES, Looks, looks_of, measure_of
-from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
-from su3d_bench.questions.sight import COLOURS, TONES, Sight, maybe_colours, tones_of
+from su3d_bench.questions.scene_map import MapObject, SceneMap
+from su3d_bench.questions.sight import (
+    BUILDS,
+    COLOURS,
+    SHAPES,
+    TONES,
+    Looks,
+    Sight,
+    looks_of,
+    maybe_colours,
+    measure_of,
+    tones_of,
+)
 
 GENERATOR = np.random.default_rng(0)
 

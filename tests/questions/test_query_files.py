@@ -17,7 +17,7 @@ from su3d_bench.core.types import GroundTruth
 from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.evaluation.evaluate import Request, evaluate
 from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
-from su3d_bench.questions.files.queries import read_query_file
+from su3d_bench.questions.query_files import read_query_file
 
 TOML = """[[query]]
 scene = "replica/room0"

@@ -15,7 +15,8 @@ from places import SCENES
 from su3d_bench.cli.main import main
 from su3d_bench.cli.sheets.pictures import FIGURES
 from su3d_bench.core.errors import DataError
-from su3d_bench.questions.files.files import (
+from su3d_bench.questions.model import KINDS, new_question
+from su3d_bench.questions.question_files import (
     PAPER,
     PAPER_FIGURES,
     csv_text,
@@ -25,7 +26,6 @@ from su3d_bench.questions.files.files import (
     toml_text,
     write_questions,
 )
-from su3d_bench.questions.model import KINDS, new_question
 
 HOSTILE = ("<script>alert(1)</script>", '=HYPERLINK("x","y")', "\u202eright to left", '😀, "chair"', "x" * 10_000)
 SET = tuple(new_question("rooms/a", KINDS[k % 4], text, (k + 1, k + 9), "made") for k, text in enumerate(HOSTILE))

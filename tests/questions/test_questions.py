@@ -14,11 +14,10 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.datasets.rooms.classes import CLASSES
 from su3d_bench.perception.embedded.lexicon import AFFORDANCES
+from su3d_bench.questions.generated import generate_questions
 from su3d_bench.questions.generator import chosen, generate, right_by_name
-from su3d_bench.questions.known_objects import is_called, known_objects, plain_name
 from su3d_bench.questions.model import KINDS, Question, new_question, question_id
-from su3d_bench.questions.reasoning.generated import generate_questions
-from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
+from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, known_objects, plain_name
 
 HOSTILE = ("<script>alert(1)</script>", '=HYPERLINK("x","y")', "\u202eright to left", "😀 chair", "x" * 10_000)
 

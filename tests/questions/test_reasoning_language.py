@@ -10,9 +10,9 @@ from bedroom_map import bedroom, box, thing
 
 from su3d_bench.perception.language.chat import ChatRequest, Reply
 from su3d_bench.perception.language.config import LanguageConfig
-from su3d_bench.questions.reasoning.language_solver import LanguageSolver, by_relevance, context_for, system_prompt
-from su3d_bench.questions.reasoning.question_words import Phrase, read_question
-from su3d_bench.questions.reasoning.scene_map import SceneMap
+from su3d_bench.questions.language_solver import LanguageSolver, by_relevance, context_for, system_prompt
+from su3d_bench.questions.scene_map import SceneMap
+from su3d_bench.questions.solver import Phrase, read_question
 
 
 class Said:

@@ -15,11 +15,10 @@ from scored_room import instances
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.metrics.questions.truths import RefinedNames
-from su3d_bench.questions.reasoning.answers import Answer
-from su3d_bench.questions.reasoning.generated import generate_questions
-from su3d_bench.questions.reasoning.question_words import Phrase, read_phrase
-from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap, map_of
-from su3d_bench.questions.reasoning.solver import Solver
+from su3d_bench.questions.generated import generate_questions
+from su3d_bench.questions.model import Answer
+from su3d_bench.questions.scene_map import MapObject, SceneMap, map_of
+from su3d_bench.questions.solver import Phrase, Solver, read_phrase
 
 
 @pytest.fixture(scope="module")

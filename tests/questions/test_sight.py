@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.types import Frame, GroundTruth, LabelSet, WholeObject
-from su3d_bench.questions.known_objects import known_objects
+from su3d_bench.questions.scene_map import known_objects
 from su3d_bench.questions.sight import LEAST_SHARE, colour_word, sights
 
 HEIGHT, WIDTH, FOCAL = 60, 80, 80.0

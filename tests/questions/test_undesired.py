@@ -10,7 +10,7 @@ import pytest
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import Instances
 from su3d_bench.opensu3d.config import OpenSU3DConfig
-from su3d_bench.questions.undesired import FilterConfig, undesired
+from su3d_bench.questions.refining import FilterConfig, undesired
 
 
 def plan_of(*sides_m: tuple[float, float]) -> Instances:

@@ -22,11 +22,10 @@ from simulated_annotators import SET_ID
 from su3d_bench.analysis.tables import measured_results
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError, GroundTruthMissing
-from su3d_bench.questions.files.files import read_questions
-from su3d_bench.questions.files.left_out import read_left_out
-from su3d_bench.questions.model import MADE_KINDS, REASONING, question_id
-from su3d_bench.questions.reasoning.answers import Answer
-from su3d_bench.questions.reasoning.generated import GeneratedQuestion, generate_questions
+from su3d_bench.questions.generated import GeneratedQuestion, generate_questions
+from su3d_bench.questions.model import MADE_KINDS, REASONING, Answer, question_id
+from su3d_bench.questions.query_files import read_left_out
+from su3d_bench.questions.question_files import read_questions
 from su3d_bench.questions.truths import fullest_truth, scene_objects
 from su3d_bench.reports.tables.judged import sheet_tables
 from su3d_bench.runs import finished as finished_run

@@ -21,10 +21,9 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, DataError
 from su3d_bench.core.maps import Instances
 from su3d_bench.metrics.questions.truths import RefinedNames
-from su3d_bench.questions.model import new_question
-from su3d_bench.questions.reasoning.answers import Answer
-from su3d_bench.questions.reasoning.asking import built_in
-from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
+from su3d_bench.questions.language_solver import built_in
+from su3d_bench.questions.model import Answer, new_question
+from su3d_bench.questions.scene_map import MapObject, SceneMap
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs.finished import read_run
 from su3d_bench.sheets.items import (

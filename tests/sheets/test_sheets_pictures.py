@@ -18,7 +18,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Frame
-from su3d_bench.questions.files.files import figure_texts
+from su3d_bench.questions.question_files import figure_texts
 from su3d_bench.reports.pictures.colours import SCALES, scale_stops, similarity_colours
 from su3d_bench.reports.pictures.items import (
     ItemParts,

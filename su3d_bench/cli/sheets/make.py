@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
     from su3d_bench.core.interfaces import Encoder
     from su3d_bench.perception.language.chat import ChatRequest
+    from su3d_bench.questions.language_solver import AskMap
     from su3d_bench.questions.model import Question
-    from su3d_bench.questions.reasoning.asking import AskMap
     from su3d_bench.sheets.items import SheetKind
     from su3d_bench.sheets.making.drafts import Draft
     from su3d_bench.sheets.making.drawing import PictureSource
@@ -99,7 +99,7 @@ def add_parser(actions: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.files.left_out import read_left_out
+    from su3d_bench.questions.query_files import read_left_out
     from su3d_bench.runs.finished import read_run
     from su3d_bench.sheets.making.run_source import RunSource
 
@@ -251,7 +251,7 @@ def _drafts(
 
 def _ask_map(source: RunSource, encoder: Encoder | None, arguments: argparse.Namespace) -> tuple[AskMap, str]:
     """Who answers the questions of reasoning sheets, and how the key calls them."""
-    from su3d_bench.questions.reasoning.asking import BUILT_IN, built_in, by_language_model
+    from su3d_bench.questions.language_solver import BUILT_IN, built_in, by_language_model
 
     if arguments.solver != "llm":
         return built_in(encoder), BUILT_IN
@@ -274,7 +274,7 @@ def _estimate(source: RunSource, left_out: Collection[str], arguments: argparse.
 
 def _given(source: RunSource, arguments: argparse.Namespace) -> Sequence[Question] | None:
     """The questions of a file or of the paper; None where they are made from the ground truth."""
-    from su3d_bench.questions.files.files import paper_queries, read_questions
+    from su3d_bench.questions.question_files import paper_queries, read_questions
 
     if arguments.questions == "generated":
         return None

@@ -13,7 +13,7 @@ from su3d_bench.core.errors import EXIT_DONE, ConfigError
 NAME = "pictures"
 SUBJECTS = ("similarity", "labels", "reasoning")
 MOST_ROWS = 40  # of one figure
-FIGURES = ("comparison", "schemes", "teaser")  # as questions/files/files.py has them
+FIGURES = ("comparison", "schemes", "teaser")  # as questions/question_files.py has them
 
 
 def add_parser(actions: Any) -> None:
@@ -43,7 +43,7 @@ def add_parser(actions: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.files.files import figure_texts
+    from su3d_bench.questions.question_files import figure_texts
     from su3d_bench.reports.pictures.colours import scale_stops
     from su3d_bench.reports.pictures.figures import draw_grid
     from su3d_bench.runs.finished import read_run

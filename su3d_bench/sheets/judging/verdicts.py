@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from su3d_bench.formats.tables.csv_text import csv_lines
-from su3d_bench.questions.files.left_out import COLUMN
+from su3d_bench.questions.query_files import COLUMN
 from su3d_bench.sheets.items import VERDICTS, Key
 from su3d_bench.sheets.judging.answers import Judgement
 

@@ -6,7 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Sequence
 
-from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
+from su3d_bench.questions.scene_map import MapObject, SceneMap
 
 UNKNOWN = "something unknown"  # what stands in place of an id that the map does not have
 

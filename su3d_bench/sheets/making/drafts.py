@@ -28,12 +28,10 @@ from su3d_bench.perception.language.chat import ChatRequest
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.questions.generator import chosen, generate
-from su3d_bench.questions.model import KINDS, REASONING, Question, question_id
-from su3d_bench.questions.reasoning.answers import Answer, unsettled
-from su3d_bench.questions.reasoning.asking import AskMap, given_answer
-from su3d_bench.questions.reasoning.language_solver import LanguageSolver
-from su3d_bench.questions.reasoning.scene_map import SceneMap
+from su3d_bench.questions.language_solver import AskMap, LanguageSolver, given_answer
+from su3d_bench.questions.model import KINDS, REASONING, Answer, Question, question_id, unsettled
 from su3d_bench.questions.retrieval import points_found, rank_all
+from su3d_bench.questions.scene_map import SceneMap
 from su3d_bench.questions.truths import own_questions, question_truth, scene_objects
 from su3d_bench.sheets.items import RIGHT, WRONG, SheetKind
 from su3d_bench.sheets.making.blinding import without_ids

@@ -13,7 +13,7 @@ from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float64Array, Frame, UInt8Array
 from su3d_bench.metrics.questions.score import labels_n
-from su3d_bench.questions.reasoning.asking import built_in
+from su3d_bench.questions.language_solver import built_in
 from su3d_bench.questions.retrieval import rank_all
 from su3d_bench.reports.pictures.colours import ROOM_SURFACES, Scale, class_colours, similarity_colours
 from su3d_bench.reports.pictures.figures import Cell, GridRow

@@ -6,10 +6,10 @@ from collections.abc import Collection, Sequence
 
 from su3d_bench.core.errors import printable
 from su3d_bench.questions.audit import held_against
+from su3d_bench.questions.generated import generate_questions
 from su3d_bench.questions.generator import chosen
 from su3d_bench.questions.model import REASONING, question_id
-from su3d_bench.questions.reasoning.generated import generate_questions
-from su3d_bench.questions.reasoning.scene_map import SceneMap
+from su3d_bench.questions.scene_map import SceneMap
 from su3d_bench.questions.truths import MIN_VERTICES, questions_of, scene_objects
 from su3d_bench.sheets.items import ASKS
 from su3d_bench.sheets.judging.scores import OF_ALL_KINDS

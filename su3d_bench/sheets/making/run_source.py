@@ -26,8 +26,8 @@ from su3d_bench.metrics.protocols.files import protocol_names
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.truths import RefinedNames
-from su3d_bench.questions.reasoning.scene_map import SceneMap, map_of
-from su3d_bench.questions.refining.refined_names import refined_names
+from su3d_bench.questions.refining import refined_names
+from su3d_bench.questions.scene_map import SceneMap, map_of
 from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.store.predictions import read_prediction
 

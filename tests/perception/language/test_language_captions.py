@@ -21,9 +21,16 @@ from su3d_bench.perception.language.client import ChatClient
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.perception.language.parsing import Described, answered, chosen_name, described
 from su3d_bench.perception.language.reply_store import ReplyStore
-from su3d_bench.questions.refining.refined_names import read_records, records_of, write_records
-from su3d_bench.questions.refining.refinement import ModelRefiner, TopNames, top_names, vote
-from su3d_bench.questions.undesired import FilterConfig
+from su3d_bench.questions.refining import (
+    FilterConfig,
+    ModelRefiner,
+    TopNames,
+    read_records,
+    records_of,
+    top_names,
+    vote,
+    write_records,
+)
 from su3d_bench.store.predictions import prediction_arrays, prediction_from_arrays, write_prediction
 from su3d_bench.store.run_folder import JobFolder
 

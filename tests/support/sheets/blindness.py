@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import BoolArray, Float64Array, UInt8Array
 from su3d_bench.numerics.statistics import holm
-from su3d_bench.questions.reasoning.asking import built_in
+from su3d_bench.questions.language_solver import built_in
 from su3d_bench.reports.pictures.items import (
     CAPTION,
     LOW_HEIGHT,

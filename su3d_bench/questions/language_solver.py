@@ -1,4 +1,5 @@
-"""A language model asked with the paper's prompting strategy: the map as context, the rules of reasoning, the question.
+"""A language model asked with the paper's prompting strategy (the map, the rules of reasoning, the question), and who
+answers questions about a map at all.
 
 A map that is larger than what the model reads is cut by relevance to the question, and it is said.
 """
@@ -6,23 +7,25 @@ A map that is larger than what the model reads is cut by relevance to the questi
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from su3d_bench.core.digests import digest_json
 from su3d_bench.core.english import words
+from su3d_bench.core.errors import printable
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import Float64Array
+from su3d_bench.metrics.questions.truths import GivenAnswer, TrueAnswer
 from su3d_bench.perception.language.captioner import STRATEGY, reason_of
 from su3d_bench.perception.language.chat import ChatRequest, Reply, n_tokens
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.perception.language.parsing import answered, is_refusal
-from su3d_bench.questions.reasoning.answers import Answer, unsettled
-from su3d_bench.questions.reasoning.named_objects import meant_by
-from su3d_bench.questions.reasoning.question_words import Phrase, read_question
-from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
+from su3d_bench.questions.model import Answer, unsettled
+from su3d_bench.questions.scene_map import MapObject, SceneMap, meant_by, nearest_by
+from su3d_bench.questions.solver import Phrase, Solver, read_question
 
 # The rules are the paper's; the sentence before them and the form of the answer are ours.
 _INTRODUCTION = (
@@ -193,3 +196,46 @@ class LanguageSolver:
 
 def _dropped(names: tuple[str, ...]) -> str:
     return f"the server does not take {', '.join(names)}; the model ran without" if names else ""
+
+
+AskMap = Callable[[SceneMap, Sequence[str]], Sequence[Answer]]
+BUILT_IN = "the built-in solver"
+
+
+@dataclass(frozen=True)
+class MapSolver:
+    """Who answers questions about a map, by name."""
+
+    name: str
+    ask: AskMap
+
+
+def built_in(encoder: Encoder | None) -> AskMap:
+    """Answers by geometry alone; ``encoder`` finds the nearest name."""
+
+    def ask(scene: SceneMap, questions: Sequence[str]) -> Sequence[Answer]:
+        solver = Solver(scene, None, None if encoder is None else nearest_by(encoder))
+        return [solver.answer(question) for question in questions]
+
+    return ask
+
+
+def by_language_model(model: LanguageModel, config: LanguageConfig) -> MapSolver:
+    """Answers of a language model, several questions at once."""
+    name = f"the language model {printable(config.text_model, 100)}"
+    return MapSolver(name, lambda scene, questions: LanguageSolver(scene, model, config).answers(questions))
+
+
+def given_answer(true: TrueAnswer, answer: Answer, scene: SceneMap) -> GivenAnswer:
+    """What ``answer`` about ``scene`` says of the kind of ``true``."""
+    rows = [scene.by_id(object_id).row for object_id in answer.object_ids]
+    return GivenAnswer(_value(true, answer), np.array(rows, np.int64), answer.is_settled)
+
+
+def _value(true: TrueAnswer, answer: Answer) -> float | int | bool | None:
+    """What the answer says; the words of a language model are read for their yes or no, or their first number."""
+    if true.value is None or answer.solver == "built-in":
+        return answer.value
+    value = answer.said(true.value)
+    is_count = value is not None and not isinstance(true.value, float | bool) and value == int(value)
+    return int(value) if is_count and value is not None else value

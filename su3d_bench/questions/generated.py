@@ -22,11 +22,9 @@ from su3d_bench.core.types import Float64Array
 from su3d_bench.numerics.relations import Relation, gap_m
 from su3d_bench.perception.embedded.naming import vocabulary
 from su3d_bench.questions.generator import extreme_of, is_flat
-from su3d_bench.questions.known_objects import plain_name
-from su3d_bench.questions.reasoning.answers import Answer
-from su3d_bench.questions.reasoning.named_objects import meant_by
-from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap, is_room_surface
-from su3d_bench.questions.reasoning.solver import Solver
+from su3d_bench.questions.model import Answer
+from su3d_bench.questions.scene_map import MapObject, SceneMap, is_room_surface, meant_by, plain_name
+from su3d_bench.questions.solver import Solver
 
 MARGIN_M, MARGIN_SHARE = 0.25, 0.25  # by which the closest leads: metres, and of the longest side of what is compared
 LEVEL_M = 0.75  # things whose middles differ more in height are not compared by distance

@@ -1,4 +1,7 @@
-"""Questions of single objects with answers in words, as Beacon3D has them, made from the truth of a scene.
+"""Chains of texts that lead to an object, and questions of single objects, as Beacon3D has them, made from a truth.
+
+The finest text of a chain means one object alone: by a property, by where it is, or by its name. Before it comes the
+name, which means every thing so called. An object has three chains; one with fewer such texts is not asked for.
 
 An object that has three chains of texts is asked about three times, each time under a text that means it alone: what
 it stands on (class), its colour (appearance), whether it is taller or larger than another (geometry), what it is next
@@ -11,19 +14,87 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from su3d_bench.core.english import is_plural, with_article, words
 from su3d_bench.core.errors import DataError
-from su3d_bench.metrics.questions.chains import CHAINS_EACH, ChainedText
+from su3d_bench.core.types import GroundTruth
+from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
+from su3d_bench.metrics.questions.chains import CHAINS_EACH, ChainedText, Place
 from su3d_bench.numerics.relations import gap_m
-from su3d_bench.questions.chains.made import chains_of
 from su3d_bench.questions.generator import TWICE, generate, is_flat
-from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
-from su3d_bench.questions.sight import COLOURS
+from su3d_bench.questions.model import KINDS, Question
+from su3d_bench.questions.scene_map import MapObject, SceneMap
+from su3d_bench.questions.sight import COLOURS, SHAPES, SIZES
+
+INSTANCE, _, PROPERTY, RELATIVE = KINDS
+FORMS = SHAPES | {word for more, less, _ in SIZES for word in (more, less) if word}
+
+
+def chain_truth(scene: str, truth: GroundTruth, objects: SceneMap, most_objects: int | None = None) -> QueryTruth:
+    """The texts of a scene in chains of objects, ``most_objects`` at most, over the instances of its truth."""
+    owner = truth.instance.astype(np.int64)
+    owner[owner <= 0] = -1
+    cases = chains_of(generate(scene, objects), objects, most_objects)
+    source = f"chains made from {truth.source}"
+    return QueryTruth(truth.points, owner, cases, truth.variant, source, truth.labels.space)
+
+
+def chains_of(
+    questions: Sequence[Question], objects: SceneMap, most_objects: int | None = None
+) -> tuple[ChainedText, ...]:
+    """Every text of the chains, once, in the order of the objects.
+
+    Of several texts that mean an object those count that come first by a digest, one of each sort in turn.
+    """
+    name_of = {question.text: question for question in questions if question.kind == INSTANCE}
+    cases: dict[str, ChainedText] = {}
+    n_objects = 0
+    for thing in objects.objects:
+        coarse = name_of.get(thing.name)
+        fine = [] if coarse is None else _meaning(thing.id, questions)
+        if coarse is None or len(fine) < CHAINS_EACH or n_objects == most_objects:
+            continue
+        for number, question in enumerate(fine[:CHAINS_EACH]):
+            for step, one in enumerate((question, coarse)):
+                known = cases.get(one.text) or ChainedText(one.text, one.answers or (), tags=_tags(one))
+                places = (*known.places, Place(n_objects, number, step))
+                cases[one.text] = replace(known, places=places)
+        n_objects += 1
+    return tuple(cases.values())
+
+
+def _meaning(object_id: int, questions: Sequence[Question]) -> list[Question]:
+    """Properties and relations that one object alone has, one sort after the other, each sort by a digest."""
+    alone = {
+        one.text: one for one in questions if one.answers == (object_id,) and one.kind.startswith((PROPERTY, RELATIVE))
+    }
+    turn = dict[frozenset[str], int]()
+    ranked = []
+    for one in sorted(alone.values(), key=lambda one: hashlib.sha256(one.text.encode()).digest()):
+        tags = _tags(one)
+        turn[tags] = turn.get(tags, 0) + 1
+        ranked.append((turn[tags], one))
+    return [one for _, one in sorted(ranked, key=lambda pair: pair[0])]
+
+
+def _tags(question: Question) -> frozenset[str]:
+    """By what a text tells its objects, in Beacon3D's words.
+
+    >>> from su3d_bench.questions.model import new_question
+    >>> sorted(_tags(new_question("a/b", "property", "red chair", (1,), "")))
+    ['appearance', 'class']
+    """
+    if question.kind == INSTANCE:
+        return frozenset(("class",))
+    if question.kind.startswith(RELATIVE):
+        return frozenset(("class", "spatial"))
+    is_form = question.text.partition(" ")[0] in FORMS
+    return frozenset(("class", "geometry" if is_form else "appearance"))
+
 
 TALLER = 1.5  # ours: times as high, from which anybody says so
 LEAD_M, FAR_M = 0.5, 1.5  # ours: by how much the closer one leads; how far away is surely not next to it

@@ -22,8 +22,7 @@ from su3d_bench.core.toml import parse_toml
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.questions.presence_counts import SAMPLINGS
 from su3d_bench.metrics.questions.truths import AskedThing
-from su3d_bench.questions.known_objects import is_called, plain_name
-from su3d_bench.questions.reasoning.scene_map import SceneMap, is_room_surface
+from su3d_bench.questions.scene_map import SceneMap, is_called, is_room_surface, plain_name
 
 RANDOM, POPULAR, ADVERSARIAL = SAMPLINGS
 # Labels of what nobody sorted: no thing to ask for.

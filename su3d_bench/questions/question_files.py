@@ -1,14 +1,13 @@
-"""Sentences that people wrote about ScanNet's scenes: files of ScanRefer, Nr3D (Sr3D) and SQA3D as question sets.
+"""Question sets in files: TOML and CSV of our own, and the forms of ScanRefer, Nr3D (Sr3D), SQA3D and Beacon3D.
+
+In a CSV a text that a spreadsheet would compute begins with ``'``, which is left out again where it is read.
 
 ScanRefer: a JSON list of ``scene_id``, ``object_id``, ``description``, and ``object_name`` by which a sentence is
 unique or multiple. Nr3D: a CSV with ``scan_id``, ``target_id``, ``utterance``, and ``stimulus_id``, ``tokens`` and
 ``mentions_target_class`` by which one is easy or hard, by the view or not, or left out. SQA3D: a JSON with
 ``questions`` of ``scene_id``, ``situation``, ``question``, ``question_id``, whose answers stand in a file of
-annotations beside it. Beacon3D: ``metadata_*.json``, see ``chains/beacon3d_files``. Object ids are ScanNet's own, one
-less than the truth's here.
-
-Other files of these and of OpenEQA and ScanQA are known, and refused with what to give instead. Sources: the
-files' descriptions in facebookresearch/open-eqa at b5752aa, Beacon3D's data and daveredrum/ScanRefer.
+annotations beside it. Beacon3D: ``metadata_*.json``, see ``beacon3d``. Object ids are ScanNet's own, one less than the
+ground truth's here. Sources: Beacon3D's data and daveredrum/ScanRefer.
 """
 
 from __future__ import annotations
@@ -17,24 +16,140 @@ import csv
 import io
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from su3d_bench.core.config import toml_value
 from su3d_bench.core.errors import DataError, printable
-from su3d_bench.core.system.files import file_bytes, opened
+from su3d_bench.core.files.atomic import make_folder, write_text
+from su3d_bench.core.system.files import file_bytes, file_text, opened
+from su3d_bench.core.toml import parse_toml
+from su3d_bench.formats.tables.csv_text import no_formula
 from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
-from su3d_bench.questions.chains.beacon3d_files import (
-    chains_of,
-    kind_of_metadata,
-    questions_of_objects,
-    read_metadata,
+from su3d_bench.questions.beacon3d import chains_of, kind_of_metadata, questions_of_objects, read_metadata
+from su3d_bench.questions.model import ALL_KINDS, KINDS, REASONING, Question, new_question
+from su3d_bench.questions.query_files import (
+    COLUMNS,
+    MORE_COLUMNS,
+    MOST_OBJECTS_ID,
+    is_text,
+    nr3d_groups,
+    read_query_rows,
 )
-from su3d_bench.questions.files.groups import nr3d_groups
-from su3d_bench.questions.files.queries import MOST_OBJECTS_ID, is_text
-from su3d_bench.questions.model import REASONING, Question, new_question
+
+PAPER = Path(__file__).parent / "paper_queries.toml"
+PAGE = "opensu3d.github.io"
+PAPER_FIGURES = ("comparison", "schemes", "teaser")
+
+
+def read_questions(path: Path, dataset: str | None = None) -> tuple[Question, ...]:
+    """The questions of a file, each scene as ``<dataset>/<scene>``.
+
+    ``dataset`` completes scenes that name none; an empty one leaves them as they are.
+
+    A query without a kind is one of kind instance. The same question of the same scene may stand there once.
+    """
+    if is_foreign(path):
+        return _each_once(read_foreign(path))
+    questions: dict[str, Question] = {}
+    for row in read_query_rows(path):
+        kind = row.kind or KINDS[0]
+        if kind not in ALL_KINDS:
+            raise DataError(f"{row.at}: unknown kind '{printable(kind, 40)}'; known: {', '.join(ALL_KINDS)}")
+        if "/" not in row.scene and dataset is None:
+            raise DataError(f"{row.at}: of which dataset is scene '{printable(row.scene, 60)}'? write dataset/scene")
+        scene = f"{dataset}/{row.scene}" if dataset and "/" not in row.scene else row.scene
+        source = row.source or printable(path.name, 100)
+        question = new_question(scene, kind, row.text, row.objects or None, source)
+        if question.id in questions:
+            raise DataError(f"{row.at}: '{printable(row.text, 60)}' stands there twice for {printable(scene, 60)}")
+        questions[question.id] = question
+    return tuple(questions.values())
+
+
+def _each_once(questions: Sequence[Question]) -> tuple[Question, ...]:
+    """The first of each id: people wrote some sentences twice; where objects or replies differ, all are right."""
+    answers: dict[str, set[int]] = {}
+    replies: dict[str, dict[str, None]] = {}
+    for question in questions:
+        answers.setdefault(question.id, set()).update(question.answers or ())
+        replies.setdefault(question.id, {}).update({question.reply: None} if question.reply else {})
+    first = {question.id: question for question in reversed(questions)}
+    return tuple(
+        replace(first[key], answers=tuple(sorted(ids)) or None, reply=" or ".join(replies[key]))
+        for key, ids in answers.items()
+    )
+
+
+def paper_queries() -> tuple[Question, ...]:
+    """The queries that the paper's page shows, for each of its 13 scenes, and its questions to reasoning of one scene.
+
+    Of these alone an answer is published, in words.
+    """
+    content = _paper()
+    asked = [(kind, text) for kind in KINDS for text in content["queries"][kind]]
+    asked += [(kind, text) for name in PAPER_FIGURES for kind, text in content["figures"][name]]
+    queries = (
+        new_question(scene, kind, text, None, PAGE)
+        for scene in content["scenes"]
+        for kind, text in dict.fromkeys(asked)
+    )
+    reasoning = (
+        new_question(one["scene"], REASONING, one["text"], None, PAGE, one["reply"]) for one in content["reasoning"]
+    )
+    return (*queries, *reasoning)
+
+
+def figure_texts(figure: str) -> tuple[str, ...]:
+    """The texts of a figure of the paper or its page, one of ``PAPER_FIGURES``, each once.
+
+    >>> figure_texts("teaser")
+    ('a musical instrument', 'which sink is closer to bed?')
+    """
+    return tuple(dict.fromkeys(text for _, text in _paper()["figures"][figure]))
+
+
+def _paper() -> dict[str, Any]:
+    return parse_toml(file_text(PAPER))
+
+
+def check_form(path: Path) -> None:
+    """``DataError`` where the name of a file to be written says no form."""
+    if path.suffix.lower() not in (".toml", ".csv"):
+        raise DataError(f"{printable(str(path), 200)}: is neither .toml nor .csv; name the file so")
+
+
+def write_questions(path: Path, questions: Sequence[Question]) -> None:
+    """Write a set as ``read_questions`` reads it, TOML or CSV by the file's name; answers in words are not kept."""
+    check_form(path)
+    make_folder(path.parent)
+    write_text(path, csv_text(questions) if path.suffix.lower() == ".csv" else toml_text(questions))
+
+
+def toml_text(questions: Sequence[Question]) -> str:
+    """The set as ``[[query]]`` tables."""
+    blocks = []
+    for question in questions:
+        values = {"scene": question.scene, "kind": question.kind, "text": question.text}
+        values_more = {"objects": list(question.answers or ()), "source": question.source}
+        lines = [f"{key} = {toml_value(value)}" for key, value in (values | values_more).items()]
+        blocks.append("\n".join(["[[query]]", *lines]))
+    return "\n\n".join(blocks) + "\n"
+
+
+def csv_text(questions: Sequence[Question]) -> str:
+    """The set as rows."""
+    text = io.StringIO(newline="")
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow((*COLUMNS, *MORE_COLUMNS))
+    for question in questions:
+        objects = " ".join(map(str, question.answers or ()))
+        rows.writerow(map(no_formula, (question.scene, question.text, objects, question.kind, question.source)))
+    return text.getvalue()
+
 
 DATASET = "scannet"
 MOST_BYTES = 256 << 20  # ScanRefer's training set has some 40 MB
