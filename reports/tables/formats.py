@@ -17,7 +17,7 @@ from typing import Any
 from su3d_bench.core.errors import printable
 from su3d_bench.formats.tables.csv_text import MOST_OF_A_CELL, csv_lines
 from su3d_bench.formats.tables.table import Cell, Prose, Table, blocks_of
-from su3d_bench.reports.tables.papers.latex import latex
+from su3d_bench.reports.tables.latex import latex
 
 CSV_COLUMNS = (
     "table",

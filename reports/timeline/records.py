@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
-from su3d_bench.reports.pictures.colours import Colour
+from su3d_bench.reports.pictures.canvas import Colour
 
 UInt16Array = NDArray[np.uint16]
 # A place is a path through these; names of methods stand below them and so can take no other's place.

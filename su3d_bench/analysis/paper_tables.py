@@ -10,8 +10,7 @@ from su3d_bench.formats.tables.table import Table
 from su3d_bench.reports.tables.ablation import ablation_table
 from su3d_bench.reports.tables.judged import JUDGED, judged_table
 from su3d_bench.reports.tables.model import Measured
-from su3d_bench.reports.tables.papers.paper import Shown, paper_table
-from su3d_bench.reports.tables.papers.published import PaperTable
+from su3d_bench.reports.tables.paper import PaperTable, Shown, paper_table
 from su3d_bench.runs.planning.ablation import read_rows
 
 

@@ -17,15 +17,15 @@ from su3d_bench.formats.tables.table import Origin, Table, is_count
 from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.scoring import ProtocolResult, combine
 from su3d_bench.numerics.statistics import SignFlipTest
-from su3d_bench.reports.tables.found import found_table
 from su3d_bench.reports.tables.judged import WHO_DID
+from su3d_bench.reports.tables.latex import PrintedCell, printed_cells
 from su3d_bench.reports.tables.model import BY_PEOPLE, Measured
-from su3d_bench.reports.tables.papers.latex import PrintedCell, printed_cells
+from su3d_bench.reports.tables.run import found_table
 from su3d_bench.reports.tables.timing import AnytimePoint
 from su3d_bench.runs.finished import FinishedRun, is_numbers_alone, read_run
 from su3d_bench.runs.found import found_in, without_score
-from su3d_bench.sheets.judging.scores import FILE as SCORES_FILE
-from su3d_bench.sheets.judging.scores import LABEL_METRICS, ScoreCell, Scores, read_scores
+from su3d_bench.sheets.scores import FILE as SCORES_FILE
+from su3d_bench.sheets.scores import LABEL_METRICS, ScoreCell, Scores, read_scores
 from su3d_bench.store.records import NumbersRecord, ResultRecord
 
 MOST_SOURCE_BYTES, MOST_SOURCES = 1 << 24, 500  # of a paper's LaTeX

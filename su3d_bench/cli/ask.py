@@ -143,7 +143,7 @@ def _draw(
     instances: Instances, scene: SceneMap, reply: Answer, job: JobFolder, arguments: argparse.Namespace
 ) -> Path | None:
     """Draw the answer; None where it names no object."""
-    from su3d_bench.reports.pictures.answers import SpokenOf, draw_reasoning
+    from su3d_bench.reports.pictures.figures import SpokenOf, draw_reasoning
 
     if not reply.object_ids:
         if arguments.out is not None:

@@ -63,7 +63,6 @@ def add_parser(verbs: Any) -> None:
     parser.add_argument(
         "--kinds", nargs="+", metavar="KIND", help="audit: of these kinds only, such as retrieval, property, 'what on'"
     )
-    parser.add_argument("--per-page", type=int, default=12, metavar="N", help="audit: questions a sheet (default: 12)")
     parser.add_argument("--score", type=Path, metavar="FILE", help="audit: add up the verdicts in this audit.csv")
     parser.add_argument(
         "--answers", type=Path, metavar="FILE", help="score: JSON with what a system answered, in Beacon3D's order"
@@ -226,7 +225,6 @@ def _audit(arguments: argparse.Namespace) -> int:
         raise ConfigError("questions audit: needs --scenes and --out FOLDER, or --score FOLDER/audit.csv")
     for flag, value, least in (
         ("--n", arguments.n, 1),
-        ("--per-page", arguments.per_page, 1),
         ("--seed", arguments.seed, 0),
     ):
         if value < least:
@@ -241,27 +239,26 @@ def _audit(arguments: argparse.Namespace) -> int:
     drawn = sample(of_kinds(every, arguments.kinds or ()), arguments.n, arguments.seed)
     if not drawn:
         raise DataError("questions audit: nothing can be asked of these scenes")
-    places = {f"{dataset.name}/{scene}": (dataset, scene) for dataset, scene in scenes}
-    sheets = make_audit(
+    places = {f"{dataset.name}/{scene}": dataset for dataset, scene in scenes}
+    page = make_audit(
         drawn,
         places.__getitem__,
         arguments.out,
-        per_sheet=arguments.per_page,
         progress=lambda scene: remark(f"{scene}: drawn", quiet=arguments.quiet),
     )
     counts = dict(sorted(Counter(question.kind for question in drawn).items()))
     kinds = ", ".join(f"{n} {kind}" for kind, n in counts.items())
     lines = (
-        f"{counted(len(drawn), 'question')} on {counted(len(sheets), 'sheet')} ({kinds})",
-        f"look at {arguments.out}/sheet-*.png or index.html, write right, arguable or wrong into audit.csv, then: "
+        f"{counted(len(drawn), 'question')} ({kinds})",
+        f"look at {page}, write right, arguable or wrong into audit.csv, then: "
         f"su3d-bench questions audit --score {arguments.out}/audit.csv",
     )
-    answer_either(arguments, {"n": len(drawn), "kinds": counts, "sheets": [str(sheet) for sheet in sheets]}, *lines)
+    answer_either(arguments, {"n": len(drawn), "kinds": counts, "page": str(page)}, *lines)
     return EXIT_DONE
 
 
 def _score(arguments: argparse.Namespace) -> int:
-    from su3d_bench.sheets.judging.audit_scores import audit_json, audit_table, read_verdicts
+    from su3d_bench.sheets.audit import audit_json, audit_table, read_verdicts
 
     verdicts = read_verdicts(arguments.score)
     answer_tables(arguments, audit_json(verdicts), [audit_table(verdicts)])

@@ -7,8 +7,6 @@ import re
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from su3d_bench.core.errors import DataError, printable
-
 KINDS = ("instance", "affordance", "property", "relative")
 # Properties and relations that nothing else of the name lacks: the name alone gives the answer.
 BY_NAME = {"property": "property by name", "relative": "relative by name"}
@@ -46,15 +44,6 @@ class Question:
     reply: str = ""
     name: str = ""
     groups: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        where = f"question '{printable(self.text, 60)}'"
-        if self.kind not in ALL_KINDS:
-            raise DataError(f"{where}: unknown kind '{printable(self.kind, 40)}'; known: {', '.join(ALL_KINDS)}")
-        if self.id != question_id(self.scene, self.kind, self.text):
-            raise DataError(f"{where}: its id '{printable(self.id, 40)}' is not that of its scene, kind and text")
-        if self.answers is not None and list(self.answers) != sorted({answer for answer in self.answers if answer > 0}):
-            raise DataError(f"{where}: answers must be instance ids above 0, ascending, each once")
 
     @property
     def is_known(self) -> bool:

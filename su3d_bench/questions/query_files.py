@@ -12,12 +12,14 @@ import ast
 import csv
 import re
 import unicodedata
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.toml import parse_toml
@@ -33,6 +35,57 @@ ADVICE = "name a file of queries, TOML or CSV, such as su3d-bench questions make
 MOST_BYTES = 16 << 20  # some hundred thousand queries
 MOST_CHARACTERS = 20_000  # of one text
 VARIANT = "query-objects"
+
+
+def is_text(value: str) -> bool:
+    """Whether ``value`` is short enough and free of control characters and lone surrogates.
+
+    >>> is_text("\u202eright to left \U0001f600"), is_text("\x1b[2J")
+    (True, False)
+    """
+    return len(value) <= MOST_CHARACTERS and not any(unicodedata.category(sign) in ("Cc", "Cs") for sign in value)
+
+
+def only_words(text: str) -> str:
+    if not text.strip() or not is_text(text):
+        raise ValueError("words are expected, without control characters")
+    return text.strip()
+
+
+Words = Annotated[str, AfterValidator(only_words)]
+ObjectId = Annotated[int, Field(ge=0, lt=MOST_OBJECTS_ID)]
+
+
+def validated(kind: Any, content: Any, where: str) -> Any:
+    """``content`` as a pydantic type has it; ``DataError`` with the place and value of the first fault."""
+    try:
+        return _adapter(kind).validate_python(content)
+    except ValidationError as error:
+        fault = error.errors()[0]
+        place = printable(".".join(map(str, fault["loc"])), 200)
+        found = printable(repr(fault["input"]), 40)
+        raise DataError(f"{where}: {place or 'it'}: {printable(fault['msg'], 200)}; found {found}") from error
+
+
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(kind)
+
+
+class _Query(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    scene: Words
+    text: Words
+    objects: tuple[Annotated[int, Field(gt=0, le=MOST_OBJECTS_ID, strict=True)], ...]
+    kind: Words | Literal[""] = ""
+    source: Words | Literal[""] = ""
+
+
+class _Queries(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    query: list[_Query]
 
 
 @dataclass(frozen=True)
@@ -108,17 +161,8 @@ def _toml_rows(text: str, where: str) -> Iterator[QueryRow]:
         content = parse_toml(text)
     except ValueError as error:
         raise DataError(f"{where}: not TOML ({printable(str(error), 120)})") from error
-    tables = content.get("query")
-    if set(content) != {"query"} or not isinstance(tables, list):
-        raise DataError(f"{where}: expected tables [[query]] and nothing else")
-    for number, table in enumerate(tables, 1):
-        at = f"{where}: query {number}"
-        if not isinstance(table, Mapping) or not set(COLUMNS) <= set(table) <= {*COLUMNS, *MORE_COLUMNS}:
-            raise DataError(f"{at}: expected the keys {', '.join(COLUMNS)}, and kind or source where they are known")
-        objects = table["objects"]
-        if not isinstance(objects, list) or not all(type(object_id) is int for object_id in objects):
-            raise DataError(f"{at}: 'objects' must be a list of instance ids")
-        yield _row(at, table, objects)
+    for number, query in enumerate(validated(_Queries, content, where).query, 1):
+        yield QueryRow(f"{where}: query {number}", **query.model_dump())
 
 
 def _csv_rows(text: str, where: str) -> Iterator[QueryRow]:
@@ -132,37 +176,16 @@ def _csv_rows(text: str, where: str) -> Iterator[QueryRow]:
         raise DataError(f"{where}: the first line must be {','.join(COLUMNS)}, and kind or source may follow")
     for number, row in enumerate(rows[1:], 2):
         at = f"{where}: row {number}"
-        if not row:
-            continue
-        if len(row) != len(header):
+        if row and len(row) != len(header):
             raise DataError(f"{at}: has {len(row)} columns; expected {','.join(header)}")
-        words = row[2].split()
-        if not all(word.isascii() and word.isdigit() and len(word) < 11 for word in words):
-            raise DataError(f"{at}: 'objects' must be instance ids with blanks between them")
-        yield _row(at, dict(zip(header, map(meant, row), strict=True)), [int(word) for word in words])
+        if row:
+            cells: dict[str, Any] = dict(zip(header, map(meant, row), strict=True))
+            query = validated(_Query, {**cells, "objects": [*map(_number, cells["objects"].split())]}, at)
+            yield QueryRow(at, **query.model_dump())
 
 
-def _row(at: str, values: Mapping[str, Any], objects: Sequence[int]) -> QueryRow:
-    if not all(0 < object_id <= MOST_OBJECTS_ID for object_id in objects):
-        raise DataError(f"{at}: 'objects' must name instance ids above 0")
-    scene, text = (_text(values[name], at) for name in ("scene", "text"))
-    kind, source = (_text(values[name], at) if values.get(name) else "" for name in MORE_COLUMNS)
-    return QueryRow(at, scene, text, tuple(objects), kind, source)
-
-
-def _text(value: Any, at: str) -> str:
-    if not isinstance(value, str) or not value.strip() or not is_text(value):
-        raise DataError(f"{at}: 'scene' and 'text' must be words; found {printable(repr(value), 40)}")
-    return value.strip()
-
-
-def is_text(value: str) -> bool:
-    """Whether ``value`` is short enough and free of control characters and lone surrogates.
-
-    >>> is_text("\u202eright to left \U0001f600"), is_text("\x1b[2J")
-    (True, False)
-    """
-    return len(value) <= MOST_CHARACTERS and not any(unicodedata.category(sign) in ("Cc", "Cs") for sign in value)
+def _number(word: str) -> int | str:
+    return int(word) if word.isascii() and word.isdigit() and len(word) < 11 else word
 
 
 UNIQUE, MULTIPLE = "unique", "multiple"

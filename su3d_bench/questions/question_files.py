@@ -15,18 +15,19 @@ from __future__ import annotations
 import csv
 import io
 import json
-import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import AfterValidator, BaseModel, Field, StringConstraints
 
 from su3d_bench.core.config import toml_value
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.files.atomic import make_folder, write_text
-from su3d_bench.core.system.files import file_bytes, file_text, opened
+from su3d_bench.core.system.files import file_text, opened
 from su3d_bench.core.toml import parse_toml
+from su3d_bench.formats.images import read_bytes
 from su3d_bench.formats.tables.csv_text import no_formula
 from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
 from su3d_bench.questions.beacon3d import chains_of, kind_of_metadata, questions_of_objects, read_metadata
@@ -34,10 +35,11 @@ from su3d_bench.questions.model import ALL_KINDS, KINDS, REASONING, Question, ne
 from su3d_bench.questions.query_files import (
     COLUMNS,
     MORE_COLUMNS,
-    MOST_OBJECTS_ID,
-    is_text,
+    ObjectId,
     nr3d_groups,
+    only_words,
     read_query_rows,
+    validated,
 )
 
 PAPER = Path(__file__).parent / "paper_queries.toml"
@@ -153,64 +155,70 @@ def csv_text(questions: Sequence[Question]) -> str:
 
 DATASET = "scannet"
 MOST_BYTES = 256 << 20  # ScanRefer's training set has some 40 MB
-MOST_QUESTIONS = 300_000  # Sr3D+ has 114,532 sentences
 NR3D_COLUMNS = ("scan_id", "target_id", "utterance")
-OWN_FORM = "write scene, text and objects of such questions as CSV or TOML"
-OWN_OR_BEACON = f"of Beacon3D give metadata_*_qa.json, or {OWN_FORM}"
-# What is no set of questions with objects: the keys of its entries, whose file it is, and what to do.
-REFUSED_ENTRIES = (
-    ({"question", "answer", "episode_history"}, "OpenEQA's questions, answered in words from a walk", OWN_FORM),
-    ({"question", "answers", "object_ids"}, "ScanQA's form, answered in words", OWN_OR_BEACON),
-    (
-        {"scan_id", "target_id", "utterance"},
-        "Nr3D, Sr3D or Beacon3D's list as JSON",
-        "give nr3d.csv or sr3d.csv as released, or Beacon3D's metadata_*_grounding.json",
-    ),
-    ({"scene_id", "object_id", "caption"}, "captions for ScanRefer", "give ScanRefer_filtered_train.json or _val.json"),
-    ({"scene_id", "object_id", "bbox"}, "boxes predicted for ScanRefer", "give ScanRefer_filtered_val.json itself"),
-)
-ONE_A_LINE = (
-    "one JSON object a line, as ScanRefer and Nr3D are handed on in SceneVerse and 3D-VisTA; give "
-    "ScanRefer_filtered_train.json or nr3d.csv as released"
+ADVICE = (
+    "give ScanRefer_filtered_*.json, nr3d.csv or sr3d.csv, SQA3D's v1_balanced_questions_*.json or Beacon3D's "
+    "metadata_*.json as released, or write scene, text and objects as CSV or TOML"
 )
 _FIRST_BYTES = 65536
+Row = TypeVar("Row", bound=BaseModel)
+Scene = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_]{1,100}$")]
+# On one line: what people typed holds line ends and tabs.
+Sentence = Annotated[str, AfterValidator(lambda text: only_words(" ".join(text.split())))]
+OptionalText = Annotated[str, AfterValidator(lambda text: only_words(text) if text else text)]
+
+
+class _ScanRefer(BaseModel):
+    scene_id: Scene
+    description: Sentence
+    object_id: ObjectId
+    object_name: OptionalText | None = None
+
+
+class _Nr3D(BaseModel):
+    scan_id: Scene
+    utterance: Sentence
+    target_id: ObjectId
+    stimulus_id: OptionalText | None = None
+    tokens: OptionalText | None = None
+    mentions_target_class: OptionalText | None = None
+
+
+class _Situated(BaseModel):
+    scene_id: Scene
+    situation: Sentence | Literal[""] | None = None
+    question: Sentence
+    question_id: Any = None
+
+
+class _Reply(BaseModel):
+    question_id: Any = None
+    answers: list[Any] = Field(min_length=1)
 
 
 def is_foreign(path: Path) -> bool:
-    """Whether a file is of one of these forms, by its ending or, for a CSV and a list of scenes, its first line."""
-    suffix = path.suffix.lower()
-    if suffix in (".json", ".jsonl"):
-        return True
-    if suffix not in (".csv", ".txt") or not path.is_file():
-        return False
+    """Whether a file is of one of these forms, by its ending or, for a CSV, its first line."""
+    if path.suffix.lower() != ".csv" or not path.is_file():
+        return path.suffix.lower() in (".json", ".jsonl")
     with opened(path) as file:
         line = file.read(_FIRST_BYTES).partition(b"\n")[0].decode("utf-8", "replace")
-    if suffix == ".txt":
-        return _is_scene(line.strip())
     return len(set(NR3D_COLUMNS) & {word.strip().strip('"').lstrip("\ufeff") for word in line.split(",")}) > 1
 
 
 def read_foreign(path: Path) -> tuple[Question, ...]:
     """The sentences of a file: descriptions and utterances as relative queries, SQA3D's as reasoning questions."""
-    where, suffix = printable(str(path), 200), path.suffix.lower()
+    where = printable(str(path), 200)
     text = _text_of(path, where)
-    if suffix == ".txt":
-        raise DataError(f"{where}: a list of scenes, as beside ScanRefer's and Nr3D's files; give its .json or .csv")
-    if suffix == ".jsonl" or (text.lstrip().startswith("{") and _is_one_a_line(text)):
-        raise DataError(f"{where}: {ONE_A_LINE}")
-    if suffix == ".csv":
-        rows = _placed(_csv_rows(text, where), where, "row", 2)
-        return tuple(_sentences(rows, ("scan_id", "utterance", "target_id"), "Nr3D"))
+    if path.suffix.lower() == ".csv":
+        return tuple(_nr3d(text, where))
     content = _json_of(text, where)
     if kind_of_metadata(content) is not None:
         return tuple(_of_objects(content, where))
-    _refuse_others(content, where)
     if isinstance(content, list):
-        rows = _placed(content, where, "entry")
-        return tuple(_sentences(rows, ("scene_id", "description", "object_id"), "ScanRefer"))
+        return tuple(_scanrefer(content, where))
     if isinstance(content, dict) and isinstance(content.get("questions"), list):
         return tuple(_situated(content["questions"], _replies(path), where))
-    raise DataError(f"{where}: is neither a list of descriptions (ScanRefer) nor has it 'questions' (SQA3D)")
+    raise DataError(f"{where}: holds no questions that can be read; {ADVICE}")
 
 
 def read_foreign_queries(path: Path) -> dict[str, tuple[TextQuery, ...]]:
@@ -229,20 +237,6 @@ def read_foreign_queries(path: Path) -> dict[str, tuple[TextQuery, ...]]:
     return {scene: tuple(queries) for scene, queries in queries_of_scene.items()}
 
 
-def _refuse_others(content: Any, where: str) -> None:
-    """``DataError`` where the content of a JSON file is of a known form that is not read."""
-    if isinstance(content, list) and content and isinstance(content[0], Mapping) and "description" not in content[0]:
-        for keys, whose, advice in REFUSED_ENTRIES:
-            if keys <= set(content[0]):
-                raise DataError(f"{where}: {whose}; {advice}")
-    if isinstance(content, list) and content and isinstance(content[0], str) and _is_scene(content[0]):
-        raise DataError(f"{where}: a list of scenes; give the file of their descriptions")
-    if not isinstance(content, dict) or not content or "questions" in content:
-        return
-    if isinstance(content.get("annotations"), list):
-        raise DataError(f"{where}: SQA3D's answers; give the file of questions beside it, ..._questions_...")
-
-
 def _of_objects(content: Any, where: str) -> Iterator[Question]:
     """Beacon3D's texts as relative queries, its questions as reasoning questions with the object they are about."""
     if kind_of_metadata(content) == "grounding":
@@ -256,74 +250,47 @@ def _of_objects(content: Any, where: str) -> Iterator[Question]:
         yield new_question(f"{DATASET}/{asked.scene}", REASONING, text, None, "Beacon3D", reply)
 
 
-def _is_one_a_line(text: str) -> bool:
-    first, _, rest = text.lstrip().partition("\n")
-    try:
-        return isinstance(json.loads(first), dict) and bool(rest.strip())
-    except (ValueError, RecursionError):
-        return False
-
-
-def _is_scene(word: str) -> bool:
-    return re.fullmatch(r"scene_?\d{4,5}_\d\d", word) is not None
-
-
 def _text_of(path: Path, where: str) -> str:
     try:
-        size = path.stat().st_size
-        if size > MOST_BYTES:
-            raise DataError(f"{where}: has {size} bytes; expected at most {MOST_BYTES}")
-        return file_bytes(path).decode("utf-8-sig")
-    except OSError as error:
-        raise DataError(f"{where}: cannot be read: {error.strerror or error}") from error
+        return read_bytes(path, where, ADVICE, MOST_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise DataError(f"{where}: not a text file in UTF-8") from error
+        raise DataError(f"{where}: not a text file in UTF-8; {ADVICE}") from error
 
 
 def _json_of(text: str, where: str) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise DataError(f"{where}: not JSON ({printable(str(error), 120)})") from error
+        raise DataError(f"{where}: not JSON ({printable(str(error), 120)}); {ADVICE}") from error
 
 
-def _sentences(rows: Iterable[tuple[str, Any]], keys: tuple[str, str, str], source: str) -> Iterator[Question]:
-    """A question for each row, which comes with its place; ``keys``: those of scene, sentence and object."""
-    for at, row in rows:
-        scene, text = _word(row, keys[0], at), _sentence(row, keys[1], at)
-        question = new_question(f"{DATASET}/{scene}", "relative", text, _answer(row, keys[2], at), source)
-        yield replace(question, name=_optional(row, "object_name", at) or "", groups=_groups(row, at))
+def _scanrefer(rows: list[Any], where: str) -> Iterator[Question]:
+    for row in _rows(_ScanRefer, rows, where, "entry"):
+        question = new_question(
+            f"{DATASET}/{row.scene_id}", "relative", row.description, (row.object_id + 1,), "ScanRefer"
+        )
+        yield replace(question, name=row.object_name or "")
 
 
-def _groups(row: Any, at: str) -> tuple[str, ...]:
-    """The groups of a row of Nr3D; none where its file has no such column."""
-    stimulus = _optional(row, "stimulus_id", at)
-    if stimulus is None:
-        return ()
-    return nr3d_groups(stimulus, _optional(row, "tokens", at), _optional(row, "mentions_target_class", at), at)
-
-
-def _optional(row: Any, key: str, at: str) -> str | None:
-    value = row.get(key)
-    if value is not None and (not isinstance(value, str) or not is_text(value)):
-        raise DataError(f"{at}: '{key}' must be a text; found {printable(repr(value), 40)}")
-    return value
-
-
-def _csv_rows(text: str, where: str) -> list[Any]:
+def _nr3d(text: str, where: str) -> Iterator[Question]:
+    """The utterances, in the groups of the file where it has such columns."""
     try:
-        return list(islice(csv.DictReader(io.StringIO(text, newline=""), strict=True), MOST_QUESTIONS + 1))
+        lines = list(csv.DictReader(io.StringIO(text, newline=""), strict=True))
     except csv.Error as error:
-        raise DataError(f"{where}: not CSV ({printable(str(error), 120)})") from error
+        raise DataError(f"{where}: not CSV ({printable(str(error), 120)}); {ADVICE}") from error
+    for number, row in enumerate(_rows(_Nr3D, lines, where, "row", 2), 2):
+        question = new_question(f"{DATASET}/{row.scan_id}", "relative", row.utterance, (row.target_id + 1,), "Nr3D")
+        groups: tuple[str, ...] = ()
+        if row.stimulus_id is not None:
+            groups = nr3d_groups(row.stimulus_id, row.tokens, row.mentions_target_class, f"{where}: row {number}")
+        yield replace(question, groups=groups)
 
 
 def _situated(rows: list[Any], replies: Mapping[str, str], where: str) -> Iterator[Question]:
-    for at, row in _placed(rows, where, "question"):
-        scene, question = _word(row, "scene_id", at), _sentence(row, "question", at)
-        situation = _sentence(row, "situation", at) if row.get("situation") else ""
-        text = f"{situation} {question}".strip()
-        reply = replies.get(str(row.get("question_id")), "")
-        yield new_question(f"{DATASET}/{scene}", REASONING, text, None, "SQA3D", reply)
+    for row in _rows(_Situated, rows, where, "question"):
+        text = f"{row.situation or ''} {row.question}".strip()
+        reply = replies.get(str(row.question_id), "")
+        yield new_question(f"{DATASET}/{row.scene_id}", REASONING, text, None, "SQA3D", reply)
 
 
 def _replies(path: Path) -> dict[str, str]:
@@ -336,47 +303,12 @@ def _replies(path: Path) -> dict[str, str]:
     rows = content.get("annotations") if isinstance(content, dict) else None
     if not isinstance(rows, list):
         raise DataError(f"{where}: has no 'annotations'")
-    reply_of = {}
-    for at, row in _placed(rows, where, "annotation"):
-        answers = row.get("answers") if isinstance(row, Mapping) else None
-        if not isinstance(answers, list) or not answers:
-            raise DataError(f"{at}: has no answers")
-        reply_of[str(row.get("question_id"))] = _sentence(answers[0], "answer", at)
-    return reply_of
+    known = _rows(_Reply, rows, where, "annotation")
+    return {str(row.question_id): validated(Sentence, row.answers[0], where) for row in known}
 
 
-def _placed(rows: list[Any], where: str, noun: str, first: int = 1) -> Iterator[tuple[str, Any]]:
-    """Each row with the words that say where it stands."""
-    if not rows or len(rows) > MOST_QUESTIONS:
-        raise DataError(f"{where}: has {len(rows)} entries; expected 1 to {MOST_QUESTIONS}")
+def _rows(kind: type[Row], rows: list[Any], where: str, noun: str, first: int = 1) -> Iterator[Row]:
+    if not rows:
+        raise DataError(f"{where}: is empty; {ADVICE}")
     for number, row in enumerate(rows, first):
-        yield f"{where}: {noun} {number}", row
-
-
-def _value(row: Any, key: str, at: str) -> Any:
-    if not isinstance(row, Mapping) or row.get(key) is None:
-        raise DataError(f"{at}: has no '{key}'")
-    return row[key]
-
-
-def _word(row: Any, key: str, at: str) -> str:
-    value = _value(row, key, at)
-    if not isinstance(value, str) or not value or not value.replace("_", "").isalnum() or len(value) > 100:
-        raise DataError(f"{at}: '{key}' must be a scene such as scene0000_00; found {printable(repr(value), 40)}")
-    return value
-
-
-def _sentence(row: Any, key: str, at: str) -> str:
-    """The text on one line: what people typed holds line ends and tabs."""
-    value = _value(row, key, at)
-    text = " ".join(value.split()) if isinstance(value, str) else ""
-    if not text or not is_text(text):
-        raise DataError(f"{at}: '{key}' must be a sentence; found {printable(repr(value), 40)}")
-    return text
-
-
-def _answer(row: Any, key: str, at: str) -> tuple[int, ...]:
-    value = str(_value(row, key, at)).strip()
-    if not (value.isascii() and value.isdigit() and len(value) < 11 and int(value) < MOST_OBJECTS_ID):
-        raise DataError(f"{at}: '{key}' must be an object id; found {printable(value, 40)}")
-    return (int(value) + 1,)
+        yield validated(kind, row, f"{where}: {noun} {number}")

@@ -19,8 +19,7 @@ from su3d_bench.metrics.protocols.files import protocol_names
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.perception.models.catalogue import WEIGHTS_CAVEAT
 from su3d_bench.reports.tables.model import Measured
-from su3d_bench.reports.tables.papers.paper import PAPER_PROFILE, PAPER_SCENES, Shown
-from su3d_bench.reports.tables.papers.published import OPEN, Figure
+from su3d_bench.reports.tables.paper import OPEN, PAPER_PROFILE, PAPER_SCENES, Figure, Shown
 from su3d_bench.reproducing.asked import method_of_row, methods_of
 from su3d_bench.reproducing.recipe import Experiment
 from su3d_bench.runs.finished import FinishedRun, read_run

@@ -10,7 +10,7 @@ import numpy as np
 from su3d_bench.core.errors import printable
 from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.maps import Instances, Partition, Prediction
-from su3d_bench.reports.tables.found import Found
+from su3d_bench.reports.tables.run import Found
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.records import read_updates

@@ -44,7 +44,7 @@ from su3d_bench.questions.language_solver import MapSolver, by_language_model
 from su3d_bench.questions.refining import refined_names
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.reports.pictures.maps import draw_scene
-from su3d_bench.reports.tables.found import Unscored, not_scored_lines
+from su3d_bench.reports.tables.run import Unscored, not_scored_lines
 from su3d_bench.runs.executors.local import Event, Report
 from su3d_bench.runs.feeding import (
     N_AHEAD,

@@ -20,7 +20,7 @@ from su3d_bench.metrics.protocols.loading import load_protocol, read_rules
 from su3d_bench.runs import finished
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run
-from su3d_bench.sheets.making.run_source import RunSource
+from su3d_bench.sheets.sources import RunSource
 
 PAINTED = f"{SCENES}/painted.py"
 

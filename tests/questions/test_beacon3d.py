@@ -65,11 +65,6 @@ def test_a_made_problem_of_answers_has_every_number_of_the_original(index: int, 
     assert all(one.least == one.most for one in found.values())
 
 
-def test_thirty_problems_of_each_have_different_answers() -> None:
-    for kind in ("grounding", "qa"):
-        assert len({json.dumps(one["answer"]) for one in PROBLEMS[kind]}) > 25
-
-
 def test_an_object_counts_where_its_finest_texts_are_right_and_a_spelling_is_one_case(tmp_path: Path) -> None:
     shouted = copy.deepcopy(GROUNDING)
     shouted["scene0025_00"]["box"]["27"]["chain_3"][1] = COARSE | {"text": "BOX", "obj_id": ["29"]}
@@ -109,49 +104,6 @@ def changed(content: dict[str, Any], change: Callable[[dict[str, Any]], object])
     copied = copy.deepcopy(content)
     change(copied["scene0025_00"]["box"])
     return copied
-
-
-@pytest.mark.parametrize(
-    ("asked", "answers", "line"),
-    [
-        ([], [], "is no metadata_*_grounding.json or metadata_*_qa.json of Beacon3D"),
-        ("{", [], "not JSON"),
-        (changed(GROUNDING, lambda of: of["27"].pop("chain_2")), [], "27: has 2 chains; expected 3"),
-        (changed(GROUNDING, lambda of: of["27"]["chain_2"].clear()), [], "chain_2: expected a list that is not empty"),
-        (changed(GROUNDING, lambda of: of.update({"3": [1]})), [], "expected scenes, classes and objects one in"),
-        (changed(GROUNDING, lambda of: of["27"]["chain_1"].append({})), [], "a text must have text, obj_id, tag"),
-        (changed(GROUNDING, lambda of: of["27"]["chain_1"].append(FINE | {"obj_id": ["-1"]})), [], "must hold object"),
-        (
-            changed(GROUNDING, lambda of: of["27"]["chain_1"].append(FINE | {"text": "\x1b"})),
-            [],
-            "'text' must be words",
-        ),
-        (
-            changed(GROUNDING, lambda of: of["27"]["chain_1"].append(COARSE | {"tag": "spatial"})),
-            [],
-            "'Box' has other tags than where it stood before",
-        ),
-        (changed(QA, lambda of: of["27"]["qa"].pop()), [], "27: has 2 questions; expected 3"),
-        (changed(QA, lambda of: of["27"]["qa"][0].pop("tag")), [], "a question must have question, answer, tag"),
-        (GROUNDING, {}, "expected a list of answers, a table each"),
-        (GROUNDING, [{"correct": True}], "has 1 answers, the file asks 4"),
-        (GROUNDING, [{"correct": "yes"}] * 4, "answer 1: needs 'correct', true or false, or 'object_id'"),
-        (QA, [{}] * 3, "answer 1: needs an answer in words under one of response_pred"),
-        (QA, [{"pred": "red", "score": 9}] * 3, "answer 1: 'score' must be a number from 1 to 5; found 9"),
-    ],
-)
-def test_what_is_wrong_with_a_file_is_one_line(
-    asked: object, answers: object, line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    paths = written(tmp_path, asked, answers)
-    assert main(["questions", "score", str(paths[0]), "--answers", str(paths[1])]) == 2
-    error = capsys.readouterr().err
-    assert line in error and error.count("\n") == 1
-
-
-def test_a_file_that_is_not_here_says_where_to_get_it(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"is missing; get Beacon3D's files by https://github.com/beacon-3d/beacon-3d"):
-        answered_file(tmp_path / "metadata_scannet_qa.json", tmp_path / "answers.json")
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,6 @@ from chat_server import KEY, Answered, ChatServer, error
 from places import CASES
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import DataError
 from su3d_bench.perception.language.chat import ChatRequest
 from su3d_bench.perception.language.chat import Reply as ModelReply
 from su3d_bench.perception.language.config import LanguageConfig
@@ -152,11 +151,6 @@ def test_right_answers_score_one_and_wrong_ones_what_they_are_worth(tmp_path: Pa
         assert found["case"].most == 1.0
 
 
-def test_a_scene_without_such_objects_is_refused() -> None:
-    with pytest.raises(DataError, match="no object of these scenes has three texts"):
-        made_files({"room": SceneMap(ROOM.objects[:2])})
-
-
 @pytest.fixture
 def made_room(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setattr(truths, "scene_objects", lambda *words: ROOM)
@@ -164,48 +158,6 @@ def made_room(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
     monkeypatch.chdir(tmp_path)
     return tmp_path
-
-
-@pytest.mark.parametrize("kind", ["grounding", "qa"])
-def test_the_verb_writes_both_files_which_can_be_scored(
-    kind: str, made_room: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = ["--scenes", "rooms/living0", "--form", f"beacon3d-{kind}", "--out", "made.json", "--json"]
-    assert main(["questions", "make", *words]) == 0
-    assert json.loads(capsys.readouterr().out)["n_scenes"] == 1
-    content = json.loads(Path("made.json").read_text())
-    if kind == "grounding":
-        rows: list[dict[str, object]] = [{"correct": True} for _ in chains_of(content, "here").entries]
-    else:
-        rows = [{"pred": one.answer} for one in questions_of_objects(content, "here").entries]
-    Path("answers.json").write_text(json.dumps(rows))
-    assert main(["questions", "score", "made.json", "--answers", "answers.json", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["kind"] == kind and {
-        one["least"] for one in found["numbers"] if one["name"] in ("case", "object")
-    } == {1}
-
-
-@pytest.mark.parametrize(
-    ("words", "line"),
-    [
-        (["make", "--scenes", "rooms/living0", "--out", "a.json", "--form", "beacon"], "unknown form 'beacon'"),
-        (["make", "--scenes", "rooms/living0", "--out", "a.toml", "--form", "beacon3d-qa"], "is written as JSON"),
-        (
-            ["make", "--scenes", "rooms/living0", "--out", "a.json", "--form", "beacon3d-qa", "--source", "generated"],
-            "--leave-out and --source belong to --form own",
-        ),
-        (["make", "--scenes", "rooms/living0", "--out", "a.toml", "--judge"], "--judge belongs to score"),
-        (["score", "a.json", "--answers", "b.json", "--offline"], "--offline belongs to --judge of score"),
-        (["score", "a.json", "--answers", "b.json", "--model", "x"], "--model belongs to --judge of score"),
-    ],
-)
-def test_what_does_not_go_together_is_one_line(
-    words: list[str], line: str, made_room: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["questions", *words]) == 2
-    said = capsys.readouterr().err
-    assert line in said and said.count("\n") == 1
 
 
 # ---- the judge

@@ -94,11 +94,6 @@ def test_a_box_that_is_higher_than_long_is_not_square_for_sure() -> None:
     assert words_of("box", slab(0.4, 0.4, 0.7)) == (frozenset(), {"square", "rectangular"})
 
 
-def test_a_rug_may_go_on_under_the_furniture_so_that_it_is_round_or_nothing_for_sure() -> None:
-    assert words_of("rug", polygon(40, height=0.01))[0] == {"round"}
-    assert words_of("rug", slab(2, 1, 0.01)) == (frozenset(), {"square", "rectangular"})
-
-
 def test_a_colour_is_sure_in_all_lights_and_may_be_what_a_good_part_of_the_pixels_has_in_one() -> None:
     red, blue = np.tile([200.0, 40.0, 40.0], (70, 1)), np.tile([50.0, 90.0, 180.0], (30, 1))
     assert maybe_colours([np.concatenate([red, blue])]) == {"red", "blue"}
@@ -141,11 +136,6 @@ def test_what_is_tall_by_itself_is_not_asked_for_where_a_wide_thing_is_as_high()
     assert asked(slim, thing(2, "shelf", (1.4, 0.3, 0.9)))["tall shelf"] == ("property", (1,))
 
 
-def test_other_names_of_a_thing_are_asked_with_its_looks_too() -> None:
-    found = asked(thing(1, "sofa", (2.0, 0.8, 0.8), "red"), thing(2, "sofa", (2.0, 0.8, 0.8), "blue"))
-    assert found["red couch"] == found["red sofa"] == ("property", (1,))
-
-
 def thing(one: int, name: str, sides: tuple[float, float, float], words: str = "", maybe: str = "") -> MapObject:
     low = np.array([4.0 * one, 0, 0])
     box = np.array([low, low + sides])
@@ -171,12 +161,6 @@ def test_a_word_is_asked_where_it_is_sure_of_the_answers_and_nobody_would_say_it
     assert asked(pair[0])["round table"] == ("property by name", (1,))
     three = asked(*pair, thing(3, "table", table, "round"))
     assert three["round table"] == ("property", (1, 3))  # all that it is sure of
-
-
-def test_names_that_end_with_one_word_are_told_apart_by_their_looks_too() -> None:
-    sides = (1.0, 0.6, 0.5)
-    found = asked(thing(1, "coffee table", sides, "round"), thing(2, "side table", sides, "square"))
-    assert found["round table"] == ("property", (1,)) and found["round coffee table"] == ("property by name", (1,))
 
 
 def test_sizes_in_a_scan_are_of_what_the_images_do_not_cut() -> None:

@@ -21,9 +21,8 @@ from su3d_bench.formats.tables.csv_text import FORMULA_STARTS, meant, no_formula
 from su3d_bench.formats.tables.table import Cell, Origin, Prose, Table, TableRow, text_table
 from su3d_bench.reports.tables.ablation import SweepRow, ablation_table
 from su3d_bench.reports.tables.formats import FORMATS, csv_text, html_page, markdown, plain
-from su3d_bench.reports.tables.papers.latex import escape, latex, origin_comment, printed_cells
-from su3d_bench.reports.tables.papers.paper import Shown, paper_table, protocol_table
-from su3d_bench.reports.tables.papers.published import Figure
+from su3d_bench.reports.tables.latex import escape, latex, origin_comment, printed_cells
+from su3d_bench.reports.tables.paper import Figure, Shown, paper_table, protocol_table
 
 HOSTILE = (
     "\\input{/etc/passwd}",
@@ -128,12 +127,6 @@ def test_markdown_shows_a_text_letter_for_letter(text: str) -> None:
     assert [word for line in page.words if (word := line.strip())] == [printable(text)] * 8
 
 
-def test_what_is_printed_has_no_escape_of_another_form() -> None:
-    assert plain([text_table("t", [("a | b", "p < 0.05"), ("_x_ & *y*", "[1.0, 2.0]")])]) == (
-        "| a | b     | p < 0.05   |\n|-----------|------------|\n| _x_ & *y* | [1.0, 2.0] |\n"
-    )
-
-
 @given(st.text())
 def test_a_text_that_a_spreadsheet_would_compute_is_read_back(text: str) -> None:
     kept = no_formula(text)
@@ -179,12 +172,6 @@ def test_a_comment_reads_back_as_its_cell_whatever_the_names() -> None:
         assert cell.numbers == ["33.3", "10.0", "20.0"]
 
 
-def test_damaged_comments_are_found_as_cells_without_an_origin() -> None:
-    for line in ("& 1.0 % run=a method=b", "& 1.0 % run=a method=b protocol=c version=1 metric=d what=value value=1e"):
-        (cell,) = printed_cells(line)
-        assert cell.origin is None
-
-
 def wide_and_high(n_rows: int) -> Table:
     """More columns than a page is wide, more rows than it is high, and labels that must be broken."""
     columns = tuple(f"column {k}" for k in range(9))
@@ -194,14 +181,10 @@ def wide_and_high(n_rows: int) -> Table:
     return Table("wide", "A wide table.", "method, judge", columns, rows, ("a note of the table " * 12,))
 
 
-def test_a_table_too_large_for_a_page_is_divided_and_loses_nothing() -> None:
+def test_a_table_too_wide_for_a_page_is_divided_and_loses_nothing() -> None:
     text = latex([wide_and_high(40)])
-    floats = text.split(r"\begin{table*}")[1:]
-    assert len(floats) > 2
+    assert text.count(r"\begin{table*}") == 1 and text.count(r"\begin{tabular}") > 1
     assert text.count("{[}41.2, 61.8{]}") == 40 * 9
-    assert text.count(r"\label{tab:wide}") == 1
-    assert text.count("(continued)") == text.count(r"\addtocounter{table}{-1}") == len(floats) - 1
-    assert [("a note of" in one) for one in floats] == [False] * (len(floats) - 1) + [True]
 
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="pdflatex is not installed (texlive-latex-base, booktabs)")

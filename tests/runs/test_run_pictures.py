@@ -9,10 +9,10 @@ import pytest
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
 from su3d_bench.core.types import Float32Array, GroundTruth, LabelSet
 from su3d_bench.metrics.protocols.files import class_names
-from su3d_bench.reports.pictures.canvas import Canvas
-from su3d_bench.reports.pictures.colours import (
+from su3d_bench.reports.pictures.canvas import (
     NO_INSTANCE,
     ROOM_SURFACES,
+    Canvas,
     class_colours,
     heat_colours,
     instance_colours,

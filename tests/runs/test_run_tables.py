@@ -7,7 +7,7 @@ from typing import Any
 
 from su3d_bench.core.types import PerceptionNeeds, SceneInfo
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.reports.tables import warnings
+from su3d_bench.reports.tables import run as warnings
 from su3d_bench.reports.tables.run import headline, markdown_table
 from su3d_bench.runs.job import caveat_of
 from su3d_bench.runs.runner import confidences_of

@@ -10,7 +10,7 @@ from painted import colour_perception
 from places import SCENES
 
 from su3d_bench.cli.main import main
-from su3d_bench.reports.tables.found import Unscored, not_scored_lines
+from su3d_bench.reports.tables.run import Unscored, not_scored_lines
 from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import scene as scene_run
 

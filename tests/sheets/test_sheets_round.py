@@ -17,9 +17,9 @@ from chromium import Chromium, find_chromium
 from waiting import wait_until
 
 from su3d_bench.cli.main import main
+from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.items import CANNOT_TELL, Key, Sheet, SheetKind
-from su3d_bench.sheets.making.drafts import Draft
-from su3d_bench.sheets.making.sets import PAGE, TABLE, WORKBOOK, Origin, make_sheets, write_sheets
+from su3d_bench.sheets.sets import PAGE, TABLE, WORKBOOK, Origin, make_sheets, write_sheets
 
 HOSTILE = '=HYPERLINK("x") <script>alert(1)</script> \u202eabc " , ; \U0001f600'
 

@@ -54,7 +54,7 @@ MORE = {
     "check": "The gate for CI: [running/ci-gate.md](running/ci-gate.md), `action.yml`.",
     "ask": "By the built-in solver or a language model: [reasoning.md](questions/reasoning.md).",
     "questions": "From the ground truth of any dataset; `--protocols rooms-retrieval` scores maps by such. "
-    "`questions audit` draws a sample as contact sheets: [human-evaluation.md](questions/human-evaluation.md).",
+    "`questions audit` draws a sample with pictures: [human-evaluation.md](questions/human-evaluation.md).",
     "sheets make": "Blind sheets with pictures, as an offline page, a workbook and a CSV: "
     "[human-evaluation.md](questions/human-evaluation.md).",
     "sheets score": "The paper's Tables IV and V with agreement: [human-evaluation.md](questions/human-evaluation.md).",

@@ -17,7 +17,7 @@ from su3d_bench.metrics.costs import summarise
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, concatenate
 from su3d_bench.reports.page.numbers import confusion_cells, series_of, summary_data
-from su3d_bench.reports.tables.found import Found, Unscored, not_scored_lines
+from su3d_bench.reports.tables.run import Found, Unscored, not_scored_lines
 from su3d_bench.runs.finished import FinishedRun, read_update_times
 from su3d_bench.runs.found import found_in, without_score
 from su3d_bench.store.records import ResultRecord, plain

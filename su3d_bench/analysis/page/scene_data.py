@@ -8,7 +8,7 @@ from typing import Any
 from su3d_bench.core.interfaces import HasSketches
 from su3d_bench.core.types import Frame, GroundTruth
 from su3d_bench.metrics.matching.nearest import Candidates
-from su3d_bench.reports.pictures.scene_look import spread
+from su3d_bench.reports.pictures.scene import spread
 from su3d_bench.runs.finished import FinishedRun
 
 MOST_LOOKED_AT = 48  # frames of a scene

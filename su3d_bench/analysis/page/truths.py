@@ -17,7 +17,7 @@ from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.instance.scene_counts import intersections
 from su3d_bench.metrics.matching.nearest import Candidates
 from su3d_bench.reports.page.maps import colour_plane, extent_of, index_plane, nearest_colours, pack_map, thinned
-from su3d_bench.reports.pictures.colours import class_colours
+from su3d_bench.reports.pictures.canvas import class_colours
 from su3d_bench.reports.pictures.maps import truth_owner
 from su3d_bench.runs.finished import FinishedRun
 

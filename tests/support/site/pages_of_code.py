@@ -21,7 +21,7 @@ from su3d_bench.metrics.protocols.kinds import RULES_OF_KIND
 from su3d_bench.metrics.protocols.loading import load_protocol, not_comparable_with
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.protocols.originals import Original, Stated, original_of
-from su3d_bench.reports.tables.papers.published import Figure, figures_of
+from su3d_bench.reports.tables.paper import Figure, figures_of
 
 PROTOCOLS = "reference/protocols"
 METHODS = "reference/methods"

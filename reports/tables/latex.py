@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 import re
 import unicodedata
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import quote, unquote
@@ -43,9 +42,6 @@ GAP_PT, SMALLEST_GAP_PT = 4, 2
 MOST_LABEL_PT = 150  # of a label in a table that is too wide for a page; a longer one is broken
 # Widths of one column and of the page in a paper of two columns (IEEEtran: 252 pt and 516 pt), a little narrower.
 FLOATS = (("table", 238), ("table*", 480))
-# Heights of a line in each type size, of a title with rules, and of what a page takes, caption aside.
-LINES_PT = {r"\small": 11.0, r"\footnotesize": 9.5, r"\scriptsize": 8.0}
-HEAD_PT, PAGE_PT, NOTE_LETTER_PT = 34.0, 600.0, 3.7
 # Type sizes and the width of a letter: digits of Computer Modern, bold, with 10 pt as the normal size.
 SIZES = ((r"\small", 5.3), (r"\footnotesize", 4.9), (r"\scriptsize", 4.4))
 _ORIGIN = re.compile(
@@ -83,10 +79,8 @@ def _letter(character: str) -> str:
 
 
 def latex(parts: Sequence[Table | Prose]) -> str:
-    """All tables as floats of their own, several where one would be too high; notes beneath in small type."""
-    blocks = [HEADER]
-    for part in parts:
-        blocks += [_paragraphs(part.lines)] if isinstance(part, Prose) else _floats(part)
+    """All tables as floats of their own, notes beneath in small type."""
+    blocks = [HEADER, *(_paragraphs(part.lines) if isinstance(part, Prose) else _float(part) for part in parts)]
     return "\n\n".join(blocks) + "\n"
 
 
@@ -109,74 +103,31 @@ class _Place:
     parts: tuple[tuple[int, ...], ...]
 
 
-@dataclass(frozen=True)
-class _Piece:
-    """Some columns and rows of a table, which stand together."""
-
-    columns: tuple[int, ...]
-    rows: tuple[TableRow, ...]
-    height_pt: float
-
-
-def _pieces(table: Table, place: _Place) -> Iterator[_Piece]:
-    """The tabulars of a table, none higher than a page."""
-    line_pt, letter_pt = LINES_PT[place.size], dict(SIZES)[place.size]
-    for columns in place.parts:
-        rows: list[TableRow] = []
-        height = HEAD_PT
-        for row in table.rows:
-            n_lines = 1 if place.label_pt is None else math.ceil(1.2 * len(row.label) * letter_pt / place.label_pt)
-            if rows and height + n_lines * line_pt > PAGE_PT:
-                yield _Piece(columns, tuple(rows), height)
-                rows, height = [], HEAD_PT
-            rows.append(row)
-            height += n_lines * line_pt
-        yield _Piece(columns, tuple(rows), height)
-
-
-def _floats(table: Table) -> Iterator[str]:
+def _float(table: Table) -> str:
     place = _place(table)
-    width_pt = dict(FLOATS)[place.kind]
-    notes_pt = sum(LINES_PT[r"\scriptsize"] * math.ceil(len(note) * NOTE_LETTER_PT / width_pt) for note in table.notes)
-    pages: list[list[_Piece]] = [[]]
-    for piece in _pieces(table, place):
-        if pages[-1] and sum(placed.height_pt for placed in (*pages[-1], piece)) > PAGE_PT:
-            pages.append([])
-        pages[-1].append(piece)
-    if sum(placed.height_pt for placed in pages[-1]) + notes_pt > PAGE_PT:
-        pages.append([])
-    for k, pieces in enumerate(pages):
-        yield _float(table, place, pieces, is_first=k == 0, is_last=k == len(pages) - 1)
-
-
-def _float(table: Table, place: _Place, pieces: Sequence[_Piece], *, is_first: bool, is_last: bool) -> str:
-    label = f"  \\label{{tab:{re.sub(r'[^A-Za-z0-9]+', '-', table.name).strip('-')}}}"
-    caption = table.heading + table.caption
     lines = [
         f"\\begin{{{place.kind}}}[t]",
         r"  \centering\hbadness=10000",  # a caption of few words in a narrow column
-        *([] if is_first else [r"  \addtocounter{table}{-1}"]),
-        f"  \\caption{{{escape(caption if is_first else f'{caption} (continued)')}}}",
-        *([label] if is_first else []),
+        f"  \\caption{{{escape(table.heading + table.caption)}}}",
+        f"  \\label{{tab:{re.sub(r'[^A-Za-z0-9]+', '-', table.name).strip('-')}}}",
         f"  {place.size}\\setlength{{\\tabcolsep}}{{{place.gap_pt}pt}}",
     ]
-    for k, piece in enumerate(pieces):
-        lines += [*(["", r"  \medskip"] if k else []), *_tabular(table, piece, place.label_pt)]
-    if table.notes and is_last:
+    for k, columns in enumerate(place.parts):
+        lines += [*(["", r"  \medskip"] if k else []), *_tabular(table, columns, place.label_pt)]
+    if table.notes:
         lines += ["", r"  \smallskip", r"  \begin{minipage}{\linewidth}", r"    \scriptsize\raggedright"]
         lines += [f"    {escape(note)}\\par" for note in table.notes]
         lines.append(r"  \end{minipage}")
     return "\n".join([*lines, f"\\end{{{place.kind}}}"])
 
 
-def _tabular(table: Table, piece: _Piece, label_pt: float | None) -> list[str]:
-    columns = piece.columns
+def _tabular(table: Table, columns: Sequence[int], label_pt: float | None) -> list[str]:
     first = "l" if label_pt is None else f"p{{{label_pt:.0f}pt}}"
     titles = [escape(table.columns[k]) for k in columns]
     lines = [f"  \\begin{{tabular}}{{@{{}}{first}{'r' * len(columns)}@{{}}}}", r"    \toprule"]
     lines.append(f"    {' & '.join([_label(table.head, label_pt), *titles])} \\\\")
     was_reported = False
-    for block in blocks_of(piece.rows):
+    for block in blocks_of(table.rows):
         lines.append(r"    \midrule")
         if block[0].is_reported and not was_reported:
             was_reported = True

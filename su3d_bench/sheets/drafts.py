@@ -1,9 +1,12 @@
-"""What is put before people, before it is shuffled and drawn: one draft for all schemes that give the same."""
+"""What is put before people, before it is shuffled and drawn: one draft for all schemes that give the same.
+
+Texts and names do not tell whose map they are of: letters stand in place of its ids.
+"""
 
 from __future__ import annotations
 
 import re
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -27,15 +30,68 @@ from su3d_bench.metrics.questions.truths import AskedText, GivenAnswer, Reasonin
 from su3d_bench.perception.language.chat import ChatRequest
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.perception.language.config import LanguageConfig
+from su3d_bench.questions.audit import held_against
+from su3d_bench.questions.generated import generate_questions
 from su3d_bench.questions.generator import chosen, generate
 from su3d_bench.questions.language_solver import AskMap, LanguageSolver, given_answer
 from su3d_bench.questions.model import KINDS, REASONING, Answer, Question, question_id, unsettled
 from su3d_bench.questions.retrieval import points_found, rank_all
-from su3d_bench.questions.scene_map import SceneMap
-from su3d_bench.questions.truths import own_questions, question_truth, scene_objects
-from su3d_bench.sheets.items import RIGHT, WRONG, SheetKind
-from su3d_bench.sheets.making.blinding import without_ids
-from su3d_bench.sheets.making.run_source import RunSource, mask_digest
+from su3d_bench.questions.scene_map import MapObject, SceneMap
+from su3d_bench.questions.truths import MIN_VERTICES, own_questions, question_truth, scene_objects
+from su3d_bench.questions.truths import questions_of as questions_of_scene
+from su3d_bench.sheets.items import ASKS, RIGHT, WRONG, SheetKind
+from su3d_bench.sheets.scores import OF_ALL_KINDS
+from su3d_bench.sheets.sources import RunSource, TruthSource, mask_digest
+
+UNKNOWN = "something unknown"  # what stands in place of an id that the map does not have
+
+
+def without_ids(text: str, scene: SceneMap, spoken_of: Sequence[int]) -> tuple[str, dict[int, str]]:
+    """``text`` with a name for each thing that it calls by its id, and these names, also of the ids ``spoken_of``.
+
+    Things of one name are told apart by letters, in the order in which the text comes to them.
+    """
+    numbers = {int(digits) for digits in re.findall(r"\d{1,18}", text)}
+    written = [thing for thing in scene.objects if thing.id in numbers]
+    forms = [
+        rf"(?:{re.escape(_plain(thing))}\s+)?(?:{_called(str(thing.id))}|\b(?:object|item|thing)\s+{thing.id}(?!\d))"
+        for thing in sorted(written, key=lambda thing: (-len(thing.name), -thing.id))
+    ]
+    calls = re.compile("|".join([*forms, _called(r"\d+")]), re.IGNORECASE)
+
+    def id_of(match: re.Match[str]) -> int:
+        return int(re.findall(r"\d+", match[0])[-1])
+
+    known = set(scene.ids)
+    in_order = dict.fromkeys((*map(id_of, calls.finditer(text)), *spoken_of))
+    names = _names([scene.by_id(number) for number in in_order if number in known])
+    return calls.sub(lambda match: names.get(id_of(match), UNKNOWN), text), names
+
+
+def _called(number: str) -> str:
+    """The forms of an id: ``#12`` as the built-in solver writes it, ``ID 12`` or ``(ID: 12)`` as language models do."""
+    return rf"\(\s*IDs?\b\s*[:=#]?\s*{number}\s*\)|(?:#|\bIDs?\b\s*[:=#]?\s*){number}(?!\d)"
+
+
+def _names(things: Sequence[MapObject]) -> dict[int, str]:
+    """A name for each thing by its id."""
+    plain = {thing.id: _plain(thing) for thing in things}
+    shared = {name for name, n in Counter(plain.values()).items() if n > 1}
+    n_before: Counter[str] = Counter()
+    names = {}
+    for number, name in plain.items():
+        names[number] = f"{name} {_letter(n_before[name])}" if name in shared else name
+        n_before[name] += 1
+    return names
+
+
+def _plain(thing: MapObject) -> str:
+    return thing.name or "object"
+
+
+def _letter(k: int) -> str:
+    return chr(ord("A") + k) if k < 26 else str(k + 1)
+
 
 MOST_TEXT = 1000  # characters of a query, a label or an answer that a sheet shows
 NO_LABEL = "(no label)"
@@ -311,7 +367,7 @@ def reasoning_drafts(
         instances = source.instances(scene, method)
         a_map = source.scene_map(scene, method)
         covered = source.covered(scene, rules, instances) if known else None
-        shown = _Shown(scene, method, instances, a_map)
+        shown = _ShownMap(scene, method, instances, a_map)
         for place, (text, answer) in enumerate(zip(texts, ask(a_map, texts), strict=True)):
             rows, (text_told, names) = shown.rows(answer.object_ids), shown.told(answer)
             key = text.encode() + b"\0" + text_told.encode() + mask_digest(instances, rows)
@@ -350,7 +406,7 @@ def told(answer: Answer) -> str:
     return NO_ANSWER if is_without else HINT.sub("", answer.text)
 
 
-class _Shown:
+class _ShownMap:
     """A map of a method whose answers become drafts."""
 
     def __init__(self, scene: str, method: str, instances: Instances, a_map: SceneMap) -> None:
@@ -410,3 +466,61 @@ def _judged_answer(rules: ProtocolRules, true: TrueAnswer, given: GivenAnswer, c
     if true.object_ids:
         judgements["objects"] = judged(are_objects_right(true, given, main))
     return judgements
+
+
+def question_drafts(source: TruthSource, scene: str, per_kind: int, left_out: Collection[str] = ()) -> list[Draft]:
+    """``per_kind`` questions of each kind and of each template of reasoning, without those whose ids are ``left_out``.
+
+    Of a template nothing takes the place of what is left out.
+    """
+    dataset, name = source.dataset(scene), scene.partition("/")[2]
+    objects = scene_objects(dataset, name, source.truth(scene), MIN_VERTICES)
+    found = [question for question in questions_of_scene(dataset, name) if question.id not in left_out]
+    shown = _ShownQuestions(source, scene, objects)
+    drafts = []
+    for question in chosen(found, per_kind):
+        told = ", ".join(objects.by_id(k).shown for k in question.answers or () if k in objects.ids)
+        drafts.append(shown.draft(f"Find: {question.text}", told, question.id, question.kind, question.answers or ()))
+    for made in generate_questions(objects, n_each=per_kind):
+        made_id, answer = question_id(scene, REASONING, made.text), made.answer
+        if made_id not in left_out:
+            held = [thing.id for thing in held_against(made, objects)]
+            told = "no" if answer.value is False else answer.text
+            drafts.append(shown.draft(made.text, told, made_id, made.kind, answer.object_ids, held))
+    return drafts
+
+
+class _ShownQuestions:
+    """A scene whose questions become drafts."""
+
+    def __init__(self, source: TruthSource, scene: str, objects: SceneMap) -> None:
+        self._scene = scene
+        ids = source.instances(scene).ids.tolist()
+        self._row_of = {instance: row for row, instance in enumerate(ids)}
+        self._objects = objects
+
+    def draft(
+        self, asked: str, told: str, made_id: str, kind: str, answers: Sequence[int], references: Sequence[int] = ()
+    ) -> Draft:
+        spoken_of = [number for number in (*answers, *references) if number in self._objects.ids]
+        told, names = without_ids(told, self._objects, spoken_of)
+        lines = asked, f"Answer: {told}"
+        rows = self._rows(answers)
+        methods = kind, OF_ALL_KINDS  # no method answers: what is counted together is a kind
+        return Draft(
+            kind="questions",
+            scene=self._scene,
+            methods=methods,
+            instance_ids=(answers[0] if len(answers) == 1 else -1,) * len(methods),
+            rows=rows,
+            title=lines,
+            text="\n".join(printable(line, MOST_TEXT) for line in lines),
+            asks=tuple(ask.name for ask in ASKS["questions"]),
+            question_id=made_id,
+            question_kind=kind,
+            others=tuple(row for row in self._rows(references) if row not in rows),
+            names=names_of_rows(names, self._row_of, len(self._row_of)),
+        )
+
+    def _rows(self, ids: Sequence[int]) -> tuple[int, ...]:
+        return tuple(self._row_of[instance] for instance in ids if instance in self._row_of)

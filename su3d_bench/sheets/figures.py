@@ -15,13 +15,12 @@ from su3d_bench.core.types import Float64Array, Frame, UInt8Array
 from su3d_bench.metrics.questions.score import labels_n
 from su3d_bench.questions.language_solver import built_in
 from su3d_bench.questions.retrieval import rank_all
-from su3d_bench.reports.pictures.colours import ROOM_SURFACES, Scale, class_colours, similarity_colours
+from su3d_bench.reports.pictures.canvas import ROOM_SURFACES, Scale, class_colours, similarity_colours
 from su3d_bench.reports.pictures.figures import Cell, GridRow
 from su3d_bench.reports.pictures.items import Tag, seen_in
-from su3d_bench.reports.pictures.map_views import DrawnMap, MapView, drawn_map, pale
-from su3d_bench.sheets.making.drawing import tags_at
-from su3d_bench.sheets.making.run_source import RunSource
-from su3d_bench.sheets.making.shown_room import ANSWER_COLOUR, OTHER_COLOUR
+from su3d_bench.reports.pictures.maps import DrawnMap, MapView, drawn_map, pale
+from su3d_bench.sheets.drawing import ANSWER_COLOUR, OTHER_COLOUR, tags_at
+from su3d_bench.sheets.sources import RunSource
 
 CELL_WIDTH, CELL_HEIGHT = 720, 500  # pixels of one picture
 SMALLER = 4  # times, of the views in which the corner is chosen

@@ -5,43 +5,59 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from su3d_bench.core.errors import DataError, printable
-from su3d_bench.core.files.atomic import write_json
 from su3d_bench.core.types import Float64Array, Int64Array, Interval
+from su3d_bench.formats.tables.csv_text import csv_lines
 from su3d_bench.numerics.statistics import DIFFERENCE, LEAST_ITEMS, mean_interval, share_interval, sign_flip_test
 from su3d_bench.questions.model import ALL_KINDS
+from su3d_bench.questions.query_files import COLUMN
+from su3d_bench.reports.sheet.page import Entry, list_page
+from su3d_bench.sheets.agreement import Agreement, agreement, cohen_kappa
+from su3d_bench.sheets.answers import LABELS, Judgement
 from su3d_bench.sheets.items import (
     ARGUABLE,
     CANNOT_TELL,
     MERGES,
     RIGHT,
+    VERDICTS,
     JudgedRun,
     Key,
     KeyItem,
     Sheet,
     SheetKind,
     read_record,
+    write_record,
 )
-from su3d_bench.sheets.judging.agreement import Agreement, agreement, cohen_kappa
-from su3d_bench.sheets.judging.answers import LABELS, Judgement
-from su3d_bench.sheets.judging.verdicts import WHOLE, whole_verdicts
 
 if TYPE_CHECKING:
+    pass
     import pandas
+
+
+WHOLE = "all three"
+LOOKS_COLUMNS = ("item_id", "question", "reason", "answers", "truth", "scene", "methods", "text", "pictures")
+DISPUTED_COLUMNS = (COLUMN, "scene", "kind", "why", "text")
+
+
+def whole_verdicts(judgements: Iterable[Judgement]) -> Iterator[Judgement]:
+    """What each annotator says of each question as a whole: the worst of what they say of its parts."""
+    given: dict[tuple[str, str], list[str]] = defaultdict(list)
+    for judgement in judgements:
+        given[judgement.item_id, judgement.annotator].append(judgement.answer)
+    for (item_id, annotator), answers in given.items():
+        yield Judgement(item_id, annotator, WHOLE, max(answers, key=VERDICTS.index))
+
 
 Judge = Literal["people", "automatic"]
 Reason = Literal["annotators disagree", "against the truth", "not right"]
-SCHEMA = 1
 STEPS = (1, 2, 6, 12, 60)  # of which shares of up to 1, 2, 3, 4, 6 judges, and their differences, are whole numbers
 MOST_STEPS = 50_000  # a distribution of 100,001 sums, some seconds for as many items
 OF_ALL_KINDS = "all"
@@ -406,21 +422,48 @@ FILE = "scores.json"
 
 def write_scores(folder: Path, scores: Scores) -> Path:
     """Write ``scores.json`` into ``folder``; its path."""
-    write_json(folder / FILE, asdict(scores))
-    return folder / FILE
+    return write_record(folder / FILE, scores)
 
 
 def read_scores(path: Path) -> Scores:
     """The scores of a file or of the folder that holds it; ``DataError`` where it is not as ``sheets score`` writes."""
-    file = path / FILE if path.is_dir() else path
-    scores = read_record(file, Scores, SCHEMA, "sheets score", "score again")
-    if not all(_is_sound(cell) for cell in scores.cells):
-        raise DataError(
-            f"{printable(str(file), 200)}: holds a number that is no share or a metric that is none; score again"
-        )
-    return scores
+    return read_record(path / FILE if path.is_dir() else path, Scores, "sheets score")
 
 
-def _is_sound(cell: ScoreCell) -> bool:
-    values = [*(() if cell.value is None else (cell.value,)), *(cell.interval or ()), *cell.per_scene.values()]
-    return cell.metric in METRICS and all(math.isfinite(value) and 0.0 <= value <= 1.0 for value in values)
+def second_looks_csv(looks: Sequence[SecondLook]) -> str:
+    """One line an item and question."""
+    rows = [
+        (one.item_id, one.ask, one.reason, _said(one), one.automatic, one.scene, ", ".join(one.methods), one.text)
+        for one in looks
+    ]
+    return csv_lines([LOOKS_COLUMNS, *((*row, ", ".join(one.pictures)) for row, one in zip(rows, looks, strict=True))])
+
+
+def _said(look: SecondLook) -> str:
+    return "; ".join(f"{name}: {answer}" for name, answer in look.answers.items())
+
+
+def second_looks_page(looks: Sequence[SecondLook], pictures: str, sheet_id: str) -> str:
+    """A page without scripts; ``pictures`` is where its picture files are, as the page sees it."""
+    return list_page(f"Second looks at {sheet_id}: {len(looks)}", "", [_entry(look) for look in looks], pictures)
+
+
+def _entry(look: SecondLook) -> Entry:
+    truth = f"; ground truth: {look.automatic}" if look.automatic else ""
+    head = f"{look.item_id}, {look.scene}, {', '.join(look.methods)}"
+    return Entry(head, look.text, (f"{look.reason}, {look.ask}: {_said(look)}{truth}",), look.pictures)
+
+
+def disputed_csv(key: Key, looks: Iterable[SecondLook]) -> str:
+    """A line for each question of ``looks``, as ``--leave-out`` reads it, with why it stands there."""
+    of_item = {item.id: item for item in key.items}
+    why: dict[str, list[str]] = defaultdict(list)
+    texts: dict[str, str] = {}
+    for look in looks:
+        texts[look.item_id] = look.text
+        why[look.item_id].append(f"{look.ask}: {', '.join(sorted(set(look.answers.values())))}")
+    rows: list[tuple[str, ...]] = [DISPUTED_COLUMNS]
+    for item_id, reasons in why.items():
+        item = of_item[item_id]
+        rows.append((item.question_id, item.scene, item.question_kind, "; ".join(reasons), texts[item_id]))
+    return csv_lines(rows)

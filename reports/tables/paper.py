@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from decimal import Decimal
+from functools import cache, partial
+from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.core.errors import ConfigError, counted, printable, some, suggest
+from su3d_bench.core.system.files import file_text
 from su3d_bench.formats.tables.table import (
     NOT_MEASURED,
     Cell,
@@ -25,7 +31,92 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.score import RELATIVE, said_by
 from su3d_bench.numerics.statistics import SignFlipTest, holm, sign_flip_test
 from su3d_bench.reports.tables.model import Measured, confidence_notes, few_scenes, label_notes
-from su3d_bench.reports.tables.papers.published import Figure, PaperTable, figures_of
+
+FILE = Path(__file__).resolve().parent / "published.toml"
+Number = Annotated[str, Field(pattern=r"^\d*\.?\d+$")]  # as printed: the number of decimals says something
+PaperTable = Literal["I", "II", "III", "IV", "V", "reasoning"]  # the last is of the text alone
+
+
+OPEN = "open"  # no source that was read says it
+Fact = Annotated[str, Field(min_length=1, max_length=200)]
+
+
+class System(BaseModel):
+    """What made a printed number, as far as a source says.
+
+    ``labels`` a mask or point; ``time`` of a scene or frame, with hardware; ``frames`` that were used; ``proposals``:
+    what finds masks, and on what it was trained.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    name: Annotated[str, Field(min_length=1)] = OPEN
+    labels: Fact = OPEN
+    time: Fact = OPEN
+    frames: Fact = OPEN
+    proposals: Fact = OPEN
+
+    @property
+    def words(self) -> str:
+        """What is known, and then what is open.
+
+        >>> System(labels="one").words
+        'labels a mask: one; time, frames, proposals: open'
+        """
+        facts = {"labels a mask": self.labels, "time": self.time, "frames": self.frames, "proposals": self.proposals}
+        known = [f"{what}: {fact}" for what, fact in facts.items() if fact != OPEN]
+        unknown = ", ".join(what for what, fact in facts.items() if fact == OPEN)
+        return "; ".join([*known, *([f"{unknown}: {OPEN}"] if unknown else [])])
+
+
+class Figure(BaseModel):
+    """One printed row: ``values`` is metric -> number as printed, in ``unit``; ``system`` is what made it.
+
+    ``table`` and ``row``: the table of OpenSU3D's paper in which it stands, and its label there. ``protocol``: ours
+    that comes nearest to the set-up. ``read_from``: the paper itself, or somebody who quotes it.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    method: Annotated[str, Field(min_length=1)]
+    dataset: Annotated[str, Field(min_length=1)]
+    setup: Annotated[str, Field(min_length=1)]
+    source: Annotated[str, Field(min_length=1)]
+    read_from: Literal["paper", "quoted"] = "paper"
+    unit: Literal["percent", "fraction"] = "percent"
+    values: Annotated[dict[str, Number], Field(min_length=1)]
+    system: System = System()
+    protocol: str | None = None
+    table: PaperTable | None = None
+    row: str | None = None
+    note: str | None = None
+
+    def percent(self, metric: str) -> str | None:
+        """The number in per cent with the decimals that it was printed with; None where it was not printed.
+
+        >>> Figure(method="a", dataset="b", setup="c", source="d", unit="fraction", values={"AP": ".204"}).percent("AP")
+        '20.4'
+        """
+        text = self.values.get(metric)
+        if text is None or self.unit == "percent":
+            return text
+        return f"{Decimal(text).scaleb(2):f}"
+
+
+@cache
+def published() -> tuple[Figure, ...]:
+    """What papers report, as ``published.toml`` has it, each figure with its system in place of that one's name."""
+    table = tomllib.loads(file_text(FILE))
+    systems = {entry["name"]: entry for entry in table["system"]}
+    figures = [one | ({"system": systems[one["system"]]} if "system" in one else {}) for one in table["figure"]]
+    return tuple(map(Figure.model_validate, figures))
+
+
+def figures_of(*, is_wanted: bool = True, **fields: str) -> list[Figure]:
+    """What is reported where each of ``fields`` is as given, such as ``method="sam3d"``; none where not wanted."""
+    figures = published() if is_wanted else ()
+    return [figure for figure in figures if all(getattr(figure, name) == value for name, value in fields.items())]
+
 
 LEVEL = 0.05
 PAPER_PROFILE = "paper"

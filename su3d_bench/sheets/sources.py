@@ -1,4 +1,4 @@
-"""What sheets take from a finished run: maps, frames and ground truth of its scenes."""
+"""What sheets take from a finished run, or from the ground truth of scenes: maps, frames and ground truth."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from su3d_bench.core.config import read_assignments
 from su3d_bench.core.errors import (
     ConfigError,
     GroundTruthMissing,
@@ -28,7 +30,11 @@ from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.truths import RefinedNames
 from su3d_bench.questions.refining import refined_names
 from su3d_bench.questions.scene_map import SceneMap, map_of
+from su3d_bench.questions.sight import instance_rows, looked_at
+from su3d_bench.questions.truths import fullest_truth
 from su3d_bench.runs.finished import FinishedRun, read_run
+from su3d_bench.runs.parts import build_dataset, part_of
+from su3d_bench.runs.planning.scenes import data_root, dataset_targets, expand_scenes
 from su3d_bench.store.predictions import read_prediction
 
 MOST_FRAMES = 32  # of a scene, among which the best view of an object is looked for
@@ -163,3 +169,64 @@ def mask_digest(instances: Instances, rows: Sequence[int]) -> bytes:
         total.update(np.ascontiguousarray(instances.points[instances.mask(row)]).tobytes())
         total.update(b"|")
     return total.digest()
+
+
+class TruthSource:
+    """The truth of ``scenes`` (``<dataset>/<scene>``); ``run`` and ``run_digest`` are empty where no run names them."""
+
+    def __init__(
+        self,
+        scenes: Sequence[str],
+        dataset_of: Callable[[str], Any],
+        opener: Callable[[], TruthSource] | None = None,
+        run: str = "",
+        run_digest: str = "",
+    ) -> None:
+        self.scenes, self.dataset = tuple(scenes), dataset_of
+        self.opener = opener or (lambda: self)
+        self.run, self.run_digest = run, run_digest
+        self.truth = lru_cache(maxsize=1)(self._truth)
+        self._map_of = lru_cache(maxsize=1)(self._map)
+        self._frames_of = lru_cache(maxsize=1)(self._frames)
+
+    def instances(self, scene: str, method: str = "") -> Instances:
+        """Every instance of the truth, whatever the method."""
+        return self._map_of(scene)
+
+    def frames(self, scene: str) -> tuple[Frame, ...]:
+        """Those in which it was looked up what can be asked about."""
+        return self._frames_of(scene)
+
+    def _truth(self, scene: str) -> GroundTruth:
+        return fullest_truth(self.dataset(scene), scene.partition("/")[2])
+
+    def _map(self, scene: str) -> Instances:
+        truth = self.truth(scene)
+        rows_of = dict(instance_rows(truth, 1))
+        classes = [int(np.bincount(truth.semantic[rows].clip(min=0)).argmax()) for rows in rows_of.values()]
+        names = tuple(truth.labels.name_of(class_id) if class_id else "" for class_id in classes)
+        return Instances.of(truth.points, list(rows_of.values()), names=names, ids=list(rows_of))
+
+    def _frames(self, scene: str) -> tuple[Frame, ...]:
+        dataset, name = self.dataset(scene), scene.partition("/")[2]
+        return tuple(looked_at(dataset, name))
+
+
+def truth_of_run(folder: Path, scenes: Sequence[str] = ()) -> TruthSource:
+    """That of these scenes of a run, of all without any; other data than the run's are refused."""
+    run = read_run(folder)
+    chosen = chosen_of(run, "scene", scenes, run.scenes)
+    return TruthSource(chosen, run.dataset, partial(truth_of_run, folder, chosen), run.name, run.record.code)
+
+
+def truth_of_addresses(addresses: Sequence[str]) -> TruthSource:
+    """That of every scene that an address or a pattern names."""
+    settings = read_assignments((), (), ())
+    parts = {target: part_of("dataset", target, settings) for target in dataset_targets(addresses)}
+    chosen, _ = expand_scenes(addresses, parts)
+    datasets = {part.name: build_dataset(part, data_root()) for part in parts.values()}
+    return TruthSource(
+        [f"{parts[target].name}/{scene}" for target, scene in chosen],
+        lambda scene: datasets[scene.partition("/")[0]],
+        partial(truth_of_addresses, [f"{target}/{scene}" for target, scene in chosen]),
+    )
