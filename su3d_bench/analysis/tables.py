@@ -24,6 +24,7 @@ from su3d_bench.reports.tables.run import found_table
 from su3d_bench.reports.tables.timing import AnytimePoint
 from su3d_bench.runs.finished import FinishedRun, is_numbers_alone, read_run
 from su3d_bench.runs.found import found_in, without_score
+from su3d_bench.sheets.items import SCHEMA
 from su3d_bench.sheets.scores import FILE as SCORES_FILE
 from su3d_bench.sheets.scores import LABEL_METRICS, ScoreCell, Scores, read_scores
 from su3d_bench.store.records import NumbersRecord, ResultRecord
@@ -98,7 +99,7 @@ def _judged_by_people(path: Path) -> list[Measured]:
                 run=str(path),
                 method=method,
                 protocol=f"{dataset}-{scores.kind}{BY_PEOPLE}",
-                version=scores.schema_version,
+                version=SCHEMA,
                 kind=scores.kind,
                 headline=tuple(cell.metric for cell in cells),
                 metrics={cell.metric: cell.value for cell in cells}

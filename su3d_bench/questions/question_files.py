@@ -191,9 +191,13 @@ class _Situated(BaseModel):
     question_id: Any = None
 
 
+class _Answer(BaseModel):
+    answer: Sentence
+
+
 class _Reply(BaseModel):
     question_id: Any = None
-    answers: list[Any] = Field(min_length=1)
+    answers: list[_Answer] = Field(min_length=1)
 
 
 def is_foreign(path: Path) -> bool:
@@ -304,7 +308,7 @@ def _replies(path: Path) -> dict[str, str]:
     if not isinstance(rows, list):
         raise DataError(f"{where}: has no 'annotations'")
     known = _rows(_Reply, rows, where, "annotation")
-    return {str(row.question_id): validated(Sentence, row.answers[0], where) for row in known}
+    return {str(row.question_id): row.answers[0].answer for row in known}
 
 
 def _rows(kind: type[Row], rows: list[Any], where: str, noun: str, first: int = 1) -> Iterator[Row]:

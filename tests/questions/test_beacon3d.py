@@ -5,18 +5,14 @@ from __future__ import annotations
 import copy
 import doctest
 import json
-from collections.abc import Callable
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from damage import damages, outcomes, truncations
 from places import CASES
 
-from su3d_bench.cli.main import main
-from su3d_bench.core.errors import DataError
 from su3d_bench.metrics.questions import chains as counting
 from su3d_bench.metrics.questions.chains import ChainedText, Place
 from su3d_bench.questions import beacon3d as answer_matching
@@ -74,21 +70,6 @@ def test_an_object_counts_where_its_finest_texts_are_right_and_a_spelling_is_one
     assert (found["chain"].least, found["fine alone"].least) == (0.0, 1.0)
 
 
-def test_without_a_judge_scores_have_a_least_and_a_most_and_say_how_to_bring_one(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    said = [{"pred": "white"}, {"pred": "white."}, {"pred": "blue"}]
-    found = numbers(tmp_path, QA, said)
-    assert (found["EM"].least, found["settled"].least) == (2 / 3, 2 / 3)
-    assert [(one.least, one.most) for one in (found["case"], found["object"])] == [(2 / 3, 1.0), (0.0, 1.0)]
-    paths = written(tmp_path, QA, said)
-    assert main(["questions", "score", str(paths[0]), "--answers", str(paths[1])]) == 0
-    shown = capsys.readouterr().out
-    assert "66.7 to 100.0" in shown and "give each answer its 'score'" in shown
-    judged = numbers(tmp_path, QA, [*said[:2], {"pred": "blue", "score": 4}])
-    assert judged["case"].least == pytest.approx(11 / 12) and judged["object"].least == 1.0
-
-
 def test_the_texts_of_a_file_ask_a_map_in_their_chains_and_are_questions_too(tmp_path: Path) -> None:
     asked, _ = written(tmp_path, GROUNDING, [])
     (scene, cases), *rest = read_foreign_queries(asked).items()
@@ -98,12 +79,6 @@ def test_the_texts_of_a_file_ask_a_map_in_their_chains_and_are_questions_too(tmp
     assert {(one.kind, one.answers) for one in read_questions(asked)} == {("relative", (28,)), ("relative", (28, 30))}
     asked, _ = written(tmp_path, QA, [])
     assert [one.reply for one in read_questions(asked)] == ["White"] * 3
-
-
-def changed(content: dict[str, Any], change: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
-    copied = copy.deepcopy(content)
-    change(copied["scene0025_00"]["box"])
-    return copied
 
 
 @pytest.mark.parametrize(
@@ -123,15 +98,6 @@ def test_damaged_files_are_read_or_refused_in_one_line(asked: object, answers: o
         n_read, n_refused = outcomes(read, chain(truncations(whole), damages(whole, 500)), must_name=".json")
         assert n_read and n_refused > 200
         path.write_bytes(whole)
-
-
-def test_texts_without_chains_are_no_truth_of_objects(tmp_path: Path) -> None:
-    from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
-
-    points = np.zeros((1, 3), np.float32)
-    truth = QueryTruth(points, np.ones(1, np.int64), (TextQuery("box", (1,)),), "query-objects", "here")
-    with pytest.raises(DataError, match="stand in no chains of objects; give a metadata"):
-        counting.chained(truth)
 
 
 def test_the_examples_hold() -> None:

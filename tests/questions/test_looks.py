@@ -14,13 +14,11 @@ from su3d_bench.questions.sight import (
     BUILDS,
     COLOURS,
     SHAPES,
-    TONES,
     Looks,
     Sight,
     looks_of,
     maybe_colours,
     measure_of,
-    tones_of,
 )
 
 GENERATOR = np.random.default_rng(0)
@@ -67,31 +65,11 @@ def test_what_is_between_two_shapes_is_neither_for_sure_and_may_be_both() -> Non
     assert words_of("table", polygon(3)) == (frozenset(), frozenset())  # a triangle is none of them
 
 
-def test_a_thing_that_hangs_flat_is_seen_from_the_front() -> None:
-    face = polygon(40)
-    clock = np.column_stack([face[:, 0], GENERATOR.uniform(0, 0.03, len(face)), face[:, 1]])
-    assert words_of("clock", clock) == ({"round"}, {"round"})
-    assert words_of("picture", slab(0.8, 0.02, 0.5))[0] & SHAPES == {"rectangular"}
-
-
 def test_of_what_is_cut_or_small_or_not_said_of_such_things_no_shape_is_told() -> None:
     assert words_of("table", polygon(40), is_cut=True) == (frozenset(), SHAPES)
     assert words_of("table", slab(0.15, 0.15, 0.1)) == (frozenset(), SHAPES)
     assert words_of("chair", slab(0.5, 0.5, 0.9)) == (frozenset(), SHAPES)
     assert words_of("cushion", slab(0.5, 0.2, 0.5)) == (frozenset(), SHAPES)  # a square one that leans
-
-
-def test_a_round_seat_on_legs_that_stand_apart_in_a_square_is_round() -> None:
-    seat = polygon(40, height=0.04) * (0.3, 0.3, 1) + (0, 0, 0.46)
-    feet = np.array([(x, y, 0.0) for x in (-0.2, 0.2) for y in (-0.2, 0.2)])
-    rises = np.linspace(0, 1, 200)[:, None, None]
-    legs = (feet * (1 - rises) + (feet * 0.4 + (0, 0, 0.46)) * rises).reshape(-1, 3)
-    assert words_of("stool", np.concatenate([seat, legs])) == ({"round"}, {"round"})
-
-
-def test_a_box_that_is_higher_than_long_is_not_square_for_sure() -> None:
-    assert words_of("box", slab(0.4, 0.4, 0.3))[0] == {"square"}
-    assert words_of("box", slab(0.4, 0.4, 0.7)) == (frozenset(), {"square", "rectangular"})
 
 
 def test_a_colour_is_sure_in_all_lights_and_may_be_what_a_good_part_of_the_pixels_has_in_one() -> None:
@@ -104,15 +82,6 @@ def test_a_colour_is_sure_in_all_lights_and_may_be_what_a_good_part_of_the_pixel
     assert looks.words & COLOURS == {"red"} and looks.maybe & COLOURS == {"red", "pink"}
     assert looks_of("picture", slab(0.8, 0.02, 0.5), sight, is_cut=False).maybe >= COLOURS
     assert looks_of("chair", slab(0.5, 0.5, 0.9), None, is_cut=False).maybe >= COLOURS  # never seen
-
-
-def test_dark_and_light_things_are_so_in_every_light() -> None:
-    tones: Any = tones_of
-    black, white, grey = (np.tile([float(value)] * 3, (100, 1)) for value in (30, 235, 150))
-    assert tones([black, black * 1.25]) == ({"dark"}, {"dark"})
-    assert tones([white, white / 1.25]) == ({"light-coloured"}, {"light-coloured"})
-    assert tones([grey, grey * 1.25]) == (frozenset(), {"light-coloured"})  # only in more light
-    assert tones([black[:3]]) == (frozenset(), TONES)
 
 
 def test_a_thing_is_long_or_tall_by_itself_where_it_plainly_is() -> None:
@@ -128,12 +97,6 @@ def test_a_thing_is_long_or_tall_by_itself_where_it_plainly_is() -> None:
     assert build("shelf", 0.8, 0.3, 1.6, is_cut=True) == (frozenset(), BUILDS)
     assert build("lamp", 0.2, 0.2, 0.5) == (frozenset(), {"tall"})  # such a one may be short for a lamp
     assert build("keyboard", 0.5, 0.15, 0.03) == (frozenset(), {"long"})
-
-
-def test_what_is_tall_by_itself_is_not_asked_for_where_a_wide_thing_is_as_high() -> None:
-    slim, wide = thing(1, "shelf", (0.5, 0.3, 1.2), "tall"), thing(2, "shelf", (1.4, 0.3, 1.3))
-    assert "tall shelf" not in asked(slim, wide)
-    assert asked(slim, thing(2, "shelf", (1.4, 0.3, 0.9)))["tall shelf"] == ("property", (1,))
 
 
 def thing(one: int, name: str, sides: tuple[float, float, float], words: str = "", maybe: str = "") -> MapObject:

@@ -46,20 +46,6 @@ def test_a_written_set_is_read_as_it_was(tmp_path: Path, name: str) -> None:
     assert read_questions(tmp_path / name) == SET
 
 
-def test_unknown_answers_stay_unknown(tmp_path: Path) -> None:
-    unknown = (new_question("rooms/a", "property", "big pillow", None, "made"),)
-    for name in ("q.toml", "q.csv"):
-        write_questions(tmp_path / name, unknown)
-        assert read_questions(tmp_path / name) == unknown
-
-
-def test_a_query_file_without_kinds_is_a_set_of_instance_queries(tmp_path: Path) -> None:
-    (tmp_path / "q.csv").write_text("scene,text,objects\nroom0,a seat,1 2\n")
-    assert read_questions(tmp_path / "q.csv", "replica") == (
-        new_question("replica/room0", "instance", "a seat", (1, 2), "q.csv"),
-    )
-
-
 def test_scanrefer_objects_are_one_more_than_its_ids_and_equal_sentences_share_answers(tmp_path: Path) -> None:
     (tmp_path / "ScanRefer.json").write_text(SCANREFER)
     text = "a white cabinet in the corner"
@@ -88,25 +74,6 @@ def test_sqa3d_takes_its_answers_from_the_file_beside_it(tmp_path: Path) -> None
     assert read_questions(questions)[0].reply == "table"
 
 
-def test_one_question_of_sqa3d_with_two_answers_keeps_both_and_they_are_shown(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    questions = tmp_path / "v1_balanced_questions_val_scannetv2.json"
-    questions.write_text(json.dumps({"questions": [SQA_QUESTION, {**SQA_QUESTION, "question_id": 8}]}))
-    replies = [{"question_id": k, "answers": [{"answer": word}]} for k, word in ((7, "table"), (8, "desk"))]
-    (tmp_path / "v1_balanced_sqa_annotations_val_scannetv2.json").write_text(json.dumps({"annotations": replies}))
-    assert [one.reply for one in read_questions(questions)] == ["table or desk"]
-    assert main(["questions", "show", str(questions)]) == 0
-    shown = capsys.readouterr().out
-    assert "1 question on 1 scene (1 reasoning); 0 with known answers, 1 with one in words" in shown
-    assert 'What is in front?  -> "table or desk"' in shown
-
-
-OPENEQA = [{"question": "What is red?", "answer": "the box", "category": "x", "episode_history": "scannet-v0/002"}]
-SCANQA = [{"question": "What is red?", "answers": ["box"], "object_ids": [3], "scene_id": "scene0000_00"}]
-NR3D_ROW = {"item_id": "nr3d_0", "scan_id": "scene0000_00", "target_id": 9, "utterance": "the plant"}
-
-
 @pytest.mark.parametrize(
     ("name", "content"),
     [("q.json", SCANREFER), ("q.csv", NR3D), ("s.json", SQA3D), ("q.toml", toml_text(SET[:2]))],
@@ -131,19 +98,6 @@ def test_the_papers_queries_are_asked_of_its_13_scenes() -> None:
     }  # fmt: skip
     assert not any(one.is_known for one in found)
     assert len({one.id for one in found}) == len(found)
-
-
-def test_the_verb_shows_a_set_without_its_control_characters(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_questions(tmp_path / "q.toml", SET)
-    assert main(["questions", "show", str(tmp_path / "q.toml")]) == 0
-    shown = capsys.readouterr().out
-    assert "5 questions on 1 scene (2 instance, 1 affordance, 1 property, 1 relative); 5 with known answers" in shown
-    assert "\u202e" not in shown
-    assert max(map(len, shown.splitlines())) < 200
-    assert main(["questions", "show", "paper", "--json"]) == 0
-    assert len(json.loads(capsys.readouterr().out)) == len(paper_queries())
 
 
 def test_the_verb_makes_questions_from_classes_boxes_and_frames(

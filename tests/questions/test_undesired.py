@@ -37,9 +37,3 @@ def test_a_box_that_covers_the_map_from_above_is_left_out() -> None:
     )
     assert undesired(made, ("rug",) * 3, FilterConfig(max_map_fraction=1.0)) == ("", "", "")
     assert undesired(made, ("rug",) * 3, FilterConfig(max_map_fraction=0.05))[2] != ""
-
-
-def test_a_map_without_points_or_area_leaves_nothing_out_for_its_size() -> None:
-    assert undesired(Instances.of(np.zeros((0, 3), np.float32), []), (), FilterConfig()) == ()
-    line = Instances.of(np.array([[0, 0, 0], [1, 0, 0]], np.float32), [np.array([0, 1])])
-    assert undesired(line, ("rope",), FilterConfig()) == ("",)

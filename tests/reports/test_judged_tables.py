@@ -13,7 +13,7 @@ from simulated_annotators import RATES, SCHEMES, annotation_set, answered, reaso
 
 from su3d_bench.analysis.tables import check_paper, measured_results
 from su3d_bench.cli.main import main
-from su3d_bench.reports.tables.judged import KINDS, judged_table
+from su3d_bench.reports.tables.judged import judged_table
 from su3d_bench.reports.tables.latex import latex
 from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.paper import Shown
@@ -102,16 +102,6 @@ def test_table_v_has_a_row_for_each_label(folders: tuple[Path, Path], capsys: py
     ]
 
 
-def test_people_and_ground_truth_stand_apart_in_one_table(folders: tuple[Path, Path]) -> None:
-    people = measured_results([folders[0]])
-    truth = by_truth(SCHEMES[0], "retrieval", "rooms", instance=0.99, affordance=0.9, property=0.8, relative=0.1)
-    table = judged_table("IV", [truth, *people], Shown(), with_published=False)
-    assert [(row.label, row.group) for row in table.rows] == [
-        *((f"{one}, people", "people") for one in SCHEMES),
-        (f"{SCHEMES[0]}, ground truth", "ground truth"),
-    ]
-
-
 def test_both_datasets_stand_in_one_table_of_eight_columns_with_the_papers_digits() -> None:
     values = {"instance": 0.8, "affordance": 0.7, "property": 0.6, "relative": 0.5}
     n = {f"n_{kind}": 40.0 + k for k, kind in enumerate(values)}
@@ -125,19 +115,6 @@ def test_both_datasets_stand_in_one_table_of_eight_columns_with_the_papers_digit
     assert [cell.text for cell in reported[-1].cells] == ["0.8", "0.9", "0.9", "0.6", "0.9", "0.7", "0.7", "0.7"]
     assert reported[0].mark == "a, b" and sum(note.startswith("[") for note in table.notes) == 2
     assert table.caption.endswith("; not the paper's set-up: other scenes, perception, judges.")
-
-
-def test_a_best_of_one_of_four_over_none_is_not_marked_and_a_clear_one_is() -> None:
-    def both(other: float) -> list[bool]:
-        rows = [by_truth("opensu3d", "retrieval", "replica", **dict.fromkeys(KINDS, value)) for value in (0.25, other)]
-        rows[0] = replace(rows[0], method="sam3d", per_scene={scene: {} for scene in SCENES[1:]})
-        one = {SCENES[0]: dict.fromkeys(KINDS, 0.5)} | {scene: dict.fromkeys(KINDS, 0.0) for scene in SCENES[1:]}
-        rows[0] = replace(rows[0], per_scene=one)
-        table = judged_table("IV", rows, Shown(), with_published=False)
-        return [row.cells[0].is_best for row in table.rows]
-
-    assert both(0.0) == [False, False]
-    assert both(0.9) == [False, True]
 
 
 def test_reasoning_has_its_scores_above_the_papers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -180,11 +157,3 @@ def test_a_paper_with_peoples_numbers_is_checked_against_their_scores(
     assert [check.fault for check in checks if check.fault] == []
     paper.write_text(latex(tables).replace("& 0.900", "& 0.901"))
     assert sum(check.fault is not None for check in check_paper(paper)) == 4
-
-
-def test_scores_alone_give_a_table_of_all_that_was_judged(
-    folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
-) -> None:
-    tables = told(capsys, str(folders[1] / "scores.json"))
-    assert [one["name"] for one in tables] == ["rooms-annotation-people"]
-    assert tables[0]["columns"][:3] == ["label n", "label n'", "well-merged"]

@@ -7,20 +7,6 @@ import pytest
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.reports.tables.paper import Figure, figures_of, published
 
-WHOLE = """
-[[figure]]
-method = "a"
-dataset = "replica"
-setup = "8 scenes"
-source = "A paper, Table I"
-values = { AP = "1.0" }
-"""
-KNOWN = """
-[[system]]
-name = "b"
-labels = "one"
-"""
-
 
 def rows(table: str) -> dict[tuple[str, str, str | None], tuple[str, ...]]:
     return {(one.method, one.dataset, one.row): tuple(one.values.values()) for one in published() if one.table == table}
@@ -60,16 +46,6 @@ def test_tables_iv_and_v_and_reasoning_are_as_printed() -> None:
     assert reasoning == ["0.83", "0.68"]
 
 
-def test_what_is_not_in_the_papers_is_open() -> None:
-    for one in published():
-        if one.table == "I":
-            assert "scheme 1" not in one.setup and "ViT-H" not in one.setup and "open" in one.setup
-    (third,) = [one for one in figures_of(method="opensu3d") if one.table == "III"]
-    assert "which encoder is open" in third.setup and "scheme 1" in third.setup  # its text says simple fusion
-    scannet = [one for one in published() if one.dataset == "scannet" and "HOV-SG" in one.source]
-    assert len(scannet) == 3 and all("encoders is open" in one.setup for one in scannet)
-
-
 def test_each_number_is_attributed_to_where_it_was_read() -> None:
     sources = {(one.method, one.dataset): one for one in published() if one.table is None}
     assert "issue 22" in sources["openmask3d", "scannet200"].source
@@ -89,17 +65,8 @@ def test_every_protocol_that_a_figure_names_exists() -> None:
         assert load_protocol(name).name == name
 
 
-def test_no_row_stands_twice() -> None:
-    keys = [(one.method, one.dataset, one.source, one.setup, one.row, tuple(one.values)) for one in published()]
-    assert len(set(keys)) == len(keys)
-
-
 @pytest.mark.parametrize(("text", "shown"), [(".231", "23.1"), ("0.9", "90"), (".30", "30"), ("1.0", "100")])
 def test_a_fraction_is_shown_in_per_cent_with_the_decimals_it_was_printed_with(text: str, shown: str) -> None:
     one = Figure(method="a", dataset="b", setup="c", source="d", unit="fraction", values={"AP": text})
     assert one.percent("AP") == shown
     assert one.percent("AP50") is None
-
-
-def test_a_percentage_stays_as_printed() -> None:
-    assert Figure(method="a", dataset="b", setup="c", source="d", values={"AP": "18.70"}).percent("AP") == "18.70"

@@ -20,7 +20,7 @@ from su3d_bench.core.errors import printable
 from su3d_bench.formats.tables.csv_text import FORMULA_STARTS, meant, no_formula
 from su3d_bench.formats.tables.table import Cell, Origin, Prose, Table, TableRow, text_table
 from su3d_bench.reports.tables.ablation import SweepRow, ablation_table
-from su3d_bench.reports.tables.formats import FORMATS, csv_text, html_page, markdown, plain
+from su3d_bench.reports.tables.formats import csv_text, html_page, markdown, plain
 from su3d_bench.reports.tables.latex import escape, latex, origin_comment, printed_cells
 from su3d_bench.reports.tables.paper import Figure, Shown, paper_table, protocol_table
 
@@ -144,16 +144,6 @@ def test_no_text_can_be_a_formula_of_a_spreadsheet() -> None:
     assert "'@SUM(A1)" in csv_text([table])
 
 
-def test_markdown_keeps_its_columns_whatever_the_names() -> None:
-    lines = [line for line in markdown([hostile_table()]).splitlines() if line.startswith("|")]
-    assert len({len(line) for line in lines}) == 1
-    assert {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {4}
-
-
-def test_a_table_without_rows_is_its_caption_and_its_notes() -> None:
-    assert markdown([Table("none", "Nothing.", "method", (), (), ("left out: a",))]) == "Nothing.\n\n- left out: a\n"
-
-
 def test_csv_has_full_precision_and_every_note_once() -> None:
     table = protocol_table([measured(accuracy=1 / 3)], Shown(intervals=True), [])
     lines = list(csv.DictReader(io.StringIO(csv_text([table]))))
@@ -216,60 +206,11 @@ def test_the_tables_compile_without_a_warning(tmp_path: Path) -> None:
     assert not faults, faults
 
 
-PARTS = (
-    Prose(("A: <b>", "B: run|2")),
-    text_table("t", [("metric", "A"), ("AP", "1.0")], heading="rules", caption=", 2 scenes", notes=("mind this",)),
-    Prose(("first", "second"), is_list=True),
-)
-
-
-def test_prose_and_headings_stand_between_tables_as_markdown_has_them() -> None:
-    assert markdown(PARTS) == (
-        "A: &lt;b>\nB: run\\|2\n\n**rules**, 2 scenes\n\n| metric | A   |\n|--------|-----|\n| AP     | 1.0 |\n\n"
-        "- mind this\n\n- first\n- second\n"
-    )
-
-
-@pytest.mark.parametrize("name", FORMATS)
-def test_prose_stands_in_every_format_as_text(name: str) -> None:
-    text = FORMATS[name](PARTS)
-    assert text.index("run") < text.index("mind this") < text.index("second")
-    assert "<b>" not in text or name in ("text", "csv")
-
-
-WIDE = text_table(
-    "wide",
-    [
-        ["run", "method", "first long heading", "second long heading", "third long heading", "fourth"],
-        ["runs/a", "opensu3d", "12.5 [10.1, 14.9]", "1,234,567", "0.1", "x"],
-        ["runs/a", "oracle", "100.0", "7", "0.2", "y"],
-    ],
-    heading="Wide",
-    notes=("a note of several words that goes on beyond the sixty characters that a line of this terminal has",),
-)
-
-
-def test_a_table_that_is_too_wide_is_folded_between_columns_and_each_block_says_whose_rows_they_are() -> None:
-    lines = plain([WIDE], 60).splitlines()
-    assert max(map(len, lines)) <= 60
-    rows = [line for line in lines if line.startswith("| runs/a | opensu3d")]
-    assert len(rows) == 3 and sum("12.5 [10.1, 14.9]" in row for row in rows) == 1
-    assert lines[-2:] == [
-        "- a note of several words that goes on beyond the sixty",
-        "  characters that a line of this terminal has",
-    ]
-
-
 def test_a_table_whose_cells_are_texts_stands_as_lists() -> None:
     table = text_table("t", [["scene", "names"], ["rooms/living0", "chair, " * 20 + "sofa"]])
     lines = plain([table], 40).splitlines()
     assert lines[0] == "scene: rooms/living0" and lines[1] == "  names  chair, chair, chair, chair,"
     assert max(map(len, lines)) <= 40
-
-
-def test_a_table_that_fits_and_one_in_a_file_keep_their_form() -> None:
-    assert plain([WIDE], 200) == plain([WIDE])
-    assert max(map(len, plain([WIDE]).splitlines())) > 90
 
 
 @given(

@@ -15,7 +15,7 @@ from su3d_bench.reports.tables.ablation import SweepRow, ablation_table
 from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
 from su3d_bench.reports.tables.latex import latex
 from su3d_bench.reports.tables.model import Measured
-from su3d_bench.reports.tables.paper import Shown, paper_table, protocol_table, selection_tables
+from su3d_bench.reports.tables.paper import Shown, paper_table, protocol_table
 
 SEMANTIC = "replica-openmask3d-semantic"
 
@@ -41,18 +41,6 @@ def test_measured_and_reported_rows_never_stand_without_a_mark() -> None:
     assert latex([table]).count("as reported, not measured here") == 1
     lines = list(csv.DictReader(io.StringIO(csv_text([table]))))
     assert {line["kind"] for line in lines if line["text"] in {"42.6", "40.9"}} == {"reported"}
-
-
-def test_published_rows_can_be_left_out() -> None:
-    (table,) = paper_table("II", [measured()], Shown(), with_published=False)
-    assert len(table.rows) == 1
-
-
-def test_intervals_scores_of_the_truth_and_scenes_are_shown_on_request() -> None:
-    table = protocol_table([measured()], Shown(intervals=True, ceilings=True, scenes_count=True), [])
-    assert table.columns == ("mAcc", "F-mIoU", "mAcc (truth)", "F-mIoU (truth)", "scenes")
-    assert texts(table) == [["opensu3d", "40.0 [35.0, 45.0]", "20.0", "98.0", "100.0", "8"]]
-    assert protocol_table([measured()], Shown(), []).columns == ("mAcc", "F-mIoU")
 
 
 def test_rows_of_different_scenes_are_not_compared() -> None:
@@ -89,21 +77,6 @@ def test_only_a_significant_best_is_marked_on_request() -> None:
     assert best(protocol_table(unclear, Shown(), [])) == [[False, False], [True, True]]
 
 
-def test_one_method_of_two_runs_is_told_apart_by_the_run() -> None:
-    table = protocol_table([measured(), measured(run="runs/second", accuracy=0.5)], Shown(), [])
-    assert [row.label for row in table.rows] == ["opensu3d (first)", "opensu3d (second)"]
-    same = protocol_table([measured(run="a/x"), measured(run="b/x")], Shown(), [])
-    assert [row.label for row in same.rows] == ["opensu3d (a/x)", "opensu3d (b/x)"]
-
-
-def test_a_metric_may_be_chosen_and_an_undefined_one_is_a_dash() -> None:
-    table = protocol_table([measured()], Shown(metrics=("mIoU", "mAcc")), [])
-    assert texts(table) == [["opensu3d", "-", "40.0"]]
-    assert table.rows[0].cells[0].origin is None
-    with pytest.raises(ConfigError, match="has no metric 'mAc'; did you mean 'mAcc'"):
-        protocol_table([measured()], Shown(metrics=("mAc",)), [])
-
-
 def test_the_papers_protocol_is_taken_where_it_is_there_and_others_say_that_they_are_not_it() -> None:
     own = measured(protocol="rooms-semantic")
     (table,) = paper_table("II", [own, measured()], Shown(), with_published=False)
@@ -128,13 +101,6 @@ def test_the_papers_protocol_is_taken_where_it_is_there_and_others_say_that_they
     assert other.caption.endswith("rooms-semantic; not the paper's set-up: other protocol, perception.")
     with pytest.raises(ConfigError, match="Table III: needs AP, AP50, AP25"):
         paper_table("III", [own], Shown(), with_published=False)
-
-
-def test_every_protocol_of_a_selection_has_a_table_of_its_own() -> None:
-    names = ("rooms-semantic", "replica-conceptgraphs-ex6")
-    tables = selection_tables([measured(protocol=name) for name in names], Shown(), with_published=True)
-    assert [table.name for table in tables] == list(names)
-    assert [any(row.is_reported for row in table.rows) for table in tables] == [False, True]
 
 
 SWEEP = [
@@ -172,22 +138,3 @@ def test_table_i_holds_each_row_against_the_methods_own_with_holms_correction() 
         "Ablation of single parameters on replica, replica-openmask3d-semantic and replica-openmask3d; not the "
         "paper's set-up: other perception."
     )
-
-
-def test_table_i_marks_no_best_that_does_not_differ() -> None:
-    rows = swept(SCENES, own=0.4, m1=0.4001, k1=0.45)
-    mixed = {scene: {"mAcc": 0.4 + (0.2 if k % 2 else -0.1), "F-mIoU": 0.2} for k, scene in enumerate(SCENES)}
-    rows = [
-        replace(row, per_scene=mixed) if (row.method, row.kind) == (SWEEP[0].method, "semantic") else row
-        for row in rows
-    ]
-    table = ablation_table(rows, SWEEP, Shown(), with_published=False)
-    assert [row.cells[0].is_best for row in table.rows] == [False, False, False, True]
-    assert [row.cells[2].is_best for row in table.rows] == [True, False, False, True]  # 0.0001 in every scene alike
-
-
-def test_table_i_marks_nothing_where_no_difference_could_be_told_and_says_so_once() -> None:
-    table = ablation_table(swept(SCENES[:6], own=0.4, m1=0.3, k1=0.45), SWEEP, Shown(), with_published=False)
-    assert not any(map(any, best(table)))  # 2 / 2**6 is below 0.05, twice that is not
-    assert sum("No best is marked" in note for note in table.notes) == 1
-    assert any("(the least is 0.062)" in note for note in table.notes)

@@ -14,7 +14,6 @@ from painted import colour_perception
 from places import SCENES
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.costs import UpdateTimes, pooled, summarise
 from su3d_bench.numerics.statistics import growth_exponent
@@ -60,11 +59,6 @@ def test_a_noisy_constant_is_called_constant_and_a_noisy_root_grows() -> None:
     assert root is not None and root.low < 0.5 < root.high and root.words == "grows"
 
 
-def test_nothing_is_said_of_growth_where_the_map_hardly_grew() -> None:
-    assert growth_exponent(np.linspace(100, 150, 50), np.ones(50)) is None
-    assert growth_exponent(np.array([1.0, 10.0, 100.0]), np.ones(3)) is None
-
-
 def test_percentiles_leave_the_first_updates_out_and_the_share_counts_them() -> None:
     total = np.array([100.0, 50.0, 10.0, 10.0, 20.0, 30.0])
     summary = summarise([times(total, match_ms=total / 2, frame=np.arange(0, 60, 10.0))], warm_up=2)
@@ -80,21 +74,6 @@ def test_updates_of_several_scenes_are_pooled_without_the_first_of_each() -> Non
     first, second = times(np.array([9.0, 1.0, 2.0])), times(np.array([8.0, 3.0]))
     assert pooled([first, second], "total", 1).tolist() == [1.0, 2.0, 3.0]
     assert pooled([], "total", 1).tolist() == []
-
-
-def test_a_single_update_stands_for_one_frame() -> None:
-    summary = summarise([times(np.array([250.0]), frame=np.array([7.0]))], warm_up=0)
-    assert (summary.updates_per_s, summary.frames_per_s) == (4.0, 4.0)
-    without_indices = summarise([times(np.array([100.0, 100.0, 50.0]))], warm_up=0)
-    assert without_indices.frames_per_s == without_indices.updates_per_s == 12.0
-
-
-def test_a_scene_whose_map_has_no_size_says_nothing_of_growth_with_it() -> None:
-    grows = times(np.linspace(1.0, 10.0, 12), n_points=np.linspace(10.0, 100.0, 12))
-    alone = stages_of(summarise([grows], warm_up=0))["total"].against_points
-    both = stages_of(summarise([times(np.full(12, 500.0)), grows], warm_up=0))["total"].against_points
-    assert both == alone
-    assert alone.exponent == pytest.approx(1.0)
 
 
 def test_sizes_are_the_largest_over_scenes_and_the_finish_that_of_the_last_maps() -> None:
@@ -116,12 +95,6 @@ def test_the_share_of_the_map_is_what_is_neither_reading_nor_perception() -> Non
     np.testing.assert_array_equal(one.ms("map"), 2.0)
 
 
-def test_a_stage_that_only_some_scenes_have_counts_as_zero_in_the_others() -> None:
-    summary = summarise([times(np.ones(5), match_ms=np.ones(5)), times(np.ones(5))], warm_up=0)
-    assert stages_of(summary)["match"].share == 0.5
-    assert stages_of(summary)["match"].n == 10
-
-
 def test_a_run_records_sizes_memory_and_the_cost_of_every_map(run: Path) -> None:
     (first, second) = read_update_times(read_run(run), "collector")
     assert [first.scene, second.scene] == ["painted/a", "painted/b"]
@@ -141,12 +114,6 @@ def test_the_maps_midway_are_scored_and_their_numbers_stand_in_the_metrics(run: 
     assert coverage[0] <= coverage[1] <= results[0]["result"]["metrics"]["mAcc"]
 
 
-def test_a_run_with_other_shares_is_another_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = [*WORDS[:-2], "0.25", "--out", str(run)]
-    assert main(words) == 2
-    assert "anytime was [0.5, 0.1], now [0.25]" in capsys.readouterr().err
-
-
 def test_the_report_prints_tables_and_writes_them_with_plots(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -164,20 +131,3 @@ def test_the_report_prints_tables_and_writes_them_with_plots(
     for name in ("update-cost", "update-course", "memory", "stages", "anytime"):
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
         assert (tmp_path / f"{name}.pdf").read_bytes().startswith(b"%PDF")
-
-
-METHODS = ("opensu3d", "conceptgraphs-detector", "openmask3d-segment3d", "sam3d@incremental", "oracle")
-
-
-@pytest.mark.parametrize("text", ["update,total_ms\n1,x\n", "update,total_ms\n1\n", "update,total_ms\n0,nan\n", "\x00"])
-def test_a_damaged_table_of_updates_is_one_line(run: Path, tmp_path: Path, text: str) -> None:
-    import shutil
-
-    shutil.copytree(run, tmp_path / "run")
-    job = read_run(tmp_path / "run").folder.job("painted/a", "collector")
-    job.updates.write_text(text)
-    if "total_ms" not in text:
-        assert [one.scene for one in read_update_times(read_run(tmp_path / "run"), "collector")] == ["painted/b"]
-        return
-    with pytest.raises(DataError, match=r"painted/a: updates\.csv: .*; run the same command again to mend it"):
-        read_update_times(read_run(tmp_path / "run"), "collector")

@@ -7,29 +7,22 @@ import json
 import re
 from collections import Counter
 from collections.abc import Sequence
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from made_sheets import PAINTED
 from painted import LABELS, Painted
-from PIL import Image
 from simulated_annotators import SET_ID
 
 from su3d_bench.analysis.tables import measured_results
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import GroundTruthMissing
-from su3d_bench.questions.generated import GeneratedQuestion, generate_questions
-from su3d_bench.questions.model import MADE_KINDS, REASONING, Answer, question_id
+from su3d_bench.questions.generated import generate_questions
+from su3d_bench.questions.model import MADE_KINDS, REASONING, question_id
 from su3d_bench.questions.query_files import read_left_out
-from su3d_bench.questions.question_files import read_questions
 from su3d_bench.questions.truths import fullest_truth, scene_objects
-from su3d_bench.sheets import drafts as question_drafts_module
 from su3d_bench.sheets.answers import Judgement, check_key
 from su3d_bench.sheets.drafts import question_drafts
-from su3d_bench.sheets.drawing import SceneDrafts, draw_all, draw_scene
 from su3d_bench.sheets.items import (
     ARGUABLE,
     ASKS,
@@ -72,14 +65,6 @@ def painted_objects() -> Any:
 # Made
 
 
-def test_what_a_no_was_held_against_is_outlined(source: TruthSource, monkeypatch: pytest.MonkeyPatch) -> None:
-    denied = GeneratedQuestion("Is there a lamp on the sofa?", "is on", Answer("no: the map has none", value=False))
-    monkeypatch.setattr(question_drafts_module, "generate_questions", lambda objects, n_each: (denied,))
-    (draft,) = [one for one in question_drafts(source, "painted/a", 1) if one.question_kind == "is on"]
-    assert draft.text.endswith("Answer: no") and not draft.rows
-    assert [draft.names[row] for row in draft.others] == ["sofa"]
-
-
 def test_each_kind_and_template_is_asked_with_the_answer_of_the_truth(source: TruthSource) -> None:
     drafts = question_drafts(source, "painted/a", 2)
     made = [one for one in drafts if one.question_kind in MADE_KINDS]
@@ -105,26 +90,6 @@ def test_each_kind_and_template_is_asked_with_the_answer_of_the_truth(source: Tr
     assert not any(one.automatic for one in drafts)
 
 
-def test_what_is_left_out_makes_room_for_others_of_its_kind(source: TruthSource) -> None:
-    before = question_drafts(source, "painted/a", 2)
-    gone = {next(one.question_id for one in before if one.question_kind == kind) for kind in ("instance", "nearest")}
-    after = question_drafts(source, "painted/a", 2, gone)
-    assert not gone & {one.question_id for one in after}
-    kinds = [Counter(one.question_kind for one in drafts) for drafts in (before, after)]
-    assert kinds[0] - kinds[1] == Counter({"nearest": 1}) and not kinds[1] - kinds[0]
-
-
-def test_the_objects_that_answer_are_outlined_in_a_frame(source: TruthSource) -> None:
-    drafts = question_drafts(source, "painted/a", 1)
-    (answered, *_) = [one for one in drafts if one.question_kind == "nearest"]
-    assert answered.others and not set(answered.others) & set(answered.rows)
-    (picture,) = draw_all(source, [answered], 1)
-    pixels = np.asarray(Image.open(BytesIO(picture)).convert("RGB")).astype(int)
-    assert (np.abs(pixels - [255, 64, 200]).sum(axis=2) < 60).mean() > 0.001
-    again = draw_scene(SceneDrafts(source.opener, {0: answered}), lambda event: None)
-    assert again == {0: picture}
-
-
 def test_sheets_of_questions_need_no_run(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["sheets", "make", "--kind", "questions", "--scenes", SCENE, "--jobs", "1", "--per-kind", "1"]
     assert main([*words, "--annotators", "2", "--overlap", "1", "--out", "out", "--json"]) == 0
@@ -140,12 +105,6 @@ def test_sheets_of_questions_need_no_run(capsys: pytest.CaptureFixture[str]) -> 
     Path("gone.csv").write_text(f"question_id\n{listed}\n")
     assert main([*words, "--leave-out", "gone.csv", "--out", "without", "--quiet"]) == 0
     assert listed not in {one.question_id for one in read_key(Path("without-key/key.json")).items}
-
-
-def test_a_scene_without_truth_is_refused(source: TruthSource, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(type(source.dataset("painted/a")), "variants", ())
-    with pytest.raises(GroundTruthMissing, match="painted/a: the dataset has no ground truth"):
-        question_drafts(source, "painted/a", 1)
 
 
 # Scored
@@ -207,16 +166,6 @@ def test_shares_of_right_are_counted_by_kind_of_question() -> None:
     assert [shares["instance", part] for part in PARTS] == [1.0, 0.5, 1.0]
 
 
-def test_what_is_disputed_or_wrong_is_looked_at_again() -> None:
-    _, _, found = scored()
-    assert [(one.item_id, one.ask, one.reason) for one in found.second_looks] == [
-        ("item-0001", "wording", "not right"),
-        ("item-0002", "answer", "not right"),
-        ("item-0003", "sense", "annotators disagree"),
-        ("item-0003", "answer", "annotators disagree"),
-    ]
-
-
 @pytest.fixture
 def answered(tmp_path: Path) -> tuple[Key, list[str]]:
     """The files of two annotators, and the words that score them."""
@@ -255,15 +204,3 @@ def test_what_not_everybody_calls_right_is_written_for_leave_out(
     assert main([*words[:2], "--key", "key", "--disputed", "x.csv"]) == 2
     assert "--disputed: lists what people say" in capsys.readouterr().err
     assert not Path("x.csv").exists()
-
-
-def test_disputed_questions_are_not_made_again(capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["questions", "make", "--scenes", SCENE, "--per-kind", "2", "--out"]
-    assert main([*words, "all.toml"]) == 0
-    before = read_questions(Path("all.toml"))
-    gone = before[0]
-    Path("gone.csv").write_text(f"\ufeffkind;question_id\r\n{gone.kind};{gone.id}\r\n;\r\n", newline="")
-    assert main([*words, "rest.toml", "--leave-out", "gone.csv"]) == 0
-    assert "1 left out" in capsys.readouterr().err
-    after = read_questions(Path("rest.toml"))
-    assert gone not in after and len(after) == len(before)  # another one takes its place

@@ -2,34 +2,30 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import zipfile
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from made_sheets import HOSTILE, METHODS, drafts_of, made
+from made_sheets import HOSTILE, METHODS, made
 from painted import WordEncoder, colour_perception
 from PIL import Image
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, DataError
-from su3d_bench.core.maps import Instances
 from su3d_bench.metrics.questions.truths import RefinedNames
 from su3d_bench.questions.language_solver import built_in
-from su3d_bench.questions.model import Answer, new_question
+from su3d_bench.questions.model import new_question
 from su3d_bench.questions.scene_map import MapObject, SceneMap
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs.finished import read_run
 from su3d_bench.sheets import sources as run_source
-from su3d_bench.sheets.drafts import _in_turn, annotation_drafts, reasoning_drafts, retrieval_drafts, told, without_ids
-from su3d_bench.sheets.items import ANSWER_COLUMNS, Sheet, read_key, read_sheet, write_key, write_sheet
-from su3d_bench.sheets.sets import table_csv, write_sheets
+from su3d_bench.sheets.drafts import annotation_drafts, reasoning_drafts, retrieval_drafts, without_ids
+from su3d_bench.sheets.items import Sheet, read_key, read_sheet, write_key, write_sheet
+from su3d_bench.sheets.sets import write_sheets
 from su3d_bench.sheets.sources import RunSource
 
 TEXTS = tuple(f"thing {k}" for k in range(12))
@@ -54,15 +50,6 @@ def test_the_key_may_not_lie_among_the_sheets(tmp_path: Path) -> None:
     for key in (tmp_path / "out", tmp_path / "out" / "deeper"):
         with pytest.raises(ConfigError, match="keep the key apart"):
             write_sheets(made("retrieval", TEXTS), tmp_path / "out", key)
-
-
-def test_the_order_is_drawn_from_the_seed_alone() -> None:
-    first, again, other = (made("retrieval", TEXTS, seed=seed) for seed in (3, 3, 4))
-    assert (first.sheet, first.key, first.pictures) == (again.sheet, again.key, again.pictures)
-    orders = [[item.text for item in one.sheet.items] for one in (first, other)]
-    assert orders[0] != orders[1] and orders[0] != sorted(orders[0])
-    assert sorted(orders[0]) == sorted(orders[1]) == sorted(TEXTS)
-    assert first.sheet.id != other.sheet.id
 
 
 def test_the_same_sheets_are_the_same_bytes(tmp_path: Path) -> None:
@@ -94,15 +81,6 @@ def test_sheet_and_key_come_back_from_their_files(tmp_path: Path) -> None:
     assert read_key(write_key(tmp_path, both.key)) == both.key
 
 
-def test_a_table_holds_hostile_text_as_text() -> None:
-    sheet = made("retrieval", HOSTILE).sheet
-    rows = list(csv.DictReader(io.StringIO(table_csv(sheet, sheet.annotators[0]))))
-    assert tuple(rows[0])[:6] == ANSWER_COLUMNS and len(rows) == len(HOSTILE)
-    assert not [cell for row in rows for cell in row.values() if cell.startswith(("=", "@", "+", "-"))]
-    assert any(row["text"].startswith("'=HYPERLINK") for row in rows)
-    assert all(len(row["text"]) <= 1001 and "\x1b" not in row["text"] and "\u202e" not in row["text"] for row in rows)
-
-
 def test_schemes_that_find_the_same_object_are_asked_about_once(painted_source: RunSource) -> None:
     asked = [new_question("painted/a", "instance", text, (k,), "test") for k, text in ((1, "chair"), (2, "sofa"))]
     drafts = retrieval_drafts(painted_source, "painted/a", asked, WordEncoder())
@@ -132,21 +110,6 @@ def test_labels_are_asked_in_drawn_order_and_equal_ones_once(
         if one.automatic:
             assert {one.stands_for[ask]: one.automatic[ask] for ask in ("label 1", "label 2")} == {
                 ("n",): "right", ("n'",): "wrong"}  # fmt: skip
-
-
-def test_what_labels_n_prime_leave_out_is_asked_about_under_label_n_alone(
-    painted_source: RunSource, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def without_first(job: object, found: Instances) -> RefinedNames:
-        return RefinedNames(("lamp",) * len(found), "test", ("'wall' is background", *[""] * (len(found) - 1)))
-
-    n = len(painted_source.scene_map("painted/a", METHODS[0]))
-    monkeypatch.setattr(run_source, "refined_names", without_first)
-    every = annotation_drafts(painted_source, "painted/a", 50, np.random.default_rng(0))
-    drafts = [one for one in every if 0 in one.rows]
-    assert {one.asks for one in drafts} == {("label 1", "merging")}
-    assert {one.stands_for["label 1"] for one in drafts} == {("n",)}
-    assert len(painted_source.scene_map("painted/a", METHODS[0])) == n - 1
 
 
 def test_answers_that_maps_share_are_judged_once(painted_source: RunSource) -> None:
@@ -230,20 +193,6 @@ def test_a_folder_of_another_set_and_one_with_answers_are_refused_and_stay(tmp_p
     with pytest.raises(ConfigError, match=r"sheet\.csv holds answers, or another set; name another folder"):
         write_sheets(made("retrieval", TEXTS), out, key)
     assert files() == answered
-
-
-def test_an_answer_hints_at_no_other_word_of_the_map() -> None:
-    text = "no: the map has no 'cabinet under tissue paper'; did you mean 'paperback'?"
-    assert told(Answer(text)) == "no: the map has no 'cabinet under tissue paper'"
-
-
-def test_methods_take_turns_in_sheets_of_labels_however_many_instances_each_has() -> None:
-    drafts = [replace(one, methods=("many",)) for one in drafts_of("annotation", TEXTS)]
-    drafts[3], drafts[5] = replace(drafts[3], methods=("few",)), replace(drafts[5], methods=("many", "few"))
-    order = np.random.default_rng(0).permutation(len(drafts)).tolist()
-    kept = _in_turn(drafts, ("few", "many"), order)
-    assert sorted(kept) == sorted(order) and {3, 5} <= set(kept[:4])
-    assert _in_turn(drafts_of("annotation", TEXTS), ("opensu3d@scheme1",), order) == order
 
 
 @pytest.mark.parametrize("change", [{"seed": 7}, {"extra": 1}, {"schema_version": 99}, {"digest": "0"}])

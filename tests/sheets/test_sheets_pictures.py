@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from made_sheets import HOSTILE, drafts_of
+from made_sheets import drafts_of
 from painted import colour_perception
 from PIL import Image
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Frame
 from su3d_bench.questions.question_files import figure_texts
 from su3d_bench.reports.pictures.items import (
-    ItemParts,
-    Panel,
     best_view,
-    compose,
     mask_in_frame,
-    png_bytes,
     seen_in,
-    zoomed,
 )
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs.executors.local import run_processes
@@ -47,40 +41,6 @@ def test_the_picture_of_an_item_is_small_and_shows_the_object(painted_source: Ru
     is_outline = (np.abs(picture - [255, 64, 200]).sum(axis=2) < 60).mean()
     assert is_outline > 0.001
     assert content == Artist(painted_source).draw(draft)
-
-
-@dataclass(frozen=True)
-class Shown:
-    """One map under any name, in the frames of a run."""
-
-    source: RunSource
-    a_map: Instances
-    opener: Any = None
-
-    def instances(self, scene: str, method: str) -> Instances:
-        return self.a_map
-
-    def frames(self, scene: str) -> tuple[Frame, ...]:
-        return self.source.frames(scene)
-
-
-@pytest.mark.parametrize("kind", ["retrieval", "annotation", "reasoning"])
-def test_a_picture_shows_nothing_of_a_map_but_what_is_judged(painted_source: RunSource, kind: Any) -> None:
-    whole = painted_source.instances("painted/a", "collector")
-    masks = [whole.mask(row) for row in range(len(whole))]
-    in_parts = [masks[1], *(part for mask in (masks[0], *masks[2:]) for part in np.array_split(mask, 7))]
-    ids = [400 + 3 * k for k in range(len(in_parts))]
-    other = Instances.of(whole.points, in_parts, names=tuple(f"other {k}" for k in ids), ids=ids)
-    draft = replace(drafts_of(kind, ["sofa"])[0], scene="painted/a", methods=("collector",), names=())
-    one = Artist(Shown(painted_source, whole)).draw(replace(draft, rows=(1,)))
-    assert one == Artist(Shown(painted_source, other)).draw(replace(draft, rows=(0,)))
-
-
-@pytest.mark.parametrize("text", HOSTILE)
-def test_hostile_titles_make_a_picture_of_the_usual_size(text: str) -> None:
-    grey = Panel("panel", np.full((30, 40, 3), 120, np.uint8), np.zeros((30, 40), bool))
-    picture = compose(ItemParts((text, text), None, grey, grey))
-    assert picture.shape[1] == 960 and 700 < picture.shape[0] < 1000
 
 
 def frame_of(depth_m: np.ndarray, x_m: float = 0.0) -> Frame:
@@ -110,19 +70,6 @@ def test_a_mask_in_a_frame_holds_what_lies_nearest_to_the_instance() -> None:
     mask = mask_in_frame(wall, KDTree(grid), is_left, bounds)
     assert mask.shape == (15, 20)
     assert mask[:, :9].all() and not mask[:, 11:].any()
-
-
-def test_a_zoom_is_around_the_object_and_within_the_picture() -> None:
-    mask = np.zeros((300, 400), bool)
-    mask[280:298, 5:20] = True
-    part = zoomed(Panel("", np.zeros((300, 400, 3), np.uint8), mask))
-    assert part.mask is not None and part.mask.sum() == mask.sum()
-    assert part.picture.shape[0] == 72
-
-
-def test_a_picture_of_many_colours_becomes_a_small_png() -> None:
-    noise = np.random.default_rng(0).integers(0, 255, (200, 200, 3)).astype(np.uint8)
-    assert Image.open(io.BytesIO(png_bytes(noise))).mode == "P"
 
 
 @pytest.mark.parametrize("suffix", ["pdf", "svg"])

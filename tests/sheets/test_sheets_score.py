@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from counted_sheets import both, scored, workbook
-from simulated_annotators import RATES, SCHEMES, annotation_set, answered, as_csv, reasoning_set, retrieval_set
+from simulated_annotators import RATES, annotation_set, answered, as_csv, retrieval_set
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.types import Float64Array
@@ -83,20 +83,6 @@ def test_known_error_rates_give_the_known_accuracies_and_agreement() -> None:
     assert confusion.n_equal / confusion.n == pytest.approx(1 - (first + second) / 2, abs=4 * (0.16 / 2 / n) ** 0.5)
 
 
-def test_the_difference_of_two_schemes_is_tested_on_the_same_questions() -> None:
-    sheet, key = retrieval_set(40)
-    found = scored(sheet, key, answered(sheet, key, {"ann": 0.0}))
-    tests = {(one.left, one.right, one.metric): one for one in found.tests}
-    assert len(tests) == 6 * 5
-    whole = tests[SCHEMES[0], SCHEMES[3], "all"]
-    # .5 and .9 of 40: 16 questions differ, all one way: 2 x 2^-16
-    assert (whole.n_items, whole.n_differ, whole.p) == (40, 16, 2.0**-15)
-    assert whole.difference == pytest.approx(0.4)
-    assert whole.interval is not None and 0.2 < whole.interval[0] < 0.4 < whole.interval[1] < 0.6
-    one_kind = tests[SCHEMES[0], SCHEMES[1], "instance"]
-    assert (one_kind.n_items, one_kind.n_differ, one_kind.p) == (10, 1, 1.0)
-
-
 def test_the_paired_test_is_the_sign_flip_test_where_both_are_exact() -> None:
     rng = np.random.default_rng(0)
 
@@ -146,35 +132,6 @@ def test_labels_and_merging_of_the_paper_come_from_the_blinded_questions() -> No
         "label": (8, 8, "right"),
         "merging": (5, 5, "well-merged"),
     }
-
-
-def test_answers_and_objects_of_reasoning_are_counted_apart() -> None:
-    sheet, key = reasoning_set([("right", "right"), ("right", "wrong"), ("wrong", "wrong"), ("right", "right")])
-    people = cells_of(scored(sheet, key, answered(sheet, key, {"ann": 0.0})))
-    assert value(people["opensu3d", "answer"]) == 0.75
-    assert value(people["opensu3d", "objects"]) == 0.5
-
-
-def test_cannot_tell_is_left_out_and_counted(small: tuple[Sheet, Key]) -> None:
-    sheet, key = small
-    rows = [replace(one, answer="cannot tell") if one.item_id == "item-0000" else one for one in both(small)]
-    before, after = cells_of(scored(sheet, key, both(small))), cells_of(scored(sheet, key, rows))
-    first = next(one for one in key.items if one.id == "item-0000")
-    place = (first.methods[0], "all")
-    assert after[place].n_items == before[place].n_items - 1
-    assert (before[place].n_cannot_tell, after[place].n_cannot_tell) == (0, 2)
-
-
-def test_an_item_judged_by_two_counts_once_with_the_share_of_them(small: tuple[Sheet, Key]) -> None:
-    sheet, key = small
-    rows = both(small)
-    rows[0] = replace(rows[0], answer="wrong" if rows[0].answer == "right" else "right")
-    found = scored(sheet, key, rows)
-    cell = cells_of(found)[key.items[0].methods[0], "all"]
-    before = cells_of(scored(sheet, key, both(small)))[key.items[0].methods[0], "all"]
-    assert abs(value(cell) - value(before)) == pytest.approx(0.5 / 8)
-    (look,) = found.second_looks
-    assert (look.item_id, look.reason, look.pictures) == ("item-0000", "annotators disagree", ("item-0000.png",))
 
 
 def test_a_judgement_against_the_truth_is_listed_for_a_second_look() -> None:
@@ -235,35 +192,3 @@ def test_files_are_scored_from_the_command_line(folder: Path, capsys: pytest.Cap
     assert main([*words[:-2], "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["n_judged"] == found["n_items"] == read_scores(folder / "scores").n_judged > 0
-
-
-def test_faults_of_all_files_are_listed_and_nothing_is_written(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    ann = folder / "answers" / "ann.csv"
-    ann.write_text(ann.read_text().replace(",right,", ",yes,", 2))
-    (folder / "answers" / "bob.xlsx").write_bytes(b"no")
-    files = [str(one) for one in sorted((folder / "answers").iterdir())]
-    words = ["sheets", "score", *files, "--key", str(folder / "key"), "--out", str(folder / "scores")]
-    assert main(words) == 2
-    lines = capsys.readouterr().err.splitlines()
-    assert [line.split(": ")[0].rpartition("/")[2] for line in lines] == [
-        "bob.xlsx",
-        "ann.csv",
-        "ann.csv",
-        "su3d-bench",
-    ]
-    assert lines[-1] == "su3d-bench: answers: 3 faults, listed above; nothing was scored; mend them first"
-    assert not (folder / "scores").exists()
-    assert main([*words, "--json"]) == 2
-    assert len(json.loads(capsys.readouterr().out)["faults"]) == 3
-
-
-def test_without_files_the_ground_truth_alone_is_scored(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["sheets", "score", "--key", str(folder / "key"), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert {one["judge"] for one in found["cells"]} == {"automatic"} and found["n_judged"] == 0
-    assert sum(one["n_items"] for one in found["cells"]) > 0 and found["tests"] == found["second_looks"] == []
-    assert main(["sheets", "score", "--key", str(folder / "key")]) == 0
-    told = capsys.readouterr()
-    assert "no person judged" in told.out and "no answers from" not in told.err
