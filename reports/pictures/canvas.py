@@ -13,7 +13,7 @@ import numpy as np
 
 from su3d_bench.core.files.atomic import make_folder, write_bytes
 from su3d_bench.core.types import Float64Array, Int64Array, UInt8Array
-from su3d_bench.metrics.protocols.files import class_names
+from su3d_bench.metrics.protocols.loading import class_names
 
 DPI = 100
 DARK, GREY = "#222222", "#666666"

@@ -20,11 +20,10 @@ from su3d_bench.core.errors import ConfigError, counted, printable, suggest
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
 from su3d_bench.core.types import Float64Array, GroundTruth, Int32Array, Int64Array
 from su3d_bench.metrics.attribution.arrays import ScoredPoints, scored_masks, scored_points
-from su3d_bench.metrics.attribution.masks import count_masks, errors_of
+from su3d_bench.metrics.attribution.masks import CAUSES, causes_of, count_masks, errors_of
 from su3d_bench.metrics.attribution.overlaps import LabelledMasks, ScoringRules, measure_overlaps, true_instances
-from su3d_bench.metrics.attribution.points import CAUSES, causes_of
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
-from su3d_bench.metrics.instance.hits import hits
+from su3d_bench.metrics.instance.scene_counts import hits
 from su3d_bench.metrics.instance.score import OBJECT
 from su3d_bench.metrics.matching.labelling import scored_classes
 from su3d_bench.metrics.matching.nearest import Points

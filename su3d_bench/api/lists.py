@@ -61,9 +61,7 @@ def list_protocols() -> pandas.DataFrame:
     >>> protocols.loc["rooms-instance", "headline"]
     'AP, AP50, AP25'
     """
-    from su3d_bench.metrics.protocols.files import protocol_names
-    from su3d_bench.metrics.protocols.loading import load_protocol
-    from su3d_bench.metrics.protocols.originals import original_of
+    from su3d_bench.metrics.protocols.loading import load_protocol, original_of, protocol_names
 
     columns = dict.fromkeys(("name", "summary", "kind", "datasets", "headline", "label_space", "original"), TEXT)
     rows = []

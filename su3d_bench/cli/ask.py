@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from su3d_bench.core.maps import Instances
-    from su3d_bench.metrics.questions.truths import RefinedNames
+    from su3d_bench.metrics.questions.score import RefinedNames
     from su3d_bench.questions.model import Answer
     from su3d_bench.questions.scene_map import SceneMap
     from su3d_bench.store.run_folder import JobFolder, RunFolder

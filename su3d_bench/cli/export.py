@@ -300,7 +300,7 @@ def _rules(name: str | None, dataset: Any, run: Path | None, *, is_ranked: bool)
 
 def _of_run(name: str, run: Path | None) -> ProtocolRules | None:
     """Somebody's own rules that ``run`` was scored by; None where it has none of that name."""
-    from su3d_bench.metrics.protocols.files import protocol_names
+    from su3d_bench.metrics.protocols.loading import protocol_names
     from su3d_bench.runs.finished import read_run
 
     if run is None or name in protocol_names() or name.endswith(".toml"):

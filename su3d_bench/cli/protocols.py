@@ -16,8 +16,8 @@ from su3d_bench.cli.texts import add_queries
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, suggest
 
 if TYPE_CHECKING:
+    from su3d_bench.metrics.protocols.loading import Stated
     from su3d_bench.metrics.protocols.model import ProtocolRules
-    from su3d_bench.metrics.protocols.originals import Stated
 
 ACTIONS = ("list", "show", "diff")
 
@@ -57,9 +57,7 @@ def add_parser(verbs: Any) -> None:
 
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.metrics.labels import labels_taken
-    from su3d_bench.metrics.protocols.files import protocol_names, rules_files
-    from su3d_bench.metrics.protocols.loading import load_protocol
-    from su3d_bench.metrics.protocols.originals import original_of
+    from su3d_bench.metrics.protocols.loading import load_protocol, original_of, protocol_names, rules_files
 
     if arguments.action not in ACTIONS:
         raise ConfigError(f"protocols: unknown action '{arguments.action}'{suggest(arguments.action, ACTIONS)}")
@@ -150,8 +148,7 @@ def _rules_lines(rules: ProtocolRules, files: Sequence[Path]) -> list[str]:
     """Every rule as a line, beneath it what the file that sets it says of it: its source, or that it is ours."""
     from su3d_bench.core.config import flatten, toml_value
     from su3d_bench.metrics.labels import labels_taken
-    from su3d_bench.metrics.protocols.files import HEADING, remarks_of
-    from su3d_bench.metrics.protocols.loading import not_comparable_with
+    from su3d_bench.metrics.protocols.loading import HEADING, not_comparable_with, remarks_of
 
     remarks = remarks_of(files)
     shown = rules.model_dump(mode="json", exclude={"classes"}) | {"not_comparable_with": not_comparable_with(rules)}

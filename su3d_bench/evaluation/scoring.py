@@ -51,13 +51,11 @@ from su3d_bench.metrics.matching.labelling import (
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import QuestionTruth, metric_of, score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
-from su3d_bench.metrics.semantic.panoptic_quality import PanopticCounts
-from su3d_bench.metrics.semantic.panoptic_score import count_segments, told_truth
+from su3d_bench.metrics.semantic.panoptic import PanopticCounts, count_segments, told_truth
 from su3d_bench.metrics.semantic.score import with_unnamed
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks, ids_of
 from su3d_bench.predictions.own_runs import OwnRuns

@@ -17,7 +17,7 @@ from su3d_bench.core.english import words
 from su3d_bench.core.errors import printable
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import Float64Array
-from su3d_bench.metrics.questions.truths import GivenAnswer, TrueAnswer
+from su3d_bench.metrics.questions.score import GivenAnswer, TrueAnswer
 from su3d_bench.perception.language.captioner import STRATEGY, reason_of
 from su3d_bench.perception.language.chat import ChatRequest, Reply, n_tokens
 from su3d_bench.perception.language.client import LanguageModel

@@ -15,8 +15,7 @@ from su3d_bench.core import registry
 from su3d_bench.core.config import toml_value
 from su3d_bench.core.errors import ConfigError, counted, printable, some
 from su3d_bench.formats.tables.table import Cell, Table, TableRow
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.perception.models.catalogue import WEIGHTS_CAVEAT
 from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.paper import OPEN, PAPER_PROFILE, PAPER_SCENES, Figure, Shown

@@ -15,7 +15,7 @@ from su3d_bench.core.types import GroundTruth, LabelSet
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth
-from su3d_bench.metrics.semantic.panoptic_score import told_truth
+from su3d_bench.metrics.semantic.panoptic import told_truth
 from su3d_bench.runs.own.watch import checked_dataset, checked_method, made, settings_model
 
 

@@ -21,13 +21,18 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.core.types import GroundTruth
-from su3d_bench.metrics.attribution import points as attribution_semantic
+from su3d_bench.metrics.attribution import masks as attribution_semantic
 from su3d_bench.metrics.attribution.arrays import EXPLAINED as EXPLAINED_KINDS
 from su3d_bench.metrics.attribution.arrays import scored_masks, scored_points
-from su3d_bench.metrics.attribution.masks import count_masks
-from su3d_bench.metrics.attribution.points import CAUSES, LabelledPoints, causes_of, mend_points, object_of_mask
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.attribution.masks import (
+    CAUSES,
+    LabelledPoints,
+    causes_of,
+    count_masks,
+    mend_points,
+    object_of_mask,
+)
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.scoring import score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.reports.tables.attribution import MEANINGS

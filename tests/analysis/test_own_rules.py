@@ -15,8 +15,7 @@ from places import SCENES
 from su3d_bench.analysis.leaderboard import leaderboard
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol, read_rules
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names, read_rules
 from su3d_bench.runs import finished
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run

@@ -275,7 +275,7 @@ def test_an_empty_first_scene_decides_nothing(tmp_path: Path) -> None:
 
 
 def test_a_protocol_of_the_user_counts_missing_scenes(tmp_path: Path) -> None:
-    from su3d_bench.metrics.protocols.files import rules_file
+    from su3d_bench.metrics.protocols.loading import rules_file
 
     text = rules_file("scannet-instance").read_text().replace('name = "scannet-instance"', 'name = "mine"')
     (tmp_path / "mine.toml").write_text(text)

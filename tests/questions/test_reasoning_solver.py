@@ -12,7 +12,7 @@ from scored_room import instances
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.datasets.rooms.dataset import Rooms
-from su3d_bench.metrics.questions.truths import RefinedNames
+from su3d_bench.metrics.questions.score import RefinedNames
 from su3d_bench.questions.generated import generate_questions
 from su3d_bench.questions.model import Answer
 from su3d_bench.questions.scene_map import MapObject, SceneMap, map_of

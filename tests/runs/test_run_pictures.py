@@ -8,7 +8,7 @@ import pytest
 
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
 from su3d_bench.core.types import Float32Array, GroundTruth, LabelSet
-from su3d_bench.metrics.protocols.files import class_names
+from su3d_bench.metrics.protocols.loading import class_names
 from su3d_bench.reports.pictures.canvas import (
     NO_INSTANCE,
     ROOM_SURFACES,

@@ -31,8 +31,7 @@ from su3d_bench.core.interfaces import HasPresets, IsSystem
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.devices import device_for
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names, protocols_for
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
 from su3d_bench.runs.executors.choose import ELSEWHERE, check_execution
 from su3d_bench.runs.job import FIELDS_KNOWN_LATER, SceneJob, config_key, own_code, refuse_other_run

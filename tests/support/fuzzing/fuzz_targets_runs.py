@@ -301,9 +301,7 @@ def _method_config(folder: Path) -> Read:
 
 
 def _protocol(folder: Path) -> Read:
-    from su3d_bench.metrics.protocols.files import rules_file
-    from su3d_bench.metrics.protocols.loading import read_protocol
-    from su3d_bench.metrics.protocols.originals import original_of
+    from su3d_bench.metrics.protocols.loading import original_of, read_protocol, rules_file
 
     for name in ("rooms-semantic", "openlex3d-topn", "rooms-instance"):
         (folder / f"{name}.toml").write_bytes(rules_file(name).read_bytes())
