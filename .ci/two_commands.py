@@ -220,7 +220,8 @@ def main() -> int:
         beside: Mapping[str, tuple[object, ...]] = {"models": mirror, "replica": ()}
 
         def fetch(what: str, *words: object, most_bytes: int | None = None) -> tuple[int, str, str]:
-            return place.run("fetch", what, *words, "--sources", table, *beside[what], most_bytes=most_bytes)
+            verb = ("models", "fetch") if what == "models" else ("datasets", "fetch", what)
+            return place.run(*verb, *words, "--sources", table, *beside[what], most_bytes=most_bytes)
 
         words = ("reproduce", "opensu3d", "--table", *TABLES, "--dry-run")
         rc, out, err = place.run(*words)

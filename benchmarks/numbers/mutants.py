@@ -81,7 +81,7 @@ GUARDS: dict[str, tuple[str, ...]] = {
     "analysis/side_numbers.py": (*_COMPARE, "analysis/test_planning"),
     "analysis/sides.py": (*_COMPARE, "analysis/test_planning"),
     "analysis/gate/": _GATE,
-    "analysis/recomputed.py": ("analysis/gate/test_gate", "analysis/test_leaderboard"),
+    "runs/verify.py": ("analysis/gate/test_gate", "analysis/test_leaderboard"),
 }  # fmt: skip
 
 

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.files.atomic import make_folder, write_json, write_text
-from su3d_bench.core.places import UP
-from su3d_bench.core.types import Float64Array, Frame, Int64Array, UInt8Array
+from su3d_bench.core.types import UP, Float64Array, Frame, Int64Array, UInt8Array
 from su3d_bench.datasets.hm3dsem.categories import category_of, room_category, scene_name
 from su3d_bench.datasets.hm3dsem.folders import COLOUR, DEPTH, INFO_NAME, LABELS_OF, OBJECTS, POSE, SPLIT, WALKS_FOLDER
 from su3d_bench.datasets.hm3dsem.frames import TO_HABITAT, UNITS_PER_METRE

@@ -11,7 +11,7 @@ from su3d_bench.reports.tables.ablation import ablation_table
 from su3d_bench.reports.tables.judged import JUDGED, judged_table
 from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.paper import PaperTable, Shown, paper_table
-from su3d_bench.runs.planning.ablation import read_rows
+from su3d_bench.runs.ablation import read_rows
 
 
 def numbered_tables(

@@ -20,15 +20,17 @@ from su3d_bench.analysis.sides import (
 from su3d_bench.core.errors import ConfigError, counted, printable
 from su3d_bench.core.types import BoolArray, Float64Array, Interval
 from su3d_bench.metrics.scoring import plain_json
-from su3d_bench.numerics.power import (
+from su3d_bench.numerics.statistics import (
+    NO_SPREAD,
     POWER,
     Variance,
     crossed_interval,
+    has_part,
+    pseudo_values,
     scenes_needed,
     variance_of,
     variance_range,
 )
-from su3d_bench.numerics.statistics import NO_SPREAD, has_part, pseudo_values
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 SCHEMA = 1

@@ -18,7 +18,7 @@ from su3d_bench.metrics.protocols.mixtures import Differing, Mixtures, differing
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combined_metrics, pack_scores, plain_json, score_scene, unpack_scores
 from su3d_bench.numerics.shares import EXACT_STEPS, N_ORDERS, Share, choices, shares
-from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report, run_inline, run_processes
+from su3d_bench.runs.executors import SCENE_DONE, Event, Report, run_inline, run_processes
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 SCHEMA = 1

@@ -31,7 +31,7 @@ from su3d_bench.metrics.metric import n_predictions
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic import confusion
 from su3d_bench.reports.tables.samples import Sample
-from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
+from su3d_bench.runs.executors import SCENE_DONE, Event, Report
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 KINDS = ("instance", "semantic")  # of the protocols that say what became of single instances

@@ -23,7 +23,7 @@ def list_datasets(names: Names = ()) -> pandas.DataFrame:
     ('rooms/living0', True)
     """
     from su3d_bench.runs.catalogue import known_datasets
-    from su3d_bench.runs.planning.scenes import data_root
+    from su3d_bench.runs.scenes import data_root
 
     rows: list[tuple[object, ...]] = []
     for one in known_datasets(several(names), data_root()):

@@ -7,6 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from su3d_bench.cli.fetch import models as fetch_models
 from su3d_bench.cli.shared.answers import answer, answer_either, answer_json, remark
 from su3d_bench.cli.shared.flags import add_group, add_settings, add_verb
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
@@ -21,12 +22,9 @@ def add_parser(verbs: Any) -> None:
     actions = add_group(
         verbs,
         "models",
-        "List the foundation models, check their files, export them to ONNX, or run them once.",
-        "list|check|export|warm",
-        (
-            "su3d-bench models list",
-            "su3d-bench models check clip-vit-h-14",
-        ),
+        "List the foundation models, fetch them, check their files, or run them once.",
+        ("su3d-bench models list", "su3d-bench models fetch --for paper --dry-run"),
+        lists=True,
     )
     listing = add_verb(
         actions,
@@ -45,35 +43,8 @@ def add_parser(verbs: Any) -> None:
     )
     checking.add_argument("names", nargs="*", metavar="MODEL", help="short names (default: every model that is here)")
     _add_settings(checking)
-    _add_export(actions)
     _add_warm(actions)
-
-
-def _add_export(actions: Any) -> None:
-    parser = add_verb(
-        actions,
-        "export",
-        "Write a model as ONNX files with a manifest, and tell how far ONNX Runtime is from torch.",
-        (
-            "su3d-bench models export clip-vit-h-14 --out models/clip-vit-h-14-onnx",
-            "su3d-bench models export ram-plus --checkout recognize-anything --environment ram-env --out ram-plus-onnx",
-        ),
-        call_export,
-        uses_all_cores=True,
-    )
-    parser.add_argument("name", metavar="MODEL", help="short name, such as clip-vit-h-14")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder that the files go to")
-    parser.add_argument("--weights", type=Path, metavar="FILE", help="default: where models are looked for")
-    own = parser.add_argument_group("ram-plus, which its authors' own code exports")
-    own.add_argument("--checkout", type=Path, metavar="DIR", help="a clone of recognize-anything")
-    own.add_argument(
-        "--environment",
-        type=Path,
-        metavar="DIR",
-        help="folder of an environment for it, made with pip where there is none",
-    )
-    own.add_argument("--python", type=Path, metavar="PYTHON", help="the Python of an environment that you made")
-    _add_settings(parser)
+    fetch_models.add_parser(actions)
 
 
 def _add_warm(actions: Any) -> None:
@@ -189,26 +160,6 @@ def _check_lines(row: dict[str, Any]) -> list[str]:
     state = "wrong" if row["problems"] else "whole"
     digests = [f"  {digest}  {name}" for name, digest in row["sha256"].items()]
     return [f"{row['name']} ({row['form']}): {row['folder']}: {state}", *digests, *(f"  {p}" for p in row["problems"])]
-
-
-def call_export(arguments: argparse.Namespace) -> int:
-    from su3d_bench.perception.models.catalogue import model_entry
-    from su3d_bench.perception.models.onnx.export_model import OwnCode, export_model
-
-    config = perception_config(arguments).models
-    entry = model_entry(arguments.name)
-    own = OwnCode(arguments.checkout, arguments.python, arguments.environment)
-    path = arguments.weights or config.paths.get(entry.name)
-    export = export_model(entry, arguments.out, path=path, folder=config.folder, own=own)
-    value = {"folder": str(arguments.out), "files": export.files, "parity": [asdict(p) for p in export.parity]}
-    lines = [f"{digest}  {arguments.out / name}" for name, digest in export.files.items()]
-    lines += [
-        f"{gap.output}: torch and ONNX Runtime differ by at most {gap.max_abs_difference:.1e} over {gap.n_values} "
-        f"values, cosine at least {gap.min_cosine:.9f}"
-        for gap in export.parity
-    ]
-    answer_either(arguments, value, *lines)
-    return EXIT_DONE
 
 
 def call_warm(arguments: argparse.Namespace) -> int:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.files.atomic import filling, read_arrays
-from su3d_bench.core.system.damage import DAMAGE
+from su3d_bench.core.files.unpacking import DAMAGE
 from su3d_bench.core.types import BoolArray, Float64Array, Frame, UInt8Array
 from su3d_bench.perception.crops import mask_boxes
 
@@ -101,8 +101,7 @@ class FrameCache:
             return
         try:
             with filling(path) as file:
-                if file is not None:  # whoever writes this entry just now writes the same
-                    np.savez(file, allow_pickle=False, **{**arrays, _CHECKSUM: _checksum(arrays)})
+                np.savez(file, allow_pickle=False, **{**arrays, _CHECKSUM: _checksum(arrays)})
         except OSError as error:
             raise StoreError(
                 f"{path.parent}: the perception cache cannot be written ({error.strerror or error}); "

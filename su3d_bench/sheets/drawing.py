@@ -34,7 +34,7 @@ from su3d_bench.reports.pictures.items import (
 from su3d_bench.reports.pictures.maps import MapView, cameras_of, pale, thinned_rows, view_of
 from su3d_bench.reports.pictures.render import colour
 from su3d_bench.reports.pictures.scene import evenly, seen_points
-from su3d_bench.runs.executors.local import Event, Report, run_inline, run_processes
+from su3d_bench.runs.executors import Event, Report, run_inline, run_processes
 from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.items import KINDS_OF_SHEETS
 from su3d_bench.sheets.sources import mask_digest

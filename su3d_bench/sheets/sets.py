@@ -16,7 +16,7 @@ import numpy as np
 
 from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.errors import ConfigError, ModelMissing, printable
-from su3d_bench.core.files.atomic import ZIP_EPOCH, is_file, make_folder, write_bytes, write_text
+from su3d_bench.core.files.atomic import is_file, make_folder, write_bytes, write_text
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.formats.tables.csv_text import csv_lines
 from su3d_bench.reports.sheet.page import page_html
@@ -49,6 +49,7 @@ COLUMNS = ("item_id", "picture", "text", "asked", "answer", "question", "sheet_i
 HIDDEN = ("question", "sheet_id", "annotator", "check")
 WIDTHS = {"item_id": 11, "picture": 88, "text": 34, "asked": 30, "answer": 17}  # in characters
 HEADER_ROW = 3
+ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)  # the date of every file in a workbook
 PICTURE_WIDTH = 600  # pixels as shown; the file has more
 POINTS_A_PIXEL = 0.75
 MOST_ROW_POINTS = 400.0  # a spreadsheet's rows end at 409

@@ -27,13 +27,13 @@ from su3d_bench.metrics.instance.score import Covered, covered_objects
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.score import RefinedNames
-from su3d_bench.questions.refining import refined_names
+from su3d_bench.questions import refining as refined_names
 from su3d_bench.questions.scene_map import SceneMap, map_of
 from su3d_bench.questions.sight import instance_rows, looked_at
 from su3d_bench.questions.truths import fullest_truth
 from su3d_bench.runs.finished import FinishedRun, read_run
-from su3d_bench.runs.parts import build_dataset, part_of
-from su3d_bench.runs.planning.scenes import data_root, dataset_targets, expand_scenes
+from su3d_bench.runs.job import build_dataset, part_of
+from su3d_bench.runs.scenes import data_root, dataset_targets, expand_scenes
 from su3d_bench.store.predictions import read_prediction
 
 MOST_FRAMES = 32  # of a scene, among which the best view of an object is looked for

@@ -370,17 +370,17 @@ def test_the_oracle_of_a_run_can_be_explained_too() -> None:
 
 
 def test_the_command_prints_a_table_and_draws_the_plot(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["attribute", "dropped", "--oracle", "oracle", "--out", "plots/errors.png"]) == 0
+    assert main(["report", "attribution", "dropped", "--oracle", "oracle", "--out", "plots/errors.png"]) == 0
     text = capsys.readouterr().out
     row = next(line for line in text.splitlines() if line.startswith("| missed "))
     assert [cell.strip() for cell in row.strip("|").split("|")][:2] == ["missed", "2"]
     assert "| with true 2D masks |" in text
     picture = Path("plots/errors.png").read_bytes()
     assert picture.startswith(b"\x89PNG")
-    assert main(["attribute", "dropped", "--oracle", "oracle", "--out", "again.png", "--quiet"]) == 0
+    assert main(["report", "attribution", "dropped", "--oracle", "oracle", "--out", "again.png", "--quiet"]) == 0
     assert Path("again.png").read_bytes() == picture
     capsys.readouterr()
-    assert main(["attribute", "dropped", "--protocol", "rooms-instance", "--json"]) == 0
+    assert main(["report", "attribution", "dropped", "--protocol", "rooms-instance", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert [one["protocol"] for one in found["protocols"]] == ["rooms-instance"]
 

@@ -45,10 +45,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 VERBS = {
-    "attribute": ["attribute", "{first}", "--method", "collector"],
-    "one protocol": ["attribute", "{first}", "--method", "collector", "--protocol", "mine-instance"],
+    "attribute": ["report", "attribution", "{first}", "--method", "collector"],
+    "one protocol": ["report", "attribution", "{first}", "--method", "collector", "--protocol", "mine-instance"],
     "compare": ["compare", "{first}:collector", "{second}:collector@drop=1", "--per-class"],
-    "plan": ["plan", "{first}", "--methods", "collector", "collector@drop=1", "--points", "5"],
+    "plan": ["report", "power", "{first}", "--methods", "collector", "collector@drop=1", "--points", "5"],
     "page": ["report", "html", "{first}", "--out", "{out}/page.html"],
     "learn": ["check", "--learn", "{first}", "{second}", "--out", "{out}/reference.json"],
 }

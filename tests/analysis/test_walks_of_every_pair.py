@@ -36,7 +36,7 @@ from su3d_bench.metrics.protocols.loading import class_names, load_protocol, pro
 from su3d_bench.metrics.protocols.mixtures import Mixtures
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine, score_scene
-from su3d_bench.numerics.shares import EXACT_STEPS, N_ORDERS
+from su3d_bench.numerics.statistics import EXACT_STEPS, N_ORDERS
 from su3d_bench.runs import finished
 from su3d_bench.runs.finished import read_run
 from su3d_bench.store.predictions import write_prediction

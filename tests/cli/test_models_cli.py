@@ -61,7 +61,6 @@ def test_the_examples_of_every_action_parse() -> None:
     for words in (
         "models list --json",
         "models check clip-vit-h-14 sam-vit-h",
-        "models export clip-vit-h-14 --out models/clip-vit-h-14-onnx",
         "models warm --profile paper --device cuda",
     ):
         assert build_parser().parse_args(words.split()).verb == "models"
@@ -99,7 +98,7 @@ def test_the_list_says_where_a_model_lies(found: Path, capsys: pytest.CaptureFix
     assert rows["clip-vit-b-32"]["found"] == {"transformers": str(found)}
     assert rows["clip-vit-b-32"]["missing"] is None
     assert rows["clip-vit-b-32"]["memory_mb"] == {"float32": 604, "float16": 302}
-    assert "su3d-bench fetch models clip-vit-h-14" in rows["clip-vit-h-14"]["missing"]
+    assert "su3d-bench models fetch clip-vit-h-14" in rows["clip-vit-h-14"]["missing"]
 
 
 @needs_models
@@ -134,12 +133,12 @@ def test_check_finds_weights_that_are_cut_short(found: Path, capsys: pytest.Capt
     [
         (["models", "check"], "none of the models is here"),
         (["models", "check", "clip-h"], "unknown model 'clip-h'"),
-        (["models", "warm", "clip-vit-b-32"], "run: su3d-bench fetch models clip-vit-b-32"),
+        (["models", "warm", "clip-vit-b-32"], "run: su3d-bench models fetch clip-vit-b-32"),
         (["models", "warm", "clip-vit-b"], "unknown encoder 'clip-vit-b'; did you mean 'clip-vit-b-32'?"),
         (["models", "warm", "embedded", "--device", "gpu"], "device = 'gpu': expected cpu, cuda or cuda:N"),
         (["models", "warm", "embedded", "--profile", "paper"], "give an encoder or --profile, not both"),
         (["models", "warm", "--profile", "papper"], "unknown profile 'papper'; did you mean 'paper'?"),
-        (["models", "warm"], "run: su3d-bench fetch models"),
+        (["models", "warm"], "run: su3d-bench models fetch"),
         (["models", "list", "--set", "perception.models.folder"], "expected KEY=VALUE"),
         (["models", "list", "--set", "perception.models.foldr=x"], "did you mean 'folder'?"),
     ],
@@ -152,37 +151,10 @@ def test_what_cannot_be_done_is_one_line(words: list[str], said: str, capsys: py
     assert len(err.splitlines()) == 1
 
 
-@needs_models
-def test_export_without_weights_or_of_a_model_that_is_not_exported_is_one_line(
-    home: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["models", "export", "clip-vit-h-14", "--out", str(home / "made")]) == 2
-    assert "run: su3d-bench fetch models clip-vit-h-14" in capsys.readouterr().err
-    assert main(["models", "export", "grounding-dino", "--out", str(home / "made")]) == 2
-    assert "'grounding-dino' is not exported by this program; known: clip-vit-h-14" in capsys.readouterr().err
-    assert not (home / "made").exists()
-
-
 def test_a_named_model_that_is_missing_is_what_to_fetch(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["models", "check", "sam-vit-h"]) == 1
     out = capsys.readouterr().out
-    assert out.startswith("model 'sam-vit-h': not found below") and "run: su3d-bench fetch models sam-vit-h" in out
-
-
-@needs_models
-def test_an_export_is_found_checked_and_run(found: Path, home: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = home / "models" / "clip-vit-b-32-onnx"
-    assert main(["models", "export", "clip-vit-b-32", "--out", str(out)]) == 0
-    answer = capsys.readouterr().out
-    assert "image: torch and ONNX Runtime differ by at most" in answer
-    assert "text: torch and ONNX Runtime differ by at most" in answer
-    assert main(["models", "check", "clip-vit-b-32", "--json"]) == 0
-    assert [row["form"] for row in json.loads(capsys.readouterr().out)] == ["transformers", "onnx"]
-    assert main(["models", "warm", "clip-vit-b-32", "--set", "perception.models.runtime=onnx", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["what"] == "ViT-B-32/openai (stand-in)"
-    (out / "text.onnx").write_bytes(b"")
-    assert main(["models", "check", "clip-vit-b-32"]) == 1
-    assert "text.onnx: is not the file that the manifest describes" in capsys.readouterr().out
+    assert out.startswith("model 'sam-vit-h': not found below") and "run: su3d-bench models fetch sam-vit-h" in out
 
 
 @needs_models

@@ -24,8 +24,7 @@ from memory import bounded_addresses, peak_bytes, reset_peak
 
 from su3d_bench.core.errors import DataError, PredictionError, StoreError, Su3dError
 from su3d_bench.core.files.atomic import read_arrays
-from su3d_bench.core.files.unpacking import FREE_BYTES, MOST_RATIO, Allowance, UnpackingError
-from su3d_bench.core.system.damage import DAMAGE
+from su3d_bench.core.files.unpacking import DAMAGE, FREE_BYTES, MOST_RATIO, Allowance, UnpackingError
 from su3d_bench.evaluation.texts import read_text_features
 from su3d_bench.formats.arrays import MOST_MEMBERS, column_members, run_members
 from su3d_bench.formats.hdf5 import read_rows

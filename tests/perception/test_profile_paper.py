@@ -285,7 +285,7 @@ def test_without_models_one_line_says_what_to_fetch(no_models: Path) -> None:
     with pytest.raises(ModelMissing) as caught:
         built(config_of(no_models), no_models)
     line = str(caught.value)
-    assert "\n" not in line and "run: su3d-bench fetch models sam-vit-h" in line
+    assert "\n" not in line and "run: su3d-bench models fetch sam-vit-h" in line
     ram = PerceptionConfig.model_validate({"paper": {"tagger": "ram-onnx"}})
     assert ram.paper.tagger == "ram-onnx"
 
@@ -298,7 +298,7 @@ def test_the_command_line_says_it_too(no_models: Path, monkeypatch: pytest.Monke
     assert said.startswith("su3d-bench: model 'clip-vit-h-14': not found below") and len(said.splitlines()) == 1
     assert not (no_models / "out").exists(), "no frame was read"
     assert main([*words, "--set", "perception.models.encoder=embedded"]) == 2
-    assert "run: su3d-bench fetch models sam-vit-h" in capsys.readouterr().err
+    assert "run: su3d-bench models fetch sam-vit-h" in capsys.readouterr().err
 
 
 def test_a_tagger_that_was_asked_for_is_looked_for_before_any_frame(models: Path, no_models: Path) -> None:

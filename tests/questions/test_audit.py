@@ -102,7 +102,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An audit of two painted scenes."""
     out = tmp_path_factory.mktemp("audit") / "audit"
     words = [
-        "questions",
+        "query",
         "audit",
         "--scenes",
         f"{PAINTED}/a",
@@ -164,16 +164,16 @@ def test_verdicts_add_up_by_kind_and_the_wrong_ones_are_listed(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = judged(folder, tmp_path / "audit.csv", ["right"] * 10 + ["Arguable", "wrong ", "", ""])
-    assert main(["questions", "audit", "--score", str(file)]) == 0
+    assert main(["query", "audit", "--score", str(file)]) == 0
     shown = capsys.readouterr().out
     assert re.search(r"\| all +\| 12 +\| 83\.3 \[.*\] +\| 91\.7 \[.*\] +\| 1 +\|", shown)
     assert "2 of 14 questions are not judged yet" in shown
     wrong = rows_of(file)[11]
     assert f"wrong: 12 {wrong['scene']}, {wrong['kind']}: {wrong['text']} -> {wrong['answer']}" in shown
     assert shown.count("- wrong: ") == 1 and shown.count("- arguable: ") == 1
-    assert main(["questions", "audit", "--score", str(file), "--format", "latex"]) == 0
+    assert main(["query", "audit", "--score", str(file), "--format", "latex"]) == 0
     assert "tabular" in capsys.readouterr().out
-    assert main(["questions", "audit", "--score", str(file), "--json"]) == 0
+    assert main(["query", "audit", "--score", str(file), "--json"]) == 0
     counts: dict[str, Any] = json.loads(capsys.readouterr().out)
     assert (counts["n"], counts["n_judged"], [one["number"] for one in counts["wrong"]]) == (14, 12, ["12"])
     assert sum(count["right"] for count in counts["kinds"].values()) == 10

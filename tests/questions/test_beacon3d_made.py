@@ -194,7 +194,7 @@ def test_answers_are_judged_once_kept_and_the_key_is_never_shown(
     Path("asked.json").write_text(json.dumps(questions))
     Path("qa.json").write_text(json.dumps(rows))
     chat.answer = lambda body: Answered("Score: 4" if "mauve" in str(body) else f"no idea {KEY}")
-    words = ["questions", "score", "asked.json", "--answers", "qa.json", "--judge"]
+    words = ["query", "score", "asked.json", "--answers", "qa.json", "--judge"]
     server = ["--base-url", chat.url, "--set", *(f"perception.language.{one}" for one in QUICK)]
     assert main([*words, *server, "--dry-run"]) == 0
     assert "2 requests" in capsys.readouterr().out and not chat.bodies

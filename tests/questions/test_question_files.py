@@ -104,7 +104,7 @@ def test_the_verb_makes_questions_from_classes_boxes_and_frames(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scenes = f"{SCENES}/painted.py:Painted/a"
-    words = ["questions", "make", "--scenes", scenes, "--quiet"]
+    words = ["query", "make", "--scenes", scenes, "--quiet"]
     assert main([*words, "--out", str(tmp_path / "q.toml")]) == 0
     assert "with known answers" in capsys.readouterr().out
     found = {one.text: one for one in read_questions(tmp_path / "q.toml")}

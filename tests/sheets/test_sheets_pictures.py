@@ -23,7 +23,7 @@ from su3d_bench.reports.pictures.items import (
     seen_in,
 )
 from su3d_bench.runs import finished as finished_run
-from su3d_bench.runs.executors.local import run_processes
+from su3d_bench.runs.executors import run_processes
 from su3d_bench.sheets.drawing import Artist, SceneDrafts, _lost, draw_all, draw_scene
 from su3d_bench.sheets.sources import RunSource
 

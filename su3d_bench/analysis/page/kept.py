@@ -71,8 +71,7 @@ class Piece:
         with suppress(OSError, StoreError):
             refuse_links(self.top, self._place)
             with filling(self._place) as stream:
-                if stream is not None:  # whoever writes this piece just now writes the same
-                    stream.write(self._seal(content) + b"\n" + content)
+                stream.write(self._seal(content) + b"\n" + content)
             self._remove_old()
 
     def _seal(self, content: bytes) -> bytes:

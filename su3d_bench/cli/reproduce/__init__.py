@@ -107,7 +107,7 @@ def call(arguments: argparse.Namespace) -> int:
 def _check_device(arguments: argparse.Namespace) -> None:
     """Raise before anything is made or weighed where there is no such GPU; a cluster's machines have theirs."""
     from su3d_bench.core.system.devices import DEVICE, EXPECTED_DEVICE, device_for
-    from su3d_bench.runs.executors.choose import ELSEWHERE
+    from su3d_bench.runs.executors import ELSEWHERE
 
     if arguments.device is None:
         return

@@ -15,7 +15,7 @@ from su3d_bench.core.files.atomic import make_folder
 from su3d_bench.datasets.layouts import LAYOUTS
 from su3d_bench.reproducing.asked import Asked, asked_runs
 from su3d_bench.reproducing.recipe import Experiment, Recipe
-from su3d_bench.runs.planning.scenes import split_address
+from su3d_bench.runs.scenes import split_address
 from su3d_bench.store.run_folder import RunFolder
 
 EMBEDDED, PAPER = "embedded", "paper"

@@ -68,7 +68,7 @@ class ModelEntry:
 
     @property
     def fetched(self) -> ModelForm:
-        """The form that ``su3d-bench fetch models`` brings: a publisher's one file where it is read, else the hub's."""
+        """The form that ``su3d-bench models fetch`` brings: a publisher's one file where it is read, else the hub's."""
         originals = [form for form in self.forms if form.form == "original" and form.is_read]
         return originals[0] if originals else self.forms[0]
 

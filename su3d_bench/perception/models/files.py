@@ -197,7 +197,7 @@ def _lacking(form: ModelForm, folder: Path) -> list[str]:
 def what_to_fetch(entry: ModelEntry, forms: Sequence[ModelForm]) -> str:
     """What to do for one of ``forms`` of ``entry``: the command that brings or makes it, else its files and address."""
     if entry.fetched in forms:
-        return f"run: su3d-bench fetch models {entry.name} ({entry.fetched.size_mb / 1000:.1f} GB)"
+        return f"run: su3d-bench models fetch {entry.name} ({entry.fetched.size_mb / 1000:.1f} GB)"
     if forms[0].form == "onnx":
         return f"run: {forms[0].source}"
     names = ", ".join(_names(requirement)[0] for requirement in forms[0].files)

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.files.atomic import make_folder, read_arrays, replacing
+from su3d_bench.core.files.unpacking import DAMAGE
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.system.damage import DAMAGE
 from su3d_bench.core.types import Detections, Float32Array, Frame, Regions, SceneInfo
 from su3d_bench.perception.stored.source import StoredFrame, check_masks
 

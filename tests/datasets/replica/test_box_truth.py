@@ -116,7 +116,7 @@ def test_a_scene_without_frames_can_be_looked_at_and_not_run(root: Path, capsys:
         assert main([*words.split(), "--quiet"]) == 0
     assert main(["datasets", "check", "replica/room0", "--quiet"]) == 0
     assert "warning       no frames; expected traj.txt" in capsys.readouterr().out
-    assert main(["questions", "make", "--scenes", "replica/room0", "--out", "a.toml", "--quiet"]) == 0
+    assert main(["query", "make", "--scenes", "replica/room0", "--out", "a.toml", "--quiet"]) == 0
     assert main(["run", "--scenes", "replica/room0", "--jobs", "1", "--quiet", "--out", "out"]) == 3
     assert "no frames; expected traj.txt and results/" in capsys.readouterr().err
 

@@ -36,7 +36,7 @@ from su3d_bench.predictions.base import vertex_masks
 from su3d_bench.questions import truths
 from su3d_bench.questions.sight import Sight
 from su3d_bench.questions.truths import question_truth
-from su3d_bench.runs.planning.plan import protocols_of_run
+from su3d_bench.runs.plan import protocols_of_run
 
 RULES = load_protocol("rooms-retrieval")
 REASONING = load_protocol("rooms-reasoning")

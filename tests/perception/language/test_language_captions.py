@@ -283,5 +283,5 @@ def test_labels_n_prime_belong_to_one_map(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="belongs to another map"):
         read_records(job)
     path.write_text('{"names": 3}')
-    with pytest.raises(StoreError, match="is not as su3d-bench refine writes it"):
+    with pytest.raises(StoreError, match="is not as su3d-bench runs refine writes it"):
         read_records(job)

@@ -142,10 +142,10 @@ def test_a_configured_path_is_used_and_nothing_beside_it(home: Path) -> None:
     assert locate("clip-vit-b-32", path=mine / "model.safetensors").folder == mine
     (mine / "config.json").unlink()
     with pytest.raises(
-        ModelMissing, match=r"mine lacks config\.json; run: su3d-bench fetch models clip-vit-b-32 \(0\.6 GB\)"
+        ModelMissing, match=r"mine lacks config\.json; run: su3d-bench models fetch clip-vit-b-32 \(0\.6 GB\)"
     ):
         locate("clip-vit-b-32", path=mine)
-    with pytest.raises(ModelMissing, match=r"there is no .*absent; mend the path, or run: su3d-bench fetch"):
+    with pytest.raises(ModelMissing, match=r"there is no .*absent; mend the path, or run: su3d-bench models fetch"):
         locate("clip-vit-b-32", path=home / "absent")
     with pytest.raises(ConfigError, match=r"is no file that it is read from; name a folder with model\.safetensors"):
         locate("clip-vit-b-32", path=fill(home / "other", ("x.bin",)) / "x.bin")
@@ -157,7 +157,7 @@ def test_a_missing_model_is_one_line_with_the_command_that_brings_it(home: Path)
     with pytest.raises(ModelMissing) as caught:
         locate("clip-vit-h-14")
     assert str(caught.value) == (
-        f"model 'clip-vit-h-14': not found below {home / 'models'}; run: su3d-bench fetch models clip-vit-h-14 (3.9 GB)"
+        f"model 'clip-vit-h-14': not found below {home / 'models'}; run: su3d-bench models fetch clip-vit-h-14 (3.9 GB)"
     )
     with pytest.raises(ModelMissing, match=r"put open_clip_model\.safetensors of https://huggingface\.co/laion/"):
         locate("clip-vit-h-14", ("open_clip",))  # which is not fetched

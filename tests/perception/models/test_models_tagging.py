@@ -195,7 +195,7 @@ def test_weights_that_lack_a_part_of_ram_are_refused(ram_package: list[dict[str,
     import torch
 
     files = ram_files(tmp_path, {"vision_multi.weight": torch.zeros(2, 3)})
-    with pytest.raises(DataError, match=r"lacks 1 tensors, such as tagging_head\.bias; run: su3d-bench fetch"):
+    with pytest.raises(DataError, match=r"lacks 1 tensors, such as tagging_head\.bias; run: su3d-bench models fetch"):
         load_ram(files, "cpu")
 
 

@@ -160,18 +160,10 @@ def _stays_inside(out: Path) -> None:
 
 
 def _record(folder: Path) -> Read:
-    from su3d_bench.fetching import record
+    from su3d_bench.fetching.bringing import Arrived, read_record, write_arrival
 
-    arrived = record.Arrived("replica-frames", "Replica.zip", "http://127.0.0.1/Replica.zip", 5, "0" * 64, ("size",))
-    record.record_path(folder).parent.mkdir(parents=True)
-    record.write_arrival(folder, arrived)
-    record.write_unpacked(folder, "replica-frames", ["room0"])
-
-    def read() -> None:
-        record.recorded_sha256(folder, "replica-frames", "Replica.zip")
-        record.unpacked_names(folder, "replica-frames")
-
-    return read
+    write_arrival(folder, Arrived("frames", "Replica.zip", "http://127.0.0.1/Replica.zip", 5, "0" * 64, ("size",)))
+    return lambda: read_record(folder)
 
 
 def _recipe(folder: Path) -> Read:

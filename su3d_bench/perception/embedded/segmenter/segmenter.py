@@ -21,7 +21,6 @@ __all__ = ["RgbdSegmenter", "SegmenterConfig"]
 # What moves the regions: their key follows it.
 SOURCES = (
     "perception/embedded/segmenter",
-    "numerics/cells.py",
     "numerics/clusters.py",
     "core/compiled.py",
     *CACHE_SOURCES,
