@@ -63,7 +63,7 @@ def call_list(arguments: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-def _check(arguments: argparse.Namespace) -> int:
+def call_check(arguments: argparse.Namespace) -> int:
     from su3d_bench.runs.trial import try_method
 
     trial = try_method(arguments.name)

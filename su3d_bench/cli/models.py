@@ -7,7 +7,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.fetch import models as fetch_models
 from su3d_bench.cli.shared.answers import answer, answer_either, answer_json, remark
 from su3d_bench.cli.shared.flags import add_group, add_settings, add_verb
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
@@ -22,9 +21,12 @@ def add_parser(verbs: Any) -> None:
     actions = add_group(
         verbs,
         "models",
-        "List the foundation models, fetch them, check their files, or run them once.",
-        ("su3d-bench models list", "su3d-bench models fetch --for paper --dry-run"),
-        lists=True,
+        "List the foundation models, check their files, or run them once.",
+        "list|check|warm",
+        (
+            "su3d-bench models list",
+            "su3d-bench models check clip-vit-h-14",
+        ),
     )
     listing = add_verb(
         actions,
@@ -44,7 +46,6 @@ def add_parser(verbs: Any) -> None:
     checking.add_argument("names", nargs="*", metavar="MODEL", help="short names (default: every model that is here)")
     _add_settings(checking)
     _add_warm(actions)
-    fetch_models.add_parser(actions)
 
 
 def _add_warm(actions: Any) -> None:
@@ -77,8 +78,6 @@ def perception_config(arguments: argparse.Namespace) -> PerceptionConfig:
 
 
 def call_list(arguments: argparse.Namespace) -> int:
-    from su3d_bench.perception.models.catalogue import STAND_IN
-
     states = _states(arguments, ())
     if answer_json(arguments, [_state_row(state) for state in states]):
         return EXIT_DONE
@@ -86,8 +85,6 @@ def call_list(arguments: argparse.Namespace) -> int:
     for state in states:
         entry = state.entry
         place = f"found: {state.files[0].folder}" if state.files else "missing"
-        if state.files and state.files[0].is_stand_in:
-            place += STAND_IN
         size = f"{entry.forms[0].size_mb / 1000:.1f} GB"
         profiles = f" (profile {', '.join(state.profiles)})" if state.profiles else ""
         answer(f"{entry.name:<{width}}  {entry.kind:<9}  {size:>6}  {entry.licence:<10}  {place}{profiles}")

@@ -25,7 +25,7 @@ from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.questions.score import RefinedNames
 from su3d_bench.opensu3d.config import OpenSU3DConfig
-from su3d_bench.perception.background import is_background
+from su3d_bench.perception.detections import is_background
 from su3d_bench.perception.language.captioner import REFINE, REFINE_FORM, list_of_names, reason_of
 from su3d_bench.perception.language.chat import ChatRequest
 from su3d_bench.perception.language.client import LanguageModel

@@ -20,7 +20,6 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth
 from su3d_bench.metrics.semantic.panoptic import told_truth
-from su3d_bench.perception.models.catalogue import STAND_IN, WEIGHTS_CAVEAT
 from su3d_bench.perception.profiles import Perception, PerceptionConfig
 from su3d_bench.questions.language_solver import answers_digest
 from su3d_bench.questions.refining import refined_digest
@@ -261,7 +260,5 @@ def caveat_of(method: Method, perception: Perception, scene: SceneInfo) -> str |
     dataset = registry.load("dataset", scene.dataset) if scene.dataset in registry.DATASETS else None
     is_made = scene.image_domain == "rendered-rooms" and isinstance(dataset, ReadsMadeRooms)
     made = f"made rooms in the layout of {scene.dataset}, not its scenes" if is_made else None
-    name = perception.encoder.name
-    weights = f"{WEIGHTS_CAVEAT} {name.removesuffix(STAND_IN)}" if name.endswith(STAND_IN) else None
-    parts = [made, weights, perception.caveat if is_seen_by_profile else None, own]
+    parts = [made, perception.caveat if is_seen_by_profile else None, own]
     return "; ".join(part for part in parts if part) or None

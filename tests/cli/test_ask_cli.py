@@ -24,7 +24,7 @@ from su3d_bench.store.predictions import write_prediction
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 SCENE = "rooms/made"
-QUICK = ["backoff_s=0.001", "max_retries=1", "total_timeout_s=1.0", "max_failures_in_a_row=50"]
+QUICK = ["max_retries=1", "timeout_s=1.0", "max_failures_in_a_row=50"]
 
 
 def cube(x: float, y: float, z: float, side: float) -> np.ndarray:

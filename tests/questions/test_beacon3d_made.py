@@ -32,7 +32,7 @@ from su3d_bench.questions.chains import made_files, metadata_of, questions_about
 from su3d_bench.questions.scene_map import MapObject, SceneMap
 
 PROBLEMS = json.loads((CASES / "beacon3d01_answers.json").read_text())["qa"]
-QUICK = ("backoff_s=0.001", "max_retries=1", "total_timeout_s=1.0", "max_failures_in_a_row=50")
+QUICK = ("max_retries=1", "timeout_s=1.0", "max_failures_in_a_row=50")
 
 
 def thing(one: int, name: str, low: Sequence[float], size: Sequence[float], caption: str = "") -> MapObject:

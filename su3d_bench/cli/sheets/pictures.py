@@ -13,7 +13,7 @@ from su3d_bench.core.errors import EXIT_DONE, ConfigError
 NAME = "pictures"
 SUBJECTS = ("similarity", "labels", "reasoning")
 MOST_ROWS = 40  # of one figure
-FIGURES = ("comparison", "schemes", "teaser")  # as questions/question_files.py has them
+FIGURES = ("comparison", "schemes", "teaser")  # as questions/files/files.py has them
 
 
 def add_parser(actions: Any) -> None:

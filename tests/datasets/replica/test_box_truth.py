@@ -15,7 +15,7 @@ from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing
 from su3d_bench.core.types import LabelSet, ObjectBoxes, OrientedBox
 from su3d_bench.datasets.checks import inspect
 from su3d_bench.datasets.replica.dataset import Replica
-from su3d_bench.perception.oracle.segmenter import OracleConfig, OracleSegmenter
+from su3d_bench.perception.oracle import OracleConfig, OracleSegmenter
 from su3d_bench.questions.truths import questions_of
 from su3d_bench.reports.pictures.scene import look_at
 

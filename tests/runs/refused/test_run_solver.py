@@ -61,7 +61,7 @@ def geometry(body: Body) -> Answered:
 
 
 def llm(server: ChatServer, *more: str) -> list[str]:
-    settings = {"base_url": server.url, "text_model": "tiny", "max_retries": 0, "backoff_s": 0.001}
+    settings = {"base_url": server.url, "text_model": "tiny", "max_retries": 0}
     told = [f"perception.language.{name}={value}" for name, value in settings.items()]
     return [*RUN, *ASKED, "--solver", "llm", "--out", "run", *more, "--set", *told]
 
