@@ -20,7 +20,7 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import GroundTruth, LabelSet
 from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.reports.pictures.canvas import Canvas
-from su3d_bench.reports.pictures.colours import class_colours
+from su3d_bench.reports.pictures.canvas import class_colours
 from su3d_bench.reports.pictures.scene import (
     CAPTION,
     HEADER,
@@ -31,7 +31,7 @@ from su3d_bench.reports.pictures.scene import (
     draw_scene_picture,
     facts_line,
 )
-from su3d_bench.reports.pictures.scene_look import CAMERAS, SceneLook, look_at
+from su3d_bench.reports.pictures.scene import CAMERAS, SceneLook, look_at
 
 
 @pytest.fixture(scope="module")

@@ -36,7 +36,7 @@ from su3d_bench.formats.tables.csv_text import separated_rows
 from su3d_bench.formats.torch_zip import read_torch
 from su3d_bench.metrics.scoring import unpack_scores
 from su3d_bench.predictions.formats import READERS
-from su3d_bench.questions.files.queries import read_query_file
+from su3d_bench.questions.query_files import read_query_file
 from su3d_bench.store.predictions import prediction_arrays, prediction_from_arrays, read_prediction
 
 MOST_GROWN = 320 * MIB

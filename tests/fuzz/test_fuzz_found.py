@@ -32,7 +32,7 @@ from su3d_bench.core.files.unpacking import DAMAGE
 from su3d_bench.formats.numpy_files import read_npy
 from su3d_bench.metrics.protocols.loading import load_protocol, read_protocol
 from su3d_bench.metrics.scoring import combine, unpack_scores
-from su3d_bench.questions.files.queries import read_query_file
+from su3d_bench.questions.query_files import read_query_file
 from su3d_bench.runs.advice import recent_update_s
 from su3d_bench.runs.finished import read_run
 from su3d_bench.store.predictions import read_prediction

@@ -12,7 +12,7 @@ from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.score import AskedThing, PresenceTruth
 from su3d_bench.metrics.scoring import combine, pack_scores, score_scene, unpack_scores
-from su3d_bench.questions.files.queries import query_truth
+from su3d_bench.questions.query_files import query_truth
 
 KEPT_COUNTS = ("rooms-panoptic", "rooms-top-k", "rooms-presence", "grounding", "query-ap")
 

@@ -86,7 +86,7 @@ def _beacon3d(kind: str) -> Make:
     def make(folder: Path) -> Read:
         from test_beacon3d import GROUNDING, QA, written
 
-        from su3d_bench.questions.chains.report import answered_file
+        from su3d_bench.questions.beacon3d import answered_file
 
         answers = [{"correct": 1}, {"object_id": 3}] * 2 if kind == "grounding" else [{"pred": "red", "score": 2}] * 3
         paths = written(folder, GROUNDING if kind == "grounding" else QA, answers)
@@ -339,7 +339,7 @@ def _queries(suffix: str) -> Make:
     def make(folder: Path) -> Read:
         from test_query_files import CSV, TOML
 
-        from su3d_bench.questions.files.queries import read_query_file
+        from su3d_bench.questions.query_files import read_query_file
 
         path = folder / f"q{suffix}"
         path.write_text(CSV if suffix == ".csv" else TOML)
@@ -352,8 +352,8 @@ def _questions(name: str, text_of: Callable[[Any], str]) -> Make:
     def make(folder: Path) -> Read:
         import test_question_files
 
-        from su3d_bench.questions.files.datasets import is_foreign, read_foreign_queries
-        from su3d_bench.questions.files.files import read_questions
+        from su3d_bench.questions.question_files import is_foreign, read_foreign_queries
+        from su3d_bench.questions.question_files import read_questions
 
         path = folder / name
         path.write_text(text_of(test_question_files))

@@ -198,7 +198,7 @@ def _answers(name: str) -> Make:
         from counted_sheets import elsewhere, sharing, workbook
         from simulated_annotators import answered, as_csv, retrieval_set
 
-        from su3d_bench.sheets.judging.answers import check_answers, read_answers
+        from su3d_bench.sheets.answers import check_answers, read_answers
 
         sheet, key = retrieval_set(4)
         rows = answered(sheet, key, {"ann": 0.0})
@@ -214,7 +214,7 @@ def _workbook_parts(folder: Path) -> Read:
     from counted_sheets import elsewhere, sharing, workbook
     from simulated_annotators import answered, retrieval_set
 
-    from su3d_bench.sheets.judging.answers import check_answers, parse_workbook
+    from su3d_bench.sheets.answers import check_answers, parse_workbook
 
     sheet, key = retrieval_set(4)
     content = elsewhere(sharing(workbook(answered(sheet, key, {"ann": 0.0}))))
@@ -250,7 +250,7 @@ def _sheet_files(folder: Path) -> Read:
 
     def asked() -> Iterator[Read]:
         from su3d_bench.sheets.items import KEY_FILE, SHEET_FILE, read_key, read_sheet
-        from su3d_bench.sheets.judging.scores import read_scores
+        from su3d_bench.sheets.scores import read_scores
 
         yield lambda: called(words)
         yield lambda: read_sheet(folder / "sheet" / SHEET_FILE)
@@ -309,14 +309,6 @@ def _protocol(folder: Path) -> Read:
     return lambda: every_one_of(
         partial(read, str(file)) for file in files for read in (lambda name: read_protocol(Path(name)), original_of)
     )
-
-
-def _published(folder: Path) -> Read:
-    from su3d_bench.reports.tables.papers.published import FILE, read_published
-
-    text = FILE.read_text(encoding="utf-8")
-    (folder / "published.toml").write_text("[[figure]]".join(text.split("[[figure]]")[:4]))
-    return lambda: read_published(folder / "published.toml")
 
 
 def _ablation(folder: Path) -> Read:
@@ -420,7 +412,6 @@ TARGETS = (
     Target("config of a run", _config("a.toml"), ("a.toml",), 0.05),
     Target("config of methods", _method_config, ("a.toml",)),
     Target("protocol", _protocol, ("*.toml",)),
-    Target("published", _published, ("published.toml",)),
     Target("ablation", _ablation, ("ablation.json",)),
     Target("assignments", _assignments, ("words.txt",)),
     Target("replies", _replies, ("replies.json",)),
