@@ -352,8 +352,7 @@ def _questions(name: str, text_of: Callable[[Any], str]) -> Make:
     def make(folder: Path) -> Read:
         import test_question_files
 
-        from su3d_bench.questions.question_files import is_foreign, read_foreign_queries
-        from su3d_bench.questions.question_files import read_questions
+        from su3d_bench.questions.question_files import is_foreign, read_foreign_queries, read_questions
 
         path = folder / name
         path.write_text(text_of(test_question_files))
