@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, Regions, SceneInfo
-from su3d_bench.formats.pickles.pickles import read_pickle_file
+from su3d_bench.formats.pickles import read_pickle_file
 from su3d_bench.perception.stored.source import StoredFrame, check_masks, numbered_files
 
 MAX_NAME_LENGTH = 100
