@@ -1,8 +1,9 @@
 """One table of floats from an HDF5 file that anyone may have made: checked first, then read in blocks of rows.
 
 The files are those of gradslam (``pc_points.h5``, ``pc_embeddings.h5``): one dataset at the root, named like the file.
-Links out of the file, external and virtual storage, and filters other than gzip and shuffle are refused, and what the
-header promises is compared with the size of the file before h5py allocates anything.
+Links out of the file, external and virtual storage are refused, and what the header promises is compared with the size
+of the file before h5py allocates anything. So are tables in chunks: HDF5 trusts what a compressed chunk unpacks to, and
+shows foreign memory where one is too short.
 """
 
 from __future__ import annotations
@@ -16,15 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, reading
-from su3d_bench.core.files.unpacking import Allowance
 from su3d_bench.core.system.files import regular
 from su3d_bench.core.types import Float32Array, Int32Array
 
 FloatArray = NDArray[np.floating[Any]]
 BLOCK_BYTES = 16 << 20
-MOST_CHUNK_BYTES = 1 << 20  # of a packed chunk, as h5py chooses them: HDF5 unpacks one to 1032 times its bytes
 MOST_COLUMNS = 1 << 16  # of a table whose width is not known; features have some thousand
-FILTERS = {1, 2}  # H5Z_FILTER_DEFLATE and H5Z_FILTER_SHUFFLE
 # What h5py raises on damaged files; it has no base class of its own.
 LIBRARY_ERRORS = (OSError, KeyError, ValueError, RuntimeError, TypeError, AttributeError, MemoryError)
 
@@ -65,8 +63,7 @@ def row_blocks(path: Path, n_columns: int, where: str) -> Iterator[FloatArray]:
     """
     with _open_table(path, where) as table:
         _check_form(table, n_columns, path.stat().st_size, where)
-        height = 1 if table.chunks is None else table.chunks[0]
-        n_rows = max(1, BLOCK_BYTES // (n_columns * table.dtype.itemsize) // height) * height
+        n_rows = max(1, BLOCK_BYTES // (n_columns * table.dtype.itemsize))
         for start in range(0, len(table), n_rows):
             yield table[start : start + n_rows]
 
@@ -93,37 +90,18 @@ def _open_table(path: Path, where: str) -> Iterator[Any]:
 
 
 def _check_form(table: Any, n_columns: int, file_bytes: int, where: str) -> None:
-    dtype, shape, chunks = table.dtype, table.shape, table.chunks
+    dtype, shape = table.dtype, table.shape
     if table.external is not None or table.is_virtual:
         raise DataError(f"{where}: the values are in other files; expected them in this one")
+    if table.chunks is not None:
+        raise DataError(f"{where}: is stored in chunks or compressed; save it as one piece, as gradslam does")
     if dtype.kind != "f" or dtype.itemsize > 8:
         raise DataError(f"{where}: holds values of type {str(dtype)[:40]}; expected float16, float32 or float64")
     if shape is None or len(shape) != 2 or shape[1] != n_columns:
         raise DataError(f"{where}: has the shape {str(shape)[:60]}; expected (N, {n_columns})")
     n_bytes = shape[0] * n_columns * dtype.itemsize
-    if chunks is None:
-        is_whole = n_bytes <= file_bytes and table.id.get_storage_size() == n_bytes
-    else:
-        chunk_bytes = int(np.prod([int(side) for side in chunks], dtype=object)) * dtype.itemsize
-        _check_filters(table, chunk_bytes, where)
-        n_chunks = -(-shape[0] // chunks[0]) * -(-n_columns // chunks[1])
-        stored: list[int] = []
-        if is_whole := n_chunks * chunk_bytes <= Allowance(file_bytes).n_bytes:
-            table.id.chunk_iter(lambda one: stored.append(one.size))
-            # compression that gains nothing adds a little: zlib's bound is below a thousandth and 64 bytes
-            is_whole = len(stored) == n_chunks and max(stored, default=0) <= chunk_bytes + chunk_bytes // 1000 + 64
-    if not is_whole:
+    if n_bytes > file_bytes or table.id.get_storage_size() != n_bytes:
         raise DataError(
-            f"{where}: promises {shape[0]} rows of {n_columns} values, {n_bytes} bytes, but the file has "
-            f"{file_bytes}; it is cut short or damaged, or unpacks to far more than it is: save it without compression"
-        )
-
-
-def _check_filters(table: Any, chunk_bytes: int, where: str) -> None:
-    pipeline = table.id.get_create_plist()
-    codes = {int(pipeline.get_filter(index)[0]) for index in range(pipeline.get_nfilters())}
-    if not codes <= FILTERS or (codes and not 0 < chunk_bytes <= MOST_CHUNK_BYTES):
-        raise DataError(
-            f"{where}: is compressed with filters {sorted(codes)} of HDF5 in chunks of {chunk_bytes} bytes; expected "
-            f"gzip, shuffle or none in chunks of at most {MOST_CHUNK_BYTES >> 10} KiB: save it without compression"
+            f"{where}: promises {shape[0]} rows of {n_columns} values, {n_bytes} bytes, but the file has {file_bytes}; "
+            "it is cut short or damaged"
         )

@@ -229,6 +229,8 @@ def _read_stream(stream: BinaryIO, n_bytes: int, where: str, is_outline: bool) -
         if int.from_bytes(stream.read(8), "little") != storage.n:
             raise PredictionError(f"{where}: storage {key} is of another size; copy the file again")
         storage.fill(stream, where)
+    if not is_outline and stream.read(1):
+        raise PredictionError(f"{where}: has more bytes behind its end; copy the file again")
     return value
 
 

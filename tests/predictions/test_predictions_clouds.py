@@ -38,7 +38,7 @@ from su3d_bench.evaluation.evaluate import Request, evaluate
 from su3d_bench.formats.pcd import write_pcd_points
 from su3d_bench.formats.ply import PlyElement, write_ply
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.predictions import gradslam, hovsg
+from su3d_bench.predictions import dense as gradslam, hovsg
 from su3d_bench.predictions.base import ScenePrediction
 from su3d_bench.predictions.formats import READERS, recognise
 

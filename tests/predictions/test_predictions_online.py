@@ -22,7 +22,7 @@ from same_values import assert_same
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
-from su3d_bench.formats.torch_stream import read_torch_of_either_form
+from su3d_bench.formats.torch_files import read_torch
 from su3d_bench.predictions.formats import READERS, recognise
 
 FILES = CASES / "online_maps"
@@ -218,14 +218,14 @@ def test_what_torch_writes_in_its_older_form_is_read_to_the_last_value(tmp_path:
     value = {"a": whole, "part": whole[1:, ::2], "n": 3, "list": [whole.half(), np.arange(3.0)], "none": None}
     value |= {"brain": whole.to(torch.bfloat16) / 3, "empty": torch.zeros(0, 4)}
     torch.save(value, tmp_path / "x", _use_new_zipfile_serialization=False)
-    found: Any = read_torch_of_either_form(tmp_path / "x")
+    found: Any = read_torch(tmp_path / "x")
     table = np.arange(12).reshape(3, 4)
     assert_same(found["part"], table[1:, ::2])
     assert_same(found["list"], [table.astype(np.float16), np.arange(3.0)])
     assert_same(found["brain"], value["brain"].float().numpy())
     assert found["empty"].shape == (0, 4) and found["none"] is None and found["n"] == 3
     torch.save(value["brain"], tmp_path / "y")
-    assert_same(read_torch_of_either_form(tmp_path / "y"), value["brain"].float().numpy())
+    assert_same(read_torch(tmp_path / "y"), value["brain"].float().numpy())
 
 
 @pytest.mark.parametrize(
@@ -247,7 +247,7 @@ def test_each_fault_of_the_older_form_is_one_line(tmp_path: Path, old: bytes, ne
     assert found
     (tmp_path / "x").write_bytes(head + new + tail)
     with pytest.raises(PredictionError) as caught:
-        read_torch_of_either_form(tmp_path / "x")
+        read_torch(tmp_path / "x")
     assert message in str(caught.value) and str(caught.value).startswith(f"{tmp_path}/x: ")
 
 
@@ -258,4 +258,4 @@ def test_bytes_behind_the_last_storage_and_other_files_are_refused(tmp_path: Pat
     (tmp_path / "z").write_bytes(b"")
     for name, message in (("y", "has more bytes behind its end"), ("z", "no file of torch.save")):
         with pytest.raises(PredictionError, match=message):
-            read_torch_of_either_form(tmp_path / name)
+            read_torch(tmp_path / name)

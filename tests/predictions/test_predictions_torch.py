@@ -21,7 +21,7 @@ from same_values import assert_same
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.files import unpacking
 from su3d_bench.formats.numpy_files import read_npy, read_npz
-from su3d_bench.formats.torch_zip import SparseTensor, read_torch, torch_kind
+from su3d_bench.formats.torch_files import SparseTensor, read_torch, torch_kind
 
 FILES = CASES / "torch_files"  # written by torch 2.13.0
 MASKS = np.arange(36).reshape(12, 3) % 5 < 2
@@ -122,7 +122,7 @@ def test_reading_needs_no_torch(tmp_path: Path) -> None:
 
     code = (
         "import sys; sys.modules['torch'] = None\nfrom pathlib import Path\n"
-        "from su3d_bench.formats.torch_zip import read_torch\n"
+        "from su3d_bench.formats.torch_files import read_torch\n"
         f"assert read_torch(Path({str(FILES / 'tensor.pt')!r})).shape == (12, 3)\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": ""})

@@ -75,7 +75,7 @@ def _pickle(kind: str) -> Make:
         from test_predictions_pickles import written
 
         from su3d_bench.formats.numpy_files import read_npy_value
-        from su3d_bench.formats.pickles.pickles import read_pickle_file
+        from su3d_bench.formats.pickles import read_pickle_file
 
         path = folder / kind
         path.write_bytes(written(folder, kind))
@@ -89,7 +89,7 @@ def _archive(name: str) -> Make:
         from test_predictions_torch import whole
 
         from su3d_bench.formats.numpy_files import read_npy, read_npz
-        from su3d_bench.formats.torch_zip import read_torch, torch_kind
+        from su3d_bench.formats.torch_files import read_torch, torch_kind
 
         path = folder / name
         path.write_bytes(whole(folder, name))
