@@ -28,7 +28,7 @@ from su3d_bench.formats.numpy_files import plain_array, plain_type
 
 GZIP_START = b"\x1f\x8b"
 MOST_INFLATED = 16 << 30  # bytes of a gzip stream; a map of ConceptGraphs with all its masks has some GiB
-INFLATED_A_READ = 1 << 20
+INFLATED_A_READ, SKIPPED_A_READ = 1 << 20, 1 << 16
 # Reads of one byte, one or two an operation; a map of ConceptGraphs takes less than a million of them.
 FREE_STEPS, MOST_STEPS = 2_000_000, 20_000_000
 MOST_NAME = 1024
@@ -102,7 +102,7 @@ class Source:
 
     def skip(self, n: int) -> None:
         while n:
-            self._n_left -= (n_read := len(self._stream.read(min(n, INFLATED_A_READ))))
+            self._n_left -= (n_read := len(self._stream.read(min(n, SKIPPED_A_READ))))
             if not n_read or self._n_left < 0:
                 raise EOFError
             n -= n_read

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, reading, shown
-from su3d_bench.core.files.unpacking import allowance_of
+from su3d_bench.core.files.unpacking import PIECE, allowance_of
 from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import UInt8Array
 from su3d_bench.formats.numpy_files import checked_shape, opened_zip, read_member
@@ -67,7 +67,7 @@ class Storage:
         """Read the bytes out of ``stream``."""
         place = memoryview(self.content)[: self.n_bytes]
         n_read = 0
-        while n_read < self.n_bytes and (n := stream.readinto(place[n_read:])):
+        while n_read < self.n_bytes and (n := stream.readinto(place[n_read : n_read + PIECE])):
             n_read += n
         if n_read < self.n_bytes:
             raise PredictionError(f"{where}: the file is cut short or damaged; copy it again")
