@@ -260,10 +260,6 @@ def test_parts_and_features_that_do_not_go_with_their_points_are_refused(
 # ---- damage
 
 
-def scene_name(format: str) -> str:
-    return "replica/scene0011_00" if format == "su3d-bench" else "scene0011_00"
-
-
 def files_to_damage(folder: Path, format: str) -> list[Path]:
     """The files of a prediction that can be hurt: what the scene is read from, and what that refers to."""
     files = list(READERS[format].scenes(folder).values())
