@@ -313,6 +313,7 @@ def unpickled(
     except (EOFError, gzip.BadGzipFile, zlib.error) as error:
         raise PredictionError(f"{where}: the file is cut short or damaged; copy it again") from error
     except (*DAMAGE, UnpackingError) as error:
+        reason = f"operation or place {error} is not known" if isinstance(error, KeyError) else str(error)
         raise PredictionError(
-            f"{where}: not read as a pickle of plain data: {printable(str(error) or type(error).__name__, 200)}"
+            f"{where}: not read as a pickle of plain data: {printable(reason or type(error).__name__, 200)}"
         ) from error
