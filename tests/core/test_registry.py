@@ -79,11 +79,6 @@ def test_a_missing_member_is_named(tmp_path: Path, kind: str, member: str) -> No
         load_text(tmp_path, kind, text)
 
 
-def test_a_required_member_that_is_misspelt_is_told_apart(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="a method has no 'finnish'; did you mean 'finish'"):
-        load_text(tmp_path, "method", METHOD.replace("finish", "finnish"))
-
-
 @pytest.mark.parametrize(
     ("kind", "lines"),
     [

@@ -36,25 +36,7 @@ def test_the_page_holds_what_the_program_writes_with_enough_simulations_and_no_c
         assert not missed or f"- {name} at {', '.join(missed)} scenes: " in shown
 
 
-def test_the_counts_of_the_semantic_world_are_those_that_were_drawn() -> None:
-    world = coverage.Semantic()
-    (n_true, methods), counts = (draw(np.random.default_rng(3), 4) for draw in (world.points, world.draw))
-    for (hit, wrong), of_method in zip(methods, counts, strict=True):
-        for k, one in enumerate(of_method):
-            np.testing.assert_array_equal(one.confusion.sum(axis=1), n_true[k])
-            np.testing.assert_array_equal(np.diag(one.confusion[:, :-1]), hit[k])
-            np.testing.assert_array_equal(one.confusion[:, :-1].sum(axis=0), hit[k] + wrong[k])
-
-
-def test_the_truth_of_a_world_is_what_many_scenes_give() -> None:
-    rng = np.random.default_rng(5)
-    for make, n_scenes in ((coverage.Semantic, 2000), (coverage.Shares, 4000)):
-        world = make()
-        values = world.values(world.draw(rng, n_scenes)[0], np.ones((1, n_scenes), np.int64))
-        for name, truth in world.truth(rng).items():
-            assert values[name][0] == pytest.approx(truth, abs=0.02)
-
-
+@pytest.mark.proof
 def test_intervals_of_few_scenes_hold_the_truth_where_a_bootstrap_s_do_not() -> None:
     world = coverage.Shares()
     tally = coverage.simulate(world, world.truth(np.random.default_rng(0)), 4, 400, 0)["share of questions"]

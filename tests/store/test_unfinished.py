@@ -68,16 +68,6 @@ def test_what_a_killed_writer_left_goes_with_the_next_and_what_a_living_one_writ
         assert names(tmp_path) == []
 
 
-def test_a_run_goes_on_in_a_folder_in_which_exports_were_killed(tmp_path: Path) -> None:
-    for _ in range(3):
-        with writer("a folder", tmp_path) as process:
-            process.kill()
-            process.wait()
-        assert len(names(tmp_path)) == 1, "the one before was cleared"
-    with RunFolder(tmp_path).locked():
-        assert names(tmp_path) == []
-
-
 def test_only_our_own_names_are_cleared(tmp_path: Path) -> None:
     (tmp_path / "kept").write_text("kept")
     for name in (".notes.tmp", ".page.html.123.tmp", ".x.unfinished", "page.html.0123456789ab.unfinished"):
@@ -125,24 +115,6 @@ def test_a_folder_is_held_by_a_file_where_folders_have_no_locks(
     assert names(tmp_path) == []
 
 
-def test_a_file_cleared_in_the_moment_before_its_lock_is_made_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lock, n_cleared = fcntl.flock, 0
-
-    def cleared_first(handle: int, operation: int) -> None:
-        nonlocal n_cleared
-        if n_cleared < 2:
-            n_cleared += 1
-            Path(f"/proc/self/fd/{handle}").resolve().unlink()
-        lock(handle, operation)
-
-    monkeypatch.setattr(fcntl, "flock", cleared_first)
-    write_text(tmp_path / "page.html", "whole")
-    assert n_cleared == 2
-    assert names(tmp_path) == ["page.html"]
-
-
 @pytest.mark.parametrize("name", ["x" * 240, "\N{GREEK SMALL LETTER ALPHA}" * 120])
 def test_the_longest_names_can_be_written(name: str, tmp_path: Path) -> None:
     with replacing(tmp_path / name) as stream:
@@ -162,11 +134,6 @@ def test_a_scene_is_known_by_its_folder(address: str) -> None:
     name = folder_of_scene(address)
     assert "/" not in name
     assert scene_of_folder(name) == address
-
-
-def test_folders_of_ordinary_scenes_keep_their_names() -> None:
-    for address in ("rooms/living0", "scannet/scene0011_00", "painted/a_b", "mine/left 1.5"):
-        assert folder_of_scene(address) == address.replace("/", ".")
 
 
 @pytest.mark.parametrize("part", ["scenes", "scenes/rooms.a", "scenes/rooms.a/m", "scenes/rooms.a/m/pictures"])
@@ -197,11 +164,3 @@ def test_replies_are_not_kept_through_a_link(part: str, tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="is a link"), RunFolder(tmp_path / "run").locked():
         pass
     assert names(tmp_path / "elsewhere") == [LEFT]
-
-
-def test_a_run_may_lie_behind_a_link(tmp_path: Path) -> None:
-    (tmp_path / "large").mkdir()
-    (tmp_path / "run").symlink_to(tmp_path / "large")
-    with RunFolder(tmp_path / "run").locked():
-        RunFolder(tmp_path / "run").job("rooms/a", "m").prepare()
-    assert (tmp_path / "large/scenes/rooms.a/m").is_dir()
