@@ -12,7 +12,6 @@ from su3d_bench.core.config import (
     Settings,
     check_keys,
     flatten,
-    key_lines,
     nest,
     read_assignments,
     read_file,
@@ -123,23 +122,6 @@ def test_run_values_out_of_range_are_refused() -> None:
     settings = Settings((Setting(("stride",), -1, "--stride"),))
     with pytest.raises(ConfigError, match=r"^--stride: stride = -1: input should be greater than or equal to 0$"):
         resolve(settings, (), RunConfig)
-
-
-def test_an_unreadable_file_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"none.toml: cannot read the configuration: No such file"):
-        read_file(tmp_path / "none.toml")
-    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigError, match="not a UTF-8 text file"):
-        read_file(tmp_path / "binary.toml")
-
-
-def test_lines_of_keys_follow_tables_and_dotted_keys() -> None:
-    lines = key_lines("a = 1\n\n[b.c]  # remark\nd = 2\ne.f = 3\n[ g . \"h i\" ]\n'j k' = 4\n")
-    assert lines[("a",)] == 1
-    assert lines[("b", "c")] == 3
-    assert lines[("b", "c", "d")] == 4
-    assert lines[("b", "c", "e", "f")] == 5
-    assert lines[("g", "h i", "j k")] == 7
 
 
 def test_written_toml_reads_back_as_it_was() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -42,17 +41,3 @@ def test_intervals_of_few_scenes_hold_the_truth_where_a_bootstrap_s_do_not() -> 
     tally = coverage.simulate(world, world.truth(np.random.default_rng(0)), 4, 400, 0)["share of questions"]
     assert 89 < (tally.per_cent(coverage.JACKKNIFE) or 0) < 98  # 93 of the page, within 3 standard errors
     assert (tally.per_cent(coverage.BOOTSTRAP) or 100) < 88
-
-
-def test_the_program_writes_its_tables_between_the_marks(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    page = tmp_path / "page.md"
-    page.write_text(f"before\n{coverage.BEGIN}\nstale\n{coverage.END}\nafter\n")
-    monkeypatch.setattr(coverage.resampling, "MANY_ROWS", 0)  # put back afterwards
-    monkeypatch.setattr(coverage, "WORLDS", (coverage.SceneMeans,))
-    coverage.main(["--simulations", "20", "--scenes", "4", "--write", str(page)])
-    text = page.read_text()
-    assert text.startswith("before\n") and text.endswith("after\n") and "stale" not in text
-    assert "| mean of scenes, difference " in text and "Krippendorff" in text
-    assert capsys.readouterr().out in text + "\n"

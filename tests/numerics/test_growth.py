@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from su3d_bench.numerics.statistics import FLAT_EXPONENT, MIN_FIT, Growth, growth_exponent
+from su3d_bench.numerics.statistics import MIN_FIT, growth_exponent
 
 
 def slope(x: np.ndarray, y: np.ndarray) -> float:
@@ -27,21 +27,6 @@ def test_the_interval_leaves_out_a_fortieth_of_the_slopes_on_either_side() -> No
     assert growth.exponent == pytest.approx(slope(x, y), abs=1e-12)
     assert np.mean(np.array(slopes) < growth.low) == pytest.approx(0.025, abs=0.012)
     assert np.mean(np.array(slopes) > growth.high) == pytest.approx(0.025, abs=0.012)
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "words"),
-    [
-        (-1.0, FLAT_EXPONENT, "constant per update"),
-        (-1.0, np.nextafter(FLAT_EXPONENT, 1), "not settled"),
-        (FLAT_EXPONENT, 1.0, "not settled"),
-        (np.nextafter(FLAT_EXPONENT, 1), 1.0, "grows"),
-        (0.0, 0.0, "constant per update"),
-    ],
-)
-def test_the_verdict_is_by_the_interval_and_not_by_the_slope(low: float, high: float, words: str) -> None:
-    for exponent in (-5.0, 0.0, FLAT_EXPONENT, 5.0):
-        assert Growth(exponent, low, high).words == words
 
 
 def test_nothing_is_said_of_too_few_points_or_of_sizes_that_hardly_differ() -> None:

@@ -25,14 +25,6 @@ def drawn(rng: np.random.Generator, n_seeds: int, n_scenes: int, mean: float = 0
     return mean + rng.normal(0, 3, n_scenes) + rng.normal(0, 1, (n_seeds, 1)) + rest
 
 
-def test_the_parts_of_the_variance_are_those_that_were_drawn() -> None:
-    rng = np.random.default_rng(0)
-    parts = [variance_of(drawn(rng, 8, 12)) for _ in range(400)]
-    assert np.mean([one.of_scenes for one in parts]) == pytest.approx(9, rel=0.1)
-    assert np.mean([one.of_seeds or 0 for one in parts]) == pytest.approx(1, rel=0.15)
-    assert np.mean([one.of_rest for one in parts]) == pytest.approx(4, rel=0.05)
-
-
 def test_the_interval_over_scenes_and_seeds_holds_the_truth_as_often_as_it_says() -> None:
     rng = np.random.default_rng(1)
     n_hold = 0

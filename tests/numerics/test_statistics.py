@@ -15,7 +15,6 @@ from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import resampling, scene_counts
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.numerics.statistics import (
-    DIFFERENCE,
     MOST_GROUPS,
     holm,
     jackknife_interval,
@@ -48,22 +47,6 @@ def test_pseudo_values_of_a_ratio_are_those_worked_out_by_hand() -> None:
     error = np.std(expected, ddof=1) / np.sqrt(3)
     half = 4.302652729911275 * error  # the quantile of a table of Student's t with 2 degrees of freedom
     assert jackknife_interval(values, bounds=(-9, 9)) == pytest.approx((0.4 - half, 0.4 + half), rel=1e-9)
-
-
-def test_the_interval_ends_where_the_values_can() -> None:
-    assert mean_interval(np.array([0.0, 1.0, 1.0])) == (0.0, 1.0)
-    assert mean_interval(np.array([-1.0, 1.0, 1.0]), DIFFERENCE) == (-1.0, 1.0)
-
-
-def test_a_single_scene_has_no_interval() -> None:
-    assert jackknife_interval(np.array([0.5, np.nan]), np.ones(1, bool)) is None
-    assert jackknife_interval(np.array([0.5])) is None
-    assert mean_interval(np.array([0.5])) is None
-
-
-def test_scenes_that_do_not_differ_tell_nothing_of_others() -> None:
-    assert mean_interval(np.full(8, 0.3)) is None
-    assert jackknife_interval(np.array([1.0, 1.0, 1.0]), np.ones(2, bool)) is None
 
 
 def test_a_number_that_rests_on_one_scene_has_no_interval() -> None:

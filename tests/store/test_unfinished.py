@@ -19,8 +19,6 @@ from hypothesis import strategies as st
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.files.atomic import make_folder, replacing, write_text
 from su3d_bench.core.files.locks import clear_unfinished, is_unfinished, unfinished_folder
-from su3d_bench.perception.language.chat import ChatRequest
-from su3d_bench.perception.language.reply_store import ReplyStore
 from su3d_bench.store.run_folder import RunFolder, folder_of_scene, scene_of_folder
 
 LEFT = ".page.html.0123456789ab.unfinished"
@@ -147,20 +145,3 @@ def test_nothing_of_a_job_is_written_through_a_link(part: str, tmp_path: Path) -
         with pytest.raises(StoreError, match=f"{link}: is a link, and a run writes into folders of its own alone"):
             write()
     assert not list((tmp_path / "elsewhere").iterdir())
-
-
-@pytest.mark.parametrize("part", ["language", "language/images"])
-def test_replies_are_not_kept_through_a_link(part: str, tmp_path: Path) -> None:
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "run").mkdir()
-    (tmp_path / "elsewhere" / LEFT).write_text("half")
-    link = tmp_path / "run" / part
-    link.parent.mkdir(exist_ok=True)
-    link.symlink_to(tmp_path / "elsewhere")
-    store = ReplyStore(tmp_path / "run/language")
-    request = ChatRequest.__new__(ChatRequest)  # its content is not looked at before the folder is
-    with pytest.raises(StoreError, match="is a link"):
-        store.save(request, None, "server")  # type: ignore[arg-type]
-    with pytest.raises(StoreError, match="is a link"), RunFolder(tmp_path / "run").locked():
-        pass
-    assert names(tmp_path / "elsewhere") == [LEFT]
