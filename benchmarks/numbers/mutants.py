@@ -55,13 +55,12 @@ GUARDS: dict[str, tuple[str, ...]] = {
     "metrics/graphs/": ("test_hovsg_graphs",),
     "metrics/instance/": (*_CURVES, *_SCORES),
     "metrics/semantic/": ("test_metrics_semantic", "test_metrics_undefined", "test_metrics_hovsg", *_SCORES),
-    "metrics/semantic/panoptic_quality.py": ("test_panoptic_protocol",),
-    "metrics/semantic/panoptic_score.py": ("test_panoptic_protocol", "test_panoptic_labelled_points"),
+    "metrics/semantic/panoptic.py": ("test_panoptic_protocol", "test_panoptic_labelled_points"),
     "metrics/semantic/top_k.py": ("test_metrics_scannetpp",),
-    "metrics/relations/": ("test_relation_protocol",),
+    "metrics/relations.py": ("test_relation_protocol",),
     "metrics/labels.py": ("evaluation/test_labels_counted",),
-    "metrics/matching/remembered.py": ("analysis/test_rules_walk", "analysis/test_walks_of_every_pair"),
-    "metrics/protocols/originals.py": ("test_originals",),
+    "metrics/matching/nearest.py": ("analysis/test_rules_walk", "analysis/test_walks_of_every_pair"),
+    "metrics/protocols/loading.py": ("test_originals",),
     "metrics/matching/checks.py": (*_SCORES, "evaluation/test_evaluate_checks", "evaluation/test_evaluate"),
     "metrics/matching/kernels.py": ("opensu3d/test_device_results",),
     "metrics/matching/labelling.py": (*_TRANSFER, "test_metrics_hovsg"),
@@ -82,7 +81,7 @@ GUARDS: dict[str, tuple[str, ...]] = {
     "analysis/side_numbers.py": (*_COMPARE, "analysis/test_planning"),
     "analysis/sides.py": (*_COMPARE, "analysis/test_planning"),
     "analysis/gate/": _GATE,
-    "analysis/recomputed.py": ("analysis/gate/test_gate", "analysis/test_leaderboard"),
+    "runs/verify.py": ("analysis/gate/test_gate", "analysis/test_leaderboard"),
 }  # fmt: skip
 
 

@@ -29,7 +29,7 @@ RUN_AGAIN = (*SUBJECTS["light"], *EXECUTORS["inline"], "--out", "run")
 SHEETS = ("sheets", "make", "run", "--kind", "annotation", "--methods", "collector", "--per-kind", "2", "--quiet")
 VERBS = {
     "export": KilledVerb(
-        ("export", "run", "--to", "openlex3d", "--method", "collector", "--out", "run/exported", "--quiet"),
+        ("runs", "export", "run", "--to", "openlex3d", "--method", "collector", "--out", "run/exported", "--quiet"),
         ("run",),
         RUN_AGAIN,
     ),

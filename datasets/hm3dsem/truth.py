@@ -25,7 +25,7 @@ from su3d_bench.formats.arrays import MOST_POINTS, checked_points
 from su3d_bench.formats.images import read_bytes
 from su3d_bench.formats.ply import read_ply
 from su3d_bench.formats.text_files import parsed_json, read_text
-from su3d_bench.metrics.protocols.files import CLASS_TABLES
+from su3d_bench.metrics.protocols.loading import CLASS_TABLES
 
 LABEL_SPACE, VARIANT = "hm3dsem", "hovsg-objects"
 MOST_OBJECTS, MOST_ID = 100_000, 10**9

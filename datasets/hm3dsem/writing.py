@@ -25,7 +25,7 @@ from su3d_bench.datasets.openlex3d.labels import CATEGORIES_NAME
 from su3d_bench.datasets.writing import Layout, ScannedDataset, ScannedObject, SceneTarget
 from su3d_bench.formats.images import depth_in_units, png_bytes
 from su3d_bench.formats.ply import Column, PlyElement, write_ply
-from su3d_bench.metrics.graphs.overlaps import voxel_ids, voxel_means
+from su3d_bench.metrics.graphs.objects import voxel_ids, voxel_means
 
 LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
 CLOUD_VOXEL_M, ROOM_VOXEL_M = 0.02, 0.05  # create_hm3dsem_walks_gt.py

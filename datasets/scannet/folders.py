@@ -111,7 +111,7 @@ def no_scans(root: Path) -> ScenesMissing:
     """What to say where no scan was found."""
     return ScenesMissing(
         f"scannet: no scan in {root} or in its folders scans, scannet, scannet/scans (a scan is a folder such as "
-        "scene0000_00 with scene0000_00.sens or exported frames); su3d-bench fetch scannet says how to get it from "
-        f"{SCANNET_URL}; or set SU3D_DATA to where it is, or make rooms in this layout: su3d-bench datasets make rooms "
-        f"--layout scannet --out {root}"
+        "scene0000_00 with scene0000_00.sens or exported frames); su3d-bench datasets fetch scannet says how to get it "
+        f"from {SCANNET_URL}; or set SU3D_DATA to where it is, or make rooms in this layout: su3d-bench datasets make "
+        f"rooms --layout scannet --out {root}"
     )

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from su3d_bench.core.types import Float64Array, Int64Array, UInt8Array
-from su3d_bench.metrics.protocols.files import class_names
+from su3d_bench.metrics.protocols.loading import class_names
 
 Colour = tuple[int, int, int]
 Scale = Literal["paper", "cividis"]

@@ -10,12 +10,12 @@ from su3d_bench.core.errors import ConfigError, DataError, printable
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.types import GroundTruth
-from su3d_bench.evaluation.explained import FilesOfTruth
 from su3d_bench.evaluation.scoring import with_confidences_of_files
+from su3d_bench.evaluation.text_truth import FilesOfTruth
 from su3d_bench.evaluation.texts import GivenTexts, read_text_features
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.runs.finished import FinishedRun
-from su3d_bench.runs.parts import as_told
+from su3d_bench.runs.job import as_told
 from su3d_bench.store.predictions import read_prediction
 
 TruthOf = Callable[[str], GroundTruth]  # by the variant that a protocol asks for

@@ -15,15 +15,15 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.analysis.recomputed import rules_of_run, why_not_counted
 from su3d_bench.core.errors import ConfigError, Su3dError, counted, printable, some
 from su3d_bench.core.types import Interval
 from su3d_bench.formats.tables.table import NOT_MEASURED, Cell, Origin, Table, TableRow, bracketed, percent
-from su3d_bench.metrics.protocols.files import protocol_names
+from su3d_bench.metrics.protocols.loading import protocol_names
 from su3d_bench.metrics.scoring import combine
 from su3d_bench.numerics.statistics import rank_intervals
 from su3d_bench.reports.tables.model import confidence_notes, few_scenes, is_ceiling
 from su3d_bench.runs.finished import FinishedRun, read_run
+from su3d_bench.runs.verify import rules_of_run, why_not_counted
 
 MOST_RUNS = 10_000
 ELSEWHERE = "made elsewhere"  # in the place of a profile

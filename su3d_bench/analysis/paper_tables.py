@@ -12,7 +12,7 @@ from su3d_bench.reports.tables.judged import JUDGED, judged_table
 from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.papers.paper import Shown, paper_table
 from su3d_bench.reports.tables.papers.published import PaperTable
-from su3d_bench.runs.planning.ablation import read_rows
+from su3d_bench.runs.ablation import read_rows
 
 
 def numbered_tables(

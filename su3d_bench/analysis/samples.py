@@ -20,11 +20,10 @@ from su3d_bench.core.errors import ConfigError, counted, printable, suggest
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
 from su3d_bench.core.types import Float64Array, GroundTruth, Int32Array, Int64Array
 from su3d_bench.metrics.attribution.arrays import ScoredPoints, scored_masks, scored_points
-from su3d_bench.metrics.attribution.masks import count_masks, errors_of
+from su3d_bench.metrics.attribution.masks import CAUSES, causes_of, count_masks, errors_of
 from su3d_bench.metrics.attribution.overlaps import LabelledMasks, ScoringRules, measure_overlaps, true_instances
-from su3d_bench.metrics.attribution.points import CAUSES, causes_of
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
-from su3d_bench.metrics.instance.hits import hits
+from su3d_bench.metrics.instance.scene_counts import hits
 from su3d_bench.metrics.instance.score import OBJECT
 from su3d_bench.metrics.matching.labelling import scored_classes
 from su3d_bench.metrics.matching.nearest import Points
@@ -32,7 +31,7 @@ from su3d_bench.metrics.metric import n_predictions
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic import confusion
 from su3d_bench.reports.tables.samples import Sample
-from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
+from su3d_bench.runs.executors import SCENE_DONE, Event, Report
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 KINDS = ("instance", "semantic")  # of the protocols that say what became of single instances

@@ -23,7 +23,7 @@ from su3d_bench.reports.tables.model import BY_PEOPLE, Measured
 from su3d_bench.reports.tables.papers.latex import PrintedCell, printed_cells
 from su3d_bench.reports.tables.timing import AnytimePoint
 from su3d_bench.runs.finished import FinishedRun, is_numbers_alone, read_run
-from su3d_bench.runs.found import found_in, without_score
+from su3d_bench.runs.summary import found_in, without_score
 from su3d_bench.sheets.judging.scores import FILE as SCORES_FILE
 from su3d_bench.sheets.judging.scores import LABEL_METRICS, ScoreCell, Scores, read_scores
 from su3d_bench.store.records import NumbersRecord, ResultRecord

@@ -1,4 +1,4 @@
-"""``su3d-bench ask``: a question about a scene, answered from its map, with the objects that the answer rests on."""
+"""``su3d-bench query ask``: a question about a scene, answered from its map, with the objects of the answer."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from su3d_bench.core.maps import Instances
-    from su3d_bench.metrics.questions.truths import RefinedNames
+    from su3d_bench.metrics.questions.score import RefinedNames
     from su3d_bench.questions.reasoning.answers import Answer
     from su3d_bench.questions.reasoning.scene_map import SceneMap
     from su3d_bench.store.run_folder import JobFolder, RunFolder
@@ -24,14 +24,14 @@ SOLVERS = ("built-in", "llm")
 NAMES = ("auto", "label", "refined")
 
 
-def add_parser(verbs: Any) -> None:
+def add_parser(actions: Any) -> None:
     parser = add_verb(
-        verbs,
+        actions,
         "ask",
         "Answer a question about a scene from its map: by geometry, or by a language model.",
         (
-            'su3d-bench ask rooms/living0 "Which lamp is closer to the sofa?"',
-            'su3d-bench ask rooms/living0 "I am feeling cold, what should I do?" --solver llm --dry-run',
+            'su3d-bench query ask rooms/living0 "Which lamp is closer to the sofa?"',
+            'su3d-bench query ask rooms/living0 "I am feeling cold, what should I do?" --solver llm --dry-run',
         ),
         call,
     )
@@ -45,7 +45,7 @@ def add_parser(verbs: Any) -> None:
         "--names",
         choices=NAMES,
         default="auto",
-        help="the map's labels n, or n' of su3d-bench refine (default: n' where it is there)",
+        help="the map's labels n, or n' of su3d-bench runs refine (default: n' where it is there)",
     )
     parser.add_argument(
         "--eye",
@@ -65,9 +65,9 @@ def call(arguments: argparse.Namespace) -> int:
 
     if not arguments.question.strip():
         raise ConfigError(
-            'the question is empty; ask such as: su3d-bench ask rooms/living0 "How many lamps are there?"'
+            'the question is empty; ask such as: su3d-bench query ask rooms/living0 "How many lamps are there?"'
         )
-    check_scene_first("ask", arguments.scene, arguments.question)
+    check_scene_first("query ask", arguments.scene, arguments.question)
     run, job, instances = map_of_scene(arguments.scene, arguments.method, arguments.run)
     if not isinstance(instances, Instances):
         raise PredictionError(f"{job.prediction}: holds no instances, so there is nothing to ask about")
@@ -96,7 +96,7 @@ def _refined(job: JobFolder, wanted: str) -> tuple[RefinedNames | None, str]:
     records = None if wanted == "label" else read_records(job)
     if records is None:
         if wanted == "refined":
-            raise StoreError(f"{job.path}: has no labels n'; make them with su3d-bench refine")
+            raise StoreError(f"{job.path}: has no labels n'; make them with su3d-bench runs refine")
         return None, "labels n"
     n_left_out = sum(bool(name.left_out) for name in records.names)
     without = f", without {n_left_out} that it leaves out" if n_left_out else ""

@@ -1,4 +1,4 @@
-"""``su3d-bench export``: predictions as the files that other evaluators take."""
+"""``su3d-bench runs export``: predictions as the files that other evaluators take."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ TARGETS = ("openlex3d", "scannet", "scannetpp", "opensun3d")
 QUERY_RULES = "opensun3d-queries"
 
 
-def add_parser(verbs: Any) -> None:
+def add_parser(actions: Any) -> None:
     parser = add_verb(
-        verbs,
+        actions,
         "export",
         "Write predictions, our own or another program's, as the files that another evaluator takes.",
         (
-            "su3d-bench export runs/my-run --to openlex3d --method opensu3d --out exported/opensu3d",
-            "su3d-bench export results/open3dis --to scannet --scenes 'replica/*' --out exported/open3dis",
+            "su3d-bench runs export runs/my-run --to openlex3d --method opensu3d --out exported/opensu3d",
+            "su3d-bench runs export results/open3dis --to scannet --scenes 'replica/*' --out exported/open3dis",
         ),
         call,
     )
@@ -176,7 +176,7 @@ def _maps_of_run(path: Path) -> dict[str, list[Path]]:
 
 def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> list[Source]:
     """The sources that a pattern matches, all without patterns; a scene without a dataset takes that of its pattern."""
-    from su3d_bench.runs.planning.scenes import split_address
+    from su3d_bench.runs.scenes import split_address
 
     if not patterns:
         return list(sources)
@@ -199,7 +199,7 @@ def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> li
 def _names(addresses: Sequence[str], *, is_flat: bool) -> list[str]:
     """The name of each scene's files: its address, or in a flat folder its last part, which must tell scenes apart."""
     from su3d_bench.predictions.export import file_name
-    from su3d_bench.runs.planning.scenes import split_address
+    from su3d_bench.runs.scenes import split_address
 
     names = []
     for address in addresses:
@@ -300,7 +300,7 @@ def _rules(name: str | None, dataset: Any, run: Path | None, *, is_ranked: bool)
 
 def _of_run(name: str, run: Path | None) -> ProtocolRules | None:
     """Somebody's own rules that ``run`` was scored by; None where it has none of that name."""
-    from su3d_bench.metrics.protocols.files import protocol_names
+    from su3d_bench.metrics.protocols.loading import protocol_names
     from su3d_bench.runs.finished import read_run
 
     if run is None or name in protocol_names() or name.endswith(".toml"):

@@ -1,4 +1,4 @@
-"""``su3d-bench refine``: one name for each instance out of the names of its best views, label n' of the paper."""
+"""``su3d-bench runs refine``: one name for each instance out of the names of its best views, label n' of the paper."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ if TYPE_CHECKING:
 REFINERS = ("vote", "model")
 
 
-def add_parser(verbs: Any) -> None:
+def add_parser(actions: Any) -> None:
     parser = add_verb(
-        verbs,
+        actions,
         "refine",
         "Give each instance of a run's maps one name out of the names of its best views (label n'), and leave out what "
         "is large background under it.",
         (
-            "su3d-bench refine runs/my-run",
-            "su3d-bench refine runs/my-run --refiner model --model llama3.1 --base-url http://localhost:11434/v1",
+            "su3d-bench runs refine runs/my-run",
+            "su3d-bench runs refine runs/my-run --refiner model --model llama3.1 --base-url http://localhost:11434/v1",
         ),
         call,
     )

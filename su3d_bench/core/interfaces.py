@@ -307,14 +307,7 @@ class WarmsUp(MethodAbility, Protocol):
 
 
 @runtime_checkable
-class TakesDevice(MethodAbility, Protocol):
-    """May compute with torch; called before all else with ``cpu`` or a device of torch such as ``cuda:0``."""
-
-    def receive_device(self, device: str) -> None: ...
-
-
-@runtime_checkable
-class TakesTools(MethodAbility, Protocol):
+class TakesTools(Protocol):
     """Works on the whole scene; called before ``start``."""
 
     def receive_tools(self, tools: SceneTools) -> None: ...
@@ -405,7 +398,44 @@ class Closes(MethodAbility, Protocol):
 
 
 INTERFACES = {"dataset": Dataset, "method": Method}
-ABILITIES = {"dataset": DatasetAbility.__subclasses__(), "method": MethodAbility.__subclasses__()}
+ABILITIES = {
+    "dataset": (
+        HasFurtherTruths,
+        HasPlaces,
+        HasStatus,
+        HasGroups,
+        HasProblems,
+        CorrectsReading,
+        SaysUp,
+        HasSurface,
+        HasQueries,
+        AsksText,
+        KnowsObjects,
+        RendersFrames,
+        HasSketches,
+        ReadsMadeRooms,
+        NamesScenes,
+    ),
+    "method": (
+        HasAbout,
+        HasPresets,
+        HasShortNames,
+        IsSystem,
+        WarmsUp,
+        TakesTools,
+        NeedsSurface,
+        TakesTruth,
+        CountsPoints,
+        CountsInstances,
+        CountsBytes,
+        CountsLosses,
+        HasFinishCosts,
+        HasInputs,
+        HasCaveat,
+        HasOwnPerception,
+        Closes,
+    ),
+}
 
 
 @runtime_checkable

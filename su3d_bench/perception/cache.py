@@ -23,11 +23,8 @@ from su3d_bench.perception.crops import mask_boxes
 
 Arrays = dict[str, NDArray[Any]]
 
-# What moves an entry on its way into the cache and out of it: keys of what is kept there follow it.
-CACHE_SOURCES = (
-    "perception/cache.py", "perception/crops.py",
-    "core/files/atomic.py", "core/files/locks.py", "core/files/unpacking.py",
-)  # fmt: skip
+# The code that can move what is kept: keys follow it.
+CODE = ("core", "numerics", "perception")
 # Moves every key: raise it when the format of an entry changes.
 CACHE_VERSION = "1"
 _CHECKSUM = "checksum"

@@ -17,7 +17,7 @@ from su3d_bench.core.errors import PredictionError, printable
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float64Array
 from su3d_bench.opensu3d.config import OpenSU3DConfig
-from su3d_bench.perception.background import is_background
+from su3d_bench.perception.detections import is_background
 
 _OF_IMAGES = OpenSU3DConfig()
 

@@ -15,13 +15,12 @@ from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.reports.tables.ablation import SweepRow
 from su3d_bench.reproducing.recipe import Experiment, Recipe
-from su3d_bench.runs.executors.local import Report
-from su3d_bench.runs.planning.ablation import ablation_rows, write_rows
-from su3d_bench.runs.planning.asked import asked_settings
-from su3d_bench.runs.planning.held import Into
-from su3d_bench.runs.planning.plan import Plan, make_plan, named_method
-from su3d_bench.runs.planning.scenes import split_address
-from su3d_bench.runs.runner import RunResult, publish, run_plan
+from su3d_bench.runs.ablation import ablation_rows, write_rows
+from su3d_bench.runs.executors import Report
+from su3d_bench.runs.existing import Into
+from su3d_bench.runs.plan import Plan, asked_settings, make_plan, named_method
+from su3d_bench.runs.runner import RunResult, run_plan
+from su3d_bench.runs.scenes import split_address
 
 RUNS = "runs"
 
@@ -173,5 +172,5 @@ def carry_out(run: AskedRun, plan: Plan, report: Report) -> RunResult:
     result = run_plan(plan, report)
     if run.rows and result.is_complete:
         write_rows(plan.folder.path, run.rows, joins=True)
-        publish(plan)
+        plan.place.publish()
     return result

@@ -17,7 +17,7 @@ from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.system.timing import calibration_ms, hardware_line
 from su3d_bench.core.toml import parse_toml
-from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
+from su3d_bench.runs.executors import SCENE_DONE, Event, Report
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 FILE = Path(__file__).resolve().parent / "unit_costs.toml"

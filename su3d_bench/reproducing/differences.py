@@ -17,7 +17,6 @@ from su3d_bench.core.errors import ConfigError, counted, printable, some
 from su3d_bench.formats.tables.table import Cell, Table, TableRow
 from su3d_bench.metrics.protocols.files import protocol_names
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.perception.models.catalogue import WEIGHTS_CAVEAT
 from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.papers.paper import PAPER_PROFILE, PAPER_SCENES, Shown
 from su3d_bench.reports.tables.papers.published import OPEN, Figure
@@ -167,7 +166,6 @@ def _why_not(experiment: Experiment, figure: Figure, method: str, metric: str, r
 
 def causes(figure: Figure, row: Measured, run: FinishedRun | None) -> Iterator[str]:
     """In what the row of a run was made otherwise than the printed number, as far as both sides say."""
-    yield from _of_weights(row)
     yield from _of_judges(figure, row)
     yield from _of_protocol(figure, row)
     yield from _of_scenes(figure, row)
@@ -177,10 +175,6 @@ def causes(figure: Figure, row: Measured, run: FinishedRun | None) -> Iterator[s
     yield from _of_labels(figure, row, run)
     if row.changed and not (figure.row and "=" in figure.row):
         yield f"settings: {some(row.changed, 4)}"
-
-
-def _of_weights(row: Measured) -> Iterator[str]:
-    yield from (part for part in (row.caveat or "").split("; ") if part.startswith(WEIGHTS_CAVEAT))
 
 
 def _of_judges(figure: Figure, row: Measured) -> Iterator[str]:

@@ -9,12 +9,12 @@ from pathlib import Path
 
 from su3d_bench.core.errors import ConfigError, printable, suggest
 from su3d_bench.evaluation.as_run import evaluate_methods
-from su3d_bench.evaluation.request import Request
+from su3d_bench.evaluation.result import Request
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.reproducing.asked import RUNS, Asked
 from su3d_bench.reproducing.preflight import scene_names
 from su3d_bench.reproducing.recipe import Experiment
-from su3d_bench.runs.planning.scenes import split_address
+from su3d_bench.runs.scenes import split_address
 
 
 @dataclass(frozen=True)

@@ -21,14 +21,14 @@ from su3d_bench.fetching.sources import built_in
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.perception.models.catalogue import PAPERS_ENCODERS, PROFILE_MODELS, FormName, model_entry
 from su3d_bench.perception.models.files import locate
-from su3d_bench.perception.models.front_end import DETECTOR, PACKAGES, TAGGER
+from su3d_bench.perception.models.loading import DETECTOR, PACKAGES, TAGGER
 from su3d_bench.perception.profiles import PerceptionConfig
 from su3d_bench.reproducing.asked import AskedRun
 from su3d_bench.reproducing.costs import FILE, NAME, Estimate, UnitCosts, Work, calibrated_ms, estimated, read_costs
-from su3d_bench.runs.feeding import surface_of
-from su3d_bench.runs.parts import build_dataset, build_method, part_of
-from su3d_bench.runs.planning.plan import method_part, named_method
-from su3d_bench.runs.planning.scenes import data_root, split_address
+from su3d_bench.runs.frame_loop import surface_of
+from su3d_bench.runs.job import build_dataset, build_method, part_of
+from su3d_bench.runs.plan import method_part, named_method
+from su3d_bench.runs.scenes import data_root, split_address
 
 PAPER = "paper"
 FETCHED_FOR_PAPER = (*PROFILE_MODELS[PAPER], *PAPERS_ENCODERS)
@@ -145,7 +145,9 @@ def scene_size(dataset: str) -> SceneSize:
         if source.group == dataset and source.scenes is not None:
             counts, n_bytes = source.scenes, source.n_bytes
             mean = None if n_bytes is None else n_bytes / counts.n_scenes
-            return SceneSize(round(counts.n_frames / counts.n_scenes), mean, f"su3d-bench fetch {source.group}")
+            return SceneSize(
+                round(counts.n_frames / counts.n_scenes), mean, f"su3d-bench datasets fetch {source.group}"
+            )
     return SceneSize()
 
 
@@ -234,7 +236,7 @@ def _truths(run: AskedRun, dataset: Any, scene: str, how: str) -> Iterator[Need]
         left = [other for other in variants if other not in missing]
         remark = f"{why}; without it {', '.join(variants[variant])} scores nothing"
         name = f"{run.dataset}/{scene}: {variant}"
-        brings = how if "su3d-bench fetch" in why else ""  # labels of others are not among what is fetched
+        brings = how if "su3d-bench datasets fetch" in why else ""  # labels of others are not among what is fetched
         yield Need("truth", name, is_here=False, how=brings, is_required=not left, remark=remark)
 
 
@@ -267,7 +269,7 @@ def _model(name: str, config: PerceptionConfig, *, is_required: bool) -> Need:
         files = locate(name, forms, path=place[0], folder=place[1])
     except ModelMissing:
         n_bytes = built_in().named(name, "models").n_bytes
-        how = f"su3d-bench fetch models {'--for paper' if name in FETCHED_FOR_PAPER else name}"
+        how = f"su3d-bench models fetch {'--for paper' if name in FETCHED_FOR_PAPER else name}"
         return Need("model", name, is_here=False, n_bytes=n_bytes, how=how, is_required=is_required, remark=remark)
     return Need("model", name, is_here=True, n_bytes=0.0, remark=str(files.folder))
 

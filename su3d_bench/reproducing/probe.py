@@ -11,7 +11,7 @@ from pathlib import Path
 from su3d_bench.core.files.scratch import TemporaryFolder
 from su3d_bench.reproducing.asked import AskedRun, carry_out, plan_of
 from su3d_bench.reproducing.costs import NAME, Stopwatch, UnitCost, clock_of, measured_costs, measured_here, write_costs
-from su3d_bench.runs.executors.local import Report
+from su3d_bench.runs.executors import Report
 from su3d_bench.store.run_folder import RunFolder
 
 N_UPDATES = 4  # of each method in the probe: the first is dearer, as that of a run is

@@ -81,16 +81,13 @@ class Experiment(BaseModel):
 
 
 class Rehearsal(BaseModel):
-    """The same on rooms that the program makes: their names, options of them, and whose perception.
-
-    ``paper``: with tiny networks that stand in for the published ones.
-    """
+    """The same on rooms that the program makes: their names, options of them, and whose perception."""
 
     model_config = _STRICT
 
     rooms: Annotated[tuple[Word, ...], Field(min_length=1)] = ("bedroom0", "office0")
     settings: tuple[Word, ...] = ("n_frames=100", "width=240", "height=180")
-    profile: Literal["paper", "embedded", "oracle"] = "paper"
+    profile: Literal["paper", "embedded", "oracle"] = "embedded"
 
 
 class Recipe(BaseModel):

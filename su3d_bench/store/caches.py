@@ -149,7 +149,7 @@ def why_large(root: Path) -> str | None:
         return None
     return (
         f"{shown(root)}: keeps about {size_text(n_bytes)} of perception; to keep what is young alone: "
-        "su3d-bench cache clear perception --older-than 30"
+        "su3d-bench dev cache clear perception --older-than 30"
     )
 
 

@@ -21,13 +21,18 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.core.types import GroundTruth
-from su3d_bench.metrics.attribution import points as attribution_semantic
+from su3d_bench.metrics.attribution import masks as attribution_semantic
 from su3d_bench.metrics.attribution.arrays import EXPLAINED as EXPLAINED_KINDS
 from su3d_bench.metrics.attribution.arrays import scored_masks, scored_points
-from su3d_bench.metrics.attribution.masks import count_masks
-from su3d_bench.metrics.attribution.points import CAUSES, LabelledPoints, causes_of, mend_points, object_of_mask
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.attribution.masks import (
+    CAUSES,
+    LabelledPoints,
+    causes_of,
+    count_masks,
+    mend_points,
+    object_of_mask,
+)
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.scoring import score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.reports.tables.attribution import MEANINGS
@@ -365,17 +370,17 @@ def test_the_oracle_of_a_run_can_be_explained_too() -> None:
 
 
 def test_the_command_prints_a_table_and_draws_the_plot(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["attribute", "dropped", "--oracle", "oracle", "--out", "plots/errors.png"]) == 0
+    assert main(["report", "attribution", "dropped", "--oracle", "oracle", "--out", "plots/errors.png"]) == 0
     text = capsys.readouterr().out
     row = next(line for line in text.splitlines() if line.startswith("| missed "))
     assert [cell.strip() for cell in row.strip("|").split("|")][:2] == ["missed", "2"]
     assert "| with true 2D masks |" in text
     picture = Path("plots/errors.png").read_bytes()
     assert picture.startswith(b"\x89PNG")
-    assert main(["attribute", "dropped", "--oracle", "oracle", "--out", "again.png", "--quiet"]) == 0
+    assert main(["report", "attribution", "dropped", "--oracle", "oracle", "--out", "again.png", "--quiet"]) == 0
     assert Path("again.png").read_bytes() == picture
     capsys.readouterr()
-    assert main(["attribute", "dropped", "--protocol", "rooms-instance", "--json"]) == 0
+    assert main(["report", "attribution", "dropped", "--protocol", "rooms-instance", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert [one["protocol"] for one in found["protocols"]] == ["rooms-instance"]
 

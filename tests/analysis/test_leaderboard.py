@@ -141,7 +141,7 @@ def test_counts_that_no_scene_gives_are_refused_by_every_reader(
     capsys.readouterr()
     assert main(["compare", str(runs / "ann/first"), str(runs / "bob")]) == 2
     assert line in capsys.readouterr().err
-    assert main(["attribute", str(runs / "bob")]) == 2
+    assert main(["report", "attribution", str(runs / "bob")]) == 2
     assert line in capsys.readouterr().err
     assert main(["report", "verify", paper]) == 1
     assert line in capsys.readouterr().out

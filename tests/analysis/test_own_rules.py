@@ -15,8 +15,7 @@ from places import SCENES
 from su3d_bench.analysis.leaderboard import leaderboard
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol, read_rules
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names, read_rules
 from su3d_bench.runs import finished
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run
@@ -46,10 +45,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 VERBS = {
-    "attribute": ["attribute", "{first}", "--method", "collector"],
-    "one protocol": ["attribute", "{first}", "--method", "collector", "--protocol", "mine-instance"],
+    "attribute": ["report", "attribution", "{first}", "--method", "collector"],
+    "one protocol": ["report", "attribution", "{first}", "--method", "collector", "--protocol", "mine-instance"],
     "compare": ["compare", "{first}:collector", "{second}:collector@drop=1", "--per-class"],
-    "plan": ["plan", "{first}", "--methods", "collector", "collector@drop=1", "--points", "5"],
+    "plan": ["report", "power", "{first}", "--methods", "collector", "collector@drop=1", "--points", "5"],
     "page": ["report", "html", "{first}", "--out", "{out}/page.html"],
     "learn": ["check", "--learn", "{first}", "{second}", "--out", "{out}/reference.json"],
 }

@@ -96,7 +96,18 @@ def test_what_is_needed_follows_from_the_pseudo_values_of_the_runs(n_seeds: int)
 
 
 def test_the_command_prints_a_table_or_json(capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["plan", "seed-0", "seed-1", "--methods", *METHODS, "--points", "10", "--protocol", "rooms-instance"]
+    words = [
+        "report",
+        "power",
+        "seed-0",
+        "seed-1",
+        "--methods",
+        *METHODS,
+        "--points",
+        "10",
+        "--protocol",
+        "rooms-instance",
+    ]
     assert main(words) == 0
     text = capsys.readouterr().out
     assert "| AP " in text and "10 points" in text and "seed 0, 1" in text
@@ -104,7 +115,7 @@ def test_the_command_prints_a_table_or_json(capsys: pytest.CaptureFixture[str]) 
     assert "intervals over 3 scenes are rough" in text
     assert main([*words, "--json"]) == 0
     assert list(json.loads(capsys.readouterr().out)["protocols"]) == ["rooms-instance"]
-    assert main(["plan", "seed-0"]) == 0
+    assert main(["report", "power", "seed-0"]) == 0
     assert "how much seeds move the difference is not known" in capsys.readouterr().out
 
 
@@ -115,7 +126,7 @@ def test_methods_that_do_not_differ_tell_nothing(tmp_path: Path, capsys: pytest.
         jobs[1].counts.write_bytes(jobs[0].counts.read_bytes())
     found = plan([tmp_path / "run"], points=[1.0]).protocols["rooms-semantic"]["mAcc"]
     assert (found.difference, found.interval, found.variance, found.needs) == (0.0, None, None, ())
-    assert main(["plan", str(tmp_path / "run")]) == 0
+    assert main(["report", "power", str(tmp_path / "run")]) == 0
     assert "no SD: the difference is the same in every scene and run" in capsys.readouterr().out
 
 
@@ -137,7 +148,7 @@ def test_what_tells_nothing_is_refused_in_one_line(name: str, capsys: pytest.Cap
     words, message = REFUSED[name]
     if not Path("copied").exists():
         shutil.copytree("seed-0", "copied")
-    assert main(["plan", *words]) == 2
+    assert main(["report", "power", *words]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
 

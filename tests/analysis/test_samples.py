@@ -18,7 +18,7 @@ from painted import WordEncoder, colour_perception
 from places import SCENES
 from scored_room import ENCODER, noisy
 
-import su3d_bench.metrics.instance.hits
+import su3d_bench.metrics.instance.average_precision
 import su3d_bench.reports.tables.samples
 from su3d_bench.analysis.attribution import attribute
 from su3d_bench.analysis.samples import Chosen, _OfPoints, samples
@@ -26,10 +26,9 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import DenseFeatures, Instances
 from su3d_bench.metrics.attribution.arrays import ScoredPoints, scored_masks
-from su3d_bench.metrics.attribution.masks import KINDS, count_masks, errors_of, mend_scene
+from su3d_bench.metrics.attribution.masks import KINDS, LabelledPoints, count_masks, errors_of, mend_scene
 from su3d_bench.metrics.attribution.overlaps import measure_overlaps, true_instances
-from su3d_bench.metrics.attribution.points import LabelledPoints
-from su3d_bench.metrics.instance.hits import hits
+from su3d_bench.metrics.instance.scene_counts import hits
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
 from su3d_bench.reports.tables.samples import COLUMNS, Sample, csv_of
@@ -53,7 +52,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def test_the_examples_hold() -> None:
-    assert doctest.testmod(su3d_bench.metrics.instance.hits).failed == 0
+    assert doctest.testmod(su3d_bench.metrics.instance.average_precision).failed == 0
     assert doctest.testmod(su3d_bench.reports.tables.samples).failed == 0
 
 

@@ -15,14 +15,16 @@ from su3d_bench.core.types import Int64Array
 from su3d_bench.metrics.attribution.masks import (
     KINDS,
     LabelledMasks,
+    LabelledPoints,
     ScoringRules,
+    causes_of,
     count_masks,
     find_errors,
+    mend_points,
     mend_scene,
     repaired,
 )
 from su3d_bench.metrics.attribution.overlaps import measure_overlaps, true_instances
-from su3d_bench.metrics.attribution.points import LabelledPoints, causes_of, mend_points
 from su3d_bench.metrics.attribution.singles import Pool, single_mask_errors, single_point_errors
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.protocols.loading import load_protocol

@@ -32,8 +32,7 @@ from su3d_bench.datasets.replica.label_file_truth import OVO_CLASSES
 from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.formats.ply import read_ply
 from su3d_bench.metrics.matching.nearest import nearest
-from su3d_bench.metrics.protocols.files import class_names, protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.loading import class_names, load_protocol, protocol_names
 from su3d_bench.metrics.protocols.mixtures import Mixtures
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine, score_scene

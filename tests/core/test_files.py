@@ -21,7 +21,6 @@ PACKAGES = ("su3d_bench", "baselines", "datasets", "reports")
 # The door; what looks at /proc alone; what a resource of the package hands out.
 OTHER_DOORS = {
     "su3d_bench/core/system/files.py", "su3d_bench/core/system/timing.py", "baselines/command/supervisor.py",
-    "su3d_bench/perception/models/onnx/ram_plus_program.py",  # runs where nothing of ours is
 }  # fmt: skip
 OWN_RESOURCE = 'files("su3d_bench.'
 READS_A_PATH = {"load", "memmap", "open_memmap", "fromfile", "loadtxt", "genfromtxt", "imread", "ZipFile", "File"}

@@ -278,7 +278,7 @@ def test_texts_of_a_prediction_have_a_bound() -> None:
 
 
 def test_masks_of_an_image_have_a_bound_in_pixels() -> None:
-    from su3d_bench.perception.stored.source import check_masks
+    from su3d_bench.perception.stored import check_masks
 
     check_masks(400, (968, 1296), "here")
     for n, shape in ((2001, (4, 4)), (500, (968, 1296))):

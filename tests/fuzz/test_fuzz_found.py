@@ -33,8 +33,8 @@ from su3d_bench.formats.numpy_files import read_npy
 from su3d_bench.metrics.protocols.loading import load_protocol, read_protocol
 from su3d_bench.metrics.scoring import combine, unpack_scores
 from su3d_bench.questions.files.queries import read_query_file
+from su3d_bench.runs.advice import recent_update_s
 from su3d_bench.runs.finished import read_run
-from su3d_bench.runs.planning.estimate import recent_update_s
 from su3d_bench.store.predictions import read_prediction
 
 DEEP, LONG = "[" * 100_000, "1" * 5000
@@ -148,7 +148,7 @@ def test_what_an_error_quotes_can_be_shown_on_a_terminal() -> None:
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["methods", "opensu3d", ""], "su3d-bench: methods: unknown argument ''"),
+        (["methods", "show", "opensu3d", ""], "su3d-bench: methods show: unknown argument ''"),
         (["report", "a\"b'c"], "su3d-bench: report: unknown"),
         (["sheets", "make", "--kind", "'", "--out", "x", "y"], "su3d-bench: sheets make: unknown --kind"),
         (["\x1b[31m"], r"su3d-bench: unknown verb '\x1b[31m'"),

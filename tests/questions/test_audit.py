@@ -161,7 +161,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An audit of two painted scenes."""
     out = tmp_path_factory.mktemp("audit") / "audit"
     words = [
-        "questions",
+        "query",
         "audit",
         "--scenes",
         f"{PAINTED}/a",
@@ -223,7 +223,7 @@ def test_verdicts_are_not_written_over(folder: Path, tmp_path: Path) -> None:
 
 
 def test_a_second_audit_leaves_nothing_of_the_first(tmp_path: Path) -> None:
-    words = ["questions", "audit", "--scenes", f"{PAINTED}/a", "--out", str(tmp_path), "--quiet", "--per-page", "2"]
+    words = ["query", "audit", "--scenes", f"{PAINTED}/a", "--out", str(tmp_path), "--quiet", "--per-page", "2"]
     assert main([*words, "--n", "4"]) == 0
     assert main([*words, "--n", "1", "--kinds", "instance"]) == 0
     assert sorted(path.name for path in tmp_path.rglob("*.png")) == ["001.png", "sheet-01.png"]
@@ -234,7 +234,7 @@ def test_an_audit_leaves_other_pictures_alone(tmp_path: Path) -> None:
     theirs[1].parent.mkdir()
     for path in theirs:
         path.write_bytes(b"theirs")
-    words = ["questions", "audit", "--scenes", f"{PAINTED}/a", "--out", str(tmp_path), "--quiet", "--n", "2"]
+    words = ["query", "audit", "--scenes", f"{PAINTED}/a", "--out", str(tmp_path), "--quiet", "--n", "2"]
     for _ in range(2):
         assert main(words) == 0
     assert all(path.read_bytes() == b"theirs" for path in theirs)
@@ -254,16 +254,16 @@ def test_verdicts_add_up_by_kind_and_the_wrong_ones_are_listed(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = judged(folder, tmp_path / "audit.csv", ["right"] * 10 + ["Arguable", "wrong ", "", ""])
-    assert main(["questions", "audit", "--score", str(file)]) == 0
+    assert main(["query", "audit", "--score", str(file)]) == 0
     shown = capsys.readouterr().out
     assert re.search(r"\| all +\| 12 +\| 83\.3 \[.*\] +\| 91\.7 \[.*\] +\| 1 +\|", shown)
     assert "2 of 14 questions are not judged yet" in shown
     wrong = rows_of(file)[11]
     assert f"wrong: 12 {wrong['scene']}, {wrong['kind']}: {wrong['text']} -> {wrong['answer']}" in shown
     assert shown.count("- wrong: ") == 1 and shown.count("- arguable: ") == 1
-    assert main(["questions", "audit", "--score", str(file), "--format", "latex"]) == 0
+    assert main(["query", "audit", "--score", str(file), "--format", "latex"]) == 0
     assert "tabular" in capsys.readouterr().out
-    assert main(["questions", "audit", "--score", str(file), "--json"]) == 0
+    assert main(["query", "audit", "--score", str(file), "--json"]) == 0
     counts: dict[str, Any] = json.loads(capsys.readouterr().out)
     assert (counts["n"], counts["n_judged"], [one["number"] for one in counts["wrong"]]) == (14, 12, ["12"])
     assert sum(count["right"] for count in counts["kinds"].values()) == 10
@@ -296,15 +296,15 @@ def test_a_table_that_does_not_fit_is_one_line(text: str, line: str, tmp_path: P
 
 
 def test_nothing_judged_is_said(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["questions", "audit", "--score", str(folder / "audit.csv")]) == 2
+    assert main(["query", "audit", "--score", str(folder / "audit.csv")]) == 2
     assert "none of 14 questions is judged; write right, arguable, wrong into 'verdict'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["--out", "x"], "needs --scenes and --out FOLDER, or --score"),
-        (["--scenes", f"{PAINTED}/a"], "needs --scenes and --out FOLDER, or --score"),
+        (["--out", "x"], "needs --scenes and --out DIR, or --score"),
+        (["--scenes", f"{PAINTED}/a"], "needs --scenes and --out DIR, or --score"),
         (["--scenes", f"{PAINTED}/a", "--out", "x", "--n", "0"], "--n is 0; expected 1 or more"),
         (["--scenes", f"{PAINTED}/a", "--out", "x", "--per-page", "0"], "--per-page is 0; expected 1 or more"),
         (["--scenes", f"{PAINTED}/a", "--out", "x", "--seed", "-1"], "--seed is -1; expected 0 or more"),
@@ -313,7 +313,7 @@ def test_nothing_judged_is_said(folder: Path, capsys: pytest.CaptureFixture[str]
     ],
 )
 def test_wrong_requests_are_one_line(words: list[str], line: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["questions", "audit", *words, "--quiet"]) == 2
+    assert main(["query", "audit", *words, "--quiet"]) == 2
     error = capsys.readouterr().err
     assert line in error and len(error.splitlines()) == 1
 
@@ -322,5 +322,5 @@ def test_scenes_of_which_nothing_can_be_asked_are_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     monkeypatch.setattr("su3d_bench.questions.audit.audited_questions", lambda *_, **__: iter(()))
-    assert main(["questions", "audit", "--scenes", f"{PAINTED}/a", "--out", str(tmp_path), "--quiet"]) == 2
+    assert main(["query", "audit", "--scenes", f"{PAINTED}/a", "--out", str(tmp_path), "--quiet"]) == 2
     assert "nothing can be asked of these scenes" in capsys.readouterr().err

@@ -86,7 +86,7 @@ def test_without_a_judge_scores_have_a_least_and_a_most_and_say_how_to_bring_one
     assert (found["EM"].least, found["settled"].least) == (2 / 3, 2 / 3)
     assert [(one.least, one.most) for one in (found["case"], found["object"])] == [(2 / 3, 1.0), (0.0, 1.0)]
     paths = written(tmp_path, QA, said)
-    assert main(["questions", "score", str(paths[0]), "--answers", str(paths[1])]) == 0
+    assert main(["query", "score", str(paths[0]), "--answers", str(paths[1])]) == 0
     shown = capsys.readouterr().out
     assert "66.7 to 100.0" in shown and "give each answer its 'score'" in shown
     judged = numbers(tmp_path, QA, [*said[:2], {"pred": "blue", "score": 4}])
@@ -143,7 +143,7 @@ def test_what_is_wrong_with_a_file_is_one_line(
     asked: object, answers: object, line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     paths = written(tmp_path, asked, answers)
-    assert main(["questions", "score", str(paths[0]), "--answers", str(paths[1])]) == 2
+    assert main(["query", "score", str(paths[0]), "--answers", str(paths[1])]) == 2
     error = capsys.readouterr().err
     assert line in error and error.count("\n") == 1
 

@@ -27,7 +27,7 @@ from su3d_bench.questions.chains.made_questions import made_files, metadata_of, 
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
 
 PROBLEMS = json.loads((CASES / "beacon3d01_answers.json").read_text())["qa"]
-QUICK = ("backoff_s=0.001", "max_retries=1", "total_timeout_s=1.0", "max_failures_in_a_row=50")
+QUICK = ("max_retries=1", "timeout_s=1.0", "max_failures_in_a_row=50")
 
 
 def thing(one: int, name: str, low: Sequence[float], size: Sequence[float], caption: str = "") -> MapObject:
@@ -165,7 +165,7 @@ def test_the_verb_writes_both_files_which_can_be_scored(
     kind: str, made_room: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["--scenes", "rooms/living0", "--form", f"beacon3d-{kind}", "--out", "made.json", "--json"]
-    assert main(["questions", "make", *words]) == 0
+    assert main(["query", "make", *words]) == 0
     assert json.loads(capsys.readouterr().out)["n_scenes"] == 1
     content = json.loads(Path("made.json").read_text())
     if kind == "grounding":
@@ -173,7 +173,7 @@ def test_the_verb_writes_both_files_which_can_be_scored(
     else:
         rows = [{"pred": one.answer} for one in questions_of_objects(content, "here").entries]
     Path("answers.json").write_text(json.dumps(rows))
-    assert main(["questions", "score", "made.json", "--answers", "answers.json", "--json"]) == 0
+    assert main(["query", "score", "made.json", "--answers", "answers.json", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["kind"] == kind and {
         one["least"] for one in found["numbers"] if one["name"] in ("case", "object")
@@ -183,21 +183,21 @@ def test_the_verb_writes_both_files_which_can_be_scored(
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["make", "--scenes", "rooms/living0", "--out", "a.json", "--form", "beacon"], "unknown form 'beacon'"),
+        (["make", "--scenes", "rooms/living0", "--out", "a.json", "--form", "beacon"], "unknown --form 'beacon'"),
         (["make", "--scenes", "rooms/living0", "--out", "a.toml", "--form", "beacon3d-qa"], "is written as JSON"),
         (
             ["make", "--scenes", "rooms/living0", "--out", "a.json", "--form", "beacon3d-qa", "--source", "generated"],
             "--leave-out and --source belong to --form own",
         ),
-        (["make", "--scenes", "rooms/living0", "--out", "a.toml", "--judge"], "--judge belongs to score"),
-        (["score", "a.json", "--answers", "b.json", "--offline"], "--offline belongs to --judge of score"),
-        (["score", "a.json", "--answers", "b.json", "--model", "x"], "--model belongs to --judge of score"),
+        (["make", "--scenes", "rooms/living0", "--out", "a.toml", "--judge"], "unknown argument '--judge'"),
+        (["score", "a.json", "--answers", "b.json", "--offline"], "--offline belongs to --judge"),
+        (["score", "a.json", "--answers", "b.json", "--model", "x"], "--model belongs to --judge"),
     ],
 )
 def test_what_does_not_go_together_is_one_line(
     words: list[str], line: str, made_room: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["questions", *words]) == 2
+    assert main(["query", *words]) == 2
     said = capsys.readouterr().err
     assert line in said and said.count("\n") == 1
 
@@ -258,7 +258,7 @@ def test_answers_are_judged_once_kept_and_the_key_is_never_shown(
     Path("asked.json").write_text(json.dumps(questions))
     Path("qa.json").write_text(json.dumps(rows))
     chat.answer = lambda body: Answered("Score: 4" if "mauve" in str(body) else f"no idea {KEY}")
-    words = ["questions", "score", "asked.json", "--answers", "qa.json", "--judge"]
+    words = ["query", "score", "asked.json", "--answers", "qa.json", "--judge"]
     server = ["--base-url", chat.url, "--set", *(f"perception.language.{one}" for one in QUICK)]
     assert main([*words, *server, "--dry-run"]) == 0
     assert "2 requests" in capsys.readouterr().out and not chat.bodies
@@ -288,7 +288,7 @@ def test_a_judge_that_fails_leaves_the_answer_open(
     Path("asked.json").write_text(json.dumps(questions))
     Path("qa.json").write_text(json.dumps([{"pred": "mauve"}] * len(questions_of_objects(questions, "h").entries)))
     chat.answer = lambda body: error(400, "no such thing")
-    words = ["questions", "score", "asked.json", "--answers", "qa.json", "--judge", "--base-url", chat.url, "--json"]
+    words = ["query", "score", "asked.json", "--answers", "qa.json", "--judge", "--base-url", chat.url, "--json"]
     assert main([*words, "--set", *(f"perception.language.{one}" for one in QUICK)]) == 0
     found = {one["name"]: one for one in json.loads(capsys.readouterr().out)["numbers"]}
     assert (found["case"]["least"], found["case"]["most"]) == (0.0, 1.0)

@@ -11,8 +11,7 @@ import pytest
 from places import CASES
 
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.metrics.questions.score import are_objects_right, is_answer_right
-from su3d_bench.metrics.questions.truths import TrueAnswer
+from su3d_bench.metrics.questions.score import TrueAnswer, are_objects_right, is_answer_right
 from su3d_bench.perception.language.chat import ChatRequest, Reply
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.questions.files.files import paper_queries

@@ -133,7 +133,7 @@ def test_one_question_of_sqa3d_with_two_answers_keeps_both_and_they_are_shown(
     replies = [{"question_id": k, "answers": [{"answer": word}]} for k, word in ((7, "table"), (8, "desk"))]
     (tmp_path / "v1_balanced_sqa_annotations_val_scannetv2.json").write_text(json.dumps({"annotations": replies}))
     assert [one.reply for one in read_questions(questions)] == ["table or desk"]
-    assert main(["questions", "show", str(questions)]) == 0
+    assert main(["query", "show", str(questions)]) == 0
     shown = capsys.readouterr().out
     assert "1 question on 1 scene (1 reasoning); 0 with known answers, 1 with one in words" in shown
     assert 'What is in front?  -> "table or desk"' in shown
@@ -208,28 +208,28 @@ def test_the_verb_shows_a_set_without_its_control_characters(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     write_questions(tmp_path / "q.toml", SET)
-    assert main(["questions", "show", str(tmp_path / "q.toml")]) == 0
+    assert main(["query", "show", str(tmp_path / "q.toml")]) == 0
     shown = capsys.readouterr().out
     assert "5 questions on 1 scene (2 instance, 1 affordance, 1 property, 1 relative); 5 with known answers" in shown
     assert "\u202e" not in shown
     assert max(map(len, shown.splitlines())) < 200
-    assert main(["questions", "show", "paper", "--json"]) == 0
+    assert main(["query", "show", "paper", "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)) == len(paper_queries())
 
 
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["mak"], "unknown action 'mak'; did you mean 'make'?"),
-        (["make"], "needs --scenes and --out"),
+        (["mak"], "unknown action 'mak'; did you mean 'make'"),
+        (["make"], "required: --scenes, --out"),
         (["make", "--scenes", "rooms/living0", "--out", "q.toml", "--per-kind", "0"], "--per-kind is 0"),
         (["make", "--scenes", "rooms/living0", "--out", "q.toml", "--source", "auot"], "did you mean 'auto'?"),
         (["make", "--scenes", "rooms/living0", "--out", "q.txt"], "is neither .toml nor .csv"),
-        (["show"], "name a file, or 'paper'"),
+        (["show"], "required: FILE"),
     ],
 )
 def test_wrong_requests_are_one_line(words: list[str], line: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["questions", *words, "--quiet"]) == 2
+    assert main(["query", *words, "--quiet"]) == 2
     assert line in capsys.readouterr().err
 
 
@@ -237,7 +237,7 @@ def test_the_verb_makes_questions_from_classes_boxes_and_frames(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scenes = f"{SCENES}/painted.py:Painted/a"
-    words = ["questions", "make", "--scenes", scenes, "--quiet"]
+    words = ["query", "make", "--scenes", scenes, "--quiet"]
     assert main([*words, "--out", str(tmp_path / "q.toml")]) == 0
     assert "with known answers" in capsys.readouterr().out
     found = {one.text: one for one in read_questions(tmp_path / "q.toml")}

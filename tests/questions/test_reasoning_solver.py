@@ -14,7 +14,7 @@ from scored_room import instances
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.datasets.rooms.dataset import Rooms
-from su3d_bench.metrics.questions.truths import RefinedNames
+from su3d_bench.metrics.questions.score import RefinedNames
 from su3d_bench.questions.reasoning.answers import Answer
 from su3d_bench.questions.reasoning.generated import generate_questions
 from su3d_bench.questions.reasoning.question_words import Phrase, read_phrase

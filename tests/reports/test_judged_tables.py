@@ -107,7 +107,7 @@ def test_table_v_has_a_row_for_each_label(folders: tuple[Path, Path], capsys: py
     ("warning", "label"),
     [
         ("every scene: n': the vote of the names of 5 views, no language model", "(n' is a vote)"),
-        ("replica/a: n': the model gpt-4 of su3d-bench refine, names of 5 views", "(n' by the model gpt-4)"),
+        ("replica/a: n': the model gpt-4 of su3d-bench runs refine, names of 5 views", "(n' by the model gpt-4)"),
         ("no label n': the map keeps no names of views", "(n')"),
     ],
 )
@@ -229,7 +229,7 @@ def test_what_people_judged_says_how_the_maps_were_made_and_what_the_encoder_was
 
 @pytest.mark.parametrize(
     ("who", "differs"),
-    [("the vote of 5 views", True), ("the model gpt-4-1106-preview of su3d-bench refine", False)],
+    [("the vote of 5 views", True), ("the model gpt-4-1106-preview of su3d-bench runs refine", False)],
 )
 def test_a_caption_says_that_labels_are_of_another_language_model(who: str, differs: bool) -> None:
     values = {"label n": 0.7, "label n'": 0.8, "well-merged": 0.5, "well-merged n'": 0.6}

@@ -32,7 +32,7 @@ def test_a_scan_without_its_mesh_is_missing_for_methods_that_cannot_do_without(
     assert missing_meshes(both, tmp_path / "out") == []
     (tmp_path / "data/Replica/bedroom0_mesh.ply").unlink()
     (need,) = missing_meshes((*both, "sam3d@ensemble"), tmp_path / "out")
-    assert need.is_required and not need.is_here and need.how == "su3d-bench fetch replica"
+    assert need.is_required and not need.is_here and need.how == "su3d-bench datasets fetch replica"
     assert need.name == "replica/bedroom0: the scan's mesh"
     assert "bedroom0_mesh.ply is missing" in need.remark
     assert need.remark.endswith("openmask3d, sam3d@ensemble cannot do without")

@@ -79,7 +79,7 @@ def test_a_run_that_may_stand_in_no_ranking_is_left_out_with_its_reason(
     rewrite_bundle(registry / "bundles" / "bob.zip", files, manifest)
     found = read_registry(registry)
     assert any(says in one.reason for one in found.refused)
-    assert main(["registry", "build", str(registry), "--out", str(registry.parent / "site")]) == 1
+    assert main(["dev", "registry", "build", str(registry), "--out", str(registry.parent / "site")]) == 1
 
 
 def other_data(files: Files) -> None:
@@ -104,7 +104,7 @@ def test_rows_that_mix_data_or_name_a_method_twice_are_refused(
     files, manifest = read_bundle(registry / "bundles" / "ann.zip")
     change(files)
     bundle = rewrite_bundle(tmp_path / "dan.zip", files, {**manifest, "program": "another"})
-    assert main(["registry", "add", str(bundle), "--to", str(registry)]) == 1
+    assert main(["dev", "registry", "add", str(bundle), "--to", str(registry)]) == 1
     assert "dan.zip: refused: " in (said := capsys.readouterr().out) and says in said
     assert sorted(path.stem for path in (registry / "bundles").iterdir()) == ["ann", "bob"]
 
@@ -112,7 +112,7 @@ def test_rows_that_mix_data_or_name_a_method_twice_are_refused(
 def test_rules_of_another_digest_under_the_same_name_do_not_mix(registry: Path, tmp_path: Path) -> None:
     """Somebody's own protocol, of which two people have two states."""
     rules = tmp_path / "mine.toml"
-    assert main(["new", "protocol", str(rules)]) == 0
+    assert main(["protocols", "new", str(rules)]) == 0
     eve = painted_bundle(tmp_path, "eve", ["@drop=2"], scenes="a", more=["--protocols", str(rules)])
     files, manifest = read_bundle(eve)
     record = json.loads(files["runs/eve/run.json"])
@@ -149,7 +149,7 @@ def test_features_of_two_encoders_do_not_mix_where_the_protocol_names_one(regist
 def test_the_site_holds_a_page_a_method_and_scene_and_no_text_of_a_bundle_is_markup(
     registry: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["registry", "build", str(registry), "--out", str(tmp_path / "site"), "--title", STRUCK]
+    words = ["dev", "registry", "build", str(registry), "--out", str(tmp_path / "site"), "--title", STRUCK]
     assert main([*words, "--bundles-at", "https://example.org/b"]) == 0
     pages = sorted(path.relative_to(tmp_path / "site").as_posix() for path in (tmp_path / "site").rglob("*.html"))
     assert len(pages) == 1 + 3 + 3
@@ -189,6 +189,6 @@ def test_wrong_words_are_one_line(
     Path("full/pointer.zip").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
     Path("full/link.zip").symlink_to(registry / "bundles" / "ann.zip")
     shutil.copy(registry / "bundles" / "ann.zip", "full/free.zip")
-    assert main(["registry", *words]) == 2
+    assert main(["dev", "registry", *words]) == 2
     said = capsys.readouterr().err
     assert says in said and said.count("\n") == 1

@@ -34,7 +34,7 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 def test_a_bundle_that_holds_comes_in_to_the_last_bit_once(
     bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["registry", "add", str(bundle), "--to", str(tmp_path)]
+    words = ["dev", "registry", "add", str(bundle), "--to", str(tmp_path)]
     assert main([*words, "--name", "opensu3d", "--json"]) == 0
     (found,) = json.loads(capsys.readouterr().out)["bundles"]
     assert found["is_added"] and found["is_to_the_bit"] and (found["n_rows"], found["n_scores"]) == (5, 5)
@@ -89,7 +89,7 @@ def test_a_tampered_bundle_is_refused_with_its_reason(
     files, manifest = read_bundle(bundle)
     tamper(files)
     rewrite_bundle(tmp_path / "t.zip", files, manifest)
-    assert main(["registry", "add", str(tmp_path / "t.zip"), "--to", str(tmp_path)]) == 1
+    assert main(["dev", "registry", "add", str(tmp_path / "t.zip"), "--to", str(tmp_path)]) == 1
     assert "t.zip: refused: " in (said := capsys.readouterr().out) and says in said
     assert not (tmp_path / "bundles").exists()
 
@@ -100,14 +100,14 @@ def test_a_file_that_is_not_the_manifests_is_refused_unread(
     content = bundle.read_bytes()
     at = content.rindex(b'"n_workers"')
     (tmp_path / "t.zip").write_bytes(content[:at] + b'"m_workers"' + content[at + 11 :])
-    assert main(["registry", "add", str(tmp_path / "t.zip"), "--to", str(tmp_path)]) == 2
+    assert main(["dev", "registry", "add", str(tmp_path / "t.zip"), "--to", str(tmp_path)]) == 2
     assert "t.zip: " in capsys.readouterr().err
 
 
 @pytest.fixture
 def repository(tmp_path: Path) -> Path:
     folder = tmp_path / "my-results"
-    assert main(["new", "registry", str(folder)]) == 0
+    assert main(["dev", "registry", "new", str(folder)]) == 0
     git(folder, "init", "--quiet", "--initial-branch", "main")
     commit(folder)
     return folder
@@ -170,5 +170,5 @@ def test_the_workflows_commands_score_a_pull_request_and_build_the_site_as_they_
 
 
 def test_a_registry_overwrites_nothing(repository: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["new", "registry", str(repository)]) == 2
+    assert main(["dev", "registry", "new", str(repository)]) == 2
     assert "README.md is there already; name another folder, nothing is overwritten" in capsys.readouterr().err

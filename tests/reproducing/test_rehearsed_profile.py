@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
-from tiny_models import needs_models
+from tiny_models import needs_models, write_fetched
 
 from su3d_bench.cli.main import main
-from su3d_bench.cli.reproduce import rehearsal
 from su3d_bench.core.errors import Su3dError
 from su3d_bench.reproducing.asked import Asked, asked_runs, plan_of
 from su3d_bench.reproducing.preflight import preflight
@@ -25,29 +25,28 @@ def out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "out"
 
 
-@needs_models
-def test_a_rehearsal_has_the_papers_profile_with_the_models_that_its_tables_need(
+def test_the_embedded_profile_is_rehearsed_and_the_first_line_says_so(
     out: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([*WORDS, "--out", str(out)]) == 0
     said = capsys.readouterr()
-    assert said.err.startswith("rehearsal: the profile 'paper' with tiny networks of random weights")
-    assert {path.name for path in (out / "models").iterdir() if not path.name.startswith(".")} == {
-        "clip-vit-l-14-336", "grounding-dino", "ram-plus-onnx", "sam-vit-h",
-    }  # fmt: skip
+    assert said.err.startswith("rehearsal: the profile 'embedded' in place of 'paper'")
     assert "everything that is required is here" in said.out
+    assert main([*WORDS, "--out", str(out), "--profile", "paper"]) == 1
+    assert "fetch models" in capsys.readouterr().out, "its models are not here"
 
 
-def test_without_the_extras_the_embedded_profile_is_rehearsed_and_the_first_line_says_so(
-    out: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@needs_models
+def test_the_profile_paper_runs_end_to_end_on_tiny_networks(
+    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(rehearsal, "find_spec", lambda name: None if name == "onnx" else name)
-    assert main([*WORDS, "--out", str(out)]) == 0
-    said = capsys.readouterr().err
-    assert said.startswith("rehearsal: the profile 'embedded' in place of 'paper': onnx is not installed (pip install")
-    assert not (out / "models").exists()
-    assert main([*WORDS, "--out", str(out), "--profile", "paper"]) == 2
-    assert "--rehearse --profile paper: onnx is not installed" in capsys.readouterr().err
+    monkeypatch.setenv("SU3D_MODELS", str(write_fetched(tmp_path / "models")))
+    words = [word for word in WORDS if word != "--dry-run"]
+    assert main([*words, "--out", str(out), "--profile", "paper", "--jobs", "1", "--quiet"]) == 0
+    cells = json.loads((out / "compared.json").read_text())["cells"]
+    assert cells and all(cell["measured"] is not None for cell in cells)
+    runs = [json.loads(path.read_text()) for path in out.glob("runs/*/run.json")]
+    assert {one["encoder"] for one in runs} >= {"ViT-L-14-336/openai"}
 
 
 @pytest.mark.parametrize("device", ["gpu", "cuda:99"])

@@ -15,7 +15,7 @@ from su3d_bench.core.errors import ConfigError
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.reproducing.predictions import Given, named_predictions
 from su3d_bench.reproducing.recipe import load_recipe
-from su3d_bench.runs.parts import build_dataset, part_of
+from su3d_bench.runs.job import build_dataset, part_of
 
 ROOM = ["--rooms", "bedroom0", "--room-settings", "n_frames=20", "width=160", "height=120", "mesh_spacing_m=0.1"]
 WORDS = ["reproduce", "hovsg", "--rehearse", *ROOM, "--jobs", "1", "--limit", "1", "--quiet"]

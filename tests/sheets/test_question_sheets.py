@@ -348,7 +348,7 @@ def test_what_not_everybody_calls_right_is_written_for_leave_out(
 
 
 def test_disputed_questions_are_not_made_again(capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["questions", "make", "--scenes", SCENE, "--per-kind", "2", "--out"]
+    words = ["query", "make", "--scenes", SCENE, "--per-kind", "2", "--out"]
     assert main([*words, "all.toml"]) == 0
     before = read_questions(Path("all.toml"))
     gone = before[0]

@@ -66,7 +66,7 @@ def told(capsys: pytest.CaptureFixture[str], *words: str) -> list[dict[str, Any]
 
 
 def asked(made: Path, server: ChatServer, *more: str) -> list[str]:
-    quick = ["perception.language.backoff_s=0.001", "perception.language.max_retries=0"]
+    quick = ["perception.language.max_retries=0"]
     words = ["--kind", "reasoning", "--questions", str(made / "asked.csv"), "--out", "out", "--solver", "llm"]
     return [*words, "--model", "tiny", "--base-url", server.url, *more, "--set", *quick]
 

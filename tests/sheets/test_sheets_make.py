@@ -20,7 +20,7 @@ from PIL import Image
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, DataError
 from su3d_bench.core.maps import Instances
-from su3d_bench.metrics.questions.truths import RefinedNames
+from su3d_bench.metrics.questions.score import RefinedNames
 from su3d_bench.questions.model import new_question
 from su3d_bench.questions.reasoning.answers import Answer
 from su3d_bench.questions.reasoning.asking import built_in

@@ -32,7 +32,7 @@ from su3d_bench.reports.pictures.items import (
     zoomed,
 )
 from su3d_bench.runs import finished as finished_run
-from su3d_bench.runs.executors.local import run_processes
+from su3d_bench.runs.executors import run_processes
 from su3d_bench.sheets.making.drawing import Artist, SceneDrafts, _lost, draw_all, draw_scene
 from su3d_bench.sheets.making.run_source import RunSource
 

@@ -12,9 +12,9 @@ from box_room import INTRINSICS, images, pose
 from painted import colour_perception
 from places import SCENES
 
-from su3d_bench.baselines.conceptfusion import feature_table
-from su3d_bench.baselines.conceptfusion.feature_table import FeatureTable
+from su3d_bench.baselines.conceptfusion import point_fusion as feature_table
 from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig
+from su3d_bench.baselines.conceptfusion.point_fusion import FeatureTable
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError, StoreError
 from su3d_bench.core.maps import DenseFeatures

@@ -14,7 +14,7 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.toml import parse_toml
 from su3d_bench.datasets.scannetpp.labels import CLASSES_NAME, INSTANCES_NAME, MAP_NAME
-from su3d_bench.metrics.protocols.files import CLASS_TABLES
+from su3d_bench.metrics.protocols.loading import CLASS_TABLES
 
 ROOM_NAME, SCENE_NAME = re.compile(r"([a-z]+)(\d{1,2})"), re.compile(r"0000000(\d)(\d\d)")
 MAP_COLUMNS = ("class", "count", "semantic_map_to", "instance_map_to")

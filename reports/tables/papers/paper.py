@@ -20,8 +20,7 @@ from su3d_bench.formats.tables.table import (
     is_count,
     percent,
 )
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.questions.score import RELATIVE, said_by
 from su3d_bench.numerics.statistics import SignFlipTest, holm, sign_flip_test
 from su3d_bench.reports.tables.model import Measured, confidence_notes, few_scenes, label_notes

@@ -15,11 +15,11 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from su3d_bench.analysis.gate.costs import Cost, calibration_of, method_cost
-from su3d_bench.analysis.recomputed import damaged_files, why_not_counted
 from su3d_bench.core.config import MOVES_NO_NUMBER
 from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, printable
 from su3d_bench.core.files.atomic import read_json
 from su3d_bench.runs.finished import FinishedRun
+from su3d_bench.runs.verify import damaged_files, why_not_counted
 from su3d_bench.store.records import ROUNDING, ResultRecord, impossible_value
 
 SCHEMA: Literal[2] = 2  # 1 had the cost of an update alone, from the stages that a method named itself

@@ -22,7 +22,7 @@ from su3d_bench.analysis.page.scene_data import SceneData
 from su3d_bench.core.errors import DataError, Su3dError, printable
 from su3d_bench.core.files.atomic import is_file
 from su3d_bench.metrics.attribution.arrays import LookedAt
-from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report, run_inline, run_processes
+from su3d_bench.runs.executors import SCENE_DONE, Event, Report, run_inline, run_processes
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 QUERIES = (

@@ -11,8 +11,7 @@ import numpy as np
 from su3d_bench.analysis.attribution import Explained, MendedJob
 from su3d_bench.core.errors import DataError, Su3dError
 from su3d_bench.metrics.attribution.arrays import EXPLAINED, MendedScene
-from su3d_bench.metrics.attribution.masks import Mended
-from su3d_bench.metrics.attribution.points import MendedPoints
+from su3d_bench.metrics.attribution.masks import Mended, MendedPoints
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.matching.nearest import COVERAGE_RADII_M
 from su3d_bench.metrics.metric import Counts, SceneScore

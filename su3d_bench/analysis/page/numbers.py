@@ -19,7 +19,7 @@ from su3d_bench.metrics.semantic.confusion import SemanticCounts, concatenate
 from su3d_bench.reports.page.numbers import confusion_cells, series_of, summary_data
 from su3d_bench.reports.tables.found import Found, Unscored, not_scored_lines
 from su3d_bench.runs.finished import FinishedRun, read_update_times
-from su3d_bench.runs.found import found_in, without_score
+from su3d_bench.runs.summary import found_in, without_score
 from su3d_bench.store.records import ResultRecord, plain
 
 MOST_PAIRS = 40  # pairs of methods that are compared: all of nine methods, and a few seconds
@@ -28,8 +28,8 @@ MOST_PAIRS = 40  # pairs of methods that are compared: all of nine methods, and 
 MOST_JOBS = 500
 MOST_MAPS = 16  # of a page of more jobs: two scenes under eight methods
 LEFT_OUT = (
-    "what each job's own files say is left out: errors (su3d-bench attribute), confusions, times (report timing), "
-    f"comparisons (compare) and all maps but those of the first scenes, at most {MOST_MAPS}"
+    "what each job's own files say is left out: errors (su3d-bench report attribution), confusions, times (report "
+    f"timing), comparisons (compare) and all maps but those of the first scenes, at most {MOST_MAPS}"
 )
 # Of a record of results: what the page says elsewhere, or not at all.
 NOT_SHOWN = ("encoder_digest", "anytime")

@@ -45,7 +45,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.analysis.timeline import SceneTimeline, refuse_nothing
     from su3d_bench.core.files.atomic import make_folder, replacing
     from su3d_bench.reports.timeline.rrd import rerun_sdk, write_rrd
-    from su3d_bench.runs.executors.local import Event
+    from su3d_bench.runs.executors import Event
     from su3d_bench.runs.finished import read_run
     from su3d_bench.sheets.making.run_source import chosen_of
     from su3d_bench.store.run_folder import refuse_records

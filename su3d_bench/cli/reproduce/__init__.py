@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from su3d_bench.reproducing.preflight import Preflight
     from su3d_bench.reproducing.recipe import Experiment, Recipe
 
-VARIABLES = ("SU3D_DATA", "SU3D_MODELS")  # where a rehearsal's own data and models lie
+VARIABLES = ("SU3D_DATA",)  # where a rehearsal's own data lie
 OF_A_RUN = ("jobs", "limit", "solver", "offline", "executor", "ray_address", "gpus_per_job", "retries", "slurm")
 
 
@@ -45,7 +45,7 @@ def add_parser(verbs: Any) -> None:
         "--probe", action="store_true", help="first measure what updates cost here, a few of each method"
     )
     parser.add_argument(
-        "--rehearse", action="store_true", help="the same on rooms made in the same layouts, with tiny networks"
+        "--rehearse", action="store_true", help="the same on rooms made in the same layouts, with embedded perception"
     )
     parser.add_argument("--rooms", nargs="+", metavar="ROOM", help="of a rehearsal (default: the recipe's)")
     parser.add_argument(
@@ -100,14 +100,14 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.reproducing.probe import environment
 
     asked = rehearsed(recipe, experiments, _asked(arguments), out, arguments)
-    with environment(**places(out, asked)):
+    with environment(**places(out)):
         return _reproduce(recipe, experiments, asked, out, arguments)
 
 
 def _check_device(arguments: argparse.Namespace) -> None:
     """Raise before anything is made or weighed where there is no such GPU; a cluster's machines have theirs."""
     from su3d_bench.core.system.devices import DEVICE, EXPECTED_DEVICE, device_for
-    from su3d_bench.runs.executors.choose import ELSEWHERE
+    from su3d_bench.runs.executors import ELSEWHERE
 
     if arguments.device is None:
         return

@@ -93,7 +93,7 @@ def add_parser(actions: Any) -> None:
         "--solver",
         choices=("built-in", "llm"),
         default="built-in",
-        help="who answers in reasoning sheets: geometry alone (default), or a language model, as in su3d-bench ask",
+        help="who answers in reasoning sheets: geometry alone (default), or a language model, as in query ask",
     )
     add_language_flags(parser)
 
@@ -293,7 +293,7 @@ def _drawn(
 ) -> dict[SheetKind, list[bytes]]:
     """The pictures of all drafts."""
     from su3d_bench.cli.shared.bars import progress
-    from su3d_bench.runs.executors.local import Event
+    from su3d_bench.runs.executors import Event
     from su3d_bench.sheets.making.drawing import draw_all
 
     flat = [draft for of_kind in drafts.values() for draft in of_kind]

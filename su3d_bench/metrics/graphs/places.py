@@ -15,7 +15,7 @@ from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import UP, Float64Array, Floor, GroundTruth, Int64Array, Places, Room
-from su3d_bench.metrics.graphs.overlaps import (
+from su3d_bench.metrics.graphs.objects import (
     THRESHOLDS,
     Cloud,
     best_pairs,

@@ -20,8 +20,8 @@ import numpy as np
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.toml import parse_toml
 from su3d_bench.core.types import GroundTruth
-from su3d_bench.metrics.questions.presence_counts import SAMPLINGS
-from su3d_bench.metrics.questions.truths import AskedThing
+from su3d_bench.metrics.questions.presence import SAMPLINGS
+from su3d_bench.metrics.questions.score import AskedThing
 from su3d_bench.questions.known_objects import is_called, plain_name
 from su3d_bench.questions.reasoning.scene_map import SceneMap, is_room_surface
 

@@ -27,7 +27,7 @@ from su3d_bench.questions.files.groups import ClassOfName, grouped_by_truth, sca
 COLUMNS = ("scene", "text", "objects")
 MORE_COLUMNS = ("kind", "source")  # may be there, in any order behind the others
 MOST_OBJECTS_ID = 2**31 - 1
-ADVICE = "name a file of queries, TOML or CSV, such as su3d-bench questions make --out queries.toml writes"
+ADVICE = "name a file of queries, TOML or CSV, such as su3d-bench query make --out queries.toml writes"
 MOST_BYTES = 16 << 20  # some hundred thousand queries
 MOST_CHARACTERS = 20_000  # of one text
 VARIANT = "query-objects"

@@ -9,7 +9,7 @@ import numpy as np
 
 from su3d_bench.core.errors import printable
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.metrics.questions.truths import GivenAnswer, TrueAnswer
+from su3d_bench.metrics.questions.score import GivenAnswer, TrueAnswer
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.questions.reasoning.answers import Answer

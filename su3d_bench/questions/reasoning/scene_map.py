@@ -11,8 +11,7 @@ from su3d_bench.core.english import last_word
 from su3d_bench.core.errors import PredictionError, printable
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import BoolArray, Float64Array
-from su3d_bench.metrics.questions.score import labels_n
-from su3d_bench.metrics.questions.truths import RefinedNames
+from su3d_bench.metrics.questions.score import RefinedNames, labels_n
 from su3d_bench.numerics.relations import (
     BUILT_IN,
     FIXTURES,

@@ -13,7 +13,7 @@ from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.files.atomic import read_json, write_json
 from su3d_bench.core.maps import Instances
-from su3d_bench.metrics.questions.truths import RefinedNames
+from su3d_bench.metrics.questions.score import RefinedNames
 from su3d_bench.questions.refining.refinement import RefinedName, TopNames
 from su3d_bench.questions.truths import voted_names
 from su3d_bench.questions.undesired import FilterConfig, undesired
@@ -61,7 +61,7 @@ class NameRecords(BaseModel):
         who = f"the model {self.model}" if self.refiner == "model" else "the vote"
         return RefinedNames(
             tuple(record.refined for record in self.names),
-            f"{who} of su3d-bench refine, names of {self.top_m} views",
+            f"{who} of su3d-bench runs refine, names of {self.top_m} views",
             tuple(record.left_out for record in self.names),
         )
 
@@ -119,12 +119,14 @@ def read_records(job: JobFolder) -> NameRecords | None:
     try:
         content = read_json(path)
         if isinstance(content, dict) and content.get("schema_version") == 1:
-            raise StoreError(f"{path}: knows no filter of large background yet; give su3d-bench refine again")
+            raise StoreError(f"{path}: knows no filter of large background yet; give su3d-bench runs refine again")
         records = NameRecords.model_validate(content)
     except (ValidationError, RecursionError) as error:
-        raise StoreError(f"{path}: is not as su3d-bench refine writes it; give that command again") from error
+        raise StoreError(f"{path}: is not as su3d-bench runs refine writes it; give that command again") from error
     if records.schema_version != SCHEMA or records.prediction_sha256 != digest_file(job.prediction):
-        raise StoreError(f"{path}: belongs to another map than {job.prediction.name}; give su3d-bench refine again")
+        raise StoreError(
+            f"{path}: belongs to another map than {job.prediction.name}; give su3d-bench runs refine again"
+        )
     return records
 
 

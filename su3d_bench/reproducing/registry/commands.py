@@ -8,8 +8,8 @@ from typing import Any
 
 from su3d_bench.core.config import DEFAULT_SOURCE, MOVES_NO_NUMBER, KeyPath, RunConfig, toml_value
 from su3d_bench.core.errors import printable
+from su3d_bench.runs.existing import existing_run
 from su3d_bench.runs.finished import FinishedRun
-from su3d_bench.runs.planning.held import held_run
 
 UNKNOWN = "not known: run.toml is not whole"
 MOST_CHARACTERS = 2000
@@ -22,7 +22,7 @@ def command_of(run: FinishedRun, method: str) -> str:
     """
     if method in run.made_elsewhere:
         return printable(_evaluation(run, method), MOST_CHARACTERS)
-    held = held_run(run.folder.path)
+    held = existing_run(run.folder.path)
     if held is None or not held.is_known:
         return UNKNOWN
     asked = {path: value for path, value in held.values.items() if held.remarks.get(path) != DEFAULT_SOURCE}

@@ -45,7 +45,7 @@ def bundle_files(folder: Path) -> list[Path]:
     A ``ConfigError`` where it is no folder.
     """
     if not folder.is_dir():
-        raise ConfigError(f"{shown(folder)}: is no folder; begin a registry with: su3d-bench new registry DIR")
+        raise ConfigError(f"{shown(folder)}: is no folder; begin a registry with: su3d-bench dev registry new DIR")
     place = folder / BUNDLES if (folder / BUNDLES).is_dir() else folder
     try:
         files = sorted(place / name for name in os.listdir(place) if name.lower().endswith(SUFFIX))
@@ -65,7 +65,7 @@ def read_registry(folder: Path) -> Registry:
     files = bundle_files(folder)
     if not files and not (folder / BUNDLES).is_dir():
         raise ConfigError(
-            f"{shown(folder)}: holds no bundle; bring one in with: su3d-bench registry add BUNDLE --to DIR"
+            f"{shown(folder)}: holds no bundle; bring one in with: su3d-bench dev registry add BUNDLE --to DIR"
         )
     rows: list[Row] = []
     refused: list[Refused] = []

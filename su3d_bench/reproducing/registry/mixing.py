@@ -10,8 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.reproducing.registry.rows import Row
 
 N_DIGITS = 12  # of a digest, in a message

@@ -11,8 +11,7 @@ from su3d_bench.core.errors import ConfigError, printable, shown, some
 from su3d_bench.core.files.atomic import is_file, make_folder, read_json, remove_file, write_json, write_text
 from su3d_bench.core.files.locks import is_unfinished
 from su3d_bench.formats.tables.table import NOT_MEASURED, Cell, Prose, Table, TableRow, is_count, with_interval
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.reports.registry.page import PAGE, page_html, page_name
 from su3d_bench.reports.tables.model import confidence_notes, few_scenes
 from su3d_bench.reproducing.registry.folder import SUFFIX, Registry
@@ -21,7 +20,7 @@ from su3d_bench.reproducing.registry.rows import Row
 INDEX, DATA = "index.html", "registry.json"
 METHODS, SCENES = "methods", "scenes"
 SCHEMA = 1
-KIND = "su3d-bench registry"  # by which an earlier site is known
+KIND = "su3d-bench dev registry"  # by which an earlier site is known
 MOST_OF_AN_ADDRESS = 500
 TITLE = "Registry of results"
 

@@ -17,13 +17,16 @@ from su3d_bench.core.types import Float32Array, GroundTruth
 from su3d_bench.metrics.instance.score import Covered
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.score import (
+    AskedText,
+    GivenAnswer,
+    ReasoningTruth,
+    TrueAnswer,
     are_objects_right,
     is_answer_right,
     judge_merging,
     judge_retrieval,
     labels_n,
 )
-from su3d_bench.metrics.questions.truths import AskedText, GivenAnswer, ReasoningTruth, TrueAnswer
 from su3d_bench.perception.language.chat import ChatRequest
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.perception.language.config import LanguageConfig

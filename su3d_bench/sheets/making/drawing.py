@@ -18,7 +18,7 @@ from su3d_bench.reports.pictures.items import ItemParts, Panel, Tag, compose, pn
 from su3d_bench.reports.pictures.map_views import MapView, pale
 from su3d_bench.reports.pictures.render import colour
 from su3d_bench.reports.pictures.scene_look import evenly
-from su3d_bench.runs.executors.local import Event, Report, run_inline, run_processes
+from su3d_bench.runs.executors import Event, Report, run_inline, run_processes
 from su3d_bench.sheets.items import SheetKind
 from su3d_bench.sheets.making.drafts import Draft
 from su3d_bench.sheets.making.run_source import mask_digest

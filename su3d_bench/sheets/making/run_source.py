@@ -22,10 +22,9 @@ from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
 from su3d_bench.core.types import Frame, GroundTruth
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.instance.score import Covered, covered_objects
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.questions.truths import RefinedNames
+from su3d_bench.metrics.questions.score import RefinedNames
 from su3d_bench.questions.reasoning.scene_map import SceneMap, map_of
 from su3d_bench.questions.refining.refined_names import refined_names
 from su3d_bench.runs.finished import FinishedRun, read_run

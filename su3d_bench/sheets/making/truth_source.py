@@ -15,8 +15,8 @@ from su3d_bench.core.types import Frame, GroundTruth
 from su3d_bench.questions.sight import instance_rows, looked_at
 from su3d_bench.questions.truths import fullest_truth
 from su3d_bench.runs.finished import read_run
-from su3d_bench.runs.parts import build_dataset, part_of
-from su3d_bench.runs.planning.scenes import data_root, dataset_targets, expand_scenes
+from su3d_bench.runs.job import build_dataset, part_of
+from su3d_bench.runs.scenes import data_root, dataset_targets, expand_scenes
 from su3d_bench.sheets.making.run_source import chosen_of
 
 

@@ -10,7 +10,7 @@ from scored_room import ENCODER, room, truth_as_prediction
 
 from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.metrics.questions.truths import AskedThing, PresenceTruth
+from su3d_bench.metrics.questions.score import AskedThing, PresenceTruth
 from su3d_bench.metrics.scoring import combine, pack_scores, score_scene, unpack_scores
 from su3d_bench.questions.files.queries import query_truth
 

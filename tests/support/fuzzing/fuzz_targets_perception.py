@@ -15,7 +15,7 @@ from fuzzing import Make, Read, Target, every_one_of
 def _gsa(folder: Path) -> Read:
     from test_perception_gsa import FRAME, PATTERN, SCENE, detections, write
 
-    from su3d_bench.perception.stored.gsa_files import GsaFiles
+    from su3d_bench.perception.stored_masks import GsaFiles
 
     write(folder, detections())
     return lambda: GsaFiles(folder, PATTERN, SCENE).frame(FRAME)
@@ -25,7 +25,7 @@ def _gsa_inside(folder: Path) -> Read:
     """The same with the gzip left whole."""
     from test_perception_gsa import FRAME, PATTERN, SCENE, detections, write
 
-    from su3d_bench.perception.stored.gsa_files import GsaFiles
+    from su3d_bench.perception.stored_masks import GsaFiles
 
     path, plain = write(folder, {}), folder / "plain.pkl"
     plain.write_bytes(pickle.dumps(detections(), 4))
@@ -41,7 +41,7 @@ def _stored(folder: Path) -> Read:
     from perception_fakes import CountingEncoder, still_life
     from test_perception_stored import written
 
-    from su3d_bench.perception.stored.npz_files import read_stored
+    from su3d_bench.perception.stored import read_stored
 
     path, encoder = written(folder, with_features=True), CountingEncoder()
     return lambda: read_stored(path, still_life(40), encoder)
@@ -51,7 +51,7 @@ def _label_images(folder: Path) -> Read:
     from perception_fakes import still_life
     from test_perception_stored_images import PATTERN, SCENE, write_image
 
-    from su3d_bench.perception.stored.label_images import LabelImages
+    from su3d_bench.perception.stored_masks import LabelImages
 
     write_image(folder)
     return lambda: LabelImages(folder, PATTERN, None, SCENE).regions(still_life(40))
@@ -59,7 +59,7 @@ def _label_images(folder: Path) -> Read:
 
 def _names(name: str) -> Make:
     def make(folder: Path) -> Read:
-        from su3d_bench.perception.stored.label_images import read_names
+        from su3d_bench.perception.stored_masks import read_names
 
         table = {"48": "book", "132": "box of things"}
         lines = "".join(f'{key} = "{text}"\n' for key, text in table.items())
@@ -78,7 +78,7 @@ def _words(folder: Path) -> Read:
 
 def _model_settings(name: str, of: Callable[[Any], tuple[Any, Callable[[Path], object]]]) -> Make:
     def make(folder: Path) -> Read:
-        import test_models_damage as settings
+        import model_settings as settings
 
         content, read = of(settings)
         path = folder / name
@@ -92,16 +92,8 @@ def _tagger_manifest(folder: Path) -> Read:
     from su3d_bench.perception.models.masks.tagging import RAM_MODEL, RAM_TAG_LIST, RamManifest
 
     digests = {RAM_MODEL: "0" * 64, RAM_TAG_LIST: "1" * 64}
-    parity = {"output": "logit", "n_values": 15, "max_abs_difference": 1e-6, "min_cosine": 1.0}
-    content: dict[str, Any] = {
-        "format": RamManifest.FORMAT,
-        "name": "ram-plus",
-        "files": digests,
-        "source": {"form": "original"},
-    }
-    content |= {"opset": 17, "parity": [parity], "n_tags": 5, "code": {"ram/models/bert.py": "2" * 64}}
     path = folder / "manifest.json"
-    path.write_text(json.dumps({**content, "made_with": {"torch": "2.13.0"}, "n_undecided": 0}))
+    path.write_text(json.dumps({"format": RamManifest.FORMAT, "name": "ram-plus", "files": digests}))
     return lambda: RamManifest.read(path)
 
 
@@ -123,9 +115,8 @@ def _completion(folder: Path) -> Read:
     from chat_server import KEY
     from test_language_client import ask
 
+    from su3d_bench.perception.language.client import Server, _Failed
     from su3d_bench.perception.language.config import LanguageConfig
-    from su3d_bench.perception.language.key_cleaning import Secret
-    from su3d_bench.perception.language.transport import GiveUp, Transport, TryAgain
 
     content = {
         "model": "made",
@@ -134,16 +125,16 @@ def _completion(folder: Path) -> Read:
     }
     path = folder / "answer.json"
     path.write_text(json.dumps(content))
-    transport, request = Transport(LanguageConfig()), ask("What is that?")
-    transport._secret = Secret(KEY)
+    server, request = Server(LanguageConfig()), ask("What is that?")
+    server._key = KEY
 
     def read() -> object:
-        text = path.read_bytes().decode("utf-8", "replace") if path.is_file() else ""
+        content = path.read_bytes() if path.is_file() else b""
         try:
-            said: object = transport._reply(request, text, ())
-        except (TryAgain, GiveUp) as failed:
-            said = failed  # the client asks again
-        if KEY.lower() in f"{said!r} {said}".lower():
+            said: object = server._reply(request, content, ())
+        except _Failed as failed:
+            said = failed
+        if KEY in f"{said!r} {said}":
             raise AssertionError(f"the key is kept: {said}")
         return said
 
@@ -185,10 +176,12 @@ TARGETS = (
     Target("names.toml", _names("names.toml"), ("names.toml",)),
     Target("names.json", _names("names.json"), ("names.json",)),
     Target("word list", _words, ("words.txt",)),
-    Target("encoder manifest", _model_settings("manifest.json", lambda one: (one.ENCODER, one.read_manifest)), ("*",)),
     Target(
-        "sam manifest", _model_settings("manifest.json", lambda one: (one.SEGMENTER, one.read_sam_manifest)), ("*",)
+        "encoder manifest",
+        _model_settings("manifest.json", lambda one: (one.ENCODER, one.EncoderManifest.read)),
+        ("*",),
     ),
+    Target("sam manifest", _model_settings("manifest.json", lambda one: (one.SEGMENTER, one.SamManifest.read)), ("*",)),
     Target(
         "model config", _model_settings("config.json", lambda one: (one.CONFIG, one.encoder_spec)), ("config.json",)
     ),

@@ -141,7 +141,7 @@ def _own_prediction(kind: str) -> Make:
 def _truth(folder: Path) -> Read:
     from evaluated_text import write_truth
 
-    from su3d_bench.evaluation.truth import read_values
+    from su3d_bench.evaluation.text_truth import read_values
 
     write_truth(folder, values=[0, 5001, 1163002, 39001, 7])
     return lambda: read_values(folder / "scene0001_00.txt")
@@ -160,7 +160,7 @@ def _proposals(folder: Path) -> Read:
     from prediction_files import write_openmask3d, write_scannet_text
     from test_proposals import SCENE, flat
 
-    from su3d_bench.baselines.openmask3d.proposal_files import digest_of_folder, read_proposals
+    from su3d_bench.baselines.openmask3d.proposals import digest_of_folder, read_proposals
 
     write_scannet_text(folder / "text", SCENE)
     write_openmask3d(folder / "torch", SCENE, np.zeros((3, 4)))
@@ -178,7 +178,7 @@ def _command_output(folder: Path) -> Read:
     from prediction_files import TOY, write_openyolo3d
     from test_proposals import flat
 
-    from su3d_bench.baselines.command.prediction import as_prediction, read_output
+    from su3d_bench.baselines.command.folders import as_prediction, read_output
 
     write_openyolo3d(folder, TOY)
     n = TOY["masks"].shape[1]

@@ -65,8 +65,8 @@ def _run(folder: Path) -> Read:
     from su3d_bench.analysis.leaderboard import leaderboard
     from su3d_bench.analysis.sides import Side
     from su3d_bench.analysis.tables import measured_results
+    from su3d_bench.runs.advice import recent_update_s
     from su3d_bench.runs.finished import read_run, read_update_times
-    from su3d_bench.runs.planning.estimate import recent_update_s
 
     path, reference = copied_run(folder), folder / "reference.json"
     reference.write_text(json.dumps(learn([read_run(path)]).model_dump(mode="json")))
@@ -101,11 +101,11 @@ def _verbs(folder: Path) -> Read:
             ["report", "leaderboard", str(folder / "runs")],
             ["compare", f"{run}:collector", f"{run}:collector@drop=1", "--per-class"],
             ["check", str(run), "--against", str(folder / "reference.json")],
-            ["attribute", str(run), "--method", "collector"],
+            ["report", "attribution", str(run), "--method", "collector"],
             ["report", "html", str(run), "--out", str(folder / "page.html")],
-            ["export", str(run), "--to", "openlex3d", "--method", "collector", "--out", str(folder / "out")],
+            ["runs", "export", str(run), "--to", "openlex3d", "--method", "collector", "--out", str(folder / "out")],
             [*_command(run), "--dry-run"],
-            ["refine", str(run), "--method", "collector"],
+            ["runs", "refine", str(run), "--method", "collector"],
             ["datasets", "check", f"{SCENES}/painted.py:Painted/a"],
         ]
     )
@@ -301,9 +301,7 @@ def _method_config(folder: Path) -> Read:
 
 
 def _protocol(folder: Path) -> Read:
-    from su3d_bench.metrics.protocols.files import rules_file
-    from su3d_bench.metrics.protocols.loading import read_protocol
-    from su3d_bench.metrics.protocols.originals import original_of
+    from su3d_bench.metrics.protocols.loading import original_of, read_protocol, rules_file
 
     for name in ("rooms-semantic", "openlex3d-topn", "rooms-instance"):
         (folder / f"{name}.toml").write_bytes(rules_file(name).read_bytes())
@@ -322,7 +320,7 @@ def _published(folder: Path) -> Read:
 
 
 def _ablation(folder: Path) -> Read:
-    from su3d_bench.runs.planning.ablation import ablation_rows, read_rows, write_rows
+    from su3d_bench.runs.ablation import ablation_rows, read_rows, write_rows
 
     write_rows(folder, ablation_rows(COLLECTOR, ["noise_m=0.0,0.3", "drop=1"], is_grid=False))
     return lambda: read_rows(folder)
@@ -331,8 +329,8 @@ def _ablation(folder: Path) -> Read:
 def _assignments(folder: Path) -> Read:
     """Words of ``--set``, of variants and of ``--vary``, one a line of a file."""
     from su3d_bench.core.config import parse_value, read_assignments
-    from su3d_bench.runs.planning.ablation import ablation_rows
-    from su3d_bench.runs.planning.plan import named_method
+    from su3d_bench.runs.ablation import ablation_rows
+    from su3d_bench.runs.plan import named_method
 
     lines = ("opensu3d.top_m=10", "top_m=10,5", "perception.cache=false", "rooms.width=64", "opensu3d.a='x'")
     (folder / "words.txt").write_text("\n".join(lines))

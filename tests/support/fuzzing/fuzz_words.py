@@ -69,9 +69,9 @@ KNOWN = (
 HELD_BACK = {
     ("run",): ["--scenes", "replica/none", "--dry-run"],
     ("ablate",): ["--scenes", "replica/none", "--dry-run"],
-    ("questions",): ["--scenes", "replica/none"],
+    ("query", "make"): ["--scenes", "replica/none"],
+    ("query", "audit"): ["--scenes", "replica/none"],
     ("datasets", "make"): ["--scenes", "none/none", "--out", "folder/out"],
-    ("models", "export"): ["--out", "folder/out"],
 }
 
 

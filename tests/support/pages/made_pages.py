@@ -101,7 +101,7 @@ def page_of_second_looks(folder: Path) -> Path:
 
 def page_of_audit(folder: Path) -> Path:
     """``questions audit``."""
-    words = ["questions", "audit", "--scenes", f"{PAINTED}:Painted/a", "--n", "6", "--out", str(folder), "--quiet"]
+    words = ["query", "audit", "--scenes", f"{PAINTED}:Painted/a", "--n", "6", "--out", str(folder), "--quiet"]
     assert main(words) == 0
     return folder / "index.html"
 
@@ -114,7 +114,7 @@ def site_of_registry(folder: Path) -> Path:
         painted_bundle(registry, "ann", ["@drop=1", "@noise_m=0.3"], said=f"{LONG} {STRUCK}")
         painted_bundle(registry, "bob", [""], scenes="ab")
         words = ["--out", str(site), "--bundles-at", "https://example.org/bundles", "--quiet"]
-        assert main(["registry", "build", str(registry), *words]) == 0
+        assert main(["dev", "registry", "build", str(registry), *words]) == 0
     return site
 
 
