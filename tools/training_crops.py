@@ -18,7 +18,8 @@ from su3d_bench.core.system.files import file_text, regular
 from su3d_bench.core.types import Float32Array, Frame, Int32Array, Int64Array, Regions, UInt8Array
 from su3d_bench.perception.crops import crop_window, mask_boxes
 from su3d_bench.perception.embedded.encoder import IMAGE_SIZE, log_size, shrink
-from su3d_bench.perception.embedded.segmenter import RgbdSegmenter, SegmenterConfig
+from su3d_bench.perception.embedded.join_rules import SegmenterConfig
+from su3d_bench.perception.embedded.segmenter import RgbdSegmenter
 
 KINDS = ("living", "bedroom", "kitchen", "office", "bathroom", "studio")
 FIRST_TRAINING_NUMBER = 10000

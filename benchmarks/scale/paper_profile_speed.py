@@ -24,7 +24,7 @@ from su3d_bench.perception.models.encoders.towers import TransformersTowers
 from su3d_bench.perception.models.masks.automatic_masks import AUTOMATIC_MASKS, AutomaticMasks
 from su3d_bench.perception.models.masks.grounding_dino import BoxConfig, GroundingDino
 from su3d_bench.perception.models.masks.sam import Sam, TorchSam, sam_config
-from su3d_bench.runs.planning.scenes import data_root
+from su3d_bench.runs.scenes import data_root
 
 N_BOXES, N_RATIOS = 15, 3  # named things in an image of a room, and the paper's crops of each
 N_TAGS = 20

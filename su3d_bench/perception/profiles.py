@@ -22,8 +22,9 @@ from su3d_bench.core.types import (
 )
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.detections import Assembler, captioned_by_colour
+from su3d_bench.perception.embedded.join_rules import SegmenterConfig
 from su3d_bench.perception.embedded.naming import Namer, NamingConfig
-from su3d_bench.perception.embedded.segmenter import RgbdSegmenter, SegmenterConfig
+from su3d_bench.perception.embedded.segmenter import RgbdSegmenter
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, PaperConfig
 from su3d_bench.perception.oracle import OracleConfig, OraclePerception

@@ -87,7 +87,7 @@ class Rehearsal(BaseModel):
 
     rooms: Annotated[tuple[Word, ...], Field(min_length=1)] = ("bedroom0", "office0")
     settings: tuple[Word, ...] = ("n_frames=100", "width=240", "height=180")
-    profile: Literal["paper", "embedded", "oracle"] = "embedded"
+    profile: Literal["embedded", "oracle"] = "embedded"
 
 
 class Recipe(BaseModel):

@@ -10,13 +10,16 @@ from typing import Any
 
 from su3d_bench.core import registry
 from su3d_bench.core.config import Settings, flatten, resolve
-from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_file, digest_json, package_versions
+from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_json, package_versions
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.interfaces import HasCaveat, HasInputs, HasOwnPerception, Method, ReadsMadeRooms, TakesTruth
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.types import GroundTruth, LabelSet, SceneInfo
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.scoring import Truth
+from su3d_bench.metrics.semantic.panoptic import told_truth
 from su3d_bench.perception.profiles import Perception, PerceptionConfig
 from su3d_bench.questions.reasoning.language_solver import answers_digest
 from su3d_bench.questions.refining.refined_names import refined_digest

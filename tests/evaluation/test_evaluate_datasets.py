@@ -14,7 +14,8 @@ from places import SCENES
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.datasets.openlex3d.labels import VISIBLE_NAME
-from su3d_bench.evaluation.evaluate import Request, evaluate
+from su3d_bench.evaluation.evaluate import evaluate
+from su3d_bench.evaluation.result import Request
 
 PAINTED = f"{SCENES}/painted.py:Painted"
 

@@ -34,7 +34,8 @@ from places import CASES, SCENES
 from prediction_files import refused
 
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
-from su3d_bench.evaluation.evaluate import Request, evaluate
+from su3d_bench.evaluation.evaluate import evaluate
+from su3d_bench.evaluation.result import Request
 from su3d_bench.formats.pcd import write_pcd_points
 from su3d_bench.formats.ply import PlyElement, write_ply
 from su3d_bench.metrics.protocols.loading import load_protocol

@@ -25,8 +25,8 @@ from su3d_bench.core.errors import PredictionError
 from su3d_bench.formats import torch_zip
 from su3d_bench.formats.numpy_files import read_npy, read_npy_value, read_npz
 from su3d_bench.formats.pickles import pickle_machine
-from su3d_bench.formats.pickles.pickle_constructors import CONSTRUCTORS
-from su3d_bench.formats.pickles.pickles import Forgotten, Inert, read_pickle, read_pickle_file
+from su3d_bench.formats.pickles.pickle_constructors import CONSTRUCTORS, Forgotten, Inert
+from su3d_bench.formats.pickles.pickles import read_pickle, read_pickle_file
 
 PROTOCOLS = range(6)
 

@@ -15,7 +15,8 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, DataError
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.datasets.replica.dataset import Replica
-from su3d_bench.evaluation.evaluate import Request, evaluate
+from su3d_bench.evaluation.evaluate import evaluate
+from su3d_bench.evaluation.result import Request
 from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
 from su3d_bench.questions.files.queries import read_query_file
 

@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 
 import pytest
-from tiny_models import needs_models, write_fetched
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import Su3dError
@@ -25,30 +24,6 @@ def out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "out"
 
 
-def test_the_embedded_profile_is_rehearsed_and_the_first_line_says_so(
-    out: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main([*WORDS, "--out", str(out)]) == 0
-    said = capsys.readouterr()
-    assert said.err.startswith("rehearsal: the profile 'embedded' in place of 'paper'")
-    assert "everything that is required is here" in said.out
-    assert main([*WORDS, "--out", str(out), "--profile", "paper"]) == 1
-    assert "fetch models" in capsys.readouterr().out, "its models are not here"
-
-
-@needs_models
-def test_the_profile_paper_runs_end_to_end_on_tiny_networks(
-    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("SU3D_MODELS", str(write_fetched(tmp_path / "models")))
-    words = [word for word in WORDS if word != "--dry-run"]
-    assert main([*words, "--out", str(out), "--profile", "paper", "--jobs", "1", "--quiet"]) == 0
-    cells = json.loads((out / "compared.json").read_text())["cells"]
-    assert cells and all(cell["measured"] is not None for cell in cells)
-    runs = [json.loads(path.read_text()) for path in out.glob("runs/*/run.json")]
-    assert {one["encoder"] for one in runs} >= {"ViT-L-14-336/openai"}
-
-
 @pytest.mark.parametrize("device", ["gpu", "cuda:99"])
 def test_a_device_that_is_not_here_is_one_line_before_anything_is_made(
     out: Path, capsys: pytest.CaptureFixture[str], device: str
@@ -65,7 +40,7 @@ def test_the_device_reaches_every_run_and_the_preflight(out: Path) -> None:
     asked = Asked("embedded", "embedded", device="cuda:99", values={})
     runs = asked_runs(recipe, recipe.experiments, asked)
     assert {run.dataset for run in runs} == {"replica", "scannet"}
-    assert any(need.kind == "GPU memory" for need in preflight(runs, out).needs)
+    assert any(need.kind == "GPU memory" for need in preflight(runs).needs)
     for run in runs:
         with pytest.raises(Su3dError, match="device 'cuda:99'"):
             plan_of(run, out)

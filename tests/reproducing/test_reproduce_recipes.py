@@ -51,25 +51,6 @@ def test_opensu3ds_recipe_has_every_figure_that_is_printed_in_its_paper() -> Non
     assert figures_of(table="I") == printed[:9]
 
 
-def test_rows_of_a_sweep_are_the_variants_that_it_makes() -> None:
-    (sweep, *_) = load_recipe("opensu3d").experiments
-    rows = {figure.row: method_of_row(sweep, figure.method, figure.row) for figure in sweep.printed()}
-    assert rows["m=1"] == "opensu3d@top_m=1"
-    assert rows["m=5"] == rows["k=3"] == rows["ratios=0.8,1,1.2"] == "opensu3d"
-    assert rows["ratios=0.1,1,1.1"] == "opensu3d@crop_ratios=[0.1,1,1.1]"
-
-
-def test_tables_of_other_encoders_are_other_runs(tmp_path: Path) -> None:
-    recipe = load_recipe("opensu3d")
-    runs = asked_runs(recipe, recipe.chosen(["II", "III"]), Asked())
-    assert [(run.name, run.encoder) for run in runs] == [
-        ("replica", "clip-vit-h-14"),
-        ("replica-clip-vit-l-14-336", "clip-vit-l-14-336"),
-    ]
-    (one,) = asked_runs(recipe, recipe.chosen(["II", "III"]), Asked(encoder="embedded"))
-    assert one.folder(tmp_path) == tmp_path / "runs" / "replica"
-
-
 @pytest.mark.parametrize(
     ("change", "says"),
     [

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from su3d_bench.core.errors import ModelMissing, printable
-from su3d_bench.core.files.atomic import ZIP_EPOCH
+from su3d_bench.datasets.openlex3d.writing import ZIP_EPOCH
 from su3d_bench.sheets.items import AnnotatorShare, Sheet
 from su3d_bench.sheets.making.guide import GUIDE, guide_of
 

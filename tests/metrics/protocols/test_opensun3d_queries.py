@@ -16,7 +16,8 @@ from su3d_bench.core.errors import ConfigError, PredictionError
 from su3d_bench.core.maps import DenseFeatures, Instances
 from su3d_bench.core.types import Float32Array, GroundTruth
 from su3d_bench.datasets.arkitscenes.challenge import TRUTH_FOLDER, Challenge, answered
-from su3d_bench.evaluation.evaluate import Request, evaluate
+from su3d_bench.evaluation.evaluate import evaluate
+from su3d_bench.evaluation.result import Request
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine, score_scene

@@ -19,16 +19,9 @@ from su3d_bench.datasets.rooms.classes import MATERIALS
 from su3d_bench.perception.embedded import encoder as embedded_encoder
 from su3d_bench.perception.embedded import lexicon
 from su3d_bench.perception.embedded import text as embedded_text
-from su3d_bench.perception.embedded.encoder import (
-    DIM,
-    IMAGE_FILE,
-    IMAGE_SIZE,
-    TEXT_FILE,
-    EmbeddedEncoder,
-    log_size,
-    shrink,
-)
+from su3d_bench.perception.embedded.encoder import IMAGE_FILE, IMAGE_SIZE, TEXT_FILE, EmbeddedEncoder, log_size, shrink
 from su3d_bench.perception.embedded.text import (
+    DIM,
     N_IDS,
     N_ROWS,
     N_WORDS,

@@ -9,8 +9,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, Int32Array, Regions, UInt8Array
+from su3d_bench.perception.embedded.join_rules import SegmenterConfig
 from su3d_bench.perception.embedded.kernels import connected, sum_rows
-from su3d_bench.perception.embedded.segmenter import RgbdSegmenter, SegmenterConfig
+from su3d_bench.perception.embedded.segmenter import RgbdSegmenter
 from su3d_bench.perception.embedded.surface_graph import border_pairs
 
 K: Float64Array = np.array([[260.0, 0, 159.5], [0, 260.0, 119.5], [0, 0, 1]])

@@ -1,4 +1,4 @@
-"""What reads tables of sources, archives and records of what was fetched, recipes and prices of reproductions."""
+"""What reads tables of sources, archives and records of what was fetched, recipes of reproductions."""
 
 from __future__ import annotations
 
@@ -72,22 +72,6 @@ protocols = ["replica-mesh-ex6"]
 figures = [{ table = "II" }]
 predictions = ["HOV-SG"]
 note = "of a made room"
-"""
-COSTS = """
-where = "a machine"
-calibration_ms = 9.7
-
-[[cost]]
-method = "opensu3d"
-profile = "embedded"
-device = "cpu"
-update_s = 0.1
-scene_s = 1.5
-once_s = 0.0
-result_bytes = 1356961.0
-cache_bytes = 22786.0
-memory_bytes = 679874560.0
-device_bytes = 0.0
 """
 
 
@@ -180,14 +164,6 @@ def _recipe(folder: Path) -> Read:
     return read
 
 
-def _costs(folder: Path) -> Read:
-    from su3d_bench.reproducing.costs import read_costs
-
-    path = folder / "unit_costs.toml"
-    path.write_text(COSTS)
-    return lambda: read_costs(path).of("opensu3d@top_m=1", "embedded", "cpu")
-
-
 TARGETS = (
     Target("fetch sources", _sources, ("sources.toml",)),
     Target("fetch zip", _zip, ("a.zip",)),
@@ -197,5 +173,4 @@ TARGETS = (
     ),
     Target("fetch record", _record, (".fetched/record.json",)),
     Target("reproduce recipe", _recipe, ("mine.toml",)),
-    Target("reproduce prices", _costs, ("unit_costs.toml",)),
 )
