@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 
-from su3d_bench.cli.parser import Parser
-from su3d_bench.cli.shared.answers import remark
+from su3d_bench.cli.options import Parser
+from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import (
     EXIT_DONE,
     EXIT_INTERNAL,
@@ -24,24 +24,22 @@ from su3d_bench.core.printing import doors
 from su3d_bench.core.system.endings import Ended, ending_in_order
 from su3d_bench.core.version import __version__
 
-# Modules of this folder with ``add_parser(verbs)``, in the order of the help.
-VERBS = (
-    "run",
-    "ablate",
-    "evaluate",
-    "reproduce",
-    "compare",
-    "check",
-    "report",
-    "runs",
-    "query",
-    "sheets",
-    "datasets",
-    "models",
-    "methods",
-    "protocols",
-    "dev",
-)
+# The modules of this folder with ``add_parser(verbs)``, and their verbs, in the order of the help.
+MODULES = {
+    "run": ("run", "ablate"),
+    "evaluate": ("evaluate",),
+    "reproduce": ("reproduce",),
+    "compare": ("compare", "check"),
+    "report": ("report",),
+    "runs": ("runs",),
+    "query": ("query",),
+    "sheets": ("sheets",),
+    "datasets": ("datasets",),
+    "models": ("models",),
+    "methods": ("methods",),
+    "protocols": ("protocols",),
+    "dev": ("dev",),
+}
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 DESCRIPTION = "Evaluate and benchmark open-vocabulary, instance-level 3D scene understanding from RGB-D."
 EPILOG = """examples:
@@ -60,7 +58,7 @@ def build_parser(verb: str | None = None) -> Parser:
     )
     parser.add_argument("--version", action="version", version=f"su3d-bench {__version__}")
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
-    for name in [name for name in VERBS if name == verb] or VERBS:
+    for name in [name for name, own in MODULES.items() if verb in own] or MODULES:
         import_module(f"su3d_bench.cli.{name}").add_parser(verbs)
     return parser
 

@@ -99,7 +99,7 @@ def test_a_file_that_goes_or_moves_changes_the_key(package: Path, name: str) -> 
     assert len({before, gone, key()}) == 3
 
 
-@pytest.mark.parametrize("name", ["cli/run.py", "cli/new/verb.py", "reports/page/page.py", "metrics/README.md"])
+@pytest.mark.parametrize("name", ["cli/run.py", "cli/templates/verb.py", "reports/page/page.py", "metrics/README.md"])
 def test_what_only_shows_leaves_the_key(package: Path, name: str) -> None:
     before = key()
     (package / name).parent.mkdir(parents=True, exist_ok=True)

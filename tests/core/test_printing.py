@@ -16,7 +16,7 @@ import pytest
 
 import su3d_bench
 from su3d_bench.cli.main import main
-from su3d_bench.cli.shared.bars import drawn_bars
+from su3d_bench.cli.output import drawn_bars
 from su3d_bench.core.config import write_toml
 from su3d_bench.core.printing import Door, doors, escaped_json, one_line
 from su3d_bench.runs.executors.local import answer_of

@@ -13,7 +13,7 @@ from damage import damages, outcomes, truncations
 from places import SCENES
 
 from su3d_bench.cli.main import main
-from su3d_bench.cli.sheets.pictures import FIGURES
+from su3d_bench.cli.sheets import FIGURES
 from su3d_bench.core.errors import DataError
 from su3d_bench.questions.files.files import (
     PAPER,

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from tiny_models import needs_models
 
+from su3d_bench.cli import rehearsal
 from su3d_bench.cli.main import main
-from su3d_bench.cli.reproduce import rehearsal
 from su3d_bench.core.errors import Su3dError
 from su3d_bench.reproducing.asked import Asked, asked_runs, plan_of
 from su3d_bench.reproducing.preflight import preflight

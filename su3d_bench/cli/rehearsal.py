@@ -8,8 +8,8 @@ from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
-from su3d_bench.cli.datasets.make import dataset_part, make_files
-from su3d_bench.cli.shared.answers import remark
+from su3d_bench.cli.make_scenes import dataset_part, make_files
+from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import ConfigError, ModelMissing, some
 from su3d_bench.core.files.atomic import make_folder
 from su3d_bench.datasets.layouts import LAYOUTS
