@@ -81,7 +81,7 @@ def _add_cache(verbs: Verbs) -> None:
 
 
 def call_cache_list(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.planning.scenes import cache_root
+    from su3d_bench.runs.scenes import cache_root
     from su3d_bench.store.caches import KINDS, cache_entries, size_text
 
     root = cache_root()
@@ -109,7 +109,7 @@ def _ago(written: float) -> str:
 
 
 def call_cache_clear(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.planning.scenes import cache_root
+    from su3d_bench.runs.scenes import cache_root
     from su3d_bench.store.caches import KINDS, cache_entries, clear_cache, size_text
 
     if not 0 <= arguments.older_than < math.inf:

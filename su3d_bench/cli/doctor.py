@@ -158,7 +158,7 @@ def loaded(package: str) -> tuple[dict[str, Any], str]:
 
 def _folders() -> Iterator[Check]:
     from su3d_bench.core.files.scratch import scratch_folder
-    from su3d_bench.runs.planning.scenes import cache_root, data_root
+    from su3d_bench.runs.scenes import cache_root, data_root
 
     named = os.environ.get("SU3D_DATA") or ""
     if "://" in named:
@@ -204,7 +204,7 @@ def _kernels() -> Check:
 
 def _datasets() -> Iterator[Check]:
     from su3d_bench.core import registry
-    from su3d_bench.runs.planning.scenes import data_root
+    from su3d_bench.runs.scenes import data_root
 
     if "://" in (os.environ.get("SU3D_DATA") or ""):
         return

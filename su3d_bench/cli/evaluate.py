@@ -13,7 +13,7 @@ from su3d_bench.cli.output import answer_tables, remark
 from su3d_bench.core.errors import EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
-    from su3d_bench.evaluation.request import Request
+    from su3d_bench.evaluation.result import Request
 
 SCHEMA = 1  # of the JSON file of several methods
 
@@ -109,7 +109,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def _request(paths: Sequence[Path], arguments: argparse.Namespace) -> Request:
-    from su3d_bench.evaluation.request import Request
+    from su3d_bench.evaluation.result import Request
 
     return Request(
         tuple(paths),
@@ -127,7 +127,7 @@ def _request(paths: Sequence[Path], arguments: argparse.Namespace) -> Request:
 
 def _named(arguments: argparse.Namespace) -> dict[str, list[Path]]:
     """The predictions by the method that they are called."""
-    from su3d_bench.evaluation.request import own_name
+    from su3d_bench.evaluation.result import own_name
 
     if not arguments.predictions and not arguments.name:
         raise ConfigError("evaluate: no predictions were named; give a folder or files, or --name METHOD=PREDICTIONS")

@@ -253,7 +253,7 @@ def _add_replica(verbs: Verbs) -> None:
 
 def call_replica(arguments: argparse.Namespace) -> int:
     from su3d_bench.fetching.bringing import plan_replica
-    from su3d_bench.runs.planning.scenes import data_root
+    from su3d_bench.runs.scenes import data_root
 
     return fetch_planned(arguments, plan_replica(sources_of(arguments), arguments.parts, data_root()))
 
@@ -284,7 +284,7 @@ def _add_scannet(verbs: Verbs) -> None:
 def call_scannet(arguments: argparse.Namespace) -> int:
     from su3d_bench.fetching.scannet import fetch_by_script, fetch_from, how_to_sign, plan_scans
     from su3d_bench.fetching.sources import built_in
-    from su3d_bench.runs.planning.scenes import data_root
+    from su3d_bench.runs.scenes import data_root
 
     source, root = built_in().named("scannet"), data_root()
     scans = plan_scans(arguments.scans, root)

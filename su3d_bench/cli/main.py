@@ -107,7 +107,7 @@ def _exit_code(words: Sequence[str]) -> int:
         arguments = parser.parse_args(words)
         if "call" not in arguments:  # a verb with several sub-verbs, given alone
             arguments = parser.parse_args([*words, "list"])
-        from su3d_bench.runs.executors.local import limit_threads  # late: --help does without what it imports
+        from su3d_bench.runs.executors import limit_threads  # late: --help does without what it imports
 
         _refuse_records(arguments)
         if not arguments.uses_all_cores:

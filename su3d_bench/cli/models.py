@@ -60,8 +60,6 @@ def _add_warm(verbs: Verbs) -> None:
 
 
 def call_list(arguments: argparse.Namespace) -> int:
-    from su3d_bench.perception.models.catalogue import STAND_IN
-
     states = _states(arguments, ())
     if answer_json(arguments, [_state_row(state) for state in states]):
         return EXIT_DONE
@@ -69,8 +67,6 @@ def call_list(arguments: argparse.Namespace) -> int:
     for state in states:
         entry = state.entry
         place = f"found: {state.files[0].folder}" if state.files else "missing"
-        if state.files and state.files[0].is_stand_in:
-            place += STAND_IN
         size = f"{entry.forms[0].size_mb / 1000:.1f} GB"
         profiles = f" (profile {', '.join(state.profiles)})" if state.profiles else ""
         answer(f"{entry.name:<{width}}  {entry.kind:<9}  {size:>6}  {entry.licence:<10}  {place}{profiles}")

@@ -233,7 +233,7 @@ def open_map(arguments: argparse.Namespace, verb: str, text: str) -> tuple[RunFo
     import shlex
 
     from su3d_bench.runs.finished import map_of_scene
-    from su3d_bench.runs.planning.scenes import looks_like_scene
+    from su3d_bench.runs.scenes import looks_like_scene
 
     scene = arguments.scene
     if not looks_like_scene(scene) and looks_like_scene(text):
@@ -302,7 +302,7 @@ def chat_client(
 def answer_estimate(arguments: argparse.Namespace, client: ChatClient | None, requests: Sequence[ChatRequest]) -> int:
     """Print what asking a language model all ``requests`` would cost, nothing without a client; the exit code."""
     from su3d_bench.cli.output import answer_either
-    from su3d_bench.perception.language.spending import Estimate
+    from su3d_bench.perception.language.client import Estimate
 
     if client is None:
         nothing = Estimate(n_requests=0, n_stored=0, input_tokens=0, output_tokens=0, usd=0.0, models=())

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from su3d_bench.formats.tables.table import Prose, Table
-    from su3d_bench.runs.executors.local import Event, Report
+    from su3d_bench.runs.executors import Event, Report
 
 MOST_UNSEEN = 8  # words that are named
 WIDE, BAR, NARROW_BAR = 100, 24, 12  # characters: a terminal with room for a long bar, and both bars
@@ -222,7 +222,7 @@ class _Board:
         self._tasks: dict[tuple[str, str], TaskID] = {}
 
     def report(self, event: Event) -> None:
-        from su3d_bench.runs.executors.local import SCENE_DONE
+        from su3d_bench.runs.executors import SCENE_DONE
 
         self._bars.update(self._scenes, remark=event.doing if event.label == SCENE_DONE else "")
         if event.label == SCENE_DONE:

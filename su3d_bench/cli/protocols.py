@@ -16,8 +16,8 @@ from su3d_bench.cli.output import answer_either, answer_tables, progress, remark
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, shown, suggest
 
 if TYPE_CHECKING:
+    from su3d_bench.metrics.protocols.loading import Stated
     from su3d_bench.metrics.protocols.model import ProtocolRules
-    from su3d_bench.metrics.protocols.originals import Stated
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -69,9 +69,7 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def call_list(arguments: argparse.Namespace) -> int:
-    from su3d_bench.metrics.protocols.files import protocol_names
-    from su3d_bench.metrics.protocols.loading import load_protocol
-    from su3d_bench.metrics.protocols.originals import original_of
+    from su3d_bench.metrics.protocols.loading import load_protocol, original_of, protocol_names
 
     rows = [(load_protocol(name), original_of(name)) for name in protocol_names()]
     fields = {"name", "version", "summary", "kind", "datasets", "headline", "ground_truth", "label_space"}
@@ -88,9 +86,7 @@ def call_list(arguments: argparse.Namespace) -> int:
 
 def call_show(arguments: argparse.Namespace) -> int:
     from su3d_bench.metrics.labels import labels_taken
-    from su3d_bench.metrics.protocols.files import rules_files
-    from su3d_bench.metrics.protocols.loading import load_protocol
-    from su3d_bench.metrics.protocols.originals import original_of
+    from su3d_bench.metrics.protocols.loading import load_protocol, original_of, rules_files
 
     rules = load_protocol(arguments.name)
     if arguments.names:
@@ -130,7 +126,7 @@ def call_diff(arguments: argparse.Namespace) -> int:
     value = apart.to_json()
     answer_tables(arguments, value, rules_tables(value))
     if arguments.out is not None:
-        from su3d_bench.reports.pictures.plots.rules_walk import draw_walk
+        from su3d_bench.reports.pictures.plots import draw_walk
 
         show()  # the plot takes longer than the answer
         draw_walk(value, arguments.out)
@@ -152,8 +148,7 @@ def _rules_lines(rules: ProtocolRules, files: Sequence[Path]) -> list[str]:
     """Every rule as a line, beneath it what the file that sets it says of it: its source, or that it is ours."""
     from su3d_bench.core.config import flatten, toml_value
     from su3d_bench.metrics.labels import labels_taken
-    from su3d_bench.metrics.protocols.files import HEADING, remarks_of
-    from su3d_bench.metrics.protocols.loading import not_comparable_with
+    from su3d_bench.metrics.protocols.loading import HEADING, not_comparable_with, remarks_of
 
     remarks = remarks_of(files)
     shown = rules.model_dump(mode="json", exclude={"classes"}) | {"not_comparable_with": not_comparable_with(rules)}

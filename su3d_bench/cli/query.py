@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from su3d_bench.core.maps import Instances
-    from su3d_bench.metrics.questions.truths import RefinedNames
-    from su3d_bench.questions.reasoning.answers import Answer
-    from su3d_bench.questions.reasoning.scene_map import SceneMap
+    from su3d_bench.metrics.questions.score import RefinedNames
+    from su3d_bench.questions.model import Answer
     from su3d_bench.questions.retrieval import Ranking
+    from su3d_bench.questions.scene_map import SceneMap
     from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 
@@ -156,7 +156,7 @@ def _add_ask(verbs: Verbs) -> None:
 
 def call_ask(arguments: argparse.Namespace) -> int:
     from su3d_bench.core.maps import Instances
-    from su3d_bench.questions.reasoning.scene_map import map_of
+    from su3d_bench.questions.scene_map import map_of
 
     if not arguments.question.strip():
         raise ConfigError(
@@ -185,7 +185,7 @@ def call_ask(arguments: argparse.Namespace) -> int:
 
 def _refined(job: JobFolder, wanted: str) -> tuple[RefinedNames | None, str]:
     """Labels n' where they are wanted and there, and which names these are."""
-    from su3d_bench.questions.refining.refined_names import read_records
+    from su3d_bench.questions.refining import read_records
 
     records = None if wanted == "label" else read_records(job)
     if records is None:
@@ -198,7 +198,7 @@ def _refined(job: JobFolder, wanted: str) -> tuple[RefinedNames | None, str]:
 
 
 def _estimate(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.reasoning.language_solver import LanguageSolver
+    from su3d_bench.questions.language_solver import LanguageSolver
 
     if arguments.solver != "llm":
         return answer_estimate(arguments, None, ())
@@ -210,9 +210,9 @@ def _solve(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> An
     import numpy as np
 
     from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
-    from su3d_bench.questions.reasoning.language_solver import LanguageSolver
-    from su3d_bench.questions.reasoning.named_objects import nearest_by
-    from su3d_bench.questions.reasoning.solver import Solver
+    from su3d_bench.questions.language_solver import LanguageSolver
+    from su3d_bench.questions.scene_map import nearest_by
+    from su3d_bench.questions.solver import Solver
 
     if arguments.solver == "llm":
         return LanguageSolver(scene, *chat_client(arguments, run)).answer(arguments.question)
@@ -237,7 +237,7 @@ def _draw_ask(
     instances: Instances, scene: SceneMap, reply: Answer, job: JobFolder, arguments: argparse.Namespace
 ) -> Path | None:
     """Draw the answer; None where it names no object."""
-    from su3d_bench.reports.pictures.answers import SpokenOf, draw_reasoning
+    from su3d_bench.reports.pictures.figures import SpokenOf, draw_reasoning
 
     if not reply.object_ids:
         if arguments.out is not None:

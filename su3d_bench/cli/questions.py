@@ -97,7 +97,7 @@ def _add_audit(verbs: Verbs) -> None:
     parser = add_verb(
         verbs,
         "audit",
-        "Draw a sample of the questions of scenes as contact sheets for people, or add up what they said of them.",
+        "Draw a sample of the questions of scenes with pictures for people, or add up what they said of them.",
         (
             "su3d-bench query audit --scenes 'rooms/*' --n 200 --out audit",
             "su3d-bench query audit --score audit/audit.csv",
@@ -105,7 +105,7 @@ def _add_audit(verbs: Verbs) -> None:
         _audit,
     )
     _add_scenes(parser)
-    parser.add_argument("--out", type=Path, metavar="DIR", help="where sheets, page and table go")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where page, pictures and table go")
     parser.add_argument("--n", type=count, default=200, metavar="N", help="so many questions (default: 200)")
     add_options(parser, "--seed")
     parser.add_argument(
@@ -149,7 +149,7 @@ def _add_scenes(parser: argparse.ArgumentParser, *, required: bool = False) -> N
 
 
 def _make(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.files.files import check_form, write_questions
+    from su3d_bench.questions.question_files import check_form, write_questions
 
     if arguments.form != FORMS[0]:
         return _make_beacon3d(arguments)
@@ -165,7 +165,7 @@ def _make_beacon3d(arguments: argparse.Namespace) -> int:
     """Write one of Beacon3D's metadata files over objects of the scenes."""
     from su3d_bench.cli.scenes import chosen_scenes
     from su3d_bench.core.files.atomic import write_json
-    from su3d_bench.questions.chains.made_questions import made_files
+    from su3d_bench.questions.chains import made_files
     from su3d_bench.questions.truths import MIN_VERTICES, fullest_truth, scene_objects
 
     if arguments.leave_out is not None or arguments.source != SOURCES[0]:
@@ -189,8 +189,8 @@ def _make_beacon3d(arguments: argparse.Namespace) -> int:
 
 def _made(arguments: argparse.Namespace) -> list[Question]:
     from su3d_bench.cli.scenes import chosen_scenes
-    from su3d_bench.questions.files.left_out import read_left_out
     from su3d_bench.questions.generator import chosen
+    from su3d_bench.questions.query_files import read_left_out
     from su3d_bench.questions.truths import questions_of
 
     left_out = frozenset[str]() if arguments.leave_out is None else read_left_out(arguments.leave_out)
@@ -206,7 +206,7 @@ def _made(arguments: argparse.Namespace) -> list[Question]:
 
 
 def _show(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.files.files import paper_queries, read_questions
+    from su3d_bench.questions.question_files import paper_queries, read_questions
 
     questions: Sequence[Question]
     questions = paper_queries() if arguments.file == PAPER else read_questions(Path(arguments.file), "")
@@ -274,27 +274,26 @@ def _audit(arguments: argparse.Namespace) -> int:
     drawn = sample(of_kinds(every, arguments.kinds), arguments.n, arguments.seed)
     if not drawn:
         raise DataError("query audit: nothing can be asked of these scenes")
-    places = {f"{dataset.name}/{scene}": (dataset, scene) for dataset, scene in scenes}
-    sheets = make_audit(
+    places = {f"{dataset.name}/{scene}": dataset for dataset, scene in scenes}
+    page = make_audit(
         drawn,
         places.__getitem__,
         arguments.out,
-        per_sheet=arguments.per_page,
         progress=lambda scene: remark(f"{scene}: drawn", quiet=arguments.quiet),
     )
     counts = dict(sorted(Counter(question.kind for question in drawn).items()))
     kinds = ", ".join(f"{n} {kind}" for kind, n in counts.items())
     lines = (
-        f"{counted(len(drawn), 'question')} on {counted(len(sheets), 'sheet')} ({kinds})",
-        f"look at {arguments.out}/sheet-*.png or index.html, write right, arguable or wrong into audit.csv, then: "
+        f"{counted(len(drawn), 'question')} ({kinds})",
+        f"look at {page}, write right, arguable or wrong into audit.csv, then: "
         f"su3d-bench query audit --score {arguments.out}/audit.csv",
     )
-    answer_either(arguments, {"n": len(drawn), "kinds": counts, "sheets": [str(sheet) for sheet in sheets]}, *lines)
+    answer_either(arguments, {"n": len(drawn), "kinds": counts, "page": str(page)}, *lines)
     return EXIT_DONE
 
 
 def _score(arguments: argparse.Namespace) -> int:
-    from su3d_bench.sheets.judging.audit_scores import audit_json, audit_table, read_verdicts
+    from su3d_bench.sheets.audit import audit_json, audit_table, read_verdicts
 
     verdicts = read_verdicts(arguments.score)
     answer_tables(arguments, audit_json(verdicts), [audit_table(verdicts)])
@@ -302,7 +301,7 @@ def _score(arguments: argparse.Namespace) -> int:
 
 
 def _score_answers(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.chains.report import answered_file, answered_json, answered_table, answers_to_questions
+    from su3d_bench.questions.beacon3d import answered_file, answered_json, answered_table, answers_to_questions
 
     asked = arguments.file
     if not arguments.judge:
@@ -310,7 +309,7 @@ def _score_answers(arguments: argparse.Namespace) -> int:
             raise ConfigError(f"query score: {flag} belongs to --judge")
         answered = answered_file(asked, arguments.answers)
     else:
-        from su3d_bench.questions.chains.judge import judge_requests, judged
+        from su3d_bench.questions.beacon3d import judge_requests, judged
         from su3d_bench.store.run_folder import RunFolder
 
         folder = RunFolder(arguments.answers.with_name(f"{arguments.answers.stem}.judged"))

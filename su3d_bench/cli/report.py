@@ -97,9 +97,8 @@ def call_tables(arguments: argparse.Namespace) -> int:
 
 
 def _tables(arguments: argparse.Namespace) -> list[Table]:
-    from su3d_bench.analysis.paper_tables import numbered_tables
-    from su3d_bench.analysis.tables import choose, found_tables, measured_results, refuse_unscored
-    from su3d_bench.reports.tables.papers.paper import Shown, selection_tables
+    from su3d_bench.analysis.tables import choose, found_tables, measured_results, numbered_tables, refuse_unscored
+    from su3d_bench.reports.tables.paper import Shown, selection_tables
 
     shown = Shown(
         metrics=tuple(arguments.metrics),
@@ -185,7 +184,7 @@ def _write(
     arguments: argparse.Namespace, files: dict[str, str], times: list[list[UpdateTimes]], anytime: list[Any]
 ) -> None:
     from su3d_bench.core.files.atomic import make_folder, write_text
-    from su3d_bench.reports.pictures.plots.timing import draw_timing
+    from su3d_bench.reports.pictures.plots import draw_timing
 
     show()  # the plots take longer than the tables
     make_folder(arguments.out)
@@ -328,7 +327,7 @@ def call_attribution(arguments: argparse.Namespace) -> int:
     ).to_json()
     answer_tables(arguments, attribution, attribution_tables(attribution))
     if arguments.out is not None:
-        from su3d_bench.reports.pictures.plots.attribution import draw_attribution
+        from su3d_bench.reports.pictures.plots import draw_attribution
 
         show()  # the plot takes longer than the answer
         draw_attribution(attribution, arguments.out)

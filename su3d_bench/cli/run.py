@@ -13,8 +13,8 @@ from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE, counted
 
 if TYPE_CHECKING:
     from su3d_bench.core.config import Settings
-    from su3d_bench.runs.planning.held import Into
-    from su3d_bench.runs.planning.plan import Plan
+    from su3d_bench.runs.existing import Into
+    from su3d_bench.runs.plan import Plan
     from su3d_bench.runs.runner import RunResult
 
 
@@ -109,7 +109,7 @@ def call_run(arguments: argparse.Namespace) -> int:
 
 def plan_of(arguments: argparse.Namespace) -> Plan:
     """The plan of what was asked for, in a process that leaves the cores to the scenes side by side."""
-    from su3d_bench.runs.planning.plan import make_plan
+    from su3d_bench.runs.plan import make_plan
 
     into: Into = "extend" if arguments.extend else "replace" if arguments.replace else "own"
     return make_plan(settings_of(arguments), arguments.set, arguments.out, into=into)
@@ -118,7 +118,7 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
 def settings_of(arguments: argparse.Namespace) -> Settings:
     """The file's settings, then those of the flags, which win."""
     from su3d_bench.core.config import RunConfig
-    from su3d_bench.runs.planning.asked import asked_settings
+    from su3d_bench.runs.plan import asked_settings
 
     scenes = [*arguments.scene, *(arguments.scenes or ())] or None
     values = {name: scenes if name == "scenes" else getattr(arguments, name) for name in RunConfig.model_fields}
@@ -128,8 +128,8 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
 
 
 def carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.planning.scenes import cache_root
     from su3d_bench.runs.runner import run_plan
+    from su3d_bench.runs.scenes import cache_root
     from su3d_bench.store.caches import why_large, why_slow
 
     for line in filter(None, (why_slow(), why_large(cache_root()))):
@@ -156,14 +156,14 @@ def _answer_result(result: RunResult, arguments: argparse.Namespace) -> None:
     for line in result.remarks:
         remark(line, quiet=arguments.quiet)
     plan = result.plan
-    place = plan.folder.path if plan.store is None else f"{plan.store} (its small files: {plan.folder.path})"
+    place = plan.place.name if plan.place.url is None else f"{plan.place.url} (its small files: {plan.folder.path})"
     remark(f"run folder: {place}", quiet=arguments.quiet)
     if not arguments.quiet:
         _say_what_is_next(result)
 
 
 def _say_what_is_next(result: RunResult) -> None:
-    from su3d_bench.runs.next_steps import next_commands, pictures_of
+    from su3d_bench.runs.advice import next_commands, pictures_of
 
     pictures = pictures_of(result)
     if pictures:
@@ -175,7 +175,7 @@ def _say_what_is_next(result: RunResult) -> None:
 
 
 def show_plan(plan: Plan, arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.planning.estimate import estimate
+    from su3d_bench.runs.advice import estimate
 
     rows = estimate(plan)
     jobs = [asdict(row) for row in rows]
@@ -197,7 +197,7 @@ def show_plan(plan: Plan, arguments: argparse.Namespace) -> int:
 
 def call_ablate(arguments: argparse.Namespace) -> int:
     from su3d_bench.core import registry
-    from su3d_bench.runs.planning.ablation import ablation_rows, write_rows
+    from su3d_bench.runs.ablation import ablation_rows, write_rows
 
     rows = ablation_rows(arguments.method, arguments.vary, is_grid=arguments.grid)
     own_name = str(registry.load("method", arguments.method).name)
@@ -210,9 +210,7 @@ def call_ablate(arguments: argparse.Namespace) -> int:
         return show_plan(plan, arguments)
     code = carry_out(plan, arguments)
     if code == EXIT_DONE:
-        from su3d_bench.runs.runner import publish
-
         write_rows(plan.folder.path, rows, joins=arguments.extend)
-        publish(plan)
+        plan.place.publish()
         remark(f"table: su3d-bench report tables {plan.folder.path} --table I", quiet=arguments.quiet or arguments.json)
     return code

@@ -27,9 +27,7 @@ from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, Stor
 
 if TYPE_CHECKING:
     from su3d_bench.core.maps import Instances
-    from su3d_bench.questions.refining.refined_names import NameRecords
-    from su3d_bench.questions.refining.refinement import RefinedName, TopNames
-    from su3d_bench.questions.undesired import FilterConfig
+    from su3d_bench.questions.refining import FilterConfig, NameRecords, RefinedName, TopNames
     from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 DEFAULT = Path("runs")
@@ -95,12 +93,12 @@ def call_show(arguments: argparse.Namespace) -> int:
     from su3d_bench.core.config import DEFAULT_SOURCE
     from su3d_bench.core.errors import StoreError, printable, printable_json
     from su3d_bench.formats.tables.table import percent
-    from su3d_bench.runs.planning.held import held_run
+    from su3d_bench.runs.existing import existing_run
 
     entry = run_entry(arguments.run)
     asked: dict[str, str] = {}
     with suppress(StoreError):  # a damaged run.toml tells nothing
-        held = held_run(arguments.run)
+        held = existing_run(arguments.run)
         for path, value in () if held is None else held.values.items():
             if held is not None and held.remarks.get(path) != DEFAULT_SOURCE:
                 asked[".".join(path)] = json.dumps(value, ensure_ascii=False, default=str)
@@ -206,8 +204,7 @@ def _add_refine(verbs: Verbs) -> None:
 
 
 def call_refine(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.refining.refined_names import records_of, write_records
-    from su3d_bench.questions.refining.refinement import top_names
+    from su3d_bench.questions.refining import records_of, top_names, write_records
 
     config = _filter(arguments)
     jobs = _jobs(arguments)
@@ -228,7 +225,7 @@ def call_refine(arguments: argparse.Namespace) -> int:
 
 
 def _filter(arguments: argparse.Namespace) -> FilterConfig:
-    from su3d_bench.questions.undesired import FilterConfig
+    from su3d_bench.questions.refining import FilterConfig
 
     share = arguments.max_map_fraction
     if share is not None and not 0 < share <= 1:
@@ -282,7 +279,7 @@ def _map(job: JobFolder) -> Instances:
 
 
 def _estimate(tops: dict[str, list[TopNames]], arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.refining.refinement import ModelRefiner
+    from su3d_bench.questions.refining import ModelRefiner
     from su3d_bench.store.run_folder import RunFolder
 
     if arguments.refiner != "model":
@@ -297,7 +294,7 @@ def _refine(
     tops: dict[str, list[TopNames]], arguments: argparse.Namespace
 ) -> tuple[dict[str, Sequence[RefinedName]], str]:
     """Labels n' of each scene, and the model that chose them."""
-    from su3d_bench.questions.refining.refinement import ModelRefiner, vote
+    from su3d_bench.questions.refining import ModelRefiner, vote
     from su3d_bench.store.run_folder import RunFolder
 
     if arguments.refiner == "vote":

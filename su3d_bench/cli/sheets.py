@@ -13,7 +13,7 @@ from su3d_bench.cli.output import answer_either, answer_json, answer_tables, rem
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, counted
 
 if TYPE_CHECKING:
-    from su3d_bench.sheets.judging.scores import Scores
+    from su3d_bench.sheets.scores import Scores
 
 SHOWN_FAULTS = 200  # lines; the number of all is told
 
@@ -75,10 +75,9 @@ def call_score(arguments: argparse.Namespace) -> int:
 
     from su3d_bench.formats.tables.table import Prose
     from su3d_bench.reports.tables.judged import sheet_tables
+    from su3d_bench.sheets.answers import check_answers, check_key, read_answers
     from su3d_bench.sheets.items import KEY_FILE, read_key, read_sheet
-    from su3d_bench.sheets.judging.answers import check_answers, check_key, read_answers
-    from su3d_bench.sheets.judging.scores import score
-    from su3d_bench.sheets.judging.verdicts import disputed_csv
+    from su3d_bench.sheets.scores import disputed_csv, score
 
     key_file = arguments.key / KEY_FILE if arguments.key.is_dir() else arguments.key
     key = read_key(key_file)
@@ -151,11 +150,10 @@ def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
     from dataclasses import asdict
 
     from su3d_bench.core.files.atomic import make_folder, write_text
-    from su3d_bench.reports.sheet.second_looks import second_looks_csv, second_looks_page
     from su3d_bench.reports.tables.formats import FORMATS
     from su3d_bench.reports.tables.judged import sheet_tables
     from su3d_bench.sheets.items import PICTURES
-    from su3d_bench.sheets.judging.scores import write_scores
+    from su3d_bench.sheets.scores import second_looks_csv, second_looks_page, write_scores
 
     make_folder(folder)
     content = asdict(scores)
@@ -164,8 +162,8 @@ def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
     for suffix, form in (("md", "markdown"), ("csv", "csv"), ("html", "html")):
         write_text(folder / f"tables.{suffix}", FORMATS[form](tables))
     pictures = Path(os.path.relpath((sheet_folder / PICTURES).resolve(), folder.resolve())).as_posix()
-    write_text(folder / "second_looks.csv", second_looks_csv(content["second_looks"]))
-    write_text(folder / "second_looks.html", second_looks_page(content["second_looks"], pictures, scores.sheet_id))
+    write_text(folder / "second_looks.csv", second_looks_csv(scores.second_looks))
+    write_text(folder / "second_looks.html", second_looks_page(scores.second_looks, pictures, scores.sheet_id))
 
 
 def _looks_line(scores: Scores) -> str:
@@ -206,12 +204,12 @@ def _add_pictures(verbs: Verbs) -> None:
 
 
 def call_pictures(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.files.files import figure_texts
-    from su3d_bench.reports.pictures.colours import scale_stops
+    from su3d_bench.questions.question_files import figure_texts
+    from su3d_bench.reports.pictures.canvas import scale_stops
     from su3d_bench.reports.pictures.figures import draw_grid
     from su3d_bench.runs.finished import read_run
-    from su3d_bench.sheets.making.figures import Figures
-    from su3d_bench.sheets.making.run_source import RunSource
+    from su3d_bench.sheets.figures import Figures
+    from su3d_bench.sheets.sources import RunSource
 
     of_figure = () if arguments.figure is None else figure_texts(arguments.figure)
     texts = [*of_figure, *(query.strip() for query in arguments.queries)]

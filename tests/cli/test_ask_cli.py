@@ -15,13 +15,13 @@ from scored_room import instances
 from su3d_bench.cli.main import main
 from su3d_bench.core.files.atomic import write_json
 from su3d_bench.core.maps import Instances
-from su3d_bench.questions.undesired import FilterConfig
-from su3d_bench.reports.pictures import answers as reasoning_picture
+from su3d_bench.questions.refining import FilterConfig
+from su3d_bench.reports.pictures import figures as reasoning_picture
 from su3d_bench.store.predictions import write_prediction
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 SCENE = "rooms/made"
-QUICK = ["backoff_s=0.001", "max_retries=1", "total_timeout_s=1.0", "max_failures_in_a_row=50"]
+QUICK = ["max_retries=1", "timeout_s=1.0", "max_failures_in_a_row=50"]
 
 
 def cube(x: float, y: float, z: float, side: float) -> np.ndarray:

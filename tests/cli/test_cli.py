@@ -25,7 +25,7 @@ COLLECTOR = f"{SCENES}/painted.py:Collector"
 RUN = ["run", "--scenes", f"{PAINTED}/*", "--methods", COLLECTOR, "--protocols", "rooms-semantic", "--no-pictures"]
 HEAVY = (
     "torch", "open3d", "open3d.cpu.pybind", "numba", "sklearn", "pandas", "matplotlib", "onnxruntime", "cv2", "scipy",
-    "transformers", "openai", "openpyxl", "psutil", "su3d_bench.predictions.formats", "su3d_bench.runs.planning.plan",
+    "transformers", "openai", "openpyxl", "psutil", "su3d_bench.predictions.formats", "su3d_bench.runs.plan",
 )  # fmt: skip
 # A tenth of a second is two thirds Python's own.
 AT_START = (*HEAVY, "numpy", "pydantic", "rich", "multiprocessing", "zipfile", "traceback", "difflib", "hashlib")
@@ -237,7 +237,7 @@ def test_a_dry_run_over_a_finished_run_knows_what_is_done(capsys: pytest.Capture
 
 def test_the_same_request_has_the_same_folder_and_another_one_another() -> None:
     from su3d_bench.cli.run import settings_of
-    from su3d_bench.runs.planning.plan import make_plan
+    from su3d_bench.runs.plan import make_plan
 
     def folder(*more: str) -> Path:
         arguments = build_parser().parse_args([*RUN, *more])

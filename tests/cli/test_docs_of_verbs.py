@@ -11,7 +11,7 @@ from fuzz_words import verbs
 from places import ROOT
 from verbs_page import MORE, PAGE, page
 
-from su3d_bench.baselines.command.placeholders import PLACEHOLDERS, variable_of
+from su3d_bench.baselines.command.method import PLACEHOLDERS, variable_of
 from su3d_bench.cli.main import build_parser
 
 ENVIRONMENT = ROOT / "docs" / "running" / "environment.md"

@@ -9,16 +9,16 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from tiny_models import CLIP_DIM, write_tiny_clip
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ModelMissing, PredictionError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.evaluation.texts import encoder_for
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.perception.models.catalogue import MODELS, STAND_IN
+from su3d_bench.perception.models.catalogue import MODELS
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.loading import load_encoder
-from su3d_bench.perception.models.stand_ins.encoders import DIM, write_tiny_clip
 from su3d_bench.runs.finished import encoder_of
 from su3d_bench.store.run_folder import RunFolder
 
@@ -114,7 +114,7 @@ def test_warm_tells_time_and_memory_and_the_digest_of_run_records(
 ) -> None:
     assert main(["models", "warm", "clip-vit-b-32"]) == 0
     out = capsys.readouterr().out
-    assert "ViT-B-32/openai (stand-in): loaded and first run" in out
+    assert "ViT-B-32/openai: loaded and first run" in out
     assert f"(process); digest {load_encoder(ModelsConfig(encoder='clip-vit-b-32')).digest[:12]}" in out
 
 
@@ -136,7 +136,7 @@ def test_a_query_reads_the_encoder_that_the_run_was_made_with(found: Path, home:
     encoder = encoder_of(_finished_run(home / "run", made.name, made.digest))
     # the text runs in float32, whatever the images ran in
     assert encoder.digest == load_encoder(ModelsConfig(encoder="clip-vit-b-32")).digest != made.digest
-    assert encoder.encode_texts(["chair"]).shape == (1, DIM)
+    assert encoder.encode_texts(["chair"]).shape == (1, CLIP_DIM)
 
 
 @needs_models
@@ -152,9 +152,9 @@ def test_a_query_over_features_of_other_weights_is_an_error(found: Path, home: P
 @needs_models
 def test_an_evaluation_names_features_with_the_protocols_encoder_where_it_is_here(tiny_clip: Path, home: Path) -> None:
     rules = load_protocol("replica-conceptgraphs-ex6")
-    assert "which is not here" in str(encoder_for(rules, DIM, None, is_own=False))
+    assert "which is not here" in str(encoder_for(rules, CLIP_DIM, None, is_own=False))
     shutil.copytree(tiny_clip, home / "models" / "clip-vit-h-14")
-    encoder = encoder_for(rules, DIM, None, is_own=False)
+    encoder = encoder_for(rules, CLIP_DIM, None, is_own=False)
     assert isinstance(encoder, Encoder)
-    assert encoder.name == f"{rules.encoder}{STAND_IN}"
+    assert encoder.name == rules.encoder
     assert "the features have 25 dimensions" in str(encoder_for(rules, 25, None, is_own=False))

@@ -1,4 +1,4 @@
-"""What ``su3d-bench new`` writes runs as it stands, in a folder where nothing else is."""
+"""What ``new`` of methods, datasets and protocols writes runs as it stands, in a folder where nothing else is."""
 
 from __future__ import annotations
 

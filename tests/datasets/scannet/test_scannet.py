@@ -39,8 +39,8 @@ from su3d_bench.datasets.scannet.folders import PAPER_SCENES, find_scans, split_
 from su3d_bench.datasets.scannet.frames import read_walk
 from su3d_bench.datasets.scannet.labels import TABLE_NAME
 from su3d_bench.formats.images import UInt16Array
-from su3d_bench.runs.parts import Part
-from su3d_bench.runs.planning.scenes import expand_scenes
+from su3d_bench.runs.job import Part
+from su3d_bench.runs.scenes import expand_scenes
 
 
 @pytest.mark.parametrize(
@@ -302,7 +302,7 @@ def test_a_split_is_asked_for_by_name_and_must_be_whole(tmp_path: Path, monkeypa
 def test_no_data_is_said_with_the_way_to_get_it(tmp_path: Path) -> None:
     with pytest.raises(DataError) as caught:
         ScanNet(tmp_path).scenes()
-    assert str(caught.value).startswith(f"scannet: no scan in {tmp_path} or in its folders scans, scannet")
+    assert str(caught.value).startswith(f"scannet: no scene in {tmp_path} or in its folders scans, scannet")
     assert "datasets make rooms --layout scannet" in str(caught.value)
     write_recording(tmp_path / SCAN / f"{SCAN}.sens", 1)
     with pytest.raises(DataError, match=r"scannet: no scene 'scene0000_01'; did you mean 'scene0000_00'\?"):

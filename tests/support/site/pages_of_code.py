@@ -16,12 +16,20 @@ import su3d_bench
 from su3d_bench.cli.main import main
 from su3d_bench.core import registry
 from su3d_bench.core.config import flatten, toml_value
-from su3d_bench.metrics.protocols.files import HEADING, protocol_names, remarks_of, rules_files
 from su3d_bench.metrics.protocols.kinds import RULES_OF_KIND
-from su3d_bench.metrics.protocols.loading import load_protocol, not_comparable_with
+from su3d_bench.metrics.protocols.loading import (
+    HEADING,
+    Original,
+    Stated,
+    load_protocol,
+    not_comparable_with,
+    original_of,
+    protocol_names,
+    remarks_of,
+    rules_files,
+)
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.protocols.originals import Original, Stated, original_of
-from su3d_bench.reports.tables.papers.published import Figure, figures_of
+from su3d_bench.reports.tables.paper import Figure, figures_of
 
 PROTOCOLS = "reference/protocols"
 METHODS = "reference/methods"
