@@ -24,7 +24,7 @@ def test_every_verb_has_json_quiet_debug_and_two_examples() -> None:
 
 
 def test_an_option_that_verbs_share_has_one_help_text() -> None:
-    for name in ("--jobs", "--device", "--set", "--run", "--queries", "--executor"):
+    for name in ("--jobs", "--device", "--set", "--run", "--executor"):
         texts = {one.help for _, parser in verbs() for one in parser._actions if name in one.option_strings}
         assert texts == {SHARED[name]["help"]}, name
 
