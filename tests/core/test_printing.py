@@ -11,7 +11,10 @@ import sys
 
 import pytest
 
-from su3d_bench.cli.shared.bars import drawn_bars
+import su3d_bench
+from su3d_bench.cli.main import main
+from su3d_bench.cli.output import drawn_bars
+from su3d_bench.core.config import write_toml
 from su3d_bench.core.printing import Door, doors, escaped_json, one_line
 
 HOSTILE = "\x1b[2Ja\r\u202eb\x9b\n::stop-commands::x ##[error]y"
