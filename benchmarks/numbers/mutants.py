@@ -78,7 +78,6 @@ GUARDS: dict[str, tuple[str, ...]] = {
         "numerics/test_growth", "numerics/test_statistics", "test_metrics_undefined", *_COMPARE,
     ),
     "analysis/comparison.py": (*_COMPARE, "analysis/test_planning"),
-    "analysis/side_numbers.py": (*_COMPARE, "analysis/test_planning"),
     "analysis/sides.py": (*_COMPARE, "analysis/test_planning"),
     "analysis/gate/": _GATE,
     "runs/verify.py": ("analysis/gate/test_gate", "analysis/test_leaderboard"),

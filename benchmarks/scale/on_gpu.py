@@ -25,9 +25,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from export_onnx import export_encoder
 from measured import write_measured
 from numpy.typing import NDArray
-from tiny_models import DINO_PX, blocks, noise_images
+from tiny_models import DINO_PX, SAM_PX, blocks, noise_images, tiny_dino, tiny_sam, tiny_tokenizer, write_tiny_clip
 from torch_devices import TORCH_ON_CPU
 
 from su3d_bench.cli.main import main as command_line
@@ -37,14 +38,10 @@ from su3d_bench.core.system.timing import synchronise_device
 from su3d_bench.metrics.matching.labelling import cosines, most_similar
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.perception.models.config import ModelsConfig
-from su3d_bench.perception.models.encoders.towers_onnx import export_encoder
 from su3d_bench.perception.models.files import locate
 from su3d_bench.perception.models.loading import load_encoder
 from su3d_bench.perception.models.masks.grounding_dino import GroundingDino
 from su3d_bench.perception.models.masks.sam import Sam, TorchSam
-from su3d_bench.perception.models.stand_ins.detector import tiny_dino, tiny_tokenizer
-from su3d_bench.perception.models.stand_ins.encoders import write_tiny_clip
-from su3d_bench.perception.models.stand_ins.segmenter import IMAGE_PX, tiny_sam
 
 REPEATS = 5
 CLIP = "clip-vit-h-14"
@@ -147,7 +144,7 @@ def networks(folder: Path) -> Iterator[Comparison]:
         pixels = detector.pixels(rgb)
         return lambda: detector.answer(pixels, "cat. coffee table. lamp.")[:2]
 
-    yield Comparison(f"SAM ({IMAGE_PX} px) by torch, masks of 3 boxes", sam, 0.01, is_share=True)
+    yield Comparison(f"SAM ({SAM_PX} px) by torch, masks of 3 boxes", sam, 0.01, is_share=True)
     yield Comparison("GroundingDINO by torch, probabilities and boxes", dino, 1e-3)
 
 

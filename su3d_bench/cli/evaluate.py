@@ -167,5 +167,5 @@ def _say_next(out: Path, methods: Sequence[str], *, was_there: bool, is_quiet: b
     state = " (held this evaluation already, and is as it was)" if was_there else ""
     remark(f"run folder: {out}{state}", quiet=is_quiet)
     remark(f"next: su3d-bench compare {pair}", quiet=is_quiet)
-    remark(f"      su3d-bench attribute {run}{whose}", quiet=is_quiet)
+    remark(f"      su3d-bench report attribution {run}{whose}", quiet=is_quiet)
     remark(f"      su3d-bench report tables {run} --format latex", quiet=is_quiet)

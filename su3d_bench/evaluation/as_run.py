@@ -36,8 +36,9 @@ from su3d_bench.evaluation.evaluate import evaluate
 from su3d_bench.evaluation.result import Evaluation, ProtocolEvaluation, Request
 from su3d_bench.evaluation.scoring import map_of
 from su3d_bench.evaluation.truth import SceneTruths
+from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.scoring import EVERY_SCENE, SceneScore, combine, pack_scores, plain_json
+from su3d_bench.metrics.scoring import EVERY_SCENE, combine, pack_scores, plain_json
 from su3d_bench.predictions.base import Content
 from su3d_bench.predictions.own_runs import write_content
 from su3d_bench.predictions.scenes import Source

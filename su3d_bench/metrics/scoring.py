@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, PredictionError, printable
 from su3d_bench.core.files.atomic import read_arrays
+from su3d_bench.core.files.unpacking import DAMAGE
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
-from su3d_bench.core.system.damage import DAMAGE
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.graphs.objects import ObjectMetric

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from su3d_bench.core.compiled import njit
-from su3d_bench.numerics.cells import ABSENT, slot_of
+from su3d_bench.numerics.clusters import ABSENT, slot_of
 
 LABEL_SHIFT = 40  # a view spans fewer voxels than 2**39, at any voxel that a depth image can fill
 OWNED, BACKGROUND, DROPPED = 0, 1, 2  # what the pixels of a ring become

@@ -24,11 +24,11 @@ from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.system.timing import processor_digest
 from su3d_bench.evaluation.evaluate import evaluate
 from su3d_bench.evaluation.result import Request
-from su3d_bench.metrics.scoring import SceneScore, pack_scores
+from su3d_bench.metrics.metric import SceneScore
+from su3d_bench.metrics.scoring import pack_scores
 from su3d_bench.reproducing.bundle import COMPARED, RECIPE, Unpacked, unpack
-from su3d_bench.reproducing.differences import Results, compared_all
+from su3d_bench.reproducing.differences import Results, compared_all, compared_json
 from su3d_bench.reproducing.recipe import parse_recipe
-from su3d_bench.reproducing.tables import compared_json
 from su3d_bench.runs.finished import FinishedRun, encoder_of, read_run
 from su3d_bench.runs.job import SceneJob
 from su3d_bench.runs.plan import make_plan

@@ -128,7 +128,7 @@ def _query(result: RunResult, run: str) -> list[list[str]]:
         known = sorted(_classes(result, job, outcome.scene), key=lambda pair: -pair[1])
         if known:
             method = [] if outcome.method == "opensu3d" else ["--method", outcome.method]
-            return [["query", outcome.scene, known[0][0], "--run", run, *method]]
+            return [["query", "text", outcome.scene, known[0][0], "--run", run, *method]]
     return []
 
 

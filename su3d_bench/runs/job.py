@@ -10,7 +10,7 @@ from typing import Any
 
 from su3d_bench.core import registry
 from su3d_bench.core.config import Settings, flatten, resolve
-from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_json, package_versions, source_digest
+from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_file, digest_json, package_versions
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.interfaces import HasCaveat, HasInputs, HasOwnPerception, Method, ReadsMadeRooms, TakesTruth
 from su3d_bench.core.maps import Prediction
@@ -20,10 +20,9 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth
 from su3d_bench.metrics.semantic.panoptic import told_truth
-from su3d_bench.perception.models.catalogue import STAND_IN, WEIGHTS_CAVEAT
 from su3d_bench.perception.profiles import Perception, PerceptionConfig
-from su3d_bench.questions.reasoning.language_solver import answers_digest
-from su3d_bench.questions.refining.refined_names import refined_digest
+from su3d_bench.questions.language_solver import answers_digest
+from su3d_bench.questions.refining import refined_digest
 from su3d_bench.runs.plugins import checked_dataset, checked_method, made, settings_model, told
 from su3d_bench.store.records import SealRecord
 from su3d_bench.store.run_folder import JobFolder
@@ -183,7 +182,7 @@ def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
 
 def own_code(target: str) -> str | None:
     """A key of the file of somebody's own dataset or method, which is no part of the program's code."""
-    return source_digest(Path(target.rpartition(":")[0]))[:16] if ".py:" in target else None
+    return digest_file(Path(target.rpartition(":")[0]))[:16] if ".py:" in target else None
 
 
 def refuse_other_run(folder: JobFolder, key: Mapping[str, str], known_later: Sequence[str] = ()) -> None:
@@ -261,7 +260,5 @@ def caveat_of(method: Method, perception: Perception, scene: SceneInfo) -> str |
     dataset = registry.load("dataset", scene.dataset) if scene.dataset in registry.DATASETS else None
     is_made = scene.image_domain == "rendered-rooms" and isinstance(dataset, ReadsMadeRooms)
     made = f"made rooms in the layout of {scene.dataset}, not its scenes" if is_made else None
-    name = perception.encoder.name
-    weights = f"{WEIGHTS_CAVEAT} {name.removesuffix(STAND_IN)}" if name.endswith(STAND_IN) else None
-    parts = [made, weights, perception.caveat if is_seen_by_profile else None, own]
+    parts = [made, perception.caveat if is_seen_by_profile else None, own]
     return "; ".join(part for part in parts if part) or None

@@ -404,7 +404,7 @@ def _notes_on_protocols(protocols: Mapping[str, Sequence[str]], wanted: Sequence
             yield f"{dataset.name}: scored under the protocols that its truth fits; --protocols chooses among them"
             continue
         truth = f"ground truth {', '.join(dataset.variants)} with labels of '{dataset.label_space}'"
-        yield f"{dataset.name}: no protocol fits its {truth}; su3d-bench new protocol FILE writes one of your own"
+        yield f"{dataset.name}: no protocol fits its {truth}; su3d-bench protocols new FILE writes one of your own"
 
 
 def asks_questions(protocols: Sequence[str]) -> bool:

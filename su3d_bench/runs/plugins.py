@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from su3d_bench.core import given, types
+from su3d_bench.core import maps, types
 from su3d_bench.core.errors import PlugInError, Su3dError, own_line, printable
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition
 from su3d_bench.core.types import (
@@ -346,7 +346,7 @@ def _is_of_our_types(error: BaseException) -> bool:
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
-    return trace is not None and trace.tb_frame.f_code.co_filename in (types.__file__, given.__file__)
+    return trace is not None and trace.tb_frame.f_code.co_filename in (types.__file__, maps.__file__)
 
 
 def _sound(place: str, found: Any) -> Any:

@@ -32,17 +32,18 @@ from su3d_bench.core.printing import one_line
 from su3d_bench.core.system.timing import MethodClock, device_memory_bytes, peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, ObjectBoxes, SceneInfo
 from su3d_bench.metrics.fitness import why_not_scorable
+from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.scoring import SceneScore, Truth, pack_scores, score_scene
+from su3d_bench.metrics.scoring import Truth, pack_scores, score_scene
 from su3d_bench.perception.language.client import ChatClient
 from su3d_bench.perception.language.reply_store import ReplyStore
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
-from su3d_bench.questions.reasoning.asking import MapSolver, by_language_model
-from su3d_bench.questions.refining.refined_names import refined_names
+from su3d_bench.questions.language_solver import MapSolver, by_language_model
+from su3d_bench.questions.refining import refined_names
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.reports.pictures.maps import draw_scene
-from su3d_bench.reports.tables.found import Unscored, not_scored_lines
+from su3d_bench.reports.tables.run import Unscored, not_scored_lines
 from su3d_bench.runs.executors import Event, Report
 from su3d_bench.runs.frame_loop import (
     N_AHEAD,

@@ -9,8 +9,9 @@ from typing import Any
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, Su3dError, printable
 from su3d_bench.core.files.atomic import is_file
+from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.scoring import ProtocolResult, SceneScore, combine
+from su3d_bench.metrics.scoring import ProtocolResult, combine
 from su3d_bench.predictions.own_runs import read_stored
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.predictions import features_beside

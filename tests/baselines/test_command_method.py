@@ -152,6 +152,7 @@ SHOWN = "import sys; open(sys.argv[1] + '/../shown', 'w').write(repr(sys.argv[2:
     [
         "RUN {output} {scene}",
         'false $SU3D_SCENE; RUN {output} "$SU3D_SCENE"',
+        "# don't be afraid of {scene}\nRUN {output} {scene}",
         'RUN "$SU3D_OUTPUT" `true {scene}` {scene} # {scene}',
         """sh -c '"$@" "$SU3D_OUTPUT" "$SU3D_SCENE"' sh RUN""",
         'for s in {scene}; do RUN {output} "$s"; done',

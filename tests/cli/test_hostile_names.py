@@ -30,9 +30,9 @@ TEXTS = (".md", ".csv", ".html", ".tex", ".xml", ".txt", ".json", ".toml", ".svg
 
 # What follows each verb on a run of hostile names, a data root of hostile scenes, files of hostile texts.
 CASES: dict[str, list[list[str]]] = {
-    "run": [["--scenes", "tum/*", "--stride", "1", "--limit", "1", "--jobs", "1", "--out", f"made{IN_A_PATH}"],
+    "run": [["--scenes", "replica/*", "--stride", "1", "--limit", "1", "--jobs", "1", "--out", f"made{IN_A_PATH}"],
             ["--config", "hostile.toml"], ["--scenes", HOSTILE], ["--set", f"{HOSTILE}=1"]],
-    "ablate": [["--vary", f"{HOSTILE}=1"], ["--vary", "m=1", "--scenes", "tum/*", "--dry-run"]],
+    "ablate": [["--vary", f"{HOSTILE}=1"], ["--vary", "m=1", "--scenes", "replica/*", "--dry-run"]],
     "evaluate": [["predictions", "--ground-truth", "truth", "--protocol", "scannet-instance", "--per-class"],
                  ["predictions", "--ground-truth", "truth", "--protocol", HOSTILE],
                  ["predictions", "--ground-truth", "truth", "--protocol", "scannet-instance", "--out", "out/mine"],
@@ -43,8 +43,8 @@ CASES: dict[str, list[list[str]]] = {
     "check": [["RUN", "--against", "reference.json", "--github", "--markdown", "out/c.md", "--junit", "out/c.xml"],
               ["RUN", "--against", "reference.json", "--json"], ["--learn", "RUN", "--out", "out/reference.json"]],
     "compare": [["RUN:METHOD", "RUN:oracle", "--per-class"], ["RUN", "RUN", "--json"], ["RUN", HOSTILE]],
-    "plan": [["RUN", "RUN"]],
-    "attribute": [["RUN", "--method", "METHOD"], ["RUN", "--method", HOSTILE]],
+    "report power": [["RUN", "RUN"]],
+    "report attribution": [["RUN", "--method", "METHOD"], ["RUN", "--method", HOSTILE]],
     "report tables": [
         *(["RUN", "--format", form, "--out", f"out/t.{form}"] for form in ("markdown", "latex", "csv", "html")),
         ["RUN", "--intervals"], ["RUN", "--json"],
@@ -59,8 +59,8 @@ CASES: dict[str, list[list[str]]] = {
     "report bundle": [["RUN", "--out", "out/run.zip"], [HOSTILE],
                       ["RUN", "--out", f"out/{IN_A_PATH}.zip", "--trained-on", HOSTILE]],
     "report verify": [["out/t.latex"], ["hostile.tex"], [f"out/{IN_A_PATH}.zip"]],
-    "registry add": [[HOSTILE], [f"out/{IN_A_PATH}.zip", "--to", "out"], ["out/run.zip", "--name", HOSTILE]],
-    "registry build": [["out", "--out", f"out/site{IN_A_PATH}", "--title", HOSTILE], [HOSTILE],
+    "dev registry add": [[HOSTILE], [f"out/{IN_A_PATH}.zip", "--to", "out"], ["out/run.zip", "--name", HOSTILE]],
+    "dev registry build": [["out", "--out", f"out/site{IN_A_PATH}", "--title", HOSTILE], [HOSTILE],
                        ["out", "--bundles-at", HOSTILE]],
     "runs list": [["."], [".", "--json"], [HOSTILE]],
     "runs show": [["RUN"], ["RUN", "--json"], [HOSTILE]],
@@ -69,41 +69,43 @@ CASES: dict[str, list[list[str]]] = {
                     ["RUN", "--kind", "annotation", "--per-kind", "1", "--jobs", "1", "--out", "out/marks"]],
     "sheets score": [["answers.csv", "--key", "out/marks-key"]],
     "sheets pictures": [["RUN", "--what", "labels", "--out", "out/labels.svg"]],
-    "query": [["SCENE", "plant", "--run", "RUN", "--method", "METHOD"], [HOSTILE, HOSTILE, "--run", "RUN"]],
-    "questions": [["show", "questions.toml"], ["show", "paper"], [HOSTILE], ["audit", "--score", "audit.csv"]],
-    "ask": [["SCENE", f"Which {HOSTILE[:40]} is largest?", "--run", "RUN", "--method", "METHOD", "--names", "label"],
-            ["SCENE", "What is the largest object?", "--run", "RUN", "--method", "METHOD"]],
-    "refine": [["RUN", "--method", "METHOD"], ["RUN", "--method", "METHOD", "--json"]],
+    "query text": [["SCENE", "plant", "--run", "RUN", "--method", "METHOD"], [HOSTILE, HOSTILE, "--run", "RUN"]],
+    "query make": [["--scenes", HOSTILE, "--out", "out/q.toml"]],
+    "query show": [["questions.toml"], ["paper"], [HOSTILE]],
+    "query audit": [["--score", "audit.csv"]],
+    "query score": [[HOSTILE, "--answers", HOSTILE]],
+    "query ask": [
+        ["SCENE", f"Which {HOSTILE[:40]} is largest?", "--run", "RUN", "--method", "METHOD", "--names", "label"],
+        ["SCENE", "What is the largest object?", "--run", "RUN", "--method", "METHOD"]],
+    "runs refine": [["RUN", "--method", "METHOD"], ["RUN", "--method", "METHOD", "--json"]],
     "datasets list": [[], ["--json"], [HOSTILE]],
-    "datasets check": [["tum/*", "--quick"], ["tum/*", "--quick", "--json"]],
-    "datasets show": [["tum/*", "--out", "out/room.png"]],
-    "datasets make": [["rooms", "--layout", "tum", "--scenes", HOSTILE, "--out", "out/made"]],
+    "datasets check": [["replica/*", "--quick"], ["replica/*", "--quick", "--json"]],
+    "datasets show": [["replica/*", "--out", "out/room.png"]],
+    "datasets make": [["rooms", "--layout", "replica", "--scenes", HOSTILE, "--out", "out/made"]],
     "new": [["method", "hostile_method.py"], ["registry", HOSTILE]],
     "methods": [["hostile.py:Loud"], ["hostile.py:Loud", "--json"]],
     "models list": [["--set", f"perception.models.folder={HOSTILE}"]],
     "models check": [[HOSTILE]],
-    "models export": [[HOSTILE, "--out", "out/model"]],
     "models warm": [["--profile", HOSTILE]],
-    "fetch models": [[HOSTILE], ["sam-vit-h", "--mirror", f"sam-vit-h={HOSTILE}"], ["sam-vit-h", "--accept", HOSTILE]],
-    "fetch replica": [[HOSTILE], ["--dry-run", "--sources", HOSTILE]],
-    "fetch scannet": [[HOSTILE], ["--script", HOSTILE, "--accept", "scannet"]],
+    "models fetch": [[HOSTILE], ["sam-vit-h", "--mirror", f"sam-vit-h={HOSTILE}"], ["sam-vit-h", "--accept", HOSTILE]],
+    "datasets fetch replica": [[HOSTILE], ["--dry-run", "--sources", HOSTILE]],
+    "datasets fetch scannet": [[HOSTILE], ["--script", HOSTILE, "--accept", "scannet"]],
     "reproduce": [["opensu3d", "--table", HOSTILE], [HOSTILE], ["opensu3d", "--out", HOSTILE, "--dry-run"]],
-    "cache list": [[], ["--json"]],
-    "cache size": [[]],
-    "cache clear": [["all"], [HOSTILE]],
-    "completion": [["bash"], ["zsh"], [HOSTILE]],
-    "doctor": [[]],
-    "protocols": [["show", "rules.toml"], ["show", "rules.toml", "--json"], ["show", "rules.toml", "--names", "--json"],
-                  ["show", "query-ap", "--names", "--queries", "lines.txt"],
-                  ["show", "query-ap", "--names", "--queries", IN_A_PATH],
-                  ["diff", "rules.toml", "rooms-semantic"], ["diff", "rules.toml", "rooms-instance", "--json"],
-                  ["diff", "rules.toml", "rooms-semantic", "--prediction", "RUN:METHOD", "--jobs", "1"],
-                  ["list", HOSTILE]],
-    "texts make": [["--protocol", "rules.toml", "--encoder", "embedded", "--out", "out/t.npz"],
+    "dev cache list": [[], ["--json"]],
+    "dev cache clear": [["all"], [HOSTILE]],
+    "dev completion": [["bash"], ["zsh"], [HOSTILE]],
+    "dev doctor": [[]],
+    "protocols list": [["--json"]],
+    "protocols show": [["rules.toml"], ["rules.toml", "--json"], ["rules.toml", "--names", "--json"],
+                       ["query-ap", "--names", "--queries", "lines.txt"],
+                       ["query-ap", "--names", "--queries", IN_A_PATH], [HOSTILE]],
+    "protocols diff": [["rules.toml", "rooms-semantic"], ["rules.toml", "rooms-instance", "--json"],
+                       ["rules.toml", "rooms-semantic", "--prediction", "RUN:METHOD", "--jobs", "1"]],
+    "protocols texts": [["--protocol", "rules.toml", "--encoder", "embedded", "--out", "out/t.npz"],
                    ["--protocol", "rooms-semantic", "--encoder", HOSTILE, "--out", f"out/{IN_A_PATH}.npz"],
                    ["--protocol", "query-ap", "--encoder", "embedded", "--queries", "lines.txt", "--out",
                     f"out/{IN_A_PATH}.npz"]],
-    "export": [["RUN", "--to", "openlex3d", "--method", "METHOD", "--out", "out/exported"],
+    "runs export": [["RUN", "--to", "openlex3d", "--method", "METHOD", "--out", "out/exported"],
                ["RUN", "--to", "openlex3d", "--method", HOSTILE, "--out", "out/other"]],
 }  # fmt: skip
 METHOD_FILE = f'''
@@ -174,8 +176,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory, rooms_data: Path) -> Path:
         protocols = ["--protocols", "rooms-semantic", "rooms-instance"]
         assert main(["run", *words, *protocols, "--out", "run"]) == 0
         scenes = ["--scenes", "living0", "--set", "n_frames=2"]
-        assert main(["datasets", "make", "rooms", "--layout", "tum", *scenes, "--out", "data", "--quiet"]) == 0
-        (folder / "data" / "tum" / "living0").rename(folder / "data" / "tum" / IN_A_PATH)
+        assert main(["datasets", "make", "rooms", "--layout", "replica", *scenes, "--out", "data", "--quiet"]) == 0
+        (folder / "data" / "Replica" / "living0").rename(folder / "data" / "Replica" / IN_A_PATH)
         assert main(["check", "--learn", "run", "--out", "reference.json"]) == 0
     return folder
 

@@ -43,8 +43,7 @@ def test_list_tells_datasets_places_and_scenes_and_how_to_get_what_is_not_here(
     text = capsys.readouterr().out
     assert f"looked for in: {tmp_path / 'data' / 'Replica'}" in text
     assert (
-        "su3d-bench fetch replica frames brings them; set SU3D_DATA to where they are, or make rooms in this layout"
-        in text
+        "su3d-bench datasets fetch replica frames brings them; set SU3D_DATA to where they are, or make rooms" in text
     )
 
 

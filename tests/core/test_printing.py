@@ -165,7 +165,6 @@ def test_nothing_is_printed_but_through_the_door() -> None:
         "cli/shared/answers.py",
         "cli/shared/bars.py",
         "core/printing.py",
-        "perception/embedded/training/train.py",
     )
     ask_of_it = ("cli/doctor/checks.py", "cli/fetch/asking.py")  # whether it is a terminal
     assert found == {package / name for name in (*through_it, *ask_of_it)}

@@ -11,8 +11,8 @@ from evaluated_text import CHAIR, TABLE, document, feature_scene, numbers, said,
 from prediction_files import write_maskclustering, write_open3dis, write_scannet_text
 
 from su3d_bench.core.errors import ConfigError, PredictionError
-from su3d_bench.evaluation.evaluate import Request, evaluate
-from su3d_bench.evaluation.result import ValuesForm
+from su3d_bench.evaluation.evaluate import evaluate
+from su3d_bench.evaluation.result import Request, ValuesForm
 from su3d_bench.metrics.instance.average_precision import THRESHOLDS, combine
 from su3d_bench.metrics.instance.scene_counts import per_scene
 from su3d_bench.metrics.protocols.loading import load_protocol

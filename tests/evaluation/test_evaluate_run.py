@@ -99,7 +99,7 @@ def test_predictions_in_two_formats_go_through_every_verb_with_the_same_numbers(
     assert (of_ap["left"], of_ap["right"]) == (ap["mine"], ap["theirs"])
     assert [f"{RUN}:mine: {MINE}", f"{RUN}:theirs: {THEIRS}"] == compared["remarks"]
     for method, line in (("mine", MINE), ("theirs", THEIRS)):
-        explained = json.loads(answered(capsys, "attribute", RUN, "--method", method, "--json"))
+        explained = json.loads(answered(capsys, "report", "attribution", RUN, "--method", method, "--json"))
         assert explained["protocols"][0]["values"]["AP"] == ap[method]
         assert f"{method}: {line}" in explained["remarks"]
     latex = answered(capsys, "report", "tables", RUN, "--format", "latex", "--truth-scores", "--intervals")
@@ -119,12 +119,14 @@ def test_predictions_in_two_formats_go_through_every_verb_with_the_same_numbers(
     answered(capsys, *words, "--scenes", "painted/a", "--per-kind", "1")
     assert Path("sheets").is_dir()
     ranking = json.loads(
-        answered(capsys, "query", "painted/a", "sofa", "--run", RUN, "--method", "mine", "--out", "q.png", "--json")
+        answered(
+            capsys, "query", "text", "painted/a", "sofa", "--run", RUN, "--method", "mine", "--out", "q.png", "--json"
+        )
     )
     assert ranking["ranking"][0]["id"] == 1
-    planned = json.loads(answered(capsys, "plan", RUN, "--protocol", "rooms-instance", "--json"))
+    planned = json.loads(answered(capsys, "report", "power", RUN, "--protocol", "rooms-instance", "--json"))
     assert planned["remarks"] == [f"mine: {MINE}", f"theirs: {THEIRS}"]
-    answered(capsys, "export", RUN, "--method", "mine", "--to", "openlex3d", "--out", "clouds")
+    answered(capsys, "runs", "export", RUN, "--method", "mine", "--to", "openlex3d", "--out", "clouds")
     assert files_of(RUN) == before
     again = ["evaluate", f"{RUN}/scenes/painted.a/mine", "--dataset", PAINTED, *PROTOCOLS[:2], "--json", "again.json"]
     assert main([*again, "--quiet"]) == 0
@@ -194,19 +196,21 @@ def test_text_truth_makes_a_run_whose_errors_are_told_and_whose_verbs_say_what_i
     numbers = run.results["mine", "scannet-instance"].result
     assert numbers is not None and numbers.metrics["AP"] == known["ap"] and numbers.coverage == {}
     assert run.scenes == ("scannet/scene0001_00", "scannet/scene0001_01", "scannet/scene0002_00")
-    explained = json.loads(answered(capsys, "attribute", "runs/mine", "--json"))
+    explained = json.loads(answered(capsys, "report", "attribution", "runs/mine", "--json"))
     assert explained["protocols"][0]["values"]["AP"] == known["ap"]
     assert explained["protocols"][0]["causes"]["missed"]["n"] == 1
-    query = answered(capsys, "query", "scannet/scene0001_00", "chair", "--run", "runs/mine", "--method", "mine", code=2)
+    query = answered(
+        capsys, "query", "text", "scannet/scene0001_00", "chair", "--run", "runs/mine", "--method", "mine", code=2
+    )
     assert "is over the points of ground-truth files, which have no coordinates" in query
     sheets = answered(capsys, "sheets", "make", "runs/mine", "--kind", "annotation", "--out", "sheets", code=2)
     assert sheets.count("\n") == 1 and "is over the points of ground-truth files" in sheets
-    answered(capsys, "export", "runs/mine", "--to", "scannet", "--out", "exported")
+    answered(capsys, "runs", "export", "runs/mine", "--to", "scannet", "--out", "exported")
     assert main([*TEXTS[:1], "exported", *TEXTS[2:-2], "--json", "again.json", "--quiet"]) == 0
     again = json.loads(Path("again.json").read_text())["protocols"]["scannet-instance"]["metrics"]
     assert again == known
     Path("gt/scene0001_00.txt").write_text("0\n" * 600)
-    assert "is not the one of runs/mine" in answered(capsys, "attribute", "runs/mine", code=2)
+    assert "is not the one of runs/mine" in answered(capsys, "report", "attribution", "runs/mine", code=2)
 
 
 def test_texts_of_a_file_name_the_features_and_must_be_there_to_explain(capsys: pytest.CaptureFixture[str]) -> None:
@@ -217,13 +221,13 @@ def test_texts_of_a_file_name_the_features_and_must_be_there_to_explain(capsys: 
     assert main([*words, "--text-features", "texts.npz", "--out", "runs/mine"]) == 0
     result = read_run(Path("runs/mine")).results["mine", "rooms-instance"]
     assert result.encoder == "theirs/v1" and result.result is not None
-    explained = json.loads(answered(capsys, "attribute", "runs/mine", "--json"))
+    explained = json.loads(answered(capsys, "report", "attribution", "runs/mine", "--json"))
     assert explained["protocols"][0]["values"]["AP"] == result.result.metrics["AP"]
-    told = answered(capsys, "query", "painted/a", "sofa", "--run", "runs/mine", "--method", "mine", code=2)
+    told = answered(capsys, "query", "text", "painted/a", "sofa", "--run", "runs/mine", "--method", "mine", code=2)
     assert "made by encoder theirs/v1" in told and "only texts of that one can be held against them" in told
     np.savez("texts.npz", names=np.array(names[::-1]), features=features)
     assert "texts.npz: is not the file that runs/mine was scored with" in answered(
-        capsys, "attribute", "runs/mine", code=2
+        capsys, "report", "attribution", "runs/mine", code=2
     )
 
 
@@ -241,9 +245,9 @@ PREDICTIONS = (
         (("compare", "runs/mine", "both.json:mine"), f"both.json: {NUMBERS_ALONE}"),
         (("compare", "pred", "runs/mine"), PREDICTIONS),
         (("compare", "nowhere", "runs/mine"), "nowhere: there is no such folder"),
-        (("attribute", "numbers.json"), f"numbers.json: {NUMBERS_ALONE}"),
-        (("attribute", "pred"), PREDICTIONS),
-        (("plan", "both.json"), f"both.json: {NUMBERS_ALONE}"),
+        (("report", "attribution", "numbers.json"), f"numbers.json: {NUMBERS_ALONE}"),
+        (("report", "attribution", "pred"), PREDICTIONS),
+        (("report", "power", "both.json"), f"both.json: {NUMBERS_ALONE}"),
         (("check", "numbers.json", "--against", "reference.json"), f"numbers.json: {NUMBERS_ALONE}"),
         (("sheets", "make", "pred", "--kind", "annotation", "--out", "sheets"), PREDICTIONS),
         (("report", "tables", "numbers.json"), f"numbers.json: {NUMBERS_ALONE}"),
@@ -260,7 +264,7 @@ PREDICTIONS = (
             ("report", "leaderboard", "pred"),
             "pred: holds no run below it; su3d-bench run writes one, and evaluate --out",
         ),
-        (("questions", "show", "nope.toml"), "nope.toml is missing; name a file of queries, TOML or CSV"),
+        (("query", "show", "nope.toml"), "nope.toml is missing; name a file of queries, TOML or CSV"),
     ],
     ids=lambda value: "-".join(value[:3]) if isinstance(value, tuple) else "",
 )

@@ -15,8 +15,8 @@ from scored_room import instances
 
 from su3d_bench.core.errors import ConfigError, PredictionError
 from su3d_bench.core.types import GroundTruth, LabelSet
-from su3d_bench.evaluation.evaluate import Request, evaluate
-from su3d_bench.evaluation.result import ValuesForm
+from su3d_bench.evaluation.evaluate import evaluate
+from su3d_bench.evaluation.result import Request, ValuesForm
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.predictions.formats import recognise

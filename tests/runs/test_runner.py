@@ -155,6 +155,9 @@ def test_scenes_whose_names_differ_in_a_slash_have_a_map_each(capsys: pytest.Cap
     assert main(twins) == 0
     capsys.readouterr()
     assert (
-        main(["export", "out", "--to", "scannet", "--scenes", "twins/a/b", "--method", "collector", "--out", "x"]) == 2
+        main(
+            ["runs", "export", "out", "--to", "scannet", "--scenes", "twins/a/b", "--method", "collector", "--out", "x"]
+        )
+        == 2
     )
     assert "scene 'a/b': cannot be the name of a file" in capsys.readouterr().err

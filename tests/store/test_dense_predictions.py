@@ -306,5 +306,5 @@ def test_a_run_of_both_is_scored_resumed_and_mended(in_folder: Path, capsys: pyt
 def test_a_query_of_a_dense_map_is_one_clear_line(in_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--no-pictures") == 0
     capsys.readouterr()
-    assert main(["query", "painted/a", "chair", "--run", "out", "--method", "conceptfusion"]) != 0
+    assert main(["query", "text", "painted/a", "chair", "--run", "out", "--method", "conceptfusion"]) != 0
     assert "has one feature a point and no instances" in capsys.readouterr().err

@@ -124,7 +124,7 @@ class LookedAt(Protocol):
 
 
 class SceneOfMasks:
-    """A scene as an evaluator of masks sees it."""
+    """A scene as an evaluator of masks sees it; ``evaluated``: the truth's values, the masks and the rules."""
 
     def __init__(
         self, rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
@@ -133,6 +133,7 @@ class SceneOfMasks:
         self.points: transfer.Points = truth.points
         self.instance = truth.instance.astype(np.int64)
         self._values, self._masks, self._scoring = scored_masks(rules, truth, prediction, encoder)
+        self.evaluated = self._values, self._masks, self._scoring
         self._has_classes = rules.class_agnostic is None
         self._names = {entry.id: entry.name for entry in rules.classes}
 
@@ -157,22 +158,24 @@ class SceneOfMasks:
         return self._names.get(number, NO_CLASS) if self._has_classes else "object"
 
 
-class _SceneOfPoints:
+class SceneOfPoints:
+    """A scene as an evaluator of points sees it; ``scored`` are the points that count."""
+
     def __init__(
         self, rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
     ) -> None:
-        self._scored = scored_points(rules, truth, prediction, encoder)
-        self.points: transfer.Points = self._scored.positions
-        number = self._scored.points.object_id
+        self.scored = scored_points(rules, truth, prediction, encoder)
+        self.points: transfer.Points = self.scored.positions
+        number = self.scored.points.object_id
         self.instance = np.where(number <= truth.instance.max(initial=0), number, 0)
         self._names = [entry.name for entry in rules.classes]
 
     def mended(self) -> MendedScene:
-        scored = self._scored
+        scored = self.scored
         return corrections.mend_points(scored.points, scored.is_counted, has_masks=scored.has_masks)
 
     def errors(self, rules: ProtocolRules, counts: Any, others: Sequence[Any], most: int) -> Errors:
-        scored = self._scored
+        scored = self.scored
         pool = Pool[SemanticCounts](SemanticMetric(rules), counts, others, confusion.concatenate)
         return single_point_errors(scored.points, scored.is_counted, pool, has_masks=scored.has_masks, most=most)
 
@@ -184,5 +187,5 @@ class _SceneOfPoints:
 Look = Callable[[ProtocolRules, GroundTruth, Prediction, Encoder | None], LookedAt]
 EXPLAINED: dict[str, tuple[tuple[str, ...], Look]] = {
     "instance": (corrections.KINDS, SceneOfMasks),
-    "semantic": (corrections.CAUSES, _SceneOfPoints),
+    "semantic": (corrections.CAUSES, SceneOfPoints),
 }

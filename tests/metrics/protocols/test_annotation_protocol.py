@@ -24,16 +24,18 @@ from su3d_bench.metrics.questions.score import (
     said_by,
 )
 from su3d_bench.metrics.scoring import metric_of, score_scene
-from su3d_bench.questions.refining.refined_names import (
+from su3d_bench.questions.refining import (
     FILE_NAME,
+    FilterConfig,
+    RefinedName,
+    TopNames,
     records_of,
     refined_digest,
     refined_names,
+    voted_names,
     write_records,
 )
-from su3d_bench.questions.refining.refinement import RefinedName, TopNames
-from su3d_bench.questions.truths import Refine, question_truth, voted_names
-from su3d_bench.questions.undesired import FilterConfig
+from su3d_bench.questions.truths import Refine, question_truth
 from su3d_bench.store.run_folder import JobFolder
 
 RULES = load_protocol("rooms-annotation")
@@ -79,7 +81,7 @@ def test_labels_go_by_the_lexicon() -> None:
 
 
 def test_refined_names_are_those_that_are_handed_in() -> None:
-    right = RefinedNames(NAMES, "the model m of su3d-bench refine, names of 5 views")
+    right = RefinedNames(NAMES, "the model m of su3d-bench runs refine, names of 5 views")
     prediction = named(("couch",) * len(NAMES))
     assert (values(prediction, lambda _: right)["label n"], values(prediction, lambda _: right)["label n'"]) == (0, 1)
     assert "n': the model m" in " ".join(score_scene(RULES, truth(lambda _: right), prediction, None).warnings)
@@ -190,7 +192,7 @@ def test_labels_of_the_file_beside_a_map_are_taken_while_it_is_that_maps(tmp_pat
     records = records_of(job, prediction, tops, [RefinedName("sofa", "model", "")] * 8, "model", "m", 5, FilterConfig())
     write_records(job, records)
     found = refined_names(job, prediction)
-    source = "the model m of su3d-bench refine, names of 5 views"
+    source = "the model m of su3d-bench runs refine, names of 5 views"
     assert found == RefinedNames(("sofa",) * 8, source, ("",) * 8)
     assert set(refined_digest(job)) == {"refined"}
     write_bytes(job.prediction, b"another map")

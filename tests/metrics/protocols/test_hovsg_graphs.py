@@ -15,8 +15,7 @@ from places import CASES
 from su3d_bench.baselines.oracle import Oracle
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.maps import Instances
-from su3d_bench.core.places import Floor, Places, Room
-from su3d_bench.core.types import GroundTruth, LabelSet
+from su3d_bench.core.types import Floor, GroundTruth, LabelSet, Places, Room
 from su3d_bench.datasets.hm3dsem.dataset import Hm3dSem
 from su3d_bench.metrics.graphs.objects import (
     FEW_LABELS,

@@ -47,7 +47,7 @@ def test_every_protocol_says_whose_evaluation_it_is_and_its_cases_are_there(name
 def test_the_facts_of_every_protocol_are_listed_shown_and_on_the_site(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["protocols"]) == 0
     listed = " ".join(capsys.readouterr().out.split())
-    assert main(["protocols", "--json"]) == 0
+    assert main(["protocols", "list", "--json"]) == 0
     rows = {row["name"]: row["original"] for row in json.loads(capsys.readouterr().out)}
     pages, in_python = made_pages(), list_protocols().set_index("name")["original"]
     for name in protocol_names():

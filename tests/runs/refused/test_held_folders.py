@@ -105,7 +105,7 @@ def test_two_things_of_one_name_are_refused_before_any_work(
     assert not Path("out").exists()
 
 
-PAINTED = f"{SCENES}/painted.py"
+PAINTED_FILE = f"{SCENES}/painted.py"
 
 
 def test_a_preset_sets_what_the_class_says() -> None:
@@ -144,8 +144,17 @@ def test_variants_stand_side_by_side_and_run_toml_repeats_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    method = f"{PAINTED}:Collector"
-    words = ["run", "--scenes", f"{PAINTED}:Painted/a", "--protocols", "rooms-semantic", "--no-pictures", "--jobs", "1"]
+    method = f"{PAINTED_FILE}:Collector"
+    words = [
+        "run",
+        "--scenes",
+        f"{PAINTED_FILE}:Painted/a",
+        "--protocols",
+        "rooms-semantic",
+        "--no-pictures",
+        "--jobs",
+        "1",
+    ]
     out = tmp_path / "out"
     assert main([*words, "--methods", method, f"{method}@stride=2", "--out", str(out)]) == 0
     results = json.loads((out / "metrics.json").read_text())["results"]
