@@ -145,7 +145,8 @@ def test_variants_stand_side_by_side_and_run_toml_repeats_them(
 ) -> None:
     monkeypatch.setattr(scene_run, "build_perception", colour_perception)
     method = f"{PAINTED_FILE}:Collector"
-    words = [
+    words = ["run", "--scenes", f"{PAINTED_FILE}:Painted/a", "--protocols", "rooms-semantic", "--no-pictures"]
+    words += ["--jobs", "1"]
         "run",
         "--scenes",
         f"{PAINTED_FILE}:Painted/a",
