@@ -147,15 +147,6 @@ def test_variants_stand_side_by_side_and_run_toml_repeats_them(
     method = f"{PAINTED_FILE}:Collector"
     words = ["run", "--scenes", f"{PAINTED_FILE}:Painted/a", "--protocols", "rooms-semantic", "--no-pictures"]
     words += ["--jobs", "1"]
-        "run",
-        "--scenes",
-        f"{PAINTED_FILE}:Painted/a",
-        "--protocols",
-        "rooms-semantic",
-        "--no-pictures",
-        "--jobs",
-        "1",
-    ]
     out = tmp_path / "out"
     assert main([*words, "--methods", method, f"{method}@stride=2", "--out", str(out)]) == 0
     results = json.loads((out / "metrics.json").read_text())["results"]
