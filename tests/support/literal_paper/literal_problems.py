@@ -1,4 +1,4 @@
-"""Random problems for the paper's text and the pipeline, their settings, what the maps differ in, both side by side."""
+"""Random problems for the paper's text and the pipeline, their settings, and what the maps differ in."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ from dataclasses import asdict, dataclass, fields, replace
 import numpy as np
 from literal_paper import NONE, Array, PaperProgram, PaperSettings, Thing
 
-from su3d_bench.core.interfaces import StageTimer
 from su3d_bench.core.maps import Instances
-from su3d_bench.core.types import Detections, Frame, SceneInfo
+from su3d_bench.core.types import Detections, Frame
 from su3d_bench.opensu3d.config import OpenSU3DConfig
-from su3d_bench.opensu3d.pipeline import OpenSU3D
 
 # Of an image's points of instances in one voxel the pipeline keeps the last.
 OURS = PaperSettings(in_one_voxel="last")
@@ -215,25 +213,3 @@ def unlike(found: Instances, k: int, thing: Thing) -> Iterator[str]:
     ):
         if not np.allclose(ours, of_paper, rtol=1e-5, atol=1e-5):
             yield f"{what} {ours}, the paper has {of_paper}"
-
-
-class SideBySide(OpenSU3D):
-    """OpenSU3D beside ``PaperProgram``, frame by frame."""
-
-    name = "side-by-side"
-    warms_up = False
-
-    def start(self, scene: SceneInfo) -> None:
-        super().start(scene)
-        self._program = PaperProgram(settings_of(self.config))
-
-    def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
-        super().update(frame, detections, timer)
-        self._program.add_image(frame, detections)
-        assert (self.n_points, self.n_instances) == (len(self._program.scene.points), len(self._program.tracks))
-
-    def finish(self) -> Instances:
-        found = super().finish()
-        lines = differences(found, self._program)
-        assert not lines, "; ".join(lines)
-        return found
