@@ -17,9 +17,11 @@ from su3d_bench.formats.tables.table import Origin, Table, is_count
 from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.scoring import ProtocolResult, combine
 from su3d_bench.numerics.statistics import SignFlipTest
-from su3d_bench.reports.tables.judged import WHO_DID
+from su3d_bench.reports.tables.ablation import ablation_table
+from su3d_bench.reports.tables.judged import JUDGED, WHO_DID, judged_table
 from su3d_bench.reports.tables.latex import PrintedCell, printed_cells
 from su3d_bench.reports.tables.model import BY_PEOPLE, Measured
+from su3d_bench.reports.tables.paper import PaperTable, Shown, paper_table
 from su3d_bench.reports.tables.run import found_table
 from su3d_bench.reports.tables.timing import AnytimePoint
 from su3d_bench.runs.ablation import read_rows
