@@ -154,7 +154,7 @@ def test_what_cannot_be_done_is_one_line(words: list[str], said: str, capsys: py
 def test_a_named_model_that_is_missing_is_what_to_fetch(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["models", "check", "sam-vit-h"]) == 1
     out = capsys.readouterr().out
-    assert out.startswith("model 'sam-vit-h': not found below") and "run: su3d-bench fetch models sam-vit-h" in out
+    assert out.startswith("model 'sam-vit-h': not found below") and "run: su3d-bench models fetch sam-vit-h" in out
 
 
 @needs_models
