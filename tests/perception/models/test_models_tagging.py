@@ -140,5 +140,5 @@ def test_the_published_package_gets_its_weights_as_plain_tensors(
     assert RamTagger(lambda: load_ram(files, "cpu"), "cpu", "digest").tags(RGB) == ("coffee table",)
     assert asked == [{"pretrained": "", "image_size": 384, "vit": "swin_l"}]
     torch.save({"model": {"vision_multi.weight": torch.zeros(2, 3)}}, path)
-    with pytest.raises(DataError, match=r"lacks 1 tensors, such as tagging_head\.bias; run: su3d-bench fetch"):
+    with pytest.raises(DataError, match=r"lacks 1 tensors, such as tagging_head\.bias; run: su3d-bench models fetch"):
         load_ram(files, "cpu")
