@@ -11,10 +11,7 @@ import sys
 
 import pytest
 
-import su3d_bench
-from su3d_bench.cli.main import main
 from su3d_bench.cli.output import drawn_bars
-from su3d_bench.core.config import write_toml
 from su3d_bench.core.printing import Door, doors, escaped_json, one_line
 
 HOSTILE = "\x1b[2Ja\r\u202eb\x9b\n::stop-commands::x ##[error]y"
