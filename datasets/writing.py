@@ -21,8 +21,7 @@ from su3d_bench.core.files.atomic import make_folder, write_bytes, write_json, w
 from su3d_bench.core.files.locks import clear_unfinished
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int32Array, UInt8Array
-from su3d_bench.datasets.recordings.joined_lists import JoinedList
-from su3d_bench.datasets.recordings.made_rooms import MARKER, read_marker
+from su3d_bench.datasets.recordings.file_dataset import MARKER, read_marker
 
 FRAMES_PER_SECOND = 30.0
 
@@ -79,8 +78,7 @@ class SceneTarget:
 
     ``folder`` bears the scene's name in the layout. ``frames`` is the name in it of what holds the frames; where that
     is one file, it is written whole. ``truth`` are the other files without which the scene is not whole. ``apart`` are
-    files and folders with a place outside ``folder``, each with its name while the scene is built; ``joined`` the files
-    of all scenes that have rows of this one.
+    files and folders with a place outside ``folder``, each with its name while the scene is built.
     """
 
     scene: str
@@ -89,7 +87,6 @@ class SceneTarget:
     frames: str
     truth: tuple[Path, ...] = ()
     apart: tuple[tuple[str, Path], ...] = ()
-    joined: tuple[JoinedList, ...] = ()
 
     @property
     def partial(self) -> Path:
@@ -102,8 +99,7 @@ class SceneTarget:
 
     @property
     def is_whole(self) -> bool:
-        is_there = all(path.exists() for path in (self.folder / self.frames, *self.truth))
-        return is_there and all(one.has(self.folder.name) for one in self.joined)
+        return all(path.exists() for path in (self.folder / self.frames, *self.truth))
 
 
 class Layout(ABC):
@@ -127,15 +123,9 @@ class Layout(ABC):
     @abstractmethod
     def target(self, scene: str, key: str, out: Path) -> SceneTarget: ...
 
-    def marker_extras(self, names: Sequence[str]) -> dict[str, Any]:
-        """What else the marker says of the scenes, by their names in the layout."""
-        return {}
-
-    def write_shared(self, dataset: ScannedDataset, scene: str, out: Path) -> None:  # noqa: B027 - none for some
+    @abstractmethod
+    def write_shared(self, dataset: ScannedDataset, scene: str, out: Path) -> None:
         """Write what all scenes share; a ``StoreError`` where there is another."""
-
-    def write_lists(self, dataset: ScannedDataset, names: Sequence[str], out: Path) -> None:  # noqa: B027 - none for some
-        """Write what lists the scenes of a folder, by their names in the layout: all that are or will be there."""
 
     @abstractmethod
     def frame_names(self, index: int) -> Sequence[str]:
@@ -174,18 +164,13 @@ def plan_scenes(layout: Layout, dataset: ScannedDataset, scenes: Sequence[str], 
         )
         if strange is not None:
             raise StoreError(f"{strange}: is there already and was made elsewhere; choose another folder with --out")
-    every = marked | {target.folder.name: target.key for target in targets}
-    for joined in {one.place: one for target in targets for one in target.joined}.values():
-        joined.check_is_ours(every)
     pending = [target for target in targets if not target.is_whole]
     if not pending:
         return []
     layout.write_shared(dataset, pending[0].scene, out)
-    marked = every
+    marked = marked | {target.folder.name: target.key for target in targets}
     marker = {"generator": f"su3d-bench {dataset.name}", "version": layout.settings[0]}
-    marker |= {"scenes": dict(sorted(marked.items()))} | layout.marker_extras(sorted(marked))
-    write_json(folder / MARKER, marker)
-    layout.write_lists(dataset, sorted(marked), out)
+    write_json(folder / MARKER, marker | {"scenes": dict(sorted(marked.items()))})
     for target in pending:
         for folder in (target.partial, *(path for path in target.partial.rglob("*") if path.is_dir())):
             clear_unfinished(folder)
@@ -229,8 +214,6 @@ def finish_scene(layout: Layout, dataset: ScannedDataset, target: SceneTarget) -
                 shutil.rmtree(place)
             place.parent.mkdir(parents=True, exist_ok=True)
             os.replace(target.partial / name, place)
-        for joined in target.joined:
-            joined.join(target.partial, target.folder.name)
         if target.folder.exists():
             _add_files(target.partial, target.folder)
         else:

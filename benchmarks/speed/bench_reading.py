@@ -29,9 +29,7 @@ from su3d_bench.core.system.timing import calibration_ms
 from su3d_bench.core.types import Float32Array, Frame, UInt8Array
 from su3d_bench.datasets.replica.frames import ReplicaFrames
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
-from su3d_bench.datasets.scannet.sens.header import SensHeader, header_bytes
-from su3d_bench.datasets.scannet.sens.read import FRAME_RECORD, SensFile
-from su3d_bench.datasets.scannet.sens.write import SensFrame, write_sens
+from su3d_bench.datasets.scannet.sens import FRAME_RECORD, SensFile, SensFrame, SensHeader, header_bytes, write_sens
 from su3d_bench.formats.images import jpeg_bytes
 from su3d_bench.runs.frame_loop import ReadAhead
 

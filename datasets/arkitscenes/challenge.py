@@ -17,13 +17,14 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing, PredictionError, converted, printable
 from su3d_bench.core.types import Float32Array, GroundTruth, LabelSet
-from su3d_bench.datasets.arkitscenes.folders import BASES, SCENE_NAMES
 from su3d_bench.formats.images import read_bytes
 from su3d_bench.formats.tables.csv_text import separated_rows
 from su3d_bench.formats.text_files import read_text
 from su3d_bench.formats.text_integers import integer_lines
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS, values_of_numbers
 
+BASES = ("", "arkitscenes", "ARKitScenes", "opensun3d")  # below the data root
+SCENE_NAMES = r"[0-9]{8}"
 TRACK = "challenge_track_1"
 CHECKOUT = "cvpr24-challenge"
 CHALLENGE_URL = "https://github.com/OpenSun3D/cvpr24-challenge"

@@ -5,41 +5,51 @@ The raw and the 3DOD release are read; the query and the truth come from a clone
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from su3d_bench.core.digests import digest_file
-from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing, suggest
-from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo, Surface
+from su3d_bench.core.errors import FramesMissing, GroundTruthMissing
+from su3d_bench.core.types import Frame, GroundTruth, Surface
 from su3d_bench.datasets.arkitscenes.challenge import (
+    BASES,
     LABEL_SPACE,
+    SCENE_NAMES,
     VARIANT,
     Challenge,
     ChallengeQuery,
     answered,
     find_challenge,
 )
-from su3d_bench.datasets.arkitscenes.folders import (
-    DEVELOPMENT,
-    SCENE_NAMES,
-    SceneFolders,
-    find_scenes,
-    no_scenes,
-)
 from su3d_bench.datasets.arkitscenes.frames import (
     MOST_CONFIDENCE,
+    TRAJECTORY_NAME,
     Images,
     PhoneFrames,
     PhoneRecording,
     open_recording,
 )
 from su3d_bench.datasets.recordings import meshes
+from su3d_bench.datasets.recordings.file_dataset import FileDataset, faults_of, keeps_last, sizes_and_ends
 from su3d_bench.datasets.recordings.recorded_frames import reading
 
-READER_VERSION = 1  # raise it whenever the same files come out as other frames or another truth
+DEVELOPMENT = "ChallengeDevelopmentSet"
+# What download_data_opensun3d.py (OpenSun3D/cvpr24-challenge at 59db30f) and download_data.py (apple/ARKitScenes at
+# 7283761) name the folders of scenes.
+SETS = (
+    DEVELOPMENT,
+    "ChallengeTestSet",
+    "FullTrainingSet",
+    "FullTrainingSetWithWideAssets",
+    *(f"{release}{fold}" for release in ("raw/", "3dod/", "") for fold in ("Training", "Validation")),
+)
+
+
+def mesh_name(scene: str) -> str:
+    return f"{scene}_3dod_mesh.ply"
 
 
 class ArkitScenesOptions(BaseModel):
@@ -56,56 +66,44 @@ class ArkitScenesOptions(BaseModel):
     challenge: Path | None = None
 
 
-class ArkitScenes:
-    """ARKitScenes and the OpenSUN3D challenge's queries over it; read below the data root."""
+class ArkitScenes(FileDataset[ArkitScenesOptions]):
+    """ARKitScenes and the OpenSUN3D challenge's queries over it; read below the data root.
+
+    A scene is a folder named after its video, such as ``42445173``, in the layout of Apple's raw release, which the
+    OpenSUN3D challenge downloads, or of its 3DOD release, whose frames lie one folder deeper, in ``42445173_frames``.
+    """
 
     name = "arkitscenes"
-    reads_made_rooms = True
+    reader_version = 2
     scene_names = SCENE_NAMES
+    places_of_scenes = tuple(f"{base}/{name}" if base else name for base in BASES for name in SETS)
+    how_to_get = (
+        f"/{DEVELOPMENT}, in raw/Training or where else https://github.com/apple/ARKitScenes and the OpenSUN3D "
+        f"challenge download them (a scene is a folder such as 42445173 with {TRAJECTORY_NAME}); set SU3D_DATA to "
+        "where they are"
+    )
     label_space = LABEL_SPACE
-    variants: tuple[str, ...] = (VARIANT,)
+    variants = (VARIANT,)
+    no_mesh = "the challenge annotates what answers its query and nothing else"
     Options = ArkitScenesOptions
 
-    def __init__(self, root: Path, options: ArkitScenesOptions | None = None) -> None:
-        self.root = root
-        self.options = options or ArkitScenesOptions()
-        self._tree: SceneFolders | None = None
-        self._challenge: Challenge | None = None
-        self._last: tuple[str, PhoneRecording] | None = None
-        self._mesh: tuple[str, Surface] | None = None
+    def is_scene(self, folder: Path) -> bool:
+        names = (TRAJECTORY_NAME, f"{folder.name}_frames", mesh_name(folder.name))
+        return re.fullmatch(SCENE_NAMES, folder.name) is not None and any((folder / one).exists() for one in names)
 
-    @property
-    def tree(self) -> SceneFolders:
-        """Where the scenes are; a ``ScenesMissing`` that says how to get data where there are none."""
-        if self._tree is None:
-            tree = find_scenes(self.root)
-            if not tree.folder_of:
-                raise no_scenes(self.root)
-            self._tree = tree
-        return self._tree
-
-    @property
+    @cached_property
     def challenge(self) -> Challenge:
         """The challenge's lists and truths, as far as they are here."""
-        if self._challenge is None:
-            self._challenge = find_challenge(self.root, self.options.challenge)
-        return self._challenge
-
-    def scenes(self) -> Sequence[str]:
-        return tuple(self.tree.folder_of)
+        return find_challenge(self.root, self.options.challenge)
 
     def groups(self) -> Mapping[str, Sequence[str]]:
         """The challenge's development scenes, and its test scenes where their list is here."""
         return self.challenge.groups
 
-    def places(self) -> Sequence[Path]:
-        """Where scenes are, or else would be looked for first."""
-        return find_scenes(self.root).places or [self.root / DEVELOPMENT]
-
     def status(self, scene: str) -> str:
         """A word on the scene from a quick look: images, and query and truth."""
         try:
-            words = f"{len(self._recording(scene).images)} images"
+            words = f"{len(self.recording(scene).images)} images"
         except FramesMissing:
             words = "no images"
         try:
@@ -115,36 +113,28 @@ class ArkitScenes:
         has_truth = any(path.suffix == ".txt" for path in self.challenge.files(scene))
         return f"{words}, query '{text}', {'ground truth' if has_truth else 'no ground truth'}"
 
-    def info(self, scene: str, stride: int) -> SceneInfo:
-        domain: ImageDomain = "rendered-rooms" if scene in self.tree.made else "camera"
-        return SceneInfo(self.name, scene, len(self.frames(scene, stride)), stride, domain)
+    def n_frames(self, scene: str, stride: int) -> int:
+        return len(self.frames(scene, stride))
 
     def frames(self, scene: str, stride: int) -> Sequence[Frame]:
         """Every ``stride``-th of the frames that have all of their files and a pose, in the order of their times."""
-        return PhoneFrames(self._recording(scene), stride, self.options.width, self.options.least_confidence)
+        return PhoneFrames(self.recording(scene), stride, self.options.width, self.options.least_confidence)
 
-    def files(self, scene: str) -> Sequence[Path]:
-        return (*self._recording(scene).files(), *self._small_files(scene))
+    def recording_files(self, scene: str) -> Sequence[Path]:
+        return self.recording(scene).files()
 
-    def digest(self, scene: str) -> str:
-        """A key of the content of the truth, the lists, the mesh, the poses, all cameras and the first and last images,
-        and of the sizes of all files: what is changed in the middle and keeps its size goes unseen."""
-        words = self.name, READER_VERSION, scene, scene in self.tree.made, self.options.model_dump_json()
-        total = hashlib.sha256(" ".join(str(word) for word in words).encode())
-        files = self._recording(scene).files()
+    def recording_key(self, scene: str) -> str:
+        files = self.recording_files(scene)
         cameras = [path for path in files if path.suffix == ".pincam"]
-        with reading(self._where(scene)):
-            for path in files:
-                total.update(f"{path.parent.name}/{path.name} {path.stat().st_size}\n".encode())
-            for path in (*files[:4], *files[-4:], *cameras, *self._small_files(scene)):
-                total.update(f"{path.name} {digest_file(path)}\n".encode())
-        return total.hexdigest()
+        with reading(self.where(scene)):
+            return sizes_and_ends(files, 4) + sizes_and_ends(cameras, len(cameras))
 
-    def ground_truth(self, scene: str, variant: str) -> GroundTruth:
+    def small_files(self, scene: str) -> tuple[Path, ...]:
+        mesh = self.mesh_file(scene)
+        return (*((mesh,) if mesh.is_file() else ()), *self.challenge.files(scene))
+
+    def own_truth(self, scene: str, variant: str) -> GroundTruth:
         """The vertices that answer the scene's query, each with the number of its object."""
-        if variant not in self.variants:
-            hint = suggest(variant, self.variants)
-            raise GroundTruthMissing(f"{self._where(scene)}: no ground truth '{variant}'{hint}")
         return self.challenge.ground_truth(scene, self.surface(scene).vertices)
 
     def asked_text(self, scene: str) -> str:
@@ -155,56 +145,30 @@ class ArkitScenes:
         """The scene's query with the numbers of the objects that answer it; ``GroundTruthMissing`` without either."""
         return (answered(self.ground_truth(scene, VARIANT), self.challenge.query(scene)),)
 
-    def instance_mesh(self, scene: str) -> InstanceMesh:
-        raise GroundTruthMissing(
-            f"{self._where(scene)}: no annotated mesh; the challenge annotates what answers its query and nothing else"
-        )
+    def mesh_file(self, scene: str) -> Path:
+        """The mesh that the phone made, which may be missing."""
+        return self.folder(scene) / mesh_name(scene)
 
+    @keeps_last
     def surface(self, scene: str) -> Surface:
-        """The mesh that the phone made, without labels; the last one is kept, because every protocol asks for it."""
-        if self._mesh is None or self._mesh[0] != scene:
-            self._folder(scene)
-            path = self.tree.mesh(scene)
-            self._mesh = scene, meshes.read_surface(path, f"{self._where(scene)}: {path.name}")
-        return self._mesh[1]
+        """The mesh that the phone made, without labels."""
+        path = self.mesh_file(scene)
+        return meshes.read_surface(path, f"{self.where(scene)}: {path.name}")
 
     def problems(self, scene: str) -> Iterator[str]:
         """What of the recording was left out, and what is wrong with query and truth; images are left to the frames."""
-        yield from self._recording(scene).missing
-        questions: list[Callable[[], object]] = [
-            lambda: self.surface(scene),
-            lambda: self.ground_truth(scene, VARIANT),
-            lambda: self.challenge.query(scene),
-        ]
-        seen = set[str]()
-        for ask in questions:
-            try:
-                ask()
-            except GroundTruthMissing:
-                pass
-            except DataError as error:
-                if str(error) not in seen:
-                    yield str(error)
-                seen.add(str(error))
+        yield from self.recording(scene).missing
+        yield from faults_of(
+            [
+                lambda: self.surface(scene),
+                lambda: self.ground_truth(scene, VARIANT),
+                lambda: self.challenge.query(scene),
+            ]
+        )
 
-    def _where(self, scene: str) -> str:
-        return f"{self.name}/{scene}"
-
-    def _folder(self, scene: str) -> Path:
-        if scene not in self.tree.folder_of:
-            hint = suggest(scene, list(self.tree.folder_of), f"{self.tree.places[0]} has")
-            raise DataError(f"arkitscenes: no scene '{scene}'{hint}")
-        return self.tree.frames_folder(scene)
-
-    def _small_files(self, scene: str) -> tuple[Path, ...]:
-        """What is read of the scene beside its recording, as far as it is there."""
-        mesh = self.tree.mesh(scene)
-        return (*((mesh,) if mesh.is_file() else ()), *self.challenge.files(scene))
-
-    def _recording(self, scene: str) -> PhoneRecording:
-        """The recording of ``scene``; the last one is kept, because each step asks for it anew."""
-        if self._last is None or self._last[0] != scene:
-            options, where = self.options, self._where(scene)
-            folder = self._folder(scene)
-            self._last = scene, open_recording(folder, scene, options.images, options.least_confidence, where)
-        return self._last[1]
+    @keeps_last
+    def recording(self, scene: str) -> PhoneRecording:
+        deeper = self.folder(scene) / f"{scene}_frames"
+        folder = deeper if deeper.is_dir() else self.folder(scene)
+        options = self.options
+        return open_recording(folder, scene, options.images, options.least_confidence, self.where(scene))

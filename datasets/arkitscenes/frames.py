@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, FramesMissing
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, UInt8Array
-from su3d_bench.datasets.arkitscenes.folders import TRAJECTORY_NAME
 from su3d_bench.datasets.arkitscenes.trajectory import Trajectory, read_trajectory
 from su3d_bench.datasets.recordings.recorded_frames import (
     StoredDepth,
@@ -29,6 +28,7 @@ from su3d_bench.formats.images import Size, decode_colour, decode_depth, read_by
 from su3d_bench.formats.text_files import read_text
 
 Images = Literal["lowres", "wide"]
+TRAJECTORY_NAME = "lowres_wide.traj"
 LOWRES, WIDE, DEPTH, FINE_DEPTH, CONFIDENCE = "lowres_wide", "wide", "lowres_depth", "highres_depth", "confidence"
 COLOUR_FOLDER: Mapping[Images, str] = {"lowres": LOWRES, "wide": WIDE}
 UNITS_PER_METRE = 1000.0  # DATA.md of apple/ARKitScenes at 7283761: millimetres

@@ -16,7 +16,7 @@ from su3d_bench.core.types import Float32Array, Int64Array
 from su3d_bench.datasets.recordings.meshes import vertex_positions
 from su3d_bench.datasets.replica.folders import find_original_scene, original_name
 from su3d_bench.datasets.replica.mesh_truth import MESH_NAME, AnnotatedMesh, read_annotated_mesh
-from su3d_bench.datasets.scannetpp.folders import BASES as SCANNETPP_BASES
+from su3d_bench.datasets.scannetpp.labels import BASES as SCANNETPP_BASES
 from su3d_bench.formats.arrays import MOST_POINTS, checked_points, kind_of
 from su3d_bench.formats.ply import read_ply
 from su3d_bench.formats.text_files import parsed_json, read_text

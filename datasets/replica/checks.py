@@ -7,7 +7,7 @@ files, which looks at images in the same way.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from su3d_bench.core.digests import digest_file
@@ -126,9 +126,9 @@ def original_problems(original: Path | None, where: str) -> Iterator[str]:
     yield from _shortened(lines, f"{where}: {INFO_NAME}")
 
 
-def digest_of(parts: Iterable[str], files: Sequence[Path], images: Sequence[Path], where: str) -> str:
-    """A key of ``parts``, the content of ``files``, and the names, sizes and content of ``images``."""
-    total = hashlib.sha256("\n".join(parts).encode())
+def digest_of(files: Sequence[Path], images: Sequence[Path], where: str) -> str:
+    """A key of the content of ``files``, and of the names, sizes and content of ``images``."""
+    total = hashlib.sha256()
     with reading(where):
         for path in files:
             total.update(f"{path.name} {digest_file(path)}\n".encode())

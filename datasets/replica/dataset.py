@@ -7,13 +7,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict
-
 from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing, counted, suggest
 from su3d_bench.core.system.files import file_bytes
-from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh, OrientedBox, SceneInfo, Surface
+from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh, OrientedBox, Surface
 from su3d_bench.datasets.openlex3d import release as openlex3d
-from su3d_bench.datasets.recordings.made_rooms import read_marker
+from su3d_bench.datasets.recordings.file_dataset import FileDataset, NoOptions, keeps_last, read_marker
 from su3d_bench.datasets.recordings.meshes import read_surface
 from su3d_bench.datasets.replica.boxes import box_truth, object_boxes_of, read_boxes
 from su3d_bench.datasets.replica.checks import digest_of, original_problems, render_problems
@@ -60,35 +58,24 @@ from su3d_bench.datasets.replica.scene_graphs import FILES as GRAPH_FILES
 from su3d_bench.datasets.replica.scene_graphs import VARIANT as SCENE_GRAPH
 from su3d_bench.datasets.replica.scene_graphs import find_graph_folder, graph_truth
 
-READER_VERSION = 3  # raise it whenever the same files come out as other frames or another truth
 
-
-class ReplicaOptions(BaseModel):
-    """Replica has no settings: its files say everything."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Replica:
+class Replica(FileDataset[NoOptions]):
     """NICE-SLAM's render of Replica, with ground truth from the original release; read below the data root."""
 
     name = "replica"
+    reader_version = 4
     reads_made_rooms = True
     scene_names = r"(room_?[0-2]|office_?[0-4])"  # those of made rooms are among them
     label_space = "replica"
-    variants: tuple[str, ...] = (
+    variants = (
         "mesh-vertices", "face-corners", "conceptgraphs", "openmask3d", "ovo-51", "boxes", SCENE_GRAPH
     )  # fmt: skip
     further_truths = openlex3d.FURTHER_TRUTHS
-    Options = ReplicaOptions
-
-    def __init__(self, root: Path, options: ReplicaOptions | None = None) -> None:
-        self.root = root
-        self.options = options or ReplicaOptions()
-        self._mesh: tuple[str, AnnotatedMesh] | None = None
+    labels_of = "replica"
+    Options = NoOptions
 
     @cached_property
-    def tree(self) -> RenderTree:
+    def rendered(self) -> RenderTree:
         """The render tree, without scenes where there is none."""
         return find_render_tree(self.root) or RenderTree(self.root / RENDER_FOLDERS[0], ())
 
@@ -97,7 +84,7 @@ class Replica:
 
         Without a render tree those of the original release, which can be looked at; beside one they are named singly.
         """
-        scenes = self.tree.scenes or unrendered_scenes(self.root)
+        scenes = self.rendered.scenes or unrendered_scenes(self.root)
         if not scenes:
             raise no_render_tree(self.root)
         return scenes
@@ -112,7 +99,7 @@ class Replica:
         frames = "no frames"
         if self._is_rendered(scene):
             try:
-                n_poses = file_bytes(self._folder(scene) / "traj.txt").rstrip().count(b"\n") + 1
+                n_poses = file_bytes(self.folder(scene) / "traj.txt").rstrip().count(b"\n") + 1
             except OSError:
                 return "traj.txt is missing"
             frames = counted(n_poses, "frame")
@@ -129,55 +116,52 @@ class Replica:
             released += [f"{variant} without its {missing[0]}" if missing else variant] if files else []
         return f"{frames}, {truth}" + (f"; also {', '.join(released)}" if released else "")
 
-    def info(self, scene: str, stride: int) -> SceneInfo:
-        """Cheap facts and a check that the scene's frames are complete; the domain tells made scenes from scans."""
-        folder = self._folder(scene)
+    def n_frames(self, scene: str, stride: int) -> int:
+        """Cheap, with a check that the scene's frames are complete."""
+        folder = self.folder(scene)
         if not self._is_rendered(scene):
-            return SceneInfo(self.name, scene, 0, stride, "camera")
-        n_poses = len(read_trajectory(folder / "traj.txt", self._where(scene)))
-        check_frames_complete(folder, n_poses, self._where(scene))
-        return SceneInfo(self.name, scene, len(range(0, n_poses, stride)), stride, self._image_domain(scene))
+            return 0
+        n_poses = len(read_trajectory(folder / "traj.txt", self.where(scene)))
+        check_frames_complete(folder, n_poses, self.where(scene))
+        return len(range(0, n_poses, stride))
+
+    def image_domain(self, scene: str) -> ImageDomain:
+        return "rendered-rooms" if scene in read_marker(self.rendered.folder) else "camera"
 
     def frames(self, scene: str, stride: int) -> Sequence[Frame]:
-        folder, where = self._folder(scene), self._where(scene)
+        folder, where = self.folder(scene), self.where(scene)
         if not self._is_rendered(scene):
             raise FramesMissing(
                 f"{where}: no frames; expected traj.txt and results/ of NICE-SLAM's render in {folder}: "
                 f"{FETCH_FRAMES}; what is here can be looked at: su3d-bench datasets show {where}"
             )
-        camera = read_camera(self.tree.folder / "cam_params.json", where)
+        camera = read_camera(self.rendered.folder / "cam_params.json", where)
         poses = read_trajectory(folder / "traj.txt", where)
         check_frames_complete(folder, len(poses), where)
         return ReplicaFrames(folder, where, camera, poses, range(0, len(poses), stride))
 
-    def files(self, scene: str) -> Sequence[Path]:
-        folder = self._folder(scene)
+    def recording_files(self, scene: str) -> Sequence[Path]:
+        folder = self.folder(scene)
         if not self._is_rendered(scene):
-            return self._truth_files(scene)
-        n_poses = len(read_trajectory(folder / "traj.txt", self._where(scene)))
+            return ()
+        n_poses = len(read_trajectory(folder / "traj.txt", self.where(scene)))
         images = [folder / name(index) for index in range(n_poses) for name in (colour_name, depth_name)]
-        return (self.tree.folder / "cam_params.json", folder / "traj.txt", *images, *self._truth_files(scene))
+        return (self.rendered.folder / "cam_params.json", folder / "traj.txt", *images)
 
-    def digest(self, scene: str) -> str:
+    def recording_key(self, scene: str) -> str:
         """A key of the content of every file; ``image_key`` says what it cannot see in an image."""
-        folder = self._folder(scene)
-        render = (self.tree.folder / "cam_params.json", folder / "traj.txt") if self._is_rendered(scene) else ()
-        files = (*render, *self._truth_files(scene))
-        parts = (f"replica {READER_VERSION}", scene, self._image_domain(scene))
-        return digest_of(parts, files, sorted(folder.glob("results/*")), self._where(scene))
+        folder = self.folder(scene)
+        files = (self.rendered.folder / "cam_params.json", folder / "traj.txt") if self._is_rendered(scene) else ()
+        return digest_of(files, sorted(folder.glob("results/*")), self.where(scene))
 
     def problems(self, scene: str) -> Iterator[str]:
         """What is wrong with the scene's files, one line each; what has no entry is no fault but void."""
-        self._folder(scene)
+        self.folder(scene)
         if self._is_rendered(scene):
-            yield from render_problems(self.tree.folder, scene, self._where(scene))
-        yield from original_problems(find_original_scene(self.root, scene), self._where(scene))
+            yield from render_problems(self.rendered.folder, scene, self.where(scene))
+        yield from original_problems(find_original_scene(self.root, scene), self.where(scene))
 
-    def ground_truth(self, scene: str, variant: str) -> GroundTruth:
-        self._folder(scene)
-        if variant in self.further_truths.values():
-            labelled: GroundTruth = openlex3d.truth_below(self.root, self.name, scene, variant)
-            return labelled
+    def own_truth(self, scene: str, variant: str) -> GroundTruth:
         match variant:
             case "mesh-vertices":
                 return vertex_truth(self._annotated_mesh(scene))
@@ -188,22 +172,21 @@ class Replica:
             case "openmask3d" | "ovo-51":
                 return self._label_file_truth(scene, variant)
             case "replicassg":
-                return graph_truth(self.root, scene, self._annotated_mesh(scene), self._where(scene))
+                return graph_truth(self.root, scene, self._annotated_mesh(scene), self.where(scene))
             case "boxes":
-                return box_truth(object_boxes_of(self._info(scene), self._where(scene)))
-        hint = suggest(variant, self.variants)
-        raise GroundTruthMissing(f"{self._where(scene)}: no ground truth '{variant}'{hint}")
+                return box_truth(object_boxes_of(self._info(scene), self.where(scene)))
+        raise AssertionError(variant)
 
     def object_boxes(self, scene: str) -> Mapping[int, OrientedBox]:
         """Object id of the original release -> its box in the world, from ``info_semantic.json`` alone."""
-        return read_boxes(self._info(scene), self._where(scene))
+        return read_boxes(self._info(scene), self.where(scene))
 
     def _info(self, scene: str) -> Path:
-        self._folder(scene)
+        self.folder(scene)
         original = find_original_scene(self.root, scene)
         if original is None or not (original / INFO_NAME).exists():
             raise GroundTruthMissing(
-                f"{self._where(scene)}: no boxes of objects; expected {original_name(scene)}/{INFO_NAME} of the "
+                f"{self.where(scene)}: no boxes of objects; expected {original_name(scene)}/{INFO_NAME} of the "
                 f"original release in {self.root / 'replica_v1'}: {FETCH_MESHES}"
             )
         return original / INFO_NAME
@@ -213,37 +196,31 @@ class Replica:
 
     def surface(self, scene: str) -> Surface:
         """The mesh beside the render, whose vertices label files for OpenMask3D and OVO describe."""
-        self._folder(scene)
+        self.folder(scene)
         mesh = self._render_mesh(scene)
         if not mesh.exists():
-            raise DataError(f"{self._where(scene)}: no mesh; {mesh.name} is missing in {self.tree.folder}")
-        return read_surface(mesh, f"{self._where(scene)}: {mesh.name}")
-
-    def _where(self, scene: str) -> str:
-        return f"{self.name}/{scene}"
+            raise DataError(f"{self.where(scene)}: no mesh; {mesh.name} is missing in {self.rendered.folder}")
+        return read_surface(mesh, f"{self.where(scene)}: {mesh.name}")
 
     def _render_mesh(self, scene: str) -> Path:
-        return self.tree.folder / f"{scene}_mesh.ply"
+        return self.rendered.folder / f"{scene}_mesh.ply"
 
-    def _folder(self, scene: str) -> Path:
+    def folder(self, scene: str) -> Path:
         """Where the scene's render is or would be; a ``DataError`` where nothing of the scene is here."""
         if not self._is_rendered(scene) and not self._is_annotated(scene):
             known = self.scenes()
-            hint = suggest(scene, known, f"{self.tree.folder} has")
+            hint = suggest(scene, known, f"{self.rendered.folder} has")
             raise DataError(f"replica: no scene '{scene}'{hint}")
-        return self.tree.folder / scene
+        return self.rendered.folder / scene
 
     def _is_annotated(self, scene: str) -> bool:
         original = find_original_scene(self.root, scene) if re.fullmatch(r"\w[\w-]*", scene, re.ASCII) else None
         return original is not None and any((original / name).is_file() for name in (MESH_NAME, INFO_NAME))
 
     def _is_rendered(self, scene: str) -> bool:
-        return scene in self.tree.scenes
+        return scene in self.rendered.scenes
 
-    def _image_domain(self, scene: str) -> ImageDomain:
-        return "rendered-rooms" if scene in read_marker(self.tree.folder) else "camera"
-
-    def _truth_files(self, scene: str) -> tuple[Path, ...]:
+    def small_files(self, scene: str) -> tuple[Path, ...]:
         """The render's mesh and every file of ground truth that is here, of whatever variant."""
         original = find_original_scene(self.root, scene)
         names = (MESH_NAME, INFO_NAME)
@@ -257,7 +234,7 @@ class Replica:
     def _released_truths(self, scene: str) -> dict[str, tuple[Path, ...]]:
         """Variant -> its files, of what others than Replica's makers released; none where nothing of it is here."""
         sequence = find_semantic_sequence(self.root, scene)
-        clouds = () if sequence is None else (*cloud_files(sequence), self._folder(scene) / REFERENCE_CLOUD)
+        clouds = () if sequence is None else (*cloud_files(sequence), self.folder(scene) / REFERENCE_CLOUD)
         labels = {variant: self._label_file(scene, variant) for variant in ("openmask3d", "ovo-51")}
         graphs = find_graph_folder(self.root)
         of_graph = () if graphs is None else tuple(graphs / name for name in GRAPH_FILES)
@@ -280,19 +257,19 @@ class Replica:
         return [mesh for mesh in meshes if mesh.path.exists()]
 
     def _label_file_truth(self, scene: str, variant: str) -> GroundTruth:
-        path, where = self._label_file(scene, variant), self._where(scene)
+        path, where = self._label_file(scene, variant), self.where(scene)
         if path is None:
             folder = INSTANCE_FOLDERS[0] if variant == "openmask3d" else SEMANTIC_LABEL_FOLDERS[0]
             raise GroundTruthMissing(
                 f"{where}: no ground truth '{variant}'; expected {folder}/{scene}.txt, one label a vertex, in "
-                f"{self.tree.folder}; {HOW_TO_GET_LABELS[variant]}"
+                f"{self.rendered.folder}; {HOW_TO_GET_LABELS[variant]}"
             )
         make = instance_file_truth if variant == "openmask3d" else class_file_truth
         return make(path, self._labelled_meshes(scene), where)
 
     def _cloud_truth(self, scene: str) -> GroundTruth:
-        where, sequence = self._where(scene), find_semantic_sequence(self.root, scene)
-        reference = self._folder(scene) / REFERENCE_CLOUD
+        where, sequence = self.where(scene), find_semantic_sequence(self.root, scene)
+        reference = self.folder(scene) / REFERENCE_CLOUD
         if sequence is None:
             raise GroundTruthMissing(
                 f"{where}: no ground truth 'conceptgraphs'; expected {original_name(scene)}/Sequence_1/{FUSED_CLOUD} "
@@ -305,24 +282,22 @@ class Replica:
             )
         return conceptgraphs_truth(sequence, reference, where)
 
+    @keeps_last
     def _annotated_mesh(self, scene: str) -> AnnotatedMesh:
-        """The mesh of ``scene``; the last one is kept, because every protocol asks for it anew."""
-        if self._mesh is None or self._mesh[0] != scene:
-            self._folder(scene)
-            self._mesh = scene, read_annotated_mesh(self._original(scene), self._where(scene))
-        return self._mesh[1]
+        self.folder(scene)
+        return read_annotated_mesh(self._original(scene), self.where(scene))
 
     def _instead(self, scene: str) -> str:
         """A clause on what scores the scene without its mesh; empty where nothing does."""
         try:
-            object_boxes_of(self._info(scene), self._where(scene))
+            object_boxes_of(self._info(scene), self.where(scene))
         except DataError:
             return ""
         return "; the protocol replica-boxes scores it by the boxes of its objects"
 
     def _original(self, scene: str) -> Path:
         """The scene's folder in the original release, with both files of the truth."""
-        original, where = find_original_scene(self.root, scene), self._where(scene)
+        original, where = find_original_scene(self.root, scene), self.where(scene)
         if original is None:
             raise GroundTruthMissing(
                 f"{where}: no ground truth; expected {original_name(scene)}/{MESH_NAME} of the original release "

@@ -11,11 +11,8 @@ import numpy as np
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.files.atomic import json_text, make_folder, write_json, write_text
 from su3d_bench.core.types import Float64Array, Frame
-from su3d_bench.datasets.openlex3d import writing as openlex3d
-from su3d_bench.datasets.openlex3d.labels import CATEGORIES_NAME
 from su3d_bench.datasets.replica.folders import original_name, replica_label_set
 from su3d_bench.datasets.replica.frames import colour_name, depth_name
-from su3d_bench.datasets.replica.graph_writing import graph_rows, joined_graphs, write_classes
 from su3d_bench.datasets.replica.mesh_truth import INFO_NAME, MESH_NAME
 from su3d_bench.datasets.writing import Layout, Scan, ScannedDataset, ScannedObject, SceneTarget, write_shared_text
 from su3d_bench.formats.images import (
@@ -32,14 +29,10 @@ LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
 DEPTH_SCALE = 6553.5  # of NICE-SLAM's render: 65535 is 10 m
 RENDER_FOLDER, ORIGINAL_FOLDER = "Replica", "replica_v1"
 STAGED_ORIGINAL, STAGED_MESH = ".original", ".mesh.ply"
-LABELS_OF = "replica"  # as OpenLex3D calls the dataset
 
 
 class ReplicaLayout(Layout):
-    """``Replica/<scene>/`` with the frames, the annotated mesh in ``replica_v1``; one camera for all scenes.
-
-    Beside them OpenLex3D's labels and ReplicaSSG's scene graphs.
-    """
+    """``Replica/<scene>/`` with the frames, the annotated mesh in ``replica_v1``; one camera for all scenes."""
 
     name = "replica"
     reader = "replica"
@@ -51,10 +44,8 @@ class ReplicaLayout(Layout):
     def target(self, scene: str, key: str, out: Path) -> SceneTarget:
         folder, mesh = out / RENDER_FOLDER / scene, out / RENDER_FOLDER / f"{scene}_mesh.ply"
         original = out / ORIGINAL_FOLDER / original_name(scene)
-        labels = openlex3d.labels_folder(out, LABELS_OF, scene)
-        truth = (mesh, original / MESH_NAME, original / INFO_NAME, labels / CATEGORIES_NAME)
-        apart = ((STAGED_ORIGINAL, original), (STAGED_MESH, mesh), (openlex3d.STAGED, labels))
-        return SceneTarget(scene, key, folder, "results", truth, apart, joined_graphs(out))
+        truth = (mesh, original / MESH_NAME, original / INFO_NAME)
+        return SceneTarget(scene, key, folder, "results", truth, ((STAGED_ORIGINAL, original), (STAGED_MESH, mesh)))
 
     def write_shared(self, dataset: ScannedDataset, scene: str, out: Path) -> None:
         make_folder(out / ORIGINAL_FOLDER)
@@ -64,8 +55,6 @@ class ReplicaLayout(Layout):
         text = json_text({"camera": sizes | {"scale": DEPTH_SCALE}})
         complaint = f"is another camera than that of {dataset.name} ({width}x{height})"
         write_shared_text(out / RENDER_FOLDER / "cam_params.json", text, complaint)
-        write_classes(out, replica_label_set().names)
-        openlex3d.write_prompts(out, LABELS_OF)
 
     def frame_names(self, index: int) -> Sequence[str]:
         return colour_name(index), depth_name(index)
@@ -74,7 +63,7 @@ class ReplicaLayout(Layout):
         return jpeg_bytes(frame.rgb), png_bytes(depth_in_units(frame.depth_m, DEPTH_SCALE))
 
     def write_truth(self, dataset: ScannedDataset, target: SceneTarget) -> None:
-        """Trajectory, annotated mesh, table of objects and plain mesh; labels and scene graph."""
+        """Trajectory, annotated mesh, table of objects and plain mesh."""
         scan = dataset.scan(target.scene)
         staged = target.partial / STAGED_ORIGINAL
         make_folder((staged / MESH_NAME).parent)
@@ -84,11 +73,6 @@ class ReplicaLayout(Layout):
         poses = dataset.trajectory(target.scene)
         lines = [" ".join(repr(float(value)) for value in pose.reshape(-1)) for pose in poses]
         write_text(target.partial / "traj.txt", "\n".join(lines) + "\n")
-        seen = [known for known in dataset.objects(target.scene) if (scan.object_id == known.id).any()]
-        numbers = {known.id: known.id for known in seen}
-        openlex3d.write_labels(target.partial / openlex3d.STAGED, target.folder.name, seen, numbers, scan.vertices)
-        for joined, row in zip(target.joined, graph_rows(original_name(target.folder.name), seen), strict=True):
-            joined.stage(target.partial, [row])
 
 
 def _vertex_element(scan: Scan) -> PlyElement:

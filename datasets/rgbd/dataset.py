@@ -16,18 +16,16 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, field_validator
 
-from su3d_bench.core.errors import DataError, GroundTruthMissing, ScenesMissing, printable, suggest
+from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.geometry import turn_to_z
 from su3d_bench.core.types import (
     Float32Array,
     Float64Array,
     Frame,
-    GroundTruth,
-    InstanceMesh,
-    SceneInfo,
     Surface,
     WorldUp,
 )
+from su3d_bench.datasets.recordings.file_dataset import FileDataset, SceneTree, keeps_last
 from su3d_bench.datasets.recordings.meshes import read_surface
 from su3d_bench.datasets.recordings.pose_convention import ROTATED, Finding
 from su3d_bench.datasets.recordings.recorded_frames import (
@@ -54,7 +52,6 @@ from su3d_bench.datasets.rgbd.files import (
 logger = logging.getLogger(__name__)
 OTHER = {"camera_to_world": "world_to_camera", "world_to_camera": "camera_to_world"}
 OTHER |= {"opencv": "opengl", "opengl": "opencv"}
-READER_VERSION = 2  # raise it whenever the same files come out as other frames
 
 
 class RgbdOptions(BaseModel):
@@ -70,38 +67,41 @@ class RgbdOptions(BaseModel):
         return [value] if isinstance(value, str) else value
 
 
-class Rgbd:
-    """Any folder of colour, depth and pose files that an rgbd.toml describes; unscored, without ground truth."""
+class Rgbd(FileDataset[RgbdOptions]):
+    """Any folder of colour, depth and pose files that an rgbd.toml describes; unscored, without ground truth.
+
+    ``folder_of`` is the description of each scene: those of the option ``files`` in its order, then those below the
+    data root. A file is called by its own name, or by its folder's where it is an ``rgbd.toml``.
+    """
 
     name = "rgbd"
+    reader_version = 3
+    places_of_scenes = ("rgbd",)
+    how_to_get = (
+        f"/rgbd (a scene is a folder with {FILE_NAME}); describe a folder of images in such a file there, or name the "
+        "file: --set rgbd.files=path/to/rgbd.toml"
+    )
     label_space = "none"
-    variants: tuple[str, ...] = ()
+    no_mesh = "folders of images have none"
     Options = RgbdOptions
 
-    def __init__(self, root: Path, options: RgbdOptions | None = None) -> None:
-        self.root = root
-        self.options = options or RgbdOptions()
-        self._last: tuple[str, RgbdDescription, Recording] | None = None
+    def find_tree(self) -> SceneTree:
+        place = self.root / "rgbd"
+        below = [folder / FILE_NAME for folder in (sorted(place.iterdir()) if place.is_dir() else ())]
+        named = [path / FILE_NAME if path.is_dir() else path for path in self.options.files]
+        path_of: dict[str, Path] = {}
+        for path in (*named, *(path for path in below if path.is_file())):
+            name = path.resolve().parent.name if path.name == FILE_NAME else path.stem
+            if name in path_of and path_of[name] != path:
+                raise DataError(f"rgbd: scene '{name}' is described twice, in {path_of[name]} and {path}; rename one")
+            path_of[name] = path
+        return SceneTree(self.root, (*self.options.files, place), path_of, frozenset())
 
-    def scenes(self) -> Sequence[str]:
-        """The scenes of the option ``files`` in its order, then those below the data root."""
-        scenes = tuple(self._descriptions())
-        if not scenes:
-            raise ScenesMissing(
-                f"rgbd: no scene in {self.root / 'rgbd'} (a scene is a folder with {FILE_NAME}); describe a folder of "
-                "images in such a file there, or name the file: --set rgbd.files=path/to/rgbd.toml"
-            )
-        return scenes
-
-    def places(self) -> Sequence[Path]:
-        """What is searched for descriptions."""
-        return [*self.options.files, self.root / "rgbd"]
-
-    def info(self, scene: str, stride: int) -> SceneInfo:
-        return SceneInfo(self.name, scene, len(RecordedFrames(self._recording(scene), stride)), stride, "camera")
+    def n_frames(self, scene: str, stride: int) -> int:
+        return len(self.frames(scene, stride))
 
     def frames(self, scene: str, stride: int) -> Sequence[Frame]:
-        return RecordedFrames(self._recording(scene), stride)
+        return RecordedFrames(self.recording(scene), stride)
 
     def is_reading_checked(self, scene: str) -> bool:
         """Whether the description lets depth be held against the poses."""
@@ -116,31 +116,24 @@ class Rgbd:
         elif finding.depth_factor != 1:
             changes.append(f"depth_unit_m = {description.depth_unit_m * finding.depth_factor:g}")
         return (
-            f"with {' and '.join(changes)}; set that in {self._description(scene).name}, or check_convention = false "
+            f"with {' and '.join(changes)}; set that in {self.folder(scene).name}, or check_convention = false "
             "to read the files as they are described"
         )
 
-    def files(self, scene: str) -> Sequence[Path]:
-        recording = self._recording(scene)
-        return (*recording.files, *recording.images())
+    def recording_files(self, scene: str) -> Sequence[Path]:
+        return (*self.recording(scene).files, *self.recording(scene).images())
 
-    def digest(self, scene: str) -> str:
-        return self._recording(scene).digest((self.name, READER_VERSION, scene))
+    def recording_key(self, scene: str) -> str:
+        return self.recording(scene).digest(())
 
     def problems(self, scene: str) -> Iterator[str]:
         """Frames that lack an image or a usable pose, one line for all; the others go on without them."""
-        yield from self._recording(scene).missing
-
-    def ground_truth(self, scene: str, variant: str) -> GroundTruth:
-        raise GroundTruthMissing(f"rgbd/{scene}: no ground truth '{variant}'; folders of images have none")
-
-    def instance_mesh(self, scene: str) -> InstanceMesh:
-        raise GroundTruthMissing(f"rgbd/{scene}: no annotated mesh; folders of images have none")
+        yield from self.recording(scene).missing
 
     def surface(self, scene: str) -> Surface:
         """The mesh that the description names."""
         description, recording = self._open(scene)
-        place = f"{recording.where}: {self._description(scene).name}"
+        place = f"{recording.where}: {self.folder(scene).name}"
         if description.mesh is None:
             raise DataError(f'{place} names no mesh; add one in the world of the poses: mesh = "mesh.ply"')
         surface = read_surface(recording.folder.file(description.mesh, place), f"{recording.where}: {description.mesh}")
@@ -152,41 +145,20 @@ class Rgbd:
     def up(self, scene: str) -> WorldUp:
         """What the description says of its world, or else what the frames show."""
         description, recording = self._open(scene)
-        name = self._description(scene).name
+        name = self.folder(scene).name
         if description.up is not None:
             return WorldUp(description.up, True, f"{name} says so")
         guess = guess_up(np.array([frame.pose for frame in recording.frames]), RecordedFrames(recording, is_quiet=True))
         return replace(guess, remedy=f'set up = "{guess.axis}" in {name}, or up = "z"')
 
-    def _descriptions(self) -> dict[str, Path]:
-        """Scene -> description; a file is called by its own name, or by its folder's where it is an ``rgbd.toml``."""
-        place = self.root / "rgbd"
-        below = [folder / FILE_NAME for folder in (sorted(place.iterdir()) if place.is_dir() else ())]
-        named = [path / FILE_NAME if path.is_dir() else path for path in self.options.files]
-        path_of: dict[str, Path] = {}
-        for path in (*named, *(path for path in below if path.is_file())):
-            name = path.resolve().parent.name if path.name == FILE_NAME else path.stem
-            if name in path_of and path_of[name] != path:
-                raise DataError(f"rgbd: scene '{name}' is described twice, in {path_of[name]} and {path}; rename one")
-            path_of[name] = path
-        return path_of
-
-    def _description(self, scene: str) -> Path:
-        descriptions = self._descriptions()
-        if scene not in descriptions:
-            known = self.scenes()
-            raise DataError(f"rgbd: no scene '{scene}'{suggest(scene, known)}")
-        return descriptions[scene]
-
-    def _recording(self, scene: str) -> Recording:
+    def recording(self, scene: str) -> Recording:
         return self._open(scene)[1]
 
+    @keeps_last
     def _open(self, scene: str) -> tuple[RgbdDescription, Recording]:
-        if self._last is None or self._last[0] != scene:
-            path, where = self._description(scene), f"{self.name}/{scene}"
-            description = read_description(path, where)
-            self._last = scene, description, open_recording(path, description, where)
-        return self._last[1:]
+        path, where = self.folder(scene), self.where(scene)
+        description = read_description(path, where)
+        return description, open_recording(path, description, where)
 
 
 def open_recording(path: Path, description: RgbdDescription, where: str) -> Recording:

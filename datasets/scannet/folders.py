@@ -12,10 +12,8 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from su3d_bench.core.errors import ScenesMissing
 from su3d_bench.core.system.files import file_text
-from su3d_bench.datasets.recordings.made_rooms import read_marker
-from su3d_bench.datasets.recordings.places import folders_in
+from su3d_bench.datasets.recordings.file_dataset import SceneTree, folders_in, read_marker
 from su3d_bench.datasets.scannet.labels import FIRST_TABLE_NAME, TABLE_NAME
 
 # The scenes of OpenSU3D's evaluation, in the order of its section IV-A.
@@ -41,23 +39,13 @@ PLACES = tuple(dict.fromkeys("/".join(part for part in (b, s) if part) or "." fo
 TABLE_FOLDERS = ("tasks", "metadata", "v2/tasks", "v1/tasks", "openscan", "OpenScan")
 SCAN_NAME = re.compile(r"scene\d{4}_\d{2}")
 EXPORTS = ("pose", "data/pose", "exported", "_info.txt")  # what tells a folder with exported frames
-SCANNET_URL = "http://www.scan-net.org"
 
 
 @dataclass(frozen=True)
-class ScanFolders:
-    """``folders`` of each scan, the first place first; ``made`` are scans that `datasets make` rendered."""
+class ScanFolders(SceneTree):
+    """Scans in the order of the paper's, then every other; ``folders`` of each, the first place first."""
 
-    root: Path
-    places: tuple[Path, ...]
     folders: Mapping[str, tuple[Path, ...]]
-    made: frozenset[str]
-
-    @property
-    def scenes(self) -> tuple[str, ...]:
-        """The paper's scenes that are here, in its order, then every other scan."""
-        first = [scan for scan in PAPER_SCENES if scan in self.folders]
-        return (*first, *sorted(set(self.folders) - set(first)))
 
     def find_file(self, scan: str, name: str) -> Path | None:
         """The file ``name`` of a scan, from the first of its folders that has it."""
@@ -91,7 +79,9 @@ def find_scans(root: Path) -> ScanFolders:
             made |= {scan.name for scan in scans if scan.name in rooms}
         for scan in scans:
             folders.setdefault(scan.name, []).append(scan)
-    return ScanFolders(root, tuple(places), {scan: tuple(paths) for scan, paths in folders.items()}, frozenset(made))
+    first = [scan for scan in PAPER_SCENES if scan in folders]
+    found = {scan: tuple(folders[scan]) for scan in (*first, *sorted(set(folders) - set(first)))}
+    return ScanFolders(root, tuple(places), {scan: paths[0] for scan, paths in found.items()}, frozenset(made), found)
 
 
 def _is_scan(folder: Path, rooms: Mapping[str, str]) -> bool:
@@ -105,13 +95,3 @@ def _is_scan(folder: Path, rooms: Mapping[str, str]) -> bool:
 def split_scenes(split: str) -> tuple[str, ...]:
     """The scans of an official split in the order of its list: Tasks/Benchmark/scannetv2_<split>.txt of ScanNet."""
     return tuple(file_text(Path(__file__).parent / "splits" / f"scannetv2_{split}.txt").split())
-
-
-def no_scans(root: Path) -> ScenesMissing:
-    """What to say where no scan was found."""
-    return ScenesMissing(
-        f"scannet: no scan in {root} or in its folders scans, scannet, scannet/scans (a scan is a folder such as "
-        "scene0000_00 with scene0000_00.sens or exported frames); su3d-bench datasets fetch scannet says how to get it "
-        f"from {SCANNET_URL}; or set SU3D_DATA to where it is, or make rooms in this layout: su3d-bench datasets make "
-        f"rooms --layout scannet --out {root}"
-    )

@@ -35,8 +35,7 @@ from su3d_bench.datasets.recordings.exported_frames import (
 )
 from su3d_bench.datasets.recordings.recorded_frames import numbers, reading, square
 from su3d_bench.datasets.recordings.source import RgbdSource, SensorPair
-from su3d_bench.datasets.scannet.sens.header import MAX_HEADER_BYTES, header_bytes, parse_header
-from su3d_bench.datasets.scannet.sens.read import SensSource
+from su3d_bench.datasets.scannet.sens import MAX_HEADER_BYTES, SensSource, header_bytes, parse_header
 from su3d_bench.formats.images import Size
 from su3d_bench.formats.text_files import read_text
 

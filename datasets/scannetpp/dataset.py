@@ -7,27 +7,21 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.core.digests import digest_file
-from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
+from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.system.files import opened
-from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo, Surface
+from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, Surface
 from su3d_bench.datasets.openlex3d import release as openlex3d
+from su3d_bench.datasets.recordings.file_dataset import FileDataset, faults_of, keeps_last, sizes_and_ends
 from su3d_bench.datasets.recordings.recorded_frames import reading
 from su3d_bench.datasets.scannetpp.annotations import MASK_NAME, MESH_NAME, SEGMENTS_NAME
-from su3d_bench.datasets.scannetpp.folders import (
-    IPHONE,
-    PLACES,
-    SCANS,
-    SCENE_NAMES,
-    SceneFolders,
-    find_scenes,
-    no_scenes,
-)
 from su3d_bench.datasets.scannetpp.iphone.frames import (
     IphoneFrames,
     IphoneRecording,
@@ -36,10 +30,10 @@ from su3d_bench.datasets.scannetpp.iphone.frames import (
     open_recording,
 )
 from su3d_bench.datasets.scannetpp.labels import (
+    BASES,
     BENCHMARK_FOLDER,
     LABEL_SPACE,
     LIST_NAMES,
-    BenchmarkClasses,
     read_benchmark_classes,
 )
 from su3d_bench.datasets.scannetpp.truth import (
@@ -51,8 +45,12 @@ from su3d_bench.datasets.scannetpp.truth import (
     read_surface,
     vertex_truth,
 )
+from su3d_bench.formats.text_files import read_text
 
-READER_VERSION = 1  # raise it whenever the same files come out as other frames or another truth
+SCENE_NAMES = r"[0-9a-f]{10}"
+SPLITS_FOLDER = "splits"
+IPHONE, SCANS = "iphone", "scans"
+MOST_SCENES = 100_000
 LARGE_BYTES, END_BYTES = 64 << 20, 1 << 20  # of a larger file, a video or a packed recording, the two ends are digested
 logger = logging.getLogger(__name__)
 
@@ -67,50 +65,57 @@ class ScannetppOptions(BaseModel):
     width: int = Field(default=640, ge=16, le=4096)  # ScanNet's depth camera
 
 
-class ScanNetPP:
-    """ScanNet++ (v1 and v2): the iPhone's frames and the annotated laser scans; read below the data root."""
+class ScanNetPP(FileDataset[ScannetppOptions]):
+    """ScanNet++ (v1 and v2): the iPhone's frames and the annotated laser scans; read below the data root.
+
+    A scene is a folder such as ``data/036bce3393`` with ``iphone/`` and ``scans/``; ``metadata/`` and ``splits/`` lie
+    beside ``data/``. Both releases have this layout.
+    """
 
     name = "scannetpp"
-    reads_made_rooms = True
+    reader_version = 2
     scene_names = SCENE_NAMES
+    places_of_scenes = tuple(f"{base}/data" if base else "data" for base in BASES)
+    how_to_get = (
+        "/data or in scannetpp/data (a scene is a folder such as 036bce3393 with iphone/ and scans/); ask for the data "
+        "at https://kaldir.vc.in.tum.de/scannetpp/ and set SU3D_DATA to where it is"
+    )
     label_space = LABEL_SPACE
-    variants: tuple[str, ...] = (VARIANT,)
+    variants = (VARIANT,)
     further_truths = openlex3d.FURTHER_TRUTHS
+    labels_of = "scannetpp"
     Options = ScannetppOptions
 
     def __init__(self, root: Path, options: ScannetppOptions | None = None) -> None:
-        self.root = root
-        self.options = options or ScannetppOptions()
-        self._scan: tuple[str, AnnotatedScan] | None = None
-        self._last: tuple[str, IphoneRecording] | None = None
-        self._tree: SceneFolders | None = None
+        super().__init__(root, options)
         self._warned_of: set[str] = set()
 
-    @property
-    def tree(self) -> SceneFolders:
-        """Where the scenes are; a ``ScenesMissing`` that says how to get data where there are none."""
-        if self._tree is None:
-            tree = find_scenes(self.root)
-            if not tree.folder_of:
-                raise no_scenes(self.root)
-            self._tree = tree
-        return self._tree
+    def is_scene(self, folder: Path) -> bool:
+        is_named = re.fullmatch(SCENE_NAMES, folder.name) is not None
+        return is_named and ((folder / IPHONE).exists() or (folder / SCANS).exists())
 
-    def scenes(self) -> Sequence[str]:
-        return tuple(self.tree.folder_of)
+    @property
+    def releases(self) -> list[Path]:
+        """The folders that hold ``data/``, ``metadata/`` and ``splits/``; a ``data/`` that is a link has two."""
+        return list(dict.fromkeys(path.parent for place in self.tree.places for path in (place, place.resolve())))
 
     def groups(self) -> Mapping[str, Sequence[str]]:
         """The official splits as far as their lists lie in ``splits/``; whether their scenes are here or not."""
-        return self.tree.splits
+        return self._splits
 
-    def places(self) -> Sequence[Path]:
-        """Where scenes are, or else would be looked for first."""
-        return find_scenes(self.root).places or [self.root / name for name in PLACES[:2]]
+    @cached_property
+    def _splits(self) -> dict[str, tuple[str, ...]]:
+        found: dict[str, tuple[str, ...]] = {}
+        for release in self.releases:
+            for path in sorted((release / SPLITS_FOLDER).glob("*.txt")):
+                if re.fullmatch(r"[a-z0-9_]{1,40}", path.stem) and path.stem not in found:
+                    found[path.stem] = read_split(path)
+        return found
 
     def status(self, scene: str) -> str:
         """A word on the scene from a quick look: frames, and ground truth."""
-        with reading(self._where(scene)):
-            words = describe_recording(self._folder(scene) / IPHONE, self.options.poses)
+        with reading(self.where(scene)):
+            words = describe_recording(self.folder(scene) / IPHONE, self.options.poses)
         try:
             self._truth_files(scene)
             self._benchmark_folder(scene)
@@ -118,103 +123,66 @@ class ScanNetPP:
             return f"{words}, {str(error).partition(': ')[2]}"
         return f"{words}, ground truth"
 
-    def info(self, scene: str, stride: int) -> SceneInfo:
-        domain: ImageDomain = "rendered-rooms" if scene in self.tree.made else "camera"
-        return SceneInfo(self.name, scene, len(self._recording(scene).every(stride)), stride, domain)
+    def n_frames(self, scene: str, stride: int) -> int:
+        return len(self.recording(scene).every(stride))
 
     def frames(self, scene: str, stride: int) -> Sequence[Frame]:
         """Every ``stride``-th of the frames that the poses name, in the order of the video; a line of the log counts
         those that have none once."""
-        recording = self._recording(scene)
+        recording = self.recording(scene)
         if (line := recording.say_what_is_lost()) and scene not in self._warned_of:
             self._warned_of.add(scene)
             logger.warning("%s", line)
         return IphoneFrames(recording, recording.every(stride), self.options.width)
 
+    def recording_files(self, scene: str) -> Sequence[Path]:
+        return self.recording(scene).files()
+
     def files(self, scene: str) -> Sequence[Path]:
         # A list of masked vertices may be empty: it is listed where it is not, because an empty file is else a fault.
-        small = [path for path in self._small_files(scene) if path.name != MASK_NAME or path.stat().st_size]
-        return (*self._recording(scene).files(), *small)
+        return [path for path in super().files(scene) if path.name != MASK_NAME or path.stat().st_size]
 
-    def digest(self, scene: str) -> str:
-        """A key of the content of the truth, the benchmark's lists, the poses and the first and last images, and of the
-        sizes of all files: what is changed in the middle of a recording and keeps its size goes unseen."""
-        words = "scannetpp", READER_VERSION, scene, scene in self.tree.made, self.options.model_dump_json()
-        total = hashlib.sha256(" ".join(str(word) for word in words).encode())
-        recording = self._recording(scene)
+    def recording_key(self, scene: str) -> str:
+        recording = self.recording(scene)
         posed = recording.posed
         arrays = posed.numbers, posed.poses, posed.intrinsics, posed.distortion
-        total.update(str(posed.size).encode() + b"".join(array.tobytes() for array in arrays))
-        images = recording.files()[len(posed.files) :]
-        with reading(self._where(scene)):
-            for path in images:
-                total.update(f"{path.parent.name}/{path.name} {path.stat().st_size}\n".encode())
-            for path in (*dict.fromkeys((*images[:1], *images[-1:])), *self._small_files(scene)):
-                total.update(f"{path.name} {_digest_of(path)}\n".encode())
-        return total.hexdigest()
+        poses = hashlib.sha256(str(posed.size).encode() + b"".join(array.tobytes() for array in arrays)).hexdigest()
+        with reading(self.where(scene)):
+            return poses + sizes_and_ends(recording.files()[len(posed.files) :], 1, _digest_of)
 
-    def ground_truth(self, scene: str, variant: str) -> GroundTruth:
-        if variant in self.further_truths.values():
-            self._folder(scene)
-            labelled: GroundTruth = openlex3d.truth_below(self.root, self.name, scene, variant)
-            return labelled
-        if variant not in self.variants:
-            hint = suggest(variant, self.variants)
-            raise GroundTruthMissing(f"{self._where(scene)}: no ground truth '{variant}'{hint}")
-        return vertex_truth(self._annotated_scan(scene))
-
-    def instance_mesh(self, scene: str) -> InstanceMesh:
-        return instance_mesh(self._annotated_scan(scene))
-
-    def surface(self, scene: str) -> Surface:
-        """The mesh, with the published segments where they are here; scenes without truth have both."""
-        folder = self._folder(scene) / SCANS
-        segments = folder / SEGMENTS_NAME
-        return read_surface(folder / MESH_NAME, segments if segments.is_file() else None, self._where(scene))
-
-    def problems(self, scene: str) -> Iterator[str]:
-        """What is wrong with the recording's poses and with the truth, a line each; images are left to the frames."""
-        questions: list[Callable[[], object]] = [lambda: self._open(scene)]
-        if (self._folder(scene) / SCANS).is_dir():
-            questions.append(lambda: self._annotated_scan(scene))
-        for ask in questions:
-            try:
-                ask()
-            except GroundTruthMissing:
-                pass
-            except DataError as error:
-                yield str(error)
-
-    def _where(self, scene: str) -> str:
-        return f"{self.name}/{scene}"
-
-    def _folder(self, scene: str) -> Path:
-        if scene not in self.tree.folder_of:
-            hint = suggest(scene, list(self.tree.folder_of), f"{self.tree.places[0]} has")
-            raise DataError(f"scannetpp: no scene '{scene}'{hint}")
-        return self.tree.folder_of[scene]
-
-    def _recording(self, scene: str) -> IphoneRecording:
-        """The recording of ``scene`` and its poses; the last one is kept, because each step asks for it anew."""
-        if self._last is None or self._last[0] != scene:
-            self._last = scene, self._open(scene)
-        return self._last[1]
-
-    def _open(self, scene: str) -> IphoneRecording:
-        with reading(self._where(scene)):
-            return open_recording(self._folder(scene) / IPHONE, self._where(scene), self.options.poses)
-
-    def _small_files(self, scene: str) -> tuple[Path, ...]:
-        """What is read of the scene beside its recording, as far as it is there."""
-        paths = [self._folder(scene) / SCANS / name for name in TRUTH_NAMES]
-        lists = self.tree.benchmark_folder(scene)
+    def small_files(self, scene: str) -> tuple[Path, ...]:
+        paths = [self.folder(scene) / SCANS / name for name in TRUTH_NAMES]
+        lists = self._find_benchmark_folder(scene)
         paths += [] if lists is None else [lists / name for name in LIST_NAMES]
         paths += openlex3d.label_files(self.root, self.name, scene)
         return tuple(path for path in paths if path.is_file())
 
+    def own_truth(self, scene: str, variant: str) -> GroundTruth:
+        return vertex_truth(self.annotated_scan(scene))
+
+    def instance_mesh(self, scene: str) -> InstanceMesh:
+        return instance_mesh(self.annotated_scan(scene))
+
+    def surface(self, scene: str) -> Surface:
+        """The mesh, with the published segments where they are here; scenes without truth have both."""
+        folder = self.folder(scene) / SCANS
+        segments = folder / SEGMENTS_NAME
+        return read_surface(folder / MESH_NAME, segments if segments.is_file() else None, self.where(scene))
+
+    def problems(self, scene: str) -> Iterator[str]:
+        """What is wrong with the recording's poses and with the truth, a line each; images are left to the frames."""
+        yield from faults_of([lambda: self.recording(scene)])
+        if (self.folder(scene) / SCANS).is_dir():
+            yield from faults_of([lambda: self.annotated_scan(scene)])
+
+    @keeps_last
+    def recording(self, scene: str) -> IphoneRecording:
+        with reading(self.where(scene)):
+            return open_recording(self.folder(scene) / IPHONE, self.where(scene), self.options.poses)
+
     def _truth_files(self, scene: str) -> dict[str, Path]:
         """The path of each file of the truth."""
-        folder = self._folder(scene) / SCANS
+        folder = self.folder(scene) / SCANS
         missing = [name for name in TRUTH_NAMES if not (folder / name).is_file()]
         if missing:
             reason = f"expected in {folder}"
@@ -222,29 +190,39 @@ class ScanNetPP:
                 reason += "; without it, vertices would be scored that the benchmark leaves out"
             elif missing[0] != MESH_NAME:
                 reason += "; the benchmark keeps the annotation of its test scenes to itself"
-            raise GroundTruthMissing(f"{self._where(scene)}: no ground truth, {missing[0]} is missing; {reason}")
+            raise GroundTruthMissing(f"{self.where(scene)}: no ground truth, {missing[0]} is missing; {reason}")
         return {name: folder / name for name in TRUTH_NAMES}
 
+    def _find_benchmark_folder(self, scene: str) -> Path | None:
+        """Where the lists of the benchmark lie, beside the scene first; None where none has all of them."""
+        near = self.folder(scene).parent.parent
+        places = [release / BENCHMARK_FOLDER for release in (near, *self.releases)]
+        return next((place for place in places if all((place / name).is_file() for name in LIST_NAMES)), None)
+
     def _benchmark_folder(self, scene: str) -> Path:
-        self._folder(scene)
-        lists = self.tree.benchmark_folder(scene)
+        lists = self._find_benchmark_folder(scene)
         if lists is None:
-            place = self._folder(scene).parent.parent / BENCHMARK_FOLDER
+            place = self.folder(scene).parent.parent / BENCHMARK_FOLDER
             raise GroundTruthMissing(
-                f"{self._where(scene)}: no ground truth, the benchmark's lists {', '.join(LIST_NAMES)} are missing; "
+                f"{self.where(scene)}: no ground truth, the benchmark's lists {', '.join(LIST_NAMES)} are missing; "
                 f"they come with the data, put them into {place}"
             )
         return lists
 
-    def _classes(self, scene: str) -> BenchmarkClasses:
-        return read_benchmark_classes(self._benchmark_folder(scene), self._where(scene))
+    @keeps_last
+    def annotated_scan(self, scene: str) -> AnnotatedScan:
+        files, where = self._truth_files(scene), self.where(scene)
+        return read_annotated_scan(files, read_benchmark_classes(self._benchmark_folder(scene), where), where)
 
-    def _annotated_scan(self, scene: str) -> AnnotatedScan:
-        """The annotated mesh of ``scene``; the last one is kept, because every protocol asks for it anew."""
-        if self._scan is None or self._scan[0] != scene:
-            files = self._truth_files(scene)
-            self._scan = scene, read_annotated_scan(files, self._classes(scene), self._where(scene))
-        return self._scan[1]
+
+def read_split(path: Path) -> tuple[str, ...]:
+    """The scenes that a split names, each once, in its order."""
+    where = f"scannetpp: {SPLITS_FOLDER}/{path.name}"
+    scenes = read_text(path, where).split()
+    wrong = next((scene for scene in scenes if not re.fullmatch(SCENE_NAMES, scene)), None)
+    if wrong is not None or len(scenes) > MOST_SCENES:
+        raise DataError(f"{where}: {(wrong or '')[:40]!a} is no scene; expected one a line, such as 036bce3393")
+    return tuple(dict.fromkeys(scenes))
 
 
 def _digest_of(path: Path) -> str:

@@ -20,6 +20,7 @@ from su3d_bench.core.types import LabelSet
 from su3d_bench.datasets.recordings.recorded_frames import numbers
 from su3d_bench.formats.text_files import read_text
 
+BASES = ("", "scannetpp", "ScanNetPP", "ScanNet++", "scannetpp_v2", "scannetpp_v1", "scannetpp/v2", "scannetpp/v1")
 LABEL_SPACE = "scannetpp"
 BENCHMARK_FOLDER = "metadata/semantic_benchmark"
 CLASSES_NAME, INSTANCES_NAME, MAP_NAME = LIST_NAMES = ("top100.txt", "top100_instance.txt", "map_benchmark.csv")

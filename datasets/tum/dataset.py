@@ -9,7 +9,7 @@ A sequence is a folder below the data root, ``tum/`` or ``TUM/`` with
   that the sequence's name tells (``fr1``, ``freiburg2``, ...), else the ROS default
 - the images: 8-bit colour; 16-bit depth registered to it, 5000 units a metre, 0 where there is none
 
-``rooms.json`` in the folder marks a sequence that ``datasets make`` rendered. There is no ground truth of objects.
+There is no ground truth of objects.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from su3d_bench.core.errors import DataError, GroundTruthMissing, ScenesMissing, suggest
-from su3d_bench.core.types import Float64Array, Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo
-from su3d_bench.datasets.recordings.made_rooms import MARKER
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import Float64Array, Frame
+from su3d_bench.datasets.recordings.file_dataset import FileDataset, keeps_last
 from su3d_bench.datasets.recordings.recorded_frames import (
     Folder,
     RecordedFrame,
@@ -40,8 +40,6 @@ from su3d_bench.datasets.tum.timed_poses import pose_at, read_trajectory, rows_o
 from su3d_bench.formats.text_files import read_text
 
 logger = logging.getLogger(__name__)
-READER_VERSION = 2  # raise it whenever the same files come out as other frames
-FOLDERS = (".", "tum", "TUM")
 UNITS_PER_METRE = 5000.0  # the benchmark's page "file formats"
 DEPTH_M_OF_VALUE = depth_m_of_values(UNITS_PER_METRE)
 MAX_CANDIDATES = 2_000_000  # pairs of images near in time; a recording has about two an image
@@ -71,70 +69,42 @@ class TumOptions(BaseModel):
     intrinsics: tuple[float, float, float, float] | None = None
 
 
-class Tum:
+class Tum(FileDataset[TumOptions]):
     """Sequences in the layout of the TUM RGB-D benchmark; unscored, because they have no ground truth of objects."""
 
     name = "tum"
-    reads_made_rooms = True
+    reader_version = 3
+    places_of_scenes = (".", "tum", "TUM")
+    how_to_get = (
+        " or in its folder tum (a sequence is a folder with rgb.txt and depth.txt); unpack one there or set SU3D_DATA "
+        "to where they are"
+    )
     label_space = "none"
-    variants: tuple[str, ...] = ()
+    no_mesh = "the benchmark has none"
     Options = TumOptions
 
-    def __init__(self, root: Path, options: TumOptions | None = None) -> None:
-        self.root = root
-        self.options = options or TumOptions()
-        self._last: tuple[str, Recording] | None = None
+    def is_scene(self, folder: Path) -> bool:
+        return not folder.name.startswith(".") and all((folder / name).is_file() for name in ("rgb.txt", "depth.txt"))
 
-    def scenes(self) -> Sequence[str]:
-        folders = [folder for place in self.places() if place.is_dir() for folder in sorted(place.iterdir())]
-        sequences = [folder.name for folder in folders if _is_sequence(folder)]
-        if not sequences:
-            raise ScenesMissing(
-                f"tum: no sequence in {self.root} or in its folder tum (a sequence is a folder with rgb.txt and "
-                "depth.txt); unpack one there or set SU3D_DATA to where they are"
-            )
-        return tuple(dict.fromkeys(sequences))
-
-    def places(self) -> Sequence[Path]:
-        """The folders that are searched for sequences."""
-        return [self.root / name for name in FOLDERS]
-
-    def info(self, scene: str, stride: int) -> SceneInfo:
-        frames = RecordedFrames(self._recording(scene), stride)
-        domain: ImageDomain = "rendered-rooms" if (self._folder(scene) / MARKER).is_file() else "camera"
-        return SceneInfo(self.name, scene, len(frames), stride, domain)
+    def n_frames(self, scene: str, stride: int) -> int:
+        return len(self.frames(scene, stride))
 
     def frames(self, scene: str, stride: int) -> Sequence[Frame]:
-        return RecordedFrames(self._recording(scene), stride)
+        return RecordedFrames(self.recording(scene), stride)
 
-    def files(self, scene: str) -> Sequence[Path]:
-        recording = self._recording(scene)
-        return (*recording.files, *recording.images())
+    def recording_files(self, scene: str) -> Sequence[Path]:
+        return (*self.recording(scene).files, *self.recording(scene).images())
 
-    def digest(self, scene: str) -> str:
-        return self._recording(scene).digest((self.name, READER_VERSION, scene, self.info(scene, 1).image_domain))
+    def recording_key(self, scene: str) -> str:
+        return self.recording(scene).digest(())
 
     def problems(self, scene: str) -> Iterator[str]:
         """What the lists name and is not there, a line in all; the frames go on without it."""
-        yield from self._recording(scene).missing
+        yield from self.recording(scene).missing
 
-    def ground_truth(self, scene: str, variant: str) -> GroundTruth:
-        raise GroundTruthMissing(f"tum/{scene}: no ground truth '{variant}'; the benchmark has none of objects")
-
-    def instance_mesh(self, scene: str) -> InstanceMesh:
-        raise GroundTruthMissing(f"tum/{scene}: no annotated mesh; the benchmark has none")
-
-    def _folder(self, scene: str) -> Path:
-        for place in self.places():
-            if "/" not in scene and _is_sequence(place / scene):
-                return place / scene
-        known = self.scenes()
-        raise DataError(f"tum: no sequence '{scene}'{suggest(scene, known)}")
-
-    def _recording(self, scene: str) -> Recording:
-        if self._last is None or self._last[0] != scene:
-            self._last = scene, self._open(self._folder(scene), f"tum/{scene}")
-        return self._last[1]
+    @keeps_last
+    def recording(self, scene: str) -> Recording:
+        return self._open(self.folder(scene), self.where(scene))
 
     def _open(self, path: Path, where: str) -> Recording:
         """The frames whose images and pose are there; what is missing is said once, as a warning."""
@@ -181,13 +151,6 @@ class Tum:
             return pinhole(fx, fy, cx, cy, where)
         camera = re.search(r"(?:freiburg|fr)([123])", path.name)
         return pinhole(*CAMERAS[camera[1] if camera else ""], where=where)
-
-
-def _is_sequence(folder: Path) -> bool:
-    """Whether the folder is a sequence; hidden ones are being made."""
-    if folder.name.startswith("."):
-        return False
-    return (folder / "rgb.txt").is_file() and (folder / "depth.txt").is_file()
 
 
 def read_pairs(folder: Path, where: str) -> list[tuple[Stamped, Stamped]]:

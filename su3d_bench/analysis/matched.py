@@ -23,9 +23,8 @@ from su3d_bench.evaluation.texts import GivenTexts, read_text_features
 from su3d_bench.metrics.attribution.arrays import EXPLAINED, LookedAt, MendedScene
 from su3d_bench.metrics.attribution.singles import SingleError
 from su3d_bench.metrics.fitness import why_not_scorable
-from su3d_bench.metrics.metric import Counts
+from su3d_bench.metrics.metric import Counts, SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.scoring import SceneScore
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.runs.job import as_told
 from su3d_bench.store.predictions import read_prediction

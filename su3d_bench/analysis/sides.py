@@ -12,9 +12,9 @@ from su3d_bench.core.config import MOVES_NO_NUMBER
 from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.types import Float64Array
-from su3d_bench.metrics.metric import Counts
+from su3d_bench.metrics.metric import Counts, SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.scoring import ProtocolResult, SceneScore, combine, metric_of
+from su3d_bench.metrics.scoring import ProtocolResult, combine, metric_of
 from su3d_bench.numerics.statistics import leave_one_out
 from su3d_bench.questions.query_files import VARIANT as QUERY_OBJECTS
 from su3d_bench.runs.finished import FinishedRun, read_run

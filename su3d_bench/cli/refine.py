@@ -15,9 +15,7 @@ from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, Stor
 
 if TYPE_CHECKING:
     from su3d_bench.core.maps import Instances
-    from su3d_bench.questions.refining import NameRecords
-    from su3d_bench.questions.refining import RefinedName, TopNames
-    from su3d_bench.questions.refining import FilterConfig
+    from su3d_bench.questions.refining import FilterConfig, NameRecords, RefinedName, TopNames
     from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 REFINERS = ("vote", "model")
@@ -62,8 +60,7 @@ def add_parser(actions: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.refining import records_of, write_records
-    from su3d_bench.questions.refining import top_names
+    from su3d_bench.questions.refining import records_of, top_names, write_records
 
     if arguments.top_m < 1:
         raise ConfigError(f"--top-m {arguments.top_m}: at least 1 view must have a say")

@@ -10,7 +10,7 @@ from typing import Any
 
 from su3d_bench.core import registry
 from su3d_bench.core.config import Settings, flatten, resolve
-from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_json, package_versions
+from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_file, digest_json, package_versions
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.interfaces import HasCaveat, HasInputs, HasOwnPerception, Method, ReadsMadeRooms, TakesTruth
 from su3d_bench.core.maps import Prediction

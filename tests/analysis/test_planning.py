@@ -18,8 +18,9 @@ import su3d_bench.analysis.sides
 from su3d_bench.analysis.comparison import compare
 from su3d_bench.analysis.planning import plan
 from su3d_bench.cli.main import main
+from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.metrics.scoring import SceneScore, combine, pack_scores
+from su3d_bench.metrics.scoring import combine, pack_scores
 from su3d_bench.numerics.statistics import scenes_needed, sign_flip_test, variance_of
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.run_folder import RunFolder

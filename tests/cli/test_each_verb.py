@@ -75,7 +75,7 @@ CASES: dict[str, tuple[list[str], int, str]] = {
     "datasets check": ([SCENE, *FEW, "--quick"], 0, "living0"),
     "datasets show": ([SCENE, *FEW, "--out", "room.png"], 0, "room.png"),
     "datasets make": (
-        ["rooms", "--layout", "tum", "--scenes", "living0", "--set", "n_frames=2", "--out", "made"],
+        ["rooms", "--layout", "replica", "--scenes", "living0", "--set", "n_frames=2", "--out", "made"],
         0,
         "",
     ),

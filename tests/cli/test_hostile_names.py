@@ -30,9 +30,9 @@ TEXTS = (".md", ".csv", ".html", ".tex", ".xml", ".txt", ".json", ".toml", ".svg
 
 # What follows each verb on a run of hostile names, a data root of hostile scenes, files of hostile texts.
 CASES: dict[str, list[list[str]]] = {
-    "run": [["--scenes", "tum/*", "--stride", "1", "--limit", "1", "--jobs", "1", "--out", f"made{IN_A_PATH}"],
+    "run": [["--scenes", "replica/*", "--stride", "1", "--limit", "1", "--jobs", "1", "--out", f"made{IN_A_PATH}"],
             ["--config", "hostile.toml"], ["--scenes", HOSTILE], ["--set", f"{HOSTILE}=1"]],
-    "ablate": [["--vary", f"{HOSTILE}=1"], ["--vary", "m=1", "--scenes", "tum/*", "--dry-run"]],
+    "ablate": [["--vary", f"{HOSTILE}=1"], ["--vary", "m=1", "--scenes", "replica/*", "--dry-run"]],
     "evaluate": [["predictions", "--ground-truth", "truth", "--protocol", "scannet-instance", "--per-class"],
                  ["predictions", "--ground-truth", "truth", "--protocol", HOSTILE],
                  ["predictions", "--ground-truth", "truth", "--protocol", "scannet-instance", "--out", "out/mine"],
@@ -79,16 +79,11 @@ CASES: dict[str, list[list[str]]] = {
         ["SCENE", "What is the largest object?", "--run", "RUN", "--method", "METHOD"]],
     "runs refine": [["RUN", "--method", "METHOD"], ["RUN", "--method", "METHOD", "--json"]],
     "datasets list": [[], ["--json"], [HOSTILE]],
-    "datasets check": [["tum/*", "--quick"], ["tum/*", "--quick", "--json"]],
-    "datasets show": [["tum/*", "--out", "out/room.png"]],
-    "datasets make": [["rooms", "--layout", "tum", "--scenes", HOSTILE, "--out", "out/made"]],
-    "methods new": [["hostile_method.py"]],
-    "datasets new": [[HOSTILE]],
-    "protocols new": [[HOSTILE]],
-    "dev registry new": [[HOSTILE]],
-    "methods list": [["--json"]],
-    "methods show": [["hostile.py:Loud"], ["hostile.py:Loud", "--json"]],
-    "methods check": [[HOSTILE]],
+    "datasets check": [["replica/*", "--quick"], ["replica/*", "--quick", "--json"]],
+    "datasets show": [["replica/*", "--out", "out/room.png"]],
+    "datasets make": [["rooms", "--layout", "replica", "--scenes", HOSTILE, "--out", "out/made"]],
+    "new": [["method", "hostile_method.py"], ["registry", HOSTILE]],
+    "methods": [["hostile.py:Loud"], ["hostile.py:Loud", "--json"]],
     "models list": [["--set", f"perception.models.folder={HOSTILE}"]],
     "models check": [[HOSTILE]],
     "models warm": [["--profile", HOSTILE]],
@@ -181,8 +176,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory, rooms_data: Path) -> Path:
         protocols = ["--protocols", "rooms-semantic", "rooms-instance"]
         assert main(["run", *words, *protocols, "--out", "run"]) == 0
         scenes = ["--scenes", "living0", "--set", "n_frames=2"]
-        assert main(["datasets", "make", "rooms", "--layout", "tum", *scenes, "--out", "data", "--quiet"]) == 0
-        (folder / "data" / "tum" / "living0").rename(folder / "data" / "tum" / IN_A_PATH)
+        assert main(["datasets", "make", "rooms", "--layout", "replica", *scenes, "--out", "data", "--quiet"]) == 0
+        (folder / "data" / "Replica" / "living0").rename(folder / "data" / "Replica" / IN_A_PATH)
         assert main(["check", "--learn", "run", "--out", "reference.json"]) == 0
     return folder
 

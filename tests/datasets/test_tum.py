@@ -84,8 +84,8 @@ def test_of_many_sequences_one_is_in_memory(tmp_path: Path) -> None:
     for scene in "ab":
         write_sequence(tmp_path, scene)
     tum = Tum(tmp_path)
-    first = weakref.ref(tum._recording("a"))
-    assert first() is tum._recording("a")
+    first = weakref.ref(tum.recording("a"))
+    assert first() is tum.recording("a")
     assert tum.digest("b") != tum.digest("a")
     assert first() is None
 
@@ -197,7 +197,7 @@ def test_quaternions_become_rotations_and_any_length_is_made_one(tmp_path: Path)
 
 
 def test_there_is_no_ground_truth_and_no_sequence_without_data(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"tum: no sequence in .*folder with rgb\.txt and depth\.txt"):
+    with pytest.raises(DataError, match=r"tum: no scene in .*folder with rgb\.txt and depth\.txt"):
         Tum(tmp_path).scenes()
     write_sequence(tmp_path)
     with pytest.raises(GroundTruthMissing, match="has none of objects"):

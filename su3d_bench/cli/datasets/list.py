@@ -137,11 +137,7 @@ def _add_make(actions: Any) -> None:
         default="native",
         help="native: the scans that the dataset keeps in its data root, frames are rendered when asked for; "
         "replica: every file of Replica, the render and the original release, about 300 MB a room; scannet: scans with "
-        ".sens, mesh and annotation; scannet-python, scannet-cpp: the same, frames as ScanNet's readers export them "
-        "(C++: about 1 GB a room); scannetpp: the iPhone's frames, mesh and annotation of ScanNet++; "
-        "arkitscenes: the OpenSUN3D challenge's scenes of ARKitScenes with queries and truth; "
-        "hm3dsem: walks as HOV-SG generates them, with their truth; "
-        "tum: the RGB-D benchmark, without ground truth (default: native)",
+        ".sens, mesh and annotation (default: native)",
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="the data root to make (native: default $SU3D_DATA)")
     add_settings(parser, "an option of the dataset, such as n_frames=200")

@@ -17,14 +17,13 @@ if TYPE_CHECKING:
 
     from su3d_bench.core.interfaces import Encoder
     from su3d_bench.perception.language.chat import ChatRequest
-    from su3d_bench.questions.model import Question
     from su3d_bench.questions.language_solver import AskMap
-    from su3d_bench.sheets.items import SheetKind
+    from su3d_bench.questions.model import Question
     from su3d_bench.sheets.drafts import Draft
     from su3d_bench.sheets.drawing import PictureSource
-    from su3d_bench.sheets.sources import RunSource
+    from su3d_bench.sheets.items import SheetKind
     from su3d_bench.sheets.sets import Origin
-    from su3d_bench.sheets.sources import TruthSource
+    from su3d_bench.sheets.sources import RunSource, TruthSource
 
 NAME = "make"
 QUESTIONS: Final = "questions"  # the kind that needs no method, and so no run
@@ -196,8 +195,8 @@ def _questions(
     truth: TruthSource, left_out: Collection[str], arguments: argparse.Namespace
 ) -> tuple[dict[SheetKind, list[Draft]], Origin]:
     """The questions that people judge, and where they come from; what is counted together stands for methods."""
-    from su3d_bench.sheets.scores import OF_ALL_KINDS
     from su3d_bench.sheets.drafts import question_drafts
+    from su3d_bench.sheets.scores import OF_ALL_KINDS
     from su3d_bench.sheets.sets import Origin, check_split
 
     n_most = arguments.per_kind or PER_KIND[QUESTIONS]

@@ -209,8 +209,8 @@ def test_a_trajectory_counts_missing_images_or_leaves_them_out(tmp_path: Path) -
 def test_of_many_scenes_one_is_in_memory(tmp_path: Path) -> None:
     shutil.copytree(write_scene(tmp_path), tmp_path / "rgbd" / "chair")
     rgbd = Rgbd(tmp_path)
-    first = weakref.ref(rgbd._recording("desk"))
-    assert first() is rgbd._recording("desk")
+    first = weakref.ref(rgbd.recording("desk"))
+    assert first() is rgbd.recording("desk")
     assert rgbd.digest("chair") != rgbd.digest("desk")
     assert first() is None
 

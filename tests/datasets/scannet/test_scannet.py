@@ -302,7 +302,7 @@ def test_a_split_is_asked_for_by_name_and_must_be_whole(tmp_path: Path, monkeypa
 def test_no_data_is_said_with_the_way_to_get_it(tmp_path: Path) -> None:
     with pytest.raises(DataError) as caught:
         ScanNet(tmp_path).scenes()
-    assert str(caught.value).startswith(f"scannet: no scan in {tmp_path} or in its folders scans, scannet")
+    assert str(caught.value).startswith(f"scannet: no scene in {tmp_path} or in its folders scans, scannet")
     assert "datasets make rooms --layout scannet" in str(caught.value)
     write_recording(tmp_path / SCAN / f"{SCAN}.sens", 1)
     with pytest.raises(DataError, match=r"scannet: no scene 'scene0000_01'; did you mean 'scene0000_00'\?"):

@@ -16,7 +16,7 @@ from scannet_toy import RECORDED, SCENE, TOY, WHERE, pgm_bytes, png_bytes, write
 from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.recordings.source import RgbdSource
 from su3d_bench.datasets.scannet.recordings import find_source, open_cpp_export, open_python_export
-from su3d_bench.datasets.scannet.sens.read import SensFile
+from su3d_bench.datasets.scannet.sens import SensFile
 
 
 def remove(*names: str) -> Callable[[Path], None]:

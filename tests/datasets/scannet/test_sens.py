@@ -24,9 +24,7 @@ from places import CASES
 from scannet_scan import colour_content, depth_content
 
 from su3d_bench.core.errors import DataError, StoreError
-from su3d_bench.datasets.scannet.sens.header import SensHeader
-from su3d_bench.datasets.scannet.sens.read import MOTION_RECORD, SensFile, SensSource
-from su3d_bench.datasets.scannet.sens.write import SensFrame, write_sens
+from su3d_bench.datasets.scannet.sens import MOTION_RECORD, SensFile, SensFrame, SensHeader, SensSource, write_sens
 
 TOY, RAW_TOY = CASES / "sens01_toy.sens", CASES / "sens02_toy_raw.sens"
 WHERE = "scannet/scene0000_00"

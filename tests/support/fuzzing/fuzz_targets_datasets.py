@@ -95,18 +95,6 @@ def _beacon3d(kind: str) -> Make:
     return make
 
 
-def _joined_list(folder: Path) -> Read:
-    from su3d_bench.datasets.recordings.joined_lists import JoinedList
-
-    joined = JoinedList(".staged", folder / "objects.json", "scan", "scans")
-    for scan in ("living_0", "office_0"):
-        joined.stage(folder, [{"scan": scan, "objects": [{"label": "chair", "id": "1"}]}])
-        joined.join(folder, scan)
-    return lambda: every_one_of(
-        iter((lambda: joined.has("living_0"), lambda: joined.check_is_ours(("living_0", "office_0"))))
-    )
-
-
 def _aligned_scannet(folder: Path) -> Read:
     from scannet_scan import write_floor_truth
     from scannet_scans import write_scan
@@ -121,7 +109,7 @@ def _sens(name: str) -> Make:
     def make(folder: Path) -> Read:
         from test_sens import WHERE, read_whole
 
-        from su3d_bench.datasets.scannet.sens.read import SensFile
+        from su3d_bench.datasets.scannet.sens import SensFile
 
         path = folder / "a.sens"
         path.write_bytes((CASES / name).read_bytes())
@@ -364,8 +352,7 @@ def _questions(name: str, text_of: Callable[[Any], str]) -> Make:
     def make(folder: Path) -> Read:
         import test_question_files
 
-        from su3d_bench.questions.question_files import is_foreign, read_foreign_queries
-        from su3d_bench.questions.question_files import read_questions
+        from su3d_bench.questions.question_files import is_foreign, read_foreign_queries, read_questions
 
         path = folder / name
         path.write_text(text_of(test_question_files))
@@ -402,7 +389,6 @@ TARGETS = (
     Target("scannet table", _scannet, ("*.tsv",), 0.15),
     Target("scannet facts", _aligned_scannet, (f"{SCAN}/scene0000_00.txt",), 0.15),
     Target("openscan attributes", _openscan, ("*.json",)),
-    Target("rows of all made scenes", _joined_list, ("objects.json",)),
     *(Target(f"beacon3d {kind}", _beacon3d(kind), ("*.json",)) for kind in ("grounding", "qa")),
     Target("sens", _sens("sens01_toy.sens"), ("a.sens",)),
     Target("sens raw", _sens("sens02_toy_raw.sens"), ("a.sens",)),

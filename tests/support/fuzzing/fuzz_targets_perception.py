@@ -143,8 +143,7 @@ def _completion(folder: Path) -> Read:
 
 def _refined_names(folder: Path) -> Read:
     from su3d_bench.core.digests import digest_file
-    from su3d_bench.questions.refining import FILE_NAME, SCHEMA, read_records
-    from su3d_bench.questions.refining import FilterConfig
+    from su3d_bench.questions.refining import FILE_NAME, SCHEMA, FilterConfig, read_records
     from su3d_bench.store.run_folder import RunFolder
 
     job = RunFolder(folder).job("rooms/living0", "opensu3d")

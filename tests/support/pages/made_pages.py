@@ -81,12 +81,6 @@ def page_of_annotation(folder: Path) -> Path:
     return folder / "out" / "annotator-1" / PAGE
 
 
-def page_of_retrieval(folder: Path) -> Path:
-    """A sheet of one question an item."""
-    write_sheets(made("retrieval", ("chair", LONG, "lamp")), folder / "out", folder / "key")
-    return folder / "out" / "annotator-1" / PAGE
-
-
 def page_of_second_looks(folder: Path) -> Path:
     """What ``sheets score`` leaves to look at again."""
     (folder / "item-1.png").write_bytes(png_bytes(np.full((400, 1200, 3), 90, np.uint8)))
@@ -128,27 +122,20 @@ def page_of_method(folder: Path) -> Path:
     return min((site_of_registry(folder) / "methods").iterdir())
 
 
-def page_of_scene(folder: Path) -> Path:
-    """The page of a scene of the site."""
-    return min((site_of_registry(folder) / "scenes").iterdir())
-
-
 PAGES: Mapping[str, Callable[[Path], Path]] = {
     "page of runs": page_of_runs,
     "tables": page_of_tables,
     "sheet of annotation": page_of_annotation,
-    "sheet of retrieval": page_of_retrieval,
     "second looks": page_of_second_looks,
     "audit": page_of_audit,
     "registry": page_of_registry,
     "method of a registry": page_of_method,
-    "scene of a registry": page_of_scene,
 }
 # The files of the program that begin a page, and the pages above that come out of each.
 WRITERS = {
     "reports/page/page.html.j2": ("page of runs",),
     "reports/tables/formats.py": ("tables",),
-    "reports/sheet/page.html.j2": ("sheet of annotation", "sheet of retrieval"),
+    "reports/sheet/page.html.j2": ("sheet of annotation",),
     "reports/sheet/page.py": ("second looks", "audit"),
-    "reports/registry/page.html.j2": ("registry", "method of a registry", "scene of a registry"),
+    "reports/registry/page.html.j2": ("registry", "method of a registry"),
 }

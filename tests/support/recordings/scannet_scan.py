@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.types import Float64Array, UInt8Array
-from su3d_bench.datasets.scannet.sens.header import ColourCompression, DepthCompression, SensHeader
-from su3d_bench.datasets.scannet.sens.write import SensFrame, write_sens
+from su3d_bench.datasets.scannet.sens import ColourCompression, DepthCompression, SensFrame, SensHeader, write_sens
 from su3d_bench.formats.images import UInt16Array, jpeg_bytes, png_bytes
 from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
 

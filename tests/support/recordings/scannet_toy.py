@@ -10,7 +10,7 @@ import numpy as np
 from places import CASES
 
 from su3d_bench.datasets.recordings.source import RgbdSource
-from su3d_bench.datasets.scannet.sens.read import SensFile, SensSource
+from su3d_bench.datasets.scannet.sens import SensFile, SensSource
 
 TOY = CASES / "sens01_toy.sens"
 SCENE = "scene0000_00"

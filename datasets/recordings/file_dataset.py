@@ -1,0 +1,233 @@
+"""What datasets of files do alike: scenes below the data root, what is read of them, their digest, what is missing."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, wraps
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from pydantic import BaseModel, ConfigDict
+
+from su3d_bench.core.digests import digest_file
+from su3d_bench.core.errors import DataError, GroundTruthMissing, ScenesMissing, suggest
+from su3d_bench.core.system.files import file_text
+from su3d_bench.core.types import GroundTruth, ImageDomain, InstanceMesh, SceneInfo
+from su3d_bench.datasets.openlex3d import release as openlex3d
+from su3d_bench.datasets.recordings.recorded_frames import reading
+
+MARKER = "rooms.json"  # in a folder of scenes: those that `datasets make` rendered
+DatasetT, OptionsT, Answer = TypeVar("DatasetT"), TypeVar("OptionsT", bound=BaseModel), TypeVar("Answer")
+
+
+class NoOptions(BaseModel):
+    """A dataset without settings: its files say everything."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+def read_marker(folder: Path) -> dict[str, str]:
+    """Scene -> content key of the scenes in a folder that ``datasets make`` rendered; empty without a marker."""
+    path = folder / MARKER
+    if not path.is_file():
+        return {}
+    try:
+        scenes = json.loads(file_text(path))["scenes"]
+        return {str(scene): str(key) for scene, key in scenes.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise DataError(
+            f"{path}: not the marker that `su3d-bench datasets make` writes ({error}); delete it if the scenes were "
+            "not made by it, otherwise make them again"
+        ) from error
+
+
+def folders_in(root: Path, names: Iterable[str]) -> Iterator[tuple[Path, list[Path]]]:
+    """Each folder of these names below ``root`` that can be read, and its sub-folders in the order of their names.
+
+    One that two names lead to comes once: by a link, or on a file system that takes scannet and ScanNet for one.
+    """
+    seen = set[tuple[int, int]]()
+    for place in (root / name for name in names):
+        try:
+            identity = place.stat().st_dev, place.stat().st_ino
+            children = sorted(child for child in place.iterdir() if child.is_dir())
+        except OSError:
+            continue
+        if identity not in seen:
+            seen.add(identity)
+            yield place, children
+
+
+@dataclass(frozen=True)
+class SceneTree:
+    """``places``: the folders with scenes; ``folder_of`` each; ``made``: those that ``datasets make`` rendered."""
+
+    root: Path
+    places: tuple[Path, ...]
+    folder_of: Mapping[str, Path]
+    made: frozenset[str]
+
+
+def find_scenes(root: Path, names: Iterable[str], is_scene: Callable[[Path], bool]) -> SceneTree:
+    """The scenes in folders of these names below ``root``, each in the first; none is no error here."""
+    folder_of: dict[str, Path] = {}
+    places, made = [], set[str]()
+    for place, children in folders_in(root, names):
+        scenes = [child for child in children if is_scene(child)]
+        if scenes:
+            rooms = read_marker(place)
+            places.append(place)
+            made |= {scene.name for scene in scenes if scene.name in rooms}
+        for scene in scenes:
+            folder_of.setdefault(scene.name, scene)
+    return SceneTree(root, tuple(places), dict(sorted(folder_of.items())), frozenset(made))
+
+
+def keeps_last(method: Callable[[DatasetT, str], Answer]) -> Callable[[DatasetT, str], Answer]:
+    """A method of a scene that keeps its last answer, because each step asks for it again."""
+    name = f"_last{method.__name__}"
+
+    @wraps(method)
+    def asked(self: DatasetT, scene: str) -> Answer:
+        last: tuple[str, Answer] | None = self.__dict__.get(name)
+        if last is None or last[0] != scene:
+            last = self.__dict__[name] = scene, method(self, scene)
+        return last[1]
+
+    return asked
+
+
+def faults_of(questions: Iterable[Callable[[], object]]) -> Iterator[str]:
+    """The line of each question that fails, each line once; ground truth that is missing is no fault."""
+    seen = set[str]()
+    for ask in questions:
+        try:
+            ask()
+        except GroundTruthMissing:
+            pass
+        except DataError as error:
+            if str(error) not in seen:
+                yield str(error)
+            seen.add(str(error))
+
+
+class FileDataset(ABC, Generic[OptionsT]):
+    """A dataset that is read from files below a data root.
+
+    ``reader_version`` is raised whenever the same files come out as other frames or another ground truth.
+    ``places_of_scenes`` are folders below the data root in which scenes may lie, the usual first. ``how_to_get`` says,
+    after "no scene in ROOT", where they are expected and come from. ``labels_of`` is what OpenLex3D calls the dataset,
+    if it labels it. ``no_mesh`` says why there is no annotated mesh.
+    """
+
+    name: str
+    reader_version: int
+    places_of_scenes: Sequence[str]
+    how_to_get: str
+    variants: tuple[str, ...] = ()
+    labels_of: str | None = None
+    no_mesh = ""
+    Options: type[OptionsT]
+
+    def __init__(self, root: Path, options: OptionsT | None = None) -> None:
+        self.root = root
+        self.options = options if options is not None else self.Options()
+
+    def is_scene(self, folder: Path) -> bool:
+        """Whether a folder in one of the places is a scene."""
+        raise NotImplementedError
+
+    def find_tree(self) -> SceneTree:
+        """Where the scenes are; none is no error here."""
+        return find_scenes(self.root, self.places_of_scenes, self.is_scene)
+
+    @cached_property
+    def tree(self) -> SceneTree:
+        """Where the scenes are; a ``ScenesMissing`` that says how to get data where there are none."""
+        tree = self.find_tree()
+        if not tree.folder_of:
+            raise ScenesMissing(f"{self.name}: no scene in {self.root}{self.how_to_get}")
+        return tree
+
+    def scenes(self) -> Sequence[str]:
+        return tuple(self.tree.folder_of)
+
+    def places(self) -> Sequence[Path]:
+        """Where scenes are, or else would be looked for first."""
+        return self.find_tree().places or [self.root / name for name in self.places_of_scenes[:2]]
+
+    def info(self, scene: str, stride: int) -> SceneInfo:
+        return SceneInfo(self.name, scene, self.n_frames(scene, stride), stride, self.image_domain(scene))
+
+    @abstractmethod
+    def n_frames(self, scene: str, stride: int) -> int:
+        """How many frames ``frames`` would give, from a cheap look."""
+
+    def image_domain(self, scene: str) -> ImageDomain:
+        return "rendered-rooms" if scene in self.tree.made else "camera"
+
+    @abstractmethod
+    def recording_files(self, scene: str) -> Sequence[Path]:
+        """The files that the frames are read from."""
+
+    @abstractmethod
+    def recording_key(self, scene: str) -> str:
+        """A key of the recording: its poses and cameras, the sizes of all files, the first and last images."""
+
+    def small_files(self, scene: str) -> tuple[Path, ...]:
+        """What is read of the scene beside its recording, as far as it is there."""
+        return ()
+
+    def files(self, scene: str) -> Sequence[Path]:
+        return (*self.recording_files(scene), *self.small_files(scene))
+
+    def digest(self, scene: str) -> str:
+        """A key of ``recording_key`` and of the content of what else is read: what is changed in the middle of a
+        recording and keeps its size goes unseen."""
+        words = self.name, self.reader_version, scene, self.image_domain(scene), self.options.model_dump_json()
+        total = hashlib.sha256(" ".join(str(word) for word in words).encode())
+        total.update(self.recording_key(scene).encode())
+        with reading(self.where(scene)):
+            for path in self.small_files(scene):
+                total.update(f"{path.name} {digest_file(path)}\n".encode())
+        return total.hexdigest()
+
+    def ground_truth(self, scene: str, variant: str) -> GroundTruth:
+        self.folder(scene)
+        if self.labels_of is not None and variant in openlex3d.FURTHER_TRUTHS.values():
+            labelled: GroundTruth = openlex3d.truth_below(self.root, self.labels_of, scene, variant)
+            return labelled
+        if variant not in self.variants:
+            hint = suggest(variant, self.variants)
+            raise GroundTruthMissing(f"{self.where(scene)}: no ground truth '{variant}'{hint}")
+        return self.own_truth(scene, variant)
+
+    def own_truth(self, scene: str, variant: str) -> GroundTruth:
+        """The ground truth under one of ``variants``."""
+        raise NotImplementedError
+
+    def instance_mesh(self, scene: str) -> InstanceMesh:
+        self.folder(scene)
+        raise GroundTruthMissing(f"{self.where(scene)}: no annotated mesh; {self.no_mesh}")
+
+    def where(self, scene: str) -> str:
+        """How messages begin."""
+        return f"{self.name}/{scene}"
+
+    def folder(self, scene: str) -> Path:
+        """The folder of a scene; a ``DataError`` where there is none."""
+        if scene not in self.tree.folder_of:
+            hint = suggest(scene, list(self.tree.folder_of), f"{self.tree.places[0]} has")
+            raise DataError(f"{self.name}: no scene '{scene}'{hint}")
+        return self.tree.folder_of[scene]
+
+
+def sizes_and_ends(files: Sequence[Path], n_ends: int, digest: Callable[[Path], Any] = digest_file) -> str:
+    """The names and sizes of files, and the content of the first and last ``n_ends``."""
+    lines = [f"{path.parent.name}/{path.name} {path.stat().st_size}" for path in files]
+    ends = dict.fromkeys((*files[:n_ends], *files[-n_ends:]))
+    return "\n".join([*lines, *(f"{path.name} {digest(path)}" for path in ends)])

@@ -1,0 +1,281 @@
+"""Scenes in the layout of ScanNet: ``scans/<scan>/`` with recording, mesh and annotation; the label table above."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.files.atomic import make_folder, write_text
+from su3d_bench.core.system.files import file_bytes, file_text
+from su3d_bench.core.toml import parse_toml
+from su3d_bench.core.types import Float64Array, Frame, Int64Array, UInt8Array
+from su3d_bench.datasets.scannet.annotations import aggregation_name, segments_name
+from su3d_bench.datasets.scannet.labels import TABLE_NAME
+from su3d_bench.datasets.scannet.sens import (
+    FRAME_RECORD,
+    MICROSECONDS,
+    MOTION_RECORD,
+    SensFrame,
+    SensHeader,
+    write_sens,
+)
+from su3d_bench.datasets.scannet.truth import labels_name, mesh_name, meta_name, truth_names
+from su3d_bench.datasets.writing import Layout, Scan, ScannedDataset, ScannedObject, SceneTarget, write_shared_text
+from su3d_bench.formats.images import JPEG_QUALITY, depth_in_units, image_size, jpeg_bytes, list_column, triangles_of
+from su3d_bench.formats.ply import Column, PlyElement, write_ply
+
+ROOM_NAME = re.compile(r"([a-z]+)(\d{1,2})")
+# The columns of scannetv2-labels.combined.tsv in the order of the release.
+TABLE_COLUMNS = (
+    "id", "raw_category", "category", "count", "nyu40id", "eigen13id", "nyuClass", "nyu40class", "eigen13class",
+    "ModelNet40", "ModelNet10", "ShapeNetCore55", "synsetoffset", "wnsynsetid", "wnsynsetkey", "mpcat40",
+    "mpcat40index",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Category:
+    """A row of ScanNet's label table."""
+
+    raw_category: str
+    id: int
+    nyu40id: int
+    nyu40class: str
+
+
+@cache
+def _facts() -> Mapping[str, Any]:
+    return parse_toml(file_text(Path(__file__).with_name("made_categories.toml")))
+
+
+@cache
+def categories() -> Mapping[str, Category]:
+    """The category of each class of the rooms."""
+    return {name: Category(*row) for name, row in _facts()["classes"].items()}
+
+
+@cache
+def nyu40_colours() -> tuple[tuple[int, int, int], ...]:
+    """RGB of the NYU40 classes, 0 (no class) to 40."""
+    return tuple((red, green, blue) for red, green, blue in _facts()["nyu40_colours"])
+
+
+def scan_name(room: str) -> str:
+    """The scan that a room is: kitchen7 is scene9207_00; raises ``DataError`` for a room beyond 99."""
+    match = ROOM_NAME.fullmatch(room)
+    if match is None or match[1] not in _facts()["kinds"]:
+        raise DataError(f"rooms/{room}: has no scan name; choose a room from 0 to 99 of its kind")
+    return f"scene9{_facts()['kinds'][match[1]][0]}{int(match[2]):02d}_00"
+
+
+def scene_type(room: str) -> str:
+    """What ScanNet calls a place of this kind."""
+    match = ROOM_NAME.fullmatch(room)
+    assert match is not None, room
+    return str(_facts()["kinds"][match[1]][1])
+
+
+def label_table_text() -> str:
+    """``scannetv2-labels.combined.tsv`` with the categories of the rooms; columns of other vocabularies are empty."""
+    rows = ["\t".join(TABLE_COLUMNS)]
+    for row in sorted(set(categories().values()), key=lambda row: row.id):
+        known = {"id": row.id, "raw_category": row.raw_category, "category": row.raw_category, "count": 0}
+        known |= {"nyu40id": row.nyu40id, "nyu40class": row.nyu40class}
+        rows.append("\t".join(str(known.get(column, "")) for column in TABLE_COLUMNS))
+    return "\n".join(rows) + "\n"
+
+
+MIN_COSINE = 0.9  # faces that meet at more than 26 degrees belong to two segments
+
+
+def annotation_id(known: ScannedObject) -> int:
+    """The id of an object in the annotation, which counts from 0."""
+    return known.id - 1
+
+
+def write_scan_truth(dataset: ScannedDataset, scene: str, scan: str, folder: Path) -> list[ScannedObject]:
+    """Write the files of ``scene`` under the name ``scan`` into ``folder``; the objects that are annotated."""
+    make_folder(folder)
+    surface, objects = dataset.scan(scene), dataset.objects(scene)
+    owner, segments = object_of_vertex(surface), segment_of_vertex(surface)
+    category_of = {known.id: categories()[known.class_name] for known in objects}
+    nyu40_of = np.zeros(max(category_of, default=0) + 1, np.uint16)
+    nyu40_of[list(category_of)] = [category.nyu40id for category in category_of.values()]
+    labels = nyu40_of[owner]
+    faces = triangles_of(surface.faces)
+    face_element = PlyElement("face", len(faces), {"vertex_indices": list_column(faces)})
+    write_ply(folder / mesh_name(scan), [_vertices(surface, surface.colours, {}), face_element])
+    label_colours = np.array(nyu40_colours(), np.uint8)[labels]
+    write_ply(folder / labels_name(scan), [_vertices(surface, label_colours, {"label": labels}), face_element])
+    params = {"minCosine": str(MIN_COSINE)}
+    _write_json(folder / segments_name(scan), {"params": params, "sceneId": scan, "segIndices": segments.tolist()})
+    seen = [known for known in objects if (owner == known.id).any()]
+    groups = [
+        {"id": annotation_id(known), "objectId": annotation_id(known),
+         "segments": np.unique(segments[owner == known.id]).tolist(), "label": category_of[known.id].raw_category}
+        for known in seen
+    ]  # fmt: skip
+    aggregation = {"sceneId": f"scannet.{scan}", "appId": "su3d-bench", "segGroups": groups}
+    _write_json(folder / aggregation_name(scan), aggregation | {"segmentsFile": f"scannet.{segments_name(scan)}"})
+    write_text(folder / meta_name(scan), _facts_of(dataset, scene))
+    return seen
+
+
+def object_of_vertex(scan: Scan) -> Int64Array:
+    """Object id (V,) of each vertex, that of its last face; 0 where no face uses it."""
+    owner = np.zeros(len(scan.vertices), np.int64)
+    owner[scan.faces] = scan.object_id[:, None]
+    return owner
+
+
+def segment_of_vertex(scan: Scan) -> Int64Array:
+    """Segment (V,) of each vertex, named after its first vertex: a connected piece of one object that bends little.
+
+    A vertex has the direction of its first face, so that a box falls apart into its sides.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    n, faces = len(scan.vertices), scan.faces.astype(np.int64)
+    first_face = np.zeros(n, np.int64)
+    first_face[faces[::-1]] = np.arange(len(faces))[::-1, None]
+    normals, owner = _face_normals(scan)[first_face], object_of_vertex(scan)
+    left, right = faces[:, [0, 1, 2, 3]].reshape(-1), faces[:, [1, 2, 3, 0]].reshape(-1)
+    is_one = (np.einsum("ij,ij->i", normals[left], normals[right]) >= MIN_COSINE) & (owner[left] == owner[right])
+    left, right = left[is_one], right[is_one]
+    graph = coo_matrix((np.ones(len(left), np.int8), (left, right)), shape=(n, n))
+    n_pieces, piece = connected_components(graph, directed=False)
+    first_vertex = np.zeros(n_pieces, np.int64)
+    first_vertex[piece[::-1]] = np.arange(n)[::-1]
+    segments: Int64Array = first_vertex[piece]
+    return segments
+
+
+def _face_normals(scan: Scan) -> Float64Array:
+    a, b, c, d = (scan.vertices[scan.faces[:, k]].astype(np.float64) for k in range(4))
+    normals = np.cross(c - a, d - b)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-15)
+    return normals
+
+
+def _vertices(scan: Scan, colours: UInt8Array, more: dict[str, Column]) -> PlyElement:
+    columns: dict[str, Column] = {name: scan.vertices[:, i].astype(np.float32) for i, name in enumerate("xyz")}
+    columns |= {name: colours[:, i] for i, name in enumerate(("red", "green", "blue"))}
+    columns["alpha"] = np.full(len(scan.vertices), 255, np.uint8)
+    return PlyElement("vertex", len(scan.vertices), columns | more)
+
+
+def _facts_of(dataset: ScannedDataset, scene: str) -> str:
+    """The content of ``<scan>.txt``, keys in the order of the release."""
+    frames = dataset.frames(scene, 1)
+    height, width = frames[0].depth_m.shape
+    k, identity = dataset.intrinsics, " ".join(f"{value:f}" for value in np.eye(4).reshape(-1))
+    facts: dict[str, Any] = {"axisAlignment": identity, "colorHeight": height, "colorToDepthExtrinsics": identity}
+    facts |= {"colorWidth": width, "depthHeight": height, "depthWidth": width}
+    for name, value in (("fx", k[0, 0]), ("fy", k[1, 1]), ("mx", k[0, 2]), ("my", k[1, 2])):
+        facts |= {f"{name}_{sensor}": f"{value:f}" for sensor in ("color", "depth")}
+    facts |= {"numColorFrames": len(frames), "numDepthFrames": len(frames), "numIMUmeasurements": 0}
+    facts["sceneType"] = scene_type(scene)
+    return "".join(f"{key} = {value}\n" for key, value in facts.items())
+
+
+def _write_json(path: Path, value: Any) -> None:
+    """JSON on one line: a mesh has a number a vertex."""
+    write_text(path, json.dumps(value, separators=(",", ":")) + "\n")
+
+
+LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
+DEPTH_SHIFT = 1000.0  # units a metre, of every recording of the release
+SCANS_FOLDER = "scans"
+SENSOR_NAME = "StructureSensor"  # as the release has it, readers may know it
+PIECES = ".frames"
+
+
+class ScannetLayout(Layout):
+    """Rooms as scans ``scene9000_00`` and so on, each with one ``.sens`` file: JPEG colour, zlib depth, no motion data.
+
+    It is joined of the records that were written one by one. Time stamps are microseconds from the first frame.
+    """
+
+    name = "scannet"
+    reader = "scannet"
+    settings = (LAYOUT_VERSION, "scannet", DEPTH_SHIFT, JPEG_QUALITY)
+
+    def scenes_folder(self, out: Path) -> Path:
+        return out / SCANS_FOLDER
+
+    def scene_name(self, scene: str) -> str:
+        return scan_name(scene)
+
+    def target(self, scene: str, key: str, out: Path) -> SceneTarget:
+        scan = scan_name(scene)
+        folder = out / SCANS_FOLDER / scan
+        truth = tuple(folder / name for name in (*truth_names(scan), meta_name(scan)))
+        return SceneTarget(scene, key, folder, f"{scan}.sens", truth)
+
+    def write_shared(self, dataset: ScannedDataset, scene: str, out: Path) -> None:
+        write_shared_text(out / TABLE_NAME, label_table_text(), "is another label table than that of the rooms")
+
+    def write_truth(self, dataset: ScannedDataset, target: SceneTarget) -> None:
+        write_scan_truth(dataset, target.scene, target.folder.name, target.partial)
+
+    def frame_names(self, index: int) -> Sequence[str]:
+        return (f"{PIECES}/{index:06d}.record",)
+
+    def frame_files(self, frame: Frame) -> Sequence[bytes]:
+        time = round(frame.timestamp_s * MICROSECONDS)
+        depth = zlib.compress(depth_in_units(frame.depth_m, DEPTH_SHIFT).astype("<u2").tobytes())
+        return (SensFrame(frame.camera_to_world, time, time, jpeg_bytes(frame.rgb), depth).stored,)
+
+    def join(self, dataset: ScannedDataset, target: SceneTarget) -> None:
+        if not target.has_frames:
+            n_frames = len(dataset.frames(target.scene, 1))
+            pieces = [target.partial / name for index in range(n_frames) for name in self.frame_names(index)]
+            header = sens_header(dataset.intrinsics, size_of(file_bytes(pieces[0])[FRAME_RECORD.itemsize :]))
+            records = (file_bytes(piece) for piece in pieces)
+            write_sens(target.partial / target.frames, header, records, np.zeros(0, MOTION_RECORD))
+        if (target.partial / PIECES).exists():
+            shutil.rmtree(target.partial / PIECES)
+
+
+def size_of(jpeg: bytes) -> tuple[int, int]:
+    """Width and height of a colour image, and so of the depth image beside it."""
+    size = image_size(jpeg)
+    assert size is not None
+    return size
+
+
+def intrinsics_4x4(intrinsics: Float64Array) -> Float64Array:
+    """The camera as ScanNet's files have it, fx 0 cx 0 / 0 fy cy 0 / 0 0 1 0 / 0 0 0 1, in the digits of float32."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = intrinsics
+    return matrix.astype(np.float32).astype(np.float64)
+
+
+def sens_header(intrinsics: Float64Array, size: tuple[int, int]) -> SensHeader:
+    """The header of a recording whose two cameras are one."""
+    camera, (width, height) = intrinsics_4x4(intrinsics), size
+    return SensHeader(
+        sensor_name=SENSOR_NAME,
+        intrinsic_colour=camera,
+        extrinsic_colour=np.eye(4),
+        intrinsic_depth=camera,
+        extrinsic_depth=np.eye(4),
+        colour_compression="jpeg",
+        depth_compression="zlib",
+        colour_width=width,
+        colour_height=height,
+        depth_width=width,
+        depth_height=height,
+        depth_shift=DEPTH_SHIFT,
+    )
