@@ -24,7 +24,6 @@ from su3d_bench.metrics.questions.score import (
     said_by,
 )
 from su3d_bench.metrics.scoring import metric_of, score_scene
-from su3d_bench.questions import refining as refined_names
 from su3d_bench.questions.refining import (
     FILE_NAME,
     FilterConfig,
@@ -32,9 +31,11 @@ from su3d_bench.questions.refining import (
     TopNames,
     records_of,
     refined_digest,
+    refined_names,
+    voted_names,
     write_records,
 )
-from su3d_bench.questions.truths import Refine, question_truth, voted_names
+from su3d_bench.questions.truths import Refine, question_truth
 from su3d_bench.store.run_folder import JobFolder
 
 RULES = load_protocol("rooms-annotation")

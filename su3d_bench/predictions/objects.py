@@ -2,22 +2,32 @@
 
 Source: concept-graphs at commit 5c4da70 (``pcd_saves/full_pcd_*.pkl.gz``, with ``_post`` after its last merging) and
 branch ali-dev at dc00a8a (``exps/<suffix>/pcd_<suffix>.pkl.gz``, with ``edges``, without ``bg_objects``).
+
+And scene graphs of FROSS: one pickle of all scenes, objects with points and classes, edges with shares of predicates.
+Source: Merging/main.py of Howardkhh/FROSS at 645153b. Classes and predicates are numbers without names; what they are
+called is told by how many there are: ReplicaSSG's list of Visual Genome, 150 and 50. Of equal scores the last counts,
+as in its Merging/evaluate.py.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, printable, shown
 from su3d_bench.core.files.unpacking import Allowance, UnpackingError
 from su3d_bench.core.maps import Instances
-from su3d_bench.core.types import Float32Array
+from su3d_bench.core.types import Float32Array, Float64Array
 from su3d_bench.formats.arrays import MOST_MASKS, checked_points, kind_of, without_nonfinite
-from su3d_bench.formats.pickles.pickles import read_pickle_file
+from su3d_bench.formats.pickles import read_pickle_file
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.relations import last_best
 from su3d_bench.predictions.base import ONES, Reader, ScenePrediction, first_found, instances_of, named_once
 
 SUFFIX = ".pkl.gz"
@@ -26,6 +36,10 @@ FULL, STREAMLINED = f"full_pcd_*{SUFFIX}", f"pcd_*{SUFFIX}"
 FORGOTTEN = ("mask", "pcd_color_np")  # the masks of every view make most of the file
 NAME_OF_NONE = "item"  # what the class-agnostic variant calls every object
 MOST_TEXT = 1000
+GRAPHS = "predictions_*.pkl"  # FROSS's
+LISTS = "replica-relations"  # the protocol with the lists by which its numbers are named
+FORGOTTEN_OF_GRAPHS = ("mean", "cov")
+MOST_SCENES, MOST_EDGES = 10_000, 10_000_000
 
 
 class ConceptGraphs(Reader):
@@ -51,18 +65,16 @@ class ConceptGraphs(Reader):
         if not isinstance(value, dict) or not isinstance(value.get("objects"), list):
             raise PredictionError(f"{where}: holds {kind_of(value)} without a list of 'objects'; expected a map")
         background = _background(value.get("bg_objects"), where)
-        _check_sum([*value["objects"], *background], file, where)
+        entries = [entry for entry in (*value["objects"], *background) if isinstance(entry, dict)]
+        _check_sum([entry.get(key) for entry in entries for key in ("pcd_np", "clip_ft", "class_id")], file, where)
         instances, more = _instances(value["objects"], background, _class_names(value.get("class_names")), where)
         return ScenePrediction(scene, self.name, file, instances, (ONES, *remarks, *more))
 
 
-def _check_sum(entries: Sequence[object], file: Path, where: str) -> None:
+def _check_sum(values: Sequence[object], file: Path, where: str) -> None:
     """Refuses objects that share what they hold, which costs the file a few bytes and memory or time for each."""
-    allowance = Allowance(file.stat().st_size)
     try:
-        for entry in entries:
-            held = [entry.get(key) for key in ("pcd_np", "clip_ft", "class_id")] if isinstance(entry, dict) else []
-            allowance.spend(4 * sum(_n_values(value) for value in held))
+        Allowance(file.stat().st_size).spend(4 * sum(map(_n_values, values)))
     except UnpackingError as error:
         raise PredictionError(f"{where}: {error}") from error
 
@@ -210,3 +222,92 @@ def _background(value: object, where: str) -> list[Any]:
     if value is not None and not isinstance(value, list):
         raise PredictionError(f"{where}: 'bg_objects' is {kind_of(value)}; expected a list")
     return [entry for entry in value or () if entry is not None]
+
+
+# ---- FROSS
+
+
+class Fross(Reader):
+    name = "fross"
+    summary = f"FROSS's {GRAPHS}: scene graphs of all scenes, with the classes and predicates of ReplicaSSG"
+    noun = "scene graph"
+
+    def recognise(self, path: Path) -> str | None:
+        return f"it is or holds {GRAPHS}" if len(_graph_files(path)) == 1 else None
+
+    def scenes(self, path: Path) -> Mapping[str, Path]:
+        files = _graph_files(path)
+        if len(files) > 1:
+            raise PredictionError(f"{shown(path)}: has {len(files)} files {GRAPHS}; give one of them")
+        return {scene: file for file in files for scene in _graphs(file)}
+
+    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
+        where = f"{shown(place)}: {printable(scene, 80)}"
+        graph = _graphs(place)[scene]
+        clouds = graph.get("pcd") if isinstance(graph, dict) else None
+        _check_sum(clouds if isinstance(clouds, list) else [], place, where)
+        instances = scene_graph(graph, load_protocol(LISTS), where)
+        return ScenePrediction(scene, self.name, place, instances, (ONES,))
+
+
+def scene_graph(graph: object, rules: ProtocolRules, where: str) -> Instances:
+    """The map of one scene of the file, its numbers named by the classes and predicates of ``rules``."""
+    if not isinstance(graph, dict):
+        raise PredictionError(f"{where}: is {kind_of(graph)}; expected a scene graph with pcd, cls and edges")
+    clouds = graph.get("pcd")
+    if not isinstance(clouds, list) or len(clouds) > MOST_MASKS:
+        raise PredictionError(f"{where}: 'pcd' is {kind_of(clouds)}; expected a list of points an object")
+    k = len(clouds)
+    classes = _table(graph.get("cls"), (k, len(rules.classes)), f"{where}: 'cls'")
+    edges = _edges(graph.get("edge_index"), k, f"{where}: 'edge_index'")
+    scores = _table(graph.get("edge_cls"), (len(edges), len(rules.predicates)), f"{where}: 'edge_cls'")
+    labels = tuple(rules.classes[place].name for place in last_best(classes).tolist())
+    points = [checked_points(cloud, f"{where}: object {row}") for row, cloud in enumerate(clouds)]
+    instances = instances_of(
+        points, where, features=None, labels=labels, names=labels, captions=("",) * k, ids=range(k)
+    )
+    return replace(instances, edges=edges, edge_scores=scores, predicates=rules.predicates)
+
+
+def _graph_files(path: Path) -> list[Path]:
+    if path.is_file():
+        return [path] if path.match(GRAPHS) else []
+    return [file for file in first_found(path, [f"{GRAPHS}", f"*/{GRAPHS}"]) if file.is_file()]
+
+
+def _graphs(file: Path) -> dict[str, Any]:
+    value = read_pickle_file(file, forget=FORGOTTEN_OF_GRAPHS)
+    if not isinstance(value, dict) or not value or len(value) > MOST_SCENES:
+        raise PredictionError(f"{shown(file)}: holds {kind_of(value)}; expected the scene graph of each scene")
+    if not all(isinstance(scene, str) for scene in value):
+        raise PredictionError(f"{shown(file)}: has a scene that is no name; expected the scene graph of each scene")
+    return value
+
+
+def _table(value: object, shape: tuple[int, int], where: str) -> Float64Array:
+    """A table of scores; without rows whatever is empty will do."""
+    if not shape[0] and _is_empty(value):
+        return np.zeros(shape)
+    if not isinstance(value, np.ndarray) or value.shape != shape or value.dtype.kind not in "fiu":
+        raise PredictionError(f"{where} is {kind_of(value)}; expected {shape[0]} rows of {shape[1]}, as ReplicaSSG has")
+    with np.errstate(over="ignore"):
+        scores: Float64Array = value.astype(np.float64)
+    if not np.isfinite(scores).all():
+        raise PredictionError(f"{where} has values that are NaN or infinite")
+    return scores
+
+
+def _edges(value: object, n_objects: int, where: str) -> NDArray[np.int32]:
+    """Rows of subject and object (E, 2) of the file's (2, E)."""
+    if _is_empty(value):
+        return np.zeros((0, 2), np.int32)
+    is_table = isinstance(value, np.ndarray) and value.ndim == 2 and len(value) == 2 and value.dtype.kind in "iu"
+    if not isinstance(value, np.ndarray) or not is_table or value.shape[1] > MOST_EDGES:
+        raise PredictionError(f"{where} is {kind_of(value)}; expected rows of subjects and of objects")
+    if not 0 <= int(value.min()) <= int(value.max()) < n_objects:
+        raise PredictionError(f"{where} names object {int(value.max())}; the scene graph has {n_objects}")
+    return np.ascontiguousarray(value.T).astype(np.int32)
+
+
+def _is_empty(value: object) -> bool:
+    return (isinstance(value, np.ndarray) and not value.size) or (isinstance(value, list) and not value)
