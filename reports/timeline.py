@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import ModelMissing, printable
 from su3d_bench.core.types import Float32Array, Frame
 from su3d_bench.formats.images import depth_in_units, png_bytes
-from su3d_bench.reports.pictures.colours import NO_INSTANCE, Colour
+from su3d_bench.reports.pictures.canvas import NO_INSTANCE, Colour
 
 UInt16Array = NDArray[np.uint16]
 # A place is a path through these; names of methods stand below them and so can take no other's place.

@@ -16,7 +16,7 @@ from su3d_bench.metrics.metric import Counts, SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import ProtocolResult, combine, metric_of
 from su3d_bench.numerics.statistics import leave_one_out
-from su3d_bench.questions.files.queries import VARIANT as QUERY_OBJECTS
+from su3d_bench.questions.query_files import VARIANT as QUERY_OBJECTS
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 # They move no number of a common scene.

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
     from su3d_bench.core.maps import Instances
     from su3d_bench.metrics.questions.score import RefinedNames
-    from su3d_bench.questions.reasoning.answers import Answer
-    from su3d_bench.questions.reasoning.scene_map import SceneMap
+    from su3d_bench.questions.model import Answer
+    from su3d_bench.questions.scene_map import SceneMap
     from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 SOLVERS = ("built-in", "llm")
@@ -60,7 +60,7 @@ def add_parser(actions: Any) -> None:
 
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.core.maps import Instances
-    from su3d_bench.questions.reasoning.scene_map import map_of
+    from su3d_bench.questions.scene_map import map_of
     from su3d_bench.runs.finished import map_of_scene
 
     if not arguments.question.strip():
@@ -91,7 +91,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 def _refined(job: JobFolder, wanted: str) -> tuple[RefinedNames | None, str]:
     """Labels n' where they are wanted and there, and which names these are."""
-    from su3d_bench.questions.refining.refined_names import read_records
+    from su3d_bench.questions.refining import read_records
 
     records = None if wanted == "label" else read_records(job)
     if records is None:
@@ -104,7 +104,7 @@ def _refined(job: JobFolder, wanted: str) -> tuple[RefinedNames | None, str]:
 
 
 def _estimate(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.reasoning.language_solver import LanguageSolver
+    from su3d_bench.questions.language_solver import LanguageSolver
 
     if arguments.solver != "llm":
         return answer_nothing_to_pay(arguments, "the built-in solver")
@@ -116,9 +116,9 @@ def _solve(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> An
     import numpy as np
 
     from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
-    from su3d_bench.questions.reasoning.language_solver import LanguageSolver
-    from su3d_bench.questions.reasoning.named_objects import nearest_by
-    from su3d_bench.questions.reasoning.solver import Solver
+    from su3d_bench.questions.language_solver import LanguageSolver
+    from su3d_bench.questions.scene_map import nearest_by
+    from su3d_bench.questions.solver import Solver
 
     if arguments.solver == "llm":
         return LanguageSolver(scene, *chat_client(arguments, run)).answer(arguments.question)
@@ -143,7 +143,7 @@ def _draw(
     instances: Instances, scene: SceneMap, reply: Answer, job: JobFolder, arguments: argparse.Namespace
 ) -> Path | None:
     """Draw the answer; None where it names no object."""
-    from su3d_bench.reports.pictures.answers import SpokenOf, draw_reasoning
+    from su3d_bench.reports.pictures.figures import SpokenOf, draw_reasoning
 
     if not reply.object_ids:
         if arguments.out is not None:

@@ -44,7 +44,7 @@ def call(arguments: argparse.Namespace) -> int:
     ).to_json()
     answer_tables(arguments, attribution, attribution_tables(attribution))
     if arguments.out is not None:
-        from su3d_bench.reports.pictures.plots.attribution import draw_attribution
+        from su3d_bench.reports.pictures.plots import draw_attribution
 
         show()  # the plot takes longer than the answer
         draw_attribution(attribution, arguments.out)

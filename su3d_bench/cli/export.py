@@ -245,11 +245,11 @@ def _write_answer(
     """The masks of a scene that answer what its dataset is searched for: as they are, or asked of a map."""
     from su3d_bench.core.interfaces import AsksText, HasSurface
     from su3d_bench.metrics.protocols.loading import load_protocol
-    from su3d_bench.predictions import opensun3d
+    from su3d_bench.predictions import export
     from su3d_bench.predictions.base import VertexMasks
 
-    if isinstance(content, VertexMasks) and opensun3d.is_answer(content):
-        return opensun3d.write_opensun3d(opensun3d.answer_as_it_is(content), name, folder)
+    if isinstance(content, VertexMasks) and export.is_answer(content):
+        return export.write_opensun3d(export.answer_as_it_is(content), name, folder)
     if "/" not in source.address:
         raise PredictionError(
             f"which dataset it is of is not known; name it, such as --scenes arkitscenes/{source.scene}"
@@ -261,8 +261,8 @@ def _write_answer(
     encoder = _encoder(content, source, rules, arguments.text_features)
     asked = dataset.asked_text(scene)
     vertices = dataset.surface(scene).vertices
-    answer = opensun3d.answer_to(asked, content, rules, vertices, encoder)
-    return opensun3d.write_opensun3d(answer, name, folder)
+    answer = export.answer_to(asked, content, rules, vertices, encoder)
+    return export.write_opensun3d(answer, name, folder)
 
 
 def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:

@@ -16,7 +16,7 @@ from su3d_bench.core.errors import EXIT_DONE, counted
 from su3d_bench.core.printing import one_line
 
 if TYPE_CHECKING:
-    from su3d_bench.reports.tables.papers.published import Figure
+    from su3d_bench.reports.tables.paper import Figure
 
 WIDTH = 118
 
@@ -87,7 +87,7 @@ def _lines(row: dict[str, Any]) -> list[str]:
 def call_show(arguments: argparse.Namespace) -> int:
     from su3d_bench.core import registry
     from su3d_bench.core.config import flatten, write_toml
-    from su3d_bench.reports.tables.papers.published import figures_of
+    from su3d_bench.reports.tables.paper import figures_of
     from su3d_bench.runs.catalogue import about_method
 
     method = registry.load("method", arguments.name)

@@ -132,7 +132,7 @@ def call_diff(arguments: argparse.Namespace) -> int:
     value = apart.to_json()
     answer_tables(arguments, value, rules_tables(value))
     if arguments.out is not None:
-        from su3d_bench.reports.pictures.plots.rules_walk import draw_walk
+        from su3d_bench.reports.pictures.plots import draw_walk
 
         show()  # the plot takes longer than the answer
         draw_walk(value, arguments.out)

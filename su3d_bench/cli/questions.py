@@ -91,7 +91,7 @@ def _add_audit(actions: Any) -> None:
     parser = add_verb(
         actions,
         "audit",
-        "Draw a sample of the questions of scenes as contact sheets for people, or add up what they said of them.",
+        "Draw a sample of the questions of scenes with pictures for people, or add up what they said of them.",
         (
             "su3d-bench query audit --scenes 'rooms/*' --n 200 --out audit",
             "su3d-bench query audit --score audit/audit.csv",
@@ -99,13 +99,12 @@ def _add_audit(actions: Any) -> None:
         _audit,
     )
     _add_scenes(parser)
-    parser.add_argument("--out", type=Path, metavar="DIR", help="where sheets, page and table go")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where page, pictures and table go")
     parser.add_argument("--n", type=int, default=200, metavar="N", help="so many questions (default: 200)")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the draw (default: 0)")
     parser.add_argument(
         "--kinds", nargs="+", default=[], metavar="KIND", help="these alone, such as retrieval, property, 'what on'"
     )
-    parser.add_argument("--per-page", type=int, default=12, metavar="N", help="questions of a sheet (default: 12)")
     parser.add_argument("--score", type=Path, metavar="FILE", help="add up the verdicts in this audit.csv instead")
     add_table_format(parser)
 
@@ -143,7 +142,7 @@ def _add_scenes(parser: argparse.ArgumentParser, *, required: bool = False) -> N
 
 
 def _make(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.files.files import check_form, write_questions
+    from su3d_bench.questions.question_files import check_form, write_questions
 
     if arguments.per_kind is not None and arguments.per_kind < 1:
         raise ConfigError(f"query make: --per-kind is {arguments.per_kind}; expected 1 or more")
@@ -161,7 +160,7 @@ def _make_beacon3d(arguments: argparse.Namespace) -> int:
     """Write one of Beacon3D's metadata files over objects of the scenes."""
     from su3d_bench.cli.datasets.check import chosen_scenes
     from su3d_bench.core.files.atomic import write_json
-    from su3d_bench.questions.chains.made_questions import made_files
+    from su3d_bench.questions.chains import made_files
     from su3d_bench.questions.truths import MIN_VERTICES, fullest_truth, scene_objects
 
     if arguments.leave_out is not None or arguments.source != SOURCES[0]:
@@ -185,8 +184,8 @@ def _make_beacon3d(arguments: argparse.Namespace) -> int:
 
 def _made(arguments: argparse.Namespace) -> list[Question]:
     from su3d_bench.cli.datasets.check import chosen_scenes
-    from su3d_bench.questions.files.left_out import read_left_out
     from su3d_bench.questions.generator import chosen
+    from su3d_bench.questions.query_files import read_left_out
     from su3d_bench.questions.truths import questions_of
 
     left_out = frozenset[str]() if arguments.leave_out is None else read_left_out(arguments.leave_out)
@@ -202,7 +201,7 @@ def _made(arguments: argparse.Namespace) -> list[Question]:
 
 
 def _show(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.files.files import paper_queries, read_questions
+    from su3d_bench.questions.question_files import paper_queries, read_questions
 
     questions: Sequence[Question]
     questions = paper_queries() if arguments.file == PAPER else read_questions(Path(arguments.file), "")
@@ -262,7 +261,6 @@ def _audit(arguments: argparse.Namespace) -> int:
         raise ConfigError("query audit: needs --scenes and --out DIR, or --score DIR/audit.csv")
     for flag, value, least in (
         ("--n", arguments.n, 1),
-        ("--per-page", arguments.per_page, 1),
         ("--seed", arguments.seed, 0),
     ):
         if value < least:
@@ -277,27 +275,26 @@ def _audit(arguments: argparse.Namespace) -> int:
     drawn = sample(of_kinds(every, arguments.kinds), arguments.n, arguments.seed)
     if not drawn:
         raise DataError("query audit: nothing can be asked of these scenes")
-    places = {f"{dataset.name}/{scene}": (dataset, scene) for dataset, scene in scenes}
-    sheets = make_audit(
+    places = {f"{dataset.name}/{scene}": dataset for dataset, scene in scenes}
+    page = make_audit(
         drawn,
         places.__getitem__,
         arguments.out,
-        per_sheet=arguments.per_page,
         progress=lambda scene: remark(f"{scene}: drawn", quiet=arguments.quiet),
     )
     counts = dict(sorted(Counter(question.kind for question in drawn).items()))
     kinds = ", ".join(f"{n} {kind}" for kind, n in counts.items())
     lines = (
-        f"{counted(len(drawn), 'question')} on {counted(len(sheets), 'sheet')} ({kinds})",
-        f"look at {arguments.out}/sheet-*.png or index.html, write right, arguable or wrong into audit.csv, then: "
+        f"{counted(len(drawn), 'question')} ({kinds})",
+        f"look at {page}, write right, arguable or wrong into audit.csv, then: "
         f"su3d-bench query audit --score {arguments.out}/audit.csv",
     )
-    answer_either(arguments, {"n": len(drawn), "kinds": counts, "sheets": [str(sheet) for sheet in sheets]}, *lines)
+    answer_either(arguments, {"n": len(drawn), "kinds": counts, "page": str(page)}, *lines)
     return EXIT_DONE
 
 
 def _score(arguments: argparse.Namespace) -> int:
-    from su3d_bench.sheets.judging.audit_scores import audit_json, audit_table, read_verdicts
+    from su3d_bench.sheets.audit import audit_json, audit_table, read_verdicts
 
     verdicts = read_verdicts(arguments.score)
     answer_tables(arguments, audit_json(verdicts), [audit_table(verdicts)])
@@ -305,7 +302,7 @@ def _score(arguments: argparse.Namespace) -> int:
 
 
 def _score_answers(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.chains.report import answered_file, answered_json, answered_table, answers_to_questions
+    from su3d_bench.questions.beacon3d import answered_file, answered_json, answered_table, answers_to_questions
 
     asked = arguments.file
     if not arguments.judge:
@@ -313,7 +310,7 @@ def _score_answers(arguments: argparse.Namespace) -> int:
             raise ConfigError(f"query score: --{flag.replace('_', '-')} belongs to --judge")
         answered = answered_file(asked, arguments.answers)
     else:
-        from su3d_bench.questions.chains.judge import judge_requests, judged
+        from su3d_bench.questions.beacon3d import judge_requests, judged
         from su3d_bench.store.run_folder import RunFolder
 
         folder = RunFolder(arguments.answers.with_name(f"{arguments.answers.stem}.judged"))

@@ -47,7 +47,7 @@ from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.predictions.base import scene_files
 from su3d_bench.predictions.own_runs import OwnRuns, read_stored
 from su3d_bench.predictions.scenes import Source, match_scenes
-from su3d_bench.questions.files.queries import VARIANT as QUERY_OBJECTS
+from su3d_bench.questions.query_files import VARIANT as QUERY_OBJECTS
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.records import TruthRecord
 

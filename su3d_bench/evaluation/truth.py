@@ -34,9 +34,9 @@ from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth
 from su3d_bench.predictions.scenes import Match, Source, is_known, match_scenes, planned_scenes
-from su3d_bench.questions.files.datasets import is_foreign, read_foreign_queries
-from su3d_bench.questions.files.queries import VARIANT as QUERY_OBJECTS
-from su3d_bench.questions.files.queries import query_truth, read_query_file
+from su3d_bench.questions.query_files import VARIANT as QUERY_OBJECTS
+from su3d_bench.questions.query_files import query_truth, read_query_file
+from su3d_bench.questions.question_files import is_foreign, read_foreign_queries
 from su3d_bench.runs.scenes import data_root
 from su3d_bench.store.records import TruthRecord
 

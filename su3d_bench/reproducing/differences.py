@@ -21,8 +21,7 @@ from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.questions.retrieval import rank
 from su3d_bench.reports.pictures.maps import draw_heat_map
 from su3d_bench.reports.tables.model import Measured
-from su3d_bench.reports.tables.papers.paper import PAPER_PROFILE, PAPER_SCENES, Shown
-from su3d_bench.reports.tables.papers.published import OPEN, Figure
+from su3d_bench.reports.tables.paper import OPEN, PAPER_PROFILE, PAPER_SCENES, Figure, Shown
 from su3d_bench.reports.tables.timing import timing_tables
 from su3d_bench.reproducing.asked import method_of_row, methods_of
 from su3d_bench.reproducing.recipe import Experiment, Recipe

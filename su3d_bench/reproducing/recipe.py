@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from su3d_bench.core.errors import ConfigError, printable, reading, suggest
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.toml import parse_toml
-from su3d_bench.reports.tables.papers.published import Figure, PaperTable, published
+from su3d_bench.reports.tables.paper import Figure, PaperTable, published
 
 FOLDER = Path(__file__).resolve().parent / "recipes"
 MOST_BYTES = 1 << 20

@@ -39,11 +39,11 @@ from su3d_bench.metrics.scoring import Truth, pack_scores, score_scene
 from su3d_bench.perception.language.client import ChatClient
 from su3d_bench.perception.language.reply_store import ReplyStore
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
-from su3d_bench.questions.reasoning.asking import MapSolver, by_language_model
-from su3d_bench.questions.refining.refined_names import refined_names
+from su3d_bench.questions.language_solver import MapSolver, by_language_model
+from su3d_bench.questions.refining import refined_names
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.reports.pictures.maps import draw_scene
-from su3d_bench.reports.tables.found import Unscored, not_scored_lines
+from su3d_bench.reports.tables.run import Unscored, not_scored_lines
 from su3d_bench.runs.executors import Event, Report
 from su3d_bench.runs.frame_loop import (
     N_AHEAD,

@@ -30,7 +30,7 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import EVERY_SCENE, combine, combined_metrics, plain_json, unpack_scores
 from su3d_bench.perception.profiles import PerceptionConfig
-from su3d_bench.reports.tables.found import Found, Unscored, not_scored_lines
+from su3d_bench.reports.tables.run import Found, Unscored, not_scored_lines
 from su3d_bench.runs.finished import FinishedRun, record_of_rules
 from su3d_bench.runs.job import MethodOutcome, SceneJob
 from su3d_bench.runs.plan import Plan

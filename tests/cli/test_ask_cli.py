@@ -17,9 +17,9 @@ from scored_room import instances
 from su3d_bench.cli.main import main
 from su3d_bench.core.files.atomic import write_json
 from su3d_bench.core.maps import Instances
-from su3d_bench.questions.undesired import FilterConfig
-from su3d_bench.reports.pictures import answers as reasoning_picture
-from su3d_bench.reports.pictures.answers import SpokenOf, draw_reasoning
+from su3d_bench.questions.refining import FilterConfig
+from su3d_bench.reports.pictures import figures as reasoning_picture
+from su3d_bench.reports.pictures.figures import SpokenOf, draw_reasoning
 from su3d_bench.store.predictions import write_prediction
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 

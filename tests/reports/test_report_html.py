@@ -32,7 +32,7 @@ from su3d_bench.reports.page.maps import (
     NOT_SCORED,
 )
 from su3d_bench.reports.page.page import page_html
-from su3d_bench.reports.pictures import scene_look
+from su3d_bench.reports.pictures import scene as scene_look
 from su3d_bench.store.predictions import read_prediction, write_prediction
 
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(1)>&\"'<!--"

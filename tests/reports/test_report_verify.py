@@ -15,8 +15,8 @@ from places import SCENES
 from su3d_bench.analysis.tables import check_paper, measured_results
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.reports.tables.papers.latex import latex
-from su3d_bench.reports.tables.papers.paper import Shown, selection_tables
+from su3d_bench.reports.tables.latex import latex
+from su3d_bench.reports.tables.paper import Shown, selection_tables
 from su3d_bench.runs import scene as scene_run
 
 

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.reports.tables.papers.published import figures_of, published
+from su3d_bench.reports.tables.paper import figures_of, published
 from su3d_bench.reproducing.asked import Asked, asked_runs, method_of_row
 from su3d_bench.reproducing.differences import Results
 from su3d_bench.reproducing.recipe import Experiment, load_recipe, recipe_names

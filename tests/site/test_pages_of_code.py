@@ -30,7 +30,7 @@ from su3d_bench.metrics.protocols.loading import (
     remarks_of,
     rules_files,
 )
-from su3d_bench.reports.tables.papers.published import figures_of
+from su3d_bench.reports.tables.paper import figures_of
 
 TAGS = {"p", "div", "table", "thead", "tbody", "tr", "th", "td", "code", "a", "details", "summary", "pre"}
 

@@ -60,8 +60,8 @@ from su3d_bench.reports.page.maps import (
     point_owners,
     thinned,
 )
-from su3d_bench.reports.pictures.colours import class_colours
-from su3d_bench.reports.pictures.scene_look import SEEN_POINTS, seen_points
+from su3d_bench.reports.pictures.canvas import class_colours
+from su3d_bench.reports.pictures.scene import SEEN_POINTS, seen_points
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.predictions import read_prediction
 

@@ -19,7 +19,7 @@ from su3d_bench.metrics.costs import MAP, TOTAL, MethodSummary, StageSummary, Up
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, concatenate
 from su3d_bench.numerics.statistics import Growth
-from su3d_bench.reports.tables.found import Found, Unscored, not_scored_lines
+from su3d_bench.reports.tables.run import Found, Unscored, not_scored_lines
 from su3d_bench.runs.finished import FinishedRun, read_update_times
 from su3d_bench.runs.summary import found_in, without_score
 from su3d_bench.store.records import ResultRecord, plain

@@ -28,9 +28,9 @@ from su3d_bench.reports.page.maps import (
     pack_map,
     thinned,
 )
-from su3d_bench.reports.pictures.colours import class_colours
+from su3d_bench.reports.pictures.canvas import class_colours
 from su3d_bench.reports.pictures.maps import truth_owner
-from su3d_bench.reports.pictures.scene_look import spread
+from su3d_bench.reports.pictures.scene import spread
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.records import read_updates
 

@@ -47,7 +47,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.reports.timeline import Recording, rerun_sdk
     from su3d_bench.runs.executors import Event
     from su3d_bench.runs.finished import read_run
-    from su3d_bench.sheets.making.run_source import chosen_of
+    from su3d_bench.sheets.sources import chosen_of
     from su3d_bench.store.run_folder import refuse_records
 
     if arguments.stride is not None and arguments.stride < 1:

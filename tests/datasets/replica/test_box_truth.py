@@ -17,7 +17,7 @@ from su3d_bench.datasets.checks import inspect
 from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.perception.oracle import OracleConfig, OracleSegmenter
 from su3d_bench.questions.truths import questions_of
-from su3d_bench.reports.pictures.scene_look import look_at
+from su3d_bench.reports.pictures.scene import look_at
 
 INFO = "replica_v1/room_0/habitat/info_semantic.json"
 THICK_M = 0.1

@@ -24,16 +24,18 @@ from su3d_bench.metrics.questions.score import (
     said_by,
 )
 from su3d_bench.metrics.scoring import metric_of, score_scene
-from su3d_bench.questions.refining.refined_names import (
+from su3d_bench.questions.refining import (
     FILE_NAME,
+    FilterConfig,
+    RefinedName,
+    TopNames,
     records_of,
     refined_digest,
     refined_names,
+    voted_names,
     write_records,
 )
-from su3d_bench.questions.refining.refinement import RefinedName, TopNames
-from su3d_bench.questions.truths import Refine, question_truth, voted_names
-from su3d_bench.questions.undesired import FilterConfig
+from su3d_bench.questions.truths import Refine, question_truth
 from su3d_bench.store.run_folder import JobFolder
 
 RULES = load_protocol("rooms-annotation")

@@ -13,11 +13,11 @@ from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.chains import TAGS, ChainedText, Place, judge_chains
 from su3d_bench.metrics.scoring import combine, pack_scores, plain_json, score_scene, unpack_scores
-from su3d_bench.questions.chains.made import chain_truth, chains_of
-from su3d_bench.questions.files.queries import query_truth
+from su3d_bench.questions.chains import chain_truth, chains_of
 from su3d_bench.questions.generator import generate
-from su3d_bench.questions.known_objects import known_objects
 from su3d_bench.questions.model import new_question
+from su3d_bench.questions.query_files import query_truth
+from su3d_bench.questions.scene_map import known_objects
 
 RULES = load_protocol("beacon3d")
 TRUTH = room()

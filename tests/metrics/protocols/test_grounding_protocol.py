@@ -21,9 +21,8 @@ from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.grounding import aligned, box_iou, choose, in_group
 from su3d_bench.metrics.scoring import combine, pack_scores, plain_json, score_scene, unpack_scores
-from su3d_bench.questions.files.datasets import read_foreign_queries
-from su3d_bench.questions.files.groups import scanrefer_groups
-from su3d_bench.questions.files.queries import query_truth
+from su3d_bench.questions.query_files import query_truth, scanrefer_groups
+from su3d_bench.questions.question_files import read_foreign_queries
 
 RULES = load_protocol("grounding")
 PROBLEMS = json.loads((CASES / "grounding01_scanrefer.json").read_text())["problems"]

@@ -22,9 +22,8 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.presence import MEASURES, SAMPLINGS, PresenceCounts, measured, relevancies
 from su3d_bench.metrics.questions.score import AskedThing, PresenceTruth
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, plain_json, score_scene, unpack_scores
-from su3d_bench.questions.absent.presence import absent_names, counted_rooms, drawn, presence_questions
-from su3d_bench.questions.known_objects import is_called, known_objects, plain_name
-from su3d_bench.questions.reasoning.scene_map import is_room_surface
+from su3d_bench.questions.presence import absent_names, counted_rooms, drawn, presence_questions
+from su3d_bench.questions.scene_map import is_called, is_room_surface, known_objects, plain_name
 
 RULES = load_protocol("rooms-presence")
 POPE = json.loads((CASES / "presence01_pope.json").read_text())

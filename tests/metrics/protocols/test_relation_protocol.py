@@ -27,7 +27,7 @@ from su3d_bench.metrics.relations import RelationCounts, geometric_edges
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, plain_json, score_scene, unpack_scores
 from su3d_bench.numerics.relations import RELATIONS
 from su3d_bench.predictions.formats import recognise
-from su3d_bench.predictions.online.fross import scene_graph
+from su3d_bench.predictions.objects import scene_graph
 from su3d_bench.store.predictions import read_prediction, write_prediction
 
 MADE = json.loads((CASES / "relations01_replicassg.json").read_text())

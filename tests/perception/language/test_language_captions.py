@@ -15,7 +15,7 @@ from su3d_bench.perception.language.captioner import Captioner
 from su3d_bench.perception.language.chat import ChatRequest, Reply
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.perception.language.parsing import Described, answered, chosen_name, described
-from su3d_bench.questions.refining.refinement import ModelRefiner, TopNames, top_names, vote
+from su3d_bench.questions.refining import ModelRefiner, TopNames, top_names, vote
 
 NAMES = ("white sofa", "sofa", "couch", "trash can", "indoor-plant")
 

@@ -13,8 +13,8 @@ from made_sheets import COLLECTOR, PAINTED
 from painted import colour_perception
 
 from su3d_bench.cli.main import main
-from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
-from su3d_bench.questions.reasoning.solver import Solver
+from su3d_bench.questions.scene_map import MapObject, SceneMap
+from su3d_bench.questions.solver import Solver
 from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.run_folder import RunFolder

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import chromium
@@ -18,10 +19,10 @@ from registry_bundles import painted_bundle
 
 from su3d_bench.cli.main import main
 from su3d_bench.reports.pictures.items import png_bytes
-from su3d_bench.reports.sheet.second_looks import second_looks_page
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.sheets.making.sets import PAGE, write_sheets
+from su3d_bench.sheets.scores import SecondLook, second_looks_page
+from su3d_bench.sheets.sets import PAGE, write_sheets
 
 PAINTED = f"{SCENES}/painted.py"
 # WebGL without a graphics card.
@@ -83,13 +84,12 @@ def page_of_annotation(folder: Path) -> Path:
 def page_of_second_looks(folder: Path) -> Path:
     """What ``sheets score`` leaves to look at again."""
     (folder / "item-1.png").write_bytes(png_bytes(np.full((400, 1200, 3), 90, np.uint8)))
-    look = {
-        "item_id": "item-1", "ask": "label 1", "reason": "annotators disagree", "automatic": "right",
-        "answers": {"annotator-1": "right", "annotator-2": "wrong"}, "scene": "rooms/living0",
-        "methods": ["opensu3d"], "text": LONG, "pictures": ["item-1.png"],
-    }  # fmt: skip
+    look = SecondLook(
+        "item-1", "label 1", LONG, "rooms/living0", ("opensu3d",), ("item-1.png",),
+        {"annotator-1": "right", "annotator-2": "wrong"}, "right", "annotators disagree",
+    )  # fmt: skip
     page = folder / "second_looks.html"
-    page.write_text(second_looks_page([look, {**look, "text": "x" * 200}], ".", "sheet-1"), encoding="utf-8")
+    page.write_text(second_looks_page([look, replace(look, text="x" * 200)], ".", "sheet-1"), encoding="utf-8")
     return page
 
 
@@ -135,8 +135,7 @@ PAGES: Mapping[str, Callable[[Path], Path]] = {
 WRITERS = {
     "reports/page/page.html.j2": ("page of runs",),
     "reports/tables/formats.py": ("tables",),
-    "reports/sheet/page.html.j2": ("sheet of annotation",),
-    "reports/sheet/second_looks.py": ("second looks",),
-    "reports/sheet/audit_page.py": ("audit",),
-    "reports/registry/page.html.j2": ("registry", "method of a registry"),
+    "reports/sheet/page.html.j2": ("sheet of annotation", "sheet of retrieval"),
+    "reports/sheet/page.py": ("second looks", "audit"),
+    "reports/registry/page.html.j2": ("registry", "method of a registry", "scene of a registry"),
 }

@@ -29,7 +29,7 @@ from su3d_bench.metrics.protocols.loading import (
     rules_files,
 )
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.reports.tables.papers.published import Figure, figures_of
+from su3d_bench.reports.tables.paper import Figure, figures_of
 
 PROTOCOLS = "reference/protocols"
 METHODS = "reference/methods"
