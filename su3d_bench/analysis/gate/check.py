@@ -18,13 +18,13 @@ from su3d_bench.analysis.gate.reference import (
     differing_keys,
     settings_of,
     why_no_cost,
-    wrong_files,
 )
 from su3d_bench.core.english import plural
 from su3d_bench.core.errors import printable
 from su3d_bench.metrics.protocols.kinds import GroundingRules, PanopticRules, PresenceQuestionRules
 from su3d_bench.reports.gate import SCENES, Compared, Finding, Verdict
 from su3d_bench.runs.finished import FinishedRun
+from su3d_bench.runs.verify import wrong_files
 from su3d_bench.store.records import NumbersRecord
 
 _SHARES = ("recall", "precision", "IoU", "F1", "F1-conceptgraphs", "mPrecision", "mF1", "mF1-conceptgraphs", "pAcc")
