@@ -49,7 +49,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert main([*words, "--seed", "0", "--out", "seed-0"]) == 0
         for seed in (1, 2):
             shutil.copytree("seed-0", f"seed-{seed}")
-            for name, text in (("run.json", '"seed": {}'), ("run.toml", "seed = {}")):
+            for name, text in (("run.json", '"seed": {}'), ("run.toml", "\nseed = {}\n")):
                 file = Path(f"seed-{seed}", name)
                 assert text.format(0) in file.read_text()
                 file.write_text(file.read_text().replace(text.format(0), text.format(seed)))

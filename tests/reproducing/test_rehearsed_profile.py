@@ -33,7 +33,7 @@ def test_the_embedded_profile_is_rehearsed_and_the_first_line_says_so(
     assert said.err.startswith("rehearsal: the profile 'embedded' in place of 'paper'")
     assert "everything that is required is here" in said.out
     assert main([*WORDS, "--out", str(out), "--profile", "paper"]) == 1
-    assert "fetch models" in capsys.readouterr().out, "its models are not here"
+    assert "models fetch" in capsys.readouterr().out, "its models are not here"
 
 
 @needs_models
