@@ -49,10 +49,10 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert main([*words, "--seed", "0", "--out", "seed-0"]) == 0
         for seed in (1, 2):
             shutil.copytree("seed-0", f"seed-{seed}")
-            for name, text in (("run.json", '"seed": {}'), ("run.toml", "\nseed = {}\n")):
+            for name, text in (("run.json", '"seed": {}'), ("run.toml", "\nseed = {}")):
                 file = Path(f"seed-{seed}", name)
                 assert text.format(0) in file.read_text()
-                file.write_text(file.read_text().replace(text.format(0), text.format(seed)))
+                file.write_text(file.read_text().replace(text.format(0), text.format(seed), 1))
         assert main([*words, "--set", "painted.n_frames=5", "--seed", "9", "--out", "other-data"]) == 0
         assert main([*words, "--limit", "2", "--seed", "8", "--out", "partial"]) == 0
     made = {name: scores_of(name) for name in PROTOCOLS}
