@@ -18,7 +18,7 @@ import pytest
 from replica_clouds import first_pose, write_clouds
 from scanned_stage import write_scene
 
-from su3d_bench.analysis.matched import Inputs
+from su3d_bench.analysis.attribution import Inputs
 from su3d_bench.analysis.rules_walk import KINDS, Walker
 from su3d_bench.cli.main import main
 from su3d_bench.core import registry
