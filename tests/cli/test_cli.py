@@ -234,7 +234,7 @@ def test_datasets_that_are_not_here_have_a_line_each_and_more_when_they_are_name
     assert lines[start + 1] == "  replica      looked for in Replica, replica, ."
     assert main(["datasets", "list", "tum"]) == 0
     named = capsys.readouterr().out
-    assert "tum: no sequence in " in named and "scannet" not in named
+    assert "tum: no scene in " in named and "scannet" not in named
     assert main(["datasets", "list", "tumm"]) == 2
     assert "did you mean 'tum'? known: rooms, " in capsys.readouterr().err
 
