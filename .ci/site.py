@@ -19,7 +19,7 @@ from urllib.parse import unquote, urlsplit
 
 import su3d_bench
 from su3d_bench.core.registry import BUILT_IN
-from su3d_bench.metrics.protocols.files import protocol_names
+from su3d_bench.metrics.protocols.loading import protocol_names
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path += [str(ROOT / "tests/support"), str(ROOT / "tests/support/programs")]

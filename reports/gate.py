@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 from xml.etree import ElementTree
 
@@ -187,19 +186,10 @@ def _told(verdict: Verdict) -> list[Finding]:
 
 
 def _as_one(alike: Sequence[Finding]) -> Finding:
-    """One finding for several of a group and text: their names, or which of them differs most."""
+    """One finding for several of a group and text, with their names."""
     first = alike[0]
-    if first.reference is None and first.measured is None:
-        names = some([one.where.rpartition(" / ")[2] for one in alike], MOST_NAMES)
-        return Finding(first.kind, first.group, f"{first.text} ({len(alike)}: {names})")
-
-    def distance(one: Finding) -> float:
-        return math.inf if one.reference is None or one.measured is None else abs(one.measured - one.reference)
-
-    far = max(alike, key=distance)
-    which = far.where.removeprefix(f"{first.group.rpartition(' / ')[0]} / ")
-    text = f"{len(alike)} values, each of which {first.text}; the farthest is {which}"
-    return replace(far, where=first.group, text=text)
+    names = some([one.where.removeprefix(f"{first.group.rpartition(' / ')[0]} / ") for one in alike], MOST_NAMES)
+    return Finding(first.kind, first.group, f"{first.text} ({len(alike)}: {names})")
 
 
 def _mark(finding: Finding) -> str:

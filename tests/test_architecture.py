@@ -5,59 +5,69 @@ from __future__ import annotations
 import ast
 import re
 import subprocess
-import sys
 import tomllib
 from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
-from house import FLOORS, LINKED, PACKAGE, PURPOSE, climbs, code_files, room_of
-from places import ROOT, SUPPORT
+from house import (
+    LINKED,
+    PACKAGE,
+    PAGE,
+    PURPOSE,
+    code_files,
+    drawn,
+    folder_imports,
+    folder_of,
+    imported,
+    imports,
+    layers,
+    page_with,
+)
+from places import ROOT
 
-CODE = code_files()
+CODE = [path for module, path in code_files().items() if module.startswith("su3d_bench")]
 HEAVY = {"open3d", "torch", "onnxruntime", "sklearn", "pandas", "matplotlib", "numba"}
 LATE = ("compiled.py", "torch_towers.py")  # they are imported late as a whole, as kernels are
 
 
-@pytest.mark.parametrize("path", CODE, ids=lambda path: str(path.relative_to(ROOT)))
-def test_imports_lead_downstairs(path: Path) -> None:
-    room = room_of(path)
-    if room is not None:
-        assert climbs(path.read_text(), room) == []
+def test_folders_stand_on_at_most_ten_layers_without_a_cycle() -> None:
+    found = layers(folder_imports())
+    assert len(found) <= 10, found
+    assert found[0] == {"core"}
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "from su3d_bench.cli.main import main",
-        "from su3d_bench import analysis",
-        "import su3d_bench.baselines.oracle",
-        "def f():\n    from su3d_bench.reports.tables import run",
-    ],
-)
-def test_an_import_in_the_wrong_direction_is_found(line: str) -> None:
-    assert climbs(line, "metrics") != []
-    assert (
-        climbs("from su3d_bench.core.errors import DataError\nfrom su3d_bench.metrics import scoring", "metrics") == []
-    )
+def test_no_files_import_each_other_in_a_circle() -> None:
+    layers(imports())
 
 
-def test_every_folder_stands_on_one_floor() -> None:
-    rooms = [room for floor in FLOORS for room in floor]
-    assert sorted(rooms) == sorted({room for path in CODE if (room := room_of(path)) is not None})
-    assert set(PURPOSE) == set(rooms)
-    assert len(FLOORS) <= 10 and len(rooms) <= 20
+def test_every_folder_has_its_purpose() -> None:
+    assert set(PURPOSE) == folder_imports().keys() - {"su3d_bench", "__main__", "benchmarks", ".ci"}
+    assert len(PURPOSE) <= 20
 
 
-@pytest.mark.parametrize("path", CODE, ids=lambda path: str(path.relative_to(ROOT)))
-def test_open3d_and_torch_are_imported_where_they_are_used(path: Path) -> None:
-    if "training" in path.parts or "kernels" in (path.stem, path.parent.name) or path.name in LATE:
-        return
-    for node in ast.parse(path.read_text()).body:
-        names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
-        names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
-        heavy = {name.split(".")[0] for name in names} & HEAVY
-        assert not heavy, f"{path.relative_to(ROOT)}:{node.lineno}: {heavy} at module level"
+def test_every_import_counts() -> None:
+    for line in (
+        "from su3d_bench.cli import main",
+        "import su3d_bench.cli.main",
+        "def f():\n    from su3d_bench.cli.main import main",
+        "if TYPE_CHECKING:\n    from su3d_bench.cli.main import main",
+    ):
+        assert {folder_of(module) for module in imported("su3d_bench.metrics.scoring", line)} == {"cli"}
+    assert imported("su3d_bench.cli.new", "from su3d_bench import Frame") == {"su3d_bench"}
+    with pytest.raises(ValueError, match="cycle of imports among b, c"):
+        layers({"a": set(), "b": {"a", "c"}, "c": {"b"}})
+
+
+def test_heavy_packages_are_imported_where_they_are_used() -> None:
+    for path in CODE:
+        if "training" in path.parts or "kernels" in (path.stem, path.parent.name) or path.name in LATE:
+            continue
+        for node in ast.parse(path.read_text()).body:
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            heavy = {name.split(".")[0] for name in names} & HEAVY
+            assert not heavy, f"{path.relative_to(ROOT)}:{node.lineno}: {heavy} at module level"
 
 
 @pytest.mark.parametrize("name", LINKED)
@@ -89,13 +99,11 @@ def test_the_harness_names_no_dataset_and_no_baseline() -> None:
     names = re.compile(
         r"replica|scannet|rgbd|\btum\b|conceptfusion|(?<!F1-)conceptgraphs|openmask3d|sam3d", re.IGNORECASE
     )
-    rooms = {"core", "numerics", "store", "runs", "sheets", "analysis"}
-    named = [path for path in CODE if room_of(path) in rooms and names.search(path.read_text())]
-    assert named == [PACKAGE / "core" / "registry.py"]
+    folders = {"core", "numerics", "store", "runs", "sheets", "analysis"}
+    files = {path for module, path in code_files().items() if folder_of(module) in folders}
+    assert [path for path in files if names.search(path.read_text())] == [PACKAGE / "core" / "registry.py"]
 
 
-def test_the_page_of_the_house_is_what_the_code_is() -> None:
-    """In a process of its own: a trip shows the first call into each module, which a process makes once."""
-    words = [sys.executable, str(SUPPORT / "house.py"), "--check"]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=600)
-    assert done.returncode == 0, done.stdout + done.stderr
+def test_the_page_of_the_architecture_is_what_the_code_is() -> None:
+    page = PAGE.read_text(encoding="utf-8")
+    assert page_with(drawn(), page) == page, "run: make architecture"

@@ -1,4 +1,8 @@
-"""Any other program as a method: it is run once a scene, gets the frames in a folder, and leaves a prediction."""
+"""Any other program as a method: it is run once a scene, gets the frames in a folder, and leaves a prediction.
+
+Folders of datasets have names that others chose, such as ``x$(touch y)``. No value is ever read as a part of a program:
+it reaches the program as a word, or through its environment; a shell's line gets the variable in its place.
+"""
 
 from __future__ import annotations
 
@@ -8,21 +12,13 @@ import re
 import shlex
 import shutil
 import uuid
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path, PurePath
 from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from su3d_bench.baselines.command.frames import ColourFormat, FrameFolder
-from su3d_bench.baselines.command.placeholders import (
-    PLACEHOLDER,
-    PLACEHOLDERS,
-    check_placeholders,
-    variable_of,
-    words_of,
-)
-from su3d_bench.baselines.command.prediction import as_prediction, class_names, read_output
+from su3d_bench.baselines.command.folders import ColourFormat, FrameFolder, as_prediction, class_names, read_output
 from su3d_bench.baselines.command.process import ContainerWatch, Finished, Leaving, TreeWatch, run_program
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError, printable
@@ -31,6 +27,84 @@ from su3d_bench.core.files.scratch import TemporaryFolder
 from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, SceneInfo, Surface
+
+PLACEHOLDER = re.compile(r"\{(\w*)\}")
+PLACEHOLDERS = ("frames", "output", "work", "scene", "dataset", "seed")
+BESIDE = re.compile(r"[\w./:=,@%+~\[\]-]*")  # what may stand in one word with a placeholder: nothing that is code
+INTERPRETER = re.compile(
+    r"(ba|da|a|z|k|mk|fi|c|tc)?sh|busybox|su|runuser|script|flock|(python|pypy|perl|ruby|lua|php)[\d.]*|node|nodejs|deno"
+    r"|bun|R|Rscript|luajit|julia|octave"
+)
+WITH_A_VALUE = re.compile(r"-[OWX]|-[a-z]*o")  # options of interpreters whose value may be a word of its own
+CODE_OPTION = re.compile(r"-[A-Za-z]*[ceEpr]|--(eval|command|print|execute)=?")  # a program follows it
+
+
+def variable_of(name: str) -> str:
+    """The environment variable that holds the value of a placeholder.
+
+    >>> variable_of("scene")
+    'SU3D_SCENE'
+    """
+    return f"SU3D_{name.upper()}"
+
+
+def words_of(command: str | Sequence[str]) -> list[str]:
+    """The words of a command; what a shell alone can split is split at spaces."""
+    if not isinstance(command, str):
+        return list(command)
+    try:
+        return shlex.split(command)
+    except ValueError:
+        return command.split()
+
+
+def check_placeholders(command: str | Sequence[str], *, is_shell: bool) -> None:
+    """A ``ValueError`` where a placeholder stands for nothing, or where its value would be read as a program."""
+    if isinstance(command, str) and is_shell:
+        for name, place in _misplaced(command):
+            right = f'write {{{name}}} outside of quotes, or "${variable_of(name)}"'
+            raise ValueError(f"'{{{name}}}' stands {place}, where a shell would read its value as commands; {right}")
+        return
+    words = shlex.split(command) if isinstance(command, str) else command
+    for k, word in enumerate(words):
+        names = [name for name in PLACEHOLDER.findall(word) if name]
+        if not names:
+            continue
+        if unknown := [name for name in names if name not in PLACEHOLDERS]:
+            raise ValueError(f"'{{{unknown[0]}}}' stands for nothing; known: {{{'}, {'.join(PLACEHOLDERS)}}}")
+        if not BESIDE.fullmatch(PLACEHOLDER.sub("", word)) or _is_code(words, k):
+            raise ValueError(
+                f"'{{{names[0]}}}' stands within what a program may read as code; make it a word of its own, or use "
+                f"the environment variable {variable_of(names[0])} there"
+            )
+
+
+def _misplaced(line: str) -> Iterator[tuple[str, str]]:
+    """The placeholders of a shell's line that stand where its quotes would be undone, or where a shell is fed."""
+    for found in PLACEHOLDER.finditer(line):
+        before = line[: found.start()]
+        unescaped = re.sub(r"\\.", "", before)
+        is_quoted = unescaped.count("'") % 2 or unescaped.count('"') % 2
+        places = {"within quotes": is_quoted, "in or after a here-document": "<<" in before}
+        places |= {f"behind a {sign}": before.endswith(sign) for sign in ("$", "\\")}
+        place = next((place for place, is_there in places.items() if is_there), None)
+        if found[1] in PLACEHOLDERS and place is not None:
+            yield found[1], place
+
+
+def _is_code(words: Sequence[str], k: int) -> bool:
+    """Whether an interpreter reads the ``k``-th word, behind nothing but its options, as a program."""
+    for start in (n for n in range(k) if INTERPRETER.fullmatch(PurePath(words[n]).name)):
+        between = words[start + 1 : k]
+        are_options = all(
+            word.startswith(("-", "+")) or (n > 0 and WITH_A_VALUE.fullmatch(between[n - 1]))
+            for n, word in enumerate(between)
+        )
+        options = [*between, PLACEHOLDER.split(words[k])[0]]
+        if are_options and any(CODE_OPTION.fullmatch(option) for option in options):
+            return True
+    return False
+
 
 logger = logging.getLogger(__name__)
 logger.setLevel(logging.INFO)  # what a program prints goes to the log of its scene

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from su3d_bench.core.compiled import njit
-from su3d_bench.numerics.cells import ABSENT, slot_of
+from su3d_bench.numerics.clusters import ABSENT, slot_of
 
 MOST_CORNERS = 16  # a rectangle cut by six planes has at most ten
 COINCIDENT_M = 1e-9

@@ -9,8 +9,8 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from su3d_bench.baselines.conceptgraphs.config import Cosine, Fraction, Interval, MappingConfig
 from su3d_bench.baselines.conceptgraphs.map import ObjectMap
+from su3d_bench.baselines.conceptgraphs.objects import Cosine, Fraction, Interval, MappingConfig
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, SceneInfo

@@ -1,23 +1,321 @@
-"""The objects of ConceptGraphs' map: merging two, denoising, dropping what was seen too rarely, overlap merging.
+"""The objects of ConceptGraphs' map: their clouds and boxes, merging two, denoising, dropping what was seen too rarely.
 
 Objects never change: a merge makes a new one, so that a map can be finished midway.
-Source: concept-graphs at commit 5c4da70, ``conceptgraph/slam/utils.py``.
+Source: concept-graphs at commit 5c4da70, ``conceptgraph/slam/utils.py``, whose geometry is Open3D's (from the regions
+of an image to clouds: ``filter_gobs``, ``gobs_to_detection_list``), and ``conceptgraph/utils/ious.py``
+(``mask_subtract_contained``; overlaps of boxes, for which it asks PyTorch3D's ``box3d_overlap``). The hyper-parameters
+are those of ``configs/slam_pipeline/base.yaml`` and of the README's commands for the SAM-only variant; options that
+these commands leave off and that change the method (``use_contain_number``, other similarities) are left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
 
-from su3d_bench.baselines.conceptgraphs.boxes import extents_of_boxes, shared_volume
-from su3d_bench.baselines.conceptgraphs.clouds import voxel_average
-from su3d_bench.baselines.conceptgraphs.config import MappingConfig
-from su3d_bench.baselines.conceptgraphs.regions import box_of, cleaned
-from su3d_bench.core.types import Float64Array, OrientedBox
+from su3d_bench.core.geometry import back_project, valid_depth
+from su3d_bench.core.types import BoolArray, Detections, Float32Array, Float64Array, Frame, Int64Array, OrientedBox
+
+Metres = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Cosine = Annotated[float, Field(ge=-1, le=1)]
+Interval = Annotated[int, Field(ge=-1)]  # processed frames; -1 or 0: never
+InstanceScore = Literal["ones", "num-detections", "max-confidence"]
+
+# The sum of both similarities that joins a detection to an object. The two rules are not equivalent: 1.1 of the paper
+# is 1.2 of the code only where the cosine is 0.8.
+SIM_THRESHOLDS = {"code": 1.2, "paper": 1.1}
+
+
+class MappingConfig(BaseModel):
+    """What both variants share; names are those of the original's configuration where it has one."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+
+    stride: int = Field(default=5, ge=1)
+    # code: overlap + cosine >= 1.2; paper: overlap + (cosine / 2 + 1 / 2) >= 1.1 (its equation for phi_sem).
+    association: Literal["code", "paper"] = "code"
+    sim_threshold: float | None = None  # another threshold than that of the rule
+    # overlap: share of the detection's points that lie at the object; iou: of axis-aligned boxes, the default that the
+    # original's commands override.
+    spatial_sim_type: Literal["overlap", "iou"] = "overlap"
+    phys_bias: float = Field(default=0.0, ge=-1, le=1)
+    mask_area_threshold: int = Field(default=25, ge=0)  # pixels; the original takes at least 10
+    mask_conf_threshold: Fraction = 0.95  # of SAM's predicted IoU
+    # Instead, where a profile's scores are on a scale of their own (Detections.score_scale); 0: all regions stay.
+    own_scale_conf_threshold: Fraction = 0.0
+    max_bbox_area_ratio: Fraction = 0.5
+    min_points_threshold: int = Field(default=16, ge=0)  # the original takes at least 5
+    # Gaussian noise on every coordinate, "to avoid colinearity": 4 mm in the code, there from an unseeded generator,
+    # here from the scene's seed. 0: none.
+    noise_m: float = Field(default=0.004, ge=0, allow_inf_nan=False)
+    downsample_voxel_size: Metres = 0.025
+    dbscan_remove_noise: bool = True
+    dbscan_eps: Metres = 0.1
+    dbscan_min_points: int = Field(default=10, ge=1)
+    denoise_interval: Interval = 20
+    filter_interval: Interval = -1
+    merge_interval: Interval = 20
+    obj_min_points: int = Field(default=0, ge=0)
+    obj_min_detections: int = Field(default=3, ge=0)
+    merge_overlap_thresh: float = Field(default=0.7, ge=0, le=1)  # 0: no overlap merge
+    merge_visual_sim: Cosine = 0.8
+    merge_text_sim: Cosine = 0.8
+    # The original has no scores; instance AP needs some. ones: as readers of its maps take it.
+    instance_score: InstanceScore = "ones"
+
+    @property
+    def association_threshold(self) -> float:
+        """The least similarity at which a detection joins an object."""
+        return SIM_THRESHOLDS[self.association] if self.sim_threshold is None else self.sim_threshold
+
+    @property
+    def score_caveat(self) -> str:
+        """What must be said of the instances' scores."""
+        if self.instance_score == "ones":
+            return "the original has no scores: 1 for every object"
+        what = {"num-detections": "number of detections", "max-confidence": "largest detection score"}
+        return f"the original has no scores: each object's {what[self.instance_score]}"
+
+
+LEAST_CLUSTER = 5  # points; a smaller largest cluster is not trusted and the whole cloud stays
+LEAST_FOR_ORIENTED_BOX = 4  # points that span a volume
+
+
+def voxel_average(points: Float64Array, voxel_m: float) -> Float64Array:
+    """The mean point (V, 3) of each occupied voxel, in the order of the voxels' first points.
+
+    The grid starts half a voxel below the cloud's own minimum, as Open3D's ``voxel_down_sample`` has it: it moves with
+    the cloud, so that a cloud averaged again is not left as it is.
+    """
+    if not len(points):
+        return points
+    from su3d_bench.baselines.conceptgraphs.kernels import means_of_cells
+
+    averaged: Float64Array = means_of_cells(points, points.min(axis=0) - voxel_m / 2, voxel_m)
+    return averaged
+
+
+def density_clusters(points: Float64Array, eps_m: float, min_points: int) -> Int64Array:
+    """DBSCAN's cluster (N,) of each point, -1 for none; the labels of Open3D's ``cluster_dbscan``."""
+    from su3d_bench.numerics import clusters
+
+    return clusters.density_clusters(points, eps_m, min_points, holds_eps=False)
+
+
+def largest_cluster(points: Float64Array, eps_m: float, min_points: int) -> Float64Array:
+    """The points of the largest DBSCAN cluster; all of them where there is none, or none of at least five points.
+
+    Of clusters of equal size the one whose first point comes first, as Python's ``Counter`` counts them.
+    """
+    labels = density_clusters(points, eps_m, min_points)
+    distinct, first, sizes = np.unique(labels[labels >= 0], return_index=True, return_counts=True)
+    if not len(distinct) or sizes.max() < LEAST_CLUSTER:
+        return points
+    largest = np.flatnonzero(sizes == sizes.max())
+    is_inside: BoolArray = labels == distinct[largest[np.argmin(first[largest])]]
+    return points[is_inside]
+
+
+def bounding_box(points: Float64Array, *, oriented: bool) -> OrientedBox:
+    """The box around ``points``: along the principal axes of their convex hull, else along the world's axes."""
+    if oriented and len(points) >= LEAST_FOR_ORIENTED_BOX:
+        import open3d as o3d
+
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+        try:
+            box = cloud.get_oriented_bounding_box(robust=True)
+            return OrientedBox(np.array(box.center), np.array(box.extent), np.array(box.R))
+        except RuntimeError:  # Qhull found no volume even in the jolted points
+            pass
+    low, high = points.min(axis=0), points.max(axis=0)
+    return OrientedBox((low + high) / 2, high - low, np.eye(3))
+
+
+# The faces of PyTorch3D's boxes in our order of corners, where bit i of a corner is its side along axis i: PyTorch3D's
+# corners 0..7 are 0, 2, 6, 4, 1, 3, 7, 5 here.
+FACES = np.array([[0, 2, 6, 4], [4, 6, 7, 5], [0, 2, 3, 1], [0, 4, 5, 1], [2, 6, 7, 3], [1, 3, 7, 5]])
+COPLANAR_M = 1e-4  # PyTorch3D's tolerance
+
+
+@dataclass(frozen=True)
+class Extents:
+    """Axis-aligned boxes: ``low`` and ``high`` (N, 3) in metres."""
+
+    low: Float64Array
+    high: Float64Array
+
+
+def grown(boxes: Sequence[OrientedBox], least_side_m: float) -> list[OrientedBox]:
+    """``boxes`` with every side that is shorter grown to ``least_side_m`` about the centre."""
+    return [OrientedBox(box.centre, np.maximum(box.sizes, least_side_m), box.rotation) for box in boxes]
+
+
+def extents_of_boxes(boxes: Sequence[OrientedBox]) -> Extents:
+    """The axis-aligned extents of oriented boxes."""
+    centres = np.array([box.centre for box in boxes]).reshape(-1, 3)
+    reach = np.array([np.abs(box.rotation) @ box.sizes / 2 for box in boxes]).reshape(-1, 3)
+    return Extents(centres - reach, centres + reach)
+
+
+def extents_of_clouds(clouds: Sequence[Float64Array]) -> Extents:
+    """The axis-aligned extents of clouds, none of them empty."""
+    low, high = [cloud.min(axis=0) for cloud in clouds], [cloud.max(axis=0) for cloud in clouds]
+    return Extents(np.array(low).reshape(-1, 3), np.array(high).reshape(-1, 3))
+
+
+def shared_volume(a: Extents, b: Extents) -> Float64Array:
+    """Volumes (A, B) that axis-aligned boxes share."""
+    low = np.maximum(a.low[:, None], b.low[None])
+    high = np.minimum(a.high[:, None], b.high[None])
+    volume: Float64Array = np.maximum(high - low, 0).prod(axis=2)
+    return volume
+
+
+def axis_aligned_iou(a: Extents, b: Extents) -> Float64Array:
+    """IoU (A, B) of axis-aligned boxes; the original adds 1e-10 m^3 to the union.
+
+    >>> unit, moved = np.zeros((1, 3)), np.array([[0.5, 0.0, 0.0]])
+    >>> round(float(axis_aligned_iou(Extents(unit, unit + 1), Extents(moved, moved + 1))[0, 0]), 6)
+    0.333333
+    """
+    shared = shared_volume(a, b)
+    volume_a, volume_b = (a.high - a.low).prod(axis=1), (b.high - b.low).prod(axis=1)
+    iou: Float64Array = shared / (volume_a[:, None] + volume_b[None] - shared + 1e-10)
+    return iou
+
+
+def oriented_iou(a: Sequence[OrientedBox], b: Sequence[OrientedBox]) -> Float64Array:
+    """IoU (A, B) of oriented boxes, exact up to rounding; every side must be longer than 0."""
+    from su3d_bench.baselines.conceptgraphs import kernels as kernels
+
+    shared = kernels.intersection_volumes(*_arrays(a), *_arrays(b))
+    volume_a = np.array([box.sizes.prod() for box in a])
+    volume_b = np.array([box.sizes.prod() for box in b])
+    iou: Float64Array = shared / (volume_a[:, None] + volume_b[None] - shared)
+    return iou
+
+
+def are_coplanar(boxes: Sequence[OrientedBox]) -> bool:
+    """Whether PyTorch3D takes ``boxes``: the corners of each face lie in a plane, in single precision.
+
+    Boxes far from the origin fail by rounding; at the size of a building none does. As in PyTorch3D the distances of
+    the six faces' fourth corners are summed with their signs, so that those of opposite faces may cancel.
+    """
+    if not boxes:
+        return True
+    corners = np.array([box.corners for box in boxes]).astype(np.float32)
+    first, second, third, fourth = np.moveaxis(corners[:, FACES], 2, 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        normals = _unit(np.cross(_unit(second - first), _unit(third - first)))
+        off = ((fourth - first) * normals).sum(axis=(1, 2), dtype=np.float32)
+    return bool((np.abs(off) < COPLANAR_M).all())
+
+
+def _unit(vectors: np.typing.NDArray[np.float32]) -> np.typing.NDArray[np.float32]:
+    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    unit: np.typing.NDArray[np.float32] = vectors / np.maximum(lengths, np.float32(1e-12))
+    return unit
+
+
+def _arrays(boxes: Sequence[OrientedBox]) -> tuple[Float64Array, Float64Array, Float64Array]:
+    centres = np.array([box.centre for box in boxes], np.float64).reshape(-1, 3)
+    halves = np.array([box.sizes for box in boxes], np.float64).reshape(-1, 3) / 2
+    rotations = np.array([box.rotation for box in boxes], np.float64).reshape(-1, 3, 3)
+    return centres, halves, rotations
+
+
+LEAST_MASK_AREA = 10  # pixels, whatever the configuration says
+LEAST_POINTS = 5  # likewise
+LEAST_VOLUME = 1e-6  # m^3 of the box of a detection
+MOST_OF_CONTAINER = 0.7  # th2: a box that covers more of the other is no part of it
+LEAST_OF_CONTAINED = 0.8  # th1
+
+
+@dataclass(frozen=True)
+class LiftedRegion:
+    """One region in the world: the row ``detection`` of the frame's detections, its cloud (N, 3) m and its box."""
+
+    detection: int
+    points: Float64Array
+    box: OrientedBox
+
+
+def kept_regions(detections: Detections, is_background: BoolArray, config: MappingConfig) -> NDArray[np.intp]:
+    """Rows of the regions that are large and sure enough; background may be as large as it is."""
+    if not len(detections):
+        return np.zeros(0, np.intp)
+    image_area = detections.masks.shape[1] * detections.masks.shape[2]
+    boxes = detections.boxes.astype(np.float64)
+    box_areas = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
+    is_published = detections.score_scale == "published"
+    least_score = np.float32(config.mask_conf_threshold if is_published else config.own_scale_conf_threshold)
+    is_kept = detections.masks.sum(axis=(1, 2)) >= max(config.mask_area_threshold, LEAST_MASK_AREA)
+    is_kept &= is_background | (box_areas <= config.max_bbox_area_ratio * image_area)
+    is_kept &= detections.scores >= least_score
+    return np.flatnonzero(is_kept)
+
+
+def subtract_contained(boxes: Float32Array, masks: BoolArray) -> BoolArray:
+    """``masks`` (K, H, W) without those of the boxes that each box contains.
+
+    Box i contains box j where j covers less than 0.7 of i and i covers more than 0.8 of j. In the order of i, then j,
+    each with what the steps before have left: what was cut out of a mask is not cut out of another by it.
+    """
+    corners = boxes.astype(np.float64)
+    areas = (corners[:, 2] - corners[:, 0]) * (corners[:, 3] - corners[:, 1])
+    low = np.maximum(corners[:, None, :2], corners[None, :, :2])
+    high = np.minimum(corners[:, None, 2:], corners[None, :, 2:])
+    shared = np.maximum(high - low, 0).prod(axis=2)
+    with np.errstate(invalid="ignore", divide="ignore"):  # a box without area is neither container nor contained
+        share = shared / areas[:, None]
+    result = masks.copy()
+    for i, j in np.argwhere((share < MOST_OF_CONTAINER) & (share.T > LEAST_OF_CONTAINED)):
+        result[i] &= ~result[j]
+    return result
+
+
+def lift(
+    frame: Frame, rows: NDArray[np.intp], masks: BoolArray, config: MappingConfig, seed: int
+) -> Iterator[LiftedRegion]:
+    """The regions ``rows`` of a frame, whose masks (K, H, W) are given in their order, those too small left out."""
+    if not len(rows):
+        return
+    has_depth = valid_depth(frame.depth_m, 0.0, np.inf)
+    points = back_project(frame.depth_m, frame.intrinsics, frame.camera_to_world, has_depth)
+    row_of_pixel = np.cumsum(has_depth.ravel()) - 1
+    noise = np.random.default_rng([seed, frame.index])
+    to_world = frame.camera_to_world[:3, :3]
+    for detection, mask in zip(rows, masks, strict=True):
+        cloud = points[row_of_pixel[np.flatnonzero(mask & has_depth)]]
+        if len(cloud) < max(config.min_points_threshold, LEAST_POINTS):
+            continue
+        if config.noise_m > 0:
+            cloud = cloud + noise.normal(0.0, config.noise_m, cloud.shape) @ to_world.T
+        cloud = cleaned(cloud, config)
+        box = box_of(cloud, config)
+        if box.sizes.prod() >= LEAST_VOLUME:
+            yield LiftedRegion(int(detection), cloud, box)
+
+
+def cleaned(points: Float64Array, config: MappingConfig) -> Float64Array:
+    """``points`` averaged by voxel, then without what does not hang together with most of them."""
+    points = voxel_average(points, config.downsample_voxel_size)
+    if not config.dbscan_remove_noise:
+        return points
+    return largest_cluster(points, config.dbscan_eps, config.dbscan_min_points)
+
+
+def box_of(points: Float64Array, config: MappingConfig) -> OrientedBox:
+    """The box of a cloud: oriented where the similarity is the overlap of points, else along the world's axes."""
+    return bounding_box(points, oriented=config.spatial_sim_type == "overlap")
+
 
 LEAST_AFTER_DENOISING = 4  # points; with fewer the object stays as it was
 

@@ -1,22 +1,239 @@
-"""Class-agnostic 3D proposals for methods that describe masks: from files, from the mesh's shape, or from the truth."""
+"""Class-agnostic 3D proposals for methods that describe masks: from files, from the mesh's shape, or from the truth.
+
+Files are those of Mask3D, Segment3D and OpenMask3D, in any format of masks that `evaluate` reads, treated as these do
+before they save: connected parts, small ones left out.
+
+From the shape alone, without weights (ours; not Mask3D's): the mesh's segments (the dataset's, else ScanNet's
+algorithm) are merged to a tree, and the nodes that bend most against what is around them for the length of their border
+become masks.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from su3d_bench.baselines.mesh_segments.segments import MIN_VERTICES, THRESHOLD
-from su3d_bench.baselines.openmask3d.components import split_into_parts, voted_by_segments
-from su3d_bench.baselines.openmask3d.proposal_files import digest_of_folder, read_proposals
-from su3d_bench.baselines.openmask3d.surface_proposals import SOURCE, NodeChoice, segments_of, surface_proposals
-from su3d_bench.core.errors import DataError
+from su3d_bench.baselines.mesh_segments.segments import MIN_VERTICES, THRESHOLD, mesh_segments
+from su3d_bench.baselines.openmask3d.segment_tree import SegmentTree, contacts_of, is_within, merge_tree
+from su3d_bench.core.digests import digest_file, digest_json
+from su3d_bench.core.errors import DataError, PredictionError, shown
 from su3d_bench.core.interfaces import SceneTools
-from su3d_bench.core.maps import Proposals
-from su3d_bench.core.types import Int64Array, Surface
+from su3d_bench.core.maps import Masks, Proposals
+from su3d_bench.core.types import Float32Array, Float64Array, Int64Array, Surface
 from su3d_bench.metrics.matching.nearest import transfer_masks
+from su3d_bench.predictions.base import VertexMasks
+
+NOISE = -1
+
+
+def split_into_parts(
+    proposals: Proposals, eps_m: float, min_points: int, most_dropped: int, kept_share: float
+) -> Proposals:
+    """Each connected part of each mask as a mask with its score, the best first, of equal ones the earlier.
+
+    Parts are DBSCAN's with ``eps_m`` and ``min_points``, whose noise belongs to none; those of at most ``most_dropped``
+    points go, and of n others the first floor(``kept_share`` n) stay.
+    """
+    parts: list[Int64Array] = []
+    scores: list[float] = []
+    for k in range(len(proposals)):
+        members = proposals.mask(k)
+        labels = density_clusters(proposals.points[members], eps_m, min_points)
+        for label in range(int(labels.max(initial=NOISE)) + 1):
+            part = members[labels == label].astype(np.int64)
+            if len(part) > most_dropped:
+                parts.append(part)
+                scores.append(float(proposals.scores[k]))
+    order = np.argsort(-np.array(scores), kind="stable")[: int(kept_share * len(scores))]
+    masks = Masks.of_sets([parts[k] for k in order])
+    return replace(proposals, indptr=masks.indptr, indices=masks.indices, scores=np.array(scores, np.float64)[order])
+
+
+def voted_by_segments(proposals: Proposals, segments: Int64Array) -> Proposals:
+    """Each mask made of whole segments: those of which it holds more than half, as both networks are evaluated.
+
+    ``segments`` (N,) are numbered from 0 on, one a point; masks that hold no segment by more than half become empty.
+
+    >>> points = np.zeros((5, 3), np.float32)
+    >>> masks = Proposals(np.array([0, 3]), np.array([0, 1, 3]), points=points, scores=np.ones(1), source="made")
+    >>> voted_by_segments(masks, np.array([0, 0, 0, 1, 1])).indices.tolist()
+    [0, 1, 2]
+    """
+    size = np.bincount(segments)
+    order = np.argsort(segments, kind="stable")
+    start = np.cumsum(size) - size
+    kept = []
+    for k in range(len(proposals)):
+        held = np.bincount(segments[proposals.mask(k)], minlength=len(size))
+        whole = np.flatnonzero(2 * held > size)
+        kept.append(np.sort(np.concatenate([order[:0], *(order[start[s] : start[s] + size[s]] for s in whole)])))
+    masks = Masks.of_sets(kept)
+    return replace(proposals, indptr=masks.indptr, indices=masks.indices)
+
+
+def density_clusters(points: Float32Array, eps_m: float, min_points: int) -> Int64Array:
+    """DBSCAN's label (N,) of each point, 0, 1, ... in the order of their first points, -1 for noise."""
+    if not len(points):
+        return np.zeros(0, np.int64)
+    if min_points <= 1:
+        return linked_within(points.astype(np.float64), eps_m)
+    from su3d_bench.numerics import clusters
+
+    return clusters.density_clusters(points.astype(np.float64), eps_m, min_points)
+
+
+def linked_within(points: Float64Array, gap_m: float) -> Int64Array:
+    """The group (N,) of each point, where points within ``gap_m`` of each other are linked: DBSCAN with one point.
+
+    DBSCAN itself lists all neighbours, which is the square of the number of points where ``gap_m`` spans a room. Here
+    points share a cube whose diagonal is ``gap_m``, and two cubes are linked by their nearest points.
+    """
+    from scipy.spatial import cKDTree
+
+    cells = np.floor((points - points.min(axis=0)) / (gap_m / np.sqrt(3))).astype(np.int64)
+    distinct, cell_of = np.unique(cells, axis=0, return_inverse=True)
+    cell_of = cell_of.reshape(-1)
+    order = np.argsort(cell_of, kind="stable")
+    members = np.split(order, np.cumsum(np.bincount(cell_of))[:-1])
+    root = np.arange(len(distinct))
+
+    def find(cell: int) -> int:
+        while root[cell] != cell:
+            root[cell] = root[root[cell]]
+            cell = int(root[cell])
+        return cell
+
+    # cubes whose points may be within the gap lie at most two apart along each axis
+    pairs = cKDTree(distinct).query_pairs(2, p=np.inf, output_type="ndarray")
+    for a, b in pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]:
+        low, high = sorted((find(int(a)), find(int(b))))
+        if low != high:
+            distances, _ = cKDTree(points[members[a]]).query(points[members[b]], distance_upper_bound=gap_m * 1.001)
+            if (distances <= gap_m).any():
+                root[high] = low
+    roots = np.array([find(cell) for cell in range(len(distinct))])[cell_of]
+    _, first, group = np.unique(roots, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return rank[group.reshape(-1)]
+
+
+def read_proposals(folder: Path, scene: str, surface: Surface) -> Proposals:
+    """The masks of ``scene`` over the vertices of ``surface``, in the order of the file; classes are left aside.
+
+    Raises ``PredictionError`` where the files hold no masks, cannot be used, or are of another mesh.
+    """
+    from su3d_bench.predictions.formats import recognise  # every format there is: not for a list of methods
+
+    reader = recognise(folder)
+    prediction = reader.read(folder, scene)
+    masks, where = prediction.content, shown(prediction.path)
+    if not isinstance(masks, VertexMasks):
+        raise PredictionError(f"{where}: format '{reader.name}' holds no masks over the mesh; give proposals that do")
+    n_vertices = len(surface.vertices)
+    if masks.n_points not in (None, n_vertices):
+        raise PredictionError(
+            f"{where}: proposals of {masks.n_points} points, but the mesh of '{scene}' has {n_vertices} vertices; take "
+            "proposals that were made on this mesh"
+        )
+    source = f"{reader.name} in {where}"
+    return Proposals(masks.indptr, masks.indices, points=surface.vertices, scores=masks.scores, source=source)
+
+
+def digest_of_folder(folder: Path) -> str:
+    """A key of the names and content of all files below ``folder``; of a missing one, of nothing."""
+    files: Mapping[str, Path] = {
+        path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*")) if path.is_file()
+    }
+    try:
+        stats = {name: path.stat() for name, path in files.items()}
+        return digest_json({name: _digest(files[name], stat.st_size, stat.st_mtime_ns) for name, stat in stats.items()})
+    except OSError as error:
+        raise PredictionError(f"{shown(folder)}: {error.filename} cannot be read: {error.strerror}") from error
+
+
+@cache
+def _digest(path: Path, size: int, changed_ns: int) -> str:
+    """Of the content; what size and time tell is that it need not be read again for the next scene."""
+    return digest_file(path)
+
+
+SOURCE = "weight-free proposals from the mesh's shape, not a network's"
+# Square metres of surface from which on size no longer speaks for a part. Chosen on rooms/living0 and rooms/office0.
+FULL_AREA_M2 = 0.5
+LEAST_BORDER = 0.2  # added to the relative length of a border, which is 0 where a part touches nothing
+LONE_BEND = 0.3  # bend of the border of a part that touches nothing
+
+
+@dataclass(frozen=True)
+class NodeChoice:
+    """Which nodes become masks: at most ``most``, of ``min_points`` vertices to ``max_share`` of all.
+
+    Of two nested ones whose IoU exceeds ``same_iou`` only the better one.
+    """
+
+    most: int
+    min_points: int
+    max_share: float
+    same_iou: float
+
+
+def segments_of(surface: Surface, threshold: float = THRESHOLD, min_vertices: int = MIN_VERTICES) -> Int64Array:
+    """The segment (V,) of each vertex, numbered 0 to S - 1: the published ones, else those of ScanNet's algorithm."""
+    segments = surface.segments
+    if segments is None:
+        segments = mesh_segments(surface.vertices, surface.triangles, threshold, min_vertices)
+    return np.unique(segments, return_inverse=True)[1].reshape(-1)
+
+
+def surface_proposals(surface: Surface, row: Int64Array, choice: NodeChoice) -> Proposals:
+    """The masks over the vertices of ``surface``, the best first; ``row`` (V,) is the segment of each vertex."""
+    tree = merge_tree(contacts_of(surface.vertices, surface.triangles, row))
+    n_points = np.bincount(row, minlength=len(tree.leaves))
+    scores = contrast(tree)
+    nodes = chosen_nodes(tree, n_points, scores, choice)
+    rank = np.empty(len(tree.leaves), np.int64)
+    rank[tree.leaves] = np.arange(len(tree.leaves))
+    order = np.argsort(rank[row], kind="stable")  # vertices in the order of the leaves
+    first = np.concatenate([[0], np.cumsum(n_points[tree.leaves])]).astype(np.int64)
+    masks = Masks.of_sets([np.sort(order[first[tree.start[k]] : first[tree.end[k]]]) for k in nodes])
+    return Proposals(masks.indptr, masks.indices, points=surface.vertices, scores=scores[nodes], source=SOURCE)
+
+
+def contrast(tree: SegmentTree) -> Float64Array:
+    """How much each node stands out (N,), about 0 to 1: mean bend of its border over the border's relative length.
+
+    The relative length is the number of contacts over the root of the number of patches; nodes of less than
+    ``FULL_AREA_M2`` count by the root of their area.
+    """
+    mean_bend = np.where(tree.n_contacts > 0, tree.bend / np.maximum(tree.n_contacts, 1), LONE_BEND)
+    border = tree.n_contacts / np.sqrt(tree.n_patches)
+    size = np.minimum(1.0, np.sqrt(tree.n_patches * tree.patch_m**2 / FULL_AREA_M2))
+    result: Float64Array = mean_bend * size / (border + LEAST_BORDER)
+    return result
+
+
+def chosen_nodes(tree: SegmentTree, n_points: Int64Array, scores: Float64Array, choice: NodeChoice) -> Int64Array:
+    """The nodes that ``choice`` takes, the best first, of equal ones the earlier; ``n_points`` (S,) of the segments."""
+    before = np.concatenate([[0], np.cumsum(n_points[tree.leaves])])
+    n_of_node = before[tree.end] - before[tree.start]
+    fits = (n_of_node >= choice.min_points) & (n_of_node <= choice.max_share * before[-1])
+    taken = np.zeros(0, np.int64)
+    for node in np.argsort(-scores, kind="stable"):
+        if len(taken) == choice.most:
+            break
+        smaller, larger = np.minimum(n_of_node[taken], n_of_node[node]), np.maximum(n_of_node[taken], n_of_node[node])
+        is_same = is_within(tree, taken, int(node)) & (smaller > choice.same_iou * larger)
+        if fits[node] and not is_same.any():
+            taken = np.append(taken, node)
+    return taken
+
 
 Kind = Literal["auto", "files", "surface", "oracle"]
 Metres = Annotated[float, Field(gt=0, allow_inf_nan=False)]

@@ -30,7 +30,7 @@ from su3d_bench.metrics.costs import (
     summarise,
 )
 from su3d_bench.numerics.statistics import Growth
-from su3d_bench.reports.pictures.plots.timing import draw_update_cost
+from su3d_bench.reports.pictures.plots import draw_update_cost
 from su3d_bench.reports.tables.formats import aligned
 from su3d_bench.runs.finished import read_run, read_update_times
 

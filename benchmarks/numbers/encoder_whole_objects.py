@@ -16,7 +16,7 @@ from su3d_bench.datasets.rooms.classes import CLASSES
 from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.datasets.rooms.truth import STRUCTURE, RoomObject
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
-from su3d_bench.runs.planning.scenes import data_root
+from su3d_bench.runs.scenes import data_root
 
 KINDS = ("living", "bedroom", "kitchen", "office", "bathroom", "studio")
 NUMBERS = (20030, 20031, 20032)

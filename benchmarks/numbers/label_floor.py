@@ -21,7 +21,7 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
-from su3d_bench.runs.planning.scenes import data_root
+from su3d_bench.runs.scenes import data_root
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.run_folder import RunFolder
 

@@ -25,7 +25,7 @@ from su3d_bench.core.types import Float64Array, GroundTruth
 from su3d_bench.metrics.matching.nearest import transfer_masks
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.runs.planning.scenes import data_root
+from su3d_bench.runs.scenes import data_root
 
 LIMITS = (0.25, 0.5, 0.75)
 

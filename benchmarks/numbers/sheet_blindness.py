@@ -17,10 +17,10 @@ from blindness import ALPHA, Looks, all_looks, asked_alike, differs, told_apart
 
 from su3d_bench.core.types import BoolArray, UInt8Array
 from su3d_bench.runs.finished import read_run
+from su3d_bench.sheets.drafts import Draft
+from su3d_bench.sheets.drawing import Artist
 from su3d_bench.sheets.items import SheetKind
-from su3d_bench.sheets.making.drafts import Draft
-from su3d_bench.sheets.making.drawing import Artist
-from su3d_bench.sheets.making.run_source import RunSource
+from su3d_bench.sheets.sources import RunSource
 
 KINDS: tuple[SheetKind, ...] = ("retrieval", "annotation", "reasoning")
 

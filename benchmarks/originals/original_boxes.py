@@ -14,7 +14,7 @@ from original_code import STOPS, Ask, Original, load, silence
 from places import CASES
 
 from su3d_bench.core.types import Float64Array
-from su3d_bench.metrics.instance.box_counts import PLACES, THRESHOLDS
+from su3d_bench.metrics.instance.boxes import PLACES, THRESHOLDS
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine
 

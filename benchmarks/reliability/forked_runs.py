@@ -159,12 +159,12 @@ def false_seals(folder: Path, expected: dict[str, Any]) -> list[str]:
 
 def load_modules(subject: str) -> None:
     """What a run imports, in this one process, which must stay without threads of its own."""
-    from su3d_bench.runs.executors.local import limit_threads
+    from su3d_bench.runs.executors import limit_threads
 
     limit_threads()
     import su3d_bench.cli.main
     import su3d_bench.reports.tables.run
-    import su3d_bench.runs.planning.plan
+    import su3d_bench.runs.plan
     import su3d_bench.runs.runner
 
     if subject == "opensu3d":

@@ -29,7 +29,7 @@ RUN_AGAIN = (*SUBJECTS["light"], *EXECUTORS["inline"], "--out", "run")
 SHEETS = ("sheets", "make", "run", "--kind", "annotation", "--methods", "collector", "--per-kind", "2", "--quiet")
 VERBS = {
     "export": KilledVerb(
-        ("export", "run", "--to", "openlex3d", "--method", "collector", "--out", "run/exported", "--quiet"),
+        ("runs", "export", "run", "--to", "openlex3d", "--method", "collector", "--out", "run/exported", "--quiet"),
         ("run",),
         RUN_AGAIN,
     ),
@@ -54,8 +54,8 @@ def load_verbs() -> None:
     import su3d_bench.cli.sheets.score
     import su3d_bench.predictions.export
     import su3d_bench.reports.page.page
-    import su3d_bench.sheets.judging.scores
-    import su3d_bench.sheets.making.sets  # noqa: F401
+    import su3d_bench.sheets.scores
+    import su3d_bench.sheets.sets  # noqa: F401
 
 
 def make_inputs(folder: Path) -> None:

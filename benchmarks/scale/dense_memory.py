@@ -32,7 +32,7 @@ from su3d_bench.core.system.timing import Timer, peak_memory_bytes, start_memory
 from su3d_bench.core.types import Detections, Float32Array, Frame, GroundTruth, LabelSet, SceneInfo, UInt8Array
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
-from su3d_bench.runs.feeding import warm_up
+from su3d_bench.runs.frame_loop import warm_up
 from su3d_bench.store.predictions import read_prediction, write_prediction
 
 SIDE_PX = 500

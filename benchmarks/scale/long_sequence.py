@@ -26,7 +26,7 @@ from measured import write_measured
 from su3d_bench.core.interfaces import StageTimer
 from su3d_bench.core.types import BoolArray, Detections, Float32Array, Frame, PerceptionNeeds, SceneInfo
 from su3d_bench.opensu3d.pipeline import OpenSU3D
-from su3d_bench.runs.feeding import Feeding, ReadAhead
+from su3d_bench.runs.frame_loop import Feeding, ReadAhead
 
 N_FRAMES = 5578
 LENGTH_M, STEP_M = 20, 0.25

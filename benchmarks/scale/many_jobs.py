@@ -30,11 +30,12 @@ from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.files.atomic import make_folder
 from su3d_bench.core.types import ImageDomain, SceneInfo
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
-from su3d_bench.metrics.scoring import SceneScore, pack_scores, unpack_scores
+from su3d_bench.metrics.metric import SceneScore
+from su3d_bench.metrics.scoring import pack_scores, unpack_scores
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
-from su3d_bench.runs.planning.plan import Plan, make_plan
+from su3d_bench.runs.plan import Plan, make_plan
 from su3d_bench.runs.resume import FinishedScenes
-from su3d_bench.runs.runner import summarise
+from su3d_bench.runs.summary import summarise
 from su3d_bench.store.run_folder import RunFolder
 
 N_FRAMES = 20

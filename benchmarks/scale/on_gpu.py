@@ -1,7 +1,7 @@
-"""Results on a GPU beside those of the CPU: matching, similarity, every kind of model, a run; differences and times.
+"""Results on a GPU beside those of the CPU: similarity, every kind of model, a run; differences and times.
 
     python benchmarks on_gpu --json build/measured/on_gpu.json
-    python benchmarks on_gpu --device cpu --points 500000
+    python benchmarks on_gpu --device cpu
 
 Some three minutes on a machine with a GPU; without one it ends at once, in one line, with code 2. ``--device cpu`` has
 torch compute on the CPU, so that all but the GPU itself is tried. Models have the tests' small configurations and
@@ -25,28 +25,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from export_onnx import export_encoder
 from measured import write_measured
 from numpy.typing import NDArray
-from tiny_models import DINO_PX, blocks, noise_images
+from tiny_models import DINO_PX, SAM_PX, blocks, noise_images, tiny_dino, tiny_sam, tiny_tokenizer, write_tiny_clip
 from torch_devices import TORCH_ON_CPU
 
 from su3d_bench.cli.main import main as command_line
 from su3d_bench.core.errors import ConfigError, ModelMissing
 from su3d_bench.core.system.devices import device_for, make_deterministic
-from su3d_bench.core.system.timing import Timer, synchronise_device
+from su3d_bench.core.system.timing import synchronise_device
 from su3d_bench.metrics.matching.labelling import cosines, most_similar
-from su3d_bench.opensu3d.config import OpenSU3DConfig
-from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.perception.models.config import ModelsConfig
-from su3d_bench.perception.models.encoders.towers_onnx import export_encoder
 from su3d_bench.perception.models.files import locate
 from su3d_bench.perception.models.loading import load_encoder
 from su3d_bench.perception.models.masks.grounding_dino import GroundingDino
 from su3d_bench.perception.models.masks.sam import Sam, TorchSam
-from su3d_bench.perception.models.stand_ins.detector import tiny_dino, tiny_tokenizer
-from su3d_bench.perception.models.stand_ins.encoders import write_tiny_clip
-from su3d_bench.perception.models.stand_ins.segmenter import IMAGE_PX, tiny_sam
 
 REPEATS = 5
 CLIP = "clip-vit-h-14"
@@ -89,44 +84,6 @@ def measured(work: Callable[[], Arrays], repeats: int) -> tuple[Arrays, float]:
         if k or not repeats:
             best = min(best, time.perf_counter() - start)
     return found, best * 1e3
-
-
-def maps(n_points: int) -> Iterator[Comparison]:
-    """A view of 204,000 points against a map, and what that map is after it took the view in."""
-    from bench_association import EPS, case
-    from bench_update import every_second_pixel, filled
-    from wall import view
-
-    scene, frame = case(n_points).scene, case(n_points).frame
-
-    def match(device: str) -> Callable[[], Arrays]:
-        method = OpenSU3D(OpenSU3DConfig(eps=EPS, density="all"))
-        method.receive_device(device)
-        for part in np.array_split(scene, max(1, n_points // 1_000_000)):
-            method._map.insert(part, np.ones(len(part), np.int32))
-        return lambda: (method._map.nearest(frame),)
-
-    def update(device: str) -> Callable[[], Arrays]:
-        method = OpenSU3D(OpenSU3DConfig(frame_voxel=0.0))
-        method.receive_device(device)
-        filled(method, n_points)
-        seen, detections = every_second_pixel(*view())
-
-        def work() -> Arrays:
-            method.update(seen, detections, Timer())
-            return contents_of(method)
-
-        return work
-
-    yield Comparison(f"match 204,000 points against {n_points:,}", match, 0.0, is_share=True)
-    yield Comparison(f"update of a map of {n_points:,} points", update, 0.0, is_share=True)
-
-
-def contents_of(method: OpenSU3D) -> Iterator[NDArray[Any]]:
-    """The map, taken from the device when it is compared."""
-    yield np.array([method.n_instances])
-    yield method._map.points
-    yield method._map.ids
 
 
 def similarities() -> Iterator[Comparison]:
@@ -187,7 +144,7 @@ def networks(folder: Path) -> Iterator[Comparison]:
         pixels = detector.pixels(rgb)
         return lambda: detector.answer(pixels, "cat. coffee table. lamp.")[:2]
 
-    yield Comparison(f"SAM ({IMAGE_PX} px) by torch, masks of 3 boxes", sam, 0.01, is_share=True)
+    yield Comparison(f"SAM ({SAM_PX} px) by torch, masks of 3 boxes", sam, 0.01, is_share=True)
     yield Comparison("GroundingDINO by torch, probabilities and boxes", dino, 1e-3)
 
 
@@ -240,7 +197,6 @@ def compare(one: Comparison, device: str) -> tuple[list[str], bool]:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cuda:0", help="cuda:0, another GPU, or cpu: torch on the CPU")
-    parser.add_argument("--points", type=int, nargs="+", default=[500_000, 5_000_000, 10_000_000], help="of the maps")
     parser.add_argument("--json", type=Path, help="write the table for benchmarks/measured.md")
     arguments = parser.parse_args()
     try:
@@ -257,7 +213,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory(prefix="on-gpu-") as name:
         folder = Path(name)
         parts: Sequence[Iterator[Comparison]] = (
-            *map(maps, arguments.points), similarities(), encoders(folder), networks(folder), runs(folder)
+            similarities(), encoders(folder), networks(folder), runs(folder)
         )  # fmt: skip
         for one in (each for part in parts for each in part):
             row, is_good = compare(one, TORCH_ON_CPU if device == "cpu" else device)

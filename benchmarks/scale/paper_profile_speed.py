@@ -20,12 +20,11 @@ import numpy as np
 from su3d_bench.core.system.devices import make_deterministic, precision_for, require_transformers
 from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.datasets.rooms.dataset import Rooms
-from su3d_bench.perception.models.encoders.towers_transformers import TransformersTowers
+from su3d_bench.perception.models.encoders.towers import TransformersTowers
 from su3d_bench.perception.models.masks.automatic_masks import AUTOMATIC_MASKS, AutomaticMasks
 from su3d_bench.perception.models.masks.grounding_dino import BoxConfig, GroundingDino
-from su3d_bench.perception.models.masks.sam import Sam, TorchSam
-from su3d_bench.perception.models.pretrained import sam_config
-from su3d_bench.runs.planning.scenes import data_root
+from su3d_bench.perception.models.masks.sam import Sam, TorchSam, sam_config
+from su3d_bench.runs.scenes import data_root
 
 N_BOXES, N_RATIOS = 15, 3  # named things in an image of a room, and the paper's crops of each
 N_TAGS = 20

@@ -2,30 +2,22 @@
 
 A frame of 204,000 points (1200x680, every second pixel each way) looks at a part of a floor-like surface of 10,000
 points a square metre; depth noise is 3 mm. All answers are exact. Open3D's KDTreeFlann answers one point a call: only
-one query in 40 is made, so its figure is a lower bound; against 5 million points every query is made too. The map of
-torch runs on the CPU, and on a GPU where there is one.
+one query in 40 is made, so its figure is a lower bound; against 5 million points every query is made too.
 
     python -m pytest benchmarks/speed/bench_association.py --benchmark-only --benchmark-group-by=group
-    python -m pytest benchmarks/speed/bench_association.py --benchmark-only -k torch
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
-from torch_devices import TORCH_ON_CPU, on_each_device
 
 from su3d_bench.core.types import Float64Array
 from su3d_bench.opensu3d.voxel_map import VoxelMap
-from su3d_bench.runs.executors.local import one_thread
-
-if TYPE_CHECKING:
-    from su3d_bench.opensu3d.kernels.voxel_map_torch import DeviceVoxelMap
 
 EPS = 0.02
 SIZES = [100_000, 500_000, 1_000_000, 5_000_000]
@@ -73,26 +65,6 @@ def test_voxel_map_as_it_grows(benchmark: BenchmarkFixture, n_scene: int) -> Non
     voxel_map, frame = filled_map(n_scene), case(n_scene).frame
     found = benchmark.pedantic(voxel_map.nearest, (frame,), rounds=15, warmup_rounds=2)
     assert np.count_nonzero(found >= 0) > 0.9 * N_FRAME
-
-
-@cache
-def filled_device_map(n_scene: int, device: str) -> DeviceVoxelMap:
-    from su3d_bench.opensu3d.kernels.voxel_map_torch import DeviceVoxelMap
-
-    device_map = DeviceVoxelMap(EPS, device, "all")
-    for part in np.array_split(case(n_scene).scene, max(1, n_scene // 1_000_000)):
-        device_map.insert(part, np.ones(len(part), np.int32))
-    return device_map
-
-
-@pytest.mark.parametrize("n_scene", [500_000, 5_000_000, 10_000_000])
-@on_each_device
-def test_torch_map_as_it_grows(benchmark: BenchmarkFixture, n_scene: int, device: str) -> None:
-    benchmark.group = f"match by torch on {'the CPU' if device == TORCH_ON_CPU else device} as the map grows"
-    device_map, frame = filled_device_map(n_scene, device), case(n_scene).frame
-    with one_thread():  # as a scene has in a run
-        found = benchmark.pedantic(device_map.nearest, (frame,), rounds=5, warmup_rounds=2)
-    np.testing.assert_array_equal(found, filled_map(n_scene).nearest(frame))
 
 
 @pytest.mark.parametrize("n_scene", SIZES)

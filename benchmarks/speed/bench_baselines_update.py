@@ -15,8 +15,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig
 from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs
-from su3d_bench.baselines.conceptgraphs.objects import MapObject, Sighting
-from su3d_bench.baselines.conceptgraphs.regions import box_of
+from su3d_bench.baselines.conceptgraphs.objects import MapObject, Sighting, box_of
 from su3d_bench.baselines.sam3d.method import SAM3D, SAM3DConfig
 from su3d_bench.baselines.sam3d.overlap import GroupedCloud, voxelise
 from su3d_bench.core.system.timing import Timer

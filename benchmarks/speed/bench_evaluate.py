@@ -22,7 +22,8 @@ import pytest
 from as_installed import as_installed
 from numpy.typing import NDArray
 
-from su3d_bench.evaluation.evaluate import Request, evaluate
+from su3d_bench.evaluation.evaluate import evaluate
+from su3d_bench.evaluation.result import Request
 from su3d_bench.metrics.instance.average_precision import (
     MIN_REGION_SIZE,
     THRESHOLDS,

@@ -21,8 +21,8 @@ from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.perception.embedded.encoder import IMAGE_SIZE, EmbeddedEncoder
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
-from su3d_bench.runs.executors.local import one_thread
-from su3d_bench.runs.feeding import ReadAhead
+from su3d_bench.runs.executors import one_thread
+from su3d_bench.runs.frame_loop import ReadAhead
 
 N_FRAMES = 8
 NEEDS = OpenSU3D(OpenSU3D.Config()).needs

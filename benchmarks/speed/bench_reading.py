@@ -31,7 +31,7 @@ from su3d_bench.datasets.replica.frames import ReplicaFrames
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 from su3d_bench.datasets.scannet.sens import FRAME_RECORD, SensFile, SensFrame, SensHeader, header_bytes, write_sens
 from su3d_bench.formats.images import jpeg_bytes
-from su3d_bench.runs.feeding import ReadAhead
+from su3d_bench.runs.frame_loop import ReadAhead
 
 Images = tuple[UInt8Array, np.ndarray]  # colour (H, W, 3) and depth (H, W) of a frame
 N_REPLICA, N_SENS, N_DIFFERENT = 24, 48, 6  # frames that are read; images that they repeat

@@ -4,8 +4,7 @@
 
 A 1200x680 image of a wall with 24 masks; the map holds that wall, far beyond the view, at one point a 2 cm voxel.
 Either every pixel is back-projected and reduced to voxels, as is the default, or every second one each way is: 204,000
-points with 3 mm of depth noise that are all matched and inserted (``frame_voxel`` 0). Last, the same with the map held
-by torch, on the CPU and on a GPU where there is one.
+points with 3 mm of depth noise that are all matched and inserted (``frame_voxel`` 0).
 """
 
 from __future__ import annotations
@@ -15,14 +14,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
-from torch_devices import TORCH_ON_CPU, on_each_device
 from wall import DISTANCE_M, HEIGHT, VOXEL_M, WIDTH, view
 
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, Frame
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
-from su3d_bench.runs.executors.local import one_thread
 
 
 def every_second_pixel(frame: Frame, detections: Detections) -> tuple[Frame, Detections]:
@@ -62,16 +59,3 @@ def test_update_of_204_000_points(benchmark: BenchmarkFixture, n_points: int) ->
     frame, detections = every_second_pixel(*view())
     benchmark.pedantic(lambda: method.update(frame, detections, Timer()), rounds=10, warmup_rounds=2)
     assert method.n_points < n_points + 204_000  # nearly every point fell into a voxel that was taken
-
-
-@pytest.mark.parametrize("n_points", [500_000, 5_000_000, 10_000_000])
-@on_each_device
-def test_update_by_torch(benchmark: BenchmarkFixture, n_points: int, device: str) -> None:
-    benchmark.group = f"update, 204,000 points, map held by torch on {'the CPU' if device == TORCH_ON_CPU else device}"
-    method = OpenSU3D(OpenSU3DConfig(frame_voxel=0.0))
-    method.receive_device(device)
-    filled(method, n_points)
-    frame, detections = every_second_pixel(*view())
-    with one_thread():  # as a scene has in a run
-        benchmark.pedantic(lambda: method.update(frame, detections, Timer()), rounds=5, warmup_rounds=2)
-    assert method.n_points < n_points + 204_000

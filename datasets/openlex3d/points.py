@@ -20,7 +20,7 @@ from su3d_bench.datasets.scannetpp.labels import BASES as SCANNETPP_BASES
 from su3d_bench.formats.arrays import MOST_POINTS, checked_points, kind_of
 from su3d_bench.formats.ply import read_ply
 from su3d_bench.formats.text_files import parsed_json, read_text
-from su3d_bench.formats.torch_zip import read_torch
+from su3d_bench.formats.torch_files import read_torch
 
 SAMPLED_DATASET = "scannetpp"
 SAMPLED_FOLDER = "prepared_semantics"  # beside data/ of ScanNet++

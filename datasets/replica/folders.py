@@ -51,7 +51,7 @@ REFERENCE_CLOUD = "rgb_cloud/pointclouds/pc_points.h5"  # in the scene of the re
 LABEL_PLACES = (*RENDER_FOLDERS, "opennerf/datasets", "datasets")
 INSTANCE_FOLDERS = ("ground_truth", "instance_gt", "instance_gt/validation", "replica_gt_instances")
 SEMANTIC_LABEL_FOLDERS = ("semantic_gt", "replica_gt_semantics")
-FETCH_FRAMES, FETCH_MESHES = "su3d-bench fetch replica frames", "su3d-bench fetch replica meshes"
+FETCH_FRAMES, FETCH_MESHES = "su3d-bench datasets fetch replica frames", "su3d-bench datasets fetch replica meshes"
 CLOUDS_URL = "https://github.com/concept-graphs/concept-graphs"  # its README has the link
 HOW_TO_GET_LABELS = {
     "openmask3d": "ask its authors (https://github.com/OpenMask3D/openmask3d/issues/1) or take the archive that "

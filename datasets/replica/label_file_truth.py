@@ -23,8 +23,7 @@ from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import Float32Array, GroundTruth, Int32Array
 from su3d_bench.datasets.recordings.meshes import vertex_positions
 from su3d_bench.datasets.replica.folders import replica_label_set
-from su3d_bench.formats.ply import read_ply
-from su3d_bench.formats.ply_parts import MAX_HEADER_BYTES, read_header
+from su3d_bench.formats.ply import MAX_HEADER_BYTES, read_header, read_ply
 
 INSTANCES_PER_CLASS = 1000  # ScanNet's format
 BLOCK_BYTES = 1 << 20

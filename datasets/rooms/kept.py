@@ -12,7 +12,7 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.files.atomic import filling, read_arrays
-from su3d_bench.core.system.damage import DAMAGE
+from su3d_bench.core.files.unpacking import DAMAGE
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.rooms.rendering.mesh import RoomMesh
 from su3d_bench.datasets.rooms.scan import RoomScan
@@ -78,8 +78,7 @@ def _kept(
             return kept
     made = make()
     with suppress(*forgiven), filling(path) as stream:
-        if stream is not None:
-            np.savez(stream, **made)
+        np.savez(stream, **made)
     return made
 
 

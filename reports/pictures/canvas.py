@@ -1,13 +1,19 @@
-"""A white page on which pictures and words are put, drawn by matplotlib and measured from its upper left corner."""
+"""A white page on which pictures and words are put, and the colours of classes, instances and similarities."""
 
 from __future__ import annotations
 
 import io
+import zlib
+from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+import numpy as np
 
 from su3d_bench.core.files.atomic import make_folder, write_bytes
-from su3d_bench.core.types import UInt8Array
+from su3d_bench.core.types import Float64Array, Int64Array, UInt8Array
+from su3d_bench.metrics.protocols.loading import class_names
 
 DPI = 100
 DARK, GREY = "#222222", "#666666"
@@ -78,3 +84,139 @@ def hex_of(colour: tuple[int, ...]) -> str:
     '#ff0010'
     """
     return "#{:02x}{:02x}{:02x}".format(*colour)
+
+
+Colour = tuple[int, int, int]
+Scale = Literal["paper", "cividis"]
+SCALES: tuple[Scale, ...] = ("paper", "cividis")
+STEPS = 256
+NO_INSTANCE = (214, 214, 210)
+# Surfaces of the room stay pale, so that the things in it stand out.
+ROOM_SURFACES = {"wall": (226, 222, 214), "floor": (208, 203, 196), "ceiling": (236, 236, 232)}
+# The most similar instance dark red, the least similar dark blue, as in the paper's heat maps.
+HEAT_STOPS = np.array(
+    [[0, 0, 128], [0, 80, 255], [90, 215, 190], [250, 190, 40], [230, 50, 10], [128, 0, 0]], np.float64
+)
+N_OTHERS = 199  # colours for names that no class table has, a prime so that sums of letters spread
+GRID = np.arange(24, 256, 11)  # of each channel, among which colours are chosen
+LIGHTNESS, LEAST_CHROMA = (0.42, 0.86), 0.16  # as below: neither black nor white, and told from the pale surfaces
+HUE_WEIGHT = 2.0  # against lightness, which shading moves
+TO_CONES = np.array(
+    [
+        [0.4122214708, 0.5363325363, 0.0514459929],
+        [0.2119034982, 0.6806995451, 0.1073969566],
+        [0.0883024619, 0.2817188376, 0.6299787005],
+    ]
+)
+TO_OKLAB = np.array(
+    [
+        [0.2104542553, 0.7936177850, -0.0040720468],
+        [1.9779984951, -2.4285922050, 0.4505937099],
+        [0.0259040371, 0.7827717662, -0.8086757660],
+    ]
+)
+FIRST = (46, 112, 222)  # the first colour of all
+
+
+def class_colours(names: Sequence[str]) -> dict[str, Colour]:
+    """Name -> colour, which is that of the name in whatever picture it stands; surfaces of the room pale.
+
+    Names of the class tables have the most distinct colours, all different. Any other has one by its letters, or the
+    next where another of these ``names`` has that one.
+
+    >>> class_colours(["book", "lamp"])["lamp"] == class_colours(["lamp"])["lamp"]
+    True
+    """
+    known = _place_of_class()
+    others = sorted({name for name in names if name not in known and name not in ROOM_SURFACES})
+    palette = distinct_colours(len(known) + (N_OTHERS if others else 0))
+    place_of, taken = dict(known), set[int]()
+    for name in others:
+        place = zlib.crc32(name.encode("utf-8", "surrogatepass")) % N_OTHERS
+        while place in taken and len(taken) < N_OTHERS:
+            place = (place + 1) % N_OTHERS
+        taken.add(place)
+        place_of[name] = len(known) + place
+    return {name: ROOM_SURFACES.get(name) or palette[place_of[name]] for name in names}
+
+
+def instance_colours(names: Sequence[str]) -> list[Colour]:
+    """One colour an instance, the first ones most distinct; surfaces of the room pale."""
+    many = distinct_colours(len(names))
+    return [ROOM_SURFACES.get(name) or many[k] for k, name in enumerate(names)]
+
+
+@cache
+def _place_of_class() -> dict[str, int]:
+    """Where each known class that is no surface of the room stands among the colours."""
+    things = (name for name in class_names() if name not in ROOM_SURFACES)
+    return {name: place for place, name in enumerate(things)}
+
+
+def distinct_colours(n: int) -> tuple[Colour, ...]:
+    """The first ``n`` of a row of colours, each as far from those before it as can be; a long row repeats itself."""
+    row = _palette(min(n, len(_place_of_class()) + N_OTHERS))
+    return tuple(row[k % len(row)] for k in range(n))
+
+
+@cache
+def _palette(n: int) -> tuple[Colour, ...]:
+    """``n`` colours: each the farthest in Oklab from all before it and from the pale ones."""
+    grid = np.stack(np.meshgrid(GRID, GRID, GRID, indexing="ij"), -1).reshape(-1, 3)
+    places = _oklab(grid)
+    is_strong = np.hypot(places[:, 1], places[:, 2]) > LEAST_CHROMA
+    is_strong &= (places[:, 0] > LIGHTNESS[0]) & (places[:, 0] < LIGHTNESS[1])
+    grid, places = grid[is_strong], places[is_strong]
+    pale = _oklab(np.array([*ROOM_SURFACES.values(), NO_INSTANCE]))
+    away = ((places[:, None] - pale) ** 2).sum(axis=2).min(axis=1)
+    chosen = [int(np.abs(grid - FIRST).sum(axis=1).argmin())]
+    while len(chosen) < n:
+        away = np.minimum(away, ((places - places[chosen[-1]]) ** 2).sum(axis=1))
+        chosen.append(int(away.argmax()))
+    return tuple((int(red), int(green), int(blue)) for red, green, blue in grid[chosen])
+
+
+def _oklab(colours: Int64Array) -> Float64Array:
+    """sRGB (N, 3) of 0..255 as lightness and two weighted axes of colour (Oklab, Ottosson 2020)."""
+    share = colours / 255.0
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    places: Float64Array = np.cbrt(linear @ TO_CONES.T) @ TO_OKLAB.T * (1.0, HUE_WEIGHT, HUE_WEIGHT)
+    return places
+
+
+def heat_colours(similarity: Float64Array) -> list[Colour]:
+    """Dark blue for the least, dark red for the greatest of ``similarity``; all alike: the middle."""
+    if len(similarity) == 0:
+        return []
+    place = _places(similarity)
+    stops = np.linspace(0.0, 1.0, len(HEAT_STOPS))
+    channels = [np.rint(np.interp(place, stops, HEAT_STOPS[:, c])).astype(int) for c in range(3)]
+    return [(int(r), int(g), int(b)) for r, g, b in zip(*channels, strict=True)]
+
+
+def _places(similarity: Float64Array) -> Float64Array:
+    """Where each value lies between the least and the greatest of them; all alike: in the middle."""
+    low, high = float(similarity.min()), float(similarity.max())
+    return np.full(len(similarity), 0.5) if high == low else (similarity - low) / (high - low)
+
+
+def scale_stops(scale: Scale) -> UInt8Array:
+    """The colours (256, 3) of a scale, the least similar first."""
+    if scale == "cividis":  # Nunez, Anderton, Renslow 2018
+        from matplotlib import colormaps
+
+        colours: UInt8Array = (colormaps["cividis"](np.arange(STEPS), bytes=True))[:, :3].astype(np.uint8)
+        return colours
+    return np.array(heat_colours(np.linspace(0.0, 1.0, STEPS)), np.uint8)
+
+
+def similarity_colours(similarity: Float64Array, scale: Scale = "paper") -> UInt8Array:
+    """A colour (K, 3) a value, from the least to the greatest of them; all alike: the middle.
+
+    >>> similarity_colours(np.array([0.2, 0.1, 0.3]))[1:].tolist()
+    [[0, 0, 128], [128, 0, 0]]
+    """
+    if len(similarity) == 0:
+        return np.zeros((0, 3), np.uint8)
+    colours: UInt8Array = scale_stops(scale)[np.rint(_places(similarity) * (STEPS - 1)).astype(np.int64)]
+    return colours

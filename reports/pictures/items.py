@@ -16,7 +16,7 @@ import numpy as np
 
 from su3d_bench.core.errors import printable
 from su3d_bench.core.geometry import back_project, valid_depth
-from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, Int64Array, UInt8Array
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, UInt8Array
 from su3d_bench.reports.pictures.canvas import drawable
 from su3d_bench.reports.pictures.render import BACKGROUND
 
@@ -225,11 +225,10 @@ def mixed(one: tuple[int, int, int], other: tuple[int, int, int], share: float) 
     return red, green, blue
 
 
-def png_bytes(picture: UInt8Array, *, is_true: bool = False, palette: UInt8Array | None = None) -> bytes:
+def png_bytes(picture: UInt8Array, *, palette: UInt8Array | None = None) -> bytes:
     """A PNG of at most ``PNG_COLOURS`` colours: the same bytes for the same picture.
 
-    ``palette`` (n, 3): of these colours instead, each pixel in the nearest, whatever the others are. ``is_true``:
-    larger, with colours that can be judged: 256, and dots of two where none is near enough.
+    ``palette`` (n, 3): of these colours instead, each pixel in the nearest, whatever the others are.
     """
     from PIL import Image
 
@@ -240,11 +239,7 @@ def png_bytes(picture: UInt8Array, *, is_true: bool = False, palette: UInt8Array
         of_palette.putpalette(palette.tobytes())
         image = whole.quantize(palette=of_palette, dither=Image.Dither.NONE)
     else:
-        image = whole.quantize(
-            256 if is_true else PNG_COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE
-        )
-    if is_true:
-        image = whole.quantize(palette=image, dither=Image.Dither.FLOYDSTEINBERG)
+        image = whole.quantize(PNG_COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
     image.save(buffer, format="PNG", compress_level=6)  # 9: a twentieth smaller in four times the time
     return buffer.getvalue()
 
@@ -389,19 +384,3 @@ def mask_in_frame(frame: Frame, tree: object, is_member: BoolArray, bounds: Floa
         rows, columns = np.nonzero(pixels)
         mask[rows[is_near][owned], columns[is_near][owned]] = True
     return mask[::PIXEL_STEP, ::PIXEL_STEP]
-
-
-def owners_in_frame(frame: Frame, tree: object, owner: Int64Array) -> Int64Array:
-    """Whose map point is nearest to what the frame shows, of every ``PIXEL_STEP``-th pixel (h, w); 0 for nobody's.
-
-    ``tree`` is the ``KDTree`` of the map's points, ``owner`` (N,) says whose each is.
-    """
-    depth_m = frame.depth_m[::PIXEL_STEP, ::PIXEL_STEP]
-    pixels = np.zeros(frame.depth_m.shape, np.bool_)
-    pixels[::PIXEL_STEP, ::PIXEL_STEP] = True
-    pixels &= valid_depth(frame.depth_m, 0.0, np.inf)
-    places = back_project(frame.depth_m, frame.intrinsics, frame.camera_to_world, pixels)
-    owners = np.zeros(depth_m.shape, np.int64)
-    _, nearest = tree.query(places, distance_upper_bound=CAP_M)  # type: ignore[attr-defined]
-    owners[pixels[::PIXEL_STEP, ::PIXEL_STEP]] = np.append(owner, 0)[nearest]
-    return owners

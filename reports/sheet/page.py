@@ -1,34 +1,58 @@
-"""One page with everything in it, on which a person judges the items of a sheet: no network, no server.
+"""Pages for people who judge: one annotator's sheet with everything in it, and lists of what to look at.
 
-What scenes, queries and maps say reaches the page as data and is written with ``textContent``; a policy in the page
-lets nothing run or load that is not in it.
+What scenes, queries and maps say reaches a sheet as data and is written with ``textContent``; a policy in each page
+lets nothing run or load that is not in it, or in lists beside it.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
+from su3d_bench.core.errors import printable
 from su3d_bench.core.system.files import file_text
-from su3d_bench.reports.page.page import rendered
+from su3d_bench.reports.page.page import embedded_json, rendered
 
 HERE = Path(__file__).parent
+MOST_CHARACTERS = 2000  # of a text in a list
 
 
 def page_html(title: str, data: Mapping[str, Any]) -> str:
     """The page of one annotator; ``data``: id, annotator, columns, guide, asks and items, pictures in base 64."""
     script = file_text(HERE / "page.js")
     names = {"sheet": data["id"], "annotator": data["annotator"]}
-    return rendered(HERE, script, title=title, data=json_in_html(data), **names)
+    return rendered(HERE, script, title=title, data=embedded_json(data), **names)
 
 
-def json_in_html(value: Any) -> str:
-    """JSON that ends no script element and begins no comment, whatever texts are in it.
+@dataclass(frozen=True)
+class Entry:
+    """Something to look at: ``head`` says which it is, ``lines`` what is said of it; ``pictures`` are file names."""
 
-    >>> json_in_html(["</script><!--"])
-    '["\\\\u003c/script\\\\u003e\\\\u003c!--"]'
+    head: str
+    text: str
+    lines: tuple[str, ...]
+    pictures: tuple[str, ...]
+
+
+def list_page(title: str, note: str, entries: Sequence[Entry], pictures: str) -> str:
+    """A page without scripts, every text escaped; ``pictures`` is the folder of the pictures, as the page sees it."""
+    from jinja2 import Environment
+
+    environment = Environment(autoescape=True)
+    environment.filters["text"] = lambda text: printable(text, MOST_CHARACTERS)
+    environment.filters["source"] = lambda name: quote(f"{pictures}/{name}")
+    template = environment.from_string(file_text(HERE / "list.html.j2"))
+    shown = [(entry, [name for name in entry.pictures if is_file_name(name)]) for entry in entries]
+    return template.render(title=title, note=note, entries=shown)
+
+
+def is_file_name(name: str) -> bool:
+    """Whether ``name`` is of a file in the folder itself.
+
+    >>> is_file_name("item-1.png"), is_file_name("../item-1.png"), is_file_name("..")
+    (True, False, False)
     """
-    text = json.dumps(value, ensure_ascii=True, allow_nan=False)
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+    return bool(name.strip(".")) and not any(character in name for character in "/\\:\0")

@@ -11,12 +11,13 @@ from su3d_bench.core.errors import ConfigError, counted
 from su3d_bench.formats.tables.table import Cell, Table, TableRow, signed
 from su3d_bench.numerics.statistics import holm, sign_flip_test
 from su3d_bench.reports.tables.model import Measured
-from su3d_bench.reports.tables.papers.paper import (
+from su3d_bench.reports.tables.paper import (
     LAYOUTS,
     LEVEL,
     Layout,
     Shown,
     cells_of,
+    figures_of,
     nothing_can_be_marked,
     of_scenes,
     other_setup,
@@ -24,7 +25,6 @@ from su3d_bench.reports.tables.papers.paper import (
     run_notes,
     units,
 )
-from su3d_bench.reports.tables.papers.published import figures_of
 
 # Table I: all of it in OpenMask3D's set-up, as the paper's text has it.
 SIDES = (Layout(LAYOUTS["II"].metrics, "replica-openmask3d-semantic"), LAYOUTS["III"])

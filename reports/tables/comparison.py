@@ -46,7 +46,7 @@ def _of_seeds(seeds: Sequence[Sequence[int]]) -> str:
     return (
         f"each scene's value is the mean of {' and of '.join(told)}; {SEEDS}: the standard deviation of one run's "
         "value, in points, from the seed alone. Test and interval are over scenes, and do not allow for what a seed "
-        "moves in all scenes alike; su3d-bench plan does"
+        "moves in all scenes alike; su3d-bench report power does"
     )
 
 

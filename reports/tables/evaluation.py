@@ -8,8 +8,7 @@ from typing import Any
 from su3d_bench.core.errors import counted, printable, some
 from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, percent, text_table, with_interval
 from su3d_bench.reports.tables.model import few_scenes
-from su3d_bench.reports.tables.run import run_tables
-from su3d_bench.reports.tables.warnings import summed
+from su3d_bench.reports.tables.run import run_tables, summed
 
 NAMES = {"ap": "AP", "ap50": "AP50", "ap25": "AP25", "macc": "mAcc", "miou": "mIoU", "fmiou": "F-mIoU"}
 NAMES |= {f"top_{k}_{key}": f"top-{k} {name}" for k in range(1, 10) for key, name in NAMES.items()}

@@ -17,7 +17,7 @@ from typing import Any
 from su3d_bench.core.errors import printable
 from su3d_bench.formats.tables.csv_text import MOST_OF_A_CELL, csv_lines
 from su3d_bench.formats.tables.table import Cell, Prose, Table, blocks_of
-from su3d_bench.reports.tables.papers.latex import latex
+from su3d_bench.reports.tables.latex import latex
 
 CSV_COLUMNS = (
     "table",
@@ -68,7 +68,7 @@ def markdown(parts: Sequence[Table | Prose]) -> str:
 def plain(parts: Sequence[Table | Prose], width: int | None = None) -> str:
     """As ``markdown``, for a terminal: texts stand there as they are.
 
-    ``width``: characters that a line may have. What is longer is folded between words and between columns.
+    ``width``: characters that a line may have. What is longer is folded between words; a wider table is a list.
     """
     return _laid_out(parts, printable, width)
 
@@ -118,27 +118,9 @@ def _wrapped(text: str, width: int, begin: str = "") -> list[str]:
 
 
 def _fitted(rows: Sequence[Sequence[str]], width: int | None) -> list[str]:
-    """``aligned``; a table that is wider than ``width`` in several blocks, each with the columns that tell its rows
-    apart, and one for whose columns even that is too narrow with its rows as lists."""
-    sizes = [max(len(row[column]) for row in rows) + 3 for column in range(len(rows[0]))]
-    if width is None or sum(sizes) + 1 <= width:
-        return aligned(rows)
-    n = _n_telling_apart(rows)
-    if n == len(sizes) or sum(sizes[:n]) + max(sizes[n:]) + 1 > width:
-        return _on_its_side(rows, width)
-    blocks: list[list[int]] = []
-    for column in range(n, len(sizes)):
-        if not blocks or sum(sizes[one] for one in (*blocks[-1], column)) + 1 > width:
-            blocks.append([*range(n)])
-        blocks[-1].append(column)
-    folded = [aligned([[row[column] for column in block] for row in rows]) for block in blocks]
-    return [line for lines in folded for line in ("", *lines)][1:]
-
-
-def _n_telling_apart(rows: Sequence[Sequence[str]]) -> int:
-    """How many columns from the left, such as run and method, no two rows have in common; 1 where none do."""
-    numbers = range(1, len(rows[0]))
-    return next((n for n in numbers if len({tuple(row[:n]) for row in rows}) == len(rows)), 1)
+    """``aligned``; of a table that is wider than ``width`` a list of its rows."""
+    lines = aligned(rows)
+    return lines if width is None or len(lines[0]) <= width else _on_its_side(rows, width)
 
 
 def _on_its_side(rows: Sequence[Sequence[str]], width: int) -> list[str]:

@@ -11,8 +11,16 @@ from su3d_bench.formats.tables.table import NOT_MEASURED, Cell, Table, TableRow,
 from su3d_bench.metrics.questions.score import ANSWERED_BY, REFINED_BY, said_by
 from su3d_bench.numerics.statistics import ALPHA, holm
 from su3d_bench.reports.tables.model import BY_PEOPLE, Measured
-from su3d_bench.reports.tables.papers.paper import PAPER_SCENES, Shown, other_setup, protocol_table, reported_rows
-from su3d_bench.reports.tables.papers.published import Figure, PaperTable, figures_of
+from su3d_bench.reports.tables.paper import (
+    PAPER_SCENES,
+    Figure,
+    PaperTable,
+    Shown,
+    figures_of,
+    other_setup,
+    protocol_table,
+    reported_rows,
+)
 
 REFINED = "refined label (n')"
 PAPER_MODEL = "gpt-4-1106-preview"  # that of labels n' and of reasoning

@@ -7,31 +7,22 @@ the kinds of errors are is said in ``metrics.attribution`` and ``metrics.attribu
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
-from functools import cache, cached_property, partial
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from su3d_bench.analysis.inputs import Inputs, TruthOf, method_of, truth_of_scene
+from su3d_bench.analysis.matched import Explained, MendedJob, explained_of, matched_instances, method_of
 from su3d_bench.analysis.sides import Side, refuse_unlike
-from su3d_bench.core.errors import ConfigError, PredictionError, counted, printable
-from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.maps import Prediction
-from su3d_bench.core.types import GroundTruth
-from su3d_bench.metrics.attribution.arrays import EXPLAINED, LookedAt, MendedScene
-from su3d_bench.metrics.attribution.singles import SingleError
-from su3d_bench.metrics.fitness import why_not_scorable
+from su3d_bench.core.errors import ConfigError, counted, printable
+from su3d_bench.metrics.attribution.arrays import EXPLAINED, MendedScene
 from su3d_bench.metrics.metric import Counts
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.scoring import SceneScore, metric_of, plain_json
+from su3d_bench.metrics.scoring import metric_of, plain_json
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 SCHEMA = 1
 Values = Mapping[str, float]
-MendedJob = Mapping[str, MendedScene]  # of a scene under a method, by protocol
 
 
 @dataclass(frozen=True)
@@ -91,133 +82,24 @@ def attribute(
     other = None if oracle is None else Side(_oracle_run(oracle), explained.method)
     if other is not None:
         other.run.check_method(other.method)
-    encoder = cache(run.encoder)
-    mended = {}
-    for scene in run.scenes:
-        truth_of = cache(partial(truth_of_scene, run, scene))
-        mended[scene] = explained.mend(scene, truth_of, encoder)
-    return explained.form(mended, other)
+    walk = matched_instances(run, [explained], run.scenes)
+    mended = {scene: explained.mended(scene, {one.rules.name: one.looked_at for one in found}) for scene, found in walk}
+    return attribution_of(explained, mended, other)
 
 
-def explained_of(run: FinishedRun, method: str, wanted: Sequence[str] = ()) -> Explained:
-    """The protocols under which the errors of ``method`` are explained: those ``wanted``, else all that can be."""
-    names, remarks = _protocols_of(run, wanted)
-    return Explained(run, method, tuple(names), tuple(remarks))
-
-
-@dataclass(frozen=True)
-class Explained:
-    """A method of a run, whose errors are explained under ``protocols``."""
-
-    run: FinishedRun
-    method: str
-    protocols: tuple[str, ...]
-    remarks: tuple[str, ...]
-
-    @cached_property
-    def _scores(self) -> Mapping[str, Mapping[str, SceneScore]]:
-        return self.run.scores(self.method)
-
-    @cached_property
-    def _inputs(self) -> Inputs:
-        return Inputs(self.run, self.method)
-
-    def _rules(self, protocol: str) -> ProtocolRules:
-        return self._inputs.rules(self.run.rules(protocol))
-
-    def mend(self, scene: str, truth_of: TruthOf, encoder: Callable[[], Encoder]) -> MendedJob:
-        """The counts of ``scene`` as they are and with its errors mended, by protocol; of those that scored it."""
-        return self.mended(scene, self.look_at(scene, truth_of, encoder))
-
-    def look_at(self, scene: str, truth_of: TruthOf, encoder: Callable[[], Encoder]) -> Mapping[str, LookedAt]:
-        """``scene`` as the evaluators of the protocols that scored it see it."""
-        looked_at: dict[str, LookedAt] = {}
-        for name in self.scored_under(scene):
-            rules, truth, prediction, naming = self.scored(name, scene, truth_of, encoder)
-            looked_at[name] = EXPLAINED[rules.kind][1](rules, truth, prediction, naming)
-        return looked_at
-
-    def mended(self, scene: str, looked_at: Mapping[str, LookedAt]) -> MendedJob:
-        """The counts of ``scene``, which must be those of the run, and those with its errors mended."""
-        mended = {name: one.mended() for name, one in looked_at.items()}
-        for name, counts in mended.items():
-            self.refuse_other_counts(name, scene, counts.as_is)
-        return mended
-
-    def errors(self, scene: str, protocol: str, looked_at: LookedAt, most: int) -> tuple[int, Sequence[SingleError]]:
-        """How many errors ``scene`` has under ``protocol``, and the ``most`` that cost the run most."""
-        scores = self._scores[protocol]
-        others = [score.counts for name, score in scores.items() if name != scene]
-        return looked_at.errors(self._rules(protocol), scores[scene].counts, others, most)
-
-    def instance_ids(self, scene: str) -> Sequence[int]:
-        """How the method numbers its instances; nothing where their places are their numbers."""
-        if self.run.data.truth_files is not None:
-            return ()
-        return getattr(self._inputs.of_map(scene), "ids", np.zeros(0, np.int64)).tolist()
-
-    def headline(self, protocol: str) -> tuple[str, ...]:
-        """The metrics in which errors under ``protocol`` are told."""
-        return tuple(self._rules(protocol).headline)
-
-    def refuse_other_counts(self, protocol: str, scene: str, formed: Counts) -> None:
-        """A ``PredictionError`` where what is explained is not what the run's own number is of."""
-        stored = self._scores[protocol][scene].counts
-        if type(stored) is type(formed) and all(
-            np.array_equal(getattr(stored, each.name), getattr(formed, each.name)) for each in fields(formed)
-        ):
-            return
-        raise PredictionError(
-            f"{printable(scene, 100)}: {protocol}: the counts of the run are not those that its prediction gives here; "
-            "score it again"
-        )
-
-    def scored_under(self, scene: str) -> list[str]:
-        """The protocols that scored ``scene``."""
-        return [name for name in self.protocols if scene in self._scores[name]]
-
-    def scored(
-        self, protocol: str, scene: str, truth_of: TruthOf, encoder: Callable[[], Encoder]
-    ) -> tuple[ProtocolRules, GroundTruth, Prediction, Encoder | None]:
-        """What a scene was scored from under a protocol: the rules, the truth, the map and what named its instances."""
-        rules = self._rules(protocol)
-        truth, prediction = self._inputs.of_scene(scene, rules, truth_of)
-        if (reason := why_not_scorable(rules, prediction)) is not None:
-            raise PredictionError(f"{scene}: {reason}")
-        return rules, truth, prediction, self._inputs.encoder(rules, prediction, encoder)
-
-    def form(self, mended: Mapping[str, MendedJob], other: Side | None = None) -> RunAttribution:
-        """What the errors of all scenes cost; ``other`` is the side with perfect 2D masks."""
-        side = Side(self.run, self.method)
-        gathered = {name: _Gathered(self._rules(name)) for name in self.protocols}
-        for scene, of_scene in mended.items():
-            for name, counts in of_scene.items():
-                gathered[name].add(scene, counts)
-        explained = [counted for counted in gathered.values() if counted.scenes]
-        formed = tuple(
-            counted.form(_oracle_values(counted.rules, side, other, counted.scenes)) for counted in explained
-        )
-        if not formed:
-            raise ConfigError(f"{side.name}: no scene is scored under {', '.join(self.protocols)}; nothing to explain")
-        return RunAttribution(self.run.name, self.method, (*self.remarks, *_remarks(self.run)), formed)
-
-
-def _protocols_of(run: FinishedRun, wanted: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The protocols that can be explained, and remarks on the others; one that is named and cannot is an error."""
-    for name in wanted:
-        run.check_protocol(name)
-    chosen, remarks = [], []
-    for name in wanted or run.protocols:
-        rules = run.rules(name)
-        if rules.kind in EXPLAINED:
-            chosen.append(name)
-        elif wanted:
-            raise ConfigError(f"protocol '{name}' is of kind '{rules.kind}'; only instance and semantic are explained")
-        else:
-            remarks.append(f"{name} is of kind {rules.kind}, which is not explained")
-    if not chosen:
-        raise ConfigError(f"{run.name}: was scored under no protocol of kind instance or semantic; nothing to explain")
-    return chosen, remarks
+def attribution_of(explained: Explained, mended: Mapping[str, MendedJob], other: Side | None = None) -> RunAttribution:
+    """What the errors of all scenes cost; ``other`` is the side with perfect 2D masks."""
+    side = Side(explained.run, explained.method)
+    gathered = {name: _Gathered(explained.rules(name)) for name in explained.protocols}
+    for scene, of_scene in mended.items():
+        for name, counts in of_scene.items():
+            gathered[name].add(scene, counts)
+    scored = [counted for counted in gathered.values() if counted.scenes]
+    formed = tuple(counted.form(_oracle_values(counted.rules, side, other, counted.scenes)) for counted in scored)
+    if not formed:
+        raise ConfigError(f"{side.name}: no scene is scored under {', '.join(explained.protocols)}; nothing to explain")
+    remarks = (*explained.remarks, *run_remarks(explained.run))
+    return RunAttribution(explained.run.name, explained.method, remarks, formed)
 
 
 def _oracle_run(path: Path) -> FinishedRun:
@@ -299,7 +181,8 @@ def _values(rules: ProtocolRules, counts: Sequence[Counts]) -> dict[str, float]:
     return {name: reported[name] for name in rules.headline}
 
 
-def _remarks(run: FinishedRun) -> list[str]:
+def run_remarks(run: FinishedRun) -> list[str]:
+    """What must be known of a run beside its numbers."""
     lines = run.elsewhere_lines()
     if run.record.is_partial:
         lines.append(f"PARTIAL: only the first {counted(run.limit, 'frame')} of each scene")

@@ -13,14 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.analysis.side_numbers import Numbers, OverScenes, SideNumbers, class_numbers, headline_numbers
 from su3d_bench.analysis.sides import (
+    Numbers,
+    OverScenes,
     Side,
-    check_shapes,
+    SideNumbers,
+    class_numbers,
+    headline_numbers,
     pair_methods,
     parse_side,
     protocols_in_both,
-    refuse_unlike,
     settings_that_differ,
 )
 from su3d_bench.core.errors import ConfigError, counted, printable
@@ -166,22 +168,14 @@ def _compare_methods(
     every = [*left.each, *right.each]
     compared = []
     for name in protocols_in_both(left, right, wanted):
-        scores = {id(of_run): numbers.scores(of_run).get(name, {}) for of_run in every}
-        common = [scene for scene in scores[id(every[0])] if all(scene in of_run for of_run in scores.values())]
-        for of_run in every[1:]:
-            refuse_unlike(every[0], of_run, name, common)
-        if not common:
+        over_scenes = numbers.over_common(name, every)
+        if not over_scenes:
             raise ConfigError(
                 f"{left.name} and {right.name}: no scene in common that is scored under {name}; compare runs of the "
                 "same scenes"
             )
-        rules = left.run.rules(name)
-        over_scenes = []
-        for of_run in every:
-            own = {scene: scores[id(of_run)][scene] for scene in common}
-            check_shapes(rules, of_run, own)
-            over_scenes.append(numbers.over_scenes(rules, of_run, own))
-        remarks = [line for of_run in every for line in _scene_remarks(of_run, scores[id(of_run)], common)]
+        rules, common = left.run.rules(name), over_scenes[0].result.scenes
+        remarks = [line for of_run in every for line in _scene_remarks(of_run, numbers.scores(of_run)[name], common)]
         remarks += _own_remarks(every, name)
         halves = over_scenes[: len(left.runs)], over_scenes[len(left.runs) :]
         compared.append(_compare_protocol(rules, left.method, right.method, halves, remarks, per_class))

@@ -12,18 +12,19 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
-from su3d_bench.analysis.recomputed import rules_of_run, why_not_counted
 from su3d_bench.core.errors import ConfigError, Su3dError, counted, printable, some
 from su3d_bench.core.types import Interval
 from su3d_bench.formats.tables.table import NOT_MEASURED, Cell, Origin, Table, TableRow, bracketed, percent
-from su3d_bench.metrics.protocols.files import protocol_names
+from su3d_bench.metrics.protocols.loading import protocol_names
 from su3d_bench.metrics.scoring import combine
 from su3d_bench.numerics.statistics import rank_intervals
 from su3d_bench.reports.tables.model import confidence_notes, few_scenes, is_ceiling
 from su3d_bench.runs.finished import FinishedRun, read_run
+from su3d_bench.runs.verify import rules_of_run, why_not_counted
 
 MOST_RUNS = 10_000
 ELSEWHERE = "made elsewhere"  # in the place of a profile
@@ -33,8 +34,10 @@ MOST_RANKED = 60  # rows whose ranks have an interval: 1,770 tests of pairs, som
 
 
 @dataclass(frozen=True)
-class Entry:
-    """One number of one run that may stand in a ranking; values are fractions, in the order of ``headline``.
+class RankingRow:
+    """The numbers of a method of a run under a protocol, as it may stand in a ranking.
+
+    Values are fractions, in the order of ``headline``.
 
     ``of_scenes``: the first headline metric of each scene, by which it is told which ranks differ. ``ranks``: the best
     and the worst that it may have among those that are no ceiling; None where that was not asked for.
@@ -66,6 +69,9 @@ class Entry:
         return self.protocol, self.digest, self.scenes
 
 
+AnyRow = TypeVar("AnyRow", bound=RankingRow)
+
+
 @dataclass(frozen=True)
 class Refused:
     """What stands in no ranking, and why."""
@@ -79,7 +85,7 @@ class Refused:
 class Leaderboard:
     """One ranking a protocol and set of scenes, the best first."""
 
-    boards: tuple[tuple[Entry, ...], ...]
+    boards: tuple[tuple[RankingRow, ...], ...]
     refused: tuple[Refused, ...]
 
 
@@ -88,7 +94,7 @@ def leaderboard(folder: Path, protocols: Sequence[str] = (), *, with_ranks: bool
 
     ``with_ranks``: the ranks that each row of up to ``MOST_RANKED`` may have are found, from tests of all pairs.
     """
-    entries: list[Entry] = []
+    entries: list[RankingRow] = []
     refused: list[Refused] = []
     for path in runs_below(folder):
         name = printable(path.relative_to(folder).as_posix(), 200)
@@ -98,13 +104,13 @@ def leaderboard(folder: Path, protocols: Sequence[str] = (), *, with_ranks: bool
             refused.append(Refused(name, "run", printable(str(error), 300)))
             continue
         for each in entries_of(name, run, protocols):
-            (entries if isinstance(each, Entry) else refused).append(each)  # type: ignore[arg-type]
+            (entries if isinstance(each, RankingRow) else refused).append(each)  # type: ignore[arg-type]
     if not entries and not refused:
         raise ConfigError(
             f"{printable(str(folder), 200)}: holds no run below it; su3d-bench run writes one, and evaluate --out "
             "of predictions made elsewhere"
         )
-    boards: list[tuple[Entry, ...]] = []
+    boards: list[tuple[RankingRow, ...]] = []
     for key in dict.fromkeys(entry.ranking for entry in entries):
         ranked_together = [entry for entry in entries if entry.ranking == key]
         alike, others = _of_same_data(ranked_together)
@@ -133,7 +139,7 @@ def runs_below(folder: Path) -> Iterator[Path]:
             yield Path(path)
 
 
-def entries_of(name: str, run: FinishedRun, protocols: Sequence[str] = ()) -> Iterator[Entry | Refused]:
+def entries_of(name: str, run: FinishedRun, protocols: Sequence[str] = ()) -> Iterator[RankingRow | Refused]:
     """Each number of ``run``, called ``name``, that may stand in a ranking, or why not; of ``protocols`` or all."""
     for (method, protocol), record in run.results.items():
         if protocols and protocol not in protocols:
@@ -157,7 +163,7 @@ def entries_of(name: str, run: FinishedRun, protocols: Sequence[str] = ()) -> It
         if unknown:
             yield Refused(name, what, f"the data of {printable(unknown[0], 80)} have no digest")
             continue
-        yield Entry(
+        yield RankingRow(
             run=name,
             method=printable(method, 120),
             protocol=protocol,
@@ -185,7 +191,7 @@ def _why_not(run: FinishedRun, protocol: str, failed: Sequence[str]) -> str | No
     return "its protocol is none of those installed here"  # a file that somebody else's run names is not looked for
 
 
-def _of_same_data(entries: Sequence[Entry]) -> tuple[list[Entry], list[Refused]]:
+def _of_same_data(entries: Sequence[RankingRow]) -> tuple[list[RankingRow], list[Refused]]:
     """The entries whose scenes have the data that most have, the first seen of equals, and the others."""
     common, _ = Counter(entry.data for entry in entries).most_common(1)[0]
     alike = [entry for entry in entries if entry.data == common]
@@ -198,7 +204,7 @@ def _of_same_data(entries: Sequence[Entry]) -> tuple[list[Entry], list[Refused]]
     return alike, others
 
 
-def _of_as_many_labels(entries: Sequence[Entry]) -> tuple[list[Entry], list[Refused]]:
+def _of_as_many_labels(entries: Sequence[RankingRow]) -> tuple[list[RankingRow], list[Refused]]:
     """The entries that give as many labels as most do, the first seen of equals, with the ceilings, and the others."""
     rivals = [entry for entry in entries if not entry.is_ceiling]
     if not rivals:
@@ -216,17 +222,17 @@ def _of_as_many_labels(entries: Sequence[Entry]) -> tuple[list[Entry], list[Refu
     return [entry for entry in entries if entry.is_ceiling or entry.labels == common], others
 
 
-def in_order(entries: Sequence[Entry]) -> tuple[Entry, ...]:
+def in_order(rows: Sequence[AnyRow]) -> tuple[AnyRow, ...]:
     """The best by the first headline metric first; what was told the truth last."""
-    return tuple(sorted(entries, key=_rank))
+
+    def rank(row: RankingRow) -> tuple[bool, float, str, str]:
+        first = row.values[0]
+        return row.is_ceiling, -(first if first is not None else -1.0), row.method, row.run
+
+    return tuple(sorted(rows, key=rank))
 
 
-def _rank(entry: Entry) -> tuple[bool, float, str, str]:
-    first = entry.values[0]
-    return entry.is_ceiling, -(first if first is not None else -1.0), entry.method, entry.run
-
-
-def ranked(board: tuple[Entry, ...]) -> tuple[Entry, ...]:
+def ranked(board: tuple[AnyRow, ...]) -> tuple[AnyRow, ...]:
     """The board with the ranks that each row may have; unchanged where nothing competes, or too many rows do."""
     rivals = [entry for entry in board if not entry.is_ceiling]
     if not 1 < len(rivals) <= MOST_RANKED:
@@ -257,7 +263,7 @@ def _left_out(refused: Sequence[Refused]) -> Iterator[str]:
         yield f"Left out: {run}, {some(methods, MOST_NAMED)}{where}: {reason}"
 
 
-def _table(board: Sequence[Entry], index: int, intervals: bool) -> Table:
+def _table(board: Sequence[RankingRow], index: int, intervals: bool) -> Table:
     first = board[0]
     rivals = [entry for entry in board if not entry.is_ceiling]
     best = [
@@ -296,14 +302,14 @@ def _table(board: Sequence[Entry], index: int, intervals: bool) -> Table:
     )
 
 
-def _ranks_text(entry: Entry) -> str:
+def _ranks_text(entry: RankingRow) -> str:
     if entry.ranks is None:
         return NOT_MEASURED
     best, worst = entry.ranks
     return str(best) if best == worst else f"{best} to {worst}"
 
 
-def _cell(entry: Entry, k: int, best: str, intervals: bool) -> Cell:
+def _cell(entry: RankingRow, k: int, best: str, intervals: bool) -> Cell:
     value, interval = entry.values[k], entry.intervals[k]
     if value is None:
         return Cell(NOT_MEASURED)

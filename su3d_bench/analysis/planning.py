@@ -9,26 +9,27 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.analysis.side_numbers import OverScenes, SideNumbers
 from su3d_bench.analysis.sides import (
+    OverScenes,
     Side,
-    check_shapes,
+    SideNumbers,
     protocols_in_both,
     refuse_other_requests,
-    refuse_unlike,
 )
 from su3d_bench.core.errors import ConfigError, counted, printable
 from su3d_bench.core.types import BoolArray, Float64Array, Interval
 from su3d_bench.metrics.scoring import plain_json
-from su3d_bench.numerics.power import (
+from su3d_bench.numerics.statistics import (
+    NO_SPREAD,
     POWER,
     Variance,
     crossed_interval,
+    has_part,
+    pseudo_values,
     scenes_needed,
     variance_of,
     variance_range,
 )
-from su3d_bench.numerics.statistics import NO_SPREAD, has_part, pseudo_values
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 SCHEMA = 1
@@ -121,24 +122,14 @@ def _over_common_scenes(
     protocol: str, sides: Sequence[tuple[Side, Side]], numbers: SideNumbers
 ) -> list[tuple[OverScenes, OverScenes]]:
     """What the two methods of each run come to over the scenes that all have."""
-    first = sides[0][0]
-    scores = {id(side): numbers.scores(side).get(protocol, {}) for of_run in sides for side in of_run}
-    common = [scene for scene in first.run.scenes if all(scene in of_side for of_side in scores.values())]
-    if len(common) < 2:
+    found = numbers.over_common(protocol, [side for of_run in sides for side in of_run])
+    n_scenes = len(found[0].result.scenes) if found else 0
+    if n_scenes < 2:
         raise ConfigError(
-            f"{first.run.name}: {counted(len(common), 'scene')} {'is' if len(common) == 1 else 'are'} scored under "
+            f"{sides[0][0].run.name}: {counted(n_scenes, 'scene')} {'is' if n_scenes == 1 else 'are'} scored under "
             f"{protocol} for both methods in every run; at least two tell how a difference varies"
         )
-    for _, other in sides:
-        refuse_unlike(first, other, protocol, common)
-    rules = first.run.rules(protocol)
-
-    def over_scenes(side: Side) -> OverScenes:
-        own = {scene: scores[id(side)][scene] for scene in common}
-        check_shapes(rules, side, own)
-        return numbers.over_scenes(rules, side, own)
-
-    return [(over_scenes(left), over_scenes(right)) for left, right in sides]
+    return list(zip(found[::2], found[1::2], strict=True))
 
 
 def _check_request(points: Sequence[float], power: float) -> None:

@@ -9,16 +9,16 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.analysis.inputs import Inputs, method_of, truth_of_scene
+from su3d_bench.analysis.matched import Inputs, method_of, truth_of_scene
 from su3d_bench.analysis.sides import parse_side
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, printable, some
 from su3d_bench.metrics.fitness import why_not_scorable
-from su3d_bench.metrics.matching.remembered import remembering
+from su3d_bench.metrics.matching.nearest import remembering
 from su3d_bench.metrics.protocols.mixtures import Differing, Mixtures, differing
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combined_metrics, pack_scores, plain_json, score_scene, unpack_scores
-from su3d_bench.numerics.shares import EXACT_STEPS, N_ORDERS, Share, choices, shares
-from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report, run_inline, run_processes
+from su3d_bench.numerics.statistics import EXACT_STEPS, N_ORDERS, Share, choices, shares
+from su3d_bench.runs.executors import SCENE_DONE, Event, Report, run_inline, run_processes
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 SCHEMA = 1

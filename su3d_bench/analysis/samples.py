@@ -7,24 +7,21 @@ differ from those of the run are refused, as where errors are explained.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.analysis.attribution import Explained, explained_of
-from su3d_bench.analysis.inputs import truth_of_scene
-from su3d_bench.core.errors import ConfigError, counted, printable, suggest
+from su3d_bench.analysis.attribution import run_remarks
+from su3d_bench.analysis.matched import Explained, Matched, explained_of, matched_instances
+from su3d_bench.core.errors import ConfigError, printable, suggest
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
-from su3d_bench.core.types import Float64Array, GroundTruth, Int32Array, Int64Array
-from su3d_bench.metrics.attribution.arrays import ScoredPoints, scored_masks, scored_points
-from su3d_bench.metrics.attribution.masks import count_masks, errors_of
-from su3d_bench.metrics.attribution.overlaps import LabelledMasks, ScoringRules, measure_overlaps, true_instances
-from su3d_bench.metrics.attribution.points import CAUSES, causes_of
+from su3d_bench.core.types import Float64Array, Int32Array, Int64Array
+from su3d_bench.metrics.attribution.arrays import SceneOfMasks, SceneOfPoints, ScoredPoints
+from su3d_bench.metrics.attribution.masks import CAUSES, causes_of, count_masks, errors_of
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
-from su3d_bench.metrics.instance.hits import hits
+from su3d_bench.metrics.instance.scene_counts import hits
 from su3d_bench.metrics.instance.score import OBJECT
 from su3d_bench.metrics.matching.labelling import scored_classes
 from su3d_bench.metrics.matching.nearest import Points
@@ -32,10 +29,9 @@ from su3d_bench.metrics.metric import n_predictions
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic import confusion
 from su3d_bench.reports.tables.samples import Sample
-from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
+from su3d_bench.runs.executors import SCENE_DONE, Event, Report
 from su3d_bench.runs.finished import FinishedRun, read_run
 
-KINDS = ("instance", "semantic")  # of the protocols that say what became of single instances
 MOST_OF_A_NAME = 200  # characters of a text in a cell
 THRESHOLDS = (0.25, 0.5)
 Box = tuple[float | None, float | None, float | None, float | None, float | None, float | None]
@@ -71,107 +67,79 @@ def samples(
     rows: list[Sample] = []
     remarks: list[str] = []
     for run in map(read_run, paths):
-        of_run = _OfRun(run, chosen)
-        remarks += of_run.remarks
-        for n, scene in enumerate(of_run.scenes, start=1):
-            rows += of_run.rows(scene)
-            report(Event(f"{run.name} {scene}", SCENE_DONE, n, len(of_run.scenes)))
+        methods = _chosen_methods(run, chosen, remarks)
+        scenes = tuple(chosen.scenes) or run.scenes
+        for n, (scene, found) in enumerate(matched_instances(run, methods, scenes), start=1):
+            for matched in found:
+                rows += _of_job(matched)
+            report(Event(f"{run.name} {scene}", SCENE_DONE, n, len(scenes)))
+        remarks += run_remarks(run)
     if not rows and remarks:
         raise ConfigError(f"{remarks[0]}; nothing has instances to list")
     return Samples(tuple(rows), tuple(dict.fromkeys(remarks)))
 
 
-class _OfRun:
-    """The jobs of one run that are listed."""
+def _chosen_methods(run: FinishedRun, chosen: Chosen, remarks: list[str]) -> list[Explained]:
+    """The methods that are listed; ``remarks`` gets why another has no rows."""
+    for method in chosen.methods:
+        run.check_method(method)
+    for scene in chosen.scenes:
+        if scene not in run.scenes:
+            hint = suggest(scene, run.scenes, "it has")
+            raise ConfigError(f"{run.name}: holds no scene '{printable(scene, 100)}'{hint}")
+    methods = []
+    for method in chosen.methods or run.methods:
+        try:
+            explained = explained_of(run, method, chosen.protocols)
+        except ConfigError as error:
+            if chosen.protocols:
+                raise
+            remarks.append(str(error))
+            continue
+        remarks += explained.remarks
+        if any(explained.scored_under(scene) for scene in run.scenes):
+            methods.append(explained)
+        else:
+            remarks.append(f"{run.name}: {printable(method, 80)} has no score of kind instance or semantic")
+    return methods
 
-    def __init__(self, run: FinishedRun, chosen: Chosen) -> None:
-        self._run = run
-        self.remarks = run.elsewhere_lines()
-        for method in chosen.methods:
-            run.check_method(method)
-        for scene in chosen.scenes:
-            if scene not in run.scenes:
-                hint = suggest(scene, run.scenes, "it has")
-                raise ConfigError(f"{run.name}: holds no scene '{printable(scene, 100)}'{hint}")
-        self.scenes = tuple(chosen.scenes) or run.scenes
-        protocols = self._protocols(chosen.protocols)
-        self._jobs = [self._explained(method, protocols) for method in (chosen.methods or run.methods)]
-        self._encoder = cache(run.encoder)
-        if run.record.is_partial:
-            self.remarks.append(f"PARTIAL: {run.name} has only the first {counted(run.limit, 'frame')} of each scene")
-        if run.is_incomplete:
-            self.remarks.append(f"INCOMPLETE: {run.name} lacks scenes that failed")
 
-    def _protocols(self, wanted: Sequence[str]) -> list[str]:
-        for name in wanted:
-            self._run.check_protocol(name)
-        names = []
-        for name in wanted or self._run.protocols:
-            kind = self._run.rules(name).kind
-            if kind in KINDS:
-                names.append(name)
-            elif wanted:
-                raise ConfigError(
-                    f"protocol '{name}' is of kind '{kind}'; instances are listed under kind {' and '.join(KINDS)}"
-                )
-            else:
-                self.remarks.append(f"{name} is of kind {kind}, which tells no instances apart")
-        return names
-
-    def _explained(self, method: str, protocols: Sequence[str]) -> Explained | None:
-        scored = self._run.scores(method)
-        mine = [name for name in protocols if scored.get(name)]
-        if not mine:
-            self.remarks.append(f"{self._run.name}: {printable(method, 80)} has no score of kind {' or '.join(KINDS)}")
-            return None
-        return explained_of(self._run, method, mine)
-
-    def rows(self, scene: str) -> Iterator[Sample]:
-        truth_of = cache(partial(truth_of_scene, self._run, scene))
-        for explained in self._jobs:
-            if explained is not None:
-                for protocol in explained.scored_under(scene):
-                    yield from self._of_job(explained, protocol, scene, truth_of)
-
-    def _of_job(
-        self, explained: Explained, protocol: str, scene: str, truth_of: Callable[[str], GroundTruth]
-    ) -> Iterator[Sample]:
-        rules, truth, prediction, naming = explained.scored(protocol, scene, truth_of, self._encoder)
-        has_places = self._run.data.truth_files is None  # files have no coordinates
-        where = (self._run.name, printable(scene), printable(explained.method), printable(protocol))
-        if rules.kind == "semantic":
-            of_points = scored_points(rules, truth, prediction, naming)
-            named = of_points.points
-            counts = confusion.per_scene(named.true_class, named.predicted, of_points.is_counted)
-            explained.refuse_other_counts(protocol, scene, counts)
-            n_instances = int(truth.instance.max(initial=0))
-            yield from _OfPoints(rules, prediction, of_points, n_instances, has_places=has_places).rows(where)
-            return
-        assert not isinstance(prediction, DenseFeatures)  # it has no score of this kind
-        seen = scored_masks(rules, truth, prediction, naming)
-        explained.refuse_other_counts(protocol, scene, count_masks(*seen))
-        yield from _rows(where, rules, prediction, seen, truth.points if has_places else None)
+def _of_job(matched: Matched) -> Iterator[Sample]:
+    explained, rules, prediction = matched.explained, matched.rules, matched.prediction
+    has_places = explained.run.data.truth_files is None  # files have no coordinates
+    where = (
+        explained.run.name, printable(matched.scene), printable(explained.method), printable(rules.name),
+    )  # fmt: skip
+    if isinstance(matched.looked_at, SceneOfPoints):
+        scored = matched.looked_at.scored
+        named = scored.points
+        counts = confusion.per_scene(named.true_class, named.predicted, scored.is_counted)
+        explained.refuse_other_counts(rules.name, matched.scene, counts)
+        n_instances = int(matched.truth.instance.max(initial=0))
+        yield from _OfPoints(rules, prediction, scored, n_instances, has_places=has_places).rows(where)
+        return
+    assert isinstance(matched.looked_at, SceneOfMasks) and not isinstance(prediction, DenseFeatures)
+    explained.refuse_other_counts(rules.name, matched.scene, count_masks(*matched.looked_at.evaluated))
+    yield from _rows(where, rules, prediction, matched.looked_at, matched.truth.points if has_places else None)
 
 
 def _rows(
     where: tuple[str, str, str, str],
     rules: ProtocolRules,
     prediction: Instances | Partition,
-    seen: tuple[Int64Array, LabelledMasks, ScoringRules],
+    seen: SceneOfMasks,
     points: Points | None,
 ) -> Iterator[Sample]:
-    values, masks, scoring = seen
-    instances = true_instances(values, scoring)
-    overlaps = measure_overlaps(instances, masks, scoring)
+    (values, masks, scoring), overlaps = seen.evaluated, seen.overlaps
     least = scoring.min_region_size
     at_25, at_50 = hits(values, masks.masks, masks.class_ids, masks.scores, scoring.class_ids, least, THRESHOLDS)
     errors = errors_of(overlaps)
-    value_of = [int(values[members[0]]) for members in instances.members]
+    value_of = [int(values[members[0]]) for members in overlaps.members]
     number_of = [value % INSTANCES_PER_CLASS for value in value_of]
     ids = _ids(prediction, len(masks.masks))
     class_of = _class_names(rules)
     called = [class_of.get(int(one), "") for one in masks.class_ids]
-    true_classes = [class_of[int(one)] for one in instances.class_of_instance]
+    true_classes = [class_of[int(one)] for one in overlaps.class_of_instance]
     for k, name in enumerate(_names(prediction, len(masks.masks))):
         met, iou = _best(overlaps.iou[k])
         yield Sample(
@@ -180,7 +148,7 @@ def _rows(
             None if met is None else number_of[met], "" if met is None else true_classes[met],
             bool(at_25.is_hit[k]), bool(at_50.is_hit[k]), errors.of_mask[k], *_box(points, masks.masks.mask(k)),
         )  # fmt: skip
-    for g, members in enumerate(instances.members):
+    for g, members in enumerate(overlaps.members):
         met, iou = _best(overlaps.iou[:, g])
         yield Sample(
             *where, "true", number_of[g], None, true_classes[g], "", None,

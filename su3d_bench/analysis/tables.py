@@ -17,15 +17,19 @@ from su3d_bench.formats.tables.table import Origin, Table, is_count
 from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.scoring import ProtocolResult, combine
 from su3d_bench.numerics.statistics import SignFlipTest
-from su3d_bench.reports.tables.found import found_table
-from su3d_bench.reports.tables.judged import WHO_DID
+from su3d_bench.reports.tables.ablation import ablation_table
+from su3d_bench.reports.tables.judged import JUDGED, WHO_DID, judged_table
+from su3d_bench.reports.tables.latex import PrintedCell, printed_cells
 from su3d_bench.reports.tables.model import BY_PEOPLE, Measured
-from su3d_bench.reports.tables.papers.latex import PrintedCell, printed_cells
+from su3d_bench.reports.tables.paper import PaperTable, paper_table
+from su3d_bench.reports.tables.run import found_table
 from su3d_bench.reports.tables.timing import AnytimePoint
+from su3d_bench.runs.ablation import read_rows
 from su3d_bench.runs.finished import FinishedRun, is_numbers_alone, read_run
-from su3d_bench.runs.found import found_in, without_score
-from su3d_bench.sheets.judging.scores import FILE as SCORES_FILE
-from su3d_bench.sheets.judging.scores import LABEL_METRICS, ScoreCell, Scores, read_scores
+from su3d_bench.runs.summary import found_in, without_score
+from su3d_bench.sheets.items import SCHEMA
+from su3d_bench.sheets.scores import FILE as SCORES_FILE
+from su3d_bench.sheets.scores import LABEL_METRICS, ScoreCell, Scores, read_scores
 from su3d_bench.store.records import NumbersRecord, ResultRecord
 
 MOST_SOURCE_BYTES, MOST_SOURCES = 1 << 24, 500  # of a paper's LaTeX
@@ -98,7 +102,7 @@ def _judged_by_people(path: Path) -> list[Measured]:
                 run=str(path),
                 method=method,
                 protocol=f"{dataset}-{scores.kind}{BY_PEOPLE}",
-                version=scores.schema_version,
+                version=SCHEMA,
                 kind=scores.kind,
                 headline=tuple(cell.metric for cell in cells),
                 metrics={cell.metric: cell.value for cell in cells}
@@ -376,3 +380,24 @@ def _numbers(origin: Origin, result: ProtocolResult | Measured) -> list[float] |
         return None
     scale = 1.0 if is_count(origin.metric) or origin.unit == "fraction" else 100.0
     return [scale * value, *(scale * end for end in interval or ())]
+
+
+def numbered_tables(
+    numbers: Sequence[PaperTable],
+    measured: Sequence[Measured],
+    runs: Sequence[Path],
+    shown: Shown,
+    *,
+    with_published: bool,
+) -> list[Table]:
+    """A table or more for each of ``numbers``; ``runs`` are those of ``measured``, among them the sweep of Table I."""
+    tables: list[Table] = []
+    for number in numbers:
+        if number == "I":
+            sweep = [row for run in runs if not is_scores(run) for row in read_rows(run)]
+            tables.append(ablation_table(measured, sweep, shown, with_published=with_published))
+        elif number in JUDGED:
+            tables.append(judged_table(number, measured, shown, with_published=with_published))
+        else:
+            tables += paper_table(number, measured, shown, with_published=with_published)
+    return tables

@@ -1,18 +1,16 @@
-"""Frames, masks, maps and truth of a scene of a run as they came one after another: records for one timeline."""
+"""Frames, masks, maps and truth of a scene of a run as they came one after another, on one timeline."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
 
 import numpy as np
 
-from su3d_bench.analysis.page.instances import fed_frames, frames_of
 from su3d_bench.analysis.page.maps import Spaces, shown_classes, shown_rules
-from su3d_bench.analysis.page.scene_data import SceneData
-from su3d_bench.core.errors import StoreError, Su3dError, counted, printable
+from su3d_bench.analysis.page.scene import SceneData, SceneReader, fed_frames, frames_of
+from su3d_bench.core.errors import StoreError, counted, printable
 from su3d_bench.core.geometry import back_project, valid_depth
 from su3d_bench.core.interfaces import HasSketches
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
@@ -22,13 +20,11 @@ from su3d_bench.metrics.matching.nearest import nearest
 from su3d_bench.metrics.metric import n_predictions
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.reports.page.maps import Cloud, point_owners, thinned
-from su3d_bench.reports.pictures.colours import NO_INSTANCE, Colour, class_colours, instance_colours
+from su3d_bench.reports.pictures.canvas import Colour, class_colours, instance_colours
 from su3d_bench.reports.pictures.render import CUT_BELOW_TOP_M, ROOM_HEIGHT_M, room_bounds
-from su3d_bench.reports.pictures.scene_look import evenly
-from su3d_bench.reports.timeline.records import (
-    ABOUT,
+from su3d_bench.reports.pictures.scene import evenly
+from su3d_bench.reports.timeline import (
     BOXES,
-    CAMERA,
     CLASSES,
     CURVES,
     GROWTH,
@@ -39,17 +35,8 @@ from su3d_bench.reports.timeline.records import (
     TOP,
     TRUE_MASKS,
     TRUTH,
-    Boxes,
-    CameraPose,
-    ColourImage,
-    DepthImage,
-    IdImage,
-    Moment,
-    Names,
-    Number,
-    Points,
-    Record,
-    Text,
+    Name,
+    Recording,
     UInt16Array,
 )
 from su3d_bench.runs.finished import FinishedRun
@@ -89,15 +76,21 @@ class Owned:
     def near_m(self) -> float:
         return NEAR_SPACINGS * self.cloud.spacing_m
 
-    def named(self) -> list[tuple[str, Names, Int64Array]]:
+    def named(self) -> list[tuple[str, Sequence[Name], Int64Array]]:
         """Of instances and of classes: the place, what its ids mean, and whose each point is."""
         tints = class_colours(self.labels)
         instances = [(k + 1, f"{name or 'without a name'} #{k}", self.colours[k]) for k, name in enumerate(self.names)]
         classes = [(k + 1, name, tints[name]) for k, name in enumerate(self.labels)]
         return [
-            (INSTANCES, Names(tuple(instances[: MOST_IDS - 1]), NO_INSTANCE), self.instance),
-            (CLASSES, Names(tuple(classes[: MOST_IDS - 1]), NO_INSTANCE), self.label),
+            (INSTANCES, instances[: MOST_IDS - 1], self.instance),
+            (CLASSES, classes[: MOST_IDS - 1], self.label),
         ]
+
+    def log_names(self, recording: Recording, place: tuple[str, ...], masks: tuple[str, ...]) -> None:
+        """What ids mean below ``place`` of the map and at ``masks``."""
+        for kind, names, _ in self.named():
+            recording.names((*place, kind), names, is_nobody_seen=True)
+        recording.names(masks, self.named()[0][1], is_nobody_seen=False)
 
     def masks(self, frame: Frame) -> UInt16Array:
         """Whose each pixel of ``frame`` is: the instance's whose point is nearest to what the camera saw there."""
@@ -112,12 +105,11 @@ class Owned:
         few = ids[::EVERY_PIXEL, ::EVERY_PIXEL]
         return few.repeat(EVERY_PIXEL, axis=0).repeat(EVERY_PIXEL, axis=1)[:height, :width]
 
-    def static(self, place: tuple[str, ...]) -> Iterator[Record]:
-        """All of it, at every moment."""
-        for kind, names, owner in self.named():
-            yield Record((*place, kind), names)
-            yield from self.points((*place, kind), np.ones(len(owner), np.bool_), owner, None)
-        yield self.boxes(place, np.ones(len(self.names), np.bool_), None)
+    def log_all(self, recording: Recording, place: tuple[str, ...]) -> None:
+        """All of it at once."""
+        everything = np.ones(len(self.instance), np.bool_)
+        self.log_points(recording, place, everything, "all")
+        self.log_boxes(recording, place, np.ones(len(self.names), np.bool_))
 
     @cached_property
     def is_top(self) -> BoolArray:
@@ -129,130 +121,108 @@ class Owned:
         is_top: BoolArray = self.cloud.points[:, 2] > high - cut
         return is_top
 
-    def points(
-        self, place: tuple[str, ...], shown: BoolArray, owner: Int64Array, moment: Moment | None
-    ) -> Iterator[Record]:
-        """The points that are ``shown``, in places of their own for each moment, so that those before stay."""
-        own = "all" if moment is None else f"from frame {moment.frame:06}"
-        for part, is_there in ((ROOM, shown & ~self.is_top), (TOP, shown & self.is_top)):
-            if is_there.any():
-                content = Points(self.cloud.points[is_there], ids_of(owner[is_there]), self.cloud.spacing_m / 2)
-                yield Record((*place, part, own), content, moment)
+    def log_points(self, recording: Recording, place: tuple[str, ...], shown: BoolArray, own: str) -> None:
+        """The points that are ``shown``, in places called ``own``, so that those logged before stay."""
+        for kind, _, owner in self.named():
+            for part, is_there in ((ROOM, shown & ~self.is_top), (TOP, shown & self.is_top)):
+                if is_there.any():
+                    where = (*place, kind, part, own)
+                    recording.points(
+                        where, self.cloud.points[is_there], ids_of(owner[is_there]), self.cloud.spacing_m / 2
+                    )
 
-    def boxes(self, place: tuple[str, ...], shown: BoolArray, moment: Moment | None) -> Record:
+    def log_boxes(self, recording: Recording, place: tuple[str, ...], shown: BoolArray) -> None:
         rows = np.flatnonzero(shown)
-        labels, tints = tuple(self.names[k] for k in rows), tuple(self.colours[k] for k in rows)
-        return Record((*place, BOXES), Boxes(self.corners[rows], labels, tints), moment)
+        labels, tints = [self.names[k] for k in rows], [self.colours[k] for k in rows]
+        recording.boxes((*place, BOXES), self.corners[rows], labels, tints)
 
 
 class Growth:
     """A finished map as it came into the camera's view: what was seen by then of the instances that were known."""
 
-    def __init__(self, place: tuple[str, ...], owned: Owned, first_frame: Sequence[int]) -> None:
-        self._place, self._owned = place, owned
+    def __init__(self, recording: Recording, place: tuple[str, ...], owned: Owned, first_frame: Sequence[int]) -> None:
+        self._recording, self._place, self._owned = recording, place, owned
         self._first_frame = np.append(np.array(first_frame, np.int64), 0)  # the last one: nobody's
         self._is_seen = np.zeros(len(owned.cloud.points), np.bool_)
         self._is_out = self._is_seen.copy()
+        self._own = "all"
 
-    def names(self) -> Iterator[Record]:
-        for kind, names, _ in self._owned.named():
-            yield Record((*self._place, kind), names)
-
-    def step(self, frame: Frame, moment: Moment) -> Iterator[Record]:
+    def step(self, frame: Frame) -> None:
         """What ``frame`` adds to the map."""
+        self._own = f"from frame {frame.index:06}"
         self._is_seen |= in_view(self._owned.cloud.points, frame)
         is_known = self._first_frame[self._owned.instance] <= frame.index
-        yield from self._show(self._is_seen & is_known, moment)
+        self._show(self._is_seen & is_known)
 
-    def end(self, moment: Moment | None) -> Iterator[Record]:
+    def end(self) -> None:
         """What no frame showed, so that the whole map stands at the end."""
-        yield from self._show(np.ones_like(self._is_out), moment)
+        self._own = "all" if self._own == "all" else "in no frame"
+        self._show(np.ones_like(self._is_out))
 
-    def _show(self, wanted: BoolArray, moment: Moment | None) -> Iterator[Record]:
+    def _show(self, wanted: BoolArray) -> None:
         new = wanted & ~self._is_out
         if not new.any():
             return
         self._is_out |= new
-        for kind, _, owner in self._owned.named():
-            yield from self._owned.points((*self._place, kind), new, owner, moment)
+        self._owned.log_points(self._recording, self._place, new, self._own)
         if len(self._owned.names):
             is_there = np.zeros(len(self._owned.names) + 1, np.bool_)
             is_there[self._owned.instance[self._is_out]] = True
-            yield self._owned.boxes(self._place, is_there[:-1], moment)
+            self._owned.log_boxes(self._recording, self._place, is_there[:-1])
 
 
 class SceneTimeline:
-    """What is shown of a scene of a run; ``remarks``: what is not, known once the records were made."""
+    """What is shown of a scene of a run; ``remarks``: what is not, known once it was written."""
 
     def __init__(self, run: FinishedRun, scene: str, methods: Sequence[str], stride: int, spaces: Spaces) -> None:
         self._run, self.scene, self._methods, self._stride = run, scene, methods, stride
         self._spaces = spaces
-        self._data = SceneData(scene)
-        self.remarks: list[str] = []
+        self._reader = SceneReader(run, scene, SceneData(scene))
+        self.remarks = self._reader.remarks
         self.n_frames = self.n_maps = 0
 
-    def records(self, tell: Tell = lambda n_done, n: None) -> Iterator[Record]:
-        """The records in the order of time; ``tell`` hears how many frames are done."""
+    def write(self, recording: Recording, tell: Tell = lambda n_done, n: None) -> None:
+        """All of it into ``recording`` in the order of time; ``tell`` hears how many frames are done."""
         frames = self._frames()
         rules = shown_rules(self._run)
-        truth = None if rules is None else self._truth(rules)
+        truth = None if rules is None else self._reader.truth(rules)
         shown_truth = None if truth is None or rules is None else owned_of_truth(rules, truth)
         maps = self._maps(rules, truth)
         self.n_maps = len(maps)
         if shown_truth is not None:
-            yield from shown_truth.static(TRUTH)
-            yield Record(TRUE_MASKS, replace(shown_truth.named()[0][1], nothing=None))
-        growing = {method: Growth((*MAP, method), owned, first) for method, (owned, first) in maps.items()}
-        for method, growth in growing.items():
-            yield from growth.names()
-            yield Record((*MASKS, method), replace(maps[method][0].named()[0][1], nothing=None))
+            shown_truth.log_names(recording, TRUTH, TRUE_MASKS)
+            shown_truth.log_all(recording, TRUTH)
+        for method, (owned, _) in maps.items():
+            owned.log_names(recording, (*MAP, method), (*MASKS, method))
+        growing = {method: Growth(recording, (*MAP, method), owned, first) for method, (owned, first) in maps.items()}
         curves = {method: self._curves(method) for method in maps}
-        moment, first_s = None, None
+        first_s = None
         for done, index in enumerate(frames):
             tell(done, len(frames))
             frame = self._frame(index)
             if frame is None:
                 continue
             first_s = frame.timestamp_s if first_s is None else first_s
-            moment = Moment(frame.index, frame.timestamp_s - first_s)
             self.n_frames += 1
-            yield from _photo(frame, moment)
+            recording.at(frame.index, frame.timestamp_s - first_s)
+            recording.photo(frame)
             if shown_truth is not None:
-                yield Record(TRUE_MASKS, IdImage(shown_truth.masks(frame)), moment)
+                recording.masks(TRUE_MASKS, shown_truth.masks(frame))
             for method, growth in growing.items():
                 if maps[method][0].names:
-                    yield Record((*MASKS, method), IdImage(maps[method][0].masks(frame)), moment)
-                yield from growth.step(frame, moment)
+                    recording.masks((*MASKS, method), maps[method][0].masks(frame))
+                growth.step(frame)
                 for curve, value in curves[method].get(index, {}).items():
-                    yield Record((*GROWTH, curve, method), Number(value), moment)
+                    recording.number((*GROWTH, curve, method), value)
         for growth in growing.values():
-            yield from growth.end(moment)
-        yield Record(ABOUT, Text(self._about()))
-
-    def _had(self, what: str, make: Callable[[], Any]) -> Any:
-        """What ``make`` gives; None and a remark where it cannot be had."""
-        try:
-            return make()
-        except Su3dError as error:
-            line = printable(f"{what}: {error}")
-            if line not in self.remarks:
-                self.remarks.append(line)
-            return None
-
-    @cached_property
-    def _dataset(self) -> Any:
-        return self._had("no frames and no truth", lambda: self._run.dataset(self.scene))
-
-    @cached_property
-    def _sequence(self) -> Sequence[Frame]:
-        if self._dataset is None:
-            return ()
-        return self._had("no frames", lambda: self._data.sequence(self._dataset)) or ()
+            growth.end()
+        recording.close(self._about())
 
     def _frames(self) -> list[int]:
         """The frames that are shown: of those that the methods were given, else of all."""
         fed = {index for method in self._methods for index in fed_frames(self._run, self.scene, method)}
-        there = sorted(index for index in fed if 0 <= index < len(self._sequence)) or range(len(self._sequence))
+        n_frames = len(self._reader.sequence)
+        there = sorted(index for index in fed if 0 <= index < n_frames) or range(n_frames)
         if self._stride:
             return list(there[:: self._stride])
         return [there[place] for place in evenly(len(there), MOST_FRAMES)] if len(there) else []
@@ -261,25 +231,19 @@ class SceneTimeline:
         name = self.scene.partition("/")[2]
 
         def read() -> Frame:
-            if isinstance(self._dataset, HasSketches):
-                return self._dataset.sketch(name, index, MOST_WIDTH)
-            return smaller(self._sequence[index], MOST_WIDTH)
+            if isinstance(self._reader.dataset, HasSketches):
+                return self._reader.dataset.sketch(name, index, MOST_WIDTH)
+            return smaller(self._reader.sequence[index], MOST_WIDTH)
 
-        frame: Frame | None = self._had("a frame is left out", read)
+        frame: Frame | None = self._reader.had("a frame is left out", read)
         return frame
-
-    def _truth(self, rules: ProtocolRules) -> GroundTruth | None:
-        if self._dataset is None:
-            return None
-        truth: GroundTruth | None = self._had("no truth", lambda: self._data.truth(self._dataset, rules.ground_truth))
-        return truth
 
     def _maps(self, rules: ProtocolRules | None, truth: GroundTruth | None) -> dict[str, tuple[Owned, Sequence[int]]]:
         """Each method's map, and the first frame in which each of its instances was seen, 0 where nobody knows."""
         maps: dict[str, tuple[Owned, Sequence[int]]] = {}
         for method in self._methods:
             file = self._run.folder.job(self.scene, method).prediction
-            prediction = self._had(f"no map of {printable(method, 80)}", partial(read_prediction, file))
+            prediction = self._reader.had(f"no map of {printable(method, 80)}", partial(read_prediction, file))
             if prediction is not None:
                 n = 0 if isinstance(prediction, DenseFeatures) else n_predictions(prediction)
                 is_known = isinstance(prediction, Instances)
@@ -295,7 +259,7 @@ class SceneTimeline:
         labels: tuple[str, ...] = ()
         if rules is not None:
             of_truth = None if truth is None else class_index_of_ids(rules, truth.semantic)
-            classes = self._had(
+            classes = self._reader.had(
                 "no classes", lambda: shown_classes(self._run, rules, prediction, of_truth, cloud, self._spaces)
             )
             if classes is not None:
@@ -306,7 +270,7 @@ class SceneTimeline:
     def _curves(self, method: str) -> dict[int, dict[str, float]]:
         """Frame -> curve -> value, of what the updates of a method say."""
         file = self._run.folder.job(self.scene, method).updates
-        columns = self._had(f"no growth of {printable(method, 80)}", lambda: read_updates(file, file.name)) or {}
+        columns = self._reader.had(f"no growth of {printable(method, 80)}", lambda: read_updates(file, file.name)) or {}
         known = {column: curve for column, curve in COLUMNS.items() if column in columns}
         frames = columns.get("frame", ())
         return {
@@ -328,13 +292,6 @@ class SceneTimeline:
             *self.remarks,
         ]
         return "\n\n".join(lines)
-
-
-def _photo(frame: Frame, moment: Moment) -> Iterator[Record]:
-    height, width = frame.depth_m.shape
-    yield Record(CAMERA, CameraPose(frame.camera_to_world, frame.intrinsics, width, height), moment)
-    yield Record((*CAMERA, "colour"), ColourImage(frame.rgb), moment)
-    yield Record((*CAMERA, "depth"), DepthImage(frame.depth_m), moment)
 
 
 def ids_of(rows: Int64Array) -> UInt16Array:

@@ -23,7 +23,7 @@ def list_datasets(names: Names = ()) -> pandas.DataFrame:
     ('rooms/living0', True)
     """
     from su3d_bench.runs.catalogue import known_datasets
-    from su3d_bench.runs.planning.scenes import data_root
+    from su3d_bench.runs.scenes import data_root
 
     rows: list[tuple[object, ...]] = []
     for one in known_datasets(several(names), data_root()):
@@ -61,9 +61,7 @@ def list_protocols() -> pandas.DataFrame:
     >>> protocols.loc["rooms-instance", "headline"]
     'AP, AP50, AP25'
     """
-    from su3d_bench.metrics.protocols.files import protocol_names
-    from su3d_bench.metrics.protocols.loading import load_protocol
-    from su3d_bench.metrics.protocols.originals import original_of
+    from su3d_bench.metrics.protocols.loading import load_protocol, original_of, protocol_names
 
     columns = dict.fromkeys(("name", "summary", "kind", "datasets", "headline", "label_space", "original"), TEXT)
     rows = []

@@ -12,9 +12,9 @@ from su3d_bench.api.results import Names, Place, Run, Scores, several
 from su3d_bench.core.errors import ConfigError, RunIncomplete, counted, suggest
 
 if TYPE_CHECKING:
-    from su3d_bench.evaluation.request import Confidences, Request, ValuesForm
-    from su3d_bench.runs.executors.local import Event, Report
-    from su3d_bench.runs.planning.held import Into
+    from su3d_bench.evaluation.result import Confidences, Request, ValuesForm
+    from su3d_bench.runs.executors import Event, Report
+    from su3d_bench.runs.existing import Into
 
 Predictions = Place | Sequence[Place]
 
@@ -61,8 +61,7 @@ def run(
     su3d_bench.core.errors.ConfigError: unknown method 'oracel'; did you mean 'oracle'? known: opensu3d, ...
     """
     from su3d_bench.core.config import toml_value
-    from su3d_bench.runs.planning.asked import asked_settings
-    from su3d_bench.runs.planning.plan import make_plan
+    from su3d_bench.runs.plan import asked_settings, make_plan
     from su3d_bench.runs.runner import run_plan
 
     chosen: tuple[Into, ...] = ("own", "extend", "replace")
@@ -189,7 +188,7 @@ def evaluate(
     """
     from su3d_bench.evaluation.as_run import evaluate_methods
     from su3d_bench.evaluation.evaluate import said_of
-    from su3d_bench.evaluation.request import Request, own_name
+    from su3d_bench.evaluation.result import Request, own_name
 
     _refuse_unknown("truth_values", truth_values, ("classes", "instances", "numbers"))
     _refuse_unknown("confidences", confidences, ("protocol", "file"))

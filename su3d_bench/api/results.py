@@ -211,7 +211,7 @@ class Run(Scores):
 
     @property
     def errors(self) -> pandas.DataFrame:
-        """What each kind of error costs each method, as ``su3d-bench attribute`` computes it.
+        """What each kind of error costs each method, as ``su3d-bench report attribution`` computes it.
 
         Columns: ``method``, ``protocol``, ``metric`` (string); ``value`` (float64), that of the run; ``part`` (string):
         ``error``, ``overlap``, ``rest`` or ``stage``; ``kind`` (string) of the error or the stage; ``n`` (Int64), how

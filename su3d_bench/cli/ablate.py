@@ -38,7 +38,7 @@ def add_parser(verbs: Any) -> None:
 
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.core import registry
-    from su3d_bench.runs.planning.ablation import ablation_rows, write_rows
+    from su3d_bench.runs.ablation import ablation_rows, write_rows
 
     rows = ablation_rows(arguments.method, arguments.vary, is_grid=arguments.grid)
     own_name = str(registry.load("method", arguments.method).name)
@@ -51,9 +51,7 @@ def call(arguments: argparse.Namespace) -> int:
         return show_plan(plan, arguments)
     code = carry_out(plan, arguments)
     if code == EXIT_DONE:
-        from su3d_bench.runs.runner import publish
-
         write_rows(plan.folder.path, rows, joins=arguments.extend)
-        publish(plan)
+        plan.place.publish()
         remark(f"table: su3d-bench report tables {plan.folder.path} --table I", quiet=arguments.quiet or arguments.json)
     return code

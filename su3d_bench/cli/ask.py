@@ -1,4 +1,4 @@
-"""``su3d-bench ask``: a question about a scene, answered from its map, with the objects that the answer rests on."""
+"""``su3d-bench query ask``: a question about a scene, answered from its map, with the objects of the answer."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from su3d_bench.core.maps import Instances
-    from su3d_bench.metrics.questions.truths import RefinedNames
-    from su3d_bench.questions.reasoning.answers import Answer
-    from su3d_bench.questions.reasoning.scene_map import SceneMap
+    from su3d_bench.metrics.questions.score import RefinedNames
+    from su3d_bench.questions.model import Answer
+    from su3d_bench.questions.scene_map import SceneMap
     from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 SOLVERS = ("built-in", "llm")
 NAMES = ("auto", "label", "refined")
 
 
-def add_parser(verbs: Any) -> None:
+def add_parser(actions: Any) -> None:
     parser = add_verb(
-        verbs,
+        actions,
         "ask",
         "Answer a question about a scene from its map: by geometry, or by a language model.",
         (
-            'su3d-bench ask rooms/living0 "Which lamp is closer to the sofa?"',
-            'su3d-bench ask rooms/living0 "I am feeling cold, what should I do?" --solver llm --dry-run',
+            'su3d-bench query ask rooms/living0 "Which lamp is closer to the sofa?"',
+            'su3d-bench query ask rooms/living0 "I am feeling cold, what should I do?" --solver llm --dry-run',
         ),
         call,
     )
@@ -45,7 +45,7 @@ def add_parser(verbs: Any) -> None:
         "--names",
         choices=NAMES,
         default="auto",
-        help="the map's labels n, or n' of su3d-bench refine (default: n' where it is there)",
+        help="the map's labels n, or n' of su3d-bench runs refine (default: n' where it is there)",
     )
     parser.add_argument(
         "--eye",
@@ -60,14 +60,14 @@ def add_parser(verbs: Any) -> None:
 
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.core.maps import Instances
-    from su3d_bench.questions.reasoning.scene_map import map_of
+    from su3d_bench.questions.scene_map import map_of
     from su3d_bench.runs.finished import map_of_scene
 
     if not arguments.question.strip():
         raise ConfigError(
-            'the question is empty; ask such as: su3d-bench ask rooms/living0 "How many lamps are there?"'
+            'the question is empty; ask such as: su3d-bench query ask rooms/living0 "How many lamps are there?"'
         )
-    check_scene_first("ask", arguments.scene, arguments.question)
+    check_scene_first("query ask", arguments.scene, arguments.question)
     run, job, instances = map_of_scene(arguments.scene, arguments.method, arguments.run)
     if not isinstance(instances, Instances):
         raise PredictionError(f"{job.prediction}: holds no instances, so there is nothing to ask about")
@@ -91,12 +91,12 @@ def call(arguments: argparse.Namespace) -> int:
 
 def _refined(job: JobFolder, wanted: str) -> tuple[RefinedNames | None, str]:
     """Labels n' where they are wanted and there, and which names these are."""
-    from su3d_bench.questions.refining.refined_names import read_records
+    from su3d_bench.questions.refining import read_records
 
     records = None if wanted == "label" else read_records(job)
     if records is None:
         if wanted == "refined":
-            raise StoreError(f"{job.path}: has no labels n'; make them with su3d-bench refine")
+            raise StoreError(f"{job.path}: has no labels n'; make them with su3d-bench runs refine")
         return None, "labels n"
     n_left_out = sum(bool(name.left_out) for name in records.names)
     without = f", without {n_left_out} that it leaves out" if n_left_out else ""
@@ -104,7 +104,7 @@ def _refined(job: JobFolder, wanted: str) -> tuple[RefinedNames | None, str]:
 
 
 def _estimate(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.reasoning.language_solver import LanguageSolver
+    from su3d_bench.questions.language_solver import LanguageSolver
 
     if arguments.solver != "llm":
         return answer_nothing_to_pay(arguments, "the built-in solver")
@@ -116,9 +116,9 @@ def _solve(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> An
     import numpy as np
 
     from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
-    from su3d_bench.questions.reasoning.language_solver import LanguageSolver
-    from su3d_bench.questions.reasoning.named_objects import nearest_by
-    from su3d_bench.questions.reasoning.solver import Solver
+    from su3d_bench.questions.language_solver import LanguageSolver
+    from su3d_bench.questions.scene_map import nearest_by
+    from su3d_bench.questions.solver import Solver
 
     if arguments.solver == "llm":
         return LanguageSolver(scene, *chat_client(arguments, run)).answer(arguments.question)
@@ -143,7 +143,7 @@ def _draw(
     instances: Instances, scene: SceneMap, reply: Answer, job: JobFolder, arguments: argparse.Namespace
 ) -> Path | None:
     """Draw the answer; None where it names no object."""
-    from su3d_bench.reports.pictures.answers import SpokenOf, draw_reasoning
+    from su3d_bench.reports.pictures.figures import SpokenOf, draw_reasoning
 
     if not reply.object_ids:
         if arguments.out is not None:

@@ -1,4 +1,4 @@
-"""``su3d-bench attribute``: where a run loses its points."""
+"""``su3d-bench report attribution``: where a run loses its points."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from su3d_bench.cli.shared.flags import add_protocols, add_table_format, add_ver
 from su3d_bench.core.errors import EXIT_DONE
 
 
-def add_parser(verbs: Any) -> None:
+def add_parser(actions: Any) -> None:
     parser = add_verb(
-        verbs,
-        "attribute",
+        actions,
+        "attribution",
         "Show where a run loses its points: the gain when each kind of error alone is corrected.",
         (
-            "su3d-bench attribute runs/my-run --out errors.png",
-            "su3d-bench attribute runs/my-run --protocols rooms-instance --oracle runs/my-oracle-run --json",
+            "su3d-bench report attribution runs/my-run --out errors.png",
+            "su3d-bench report attribution runs/my-run --protocols rooms-instance --oracle runs/my-oracle-run --json",
         ),
         call,
     )
@@ -44,7 +44,7 @@ def call(arguments: argparse.Namespace) -> int:
     ).to_json()
     answer_tables(arguments, attribution, attribution_tables(attribution))
     if arguments.out is not None:
-        from su3d_bench.reports.pictures.plots.attribution import draw_attribution
+        from su3d_bench.reports.pictures.plots import draw_attribution
 
         show()  # the plot takes longer than the answer
         draw_attribution(attribution, arguments.out)

@@ -1,4 +1,4 @@
-"""``su3d-bench cache``: what is kept to be quick, how large and how old it is, and removing it."""
+"""``su3d-bench dev cache``: what is kept to be quick, how large and how old it is, and removing it."""
 
 from __future__ import annotations
 
@@ -23,29 +23,22 @@ def add_parser(verbs: Any) -> None:
     actions = add_group(
         verbs,
         "cache",
-        "Tell what is kept in $SU3D_CACHE to be quick, and remove it.",
-        "list|size|clear",
-        ("su3d-bench cache list", "su3d-bench cache clear perception --older-than 30"),
+        "List what is kept in $SU3D_CACHE to be quick, and remove it.",
+        ("su3d-bench dev cache list", "su3d-bench dev cache clear perception --older-than 30"),
+        lists=True,
     )
     add_verb(
         actions,
         "list",
         "List what is kept by kind: how many files, how large, how old.",
-        ("su3d-bench cache list", "su3d-bench cache list --json cache.json"),
+        ("su3d-bench dev cache list", "su3d-bench dev cache list --json cache.json"),
         call_list,
-    )
-    add_verb(
-        actions,
-        "size",
-        "Tell how large all that is kept is.",
-        ("su3d-bench cache size", "su3d-bench cache size --json"),
-        call_size,
     )
     parser = add_verb(
         actions,
         "clear",
         "Remove what is kept, of some kinds or all; nothing but files of the cache's own form, never through links.",
-        ("su3d-bench cache clear all --dry-run", "su3d-bench cache clear perception --older-than 30"),
+        ("su3d-bench dev cache clear all --dry-run", "su3d-bench dev cache clear perception --older-than 30"),
         call_clear,
     )
     parser.add_argument(
@@ -63,27 +56,19 @@ def call_list(arguments: argparse.Namespace) -> int:
     from su3d_bench.store.caches import KINDS, size_text
 
     root, rows = _kept()
-    lines = [f"cache: {shown(root)} ($SU3D_CACHE)"]
+    n_bytes = sum(row["n_bytes"] for row in rows)
+    lines = [f"cache: {shown(root)} ($SU3D_CACHE): {size_text(n_bytes)}"]
     for row in rows:
         old = f"written {_ago(row['newest'])} to {_ago(row['oldest'])} ago" if row["n_files"] else "nothing"
         n_files = counted(row["n_files"], "file")
         lines.append(f"  {row['kind']:<13}  {size_text(row['n_bytes']):>9}  {n_files:>13}  {old}")
         lines.append(f"  {'':<13}  {KINDS[row['kind']].what}")
-    answer_either(arguments, {"folder": str(root), "kinds": rows}, *lines)
-    return EXIT_DONE
-
-
-def call_size(arguments: argparse.Namespace) -> int:
-    from su3d_bench.store.caches import size_text
-
-    root, rows = _kept()
-    n_bytes = sum(row["n_bytes"] for row in rows)
-    answer_either(arguments, {"folder": str(root), "n_bytes": n_bytes}, f"{size_text(n_bytes)} in {shown(root)}")
+    answer_either(arguments, {"folder": str(root), "n_bytes": n_bytes, "kinds": rows}, *lines)
     return EXIT_DONE
 
 
 def call_clear(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.planning.scenes import cache_root
+    from su3d_bench.runs.scenes import cache_root
     from su3d_bench.store.caches import KINDS, cache_entries, clear_cache, size_text
 
     days = arguments.older_than
@@ -107,7 +92,8 @@ def call_clear(arguments: argparse.Namespace) -> int:
     answer_either(arguments, {"folder": str(root), "is_dry": arguments.dry_run, "kinds": rows}, *lines)
     if "all" in arguments.kinds and "replies" not in arguments.kinds and any(cache_entries(root, KINDS["replies"])):
         remark(
-            "replies of language models are left; su3d-bench cache clear replies removes them", quiet=arguments.quiet
+            "replies of language models stay; su3d-bench dev cache clear replies removes them",
+            quiet=arguments.quiet,
         )
     return EXIT_DONE
 
@@ -119,7 +105,7 @@ def _chosen(names: list[str], kinds: dict[str, CacheKind]) -> list[CacheKind]:
 
 def _kept() -> tuple[Path, list[dict[str, Any]]]:
     """The cache folder and what it holds of each kind."""
-    from su3d_bench.runs.planning.scenes import cache_root
+    from su3d_bench.runs.scenes import cache_root
     from su3d_bench.store.caches import KINDS, cache_entries
 
     root = cache_root()

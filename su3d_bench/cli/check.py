@@ -57,8 +57,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def _learn(arguments: argparse.Namespace) -> int:
-    from su3d_bench.analysis.gate.costs import why_no_cost
-    from su3d_bench.analysis.gate.reference import ACROSS_MACHINES, COST_LIMIT, MOST_COST_LIMIT, learn
+    from su3d_bench.analysis.gate.reference import ACROSS_MACHINES, COST_LIMIT, MOST_COST_LIMIT, learn, why_no_cost
     from su3d_bench.core.errors import counted, printable
     from su3d_bench.core.files.atomic import json_text
     from su3d_bench.runs.finished import read_run

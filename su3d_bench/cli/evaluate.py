@@ -13,7 +13,7 @@ from su3d_bench.cli.shared.flags import add_protocols, add_table_format, add_ver
 from su3d_bench.core.errors import EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
-    from su3d_bench.evaluation.request import Request
+    from su3d_bench.evaluation.result import Request
 
 SCHEMA = 1  # of the JSON file of several methods
 
@@ -121,7 +121,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def _request(paths: Sequence[Path], arguments: argparse.Namespace) -> Request:
-    from su3d_bench.evaluation.request import Request
+    from su3d_bench.evaluation.result import Request
 
     return Request(
         tuple(paths),
@@ -139,7 +139,7 @@ def _request(paths: Sequence[Path], arguments: argparse.Namespace) -> Request:
 
 def _named(arguments: argparse.Namespace) -> dict[str, list[Path]]:
     """The predictions by the method that they are called."""
-    from su3d_bench.evaluation.request import own_name
+    from su3d_bench.evaluation.result import own_name
 
     if not arguments.predictions and not arguments.name:
         raise ConfigError("evaluate: no predictions were named; give a folder or files, or --name METHOD=PREDICTIONS")
@@ -167,5 +167,5 @@ def _say_next(out: Path, methods: Sequence[str], *, was_there: bool, is_quiet: b
     state = " (held this evaluation already, and is as it was)" if was_there else ""
     remark(f"run folder: {out}{state}", quiet=is_quiet)
     remark(f"next: su3d-bench compare {pair}", quiet=is_quiet)
-    remark(f"      su3d-bench attribute {run}{whose}", quiet=is_quiet)
+    remark(f"      su3d-bench report attribution {run}{whose}", quiet=is_quiet)
     remark(f"      su3d-bench report tables {run} --format latex", quiet=is_quiet)

@@ -1,4 +1,4 @@
-"""``su3d-bench export``: predictions as the files that other evaluators take."""
+"""``su3d-bench runs export``: predictions as the files that other evaluators take."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ TARGETS = ("openlex3d", "scannet", "scannetpp", "opensun3d")
 QUERY_RULES = "opensun3d-queries"
 
 
-def add_parser(verbs: Any) -> None:
+def add_parser(actions: Any) -> None:
     parser = add_verb(
-        verbs,
+        actions,
         "export",
         "Write predictions, our own or another program's, as the files that another evaluator takes.",
         (
-            "su3d-bench export runs/my-run --to openlex3d --method opensu3d --out exported/opensu3d",
-            "su3d-bench export results/open3dis --to scannet --scenes 'replica/*' --out exported/open3dis",
+            "su3d-bench runs export runs/my-run --to openlex3d --method opensu3d --out exported/opensu3d",
+            "su3d-bench runs export results/open3dis --to scannet --scenes 'replica/*' --out exported/open3dis",
         ),
         call,
     )
@@ -176,7 +176,7 @@ def _maps_of_run(path: Path) -> dict[str, list[Path]]:
 
 def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> list[Source]:
     """The sources that a pattern matches, all without patterns; a scene without a dataset takes that of its pattern."""
-    from su3d_bench.runs.planning.scenes import split_address
+    from su3d_bench.runs.scenes import split_address
 
     if not patterns:
         return list(sources)
@@ -199,7 +199,7 @@ def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> li
 def _names(addresses: Sequence[str], *, is_flat: bool) -> list[str]:
     """The name of each scene's files: its address, or in a flat folder its last part, which must tell scenes apart."""
     from su3d_bench.predictions.export import file_name
-    from su3d_bench.runs.planning.scenes import split_address
+    from su3d_bench.runs.scenes import split_address
 
     names = []
     for address in addresses:
@@ -245,11 +245,11 @@ def _write_answer(
     """The masks of a scene that answer what its dataset is searched for: as they are, or asked of a map."""
     from su3d_bench.core.interfaces import AsksText, HasSurface
     from su3d_bench.metrics.protocols.loading import load_protocol
-    from su3d_bench.predictions import opensun3d
+    from su3d_bench.predictions import export
     from su3d_bench.predictions.base import VertexMasks
 
-    if isinstance(content, VertexMasks) and opensun3d.is_answer(content):
-        return opensun3d.write_opensun3d(opensun3d.answer_as_it_is(content), name, folder)
+    if isinstance(content, VertexMasks) and export.is_answer(content):
+        return export.write_opensun3d(export.answer_as_it_is(content), name, folder)
     if "/" not in source.address:
         raise PredictionError(
             f"which dataset it is of is not known; name it, such as --scenes arkitscenes/{source.scene}"
@@ -261,8 +261,8 @@ def _write_answer(
     encoder = _encoder(content, source, rules, arguments.text_features)
     asked = dataset.asked_text(scene)
     vertices = dataset.surface(scene).vertices
-    answer = opensun3d.answer_to(asked, content, rules, vertices, encoder)
-    return opensun3d.write_opensun3d(answer, name, folder)
+    answer = export.answer_to(asked, content, rules, vertices, encoder)
+    return export.write_opensun3d(answer, name, folder)
 
 
 def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:
@@ -300,7 +300,7 @@ def _rules(name: str | None, dataset: Any, run: Path | None, *, is_ranked: bool)
 
 def _of_run(name: str, run: Path | None) -> ProtocolRules | None:
     """Somebody's own rules that ``run`` was scored by; None where it has none of that name."""
-    from su3d_bench.metrics.protocols.files import protocol_names
+    from su3d_bench.metrics.protocols.loading import protocol_names
     from su3d_bench.runs.finished import read_run
 
     if run is None or name in protocol_names() or name.endswith(".toml"):

@@ -29,36 +29,24 @@ VERBS = (
     "run",
     "ablate",
     "evaluate",
-    "check",
-    "compare",
-    "plan",
     "reproduce",
-    "attribute",
+    "compare",
+    "check",
     "report",
-    "registry",
     "runs",
-    "sheets",
     "query",
-    "questions",
-    "ask",
-    "refine",
-    "datasets.list",
-    "methods",
-    "new",
+    "sheets",
+    "datasets",
     "models",
-    "fetch",
+    "methods",
     "protocols",
-    "texts",
-    "export",
-    "cache",
-    "completion",
-    "doctor",
+    "dev",
 )
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 DESCRIPTION = "Evaluate and benchmark open-vocabulary, instance-level 3D scene understanding from RGB-D."
 EPILOG = """examples:
   su3d-bench run --scenes rooms/living0 --methods opensu3d oracle
-  su3d-bench query rooms/living0 "plant on shelf"
+  su3d-bench query text rooms/living0 "plant on shelf"
 """
 
 
@@ -72,7 +60,7 @@ def build_parser(verb: str | None = None) -> Parser:
     )
     parser.add_argument("--version", action="version", version=f"su3d-bench {__version__}")
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
-    for name in [name for name in VERBS if name.partition(".")[0] == verb] or VERBS:
+    for name in [name for name in VERBS if name == verb] or VERBS:
         import_module(f"su3d_bench.cli.{name}").add_parser(verbs)
     return parser
 
@@ -95,6 +83,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     return code
 
 
+def complete(parser: Parser) -> None:
+    """Answer the shell that completes a command line, and end."""
+    import argcomplete
+
+    argcomplete.autocomplete(parser)
+
+
 def _refuse_records(arguments: argparse.Namespace) -> None:
     """Refuse an ``--out`` that is a file of a finished run, whatever the verb would put there."""
     out = getattr(arguments, "out", None)
@@ -109,7 +104,7 @@ def _exit_code(words: Sequence[str]) -> int:
     arguments = argparse.Namespace()
     try:
         arguments = build_parser(words[0] if words else None).parse_args(words)
-        from su3d_bench.runs.executors.local import limit_threads  # late: --help does without what it imports
+        from su3d_bench.runs.executors import limit_threads  # late: --help does without what it imports
 
         _refuse_records(arguments)
         if not arguments.uses_all_cores:

@@ -9,49 +9,64 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+from su3d_bench.cli.new import add_new
 from su3d_bench.cli.shared.answers import answer, answer_document, answer_either, answer_json
-from su3d_bench.cli.shared.flags import add_verb
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, counted
+from su3d_bench.cli.shared.flags import add_group, add_verb
+from su3d_bench.core.errors import EXIT_DONE, counted
 from su3d_bench.core.printing import one_line
 
 if TYPE_CHECKING:
-    from su3d_bench.reports.tables.papers.published import Figure
+    from su3d_bench.reports.tables.paper import Figure
 
 WIDTH = 118
 
 
 def add_parser(verbs: Any) -> None:
-    parser = add_verb(
+    actions = add_group(
         verbs,
         "methods",
-        "List the methods that can be run; with a name, its settings and what papers report of it.",
-        ("su3d-bench methods opensu3d", "su3d-bench methods check oracle"),
-        call,
+        "List the methods that can be run, show the settings of one, try one on two frames, or write one of your own.",
+        ("su3d-bench methods list", "su3d-bench methods show opensu3d"),
+        lists=True,
     )
-    parser.add_argument("name", nargs="?", help="show the settings of this method and its published figures; or: check")
-    parser.add_argument("tried", nargs="?", metavar="METHOD", help="with check: the method that is tried on two frames")
+    add_verb(
+        actions,
+        "list",
+        "List the methods that can be run: where they come from, their licence, what they need.",
+        ("su3d-bench methods list", "su3d-bench methods list --json"),
+        call_list,
+    )
+    parser = add_verb(
+        actions,
+        "show",
+        "Show the settings of a method, its presets and what papers report of it.",
+        ("su3d-bench methods show opensu3d", "su3d-bench methods show my_method.py:MyMethod"),
+        call_show,
+    )
+    parser.add_argument("name", metavar="METHOD", help="its name, or file.py:Class")
+    parser = add_verb(
+        actions,
+        "check",
+        "Try a method on two frames of a room, and name what is wrong with what it gives.",
+        ("su3d-bench methods check oracle", "su3d-bench methods check my_method.py:MyMethod"),
+        call_check,
+    )
+    parser.add_argument("name", metavar="METHOD", help="its name, or file.py:Class")
+    add_new(actions, "method")
 
 
-def call(arguments: argparse.Namespace) -> int:
+def call_list(arguments: argparse.Namespace) -> int:
     from su3d_bench.runs.catalogue import known_methods
 
-    if arguments.name == "check":
-        return _check(arguments)
-    if arguments.tried is not None:
-        raise ConfigError(f"methods: unknown argument '{arguments.tried}'; name one method, or: methods check METHOD")
-    if arguments.name is not None:
-        return _show(arguments)
     rows = known_methods()
     answer_either(arguments, rows, *[line for row in rows for line in ("", *_lines(row))][1:])
     return EXIT_DONE
 
 
-def _check(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.own.trial import try_method
+def call_check(arguments: argparse.Namespace) -> int:
+    from su3d_bench.runs.trial import try_method
 
-    if arguments.tried is None:
-        raise ConfigError("methods check: name the method, such as my_method.py:MyMethod")
-    trial = try_method(arguments.tried)
+    trial = try_method(arguments.name)
     made = f"{trial.kind} of {counted(trial.n_points, 'point')}"
     made += "" if trial.n_instances is None else f", {counted(trial.n_instances, 'instance')}"
     features = "with features" if trial.has_features else "without features"
@@ -69,10 +84,10 @@ def _lines(row: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _show(arguments: argparse.Namespace) -> int:
+def call_show(arguments: argparse.Namespace) -> int:
     from su3d_bench.core import registry
     from su3d_bench.core.config import flatten, write_toml
-    from su3d_bench.reports.tables.papers.published import figures_of
+    from su3d_bench.reports.tables.paper import figures_of
     from su3d_bench.runs.catalogue import about_method
 
     method = registry.load("method", arguments.name)

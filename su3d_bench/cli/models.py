@@ -21,8 +21,8 @@ def add_parser(verbs: Any) -> None:
     actions = add_group(
         verbs,
         "models",
-        "List the foundation models, check their files, export them to ONNX, or run them once.",
-        "list|check|export|warm",
+        "List the foundation models, check their files, or run them once.",
+        "list|check|warm",
         (
             "su3d-bench models list",
             "su3d-bench models check clip-vit-h-14",
@@ -45,35 +45,7 @@ def add_parser(verbs: Any) -> None:
     )
     checking.add_argument("names", nargs="*", metavar="MODEL", help="short names (default: every model that is here)")
     _add_settings(checking)
-    _add_export(actions)
     _add_warm(actions)
-
-
-def _add_export(actions: Any) -> None:
-    parser = add_verb(
-        actions,
-        "export",
-        "Write a model as ONNX files with a manifest, and tell how far ONNX Runtime is from torch.",
-        (
-            "su3d-bench models export clip-vit-h-14 --out models/clip-vit-h-14-onnx",
-            "su3d-bench models export ram-plus --checkout recognize-anything --environment ram-env --out ram-plus-onnx",
-        ),
-        call_export,
-        uses_all_cores=True,
-    )
-    parser.add_argument("name", metavar="MODEL", help="short name, such as clip-vit-h-14")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder that the files go to")
-    parser.add_argument("--weights", type=Path, metavar="FILE", help="default: where models are looked for")
-    own = parser.add_argument_group("ram-plus, which its authors' own code exports")
-    own.add_argument("--checkout", type=Path, metavar="DIR", help="a clone of recognize-anything")
-    own.add_argument(
-        "--environment",
-        type=Path,
-        metavar="DIR",
-        help="folder of an environment for it, made with pip where there is none",
-    )
-    own.add_argument("--python", type=Path, metavar="PYTHON", help="the Python of an environment that you made")
-    _add_settings(parser)
 
 
 def _add_warm(actions: Any) -> None:
@@ -106,8 +78,6 @@ def perception_config(arguments: argparse.Namespace) -> PerceptionConfig:
 
 
 def call_list(arguments: argparse.Namespace) -> int:
-    from su3d_bench.perception.models.catalogue import STAND_IN
-
     states = _states(arguments, ())
     if answer_json(arguments, [_state_row(state) for state in states]):
         return EXIT_DONE
@@ -115,8 +85,6 @@ def call_list(arguments: argparse.Namespace) -> int:
     for state in states:
         entry = state.entry
         place = f"found: {state.files[0].folder}" if state.files else "missing"
-        if state.files and state.files[0].is_stand_in:
-            place += STAND_IN
         size = f"{entry.forms[0].size_mb / 1000:.1f} GB"
         profiles = f" (profile {', '.join(state.profiles)})" if state.profiles else ""
         answer(f"{entry.name:<{width}}  {entry.kind:<9}  {size:>6}  {entry.licence:<10}  {place}{profiles}")
@@ -189,26 +157,6 @@ def _check_lines(row: dict[str, Any]) -> list[str]:
     state = "wrong" if row["problems"] else "whole"
     digests = [f"  {digest}  {name}" for name, digest in row["sha256"].items()]
     return [f"{row['name']} ({row['form']}): {row['folder']}: {state}", *digests, *(f"  {p}" for p in row["problems"])]
-
-
-def call_export(arguments: argparse.Namespace) -> int:
-    from su3d_bench.perception.models.catalogue import model_entry
-    from su3d_bench.perception.models.onnx.export_model import OwnCode, export_model
-
-    config = perception_config(arguments).models
-    entry = model_entry(arguments.name)
-    own = OwnCode(arguments.checkout, arguments.python, arguments.environment)
-    path = arguments.weights or config.paths.get(entry.name)
-    export = export_model(entry, arguments.out, path=path, folder=config.folder, own=own)
-    value = {"folder": str(arguments.out), "files": export.files, "parity": [asdict(p) for p in export.parity]}
-    lines = [f"{digest}  {arguments.out / name}" for name, digest in export.files.items()]
-    lines += [
-        f"{gap.output}: torch and ONNX Runtime differ by at most {gap.max_abs_difference:.1e} over {gap.n_values} "
-        f"values, cosine at least {gap.min_cosine:.9f}"
-        for gap in export.parity
-    ]
-    answer_either(arguments, value, *lines)
-    return EXIT_DONE
 
 
 def call_warm(arguments: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""``su3d-bench plan``: how many scenes and seeds show a difference."""
+"""``su3d-bench report power``: how many scenes and seeds show a difference."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from su3d_bench.cli.shared.flags import add_protocols, add_table_format, add_ver
 from su3d_bench.core.errors import EXIT_DONE
 
 
-def add_parser(verbs: Any) -> None:
+def add_parser(actions: Any) -> None:
     parser = add_verb(
-        verbs,
-        "plan",
+        actions,
+        "power",
         "Tell how many scenes and seeds show a difference of so many points between two methods.",
         (
-            "su3d-bench plan runs/my-run --methods opensu3d conceptgraphs --points 1 2 5",
-            "su3d-bench plan runs/seed-0 runs/seed-1 runs/seed-2 --protocols rooms-instance --json",
+            "su3d-bench report power runs/my-run --methods opensu3d conceptgraphs --points 1 2 5",
+            "su3d-bench report power runs/seed-0 runs/seed-1 runs/seed-2 --protocols rooms-instance --json",
         ),
         call,
     )

@@ -9,82 +9,72 @@ from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
+from su3d_bench.cli import texts
+from su3d_bench.cli.new import add_new
 from su3d_bench.cli.shared.answers import answer_either, answer_tables, remark, show
 from su3d_bench.cli.shared.bars import progress
-from su3d_bench.cli.shared.flags import add_table_format, add_verb
-from su3d_bench.cli.texts import add_queries
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, suggest
+from su3d_bench.cli.shared.flags import add_group, add_table_format, add_verb
+from su3d_bench.core.errors import EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
+    from su3d_bench.metrics.protocols.loading import Stated
     from su3d_bench.metrics.protocols.model import ProtocolRules
-    from su3d_bench.metrics.protocols.originals import Stated
-
-ACTIONS = ("list", "show", "diff")
 
 
 def add_parser(verbs: Any) -> None:
-    parser = add_verb(
+    actions = add_group(
         verbs,
         "protocols",
-        "List the protocols and whose evaluations they repeat; 'show NAME' prints every rule of one, 'diff A B' the "
-        "rules in which two differ.",
+        "List the protocols, show the rules of one, compare the rules of two, or write one of your own.",
+        ("su3d-bench protocols show rooms-semantic", "su3d-bench protocols diff rooms-semantic replica-mesh-ex6"),
+        lists=True,
+    )
+    add_verb(
+        actions,
+        "list",
+        "List the protocols and whose evaluations they repeat.",
+        ("su3d-bench protocols list", "su3d-bench protocols list --json"),
+        call_list,
+    )
+    parser = add_verb(
+        actions,
+        "show",
+        "Print every rule of a protocol with its source, or the texts that features are compared with.",
+        ("su3d-bench protocols show rooms-semantic", "su3d-bench protocols show rooms-semantic --names"),
+        call_show,
+    )
+    parser.add_argument("name", metavar="PROTOCOL", help="its name, or a .toml file of the same form")
+    parser.add_argument("--names", action="store_true", help="the texts, one a line, to encode elsewhere")
+    texts.add_queries(parser)
+    parser = add_verb(
+        actions,
+        "diff",
+        "Print the rules in which two protocols differ, and with --prediction what each does to the numbers.",
         (
-            "su3d-bench protocols show rooms-semantic --names",
             "su3d-bench protocols diff rooms-semantic replica-mesh-ex6",
+            "su3d-bench protocols diff rooms-semantic replica-mesh-ex6 --prediction runs/demo --out steps.png",
         ),
-        call,
+        call_diff,
     )
-    parser.add_argument("action", nargs="?", default="list", metavar="list|show|diff")
-    parser.add_argument("name", nargs="?", help="a protocol's name, or a .toml file of the same form")
-    parser.add_argument("other", nargs="?", help="with diff: the one that it is held against")
-    parser.add_argument(
-        "--names",
-        action="store_true",
-        help="the texts that features are compared with, one a line, to encode elsewhere",
-    )
-    add_queries(parser)
+    parser.add_argument("name", metavar="A", help="a protocol's name, or a .toml file of the same form")
+    parser.add_argument("other", metavar="B", help="the protocol that it is compared with")
     parser.add_argument(
         "--prediction",
         metavar="RUN[:METHOD]",
-        help="with diff: score it under every choice of the rules, and split the difference of its numbers among them",
+        help="score it under every choice of the rules, and split the difference of its numbers among them",
     )
     parser.add_argument("--out", type=Path, metavar="PNG", help="with --prediction: draw the steps to this file")
     parser.add_argument(
         "--jobs", type=int, default=0, metavar="N", help="scenes scored side by side (default: the CPU cores)"
     )
     add_table_format(parser)
+    texts.add_parser(actions)
+    add_new(actions, "protocol")
 
 
-def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.metrics.labels import labels_taken
-    from su3d_bench.metrics.protocols.files import protocol_names, rules_files
-    from su3d_bench.metrics.protocols.loading import load_protocol
-    from su3d_bench.metrics.protocols.originals import original_of
+def call_list(arguments: argparse.Namespace) -> int:
+    from su3d_bench.metrics.protocols.loading import load_protocol, original_of, protocol_names
 
-    if arguments.action not in ACTIONS:
-        raise ConfigError(f"protocols: unknown action '{arguments.action}'{suggest(arguments.action, ACTIONS)}")
-    if arguments.names and arguments.action != "show":
-        raise ConfigError("protocols: --names belongs to show NAME")
-    if arguments.queries is not None and not arguments.names:
-        raise ConfigError("protocols: --queries belongs to show NAME --names")
-    if arguments.action == "diff":
-        return _answer_diff(arguments)
-    if arguments.action == "list" and arguments.name is not None:
-        raise ConfigError(f"protocols list: takes no name; su3d-bench protocols show {arguments.name}")
-    if arguments.other is not None or arguments.prediction is not None or arguments.out is not None:
-        raise ConfigError("protocols: a second protocol, --prediction and --out belong to diff A B")
-    if arguments.action == "show":
-        if arguments.name is None:
-            raise ConfigError(f"protocols show: name one of {', '.join(protocol_names())}")
-        rules = load_protocol(arguments.name)
-        if arguments.names:
-            return _answer_names(arguments, rules)
-        stated = original_of(arguments.name)
-        value = rules.model_dump(mode="json") | {"digest": rules.digest, "labels_taken": labels_taken(rules)}
-        value |= {"original": _plain(stated)}
-        lines = [*_rules_lines(rules, rules_files(arguments.name)), *_original_lines(stated)]
-        answer_either(arguments, value, *lines)
-        return EXIT_DONE
     rows = [(load_protocol(name), original_of(name)) for name in protocol_names()]
     fields = {"name", "version", "summary", "kind", "datasets", "headline", "ground_truth", "label_space"}
     values = [rules.model_dump(mode="json", include=fields) | {"original": _plain(stated)} for rules, stated in rows]
@@ -98,6 +88,22 @@ def call(arguments: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
+def call_show(arguments: argparse.Namespace) -> int:
+    from su3d_bench.metrics.labels import labels_taken
+    from su3d_bench.metrics.protocols.loading import load_protocol, original_of, rules_files
+
+    rules = load_protocol(arguments.name)
+    if arguments.names:
+        return _answer_names(arguments, rules)
+    if arguments.queries is not None:
+        raise ConfigError("protocols show: --queries belongs to --names")
+    stated = original_of(arguments.name)
+    value = rules.model_dump(mode="json") | {"digest": rules.digest, "labels_taken": labels_taken(rules)}
+    lines = [*_rules_lines(rules, rules_files(arguments.name)), *_original_lines(stated)]
+    answer_either(arguments, value | {"original": _plain(stated)}, *lines)
+    return EXIT_DONE
+
+
 def _plain(stated: Stated | None) -> dict[str, Any] | None:
     return None if stated is None else stated.original.model_dump(mode="json") | {"of": stated.base}
 
@@ -107,13 +113,11 @@ def _original_lines(stated: Stated | None) -> list[str]:
     return ["", *(f"{name:<28} {text}" for name, text in facts.items())]
 
 
-def _answer_diff(arguments: argparse.Namespace) -> int:
+def call_diff(arguments: argparse.Namespace) -> int:
     from su3d_bench.analysis.rules_walk import Walker, rules_apart
     from su3d_bench.metrics.protocols.loading import load_protocol
     from su3d_bench.reports.tables.rules import rules_tables
 
-    if arguments.name is None or arguments.other is None:
-        raise ConfigError("protocols diff: name two protocols; su3d-bench protocols lists them")
     if arguments.out is not None and arguments.prediction is None:
         raise ConfigError("protocols diff: --out draws the steps of a --prediction; name one")
     if arguments.jobs < 0:
@@ -128,7 +132,7 @@ def _answer_diff(arguments: argparse.Namespace) -> int:
     value = apart.to_json()
     answer_tables(arguments, value, rules_tables(value))
     if arguments.out is not None:
-        from su3d_bench.reports.pictures.plots.rules_walk import draw_walk
+        from su3d_bench.reports.pictures.plots import draw_walk
 
         show()  # the plot takes longer than the answer
         draw_walk(value, arguments.out)
@@ -150,8 +154,7 @@ def _rules_lines(rules: ProtocolRules, files: Sequence[Path]) -> list[str]:
     """Every rule as a line, beneath it what the file that sets it says of it: its source, or that it is ours."""
     from su3d_bench.core.config import flatten, toml_value
     from su3d_bench.metrics.labels import labels_taken
-    from su3d_bench.metrics.protocols.files import HEADING, remarks_of
-    from su3d_bench.metrics.protocols.loading import not_comparable_with
+    from su3d_bench.metrics.protocols.loading import HEADING, not_comparable_with, remarks_of
 
     remarks = remarks_of(files)
     shown = rules.model_dump(mode="json", exclude={"classes"}) | {"not_comparable_with": not_comparable_with(rules)}

@@ -1,4 +1,4 @@
-"""``su3d-bench query``: a text -> the instances of a map by similarity, and a heat map."""
+"""``su3d-bench query text``: a text -> the instances of a map by similarity, and a heat map."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from su3d_bench.cli import ask, questions
 from su3d_bench.cli.shared.answers import answer, answer_json, file_name_of, remark, remark_unseen, show
-from su3d_bench.cli.shared.flags import add_verb, add_whose_map, check_scene_first
+from su3d_bench.cli.shared.flags import add_group, add_verb, add_whose_map, check_scene_first
 from su3d_bench.core.errors import ConfigError, PredictionError
 
 if TYPE_CHECKING:
@@ -16,13 +17,25 @@ if TYPE_CHECKING:
 
 
 def add_parser(verbs: Any) -> None:
-    parser = add_verb(
+    actions = add_group(
         verbs,
         "query",
+        "Ask the map of a scene for a text or a question, and make, show, audit or score sets of questions.",
+        ('su3d-bench query text rooms/living0 "plant on shelf"', "su3d-bench query show paper"),
+    )
+    _add_text(actions)
+    ask.add_parser(actions)
+    questions.add_parser(actions)
+
+
+def _add_text(actions: Any) -> None:
+    parser = add_verb(
+        actions,
+        "text",
         "Rank the instances of a scene's map by their similarity to a text and draw the heat map.",
         (
-            'su3d-bench query rooms/living0 "plant on shelf"',
-            'su3d-bench query rooms/living0 "place to sit" --top 3 --method opensu3d --json',
+            'su3d-bench query text rooms/living0 "plant on shelf"',
+            'su3d-bench query text rooms/living0 "place to sit" --top 3 --method opensu3d --json',
         ),
         call,
     )
@@ -40,10 +53,10 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.runs.finished import encoder_of, map_of_scene
 
     if not arguments.text.strip():
-        raise ConfigError('the text is empty; say what to look for, such as: su3d-bench query rooms/living0 "a plant"')
+        raise ConfigError('the text is empty; say what to look for: su3d-bench query text rooms/living0 "a plant"')
     if arguments.top < 1:
         raise ConfigError(f"--top {arguments.top}: at least 1 instance must be listed")
-    check_scene_first("query", arguments.scene, arguments.text)
+    check_scene_first("query text", arguments.scene, arguments.text)
     run, job, prediction = map_of_scene(arguments.scene, arguments.method, arguments.run)
     if not isinstance(prediction, Instances):
         what = "one feature a point and no instances" if isinstance(prediction, DenseFeatures) else "no instances"

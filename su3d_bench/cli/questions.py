@@ -1,4 +1,4 @@
-"""``su3d-bench questions``: make sets of queries with known answers, look at sets, and at whether they are right."""
+"""``su3d-bench query make|show|audit|score``: sets of questions with known answers."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 from su3d_bench.cli.shared.answers import answer, answer_either, answer_json, answer_tables, remark
 from su3d_bench.cli.shared.flags import add_table_format, add_verb
 from su3d_bench.cli.shared.language import add_language_flags, answer_estimate, chat_client
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, counted, suggest
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, counted
 
 if TYPE_CHECKING:
     from su3d_bench.questions.model import Question
 
-ACTIONS = ("make", "show", "audit", "score")
 PAPER = "paper"
 SOURCES = ("auto", "generated")
 FORMS = ("own", "beacon3d-grounding", "beacon3d-qa")
@@ -26,89 +25,127 @@ N_SHOWN = 20
 MOST_CHARACTERS = 80
 
 
-def add_parser(verbs: Any) -> None:
+def add_parser(actions: Any) -> None:
+    _add_make(actions)
+    _add_show(actions)
+    _add_audit(actions)
+    _add_score(actions)
+
+
+def _add_make(actions: Any) -> None:
     parser = add_verb(
-        verbs,
-        "questions",
-        "Make sets of queries with known answers, show a set, see whether its questions are right, or score answers.",
+        actions,
+        "make",
+        "Make a set of questions with known answers from the ground truth of scenes.",
         (
-            "su3d-bench questions make --scenes 'rooms/*' --per-kind 40 --leave-out disputed.csv --out queries.toml",
-            "su3d-bench questions audit --scenes 'rooms/*' --n 200 --out audit",
+            "su3d-bench query make --scenes 'rooms/*' --per-kind 40 --leave-out disputed.csv --out queries.toml",
+            "su3d-bench query make --scenes 'rooms/*' --form beacon3d-qa --out metadata_qa.json",
         ),
-        call,
+        _make,
     )
-    parser.add_argument("action", metavar="make|show|audit|score")
+    _add_scenes(parser, required=True)
     parser.add_argument(
-        "file",
-        nargs="?",
-        help="show: a set (.toml, .csv, ScanRefer, Nr3D, SQA3D, Beacon3D), or 'paper'; "
-        "score: a metadata_*.json of Beacon3D",
+        "--out",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="a .toml or .csv file; .json in a form of Beacon3D",
     )
-    parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="addresses or patterns such as 'rooms/*'")
-    parser.add_argument("--per-kind", type=int, metavar="N", help="at most N of each kind and scene (default: all)")
+    parser.add_argument(
+        "--per-kind",
+        type=int,
+        metavar="N",
+        help="at most N questions of each kind and scene, or objects of a scene (default: all)",
+    )
     parser.add_argument(
         "--source",
-        default="auto",
-        metavar="auto|generated",
-        help="auto: what the dataset itself knows, else generated from classes and boxes",
+        default=SOURCES[0],
+        choices=SOURCES,
+        help="auto: what the dataset itself knows, else generated from classes and boxes (default: auto)",
     )
     parser.add_argument(
-        "--leave-out", type=Path, metavar="FILE", help="make: without the questions that a CSV file lists by their id"
-    )
-    parser.add_argument(
-        "--out", type=Path, metavar="PATH", help="where to write: make: a .toml or .csv file; audit: a folder"
-    )
-    parser.add_argument("--n", type=int, default=200, metavar="N", help="audit: so many questions (default: 200)")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="audit: of the draw (default: 0)")
-    parser.add_argument(
-        "--kinds", nargs="+", metavar="KIND", help="audit: of these kinds only, such as retrieval, property, 'what on'"
-    )
-    parser.add_argument("--per-page", type=int, default=12, metavar="N", help="audit: questions a sheet (default: 12)")
-    parser.add_argument("--score", type=Path, metavar="FILE", help="audit: add up the verdicts in this audit.csv")
-    parser.add_argument(
-        "--answers", type=Path, metavar="FILE", help="score: JSON with what a system answered, in Beacon3D's order"
+        "--leave-out", type=Path, metavar="FILE", help="without the questions that a CSV file lists by their id"
     )
     parser.add_argument(
         "--form",
-        default="own",
-        metavar="|".join(FORMS),
-        help="make: own sets of queries, or Beacon3D's metadata_*.json of grounding or of answers in words (--out "
-        "FILE.json; --per-kind: objects a scene)",
+        default=FORMS[0],
+        choices=FORMS,
+        help="own sets of queries, or Beacon3D's metadata_*.json of grounding or of answers in words (default: own)",
+    )
+
+
+def _add_show(actions: Any) -> None:
+    parser = add_verb(
+        actions,
+        "show",
+        "Show a set of questions: how many of each kind, and the first of them.",
+        ("su3d-bench query show queries.toml", "su3d-bench query show paper --json"),
+        _show,
     )
     parser.add_argument(
-        "--judge", action="store_true", help="score: a language model scores the answers that match no right one"
+        "file", metavar="FILE", help="a set (.toml, .csv, ScanRefer, Nr3D, SQA3D, Beacon3D), or 'paper'"
+    )
+
+
+def _add_audit(actions: Any) -> None:
+    parser = add_verb(
+        actions,
+        "audit",
+        "Draw a sample of the questions of scenes with pictures for people, or add up what they said of them.",
+        (
+            "su3d-bench query audit --scenes 'rooms/*' --n 200 --out audit",
+            "su3d-bench query audit --score audit/audit.csv",
+        ),
+        _audit,
+    )
+    _add_scenes(parser)
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where page, pictures and table go")
+    parser.add_argument("--n", type=int, default=200, metavar="N", help="so many questions (default: 200)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the draw (default: 0)")
+    parser.add_argument(
+        "--kinds", nargs="+", default=[], metavar="KIND", help="these alone, such as retrieval, property, 'what on'"
+    )
+    parser.add_argument("--score", type=Path, metavar="FILE", help="add up the verdicts in this audit.csv instead")
+    add_table_format(parser)
+
+
+def _add_score(actions: Any) -> None:
+    parser = add_verb(
+        actions,
+        "score",
+        "Score answers to the questions of a metadata_*.json of Beacon3D.",
+        (
+            "su3d-bench query score metadata_qa.json --answers answers.json",
+            "su3d-bench query score metadata_qa.json --answers answers.json --judge --dry-run",
+        ),
+        _score_answers,
+    )
+    parser.add_argument("file", type=Path, metavar="FILE", help="a metadata_*.json of Beacon3D")
+    parser.add_argument(
+        "--answers",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="JSON with what a system answered, in Beacon3D's order",
+    )
+    parser.add_argument(
+        "--judge", action="store_true", help="let a language model score the answers that match no right one"
     )
     add_language_flags(parser, JUDGE_MODEL)
     add_table_format(parser)
 
 
-def call(arguments: argparse.Namespace) -> int:
-    if arguments.action not in ACTIONS:
-        raise ConfigError(f"questions: unknown action '{arguments.action}'{suggest(arguments.action, ACTIONS)}")
-    if arguments.answers is not None and arguments.action != "score":
-        raise ConfigError("questions: --answers belongs to score")
-    if arguments.judge and arguments.action != "score":
-        raise ConfigError("questions: --judge belongs to score")
-    if not arguments.judge and (flag := next((flag for flag in OF_JUDGE if getattr(arguments, flag)), None)):
-        raise ConfigError(f"questions: --{flag.replace('_', '-')} belongs to --judge of score")
-    calls = {"make": _make, "show": _show, "audit": _audit, "score": _score_answers}
-    return calls[arguments.action](arguments)
+def _add_scenes(parser: argparse.ArgumentParser, *, required: bool = False) -> None:
+    parser.add_argument(
+        "--scenes", nargs="+", required=required, metavar="SCENE", help="addresses or patterns, such as 'rooms/*'"
+    )
 
 
 def _make(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.files.files import check_form, write_questions
+    from su3d_bench.questions.question_files import check_form, write_questions
 
-    if arguments.file is not None:
-        raise ConfigError("questions make: takes no file; name it with --out")
-    if not arguments.scenes or arguments.out is None:
-        raise ConfigError("questions make: needs --scenes and --out FILE.toml")
     if arguments.per_kind is not None and arguments.per_kind < 1:
-        raise ConfigError(f"questions make: --per-kind is {arguments.per_kind}; expected 1 or more")
-    if arguments.source not in SOURCES:
-        hint = suggest(arguments.source, SOURCES)
-        raise ConfigError(f"questions make: unknown source '{arguments.source}'{hint}")
-    if arguments.form not in FORMS:
-        raise ConfigError(f"questions make: unknown form '{arguments.form}'{suggest(arguments.form, FORMS)}")
+        raise ConfigError(f"query make: --per-kind is {arguments.per_kind}; expected 1 or more")
     if arguments.form != FORMS[0]:
         return _make_beacon3d(arguments)
     check_form(arguments.out)
@@ -123,17 +160,17 @@ def _make_beacon3d(arguments: argparse.Namespace) -> int:
     """Write one of Beacon3D's metadata files over objects of the scenes."""
     from su3d_bench.cli.datasets.check import chosen_scenes
     from su3d_bench.core.files.atomic import write_json
-    from su3d_bench.questions.chains.made_questions import made_files
+    from su3d_bench.questions.chains import made_files
     from su3d_bench.questions.truths import MIN_VERTICES, fullest_truth, scene_objects
 
     if arguments.leave_out is not None or arguments.source != SOURCES[0]:
-        raise ConfigError("questions make: --leave-out and --source belong to --form own")
+        raise ConfigError("query make: --leave-out and --source belong to --form own")
     if arguments.out.suffix != ".json":
-        raise ConfigError(f"questions make: --form {arguments.form} is written as JSON; name --out FILE.json")
+        raise ConfigError(f"query make: --form {arguments.form} is written as JSON; name --out FILE.json")
     objects = {}
     for dataset, scene in chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet):
         if scene in objects:
-            raise ConfigError(f"questions make: two datasets have a scene '{scene}', and the form has scenes by name")
+            raise ConfigError(f"query make: two datasets have a scene '{scene}', and the form has scenes by name")
         objects[scene] = scene_objects(dataset, scene, fullest_truth(dataset, scene), MIN_VERTICES)
         remark(f"{dataset.name}/{scene}: {counted(len(objects[scene]), 'object')}", quiet=arguments.quiet)
     files = made_files(objects, arguments.per_kind)
@@ -147,8 +184,8 @@ def _make_beacon3d(arguments: argparse.Namespace) -> int:
 
 def _made(arguments: argparse.Namespace) -> list[Question]:
     from su3d_bench.cli.datasets.check import chosen_scenes
-    from su3d_bench.questions.files.left_out import read_left_out
     from su3d_bench.questions.generator import chosen
+    from su3d_bench.questions.query_files import read_left_out
     from su3d_bench.questions.truths import questions_of
 
     left_out = frozenset[str]() if arguments.leave_out is None else read_left_out(arguments.leave_out)
@@ -164,10 +201,8 @@ def _made(arguments: argparse.Namespace) -> list[Question]:
 
 
 def _show(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.files.files import paper_queries, read_questions
+    from su3d_bench.questions.question_files import paper_queries, read_questions
 
-    if arguments.file is None:
-        raise ConfigError("questions show: name a file, or 'paper' for the queries that the paper's page shows")
     questions: Sequence[Question]
     questions = paper_queries() if arguments.file == PAPER else read_questions(Path(arguments.file), "")
     if answer_json(arguments, [_row(question) for question in questions]):
@@ -222,15 +257,14 @@ def _audit(arguments: argparse.Namespace) -> int:
 
     if arguments.score is not None:
         return _score(arguments)
-    if arguments.file is not None or not arguments.scenes or arguments.out is None:
-        raise ConfigError("questions audit: needs --scenes and --out FOLDER, or --score FOLDER/audit.csv")
+    if not arguments.scenes or arguments.out is None:
+        raise ConfigError("query audit: needs --scenes and --out DIR, or --score DIR/audit.csv")
     for flag, value, least in (
         ("--n", arguments.n, 1),
-        ("--per-page", arguments.per_page, 1),
         ("--seed", arguments.seed, 0),
     ):
         if value < least:
-            raise ConfigError(f"questions audit: {flag} is {value}; expected {least} or more")
+            raise ConfigError(f"query audit: {flag} is {value}; expected {least} or more")
     scenes = chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet)
     n_each = n_of_each(arguments.n, len(scenes))
     every = []
@@ -238,30 +272,29 @@ def _audit(arguments: argparse.Namespace) -> int:
         of_scene = list(audited_questions(dataset, scene, n_each=n_each, seed=arguments.seed))
         remark(f"{dataset.name}/{scene}: {counted(len(of_scene), 'question')}", quiet=arguments.quiet)
         every += of_scene
-    drawn = sample(of_kinds(every, arguments.kinds or ()), arguments.n, arguments.seed)
+    drawn = sample(of_kinds(every, arguments.kinds), arguments.n, arguments.seed)
     if not drawn:
-        raise DataError("questions audit: nothing can be asked of these scenes")
-    places = {f"{dataset.name}/{scene}": (dataset, scene) for dataset, scene in scenes}
-    sheets = make_audit(
+        raise DataError("query audit: nothing can be asked of these scenes")
+    places = {f"{dataset.name}/{scene}": dataset for dataset, scene in scenes}
+    page = make_audit(
         drawn,
         places.__getitem__,
         arguments.out,
-        per_sheet=arguments.per_page,
         progress=lambda scene: remark(f"{scene}: drawn", quiet=arguments.quiet),
     )
     counts = dict(sorted(Counter(question.kind for question in drawn).items()))
     kinds = ", ".join(f"{n} {kind}" for kind, n in counts.items())
     lines = (
-        f"{counted(len(drawn), 'question')} on {counted(len(sheets), 'sheet')} ({kinds})",
-        f"look at {arguments.out}/sheet-*.png or index.html, write right, arguable or wrong into audit.csv, then: "
-        f"su3d-bench questions audit --score {arguments.out}/audit.csv",
+        f"{counted(len(drawn), 'question')} ({kinds})",
+        f"look at {page}, write right, arguable or wrong into audit.csv, then: "
+        f"su3d-bench query audit --score {arguments.out}/audit.csv",
     )
-    answer_either(arguments, {"n": len(drawn), "kinds": counts, "sheets": [str(sheet) for sheet in sheets]}, *lines)
+    answer_either(arguments, {"n": len(drawn), "kinds": counts, "page": str(page)}, *lines)
     return EXIT_DONE
 
 
 def _score(arguments: argparse.Namespace) -> int:
-    from su3d_bench.sheets.judging.audit_scores import audit_json, audit_table, read_verdicts
+    from su3d_bench.sheets.audit import audit_json, audit_table, read_verdicts
 
     verdicts = read_verdicts(arguments.score)
     answer_tables(arguments, audit_json(verdicts), [audit_table(verdicts)])
@@ -269,15 +302,15 @@ def _score(arguments: argparse.Namespace) -> int:
 
 
 def _score_answers(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.chains.report import answered_file, answered_json, answered_table, answers_to_questions
+    from su3d_bench.questions.beacon3d import answered_file, answered_json, answered_table, answers_to_questions
 
-    if arguments.file is None or arguments.answers is None:
-        raise ConfigError("questions score: needs a metadata_*.json of Beacon3D and --answers FILE")
-    asked = Path(arguments.file)
+    asked = arguments.file
     if not arguments.judge:
+        if flag := next((flag for flag in OF_JUDGE if getattr(arguments, flag)), None):
+            raise ConfigError(f"query score: --{flag.replace('_', '-')} belongs to --judge")
         answered = answered_file(asked, arguments.answers)
     else:
-        from su3d_bench.questions.chains.judge import judge_requests, judged
+        from su3d_bench.questions.beacon3d import judge_requests, judged
         from su3d_bench.store.run_folder import RunFolder
 
         folder = RunFolder(arguments.answers.with_name(f"{arguments.answers.stem}.judged"))

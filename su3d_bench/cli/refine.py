@@ -1,4 +1,4 @@
-"""``su3d-bench refine``: one name for each instance out of the names of its best views, label n' of the paper."""
+"""``su3d-bench runs refine``: one name for each instance out of the names of its best views, label n' of the paper."""
 
 from __future__ import annotations
 
@@ -15,23 +15,21 @@ from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, Stor
 
 if TYPE_CHECKING:
     from su3d_bench.core.maps import Instances
-    from su3d_bench.questions.refining.refined_names import NameRecords
-    from su3d_bench.questions.refining.refinement import RefinedName, TopNames
-    from su3d_bench.questions.undesired import FilterConfig
+    from su3d_bench.questions.refining import FilterConfig, NameRecords, RefinedName, TopNames
     from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 REFINERS = ("vote", "model")
 
 
-def add_parser(verbs: Any) -> None:
+def add_parser(actions: Any) -> None:
     parser = add_verb(
-        verbs,
+        actions,
         "refine",
         "Give each instance of a run's maps one name out of the names of its best views (label n'), and leave out what "
         "is large background under it.",
         (
-            "su3d-bench refine runs/my-run",
-            "su3d-bench refine runs/my-run --refiner model --model llama3.1 --base-url http://localhost:11434/v1",
+            "su3d-bench runs refine runs/my-run",
+            "su3d-bench runs refine runs/my-run --refiner model --model llama3.1 --base-url http://localhost:11434/v1",
         ),
         call,
     )
@@ -62,8 +60,7 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.refining.refined_names import records_of, write_records
-    from su3d_bench.questions.refining.refinement import top_names
+    from su3d_bench.questions.refining import records_of, top_names, write_records
 
     if arguments.top_m < 1:
         raise ConfigError(f"--top-m {arguments.top_m}: at least 1 view must have a say")
@@ -86,7 +83,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def _filter(arguments: argparse.Namespace) -> FilterConfig:
-    from su3d_bench.questions.undesired import FilterConfig
+    from su3d_bench.questions.refining import FilterConfig
 
     share = arguments.max_map_fraction
     if share is not None and not 0 < share <= 1:
@@ -140,7 +137,7 @@ def _map(job: JobFolder) -> Instances:
 
 
 def _estimate(tops: dict[str, list[TopNames]], arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.refining.refinement import ModelRefiner
+    from su3d_bench.questions.refining import ModelRefiner
     from su3d_bench.store.run_folder import RunFolder
 
     if arguments.refiner != "model":
@@ -155,7 +152,7 @@ def _refine(
     tops: dict[str, list[TopNames]], arguments: argparse.Namespace
 ) -> tuple[dict[str, Sequence[RefinedName]], str]:
     """Labels n' of each scene, and the model that chose them."""
-    from su3d_bench.questions.refining.refinement import ModelRefiner, vote
+    from su3d_bench.questions.refining import ModelRefiner, vote
     from su3d_bench.store.run_folder import RunFolder
 
     if arguments.refiner == "vote":

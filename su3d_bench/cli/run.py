@@ -13,8 +13,8 @@ from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE, counted
 
 if TYPE_CHECKING:
     from su3d_bench.core.config import Settings
-    from su3d_bench.runs.planning.held import Into
-    from su3d_bench.runs.planning.plan import Plan
+    from su3d_bench.runs.existing import Into
+    from su3d_bench.runs.plan import Plan
     from su3d_bench.runs.runner import RunResult
 
 
@@ -127,7 +127,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 def plan_of(arguments: argparse.Namespace) -> Plan:
     """The plan of what was asked for, in a process that leaves the cores to the scenes side by side."""
-    from su3d_bench.runs.planning.plan import make_plan
+    from su3d_bench.runs.plan import make_plan
 
     into: Into = "extend" if arguments.extend else "replace" if arguments.replace else "own"
     return make_plan(settings_of(arguments), arguments.set, arguments.out, into=into)
@@ -136,7 +136,7 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
 def settings_of(arguments: argparse.Namespace) -> Settings:
     """The file's settings, then those of the flags, which win."""
     from su3d_bench.core.config import RunConfig
-    from su3d_bench.runs.planning.asked import asked_settings
+    from su3d_bench.runs.plan import asked_settings
 
     scenes = [*arguments.scene, *(arguments.scenes or ())] or None
     values = {name: scenes if name == "scenes" else getattr(arguments, name) for name in RunConfig.model_fields}
@@ -147,8 +147,8 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
 
 def carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
     from su3d_bench.cli.shared.bars import progress
-    from su3d_bench.runs.planning.scenes import cache_root
     from su3d_bench.runs.runner import run_plan
+    from su3d_bench.runs.scenes import cache_root
     from su3d_bench.store.caches import why_large, why_slow
 
     for line in filter(None, (why_slow(), why_large(cache_root()))):
@@ -175,14 +175,14 @@ def _answer_result(result: RunResult, arguments: argparse.Namespace) -> None:
     for line in result.remarks:
         remark(line, quiet=arguments.quiet)
     plan = result.plan
-    place = plan.folder.path if plan.store is None else f"{plan.store} (its small files: {plan.folder.path})"
+    place = plan.place.name if plan.place.url is None else f"{plan.place.url} (its small files: {plan.folder.path})"
     remark(f"run folder: {place}", quiet=arguments.quiet)
     if not arguments.quiet:
         _say_what_is_next(result)
 
 
 def _say_what_is_next(result: RunResult) -> None:
-    from su3d_bench.runs.next_steps import next_commands, pictures_of
+    from su3d_bench.runs.advice import next_commands, pictures_of
 
     pictures = pictures_of(result)
     if pictures:
@@ -194,7 +194,7 @@ def _say_what_is_next(result: RunResult) -> None:
 
 
 def show_plan(plan: Plan, arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.planning.estimate import estimate
+    from su3d_bench.runs.advice import estimate
 
     rows = estimate(plan)
     jobs = [asdict(row) for row in rows]

@@ -1,4 +1,4 @@
-"""``su3d-bench texts``: features of what predictions are named with, for ``evaluate --text-features``."""
+"""``su3d-bench protocols texts``: features of what predictions are named with, for ``evaluate --text-features``."""
 
 from __future__ import annotations
 
@@ -8,25 +8,23 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.cli.shared.answers import answer_either, remark
-from su3d_bench.cli.shared.flags import add_group, add_settings, add_verb
+from su3d_bench.cli.shared.flags import add_settings, add_verb
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, shown, suggest
 
 SUFFIX = ".npz"
 FORMS_OF_EVALUATE = (".toml", ".csv")  # of queries, with the objects that they speak of
 
 
-def add_parser(verbs: Any) -> None:
-    examples = (
-        "su3d-bench texts make --protocol rooms-semantic --encoder embedded --out texts.npz",
-        "su3d-bench texts make --protocol replica-openmask3d --encoder clip-vit-l-14-336 --out texts.npz",
-    )
-    actions = add_group(verbs, "texts", "Encode the texts that a protocol compares features with.", "make", examples)
+def add_parser(actions: Any) -> None:
     parser = add_verb(
         actions,
-        "make",
+        "texts",
         "Encode every text of a protocol: its classes under its prompts, or queries, for evaluate --text-features.",
-        examples,
-        call_make,
+        (
+            "su3d-bench protocols texts --protocol rooms-semantic --encoder embedded --out texts.npz",
+            "su3d-bench protocols texts --protocol replica-openmask3d --encoder clip-vit-l-14-336 --out texts.npz",
+        ),
+        call,
     )
     parser.add_argument("--protocol", required=True, metavar="P", help="whose texts; a name, or a .toml file")
     parser.add_argument(
@@ -49,7 +47,7 @@ def add_queries(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def call_make(arguments: argparse.Namespace) -> int:
+def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.cli.models import perception_config
     from su3d_bench.core.files.atomic import make_folder, write_npz
     from su3d_bench.evaluation.texts import distinct_texts, named_texts, text_arrays
@@ -59,7 +57,7 @@ def call_make(arguments: argparse.Namespace) -> int:
 
     out: Path = arguments.out
     if out.suffix != SUFFIX:
-        raise ConfigError(f"texts make: --out {shown(out)}: give a file that ends in {SUFFIX}")
+        raise ConfigError(f"protocols texts: --out {shown(out)}: give a file that ends in {SUFFIX}")
     rules = load_protocol(arguments.protocol)
     named = named_texts(rules, arguments.queries)
     name = _encoder_name(arguments.encoder, rules.name, rules.encoder)
@@ -103,7 +101,7 @@ def _encoder_name(said: str | None, protocol: str, of_protocol: str | None) -> s
     asked = of_protocol if said is None else said
     if asked is None:
         listed = ", ".join(known)
-        raise ConfigError(f"texts make: protocol '{protocol}' names no encoder; name one with --encoder: {listed}")
+        raise ConfigError(f"protocols texts: protocol '{protocol}' names no encoder; name one with --encoder: {listed}")
     if asked in known:
         return asked
     if asked == EmbeddedEncoder.name:
@@ -112,4 +110,4 @@ def _encoder_name(said: str | None, protocol: str, of_protocol: str | None) -> s
         return entry.name
     whose = "" if said is not None else f" of protocol '{protocol}'"
     hint = suggest(asked, known) or f"; known: {', '.join(known)}"
-    raise ConfigError(f"texts make: unknown encoder '{asked}'{whose}{hint}")
+    raise ConfigError(f"protocols texts: unknown encoder '{asked}'{whose}{hint}")

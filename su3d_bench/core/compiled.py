@@ -1,4 +1,8 @@
-"""Numba's ``njit`` for kernels kept on disk, where the place of the kept ones may be damaged, full or closed."""
+"""Numba's ``njit`` for kernels kept on disk.
+
+``numba.njit(cache=True)`` alone keeps a kernel whose imported kernels have changed, which gives numbers of old code,
+ends with a traceback where its files were damaged by a power cut, and refuses to import where no folder can be written.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +18,9 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 
 from su3d_bench.core.digests import digest_file
-from su3d_bench.core.system.damage import DAMAGE
+from su3d_bench.core.files.unpacking import DAMAGE
 
+_digest = remembered(digest_file)
 UNREADABLE: tuple[type[Exception], ...] = (*DAMAGE, LookupError, AttributeError, ImportError, pickle.UnpicklingError)
 
 
@@ -36,16 +41,13 @@ class MendingCache(FunctionCache):
         try:
             return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         except UNREADABLE:
-            self._forget()
+            with suppress(OSError):
+                self.flush()  # type: ignore[no-untyped-call]
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         with suppress(OSError):
             super().save_overload(sig, data)  # type: ignore[no-untyped-call]
-
-    def _forget(self) -> None:
-        with suppress(OSError):
-            self.flush()  # type: ignore[no-untyped-call]
 
 
 def imported_sources(function: Callable[..., Any]) -> list[Path]:
@@ -58,11 +60,6 @@ def imported_sources(function: Callable[..., Any]) -> list[Path]:
                 sources.add(value.py_func.__code__.co_filename)
                 waiting.append(value.py_func)
     return sorted(Path(name) for name in sources - {own})
-
-
-@remembered
-def _digest(path: Path) -> str:
-    return digest_file(path)
 
 
 def njit(*, cache: bool, **options: Any) -> Callable[[Callable[..., Any]], Any]:

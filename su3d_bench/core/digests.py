@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import ast
 import hashlib
 import json
 import subprocess
 import sys
-import tomllib
 from collections.abc import Iterator
-from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from importlib.util import cache_from_source
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
-from su3d_bench.core.system.files import file_bytes, file_text, opened
+from su3d_bench.core.system.files import opened
 
 PACKAGE_ROOT = Path(__file__).resolve().parents[1]
 # What shows numbers and moves none; everything else of the package counts, in whatever folder it stands.
@@ -45,29 +41,24 @@ def digest_file(path: Path) -> str:
 
 @cache
 def code_digest() -> str:
-    """A key of the installed code, rules, tables and weights that can move a number.
-
-    Comments, docstrings and the layout of Python and TOML files leave it as it is. See ``package_digest``.
-    """
+    """A key of the installed code, rules, tables and weights that can move a number."""
     names = {path.relative_to(PACKAGE_ROOT).parts[0] for path in _sources(PACKAGE_ROOT)}
     return package_digest(*sorted(names - set(ONLY_SHOWN)))[:16]
 
 
 @cache
 def package_digest(*names: str) -> str:
-    """A key of parts of the package: ``"metrics"``, all that lies in that folder and below, or one file.
+    """A key of parts of the package by their bytes: ``"metrics"``, all that lies in that folder and below, or one file.
 
-    Python counts by its syntax without docstrings, TOML by its values, anything else by its bytes. Raises
-    ``FileNotFoundError`` for a name under which no file lies: a key of nothing would fit any code.
+    Raises ``FileNotFoundError`` for a name under which no file lies: a key of nothing would fit any code.
     """
     total = hashlib.sha256()
-    with _KeptDigests() as kept:
-        for name in names:
-            paths = sorted(_sources(PACKAGE_ROOT / name))
-            if not paths:
-                raise FileNotFoundError(f"{PACKAGE_ROOT / name}: holds no code of which a key could be made")
-            for path in paths:
-                total.update(f"{path.relative_to(PACKAGE_ROOT).as_posix()} {kept.digest(path)}\n".encode())
+    for name in names:
+        paths = sorted(_sources(PACKAGE_ROOT / name))
+        if not paths:
+            raise FileNotFoundError(f"{PACKAGE_ROOT / name}: holds no code of which a key could be made")
+        for path in paths:
+            total.update(f"{path.relative_to(PACKAGE_ROOT).as_posix()} {digest_file(path)}\n".encode())
     return total.hexdigest()
 
 
@@ -79,62 +70,6 @@ def _sources(place: Path) -> Iterator[Path]:
         for child in place.iterdir():
             if not (child.name.startswith(NO_CODE[:2]) or child.name.endswith(NO_CODE[2:])):
                 yield from _sources(child)
-
-
-class _KeptDigests:
-    """Digests of source files by what they mean, kept beside Python's own compiled files.
-
-    As there, a file of the same time and size counts as the same; what is kept wrongly or cannot be kept is made anew.
-    """
-
-    def __init__(self) -> None:
-        self._place = Path(cache_from_source(str(PACKAGE_ROOT / "code.py"))).with_suffix(".json")
-        self._is_changed = False
-        self._kept: dict[str, list[Any]] = {}
-
-    def __enter__(self) -> Self:
-        with suppress(OSError, ValueError, RecursionError):
-            kept = json.loads(file_text(self._place))
-            self._kept = kept if isinstance(kept, dict) else {}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._is_changed:
-            with suppress(OSError):
-                self._place.parent.mkdir(exist_ok=True)
-                self._place.write_text(json.dumps(self._kept))  # half of it is no JSON, and made anew
-
-    def digest(self, path: Path) -> str:
-        state = path.stat()
-        stamp = [state.st_mtime_ns, state.st_size]
-        name = path.relative_to(PACKAGE_ROOT).as_posix()
-        kept = self._kept.get(name)
-        if not isinstance(kept, list) or len(kept) != 2 or kept[0] != stamp or not isinstance(kept[1], str):
-            self._kept[name] = kept = [stamp, source_digest(path)]
-            self._is_changed = True
-        return str(kept[1])
-
-
-def source_digest(path: Path) -> str:
-    """SHA-256 of what a source file means to the program; of its bytes where it is no Python or TOML that parses."""
-    content = file_bytes(path)
-    with suppress(SyntaxError, ValueError):
-        if path.suffix == ".py":
-            return digest_bytes(_syntax(content).encode())
-        if path.suffix == ".toml":
-            return digest_bytes(repr(tomllib.loads(content.decode())).encode())
-    return digest_bytes(content)
-
-
-def _syntax(source: bytes) -> str:
-    """The syntax tree of a module as a text, without docstrings and places."""
-    tree = ast.parse(source)
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and (
-            ast.get_docstring(node, clean=False) is not None
-        ):
-            del node.body[0]
-    return ast.dump(tree)
 
 
 @cache

@@ -1,7 +1,7 @@
 """What a dataset, a method and perception offer to the runner, and what it hands a method besides frames.
 
-``Dataset`` and ``Method`` are what each must have. An ability that it may have is a protocol of its own, listed in
-``ABILITIES``; ``registry.load`` refuses a class with a misspelt one.
+``Dataset`` and ``Method`` are what each must have. An ability that it may have is a protocol of its own;
+``registry.load`` refuses a class with a misspelt one.
 """
 
 from __future__ import annotations
@@ -29,6 +29,14 @@ from su3d_bench.core.types import (
     WholeObject,
     WorldUp,
 )
+
+
+class DatasetAbility(Protocol):
+    """What a dataset may offer besides; each is a protocol of its own."""
+
+
+class MethodAbility(Protocol):
+    """The same of a method."""
 
 
 class RegionPerception(Protocol):
@@ -99,42 +107,42 @@ class Dataset(Protocol):
 
 
 @runtime_checkable
-class HasFurtherTruths(Protocol):
+class HasFurtherTruths(DatasetAbility, Protocol):
     """Ground truths with labels of other label spaces than its own: label space -> the one of ``ground_truth``."""
 
     further_truths: Mapping[str, str]
 
 
 @runtime_checkable
-class HasPlaces(Protocol):
+class HasPlaces(DatasetAbility, Protocol):
     """The folders that a dataset searches."""
 
     def places(self) -> Sequence[Path]: ...
 
 
 @runtime_checkable
-class HasStatus(Protocol):
+class HasStatus(DatasetAbility, Protocol):
     """A word on a scene, from a quick look."""
 
     def status(self, scene: str) -> str: ...
 
 
 @runtime_checkable
-class HasGroups(Protocol):
+class HasGroups(DatasetAbility, Protocol):
     """Names for sets of scenes, such as official splits."""
 
     def groups(self) -> Mapping[str, Sequence[str]]: ...
 
 
 @runtime_checkable
-class HasProblems(Protocol):
+class HasProblems(DatasetAbility, Protocol):
     """Every fault of a scene's files, a line each."""
 
     def problems(self, scene: str) -> Sequence[str]: ...
 
 
 @runtime_checkable
-class CorrectsReading(Protocol):
+class CorrectsReading(DatasetAbility, Protocol):
     """Its files are read as a description says: whether depth shall be held against poses, and what to change in the
     description where another reading, a ``Finding`` of ``pose_convention``, agrees better."""
 
@@ -144,21 +152,21 @@ class CorrectsReading(Protocol):
 
 
 @runtime_checkable
-class SaysUp(Protocol):
+class SaysUp(DatasetAbility, Protocol):
     """Its files may have any world: which axis of it points up."""
 
     def up(self, scene: str) -> WorldUp: ...
 
 
 @runtime_checkable
-class HasSurface(Protocol):
+class HasSurface(DatasetAbility, Protocol):
     """The scan's mesh without labels."""
 
     def surface(self, scene: str) -> Surface: ...
 
 
 @runtime_checkable
-class KnowsObjects(Protocol):
+class KnowsObjects(DatasetAbility, Protocol):
     """The objects of a scene as they are, of which the ground truth may hold what a recording saw alone."""
 
     def whole_objects(self, scene: str) -> Sequence[WholeObject]: ...
@@ -179,21 +187,21 @@ class IsAligned(Protocol):
 
 
 @runtime_checkable
-class HasQueries(Protocol):
+class HasQueries(DatasetAbility, Protocol):
     """Texts with ``kind`` and ``answers``, the ids of all objects that answer them."""
 
     def queries(self, scene: str) -> Sequence[Any]: ...
 
 
 @runtime_checkable
-class AsksText(Protocol):
+class AsksText(DatasetAbility, Protocol):
     """The one text that a scene is searched for, known without its truth; its mesh has the vertices of the answer."""
 
     def asked_text(self, scene: str) -> str: ...
 
 
 @runtime_checkable
-class RendersFrames(Protocol):
+class RendersFrames(DatasetAbility, Protocol):
     """True where frames are computed and not read.
 
     They are not made ahead then, since the pipeline's timed stages would wait for the interpreter.
@@ -203,21 +211,21 @@ class RendersFrames(Protocol):
 
 
 @runtime_checkable
-class HasSketches(Protocol):
+class HasSketches(DatasetAbility, Protocol):
     """A frame ``width`` pixels wide, in far less time than the whole; ``index`` is its place among all frames."""
 
     def sketch(self, scene: str, index: int, width: int) -> Frame: ...
 
 
 @runtime_checkable
-class ReadsMadeRooms(Protocol):
+class ReadsMadeRooms(DatasetAbility, Protocol):
     """True where rooms that the program makes are written in its layout, which are not its scenes."""
 
     reads_made_rooms: bool
 
 
 @runtime_checkable
-class NamesScenes(Protocol):
+class NamesScenes(DatasetAbility, Protocol):
     """The regular expression of names that only its scenes have, by which files of predictions are known."""
 
     scene_names: str
@@ -265,44 +273,37 @@ class MethodAbout:
 
 
 @runtime_checkable
-class HasAbout(Protocol):
+class HasAbout(MethodAbility, Protocol):
     about: MethodAbout
 
 
 @runtime_checkable
-class HasPresets(Protocol):
+class HasPresets(MethodAbility, Protocol):
     """Settings under a name: ``METHOD@PRESET`` is a method of its own."""
 
     presets: Mapping[str, Mapping[str, Any]]
 
 
 @runtime_checkable
-class HasShortNames(Protocol):
+class HasShortNames(MethodAbility, Protocol):
     """Other names of settings for sweeps: the setting, and what a value written there comes to."""
 
     short_names: Mapping[str, tuple[str, Callable[[Any], Any]]]
 
 
 @runtime_checkable
-class IsSystem(Protocol):
+class IsSystem(MethodAbility, Protocol):
     """False where ``all`` methods are not meant to hold it: the truth itself, a program that must be named."""
 
     is_system: bool
 
 
 @runtime_checkable
-class WarmsUp(Protocol):
+class WarmsUp(MethodAbility, Protocol):
     """True where its first frames wait for compilers or imports: before the clock runs, a scratch of its kind is fed a
     made-up frame; it needs no tools for that."""
 
     warms_up: bool
-
-
-@runtime_checkable
-class TakesDevice(Protocol):
-    """May compute with torch; called before all else with ``cpu`` or a device of torch such as ``cuda:0``."""
-
-    def receive_device(self, device: str) -> None: ...
 
 
 @runtime_checkable
@@ -313,21 +314,21 @@ class TakesTools(Protocol):
 
 
 @runtime_checkable
-class NeedsSurface(Protocol):
+class NeedsSurface(MethodAbility, Protocol):
     """Whether it cannot do without the scan's mesh, as it is set."""
 
     needs_surface: bool
 
 
 @runtime_checkable
-class TakesTruth(Method, Protocol):
+class TakesTruth(MethodAbility, Method, Protocol):
     """Is told the ground truth, and is a ceiling."""
 
     def receive_truth(self, truth: GroundTruth) -> None: ...
 
 
 @runtime_checkable
-class CountsPoints(Protocol):
+class CountsPoints(MethodAbility, Protocol):
     """The points of its map after an update."""
 
     @property
@@ -335,7 +336,7 @@ class CountsPoints(Protocol):
 
 
 @runtime_checkable
-class CountsInstances(Protocol):
+class CountsInstances(MethodAbility, Protocol):
     """The instances of its map after an update."""
 
     @property
@@ -343,7 +344,7 @@ class CountsInstances(Protocol):
 
 
 @runtime_checkable
-class CountsBytes(Protocol):
+class CountsBytes(MethodAbility, Protocol):
     """The memory of its map after an update."""
 
     @property
@@ -351,7 +352,7 @@ class CountsBytes(Protocol):
 
 
 @runtime_checkable
-class CountsLosses(Protocol):
+class CountsLosses(MethodAbility, Protocol):
     """What the last update left out, by the name of its column in ``updates.csv``."""
 
     @property
@@ -359,7 +360,7 @@ class CountsLosses(Protocol):
 
 
 @runtime_checkable
-class HasFinishCosts(Protocol):
+class HasFinishCosts(MethodAbility, Protocol):
     """Numbers on the last ``finish`` that stand beside its time."""
 
     @property
@@ -367,7 +368,7 @@ class HasFinishCosts(Protocol):
 
 
 @runtime_checkable
-class HasInputs(Protocol):
+class HasInputs(MethodAbility, Protocol):
     """Digests, by name, of files outside the configuration that move its numbers."""
 
     @property
@@ -375,7 +376,7 @@ class HasInputs(Protocol):
 
 
 @runtime_checkable
-class HasCaveat(Protocol):
+class HasCaveat(MethodAbility, Protocol):
     """What must be said beside its numbers."""
 
     @property
@@ -383,14 +384,14 @@ class HasCaveat(Protocol):
 
 
 @runtime_checkable
-class HasOwnPerception(Protocol):
+class HasOwnPerception(MethodAbility, Protocol):
     """True where it finds masks itself, so that the caveat of the run's perception is not its."""
 
     has_own_perception: bool
 
 
 @runtime_checkable
-class Closes(Protocol):
+class Closes(MethodAbility, Protocol):
     """Gives back what it holds, called when the prediction is written or could not be."""
 
     def close(self) -> None: ...
@@ -421,7 +422,6 @@ ABILITIES = {
         HasShortNames,
         IsSystem,
         WarmsUp,
-        TakesDevice,
         TakesTools,
         NeedsSurface,
         TakesTruth,

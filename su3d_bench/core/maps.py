@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.given import features_given, points_given, scores_given, sets_given, views_given
-from su3d_bench.core.places import Places
 from su3d_bench.core.types import (
     BoolArray,
     Float32Array,
@@ -19,6 +18,7 @@ from su3d_bench.core.types import (
     Int32Array,
     Int64Array,
     IntArray,
+    Places,
     check_arrays,
 )
 
@@ -202,8 +202,8 @@ class Instances(Masks):
         >>> [mask.tolist() for mask in whole.sets()], Instances.of(points, np.array([0, 0, -1, 1])).indices.tolist()
         ([[0, 1], [3]], [0, 1, 3])
         """
-        points = points_given(points)
-        masks = masks if isinstance(masks, Masks) else Masks.of_sets(sets_given(masks, len(points)))
+        points = _array("points", points, (None, 3), "f", "floats (M, 3) in metres")
+        masks = masks if isinstance(masks, Masks) else Masks.of_sets(_sets(masks, len(points)))
         _check_masks(masks, len(points))
         k = len(masks)
         boxes, means = np.zeros((k, 2, 3), np.float32), np.zeros((k, 3), np.float32)
@@ -215,20 +215,92 @@ class Instances(Masks):
             masks.indptr,
             masks.indices,
             points=points,
-            scores=scores_given(scores, k),
-            features=features_given(features, k),
+            scores=np.ones(k) if scores is None else _scores(scores, k),
+            features=None if features is None else _features(features, k),
             labels=None if labels is None else tuple(labels),
             names=("",) * k if names is None else tuple(names),
             captions=("",) * k if captions is None else tuple(captions),
             boxes=boxes,
             centroids=means if centroids is None else centroids,
             view_indptr=np.zeros(k + 1, np.int64) if views is None else starts_of(map(len, views)),
-            views=views_given(views, k),
+            views=_views(views or [()] * k, k),
             ids=np.array(ids, np.int64),
             view_names=view_names,
             view_scores=view_scores,
             further_labels=tuple(map(tuple, further_labels)) if further_labels else None,
         )
+
+
+def _array(name: str, value: Any, shape: tuple[int | None, ...], kinds: str, expected: str) -> NDArray[Any]:
+    """``value`` as an array of this shape, None for any length, and of values of these kinds."""
+    try:
+        array = np.asarray(value)
+    except (ValueError, TypeError) as error:  # rows of several lengths
+        raise PredictionError(f"instances: {name}: is no array: {error}") from error
+    fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
+    if not fits or (array.size and array.dtype.kind not in kinds):
+        found = {"U": "texts", "O": "objects"}.get(array.dtype.kind, array.dtype.name)
+        raise PredictionError(f"instances: {name} is {found} {array.shape}; {expected} is expected")
+    return array
+
+
+def _scores(scores: Any, k: int) -> Float64Array:
+    array = _array("scores", scores, (k,), "fiub", f"one number for each of {k} masks")
+    return array if array.dtype.kind == "f" else array.astype(np.float64)
+
+
+def _features(features: Any, k: int) -> Float32Array | None:
+    if not k and np.ndim(features) == 1:
+        return None
+    return _array("features", features, (k, None), "f", f"floats ({k}, D), one row per mask,")
+
+
+def _views(views: Sequence[Sequence[tuple[int, int]]], k: int) -> Int32Array:
+    """The views (V, 2) of all instances, one after another."""
+    if len(views) != k:
+        raise PredictionError(f"instances: views of {len(views)} instances for {k} masks")
+    rows = [view for of_instance in views for view in of_instance] or np.zeros((0, 2), np.int32)
+    return _array("views", rows, (None, 2), "iu", "pairs of integers, frame index and row,").astype(np.int32)
+
+
+def _sets(masks: Any, n_points: int) -> list[NDArray[Any]]:
+    """The points of each mask, ascending and each once; ``Instances.of`` says what ``masks`` may be."""
+    if not isinstance(masks, Iterable):
+        raise PredictionError(
+            f"instances: masks is {masks!r:.40}; a list of point indices or bools of each instance is expected"
+        )
+    if isinstance(masks, np.ndarray) and masks.ndim == 1:
+        return _sets_of_owners(masks, n_points)
+    return [_set(f"the mask of instance {k}", mask, n_points) for k, mask in enumerate(masks)]
+
+
+def _sets_of_owners(masks: NDArray[Any], n_points: int) -> list[NDArray[Any]]:
+    owners = _array(
+        "masks", masks, (n_points,), "iu", f"a list of masks, or the instance of each of {n_points} points,"
+    )
+    if not len(owners):
+        return []
+    if owners.min() < -1 or owners.max() >= n_points:
+        raise PredictionError(
+            f"instances: masks holds numbers {owners.min()} to {owners.max()}; instances are numbered from 0 on "
+            f"without gaps, -1 is none, and there are {n_points} points"
+        )
+    owners = owners.astype(np.int64)
+    order = np.argsort(owners, kind="stable")
+    sets: list[NDArray[Any]] = np.split(order, np.cumsum(np.bincount(owners + 1, minlength=1)))[1:-1]
+    if empty := [k for k, members in enumerate(sets) if not len(members)]:
+        raise PredictionError(
+            f"instances: masks numbers no point {empty[0]}, but higher ones; number them without gaps"
+        )
+    return sets
+
+
+def _set(name: str, mask: Any, n_points: int) -> NDArray[Any]:
+    array = _array(name, mask, (None,), "iub", f"indices of points, or a bool for each of {n_points} points,")
+    if array.size and array.dtype.kind == "b":
+        return np.flatnonzero(_array(name, array, (n_points,), "b", f"a bool for each of {n_points} points"))
+    array = array if array.size else np.zeros(0, np.int32)
+    return np.unique(array) if (array[1:] <= array[:-1]).any() else array
 
 
 def _check_masks(masks: Masks, n_points: int) -> None:

@@ -7,14 +7,13 @@ Coordinates are metres in the world frame unless a name says otherwise, and z po
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, Su3dError
-from su3d_bench.core.places import Places
 
 BoolArray = NDArray[np.bool_]
 UInt8Array = NDArray[np.uint8]
@@ -27,6 +26,7 @@ FloatArray = NDArray[np.floating[Any]]
 
 ImageDomain = Literal["rendered-rooms", "camera"]
 Interval = tuple[float, float]
+UP = 1  # the axis of heights in buildings' graphs, as Habitat has it
 UpAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
 
 
@@ -167,6 +167,37 @@ class TrueGraph:
             for object_id in relation[::2]:
                 if object_id not in self.class_of_object:
                     raise DataError(f"scene graph: a relation names object {object_id}, which is none of the graph")
+
+
+@dataclass(frozen=True)
+class Floor:
+    """A storey of a building's graph, in a world whose y points up, from ``lowest_m`` to ``highest_m``."""
+
+    lowest_m: float
+    highest_m: float
+
+
+@dataclass(frozen=True)
+class Room:
+    """A room: ``points`` (K, 3) m that lie in it, its heights, and the mean of these or of its points.
+
+    ``category`` is its name, '' where it has none.
+    """
+
+    points: Float64Array
+    lowest_m: float
+    highest_m: float
+    middle_m: float
+    category: str = ""
+
+
+@dataclass(frozen=True)
+class Places:
+    """Floors and rooms; of a truth also ``object_boxes``: instance id -> centre and sides (2, 3) m."""
+
+    floors: tuple[Floor, ...]
+    rooms: tuple[Room, ...]
+    object_boxes: Mapping[int, Float64Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -33,19 +33,19 @@ from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.timing import hardware_line, processor_digest
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.evaluation.evaluate import evaluate
-from su3d_bench.evaluation.request import Request
-from su3d_bench.evaluation.result import Evaluation, ProtocolEvaluation
+from su3d_bench.evaluation.result import Evaluation, ProtocolEvaluation, Request
 from su3d_bench.evaluation.scoring import map_of
 from su3d_bench.evaluation.truth import SceneTruths
+from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.scoring import EVERY_SCENE, SceneScore, combine, pack_scores, plain_json
+from su3d_bench.metrics.scoring import EVERY_SCENE, combine, pack_scores, plain_json
 from su3d_bench.predictions.base import Content
 from su3d_bench.predictions.own_runs import write_content
 from su3d_bench.predictions.scenes import Source
+from su3d_bench.runs.existing import sealed
 from su3d_bench.runs.finished import made_elsewhere
-from su3d_bench.runs.planning.held import sealed
-from su3d_bench.runs.planning.plan import check_folder_name
-from su3d_bench.runs.runner import BY_THE_METHOD, confidences_of
+from su3d_bench.runs.plan import check_folder_name
+from su3d_bench.runs.summary import BY_THE_METHOD, confidences_of
 from su3d_bench.store.records import (
     GitRecord,
     MetricsRecord,

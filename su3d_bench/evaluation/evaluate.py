@@ -1,4 +1,4 @@
-"""Predictions made elsewhere to the numbers of the published protocols: ``evaluate``.
+"""Predictions made elsewhere to the numbers of the published protocols: load, match to ground truth, score, report.
 
 Scene by scene, so that only one scene's masks are in memory. Wrong input raises a ``Su3dError`` of one line before
 anything is answered; what is merely doubtful goes into the result as warnings.
@@ -6,18 +6,43 @@ anything is answered; what is merely doubtful goes into the result as warnings.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
-from su3d_bench.core.errors import PredictionError, shown
+from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, PredictionError, shown
+from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.maps import Instances, Masks
 from su3d_bench.core.system.files import noted
-from su3d_bench.evaluation.request import Request
-from su3d_bench.evaluation.result import Evaluation, ProtocolEvaluation, some_names
-from su3d_bench.evaluation.scoring import Scoring
-from su3d_bench.evaluation.truth import NOT_MEANT, SceneTruths, kind_of_truth
+from su3d_bench.core.types import GroundTruth
+from su3d_bench.datasets.openlex3d.release import OpenLexRelease
+from su3d_bench.evaluation.result import Evaluation, ProtocolEvaluation, Request, SceneOutcomes, formed, some_names
+from su3d_bench.evaluation.scoring import (
+    facts_of,
+    nothing_like,
+    score_on_objects,
+    score_on_truth,
+    score_on_vertices,
+    skips_missing_scenes,
+    with_confidences_of_files,
+)
+from su3d_bench.evaluation.text_truth import FLAG, TextTruths
+from su3d_bench.evaluation.texts import TextFeatures, encoder_for, read_text_features
+from su3d_bench.evaluation.truth import NOT_MEANT, DatasetTruths, OpenLexTruths, SceneTruths, VertexTruth
+from su3d_bench.metrics.fitness import (
+    ContentFacts,
+    n_feature_dimensions,
+    why_not_content,
+    why_not_length,
+    why_not_numbers,
+)
+from su3d_bench.metrics.labels import labels_counted, under_several_labels
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.predictions.base import Content
+from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
+from su3d_bench.predictions.own_runs import OwnRuns
 from su3d_bench.predictions.scannet_text import ScannetText
 from su3d_bench.predictions.scenes import Source, open_sources
 
@@ -34,18 +59,24 @@ class Keeps(Protocol):
 
 def evaluate(request: Request, kept: Keeps | None = None) -> Evaluation:
     """The numbers of ``request`` under every protocol that is named, or else that fits; ``kept`` gets each scene."""
-    kind, scoring = kind_of_truth(request), Scoring(request)
+    # Load.
+    _refuse_values_without_texts(request, is_text=request.ground_truth is not None)
+    texts = read_text_features(request.text_features)
     sources = open_sources(request.predictions, request.format)
-    truths = kind(request, sources)
+
+    # Match to ground truth.
+    truths = _open_truths(request, sources)
     if request.queries is not None:
         truths.take_queries(request.queries)
     if not truths.matches:
         raise PredictionError(f"{shown(request.predictions[0])}: has no prediction of a scene of {truths.where}")
-    counts_confidences = _count_file_confidences(request, sources)
-    scoring.begin(truths, counts_file_confidences=counts_confidences)
+
+    # Score.
+    file_confidences = _count_file_confidences(request, sources)
+    scoring = Scoring(truths, request.protocols, texts, file_confidences=file_confidences)
     if kept is not None:
-        kept.begin(truths, sources, counts_file_confidences=counts_confidences)
-    of_files: dict[str, list[str]] = {}
+        kept.begin(truths, sources, counts_file_confidences=file_confidences)
+    scenes_of_remark: dict[str, list[str]] = {}
     for match in truths.matches:
         with noted() as files:
             prediction = match.source.reader.read(match.source.path, match.name)
@@ -53,19 +84,19 @@ def evaluate(request: Request, kept: Keeps | None = None) -> Evaluation:
         if kept is not None:
             kept.keep(match.scene, prediction.content, files, scoring.rules_of(match.scene))
         for line in prediction.remarks:
-            of_files.setdefault(line, []).append(match.scene)
-    with_prediction = [match.scene for match in truths.matches]
-    nothing = scoring.add_missed([scene for scene in truths.scenes if scene not in with_prediction])
-    for scene in truths.scenes:
-        if kept is not None and scene not in with_prediction and (rules := scoring.rules_of(scene)):
+            scenes_of_remark.setdefault(line, []).append(match.scene)
+    with_prediction = {match.scene for match in truths.matches}
+    missed = [scene for scene in truths.scenes if scene not in with_prediction]
+    nothing = scoring.add_missed(missed)
+    for scene in missed:
+        if kept is not None and (rules := scoring.rules_of(scene)):
             kept.keep(scene, nothing, (), rules)
-    remarks = list(truths.remarks)
-    for line, scenes in of_files.items():
-        n = len(with_prediction)
-        which = scenes[0] if len(scenes) == 1 else f"{len(scenes)} of {n} scenes ({some_names(scenes)})"
-        remarks.append(f"{'every scene' if len(scenes) == n > 1 else which}: {line}")
+
+    # Report.
+    remarks = [*truths.remarks, *_remarks_on_files(scenes_of_remark, len(truths.matches))]
+    protocols, not_scored = scoring.results()
     formats = tuple(dict.fromkeys(source.reader.name for source in sources))
-    return scoring.tally.evaluation(formats, truths.where, remarks)
+    return Evaluation(protocols, not_scored, formats, truths.where, tuple(dict.fromkeys(remarks)))
 
 
 def said_of(result: Evaluation) -> list[str]:
@@ -78,8 +109,177 @@ def said_of(result: Evaluation) -> list[str]:
     return lines + [f"not scored under {', '.join(names)}: {reason}" for reason, names in told.items()]
 
 
+def _open_truths(request: Request, sources: Sequence[Source]) -> SceneTruths:
+    """The ground truth that is asked for: a dataset's, or a folder of labels of OpenLex3D or of text files."""
+    if request.ground_truth is None:
+        return DatasetTruths(request, sources)
+    if OpenLexRelease.datasets_at(request.ground_truth):
+        _refuse_values_without_texts(request, is_text=False)
+        return OpenLexTruths(request, sources)
+    return TextTruths(request, sources)
+
+
+def _refuse_values_without_texts(request: Request, *, is_text: bool) -> None:
+    if request.truth_values is not None and not is_text:
+        raise ConfigError(
+            f"evaluate: {FLAG} says what the texts of --ground-truth hold; leave it out, there are none here"
+        )
+
+
 def _count_file_confidences(request: Request, sources: Sequence[Source]) -> bool:
     """Whether the confidences of the files count even where a protocol has 1 for every mask."""
     if request.confidences is not None:
         return request.confidences == "file"
     return all(source.reader.name == ScannetText.name for source in sources)
+
+
+def _remarks_on_files(scenes_of_remark: dict[str, list[str]], n: int) -> Iterable[str]:
+    """Each remark with the scenes, of ``n`` that have a prediction, whose files it is about."""
+    for line, scenes in scenes_of_remark.items():
+        which = scenes[0] if len(scenes) == 1 else f"{len(scenes)} of {n} scenes ({some_names(scenes)})"
+        yield f"{'every scene' if len(scenes) == n > 1 else which}: {line}"
+
+
+class Scoring:
+    """Scene after scene under the protocols that are named, or else that fit.
+
+    ``rules`` and ``outcomes`` hold, by name, the protocols that are still in and what the scenes gave so far; ``unfit``
+    says why others are out. ``file_confidences``: those of the files count where a protocol has 1 for every mask.
+    """
+
+    def __init__(
+        self, truths: SceneTruths, named: Sequence[str], texts: TextFeatures | None, *, file_confidences: bool
+    ) -> None:
+        """Choose the protocols that may score these truths; named ones that cannot are an error."""
+        self.rules: dict[str, ProtocolRules] = {}
+        self.outcomes: dict[str, SceneOutcomes] = {}
+        self.unfit: dict[str, str] = {}
+        self._truths, self._texts, self._file_confidences = truths, texts, file_confidences
+        self._is_named = bool(named)
+        self._first: Content | None = None  # the first prediction that is not empty
+        for rules in map(load_protocol, dict.fromkeys(named or protocol_names())):
+            reason = truths.why_not(rules, is_named=self._is_named)
+            if reason is None:
+                self.rules[rules.name], self.outcomes[rules.name] = rules, SceneOutcomes()
+            elif self._is_named:
+                raise ConfigError(f"protocol '{rules.name}' cannot score these predictions: {reason}")
+            else:
+                self.unfit[rules.name] = reason
+        if not self.rules:
+            raise ConfigError(f"no protocol scores {truths.where}; see su3d-bench protocols")
+
+    def rules_of(self, scene: str) -> list[ProtocolRules]:
+        """The rules under which a scene has a score."""
+        return [rules for name, rules in self.rules.items() if scene in self.outcomes[name].scores]
+
+    def add(self, scene: str, prediction: ScenePrediction, where: str) -> None:
+        """Score one scene; at the first that is not empty, protocols that do not fit go out or, when named, raise."""
+        facts = facts_of(prediction.content)
+        if any(rules.names_masks for rules in self.rules.values()):
+            facts = replace(facts, n_several=_n_under_several_labels(prediction.content))
+        why_not = {name: self._score(rules, scene, prediction, facts) for name, rules in self.rules.items()}
+        reasons = {name: reason for name, reason in why_not.items() if reason is not None}
+        for name, reason in reasons.items():
+            if self._is_named or self._first is not None:
+                raise PredictionError(f"{where}: {name}: {reason}")
+            del self.rules[name], self.outcomes[name]
+            self.unfit[name] = reason
+        if not self.rules:
+            # the one that most of them have says most: files that are missing for one alone may be nobody's
+            (first, _), *others = Counter(reasons.values()).most_common()
+            more = f" (and {len(others)} more reasons)" if others else ""
+            raise PredictionError(f"{where}: none of {len(reasons)} protocols can score it: {first}{more}")
+        is_empty = isinstance(prediction.content, VertexMasks | Instances) and not len(prediction.content)
+        if self._first is None and not is_empty:
+            self._first = prediction.content
+
+    def add_missed(self, scenes: Sequence[str]) -> Content:
+        """Scenes without a prediction: left out where the original leaves them out, otherwise counted as missed.
+
+        What stands for the prediction of one that is counted.
+        """
+        nothing = nothing_like(self._first)
+        for name, rules in self.rules.items():
+            kept = self.outcomes[name]
+            if skips_missing_scenes(rules):
+                kept.skipped += scenes
+                continue
+            for scene in scenes:
+                reason = self._score_content(rules, scene, nothing, None)
+                if reason is not None:
+                    raise DataError(f"{name}: {reason}")
+                if scene not in kept.unscored:
+                    kept.missed.append(scene)
+        return nothing
+
+    def results(self) -> tuple[tuple[ProtocolEvaluation, ...], dict[str, str]]:
+        """The numbers of all scenes, and why the other protocols have none."""
+        not_scored = dict(self.unfit)
+        protocols = []
+        for name, kept in self.outcomes.items():
+            if kept.scores:
+                protocols.append(formed(self.rules[name], kept, file_confidences=self._file_confidences))
+            else:
+                not_scored[name] = next(iter(kept.unscored.values()), "no scene was scored")
+        if not protocols:
+            raise PredictionError(f"nothing could be scored: {next(iter(not_scored.values()))}")
+        return tuple(protocols), dict(sorted(not_scored.items()))
+
+    def _score(self, rules: ProtocolRules, scene: str, prediction: ScenePrediction, facts: ContentFacts) -> str | None:
+        """The reason why a scene cannot be scored under the protocol; None where it was."""
+        has_points, kept = self._truths.has_points, self.outcomes[rules.name]
+        reason = why_not_content(rules, facts, has_points=has_points)
+        if reason is None and has_points and not self._is_named and self._first is None:
+            reason = why_not_numbers(rules, facts)
+        if reason is not None:
+            return reason
+        encoder: Encoder | str | None = None
+        if (n_dimensions := n_feature_dimensions(rules, facts)) is not None:
+            encoder = encoder_for(rules, n_dimensions, self._texts, is_own=prediction.format == OwnRuns.name)
+        if isinstance(encoder, str):
+            return encoder
+        if encoder is not None:
+            kept.encoder = encoder.name, encoder.digest
+        if facts.n and (rules.n_labels or 0) > 1:
+            content = prediction.content
+            further = content.further if isinstance(content, VertexLabels) else getattr(content, "further_labels", None)
+            given = labels_counted(rules, by_features=encoder is not None, are_several=further is not None)
+            if kept.labels not in (None, given):
+                return f"gives {given} of a point, and {kept.labels} in the scenes before; give all alike"
+            kept.labels = given
+        kept.n_masks += facts.n
+        kept.n_several += facts.n_several
+        return self._score_content(rules, scene, prediction.content, encoder)
+
+    def _score_content(self, rules: ProtocolRules, scene: str, content: Content, encoder: Encoder | None) -> str | None:
+        kept, facts = self.outcomes[rules.name], facts_of(content)
+        try:
+            truth = self._truths.of_scene(rules, scene)
+        except GroundTruthMissing as error:
+            if kept.scores or len(self._truths.scenes) > 1:
+                kept.unscored[scene] = str(error)
+                return None
+            return str(error)
+        used = with_confidences_of_files(rules) if self._file_confidences else rules
+        if isinstance(truth, VertexTruth):
+            if (reason := why_not_length(facts, len(truth.values))) is not None:
+                raise PredictionError(f"{scene}: {reason}")
+            outcome = score_on_vertices(used, truth, scene, content, encoder)
+            kept.warnings += [line for line in truth.doubts if line not in kept.warnings]
+        elif isinstance(truth, GroundTruth):
+            if (reason := why_not_length(facts, len(truth.points))) is not None:
+                return reason
+            outcome = score_on_truth(used, truth, scene, content, encoder)
+        else:
+            outcome = score_on_objects(used, truth, scene, content, encoder)
+        kept.has_coverage = self._truths.has_points
+        kept.add(scene, outcome)
+        return None
+
+
+def _n_under_several_labels(content: Content) -> int:
+    """How many masks stand there under another label too; 0 where no label is given."""
+    labels = content.class_numbers if isinstance(content, VertexMasks) else getattr(content, "labels", None)
+    if labels is None or not isinstance(content, Masks):
+        return 0
+    return int(under_several_labels(content, [*labels]).sum())

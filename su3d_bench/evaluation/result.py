@@ -1,14 +1,14 @@
-"""The numbers of an evaluation with what must stand beside them, and their JSON form."""
+"""What an evaluation is asked for; its numbers with what must stand beside them, and their JSON form."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, cast
+from pathlib import Path
+from typing import Any, Literal, cast
 
 import numpy as np
 
-from su3d_bench.core.errors import PredictionError
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
 from su3d_bench.metrics.labels import LEAST_SEVERAL, labels_counted
@@ -16,6 +16,38 @@ from su3d_bench.metrics.matching.checks import MaskFacts
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import ProtocolResult, combine, combined_metrics, metric_of, plain_json
+
+Confidences = Literal["protocol", "file"]
+ValuesForm = Literal["classes", "instances", "numbers"]
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to score: ``predictions`` are folders or files; everything else may be left out.
+
+    ``ground_truth``: a folder of <scene>.txt in ScanNet's layout, in place of the dataset's own. ``truth_values``: what
+    their values are, where that is not plain from them. ``protocols``: all that fit where none is named. ``scenes``:
+    names or patterns. ``confidences``: where a protocol has 1 for every mask, its own rule, or what the files say;
+    None: what the files say in the official script's format, which that script reads as it stands, and the protocol's
+    rule in all others. ``queries``: a file of texts and the objects that they speak of, for ``query-ap``.
+    """
+
+    predictions: tuple[Path, ...]
+    dataset: str | None = None
+    ground_truth: Path | None = None
+    truth_values: ValuesForm | None = None
+    protocols: tuple[str, ...] = ()
+    scenes: tuple[str, ...] = ()
+    format: str | None = None
+    text_features: Path | None = None
+    confidences: Confidences | None = None
+    queries: Path | None = None
+
+
+def own_name(out: Path | None) -> str:
+    """What predictions are called that nobody named: as the folder of their run, where they become one."""
+    return "predictions" if out is None else out.resolve().name
+
 
 SCHEMA = 1
 # What the file calls the metrics; the first ones of each kind are its headline.
@@ -165,45 +197,8 @@ class Evaluation:
         }
 
 
-@dataclass
-class Tally:
-    """What the scenes gave so far under the protocols that are still in, and why others are out.
-
-    ``counts_file_confidences``: those of the files count where a protocol has 1 for every mask.
-    """
-
-    rules: dict[str, ProtocolRules] = field(default_factory=dict)
-    outcomes: dict[str, SceneOutcomes] = field(default_factory=dict)
-    unfit: dict[str, str] = field(default_factory=dict)
-    counts_file_confidences: bool = False
-
-    def enter(self, rules: ProtocolRules) -> None:
-        """Score under a protocol."""
-        self.rules[rules.name], self.outcomes[rules.name] = rules, SceneOutcomes()
-
-    def leave_out(self, name: str, reason: str) -> None:
-        """Score no longer under a protocol."""
-        self.rules.pop(name, None)
-        self.outcomes.pop(name, None)
-        self.unfit[name] = reason
-
-    def evaluation(self, formats: tuple[str, ...], ground_truth: str, remarks: Sequence[str]) -> Evaluation:
-        """The numbers of all scenes; a protocol for which no scene has a truth joins those that are not scored."""
-        not_scored = dict(self.unfit)
-        for name, kept in self.outcomes.items():
-            if not kept.scores:
-                not_scored[name] = next(iter(kept.unscored.values()), "no scene was scored")
-        formed = [
-            _form(self.rules[name], kept, self.counts_file_confidences)
-            for name, kept in self.outcomes.items()
-            if kept.scores
-        ]
-        if not formed:
-            raise PredictionError(f"nothing could be scored: {next(iter(not_scored.values()))}")
-        return Evaluation(tuple(formed), dict(sorted(not_scored.items())), formats, ground_truth, tuple(_once(remarks)))
-
-
-def _form(rules: ProtocolRules, kept: SceneOutcomes, file_confidences: bool) -> ProtocolEvaluation:
+def formed(rules: ProtocolRules, kept: SceneOutcomes, *, file_confidences: bool) -> ProtocolEvaluation:
+    """The numbers of all scenes under one protocol."""
     result = combine(rules, kept.scores)
     ceilings = {scene: ceiling for scene, ceiling in kept.ceilings.items() if ceiling is not None}
     is_whole = len(ceilings) == len(kept.scores)

@@ -1,28 +1,17 @@
-"""Scene after scene under the protocols of an evaluation: which may score it, its counts, what stands beside them."""
+"""One scene under one protocol: its counts, those of the ceiling, and what must stand beside them."""
 
 from __future__ import annotations
-
-from collections import Counter
-from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from su3d_bench.core import registry
-from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, PredictionError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition, Prediction
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int64Array
-from su3d_bench.evaluation.request import Request
-from su3d_bench.evaluation.result import SceneOutcome, Tally
-from su3d_bench.evaluation.texts import encoder_for, read_text_features
-from su3d_bench.evaluation.truth import SceneTruths, VertexTruth
+from su3d_bench.evaluation.result import SceneOutcome
+from su3d_bench.evaluation.truth import VertexTruth
 from su3d_bench.metrics.fitness import (
     ContentFacts,
-    n_feature_dimensions,
-    why_not_content,
-    why_not_length,
-    why_not_numbers,
 )
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import scene_counts
@@ -33,7 +22,6 @@ from su3d_bench.metrics.instance.score import (
     named_classes,
     without_labels,
 )
-from su3d_bench.metrics.labels import labels_counted, under_several_labels
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.checks import (
     check_cloud,
@@ -51,145 +39,20 @@ from su3d_bench.metrics.matching.labelling import (
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.loading import protocol_names
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import QuestionTruth, metric_of, score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
-from su3d_bench.metrics.semantic.panoptic_quality import PanopticCounts
-from su3d_bench.metrics.semantic.panoptic_score import count_segments, told_truth
+from su3d_bench.metrics.semantic.panoptic import PanopticCounts, count_segments, told_truth
 from su3d_bench.metrics.semantic.score import with_unnamed
-from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks, ids_of
-from su3d_bench.predictions.own_runs import OwnRuns
+from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks, ids_of
 
 NOTHING = Instances.of(np.zeros((0, 3), np.float32), [], labels=())
-
-
-class Scoring:
-    """Outcomes of scene after scene under the protocols that are named, or else that fit."""
-
-    def __init__(self, request: Request) -> None:
-        self.tally = Tally()
-        self._named = request.protocols
-        self._texts = read_text_features(request.text_features)
-        self._first: Content | None = None
-
-    def begin(self, truths: SceneTruths, *, counts_file_confidences: bool) -> None:
-        """Choose the protocols that may score these truths; named ones that cannot are an error."""
-        self._truths = truths
-        self.tally.counts_file_confidences = counts_file_confidences
-        for rules in map(load_protocol, dict.fromkeys(self._named or protocol_names())):
-            reason = truths.why_not(rules, is_named=bool(self._named))
-            if reason is None:
-                self.tally.enter(rules)
-            elif self._named:
-                raise ConfigError(f"protocol '{rules.name}' cannot score these predictions: {reason}")
-            else:
-                self.tally.leave_out(rules.name, reason)
-        if not self.tally.rules:
-            raise ConfigError(f"no protocol scores {truths.where}; see su3d-bench protocols")
-
-    def add(self, scene: str, prediction: ScenePrediction, where: str) -> None:
-        """Score one scene; at the first that is not empty, protocols that do not fit go out or, when named, raise."""
-        facts = facts_of(prediction.content)
-        if any(rules.names_masks for rules in self.tally.rules.values()):
-            facts = replace(facts, n_several=_n_under_several_labels(prediction.content))
-        outcomes = {name: self._score(rules, scene, prediction, facts) for name, rules in self.tally.rules.items()}
-        reasons = {name: reason for name, reason in outcomes.items() if reason is not None}
-        for name, reason in reasons.items():
-            if self._named or self._first is not None:
-                raise PredictionError(f"{where}: {name}: {reason}")
-            self.tally.leave_out(name, reason)
-        if not self.tally.rules:
-            # the one that most of them have says most: files that are missing for one alone may be nobody's
-            (first, _), *others = Counter(reasons.values()).most_common()
-            more = f" (and {len(others)} more reasons)" if others else ""
-            raise PredictionError(f"{where}: none of {len(reasons)} protocols can score it: {first}{more}")
-        if self._first is None and not _is_empty(prediction.content):
-            self._first = prediction.content
-
-    def rules_of(self, scene: str) -> list[ProtocolRules]:
-        """The rules under which a scene has a score."""
-        return [rules for name, rules in self.tally.rules.items() if scene in self.tally.outcomes[name].scores]
-
-    def add_missed(self, scenes: Sequence[str]) -> Content:
-        """Scenes without a prediction: left out where the original leaves them out, otherwise counted as missed.
-
-        What stands for the prediction of one that is counted.
-        """
-        nothing = nothing_like(self._first)
-        for rules in self.tally.rules.values():
-            kept = self.tally.outcomes[rules.name]
-            if skips_missing_scenes(rules):
-                kept.skipped += scenes
-                continue
-            for scene in scenes:
-                reason = self._score_content(rules, scene, nothing, None)
-                if reason is not None:
-                    raise DataError(f"{rules.name}: {reason}")
-                if scene not in kept.unscored:
-                    kept.missed.append(scene)
-        return nothing
-
-    def _score(self, rules: ProtocolRules, scene: str, prediction: ScenePrediction, facts: ContentFacts) -> str | None:
-        """The reason why a scene cannot be scored under the protocol; None where it was."""
-        has_points, kept = self._truths.has_points, self.tally.outcomes[rules.name]
-        reason = why_not_content(rules, facts, has_points=has_points)
-        if reason is None and has_points and not self._named and self._first is None:
-            reason = why_not_numbers(rules, facts)
-        if reason is not None:
-            return reason
-        encoder: Encoder | str | None = None
-        if (n_dimensions := n_feature_dimensions(rules, facts)) is not None:
-            encoder = encoder_for(rules, n_dimensions, self._texts, is_own=prediction.format == OwnRuns.name)
-        if isinstance(encoder, str):
-            return encoder
-        if encoder is not None:
-            kept.encoder = encoder.name, encoder.digest
-        if facts.n and (rules.n_labels or 0) > 1:
-            content = prediction.content
-            further = content.further if isinstance(content, VertexLabels) else getattr(content, "further_labels", None)
-            given = labels_counted(rules, by_features=encoder is not None, are_several=further is not None)
-            if kept.labels not in (None, given):
-                return f"gives {given} of a point, and {kept.labels} in the scenes before; give all alike"
-            kept.labels = given
-        kept.n_masks += facts.n
-        kept.n_several += facts.n_several
-        return self._score_content(rules, scene, prediction.content, encoder)
-
-    def _score_content(self, rules: ProtocolRules, scene: str, content: Content, encoder: Encoder | None) -> str | None:
-        kept, facts = self.tally.outcomes[rules.name], facts_of(content)
-        try:
-            truth = self._truths.of_scene(rules, scene)
-        except GroundTruthMissing as error:
-            if kept.scores or len(self._truths.scenes) > 1:
-                kept.unscored[scene] = str(error)
-                return None
-            return str(error)
-        used = with_confidences_of_files(rules) if self.tally.counts_file_confidences else rules
-        if isinstance(truth, VertexTruth):
-            if (reason := why_not_length(facts, len(truth.values))) is not None:
-                raise PredictionError(f"{scene}: {reason}")
-            outcome = score_on_vertices(used, truth, scene, content, encoder)
-            kept.warnings += [line for line in truth.doubts if line not in kept.warnings]
-        elif isinstance(truth, GroundTruth):
-            if (reason := why_not_length(facts, len(truth.points))) is not None:
-                return reason
-            outcome = score_on_truth(used, truth, scene, content, encoder)
-        else:
-            outcome = score_on_objects(used, truth, scene, content, encoder)
-        kept.has_coverage = self._truths.has_points
-        kept.add(scene, outcome)
-        return None
 
 
 def with_confidences_of_files(rules: ProtocolRules) -> ProtocolRules:
     """The rules with the predictions' own confidences where a protocol has 1 for every mask."""
     return rules.model_copy(update={"confidence": "prediction"}) if rules.confidence == "ones" else rules
-
-
-def _is_empty(content: Content) -> bool:
-    return isinstance(content, VertexMasks | Instances) and not len(content)
 
 
 def skips_missing_scenes(rules: ProtocolRules) -> bool:
@@ -203,14 +66,6 @@ def skips_missing_scenes(rules: ProtocolRules) -> bool:
     if rules.metric != "scannet" or rules.name not in protocol_names() or stops:
         return False
     return not any(getattr(registry.load("dataset", name), "renders_frames", False) for name in rules.datasets)
-
-
-def _n_under_several_labels(content: Content) -> int:
-    """How many masks stand there under another label too; 0 where no label is given."""
-    labels = content.class_numbers if isinstance(content, VertexMasks) else getattr(content, "labels", None)
-    if labels is None or not isinstance(content, Masks):
-        return 0
-    return int(under_several_labels(content, [*labels]).sum())
 
 
 def facts_of(content: Content) -> ContentFacts:

@@ -9,12 +9,10 @@ from __future__ import annotations
 import fnmatch
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from su3d_bench.core import registry
 from su3d_bench.core.digests import digest_file
@@ -22,33 +20,24 @@ from su3d_bench.core.errors import (
     ConfigError,
     DataError,
     GroundTruthMissing,
-    PredictionError,
-    converted,
-    printable,
-    reading,
     shown,
     suggest,
 )
 from su3d_bench.core.interfaces import IsAligned, NamesCategories
 from su3d_bench.core.registry import FILES_OF_TRUTH
-from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import GroundTruth, Int64Array
 from su3d_bench.datasets.openlex3d.release import FACE_CORNERS, VISIBLE, OpenLexRelease
-from su3d_bench.evaluation.request import Request
-from su3d_bench.evaluation.truth_values import FLAG, TruthValues, check_said
-from su3d_bench.formats.arrays import MOST_POINTS
-from su3d_bench.formats.text_integers import integer_lines
-from su3d_bench.metrics.fitness import ID_LISTS, LARGEST_NYU40_ID, TruthFacts, list_of_ids, why_not_truth
+from su3d_bench.evaluation.result import Request
+from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
 from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth
-from su3d_bench.predictions.base import scene_files
 from su3d_bench.predictions.scenes import Match, Source, is_known, match_scenes, planned_scenes
-from su3d_bench.questions.files.datasets import is_foreign, read_foreign_queries
-from su3d_bench.questions.files.queries import VARIANT as QUERY_OBJECTS
-from su3d_bench.questions.files.queries import query_truth, read_query_file
-from su3d_bench.runs.planning.scenes import data_root
+from su3d_bench.questions.query_files import VARIANT as QUERY_OBJECTS
+from su3d_bench.questions.query_files import query_truth, read_query_file
+from su3d_bench.questions.question_files import is_foreign, read_foreign_queries
+from su3d_bench.runs.scenes import data_root
 from su3d_bench.store.records import TruthRecord
 
 NOT_MEANT = "is not meant for"
@@ -111,19 +100,6 @@ class SceneTruths(ABC):
         """What a protocol scores a scene against; ``GroundTruthMissing`` where there is none in its form."""
 
 
-def kind_of_truth(request: Request) -> Callable[[Request, Sequence[Source]], SceneTruths]:
-    """The kind of truth that is asked for, to be opened with the request and the predictions."""
-    check_said(request.truth_values, is_text=request.ground_truth is not None)
-    return DatasetTruths if request.ground_truth is None else _folder_truths
-
-
-def _folder_truths(request: Request, sources: Sequence[Source]) -> SceneTruths:
-    assert request.ground_truth is not None
-    kind = OpenLexTruths if OpenLexRelease.datasets_at(request.ground_truth) else TextTruths
-    check_said(request.truth_values, is_text=kind is TextTruths)
-    return kind(request, sources)
-
-
 # ---- datasets
 
 
@@ -170,7 +146,7 @@ class DatasetTruths(SceneTruths):
 
     def why_not(self, rules: ProtocolRules, *, is_named: bool) -> str | None:
         if rules.ground_truth == QUERY_OBJECTS:
-            return _why_no_queries(is_named=is_named) if self._queries is None else None
+            return why_no_queries(is_named=is_named) if self._queries is None else None
         if not is_named and (self.dataset_name not in rules.datasets or not rules.by_default):
             return f"{NOT_MEANT} {self.dataset_name} unless it is named"
         return why_not_truth(rules, TruthFacts.of_dataset(self._dataset))
@@ -201,7 +177,7 @@ class DatasetTruths(SceneTruths):
         return self._kept[scene, variant]
 
 
-def _why_no_queries(*, is_named: bool) -> str:
+def why_no_queries(*, is_named: bool) -> str:
     return "needs --queries FILE" if is_named else f"{NOT_MEANT} scenes without queries"
 
 
@@ -244,6 +220,20 @@ def choose_scenes(words: Sequence[str], known: Sequence[str], where: str) -> lis
             raise DataError(f"no scene of {where} matches '{word}'{hint}")
         chosen.update(dict.fromkeys(matching))
     return list(chosen)
+
+
+def dataset_of_names(scenes: Iterable[str]) -> str | None:
+    """The dataset whose scenes have such names; None where that cannot be told.
+
+    >>> dataset_of_names(["scene0011_00", "scene0011_01"]), dataset_of_names(["a"])
+    ('scannet', None)
+    """
+    names = list(scenes)
+    for dataset in registry.names("dataset"):
+        form = getattr(registry.load("dataset", dataset), "scene_names", None)
+        if form is not None and names and all(re.fullmatch(form, name) for name in names):
+            return dataset
+    return None
 
 
 # ---- OpenLex3D
@@ -305,116 +295,3 @@ def _labelled_release(request: Request, sources: Sequence[Source]) -> OpenLexRel
 def _names_one(word: str, scenes: Sequence[str]) -> bool:
     """Whether a scene, a pattern of scenes or a prediction's name fits one of ``scenes``."""
     return "/" not in word and (bool(fnmatch.filter(scenes, word)) or is_known(word, scenes))
-
-
-# ---- texts
-
-
-class TextTruths(SceneTruths):
-    """Labels of points without coordinates; what values mean is said, or told from all scenes together."""
-
-    has_points = False
-
-    def __init__(self, request: Request, sources: Sequence[Source]) -> None:
-        assert request.ground_truth is not None
-        every_file = text_scenes(request.ground_truth)
-        self.where = shown(request.ground_truth)
-        chosen = choose_scenes(request.scenes, list(every_file), self.where) if request.scenes else list(every_file)
-        self._files = {scene: every_file[scene] for scene in chosen}
-        self.scenes = tuple(chosen)
-        self.dataset_name = dataset_of_names(chosen)
-        if request.dataset is not None:
-            self.dataset_name = str(registry.load("dataset", request.dataset).name)
-        left_out = set(every_file) - set(chosen)
-        sources = [
-            replace(source, scenes=tuple(name for name in source.scenes if name not in left_out)) for source in sources
-        ]
-        requested = chosen if request.scenes else ()
-        self.matches, self.remarks = match_scenes(sources, chosen, self.dataset_name, self.where, requested)
-        self._values = {match.scene: read_values(self._files[match.scene]) for match in self.matches}
-        self._said = request.truth_values
-        self._path = request.ground_truth
-        self._range = self._all = TruthValues.of(self._values.values(), self._said)
-        if self.matches and self.dataset_name is None and not request.protocols:
-            raise ConfigError(
-                f"{self.where}: whose labels are these? name the protocol with --protocol or the dataset with --dataset"
-            )
-
-    @property
-    def record(self) -> TruthRecord:
-        return TruthRecord(None, str(self._path), self._said)
-
-    def digest(self, scene: str) -> str:
-        return digest_file(self._files[scene])
-
-    def why_not(self, rules: ProtocolRules, *, is_named: bool) -> str | None:
-        if rules.ground_truth == QUERY_OBJECTS:
-            return _why_no_queries(is_named=is_named)
-        if rules.asks and not is_named:
-            return f"{NOT_MEANT} texts"
-        if not is_named and (self.dataset_name not in rules.datasets or not rules.by_default):
-            return f"{NOT_MEANT} {self.dataset_name}"
-        facts = TruthFacts(self.where, None, (), has_points=False)
-        reason = why_not_truth(rules, facts) or self._range.why_not(rules)
-        if reason is not None or is_named or rules.ground_truth not in ID_LISTS:
-            return reason
-        if self._range.form(rules) == "numbers":
-            return None
-        variant = list_of_ids(largest := self._range.largest_label(rules))
-        if variant == rules.ground_truth:
-            return None
-        other = "; name the protocol where they are of its own list" if largest <= LARGEST_NYU40_ID else ""
-        return f"the labels of the ground truth go up to {largest}, as {ID_LISTS[variant]}{other}"
-
-    def of_scene(self, rules: ProtocolRules, scene: str) -> VertexTruth:
-        if scene not in self._values:  # missed: the doubts speak of all that are scored
-            self._values |= {name: read_values(file) for name, file in self._files.items() if name not in self._values}
-            self._all = TruthValues.of(self._values.values(), self._said)
-        if self._all.form(rules) != self._range.form(rules):
-            raise DataError(
-                f"{self.where}: the values of scenes without a prediction go up to {self._all.highest}, those of the "
-                f"others to {self._range.highest}; say what they are with {FLAG} classes, instances or numbers"
-            )
-        values, labels = self._range.read(self._values[scene], rules)
-        return VertexTruth(values, labels, self._all.doubts(rules))
-
-
-def text_scenes(folder: Path) -> dict[str, Path]:
-    """Scene -> its file in a folder of ground truth."""
-    if not folder.is_dir():
-        raise DataError(f"{shown(folder)}: no such folder; give the one with <scene>.txt, one value a point")
-    with converted(PredictionError, DataError):
-        files = scene_files(folder, (".txt",))
-    if odd := next((name for name in files if not name.isprintable()), None):
-        raise DataError(f"{shown(folder)}: holds a file '{printable(odd, 80)}'; name files after scenes")
-    if not files:
-        raise DataError(f"{shown(folder)}: has no .txt file; expected <scene>.txt, one value a point")
-    return files
-
-
-def read_values(path: Path) -> Int64Array:
-    """One value a point of a scene: a class id, or class id * 1000 + instance."""
-    where = shown(path)
-    with converted(PredictionError, DataError), reading(where, DataError):
-        values = integer_lines(file_bytes(path), where).astype(np.int64)
-    if not 0 < len(values) <= MOST_POINTS:
-        raise DataError(f"{where}: has {len(values)} values; expected one a point of the scene")
-    is_wrong = (values < 0) | (values > LARGEST_VALUE)
-    if is_wrong.any():
-        line = int(np.argmax(is_wrong))
-        raise DataError(f"{where}:{line + 1}: {int(values[line])} is no class id * 1000 + instance; expected 0 or more")
-    return values
-
-
-def dataset_of_names(scenes: Iterable[str]) -> str | None:
-    """The dataset whose scenes have such names; None where that cannot be told.
-
-    >>> dataset_of_names(["scene0011_00", "scene0011_01"]), dataset_of_names(["a"])
-    ('scannet', None)
-    """
-    names = list(scenes)
-    for dataset in registry.names("dataset"):
-        form = getattr(registry.load("dataset", dataset), "scene_names", None)
-        if form is not None and names and all(re.fullmatch(form, name) for name in names):
-            return dataset
-    return None

@@ -1,4 +1,4 @@
-"""What is asked for, what of it is missing here, and how it comes to its place: brought, checked, unpacked, moved.
+"""What is asked for, what of it is missing here, and how it comes to its place: downloaded, checked, unpacked, moved.
 
 Below the root (of models, of data) lies ``.fetched``: what is under way, and the record. Into the place where datasets
 and models are looked for goes only what is whole: scenes and files of models are moved there by their names.
@@ -8,13 +8,18 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache
 from pathlib import Path, PurePosixPath
 
+from pydantic import TypeAdapter, ValidationError
+
 from su3d_bench.core.errors import ConfigError, DataError, ModelMissing, StoreError
-from su3d_bench.core.files.atomic import make_folder, write_error
+from su3d_bench.core.files.atomic import make_folder, write_error, write_json
 from su3d_bench.core.files.locks import clear_unfinished, hold_folder
+from su3d_bench.core.system.files import file_bytes
 from su3d_bench.datasets.replica.folders import (
     OFFICIAL_SCENES,
     ORIGINAL_FILES,
@@ -22,24 +27,59 @@ from su3d_bench.datasets.replica.folders import (
     find_render_tree,
 )
 from su3d_bench.fetching.archives import members, unpack_tar_gz, unpack_zip
-from su3d_bench.fetching.checksums import Stated, checked
-from su3d_bench.fetching.download import Patience, Wanted, Watch, bring, unfinished_bytes
+from su3d_bench.fetching.download import Patience, Stated, Wanted, Watch, bring, checked, part_of, size_of
 from su3d_bench.fetching.hub import hub_files
-from su3d_bench.fetching.record import (
-    STATE,
-    Arrived,
-    record_path,
-    recorded_sha256,
-    unpacked_names,
-    write_arrival,
-    write_unpacked,
-)
 from su3d_bench.fetching.sources import Source, Sources
 from su3d_bench.perception.models.catalogue import MODELS, PAPERS_ENCODERS, PROFILE_MODELS
 from su3d_bench.perception.models.files import locate
 
 RENDER, ORIGINAL = "Replica", "replica_v1"  # folders of the two trees, as the archives' own names have them
-UNPACKED = "unpacked"
+FETCHED, UNPACKED = ".fetched", "unpacked"
+
+
+@dataclass(frozen=True)
+class Arrived:
+    """One file as it came; ``held_against`` names what its content agreed with, empty where nobody states anything."""
+
+    source: str
+    name: str
+    address: str
+    n_bytes: int
+    sha256: str
+    held_against: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Record:
+    """``record.json`` below ``.fetched``: files by ``source/name``, and what an archive was unpacked to by source."""
+
+    files: dict[str, Arrived] = field(default_factory=dict)
+    unpacked: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+@cache
+def _records() -> TypeAdapter[Record]:
+    return TypeAdapter(Record)
+
+
+def record_path(root: Path) -> Path:
+    return root / FETCHED / "record.json"
+
+
+def read_record(root: Path) -> Record:
+    """What was brought below ``root``."""
+    path = record_path(root)
+    try:
+        return _records().validate_json(file_bytes(path)) if path.exists() else Record()
+    except (OSError, ValidationError) as error:
+        raise StoreError(f"{path}: is no record of what was fetched; move it away to begin another") from error
+
+
+def write_arrival(root: Path, arrived: Arrived) -> None:
+    """Keep what is known of a file; the entry of an earlier one of its name is replaced."""
+    record = read_record(root)
+    record.files[f"{arrived.source}/{arrived.name}"] = arrived
+    write_json(record_path(root), asdict(record))
 
 
 @dataclass(frozen=True)
@@ -52,7 +92,8 @@ class Planned:
 
     @property
     def state(self) -> Path:
-        return self.root / STATE / self.source.name
+        """Where it lies until it is whole."""
+        return self.root / FETCHED / self.source.name
 
 
 @dataclass(frozen=True)
@@ -95,7 +136,7 @@ def plan_replica(sources: Sources, names: Sequence[str], root: Path) -> list[Pla
 def _replica_here(source: Source, root: Path) -> Path | None:
     """Where it lies: all that an earlier call unpacked, or the official scenes, however they came."""
     place = root / (RENDER if source.archive == "zip" else ORIGINAL)
-    names = unpacked_names(root, source.name)
+    names = read_record(root).unpacked.get(source.name, ())
     if names and all((place / name).exists() for name in names):
         return place
     if source.archive == "zip":
@@ -115,16 +156,37 @@ def fetch(planned: Planned, watch: Watch, patience: Patience | None = None, *, k
     assert planned.here is None
     source, root = planned.source, planned.root
     wanted = hub_files(source) if source.hub is not None else plain_files(source)
-    place = root / source.name if source.archive is None else root
+    place = root / source.name
     missing = wanted if source.archive is not None else [file for file in wanted if not _is_there(file, place)]
     check_space(planned, missing)
-    arrived = tuple(bring_file(planned, file, watch, patience) for file in missing)
-    if source.archive is None:
-        _move_files([planned.state / file.name for file in missing], place)
-        _remove(planned.state)
-        return Brought(source, place, arrived, _remarks(planned, arrived))
-    there, left = _unpack(planned, watch, keep_archives=keep_archives)
-    return Brought(source, there, arrived, (*_remarks(planned, arrived), *left))
+    with held_state(planned):
+        arrived = tuple(bring_file(planned, file, watch, patience) for file in missing)
+        left: list[str] = []
+        if source.archive is None:  # the weights last, without which nothing takes the folder for a model
+            move([planned.state / file.name for file in missing], place)
+        else:
+            place, left = _unpack(planned, watch)
+        if keep_archives:
+            shutil.rmtree(planned.state / UNPACKED, ignore_errors=True)
+        else:
+            shutil.rmtree(planned.state, ignore_errors=True)
+    return Brought(source, place, arrived, (*_remarks(planned, arrived), *left))
+
+
+@contextmanager
+def held_state(planned: Planned) -> Iterator[None]:
+    """Keep other processes from fetching the same source meanwhile."""
+    make_folder(planned.state)
+    try:
+        handle = hold_folder(planned.state)
+    except BlockingIOError:
+        raise StoreError(f"{planned.state}: another process fetches it; wait for its end and try again") from None
+    except OSError as error:
+        raise write_error(planned.state, error) from error
+    try:
+        yield
+    finally:
+        os.close(handle)
 
 
 def plain_files(source: Source) -> list[Wanted]:
@@ -137,18 +199,20 @@ def plain_files(source: Source) -> list[Wanted]:
 
 def bring_file(planned: Planned, wanted: Wanted, watch: Watch, patience: Patience | None = None) -> Arrived:
     """Bring one file into the state of ``planned``, where it may lie already, and record it."""
-    place = planned.state / wanted.name
-    known = None if wanted.stated.is_published else recorded_sha256(planned.root, planned.source.name, wanted.name)
+    place, known = planned.state / wanted.name, None
+    if not wanted.stated.is_published:
+        first = read_record(planned.root).files.get(f"{planned.source.name}/{wanted.name}")
+        known = None if first is None else first.sha256
     wanted = replace(wanted, stated=replace(wanted.stated, recorded=known))
     if place.is_file():
         sha256, wrong = checked(place, wanted.stated)
         if wrong is not None or wanted.n_bytes not in (None, place.stat().st_size):
-            raise DataError(f"{place}: {wrong or 'has another size than is stated'}; delete it and fetch anew")
+            raise DataError(f"{place}: {wrong or 'has another size than is stated'}; delete it and fetch it again")
     else:
         try:
             sha256 = bring(wanted, place, watch, patience)
         except DataError as error:
-            if known is not None and "first download" in str(error):
+            if known is not None and known in str(error):
                 raise DataError(f"{error}; the first one is recorded in {record_path(planned.root)}") from error
             raise
     n_bytes = place.stat().st_size
@@ -162,7 +226,8 @@ def check_space(planned: Planned, files: Sequence[Wanted]) -> None:
     """``StoreError`` where the disk lacks the room for what is still to come; a zip archive needs it twice."""
     sizes = [file.n_bytes for file in files]
     total = sum(size for size in sizes if size is not None) if None not in sizes else planned.source.n_bytes or 0
-    held = sum(_size(planned.state / file.name) or unfinished_bytes(planned.state / file.name) for file in files)
+    places = [planned.state / file.name for file in files]
+    held = sum(size_of(place) or size_of(part_of(place)) for place in places)
     needed = total - held + (total if planned.source.archive == "zip" else 0)
     check_room(planned.root, needed, planned.source.name)
 
@@ -178,13 +243,6 @@ def check_room(root: Path, needed: int, what: str) -> None:
         )
 
 
-def _size(path: Path) -> int:
-    try:
-        return path.stat().st_size
-    except OSError:
-        return 0
-
-
 def _is_there(wanted: Wanted, place: Path) -> bool:
     path = place / wanted.name
     if not path.exists():
@@ -195,52 +253,46 @@ def _is_there(wanted: Wanted, place: Path) -> bool:
     return True
 
 
-def _move_files(files: Sequence[Path], folder: Path) -> None:
+def move(paths: Sequence[Path], folder: Path) -> None:
+    """Move files and folders into ``folder``, one after another."""
     make_folder(folder)
-    for file in files:  # the weights last, without which nothing takes the folder for a model
+    for path in paths:
         try:
-            os.replace(file, folder / file.name)
+            os.replace(path, folder / path.name)
         except OSError as error:
-            raise write_error(folder / file.name, error) from error
+            raise write_error(folder / path.name, error) from error
 
 
-def _unpack(planned: Planned, watch: Watch, *, keep_archives: bool) -> tuple[Path, list[str]]:
+def _unpack(planned: Planned, watch: Watch) -> tuple[Path, list[str]]:
     """Unpack what lies in the state, and move each scene to its place; where the scenes lie, and what is to be said."""
-    source, state = planned.source, planned.state
-    archives = [state / file.name for file in source.files]
-    folder = state / UNPACKED
+    source = planned.source
+    archives = [planned.state / file.name for file in source.files]
+    folder = planned.state / UNPACKED
     make_folder(folder)
-    handle = _held(folder)
     try:
         if source.archive == "zip":
             room = sum(size for name, size in members(archives[0]) if _rendered(PurePosixPath(name)) is not None)
-            check_room(planned.root, room - _size_of_tree(folder), f"{source.name}, unpacked,")
+            held = sum(size_of(path) for path in folder.rglob("*"))
+            check_room(planned.root, room - held, f"{source.name}, unpacked,")
             n, top = unpack_zip(archives[0], folder, _rendered, watch), RENDER
         else:
             n, top = unpack_tar_gz(archives, folder, _annotated, watch), ORIGINAL
         if not n:
             raise DataError(f"{archives[0]}: holds nothing of {source.what}; name the right one with --mirror")
-        place = planned.root / top
-        names = [path.name for path in (folder / top).iterdir()]
-        left = _move_tree(folder / top, place)
-        write_unpacked(planned.root, source.name, sorted(names))
     except DataError:
-        _remove(folder)  # what came out of a damaged archive is not to be passed over by the next call
+        shutil.rmtree(folder, ignore_errors=True)  # what came out of a damaged archive is not to be kept
         raise
-    finally:
-        if handle is not None:
-            os.close(handle)
-    _remove(folder if keep_archives else state)
+    place = planned.root / top
+    for above, _, _ in os.walk(folder):
+        clear_unfinished(Path(above))
+    # Loose files (cam_params.json) first: with a scene's folder a dataset is there.
+    unpacked = sorted((folder / top).iterdir(), key=lambda path: (path.is_dir(), path.name))
+    left = [path.name for path in unpacked if (place / path.name).exists()]
+    move([path for path in unpacked if path.name not in left], place)
+    record = read_record(planned.root)
+    record.unpacked[source.name] = tuple(sorted(path.name for path in unpacked))
+    write_json(record_path(planned.root), asdict(record))
     return place, [f"{name} was there already and is left as it is" for name in left]
-
-
-def _held(folder: Path) -> int | None:
-    try:
-        return hold_folder(folder)
-    except BlockingIOError:
-        raise StoreError(f"{folder}: another process is unpacking there; wait for its end") from None
-    except OSError:  # a disk without locks
-        return None
 
 
 def _rendered(path: PurePosixPath) -> PurePosixPath | None:
@@ -255,40 +307,13 @@ def _annotated(path: PurePosixPath) -> PurePosixPath | None:
     return PurePosixPath(ORIGINAL, *path.parts[-3:])
 
 
-def _size_of_tree(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-
-
-def _move_tree(unpacked: Path, place: Path) -> list[str]:
-    """Move what lies in ``unpacked`` to ``place``, a scene at a time; the names of what is there and stays as it is."""
-    left = []
-    for folder, _, _ in os.walk(unpacked):
-        clear_unfinished(Path(folder))
-    make_folder(place)
-    # Loose files (cam_params.json) first: with a scene's folder a dataset is there.
-    for child in sorted(unpacked.iterdir(), key=lambda path: (path.is_dir(), path.name)):
-        target = place / child.name
-        if target.exists():
-            left.append(child.name)
-            continue
-        try:
-            os.rename(child, target)
-        except OSError as error:
-            raise write_error(target, error) from error
-    return left
-
-
-def _remove(folder: Path) -> None:
-    shutil.rmtree(folder, ignore_errors=True)
-
-
 def _remarks(planned: Planned, arrived: Sequence[Arrived]) -> tuple[str, ...]:
     remarks = []
     if unstated := [file.name for file in arrived if not file.held_against]:
         first = unstated[0] + (f" and {len(unstated) - 1} more" if len(unstated) > 1 else "")
         remarks.append(
             f"the publisher states no checksum of {first}: that of this first download is recorded in "
-            f"{record_path(planned.root)}, and the next one is held against it"
+            f"{record_path(planned.root)}, and the next one is compared with it"
         )
     if planned.source.name == "ram-plus":
         remarks.append("RAM++ runs through its own package or an export of it; see docs/methods/models.md")

@@ -1,31 +1,80 @@
-"""One file brought here whole or not at all: taken up where it broke off, bounded, held against its checksums.
+"""One file downloaded whole or not at all: resumed where it broke off, bounded, checked against its checksums.
 
-What has come so far lies beside its place under the name that ``store.unfinished`` gives, held by a lock, with a note
-of the server's state beside it; it takes its place when size and checksum are right.
+What has arrived lies beside its place as ``NAME.part``. No library does this: pooch 1.9 begins a broken download again,
+and huggingface_hub resumes files of its own hub alone and leaves their SHA-256 unchecked.
 """
 
 from __future__ import annotations
 
+import hashlib
 import http.client
 import os
 import time
-from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
-from su3d_bench.core.errors import DataError, StoreError, printable
-from su3d_bench.core.files.atomic import read_json, write_error, write_json
-from su3d_bench.core.files.locks import SHARED, beside, own_file
-from su3d_bench.fetching.checksums import Stated, checked
-from su3d_bench.fetching.http import TIMEOUT_S, Answer, Broken, Stale, Validator, ask
-from su3d_bench.fetching.sources import MOST_BYTES
+from su3d_bench.core.errors import DataError, printable
+from su3d_bench.core.files.atomic import write_error, write_text
+from su3d_bench.core.system.files import file_text, opened
+from su3d_bench.fetching.sources import MOST_BYTES, check_address
 
-PIECE = 1 << 18
-MOST_STARTS_ANEW = 2  # of one file in one command: a server that changes it each time is given up
-
+PIECE = 1 << 20
+MAX_REDIRECTS = 5
+STATUS_TO_RETRY = (408, 425, 429)
 Watch = Callable[[str, int, int | None], None]
+
+
+@dataclass(frozen=True)
+class Stated:
+    """What is said of a file's content: ``git_blob`` is git's SHA-1 of it, ``recorded`` the SHA-256 of an earlier one.
+
+    ``md5_prefix``: how the MD5 begins. Bytes are hexadecimal digits in lower case.
+    """
+
+    sha256: str | None = None
+    md5_prefix: str | None = None
+    git_blob: str | None = None
+    recorded: str | None = None
+
+    @property
+    def is_published(self) -> bool:
+        return bool(self.sha256 or self.md5_prefix or self.git_blob)
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """What a file is checked against, in words."""
+        kinds = (
+            (self.sha256, "published SHA-256"),
+            (self.md5_prefix, f"published beginning of the MD5 ({self.md5_prefix})"),
+            (self.git_blob, "published git blob"),
+            (self.recorded, "SHA-256 of the first download"),
+        )
+        return tuple(words for value, words in kinds if value)
+
+
+def checked(path: Path, stated: Stated) -> tuple[str, str | None]:
+    """The SHA-256 of a file, and what of ``stated`` it contradicts, in words; None where it agrees with all."""
+    sha256, md5 = hashlib.sha256(), hashlib.md5(usedforsecurity=False)
+    blob = hashlib.sha1(b"blob %d\0" % path.stat().st_size, usedforsecurity=False)
+    wanted = [sha256, *([md5] if stated.md5_prefix else []), *([blob] if stated.git_blob else [])]
+    with opened(path) as stream:
+        while piece := stream.read(PIECE):
+            for digest in wanted:
+                digest.update(piece)
+    found = sha256.hexdigest()
+    if stated.sha256 not in (None, found):
+        return found, f"SHA-256 is {found}, published is {stated.sha256}"
+    if stated.md5_prefix is not None and not md5.hexdigest().startswith(stated.md5_prefix):
+        return found, f"MD5 is {md5.hexdigest()}, its published beginning {stated.md5_prefix}"
+    if stated.git_blob not in (None, blob.hexdigest()):
+        return found, f"git's SHA-1 is {blob.hexdigest()}, published is {stated.git_blob}"
+    if stated.recorded not in (None, found):
+        return found, f"SHA-256 is {found}, that of the first download was {stated.recorded}"
+    return found, None
 
 
 @dataclass(frozen=True)
@@ -41,184 +90,176 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Patience:
-    """How often a broken download is taken up again, counted anew when bytes came, and after which pause at first."""
+    """How often a broken download is resumed, counted again whenever bytes came, and after which pause at first."""
 
     n_retries: int = 3
     pause_s: float = 1.0
-    timeout_s: float = TIMEOUT_S
+    timeout_s: float = 30.0  # without a byte
 
 
-def unfinished_bytes(place: Path) -> int:
-    """How much of the file that is to lie at ``place`` has come so far."""
-    try:
-        return beside(place, SHARED).stat().st_size
-    except OSError:
-        return 0
+class _Broken(Exception):
+    """The connection failed or broke off; the next attempt may do better."""
+
+
+def part_of(place: Path) -> Path:
+    """Where the file that is to lie at ``place`` lies until it is whole."""
+    return place.with_name(f"{place.name}.part")
+
+
+def size_of(path: Path) -> int:
+    """The bytes of a file; 0 where there is none."""
+    return path.stat().st_size if path.is_file() else 0
 
 
 def bring(wanted: Wanted, place: Path, watch: Watch, patience: Patience | None = None) -> str:
     """Put the file at ``place``, where nothing is, and give its SHA-256; ``watch`` hears how much has come.
 
-    Raises ``StoreError`` where the disk refuses or another process brings the same, and ``DataError`` where the server
-    does not give the file that was stated; what has come of it by then is kept, unless it is known to be wrong.
+    Raises ``StoreError`` where the disk refuses, and ``DataError`` where the server does not give the file that was
+    stated; what has come of it by then is kept, unless it is known to be wrong. One process at a time.
     """
-    patience = patience or Patience()
-    part = beside(place, SHARED)
-    try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        handle = own_file(part, os.O_RDWR | os.O_CREAT)
-    except OSError as error:
-        raise write_error(place, error) from error
-    if handle is None:
-        raise StoreError(f"{place}: another process is bringing it; wait for its end and run the same command again")
-    with os.fdopen(handle, "r+b") as stream:
-        _Download(wanted, place, stream, watch, patience).run()
-        sha256, wrong = checked(part, wanted.stated)
-        if wrong is not None:
-            _forget(part, place)
-            raise DataError(
-                f"{place.name} from {wanted.address}: {wrong}; it was thrown away: run the same command again, or name "
-                "a mirror with --mirror"
-            )
+    patience, part, n_idle = patience or Patience(), part_of(place), 0
+    while True:
+        n_before = size_of(part)
         try:
-            os.fsync(stream.fileno())
-            os.replace(part, place)
-        except OSError as error:
-            raise write_error(place, error) from error
-    _note(place).unlink(missing_ok=True)
+            _receive(wanted, part, watch, patience.timeout_s)
+            break
+        except _Broken as error:
+            n_held = size_of(part)
+            n_idle = 1 if n_held > n_before else n_idle + 1
+            if n_idle > patience.n_retries:
+                come = f"{n_held:,} bytes of it are here" if n_held else "nothing of it is here"
+                raise DataError(
+                    f"{wanted.address}: {printable(str(error), 200)}; {come}, and the same command goes on from there"
+                ) from None
+            time.sleep(min(patience.pause_s * 2 ** (n_idle - 1), 60.0))
+    sha256, wrong = checked(part, wanted.stated)
+    if wrong is None:
+        os.replace(part, place)
+    part.unlink(missing_ok=True)
+    _state_of(part).unlink(missing_ok=True)
+    if wrong is not None:
+        raise DataError(
+            f"{place.name} from {wanted.address}: {wrong}; it was thrown away: run the same command again, or name "
+            "a mirror with --mirror"
+        )
     return sha256
 
 
-def _note(place: Path) -> Path:
-    """Where it is kept which state of the server's file the unfinished one is the beginning of."""
-    return place.with_name(f".{place.name}.state.json")
+def _state_of(part: Path) -> Path:
+    """Where the address and the entity tag are kept of the file whose beginning ``part`` is."""
+    return part.with_name(f"{part.name}.state")
 
 
-def _forget(part: Path, place: Path) -> None:
-    for path in (part, _note(place)):
-        with suppress(OSError):
-            path.unlink(missing_ok=True)
+def _receive(wanted: Wanted, part: Path, watch: Watch, timeout_s: float) -> None:
+    """Append to ``part`` what is missing of the file.
+
+    Without a published checksum only the rest of a file of the same entity tag or time of change is taken (RFC 9110,
+    13.1.5); otherwise the file is read from its beginning.
+    """
+    n_held, state = size_of(part), _state_of(part)
+    if n_held and n_held == wanted.n_bytes:
+        return
+    address, _, tag = file_text(state).partition("\n") if state.is_file() else ("", "", "")
+    headers = {"Accept-Encoding": "identity", "User-Agent": "su3d-bench"}
+    is_known = address == wanted.address and bool(tag)
+    if n_held and (is_known or wanted.stated.is_published):
+        headers |= {"Range": f"bytes={n_held}-"} | ({"If-Range": tag} if is_known else {})
+    try:
+        response = _opened(wanted, headers, timeout_s)
+    except urllib.error.HTTPError as error:
+        if error.code != 416:
+            raise _refusal(wanted.address, error) from None
+        if (error.headers.get("Content-Range") or "").endswith(f"/{n_held}"):
+            return
+        part.unlink()
+        raise _Broken("the server has another file by now") from None
+    with response:
+        is_rest = response.status == 206 and response.headers.get("Content-Range", "").startswith(f"bytes {n_held}-")
+        start = n_held if is_rest else 0
+        n_bytes = _size_stated(wanted, response, start)
+        tag = response.headers.get("ETag") or ""
+        tag = tag if tag.startswith('"') else response.headers.get("Last-Modified") or ""
+        write_text(state, f"{wanted.address}\n{tag.strip()}")
+        _append(response, part, start, n_bytes, lambda n: watch(wanted.name, n, n_bytes))
 
 
-class _Download:
-    def __init__(self, wanted: Wanted, place: Path, stream: IO[bytes], watch: Watch, patience: Patience) -> None:
-        self._wanted, self._place, self._stream = wanted, place, stream
-        self._watch, self._patience = watch, patience
-        self._n_held = stream.seek(0, os.SEEK_END)
-        self._validator, self._n_bytes = self._kept()
-        if not self._validator.words and not wanted.stated.is_published:
-            self._begin_anew()  # nothing would tell whether both parts are of one file
-        if wanted.n_bytes is not None and self._n_held > wanted.n_bytes:
-            self._begin_anew()
-
-    def run(self) -> None:
-        n_idle, n_anew = 0, 0
-        while not self._is_whole():
-            n_before = self._n_held
+def _append(response: Any, part: Path, start: int, n_bytes: int, watch: Callable[[int], None]) -> None:
+    """Write the answer into ``part`` from byte ``start`` on, which makes it ``n_bytes`` long."""
+    n_held = start
+    try:
+        stream = part.open("ab")
+    except OSError as error:
+        raise write_error(part, error) from error
+    with stream:
+        stream.truncate(start)
+        while n_held < n_bytes:
+            watch(n_held)
             try:
-                self._attempt()
-            except Stale as reason:
-                if reason.n_bytes == self._n_held and self._n_bytes == self._n_held:
-                    return
-                n_anew += 1
-                if n_anew > MOST_STARTS_ANEW:
-                    raise DataError(
-                        f"{self._wanted.address}: {printable(str(reason), 200)}, and it is another file each time; "
-                        "name a mirror with --mirror"
-                    ) from None
-                self._begin_anew()
-            except Broken as reason:
-                n_idle = 1 if self._n_held > n_before else n_idle + 1
-                if n_idle > self._patience.n_retries:
-                    raise DataError(self._broken_off(reason)) from None
-                time.sleep(min(self._patience.pause_s * 2 ** min(n_idle - 1, 6), 60.0))
-
-    def _is_whole(self) -> bool:
-        """Without a stated size, the server is asked once more whether that is all."""
-        return self._n_held > 0 and self._n_held == self._wanted.n_bytes
-
-    def _attempt(self) -> None:
-        wanted = self._wanted
-        answer = ask(wanted.address, wanted.hosts, self._n_held, self._validator, self._patience.timeout_s)
-        with answer.body:
-            n_bytes = self._size_of(answer)
-            if answer.start != self._n_held:
-                self._begin_anew()  # the server gives no parts, or the file is another by now
-            elif self._n_held and self._n_bytes not in (None, n_bytes):
-                raise Stale(f"had {self._n_bytes:,} bytes and has {n_bytes:,}")
-            self._keep(answer.validator, n_bytes)
-            self._take(answer, n_bytes)
-        if wanted.n_bytes is None:
-            self._wanted = replace(wanted, n_bytes=n_bytes)
-
-    def _size_of(self, answer: Answer) -> int:
-        stated, wanted = self._wanted.n_bytes, answer.n_bytes
-        if stated is not None and wanted not in (None, stated):
-            raise DataError(
-                f"{self._wanted.address}: has {wanted:,} bytes, stated are {stated:,}: it is another file by now; name "
-                "a mirror with --mirror, or its facts with --sources"
-            )
-        size = stated if wanted is None else wanted
-        if size is None:
-            raise DataError(f"{self._wanted.address}: nobody says how large it is; name a mirror with --mirror")
-        if not 0 < size <= MOST_BYTES:
-            raise DataError(f"{self._wanted.address}: has {size:,} bytes, which is no file of this kind")
-        return size
-
-    def _take(self, answer: Answer, n_bytes: int) -> None:
-        self._watch(self._wanted.name, self._n_held, n_bytes)
-        while True:
-            try:
-                piece = answer.body.read(min(PIECE, n_bytes - self._n_held + 1))
+                piece = response.read(min(PIECE, n_bytes - n_held))
             except (OSError, http.client.HTTPException, ValueError) as error:
-                raise Broken(printable(str(error), 120) or type(error).__name__) from None
+                raise _Broken(printable(str(error), 120) or type(error).__name__) from None
             if not piece:
-                break
-            if self._n_held + len(piece) > n_bytes:
-                raise Stale(f"sends more than the {n_bytes:,} bytes that it promised")
+                raise _Broken("the connection was closed")
             try:
-                self._stream.write(piece)
-                self._stream.flush()
+                stream.write(piece)
+                stream.flush()
             except OSError as error:
-                raise write_error(self._place, error) from error
-            self._n_held += len(piece)
-            self._watch(self._wanted.name, self._n_held, n_bytes)
-        if self._n_held < n_bytes:
-            raise Broken("the connection was closed")
+                raise write_error(part, error) from error
+            n_held += len(piece)
+        os.fsync(stream.fileno())
+    watch(n_held)
 
-    def _begin_anew(self) -> None:
-        self._stream.seek(0)
-        self._stream.truncate()
-        self._n_held = 0
-        self._n_bytes = None
-        self._validator = Validator()
 
-    def _broken_off(self, reason: Broken) -> str:
-        come = f"{self._n_held:,} bytes of it are here" if self._n_held else "nothing of it is here"
-        return f"{self._wanted.address}: {printable(str(reason), 200)}; {come}, and the same command goes on from there"
+def _size_stated(wanted: Wanted, response: Any, start: int) -> int:
+    """The size of the whole file of which the answer holds what comes from byte ``start`` on."""
+    if response.status not in (200, 206) or (response.status == 206) != (start > 0):
+        raise DataError(f"{wanted.address}: answers with another part than was asked for; name a mirror with --mirror")
+    if (response.headers.get("Content-Encoding") or "identity").lower() != "identity":
+        raise DataError(f"{wanted.address}: comes compressed, which was not asked for; name a mirror with --mirror")
+    length = response.headers.get("Content-Length") or ""
+    size = start + int(length) if length.isdecimal() and len(length) < 20 else wanted.n_bytes
+    if size is None:
+        raise DataError(f"{wanted.address}: nobody says how large it is; name a mirror with --mirror")
+    if wanted.n_bytes not in (None, size):
+        raise DataError(
+            f"{wanted.address}: has {size:,} bytes, stated are {wanted.n_bytes:,}: it is another file by now; name "
+            "a mirror with --mirror, or its facts with --sources"
+        )
+    if not 0 < size <= MOST_BYTES:
+        raise DataError(f"{wanted.address}: has {size:,} bytes, which is no file of this kind")
+    return size
 
-    def _kept(self) -> tuple[Validator, int | None]:
-        """The state and size of the server's file of which the beginning is here; a damaged note counts as none."""
-        unknown = Validator(), None
-        if not self._n_held:
-            return unknown
+
+class _NamedHostsOnly(urllib.request.HTTPRedirectHandler):
+    max_redirections = MAX_REDIRECTS
+
+    def __init__(self, hosts: Sequence[str]) -> None:
+        self._hosts = hosts
+
+    def redirect_request(self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str) -> Any:
         try:
-            content: Any = read_json(_note(self._place))
-        except StoreError:
-            return unknown
-        if not isinstance(content, dict) or content.get("address") != self._wanted.address:
-            return unknown
-        texts, n_bytes = (content.get("etag"), content.get("last_modified")), content.get("n_bytes")
-        if type(n_bytes) is not int or not all(isinstance(t, str) and t.isascii() and t.isprintable() for t in texts):
-            return unknown
-        return Validator(*map(str, texts)), n_bytes
+            check_address(newurl, self._hosts)
+        except ValueError as error:
+            raise DataError(f"{req.full_url}: is redirected, which is refused: {error}") from error
+        return super().redirect_request(req, fp, code, msg, headers, newurl)
 
-    def _keep(self, validator: Validator, n_bytes: int) -> None:
-        self._validator, self._n_bytes = validator, n_bytes
-        state = {
-            "address": self._wanted.address,
-            "n_bytes": n_bytes,
-            "etag": validator.etag,
-            "last_modified": validator.last_modified,
-        }
-        write_json(_note(self._place), state)
+
+def _opened(wanted: Wanted, headers: dict[str, str], timeout_s: float) -> Any:
+    opener = urllib.request.build_opener(_NamedHostsOnly(wanted.hosts))
+    try:
+        return opener.open(urllib.request.Request(wanted.address, headers=headers), timeout=timeout_s)
+    except urllib.error.HTTPError:
+        raise
+    except (OSError, http.client.HTTPException, ValueError) as error:
+        reason = getattr(error, "reason", None) or error
+        raise _Broken(f"the connection failed: {printable(str(reason), 120) or type(error).__name__}") from None
+
+
+def _refusal(address: str, error: urllib.error.HTTPError) -> Exception:
+    with error:
+        reason = f"status {error.code} ({printable(str(error.reason), 80)})"
+    if error.code in STATUS_TO_RETRY or error.code >= 500:
+        return _Broken(reason)
+    return DataError(
+        f"{address}: {reason}: it is not given to everybody, or lies elsewhere; name a mirror with --mirror"
+    )

@@ -1,7 +1,7 @@
 """Files of a repository on Hugging Face's hub: which there are, and what the hub states of each.
 
 ``huggingface_hub`` is asked for names, sizes and checksums of one revision; the bytes come as those of any server do:
-bounded, taken up where they broke off, held against what was stated. No token of the user's is sent.
+bounded, resumed, checked against what was stated. No token of the user's is sent.
 """
 
 from __future__ import annotations
@@ -12,9 +12,8 @@ from urllib.parse import urlsplit
 
 from su3d_bench.core.errors import ConfigError, DataError, printable
 from su3d_bench.core.system.devices import require
-from su3d_bench.fetching.checksums import Stated
-from su3d_bench.fetching.download import Wanted
-from su3d_bench.fetching.sources import HubFiles, Source, check_address
+from su3d_bench.fetching.download import Stated, Wanted
+from su3d_bench.fetching.sources import Source, check_address
 
 HUB = "https://huggingface.co"
 TIMEOUT_S = 30.0
@@ -30,7 +29,7 @@ def hub_files(source: Source) -> list[Wanted]:
     os.environ.setdefault("HF_HUB_DISABLE_TELEMETRY", "1")
     hub = require("huggingface_hub", f"fetch {source.name}")
     constants = require("huggingface_hub.constants", f"fetch {source.name}")
-    endpoint = source.endpoint or os.environ.get("HF_ENDPOINT", "").rstrip("/") or HUB
+    endpoint = _endpoint(source)
     hosts = source.hosts if endpoint == HUB else (*source.hosts, urlsplit(endpoint).hostname or "")
     try:
         check_address(endpoint)
@@ -90,10 +89,10 @@ def _names(source: Source, stated: Any) -> list[str]:
 def hub_addresses(source: Source) -> list[str]:
     """Where the files lie, as far as that can be said without asking which of the alternatives are there."""
     assert source.hub is not None
-    endpoint = source.endpoint or os.environ.get("HF_ENDPOINT", "").rstrip("/") or HUB
-    return [f"{endpoint}/{source.hub.repository}/resolve/main/{name}" for name in _first_names(source.hub)]
+    first = [name.strip() for requirement in source.hub.files for name in requirement.split("|")[0].split("+")]
+    names = dict.fromkeys((*first, *source.hub.optional))
+    return [f"{_endpoint(source)}/{source.hub.repository}/resolve/main/{name}" for name in names]
 
 
-def _first_names(files: HubFiles) -> list[str]:
-    first = [name.strip() for requirement in files.files for name in requirement.split("|")[0].split("+")]
-    return [*dict.fromkeys((*first, *files.optional))]
+def _endpoint(source: Source) -> str:
+    return source.endpoint or os.environ.get("HF_ENDPOINT", "").rstrip("/") or HUB

@@ -9,7 +9,6 @@ it waits for a key by which the terms are confirmed, and passes over what is the
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import tempfile
@@ -19,13 +18,10 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from su3d_bench.core.errors import ConfigError, DataError, StoreError, printable, suggest
-from su3d_bench.core.files.atomic import make_folder, write_error
 from su3d_bench.datasets.scannet.folders import PAPER_SCENES, SCAN_NAME, SPLITS, find_scans, split_scenes
 from su3d_bench.datasets.scannet.labels import TABLE_NAME
-from su3d_bench.fetching.bringing import Brought, Planned, bring_file
-from su3d_bench.fetching.checksums import sha256_of
-from su3d_bench.fetching.download import Patience, Wanted, Watch
-from su3d_bench.fetching.record import Arrived, write_arrival
+from su3d_bench.fetching.bringing import Arrived, Brought, Planned, bring_file, held_state, move, write_arrival
+from su3d_bench.fetching.download import Patience, Stated, Wanted, Watch, checked
 from su3d_bench.fetching.sources import Source, check_address
 
 RECORDING = ".sens"
@@ -99,19 +95,18 @@ def fetch_by_script(source: Source, scans: Scans, script: Path, watch: Watch) ->
     if not script.is_file():
         raise ConfigError(f"--script {script}: there is no such file; name the script that ScanNet's answer led to")
     planned, n_done = Planned(source, scans.root), 0
-    make_folder(planned.state)
     arrived: list[Arrived] = []
-    for scan, names in scans.missing.items():
-        top = _top(scan)
-        for name in names:
-            watch(name, n_done, scans.n_files)
-            suffix = name.removeprefix(scan)
-            _run(script, planned.state, ["--id", scan, "--type", suffix], planned.state / top / scan / name)
-            n_done += 1
-        arrived += _moved(planned, planned.state / top / scan, scans.root / top / scan, names, "the user's own script")
-    if scans.label_table:
-        _run(script, planned.state, ["--label_map"], planned.state / TABLE_NAME)
-        arrived += _moved(planned, planned.state, scans.root, [TABLE_NAME], "the user's own script")
+    with held_state(planned):
+        for scan, names in scans.missing.items():
+            folder = planned.state / _top(scan) / scan
+            for name in names:
+                watch(name, n_done, scans.n_files)
+                _run(script, planned.state, ["--id", scan, "--type", name.removeprefix(scan)], folder / name)
+                n_done += 1
+            arrived += _moved(planned, [folder / name for name in names], scans.root / _top(scan) / scan)
+        if scans.label_table:
+            _run(script, planned.state, ["--label_map"], planned.state / TABLE_NAME)
+            arrived += _moved(planned, [planned.state / TABLE_NAME], scans.root)
     watch("scans", scans.n_files, scans.n_files)
     return Brought(source, scans.root / "scans", tuple(arrived))
 
@@ -125,16 +120,17 @@ def fetch_from(source: Source, scans: Scans, address: str, watch: Watch, patienc
     base, hosts = address.rstrip("/"), (urlsplit(address).hostname or "",)
     planned = Planned(source, scans.root)
     arrived: list[Arrived] = []
-    for scan, names in scans.missing.items():
-        for name in names:
-            release = "v1" if name.endswith(RECORDING) else "v2"
-            wanted = Wanted(name, f"{base}/{release}/scans/{scan}/{name}", hosts)
+    with held_state(planned):
+        for scan, names in scans.missing.items():
+            for name in names:
+                release = "v1" if name.endswith(RECORDING) else "v2"
+                wanted = Wanted(name, f"{base}/{release}/scans/{scan}/{name}", hosts)
+                arrived.append(bring_file(planned, wanted, watch, patience))
+            move([planned.state / name for name in names], scans.root / _top(scan) / scan)
+        if scans.label_table:
+            wanted = Wanted(TABLE_NAME, f"{base}/v2/tasks/{TABLE_NAME}", hosts)
             arrived.append(bring_file(planned, wanted, watch, patience))
-        _move(planned.state, scans.root / _top(scan) / scan, names)
-    if scans.label_table:
-        wanted = Wanted(TABLE_NAME, f"{base}/v2/tasks/{TABLE_NAME}", hosts)
-        arrived.append(bring_file(planned, wanted, watch, patience))
-        _move(planned.state, scans.root, [TABLE_NAME])
+            move([planned.state / TABLE_NAME], scans.root)
     return Brought(source, scans.root / "scans", tuple(arrived))
 
 
@@ -162,22 +158,12 @@ def _run(script: Path, folder: Path, words: Sequence[str], result: Path) -> None
         )
 
 
-def _moved(planned: Planned, folder: Path, place: Path, names: Sequence[str], address: str) -> list[Arrived]:
+def _moved(planned: Planned, paths: Sequence[Path], place: Path) -> list[Arrived]:
     """Record and move what the script wrote."""
     arrived = []
-    for name in names:
-        path = folder / name
-        entry = Arrived(planned.source.name, name, address, path.stat().st_size, sha256_of(path), ())
-        write_arrival(planned.root, entry)
-        arrived.append(entry)
-    _move(folder, place, names)
+    for path in paths:
+        sha256, n_bytes = checked(path, Stated())[0], path.stat().st_size
+        arrived.append(Arrived(planned.source.name, path.name, "the user's own script", n_bytes, sha256, ()))
+        write_arrival(planned.root, arrived[-1])
+    move(paths, place)
     return arrived
-
-
-def _move(folder: Path, place: Path, names: Sequence[str]) -> None:
-    make_folder(place)
-    for name in names:
-        try:
-            os.replace(folder / name, place / name)
-        except OSError as error:
-            raise write_error(place / name, error) from error

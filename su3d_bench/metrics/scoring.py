@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, PredictionError, printable
 from su3d_bench.core.files.atomic import read_arrays
+from su3d_bench.core.files.unpacking import DAMAGE
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
-from su3d_bench.core.system.damage import DAMAGE
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.graphs.objects import ObjectMetric
 from su3d_bench.metrics.graphs.places import PlaceMetric
-from su3d_bench.metrics.instance.box_score import BoxMetric
+from su3d_bench.metrics.instance.boxes import BoxMetric
 from su3d_bench.metrics.instance.score import InstanceMetric
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.metric import MOST_COUNTED, Counts, Metric, SceneScore, scene_mean
@@ -35,10 +35,17 @@ from su3d_bench.metrics.protocols.model import Kind, ProtocolRules
 from su3d_bench.metrics.questions.chains import ChainMetric
 from su3d_bench.metrics.questions.grounding import GroundingMetric
 from su3d_bench.metrics.questions.presence import PresenceMetric
-from su3d_bench.metrics.questions.score import AnnotationMetric, ReasoningMetric, RetrievalMetric
-from su3d_bench.metrics.questions.truths import AnnotationTruth, PresenceTruth, ReasoningTruth, RetrievalTruth
-from su3d_bench.metrics.relations.score import RelationMetric
-from su3d_bench.metrics.semantic.panoptic_score import PanopticMetric
+from su3d_bench.metrics.questions.score import (
+    AnnotationMetric,
+    AnnotationTruth,
+    PresenceTruth,
+    ReasoningMetric,
+    ReasoningTruth,
+    RetrievalMetric,
+    RetrievalTruth,
+)
+from su3d_bench.metrics.relations import RelationMetric
+from su3d_bench.metrics.semantic.panoptic import PanopticMetric
 from su3d_bench.metrics.semantic.score import SemanticMetric
 from su3d_bench.metrics.semantic.top_k import TopKMetric
 from su3d_bench.numerics.statistics import jackknife_interval, leave_one_out

@@ -33,7 +33,7 @@ def paint(masks: BoolArray, border_px: int, shape: Literal["disc", "square"]) ->
     Larger masks are painted first, equal ones in order, so that where masks overlap the smaller one shows. Each mask
     takes the ring of ``border_px`` around it from what was painted before.
     """
-    from su3d_bench.opensu3d.kernels import image as kernels
+    from su3d_bench.opensu3d import kernels
 
     ids = np.full(masks.shape[1:], NO_DETECTION, np.int32)
     owner = ids.copy()
@@ -93,7 +93,7 @@ def _cloud(
     frame: Frame, pixels: BoolArray, painted: IdImage, config: OpenSU3DConfig
 ) -> tuple[Float64Array, Int32Array, NDArray[np.int8]]:
     """Points, owners and ranks (0 inside a mask, 1 in a ring, 2 in no mask) of ``pixels`` in row-major order."""
-    from su3d_bench.opensu3d.kernels import image as kernels
+    from su3d_bench.opensu3d import kernels
 
     rings = {"owner": kernels.OWNED, "background": kernels.BACKGROUND, "drop": kernels.DROPPED}
     cloud: tuple[Float64Array, Int32Array, NDArray[np.int8]] = kernels.cloud(

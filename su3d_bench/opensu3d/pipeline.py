@@ -6,7 +6,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -14,17 +14,20 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.files.scratch import Scratch
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.maps import Instances
-from su3d_bench.core.system.devices import CPU
 from su3d_bench.core.types import Detections, Frame, Int32Array, Int64Array, PerceptionNeeds, SceneInfo
-from su3d_bench.opensu3d.association import assign_ids, count_overlaps, overlap_ratios
 from su3d_bench.opensu3d.config import SCHEMES, OpenSU3DConfig, crop_levels
 from su3d_bench.opensu3d.frame_cloud import NO_DETECTION, FrameCloud, frame_cloud
 from su3d_bench.opensu3d.postprocess import CONFIDENCES, IDS, segments_of, to_instances
-from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View, record_of
+from su3d_bench.opensu3d.tracking import (
+    ImageRecord,
+    TrackingTable,
+    View,
+    assign_ids,
+    count_overlaps,
+    overlap_ratios,
+    record_of,
+)
 from su3d_bench.opensu3d.voxel_map import NO_INSTANCE, VoxelMap
-
-if TYPE_CHECKING:
-    from su3d_bench.opensu3d.kernels.voxel_map_torch import DeviceVoxelMap
 
 logger = logging.getLogger(__name__)
 logger.setLevel(logging.INFO)  # what is left out goes to the log of its scene
@@ -59,13 +62,12 @@ class OpenSU3D:
     def __init__(self, config: OpenSU3DConfig | None = None) -> None:
         self.config = config or OpenSU3DConfig()
         self._scratch = Scratch()
-        self._device = CPU
         self._clear()
 
     def _clear(self) -> None:
         self._scratch.close()
         self._scratch = Scratch()
-        self._map = _empty_map(self.config, self._device)
+        self._map = VoxelMap(self.config.eps, self.config.density)
         self._table = TrackingTable(list)
         self._images: list[ImageRecord] = []
         self._seeds: dict[int, int] = {}
@@ -94,11 +96,6 @@ class OpenSU3D:
     def n_instances(self) -> int:
         """Scene ids given so far, before post-processing."""
         return self._next_id - 1 - NO_INSTANCE
-
-    def receive_device(self, device: str) -> None:
-        """Has the map held and matched by torch on ``device`` (``cuda:0``), unless that is ``cpu``."""
-        self._device = device
-        self._clear()
 
     def start(self, scene: SceneInfo) -> None:
         """Forgets the scene before; of the new one nothing needs to be known."""
@@ -189,11 +186,3 @@ class OpenSU3D:
             )
         self._clear()
         self._scratch.close()
-
-
-def _empty_map(config: OpenSU3DConfig, device: str) -> VoxelMap | DeviceVoxelMap:
-    if device == CPU:
-        return VoxelMap(config.eps, config.density)
-    from su3d_bench.opensu3d.kernels.voxel_map_torch import DeviceVoxelMap
-
-    return DeviceVoxelMap(config.eps, device, config.density)

@@ -11,8 +11,7 @@ from su3d_bench.core.english import with_article
 from su3d_bench.core.maps import Instances, Masks, starts_of
 from su3d_bench.core.types import Float64Array, Int32Array, Int64Array
 from su3d_bench.opensu3d.config import InstanceScore, OpenSU3DConfig
-from su3d_bench.opensu3d.feature_fusion import fuse_views
-from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View
+from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View, fuse_views
 
 NOISE = -1
 # Ids of clusters are above those of scene segments, which they show: 7000012 is a part of 12.

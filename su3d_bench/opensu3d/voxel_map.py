@@ -86,7 +86,7 @@ class VoxelMap:
 
     def nearest_counted(self, queries: Float64Array) -> tuple[Int64Array, int]:
         """As ``nearest``, with the number of voxels that were looked into."""
-        from su3d_bench.opensu3d.kernels import voxel_map as _kernels
+        from su3d_bench.opensu3d import kernels as _kernels
 
         queries = checked_points(queries)
         answer = np.empty(len(queries), np.int64)
@@ -104,7 +104,7 @@ class VoxelMap:
         self, lower: Float64Array, upper: Float64Array, wanted: Int32Array
     ) -> tuple[Int64Array, int]:
         """As ``count_inside``, with the number of blocks that were looked for."""
-        from su3d_bench.opensu3d.kernels import voxel_map as _kernels
+        from su3d_bench.opensu3d import kernels as _kernels
 
         counts = np.zeros(len(wanted), np.int64)
         if len(wanted) == 0:
@@ -121,7 +121,7 @@ class VoxelMap:
         Where one meets a voxel that is held, ``density`` says which goes: the held point (``scene``), which stays only
         where it has an instance and the new one has none; the new one (``frame``); neither (``all``).
         """
-        from su3d_bench.opensu3d.kernels import voxel_map as _kernels
+        from su3d_bench.opensu3d import kernels as _kernels
 
         points, ids = checked_points(points), np.ascontiguousarray(ids, np.int32)
         self._reserve_points(len(self) + len(points))
@@ -145,7 +145,7 @@ class VoxelMap:
         self._following = _grown(self._following, capacity, len(self))
 
     def _double_blocks(self) -> None:
-        from su3d_bench.opensu3d.kernels import voxel_map as _kernels
+        from su3d_bench.opensu3d import kernels as _kernels
 
         capacity = 2 * len(self._keys)
         self._keys = _grown(self._keys, capacity, self.n_blocks)

@@ -17,17 +17,14 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.files.atomic import filling, read_arrays
-from su3d_bench.core.system.damage import DAMAGE
+from su3d_bench.core.files.unpacking import DAMAGE
 from su3d_bench.core.types import BoolArray, Float64Array, Frame, UInt8Array
 from su3d_bench.perception.crops import mask_boxes
 
 Arrays = dict[str, NDArray[Any]]
 
-# What moves an entry on its way into the cache and out of it: keys of what is kept there follow it.
-CACHE_SOURCES = (
-    "perception/cache.py", "perception/crops.py",
-    "core/files/atomic.py", "core/files/locks.py", "core/files/unpacking.py",
-)  # fmt: skip
+# The code that can move what is kept: keys follow it.
+CODE = ("core", "numerics", "perception")
 # Moves every key: raise it when the format of an entry changes.
 CACHE_VERSION = "1"
 _CHECKSUM = "checksum"
@@ -101,8 +98,7 @@ class FrameCache:
             return
         try:
             with filling(path) as file:
-                if file is not None:  # whoever writes this entry just now writes the same
-                    np.savez(file, allow_pickle=False, **{**arrays, _CHECKSUM: _checksum(arrays)})
+                np.savez(file, allow_pickle=False, **{**arrays, _CHECKSUM: _checksum(arrays)})
         except OSError as error:
             raise StoreError(
                 f"{path.parent}: the perception cache cannot be written ({error.strerror or error}); "

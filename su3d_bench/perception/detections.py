@@ -2,19 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from su3d_bench.core.english import head_phrases, words
 from su3d_bench.core.interfaces import Encoder, StageTimer
 from su3d_bench.core.types import Detections, Float32Array, Frame, PerceptionNeeds, Regions
-from su3d_bench.perception.background import is_background
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.embedded.naming import Namer, colour_word, scene_caption
 from su3d_bench.perception.regions import CropEncoder
+
+# Words that end in the same noun and mean something else.
+_OTHER_THINGS = frozenset((("coffee", "ground"), ("video", "wall")))
+
+
+def is_background(name: str, background_names: Iterable[str]) -> bool:
+    """Whether all that ``name`` names is one of ``background_names``, with whatever stands before it.
+
+    >>> names = ("Brick walls", "hardwood flooring", "wall lamp", "floor mat")
+    >>> [is_background(name, ("wall", "floor")) for name in names]
+    [True, True, False, False]
+    """
+    phrases = head_phrases(name)
+    background = [words(one) for one in background_names]
+    return bool(phrases) and all(_ends_in_one(phrase, background) for phrase in phrases)
+
+
+def _ends_in_one(phrase: tuple[str, ...], background: list[tuple[str, ...]]) -> bool:
+    # Flooring is floor and roofing is roof.
+    spoken = phrase, (*phrase[:-1], phrase[-1].removesuffix("ing"))
+    return phrase[-2:] not in _OTHER_THINGS and any(
+        one and each[-len(one) :] == one for one in background for each in spoken
+    )
+
 
 # Regions that are kept, with what they are to be called and how they are described.
 Describe = Callable[[Frame, Regions, StageTimer], Regions]

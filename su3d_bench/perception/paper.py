@@ -12,7 +12,7 @@ from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.crops import crop_images
 from su3d_bench.perception.detections import Assembler, captioned
 from su3d_bench.perception.language.captioner import Captioner
-from su3d_bench.perception.models.catalogue import MODELS, STAND_IN, WEIGHTS_CAVEAT
+from su3d_bench.perception.models.catalogue import MODELS
 from su3d_bench.perception.models.config import PaperConfig
 from su3d_bench.perception.models.masks.automatic_masks import AUTOMATIC_MASKS
 from su3d_bench.perception.models.masks.grounded_sam import (
@@ -31,13 +31,12 @@ PAPER_ENCODER, PAPER_SEGMENTER, PAPER_VISION_MODEL = "clip-vit-h-14", "sam-vit-h
 
 def stand_ins(config: PaperConfig, networks: Networks, encoder: Encoder, captioner: Captioner | None) -> list[str]:
     """What is computed here otherwise than in OpenSU3D's paper, a sentence each; nothing where all is the paper's."""
-    said = [f"{WEIGHTS_CAVEAT} {', '.join(networks.stand_ins)}"] if networks.stand_ins else []
-    said += [networks.tagger.caveat] if networks.tagger.caveat else []
+    said = [networks.tagger.caveat] if networks.tagger.caveat else []
     if config.segmenter != PAPER_SEGMENTER:
         said.append(f"masks: {config.segmenter} stands in for the paper's {PAPER_SEGMENTER}")
     if others := _settings_besides_the_papers(config.grounded):
         said.append(f"named masks: {', '.join(others)} set otherwise than OpenSU3D's")
-    if encoder.name.removesuffix(STAND_IN) != MODELS[PAPER_ENCODER].known_as:
+    if encoder.name != MODELS[PAPER_ENCODER].known_as:
         said.append(f"features: {encoder.name} stands in for the paper's {PAPER_ENCODER}")
     if captioner is None:
         said.append("names and captions: the tagger's names and a template stand in for the paper's vision model")

@@ -9,19 +9,28 @@ from pydantic import BaseModel, ConfigDict
 
 from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.core.interfaces import Encoder, RegionPerception, StageTimer
-from su3d_bench.core.types import Detections, Frame, ImageDomain, InstanceMesh, ObjectBoxes, PerceptionNeeds, SceneInfo
-from su3d_bench.perception.cache import FrameCache
+from su3d_bench.core.system.timing import Timer
+from su3d_bench.core.types import (
+    Detections,
+    Frame,
+    ImageDomain,
+    InstanceMesh,
+    ObjectBoxes,
+    PerceptionNeeds,
+    Regions,
+    SceneInfo,
+)
+from su3d_bench.perception.cache import FrameCache, content_key
+from su3d_bench.perception.detections import Assembler, captioned_by_colour
+from su3d_bench.perception.embedded.join_rules import SegmenterConfig
 from su3d_bench.perception.embedded.naming import Namer, NamingConfig
-from su3d_bench.perception.embedded.perception import EmbeddedPerception
-from su3d_bench.perception.embedded.segmenter.segmenter import SegmenterConfig
+from su3d_bench.perception.embedded.segmenter import RgbdSegmenter
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, PaperConfig
-from su3d_bench.perception.oracle.perception import OraclePerception
-from su3d_bench.perception.oracle.segmenter import OracleConfig
-from su3d_bench.perception.stored.label_images import LabelImages
-from su3d_bench.perception.stored.npz_files import NpzFiles
-from su3d_bench.perception.stored.perception import StoredPerception
-from su3d_bench.perception.stored.source import StoredConfig
+from su3d_bench.perception.oracle import OracleConfig, OraclePerception
+from su3d_bench.perception.regions import RegionsOnDemand, cached_regions
+from su3d_bench.perception.stored import NpzFiles, StoredConfig, StoredPerception
+from su3d_bench.perception.stored_masks import LabelImages
 
 PROFILES = ("auto", "embedded", "paper", "oracle", "stored")
 # Replies of vision models, below the cache's folder: a rerun asks nothing twice.
@@ -60,6 +69,45 @@ class Perception(Protocol):
         ...
 
 
+CAMERA_CAVEAT = (
+    "embedded perception on camera images: its encoder has seen rendered rooms only, so names and labels mean little "
+    "here; use --profile paper, or --profile stored with detections made by real models"
+)
+
+
+class EmbeddedPerception:
+    """Geometric segmentation of the frame, names by the encoder, captions from a template."""
+
+    profile = "embedded"
+
+    def __init__(
+        self, segmenter: SegmenterConfig, naming: NamingConfig, scene: SceneInfo, encoder: Encoder, cache: FrameCache
+    ) -> None:
+        self.encoder = encoder
+        self.caveat = CAMERA_CAVEAT if scene.image_domain == "camera" else None
+        self._segmenters = {
+            "grounded": RgbdSegmenter(segmenter, "objects"),
+            "class-agnostic": RgbdSegmenter(segmenter, "parts"),
+        }
+        self._namer = Namer(naming, encoder)
+        self._cache = cache
+        self._assembler = Assembler(encoder, cache, "own")
+        digests = [segmenter.digest for segmenter in self._segmenters.values()]
+        self.digest = content_key(self.profile, *digests, self._namer.digest, encoder.digest)
+
+    def detect(self, frame: Frame, needs: PerceptionNeeds, timer: StageTimer) -> Detections:
+        assert needs.masks != "none", "the runner asks nothing for a method that needs no masks"
+        segmented = self._segmented(needs.masks, frame, timer)
+        regions, known = self._assembler.named(frame, segmented, self._namer, needs, timer)
+        return self._assembler.assemble(frame, regions, needs, timer, describe=captioned_by_colour, known=known)
+
+    def regions(self) -> RegionPerception:
+        return RegionsOnDemand(lambda frame: self._segmented("class-agnostic", frame, Timer()), self.encoder)
+
+    def _segmented(self, masks: str, frame: Frame, timer: StageTimer) -> Regions:
+        return cached_regions(self._segmenters[masks], frame, self._cache, False, timer)
+
+
 def resolve_profile(profile: str, image_domain: ImageDomain, config: PerceptionConfig | None = None) -> str:
     """The profile behind ``profile``: ``auto`` is ``paper`` on camera images where its models are here.
 
@@ -71,7 +119,7 @@ def resolve_profile(profile: str, image_domain: ImageDomain, config: PerceptionC
         return profile
     if config is None or image_domain != "camera":
         return "embedded"
-    from su3d_bench.perception.models.front_end import is_front_end_here
+    from su3d_bench.perception.models.loading import is_front_end_here
 
     return "paper" if is_front_end_here(config.paper, config.models) else "embedded"
 
@@ -79,7 +127,7 @@ def resolve_profile(profile: str, image_domain: ImageDomain, config: PerceptionC
 def check_models(profile: str, config: PerceptionConfig) -> None:
     """Raises ``ModelMissing`` for the first model that is certainly needed and not here; nothing heavy is imported."""
     if profile == "paper":
-        from su3d_bench.perception.models.front_end import check_front_end
+        from su3d_bench.perception.models.loading import check_front_end
 
         check_front_end(config.paper, config.models)
     elif config.models.encoder not in (None, EMBEDDED):
@@ -108,8 +156,7 @@ def build_perception(
     resolved = resolve_profile(profile, scene.image_domain, config)
     cache = FrameCache(cache_root if config.cache else None)
     if encoder is None:
-        from su3d_bench.perception.models.front_end import PAPER_ENCODER
-        from su3d_bench.perception.models.loading import load_encoder
+        from su3d_bench.perception.models.loading import PAPER_ENCODER, load_encoder
 
         own = PAPER_ENCODER if resolved == "paper" else EMBEDDED
         encoder = load_encoder(config.models, default=own, cache=cache, job_index=job_index)
@@ -133,7 +180,7 @@ def _stored(config: PerceptionConfig, scene: SceneInfo, encoder: Encoder, cache:
         images = LabelImages(stored.folder, stored.images, stored.names, scene)
         return StoredPerception(images, encoder, cache, Namer(config.naming, encoder))
     if stored.detections is not None:
-        from su3d_bench.perception.stored.gsa_files import GsaFiles
+        from su3d_bench.perception.stored_masks import GsaFiles
 
         return StoredPerception(GsaFiles(stored.folder, stored.detections, scene), encoder, cache)
     return StoredPerception(NpzFiles(stored.folder, scene, encoder), encoder, cache)
@@ -142,7 +189,7 @@ def _stored(config: PerceptionConfig, scene: SceneInfo, encoder: Encoder, cache:
 def _paper(
     config: PerceptionConfig, encoder: Encoder, cache: FrameCache, replies: Path, is_offline: bool, job_index: int
 ) -> Perception:
-    from su3d_bench.perception.models.front_end import load_networks
+    from su3d_bench.perception.models.loading import load_networks
     from su3d_bench.perception.paper import PaperPerception
 
     captioner = None

@@ -12,7 +12,7 @@ from su3d_bench.core.digests import package_digest
 from su3d_bench.core.interfaces import Encoder, Segmenter, StageTimer
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, Int64Array, Regions
 from su3d_bench.perception.cache import (
-    CACHE_SOURCES,
+    CODE,
     FrameCache,
     array_digest,
     content_key,
@@ -21,8 +21,6 @@ from su3d_bench.perception.cache import (
 )
 from su3d_bench.perception.crops import crop_images
 
-# What moves the features of crops: their key follows it.
-SOURCES = ("perception/regions.py", *CACHE_SOURCES)
 Computed = TypeVar("Computed")
 
 
@@ -121,7 +119,7 @@ class CropEncoder:
     def __init__(self, encoder: Encoder, cache: FrameCache) -> None:
         self._encoder = encoder
         self._cache = cache
-        self._source = package_digest(*SOURCES)
+        self._source = package_digest(*CODE)
 
     def crops(
         self,

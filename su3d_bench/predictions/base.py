@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -230,30 +230,68 @@ class Reader(ABC):
         """The prediction in the file or folder of a scene."""
 
 
+Parsed = tuple[Content, Sequence[str]]  # of one scene, with remarks
+Parse = Callable[[Path, str], Parsed]  # by its file or folder, and its name
+
+
 class SceneFiles(Reader):
     """A format of one file a scene, called after it and ending in the first of ``suffixes`` that fits."""
 
     suffixes: tuple[str, ...]
 
-    def scenes(self, path: Path) -> dict[str, Path]:
+    def scenes(self, path: Path) -> Mapping[str, Path]:
         return scene_files(path, self.suffixes)
 
-    def first(self, path: Path, suffix: str) -> Path | None:
-        """The first of the files with ``suffix`` at ``path``, in alphabetical order."""
-        if not path.is_dir() and path.suffix != suffix:
-            return None
-        return next(iter(scene_files(path, (suffix,)).values()), None)
 
+@dataclass(frozen=True)
+class FileFormat(SceneFiles):
+    """A row of the table of formats: a file a scene.
 
-class SceneFolders(Reader):
-    """A format of a folder a scene, at most ``n_above`` folders below the path: ``first`` and ``second`` lie in it."""
+    ``looks`` says of the first file with the last suffix, then of those with the others, why it is of this format.
+    """
 
-    first: str
-    second: str
-    n_above = 2
+    name: str
+    suffixes: tuple[str, ...]
+    looks: Callable[[Path], str | None]
+    parse: Parse
+    summary: str
 
     def recognise(self, path: Path) -> str | None:
-        return f"it holds {self.first} and {self.second}" if path.is_dir() and self._folders(path) else None
+        for suffix in reversed(self.suffixes):
+            first = next(iter(scene_files(path, (suffix,)).values()), None) if path.exists() else None
+            if first is not None and (reason := self.looks(first)) is not None:
+                return reason
+        return None
+
+    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
+        content, remarks = self.parse(place, scene)
+        return ScenePrediction(scene, self.name, place, content, tuple(remarks))
+
+
+def scene_of_folder(folder: Path, path: Path) -> str:
+    """The name of the scene whose ``folder`` was found at ``path``."""
+    return folder.absolute().name
+
+
+@dataclass(frozen=True)
+class FolderFormat(Reader):
+    """A row of the table of formats: a folder a scene, at most ``n_above`` folders below the path.
+
+    ``first`` and ``second`` lie in it; ``scene_of`` names the scene of a folder that was found at a path.
+    """
+
+    name: str
+    first: str
+    second: str
+    parse: Parse
+    summary: str
+    noun: str = "map"
+    scene_of: Callable[[Path, Path], str] = scene_of_folder
+    n_above: int = 2
+
+    def recognise(self, path: Path) -> str | None:
+        names = " and ".join(dict.fromkeys((self.first, self.second)))
+        return f"it holds {names}" if path.is_dir() and self._folders(path) else None
 
     def scenes(self, path: Path) -> Mapping[str, Path]:
         return named_once([(self.scene_of(folder, path), folder) for folder in self._folders(path)], path)
@@ -262,9 +300,9 @@ class SceneFolders(Reader):
         files = first_found(path, ["*/" * n + self.first for n in range(self.n_above + 1)])
         return [file.parent for file in files if (file.parent / self.second).exists()]
 
-    @abstractmethod
-    def scene_of(self, folder: Path, path: Path) -> str:
-        """The name of the scene whose ``folder`` was found at ``path``."""
+    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
+        content, remarks = self.parse(place, scene)
+        return ScenePrediction(scene, self.name, place, content, tuple(remarks))
 
 
 def scene_files(path: Path, suffixes: Sequence[str]) -> dict[str, Path]:

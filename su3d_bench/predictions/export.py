@@ -1,5 +1,6 @@
 """Predictions in the forms that other evaluators take: OpenLex3D's three files, the lists of masks of ScanNet and
-ScanNet++, and the ranked classes of ScanNet++."""
+ScanNet++, the ranked classes of ScanNet++, and the OpenSUN3D challenge's submissions, for each scene the masks that
+answer its query."""
 
 from __future__ import annotations
 
@@ -23,18 +24,19 @@ from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32
 from su3d_bench.formats.pcd import write_pcd_points
 from su3d_bench.metrics.instance.score import masks_and_scores, named_classes
 from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.matching.labelling import (
-    encoder_warning,
-)
+from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, text_features
+from su3d_bench.metrics.open_vocabulary.score import NEEDS_FEATURES
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.top_k import ranked_at
 from su3d_bench.predictions.base import Content, Numbering, VertexLabels, VertexMasks
-from su3d_bench.predictions.openlex3d import CLOUD, EMBEDDINGS, INDEX
+from su3d_bench.predictions.dense import CLOUD, LEX_EMBEDDINGS, LEX_INDEX
 from su3d_bench.predictions.scannet_text import MASK_OF_RUNS
 
 MASKS_FOLDER = "pred_mask"
 RUNS_FOLDER = "predicted_masks"  # as ScanNet++'s own writer and the OpenSUN3D challenge call it
 ROWS_AT_ONCE = 1 << 14
+# demo_eval.py of OpenSun3D/cvpr24-challenge at 59db30f reads a list with numpy.loadtxt and stops at one of fewer lines.
+LEAST_MASKS = 2
 FILE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,150}")
 
 
@@ -135,8 +137,8 @@ def write_openlex(content: Content, folder: Path) -> tuple[str, ...]:
     parts = openlex_parts(content)
     make_folder(folder)
     write_pcd_points(folder / CLOUD, parts.points)
-    np.save(folder / INDEX, parts.index)
-    with (folder / EMBEDDINGS).open("wb") as stream:
+    np.save(folder / LEX_INDEX, parts.index)
+    with (folder / LEX_EMBEDDINGS).open("wb") as stream:
         header = {"descr": "<f4", "fortran_order": False, "shape": parts.features.shape}
         np.lib.format.write_array_header_1_0(stream, header)
         for start in range(0, len(parts.features), ROWS_AT_ONCE):  # the table may be larger than memory
@@ -315,3 +317,57 @@ def _left_out(n_masks: int, n_empty: int, n_unnamed: int) -> Sequence[str]:
     if n_unnamed:
         remarks.append(f"{n_unnamed} of {n_masks} masks have none of the classes and were left out")
     return remarks
+
+
+# ---- OpenSUN3D
+
+
+def is_answer(content: Content) -> bool:
+    """Whether a prediction is masks on the vertices with confidences and nothing that a text could be compared with."""
+    return isinstance(content, VertexMasks) and content.features is None
+
+
+def answer_as_it_is(content: VertexMasks) -> LabelledMasks:
+    """Masks on the vertices with their own confidences; their classes, if they have some, say nothing here."""
+    return LabelledMasks(content, content.n_points or 0, np.zeros(len(content), np.int64), content.scores)
+
+
+def answer_to(
+    text: str, content: Content, rules: ProtocolRules, vertices: Float32Array, encoder: Encoder | None
+) -> LabelledMasks:
+    """Every mask of a map on the ``vertices`` (V, 3) m, its cosine with ``text`` as its confidence.
+
+    ``rules``, of kind ``queries``, say how masks reach the vertices. ``PredictionError`` where the map has no masks or
+    no features.
+    """
+    if isinstance(content, VertexLabels | DenseFeatures):
+        raise PredictionError("has no masks, and the challenge's submission needs them")
+    if isinstance(content, VertexMasks) and content.n_points not in {None, len(vertices)}:
+        raise PredictionError(
+            f"is of {content.n_points} points, the mesh has {len(vertices)} vertices; both must be of one mesh"
+        )
+    named = content.on(vertices, rules) if isinstance(content, VertexMasks) else content
+    masks = transfer.masks_of(named)
+    scores = np.zeros(0)
+    if len(masks):
+        if named.features is None or encoder is None:
+            raise PredictionError(NEEDS_FEATURES)
+        encoded = text_features(rules, [text], named.features, encoder)
+        scores = cosines(named.features, encoded, device_of(encoder))[:, 0]
+    if not np.isfinite(named.points).all() or not np.isfinite(scores).all():
+        raise PredictionError("has points or features that are NaN or infinite; make it again")
+    moved = transfer.transfer_masks(
+        named.points, masks, vertices, rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
+    )
+    return LabelledMasks(moved, len(vertices), np.zeros(len(masks), np.int64), scores)
+
+
+def write_opensun3d(answer: LabelledMasks, scene: str, folder: Path) -> tuple[str, ...]:
+    """``<scene>.txt`` and a file of digits for each mask; masks without points are left out and told."""
+    form = RUNS_FOLDER, ".txt", lambda k: digits_of(answer, k)
+    remarks = write_list(answer, np.zeros(len(answer.class_ids), np.int64), scene, folder, None, form)
+    n_written = int((answer.masks.sizes > 0).sum())
+    if n_written < LEAST_MASKS:
+        said = f"has {n_written or 'no'} mask{'s' * (n_written != 1)}"
+        remarks = (*remarks, f"{said}: the challenge's own script stops at a list of fewer than {LEAST_MASKS}")
+    return tuple(remarks)

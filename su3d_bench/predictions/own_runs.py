@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import PredictionError, printable, shown
 from su3d_bench.core.files.atomic import write_npz
 from su3d_bench.core.maps import DenseFeatures, Prediction
-from su3d_bench.core.system.files import regular
 from su3d_bench.formats.arrays import kind_of
-from su3d_bench.formats.numpy_files import npy_header_of, npz_names, read_npz
+from su3d_bench.formats.numpy_files import map_npy, npz_names, read_npz
 from su3d_bench.predictions.base import Content, Numbering, Reader, ScenePrediction, VertexLabels, VertexMasks
 from su3d_bench.store.predictions import (
     OVER_VERTICES,
@@ -27,7 +26,6 @@ from su3d_bench.store.predictions import (
 from su3d_bench.store.run_folder import JOBS, scene_of_folder
 
 FILE = "prediction.npz"
-FLOATS = ("f2", "f4", "f8")
 NUMBERINGS: dict[str, Numbering] = {name: name for name in get_args(Numbering)}
 
 
@@ -148,19 +146,10 @@ def _over_vertices(arrays: Mapping[str, NDArray[Any]], where: str) -> VertexMask
 
 def _mapped_features(file: Path) -> NDArray[Any]:
     """The features that lie beside a dense prediction, without reading them."""
-    header = npy_header_of(file)
-    if header is None or len(header.shape) != 2 or header.is_fortran or header.code.lstrip("<=") not in FLOATS:
+    table = map_npy(file)
+    if table.ndim != 2 or table.dtype.kind != "f" or not table.flags.c_contiguous:
         raise PredictionError(f"{shown(file)}: no .npy table of features; copy it beside the prediction again")
-    n_rows, n_columns = header.shape
-    n_bytes = header.start + n_rows * n_columns * np.dtype(header.code).itemsize
-    if file.stat().st_size != n_bytes:
-        raise PredictionError(
-            f"{shown(file)}: {n_rows} rows of {n_columns} need {n_bytes} bytes, {file.stat().st_size} are there; copy "
-            "the file again"
-        )
-    if n_rows == 0 or n_columns == 0:
-        return np.zeros((n_rows, n_columns), np.dtype(header.code))
-    return np.memmap(regular(file), np.dtype(header.code), "r", header.start, (n_rows, n_columns))
+    return table
 
 
 def _check_points(where: str, content: Prediction) -> None:

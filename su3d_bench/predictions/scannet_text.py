@@ -1,5 +1,10 @@
-"""Text predictions of ScanNet's benchmark: lists of masks, as Mask3D and Segment3D export them too, and labels; and the
-lists of the OpenSUN3D challenge, which have no class."""
+"""Text predictions of ScanNet's benchmark: lists of masks, as Mask3D and Segment3D export them too, and labels; the
+lists of the OpenSUN3D challenge, which have no class; and those of the ScanNet++ benchmark, lists of run-length masks
+and the likeliest classes of every vertex.
+
+Class numbers of ScanNet++ are places in the benchmark's list of classes, from 0. Source: semantic/eval of
+scannetpp/scannetpp at commit f3b4712.
+"""
 
 from __future__ import annotations
 
@@ -7,23 +12,25 @@ import json
 import math
 import os
 import stat
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.errors import PredictionError, printable, reading, shown
+from su3d_bench.core.errors import PredictionError, counted, printable, reading, shown
 from su3d_bench.core.system.files import file_bytes, opened
 from su3d_bench.core.types import Int32Array
-from su3d_bench.formats.arrays import check_members, run_members
+from su3d_bench.formats.arrays import MOST_POINTS, check_members, run_members
 from su3d_bench.formats.text_integers import integer_lines
 from su3d_bench.metrics.instance.average_precision import last_line_of_each_mask_file
-from su3d_bench.predictions.base import SceneFiles, ScenePrediction, VertexLabels, vertex_masks
+from su3d_bench.predictions.base import SceneFiles, ScenePrediction, VertexLabels, VertexMasks, vertex_masks
 
 OWN_OUTPUT = "semantic_instance_evaluation"  # the original evaluator's own answer, which it leaves out
 MASK3D_FOLDER = "decoder_-1"  # Mask3D and Segment3D write the lists of the last decoder here
 MASK_OF_RUNS = ".json"  # ScanNet++'s
+TOP = 3  # classes a vertex, where a line of ScanNet++ has several: eval_semantic.py takes 1 or the largest of its k
+SEPARATOR = ","  # between them
 MOST_FIRST_LINE = 4096
 MOST_LOOKED_AT = 50
 
@@ -43,10 +50,8 @@ class TextFiles(SceneFiles):
 
     suffixes = (".txt",)
 
-    def scenes(self, path: Path) -> dict[str, Path]:
-        files = super().scenes(path)
-        files.pop(OWN_OUTPUT, None)
-        return files
+    def scenes(self, path: Path) -> Mapping[str, Path]:
+        return {name: file for name, file in super().scenes(path).items() if name != OWN_OUTPUT}
 
     def first_lines(self, path: Path) -> list[str]:
         """The first line of some files, empty for empty ones."""
@@ -75,7 +80,7 @@ class ScannetText(TextFiles):
         is_list = words is not None and not words[0].endswith(MASK_OF_RUNS)
         return "its .txt files list a mask file, a class and a confidence a line" if is_list else None
 
-    def scenes(self, path: Path) -> dict[str, Path]:
+    def scenes(self, path: Path) -> Mapping[str, Path]:
         return super().scenes(path / MASK3D_FOLDER if (path / MASK3D_FOLDER).is_dir() else path)
 
     def read_scene(self, place: Path, scene: str) -> ScenePrediction:
@@ -132,6 +137,60 @@ class ScannetSemanticText(TextFiles):
             line = int(np.argmax(is_wrong))
             raise PredictionError(f"{where}:{line + 1}: {int(values[line])} is no class id")
         return ScenePrediction(scene, self.name, place, VertexLabels(values.astype(np.int32)))
+
+
+class ScannetppMasks(ScannetText):
+    name = "scannetpp"
+    summary = "ScanNet++'s instance submission: <scene>.txt with lines 'mask.json, class, confidence', run-length masks"
+
+    def recognise(self, path: Path) -> str | None:
+        words = list_words(self.first_lines(path))
+        is_list = words is not None and words[0].endswith(MASK_OF_RUNS)
+        return "its .txt files list a .json mask, a class and a confidence a line" if is_list else None
+
+    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
+        found = super().read_scene(place, scene)
+        assert isinstance(found.content, VertexMasks)
+        return replace(found, content=replace(found.content, numbering="line"))
+
+
+class ScannetppLabels(TextFiles):
+    name = "scannetpp-semantic"
+    summary = "ScanNet++'s semantic submission: <scene>.txt with one class a line, or three with commas between"
+
+    def recognise(self, path: Path) -> str | None:
+        words = next((line.split(SEPARATOR) for line in self.first_lines(path) if line), [])
+        is_ranked = len(words) > 1 and all(word.strip().isdigit() for word in words)
+        return "its .txt files hold integers with commas between" if is_ranked else None
+
+    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
+        where = shown(place)
+        numbers = _ranked_numbers(_content(place, where), where)
+        further = numbers[:, 1:] if numbers.shape[1] > 1 else None
+        return ScenePrediction(scene, self.name, place, VertexLabels(numbers[:, 0], further, "line"))
+
+
+def _ranked_numbers(content: bytes, where: str) -> Int32Array:
+    """The class numbers (N, 1) or (N, 3) of the vertices, the likeliest first."""
+    if (n_lines := content.count(b"\n")) > MOST_POINTS:
+        raise PredictionError(f"{where}: has {n_lines} lines; is it damaged?")
+    rows = [line.split(SEPARATOR.encode()) for line in content.splitlines()]
+    if not rows:
+        raise PredictionError(f"{where}: is empty; expected one or three classes a line, one line a vertex")
+    width = len(rows[0])
+    for number, row in enumerate(rows, 1):
+        if len(row) != width or width not in (1, TOP):
+            raise PredictionError(
+                f"{where}:{number}: has {counted(len(row), 'class')}; expected one in every line, or {TOP} in each"
+            )
+    columns = [integer_lines(b"\n".join(row[rank] for row in rows) + b"\n", where) for rank in range(width)]
+    numbers = np.column_stack(columns)
+    is_wrong = ((numbers < 0) | (numbers > np.iinfo(np.int32).max)).any(axis=1)
+    if is_wrong.any():
+        line = int(np.argmax(is_wrong))
+        shown_row = SEPARATOR.join(map(str, numbers[line].tolist()))
+        raise PredictionError(f"{where}:{line + 1}: {shown_row} is no place in a list of classes; they count from 0")
+    return numbers.astype(np.int32)
 
 
 def list_words(lines: Sequence[str]) -> list[str] | None:

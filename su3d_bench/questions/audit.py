@@ -13,10 +13,9 @@ import numpy as np
 from su3d_bench.core.english import plural, with_article
 from su3d_bench.core.errors import ConfigError, printable, suggest
 from su3d_bench.numerics.relations import RELATIONS
-from su3d_bench.questions.model import MADE_KINDS, REASONING, Question
-from su3d_bench.questions.reasoning.answers import Answer
-from su3d_bench.questions.reasoning.generated import GeneratedQuestion, generate_questions
-from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
+from su3d_bench.questions.generated import GeneratedQuestion, generate_questions
+from su3d_bench.questions.model import MADE_KINDS, REASONING, Answer, Question
+from su3d_bench.questions.scene_map import MapObject, SceneMap
 from su3d_bench.questions.truths import MIN_VERTICES, fullest_truth, questions_of, scene_objects
 
 RETRIEVAL = "retrieval"  # stands for all kinds of queries, as ``REASONING`` for all templates

@@ -21,12 +21,9 @@ from su3d_bench.core.english import last_word, with_article, words
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.toml import parse_toml
 from su3d_bench.numerics.relations import RELATIONS
-from su3d_bench.questions.known_objects import is_called
-from su3d_bench.questions.looks import LEAD, SIZES, Looks, measure_of
 from su3d_bench.questions.model import BY_NAME, KINDS, MADE_KINDS, Question, new_question
-from su3d_bench.questions.reasoning.named_objects import meant_by
-from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
-from su3d_bench.questions.sight import COLOURS
+from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, meant_by
+from su3d_bench.questions.sight import COLOURS, LEAD, SIZES, Looks, measure_of
 
 SOURCE = "generated"
 MAX_ANSWER_SHARE = 1 / 3  # ours: what more objects answer asks for nothing

@@ -1,11 +1,11 @@
-"""What people, or a program, are asked of a scene: a text, and where they are known the objects that answer it."""
+"""What people, or a program, are asked of a scene, where they are known the objects that answer it, and an answer."""
 
 from __future__ import annotations
 
 import hashlib
+import re
 from dataclasses import dataclass
-
-from su3d_bench.core.errors import DataError, printable
+from typing import Any, Literal
 
 KINDS = ("instance", "affordance", "property", "relative")
 # Properties and relations that nothing else of the name lacks: the name alone gives the answer.
@@ -45,15 +45,6 @@ class Question:
     name: str = ""
     groups: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        where = f"question '{printable(self.text, 60)}'"
-        if self.kind not in ALL_KINDS:
-            raise DataError(f"{where}: unknown kind '{printable(self.kind, 40)}'; known: {', '.join(ALL_KINDS)}")
-        if self.id != question_id(self.scene, self.kind, self.text):
-            raise DataError(f"{where}: its id '{printable(self.id, 40)}' is not that of its scene, kind and text")
-        if self.answers is not None and list(self.answers) != sorted({answer for answer in self.answers if answer > 0}):
-            raise DataError(f"{where}: answers must be instance ids above 0, ascending, each once")
-
     @property
     def is_known(self) -> bool:
         """Whether an object is known that answers it."""
@@ -66,3 +57,48 @@ def new_question(
     """A question with the id that its scene, kind and text give it."""
     ascending = None if answers is None else tuple(sorted(set(answers)))
     return Question(question_id(scene, kind, text), scene, kind, text, ascending, source, reply)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """``text`` says it; ``object_ids`` are the answer, ``reference_ids`` what it was held against.
+
+    ``value`` is the number of a count, the metres of a distance, the truth of a yes-no question, else None; ``notes``
+    say what was assumed. Where ``is_settled`` is false, ``text`` says why.
+    """
+
+    text: str
+    object_ids: tuple[int, ...] = ()
+    reference_ids: tuple[int, ...] = ()
+    value: float | int | bool | None = None
+    kind: str = ""
+    notes: tuple[str, ...] = ()
+    is_settled: bool = True
+    solver: Literal["built-in", "llm"] = "built-in"
+
+    def said(self, like: float | int | bool) -> float | int | bool | None:
+        """What it says of the kind of ``like``, read from its words where it gives no value; None for nothing."""
+        if self.value is not None:
+            return self.value
+        if isinstance(like, bool):
+            word = re.search(r"\b(yes|no)\b", self.text.lower())
+            return None if word is None else word[1] == "yes"
+        number = re.search(r"(?<![\w#.])\d+(?:\.\d+)?", self.text)
+        return None if number is None else float(number[0])
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "answer": self.text,
+            "object_ids": list(self.object_ids),
+            "reference_ids": list(self.reference_ids),
+            "value": self.value,
+            "kind": self.kind,
+            "is_settled": self.is_settled,
+            "notes": list(self.notes),
+            "solver": self.solver,
+        }
+
+
+def unsettled(reason: str, notes: tuple[str, ...] = ()) -> Answer:
+    """The honest answer where geometry does not settle the question."""
+    return Answer(f"I cannot settle this: {reason}", notes=notes, is_settled=False)

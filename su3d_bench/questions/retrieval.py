@@ -13,7 +13,7 @@ from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances
 from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.metrics.matching.labelling import cosines
-from su3d_bench.opensu3d.feature_fusion import cosine
+from su3d_bench.opensu3d.tracking import cosine
 
 LEAST_SHARE = 0.6  # similarity_thresh of ConceptFusion's examples/demo_text_query.py (fa4e95b)
 BLOCK_ROWS = 65536  # of features that are looked at together: the table may be larger than memory

@@ -14,7 +14,7 @@ from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.questions.truths import (
+from su3d_bench.metrics.questions.score import (
     AnnotationTruth,
     AskedText,
     GivenAnswer,
@@ -25,16 +25,15 @@ from su3d_bench.metrics.questions.truths import (
     TrueAnswer,
 )
 from su3d_bench.metrics.scoring import QuestionTruth
-from su3d_bench.questions.absent.presence import counted_rooms, presence_questions
-from su3d_bench.questions.chains.made import chain_truth
+from su3d_bench.questions.chains import chain_truth
+from su3d_bench.questions.generated import generate_questions
 from su3d_bench.questions.generator import chosen, generate, right_by_name
-from su3d_bench.questions.known_objects import is_called, known_objects
+from su3d_bench.questions.language_solver import BUILT_IN, MapSolver, built_in, given_answer
 from su3d_bench.questions.model import Question, new_question
-from su3d_bench.questions.reasoning.asking import BUILT_IN, MapSolver, built_in, given_answer
-from su3d_bench.questions.reasoning.generated import generate_questions
-from su3d_bench.questions.reasoning.scene_map import SceneMap, map_of
+from su3d_bench.questions.presence import counted_rooms, presence_questions
+from su3d_bench.questions.refining import voted_names
+from su3d_bench.questions.scene_map import SceneMap, is_called, known_objects, map_of
 from su3d_bench.questions.sight import Sight, sights
-from su3d_bench.questions.undesired import FilterConfig, undesired
 
 Refine = Callable[[Instances], RefinedNames | None]
 MIN_VERTICES = 100  # ScanNet's smallest instance that counts
@@ -44,7 +43,6 @@ BOXES = "boxes"  # the truth of which the least must be here
 MOST_KEPT = 4  # scenes whose objects are kept: every method and protocol asks for the same
 _Kept = OrderedDict[tuple[int, str, str, int], tuple[Any, SceneMap]]  # with the dataset, whose id is in the key
 _KEPT: _Kept = OrderedDict()
-MOST_NAMES = 5  # the paper's m: n' comes from the names of so many best views
 
 
 def has_own_queries(dataset: Any) -> bool:
@@ -157,17 +155,6 @@ def _reasoning_truth(
         return [given_answer(*both, scene) for both in zip(true, answers, strict=True)]
 
     return ReasoningTruth(truth, tuple(true), solve, solver.name if solver else BUILT_IN)
-
-
-def voted_names(instances: Instances) -> RefinedNames | None:
-    """Label n' by vote: of the names that the best views gave, the one with the greatest sum of prediction scores."""
-    from su3d_bench.questions.refining.refinement import top_names, vote
-
-    if instances.view_names is None or instances.view_scores is None:
-        return None
-    names = tuple(vote(top).name for top in top_names(instances, MOST_NAMES))
-    left_out = undesired(instances, names, FilterConfig())
-    return RefinedNames(names, f"the vote of the names of {MOST_NAMES} views, no language model", left_out)
 
 
 def questions_of(dataset: Any, scene: str, *, per_kind: int | None = None, own: bool = True) -> tuple[Question, ...]:

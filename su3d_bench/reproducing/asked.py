@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import fnmatch
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from su3d_bench.core import registry
 from su3d_bench.core.config import Settings
-from su3d_bench.core.errors import ConfigError, printable
+from su3d_bench.core.errors import ConfigError, Su3dError, printable, suggest
 from su3d_bench.core.files.atomic import is_file
+from su3d_bench.core.interfaces import HasGroups
+from su3d_bench.evaluation.as_run import evaluate_methods
+from su3d_bench.evaluation.result import Request
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.reports.tables.ablation import SweepRow
 from su3d_bench.reproducing.recipe import Experiment, Recipe
-from su3d_bench.runs.executors.local import Report
-from su3d_bench.runs.planning.ablation import ablation_rows, write_rows
-from su3d_bench.runs.planning.asked import asked_settings
-from su3d_bench.runs.planning.held import Into
-from su3d_bench.runs.planning.plan import Plan, make_plan, named_method
-from su3d_bench.runs.planning.scenes import split_address
-from su3d_bench.runs.runner import RunResult, publish, run_plan
+from su3d_bench.runs.ablation import ablation_rows, write_rows
+from su3d_bench.runs.executors import Report
+from su3d_bench.runs.existing import Into
+from su3d_bench.runs.job import build_dataset, part_of
+from su3d_bench.runs.plan import Plan, asked_settings, make_plan, named_method
+from su3d_bench.runs.runner import RunResult, run_plan
+from su3d_bench.runs.scenes import data_root, split_address
 
 RUNS = "runs"
 
@@ -152,6 +159,29 @@ def _fitting(experiment: Experiment, dataset: str) -> tuple[str, ...]:
     return names
 
 
+def dataset_named(name: str) -> Any:
+    return build_dataset(part_of("dataset", name, Settings()), data_root())
+
+
+def known_scenes(dataset: Any) -> tuple[str, ...]:
+    try:
+        return tuple(dataset.scenes())
+    except Su3dError:
+        return ()
+
+
+def scene_names(dataset_name: str, addresses: Sequence[str]) -> Iterator[str]:
+    """The scenes that ``addresses`` of a dataset name; a group's members, and what of a pattern is here."""
+    dataset = dataset_named(dataset_name)
+    groups = dataset.groups() if isinstance(dataset, HasGroups) else {}
+    for address in addresses:
+        _, name = split_address(address)
+        if any(character in name for character in "*?["):
+            yield from (scene for scene in known_scenes(dataset) if fnmatch.fnmatchcase(scene, name))
+        else:
+            yield from groups.get(name, (name,))
+
+
 def plan_of(run: AskedRun, out: Path) -> Plan:
     """The plan of a run; what its folder holds already is joined with, so that a table more makes it longer."""
     values = dict(run.values) | {
@@ -173,5 +203,95 @@ def carry_out(run: AskedRun, plan: Plan, report: Report) -> RunResult:
     result = run_plan(plan, report)
     if run.rows and result.is_complete:
         write_rows(plan.folder.path, run.rows, joins=True)
-        publish(plan)
+        plan.place.publish()
     return result
+
+
+@contextmanager
+def environment(**values: str) -> Iterator[None]:
+    """Variables of the environment, which the workers inherit, for the time of the block."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@dataclass(frozen=True)
+class Given:
+    """The predictions of one method: where they lie, and what its encoder makes of texts, where that is given."""
+
+    place: Path
+    text_features: Path | None = None
+
+
+def named_predictions(
+    experiments: Sequence[Experiment], texts: Sequence[str], text_features: Sequence[str] = ()
+) -> dict[str, Given]:
+    """What ``METHOD=DIR`` and ``METHOD=FILE`` give, by printed method.
+
+    Raises ``ConfigError`` for a method of which no experiment takes predictions or that is named twice, for what is
+    not there, and for one folder under two names.
+    """
+    places = _named(
+        "--predictions", "DIR", dict.fromkeys(name for one in experiments for name in one.predictions), texts
+    )
+    features = _named("--text-features", "FILE", places, text_features)
+    methods: dict[Path, str] = {}
+    for method, place in places.items():
+        other = methods.setdefault(place.resolve(), method)
+        if other != method:
+            raise ConfigError(
+                f"--predictions {printable(method, 60)}: {printable(str(place), 200)} was given for "
+                f"{printable(other, 60)}; each method has a folder of its own"
+            )
+    return {method: Given(place, features.get(method)) for method, place in places.items()}
+
+
+def _named(flag: str, kind: str, known: Mapping[str, object], texts: Sequence[str]) -> dict[str, Path]:
+    named: dict[str, Path] = {}
+    for text in texts:
+        method, equals, path = text.partition("=")
+        if not equals or not path:
+            raise ConfigError(f"{flag} {printable(text, 80)}: expected METHOD={kind}")
+        if method not in known:
+            hint = suggest(method, known, "it takes") if known else "; name its --predictions too"
+            raise ConfigError(f"{flag}: this recipe takes none of '{printable(method, 60)}'{hint}")
+        if method in named:
+            raise ConfigError(f"{flag}: '{printable(method, 60)}' is given twice; give it once")
+        if not Path(path).exists():
+            raise ConfigError(f"{flag} {printable(method, 60)}: there is no {printable(path, 200)}")
+        named[method] = Path(path)
+    return named
+
+
+def evaluate_predictions(
+    named: Mapping[str, Given], experiments: Sequence[Experiment], asked: Asked, out: Path
+) -> list[Path]:
+    """The run folders of predictions, one a method and dataset; a folder that holds the same stays as it is."""
+    folders: list[Path] = []
+    for method, given in named.items():
+        mine = [one for one in experiments if method in one.predictions]
+        for dataset in dict.fromkeys(split_address(scene)[0] for one in mine for scene in one.scenes):
+            protocols = dict.fromkeys(name for one in mine for name in one.protocols)
+            fitting = tuple(name for name in protocols if dataset in load_protocol(name).datasets)
+            name = re.sub(r"[^A-Za-z0-9-]+", "-", method).strip("-").lower()
+            folder = out / RUNS / f"{dataset}-predictions-{name}"
+            scenes = _scenes(mine, asked, dataset)
+            request = Request((given.place,), dataset, None, None, fitting, scenes, None, given.text_features)
+            evaluate_methods({method: request}, folder)
+            folders.append(folder)
+    return folders
+
+
+def _scenes(experiments: Sequence[Experiment], asked: Asked, dataset: str) -> tuple[str, ...]:
+    """The recipe's scenes of ``dataset``: what else was predicted is of no row of its tables."""
+    addresses = asked.scenes.get(dataset) if asked.scenes else None
+    if addresses is None:
+        addresses = tuple(scene for one in experiments for scene in one.scenes if split_address(scene)[0] == dataset)
+    return tuple(dict.fromkeys(scene_names(dataset, addresses)))

@@ -4,31 +4,36 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.analysis.paper_tables import numbered_tables
-from su3d_bench.analysis.tables import choose, measured_results
+from su3d_bench.analysis.tables import choose, measured_results, numbered_tables
 from su3d_bench.core import registry
 from su3d_bench.core.config import toml_value
 from su3d_bench.core.errors import ConfigError, counted, printable, some
-from su3d_bench.formats.tables.table import Cell, Table, TableRow
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.perception.models.catalogue import WEIGHTS_CAVEAT
+from su3d_bench.core.files.atomic import is_file, make_folder
+from su3d_bench.core.maps import Instances
+from su3d_bench.formats.tables.table import Cell, Prose, Table, TableRow
+from su3d_bench.metrics.costs import summarise
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
+from su3d_bench.questions.retrieval import rank
+from su3d_bench.reports.pictures.maps import draw_heat_map
 from su3d_bench.reports.tables.model import Measured
-from su3d_bench.reports.tables.papers.paper import PAPER_PROFILE, PAPER_SCENES, Shown
-from su3d_bench.reports.tables.papers.published import OPEN, Figure
+from su3d_bench.reports.tables.paper import OPEN, PAPER_PROFILE, PAPER_SCENES, Figure, Shown
+from su3d_bench.reports.tables.timing import timing_tables
 from su3d_bench.reproducing.asked import method_of_row, methods_of
-from su3d_bench.reproducing.recipe import Experiment
-from su3d_bench.runs.finished import FinishedRun, read_run
+from su3d_bench.reproducing.recipe import Experiment, Recipe
+from su3d_bench.runs.finished import FinishedRun, encoder_of, read_run, read_update_times
+from su3d_bench.store.predictions import read_prediction
 
 _NAMES = ("name", "version", "summary", "original", "headline", "not_comparable_with", "datasets", "by_default")
 _ENCODER = ("perception", "models", "encoder")
 _EVERY = re.compile(r"every (\d+)(?:st|nd|rd|th)")
 MOST_RULES = 4
+WARM_UP, CAMERA_HZ = 3, 30.0  # as `report timing` has them
+SCHEMA = 1
 
 
 @dataclass(frozen=True)
@@ -167,7 +172,6 @@ def _why_not(experiment: Experiment, figure: Figure, method: str, metric: str, r
 
 def causes(figure: Figure, row: Measured, run: FinishedRun | None) -> Iterator[str]:
     """In what the row of a run was made otherwise than the printed number, as far as both sides say."""
-    yield from _of_weights(row)
     yield from _of_judges(figure, row)
     yield from _of_protocol(figure, row)
     yield from _of_scenes(figure, row)
@@ -177,10 +181,6 @@ def causes(figure: Figure, row: Measured, run: FinishedRun | None) -> Iterator[s
     yield from _of_labels(figure, row, run)
     if row.changed and not (figure.row and "=" in figure.row):
         yield f"settings: {some(row.changed, 4)}"
-
-
-def _of_weights(row: Measured) -> Iterator[str]:
-    yield from (part for part in (row.caveat or "").split("; ") if part.startswith(WEIGHTS_CAVEAT))
 
 
 def _of_judges(figure: Figure, row: Measured) -> Iterator[str]:
@@ -340,3 +340,72 @@ def tables_of(experiment: Experiment, results: Results) -> list[Table]:
         return numbered_tables([experiment.table], rows, folders, Shown(intervals=True), with_published=True)
     except ConfigError as error:
         raise ConfigError(f"experiment {experiment.name}: {error}") from error
+
+
+def result_tables(
+    experiments: Sequence[Experiment], cells: Mapping[str, Sequence[Compared]], results: Results
+) -> list[Table | Prose]:
+    """Of each experiment the paper's own table, and under it reported beside measured; of timing its tables."""
+    tables: list[Table | Prose] = []
+    for experiment in experiments:
+        tables += tables_of(experiment, results)
+        if cells.get(experiment.name):
+            tables.append(comparison_table(experiment, cells[experiment.name]))
+        if experiment.timing:
+            tables += _timing(experiment, results.of(experiment))
+    return tables
+
+
+def _timing(experiment: Experiment, results: Results) -> Sequence[Table | Prose]:
+    timed = [
+        times
+        for run in results.runs.values()
+        for method in methods_of(experiment)
+        if method in run.methods and set(experiment.protocols) & set(run.protocols)
+        if (times := read_update_times(run, method))
+    ]
+    hardware = {run.name: run.record.hardware for run in results.runs.values()}
+    return timing_tables([summarise(each, WARM_UP) for each in timed], [], hardware, CAMERA_HZ) if timed else []
+
+
+def compared_json(recipe: Recipe, cells: Mapping[str, Sequence[Compared]]) -> dict[str, Any]:
+    """Every printed cell with what was measured, as it is kept."""
+    rows = [
+        {**asdict(cell), "difference": cell.difference, "difference_interval": cell.difference_interval}
+        for each in cells.values()
+        for cell in each
+    ]
+    return {"schema": SCHEMA, "recipe": recipe.name, "cells": rows}
+
+
+SHOWN = 5  # instances that are listed beneath a picture
+
+
+def draw_queries(experiments: Sequence[Experiment], results: Results, out: Path, device: str) -> Iterator[Path]:
+    """A picture a text and method, of the first scene of the run; maps without instances have none."""
+    for experiment in experiments:
+        if not experiment.queries:
+            continue
+        for run in results.of(experiment).runs.values():
+            if experiment.queries and set(methods_of(experiment)) <= set(run.methods):
+                yield from _of_run(experiment, run, out / experiment.name, device)
+                break
+
+
+def _of_run(experiment: Experiment, run: FinishedRun, out: Path, device: str) -> Iterator[Path]:
+    names = [scene for scene in run.scenes if scene in experiment.scenes] or list(run.scenes[:1])
+    encoder = encoder_of(run.folder, device)
+    make_folder(out)
+    for scene in names[:1]:
+        for method in methods_of(experiment):
+            file = run.folder.job(scene, method).prediction
+            prediction = read_prediction(file) if is_file(file) else None
+            if not isinstance(prediction, Instances):
+                continue
+            for text in experiment.queries:
+                ranking = rank(prediction, text, encoder)
+                first = [(prediction.names[k], float(ranking.similarity[k])) for k in ranking.order[:SHOWN]]
+                lines = [f"{place}. {name}  {value:.3f}" for place, (name, value) in enumerate(first, 1)]
+                picture = out / f"{text.replace(' ', '-')}-{method.replace('@', '-')}.png"
+                draw_heat_map(prediction, ranking.similarity, picture, f'{scene}, {method}: "{text}"', lines)
+                yield picture

@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from su3d_bench.core.errors import ConfigError, printable, reading, suggest
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.toml import parse_toml
-from su3d_bench.reports.tables.papers.published import Figure, PaperTable, published
+from su3d_bench.reports.tables.paper import Figure, PaperTable, published
 
 FOLDER = Path(__file__).resolve().parent / "recipes"
 MOST_BYTES = 1 << 20
@@ -81,16 +81,13 @@ class Experiment(BaseModel):
 
 
 class Rehearsal(BaseModel):
-    """The same on rooms that the program makes: their names, options of them, and whose perception.
-
-    ``paper``: with tiny networks that stand in for the published ones.
-    """
+    """The same on rooms that the program makes: their names, options of them, and whose perception."""
 
     model_config = _STRICT
 
     rooms: Annotated[tuple[Word, ...], Field(min_length=1)] = ("bedroom0", "office0")
     settings: tuple[Word, ...] = ("n_frames=100", "width=240", "height=180")
-    profile: Literal["paper", "embedded", "oracle"] = "paper"
+    profile: Literal["embedded", "oracle"] = "embedded"
 
 
 class Recipe(BaseModel):

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.analysis.recomputed import damaged_files, rules_of_run, why_not_counted
 from su3d_bench.core import registry
 from su3d_bench.core.config import MOVES_NO_NUMBER, Setting, Settings
 from su3d_bench.core.errors import StoreError, Su3dError, counted, printable
@@ -24,16 +23,17 @@ from su3d_bench.core.system.devices import device_for
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.system.timing import processor_digest
 from su3d_bench.evaluation.evaluate import evaluate
-from su3d_bench.evaluation.request import Request
-from su3d_bench.metrics.scoring import SceneScore, pack_scores
+from su3d_bench.evaluation.result import Request
+from su3d_bench.metrics.metric import SceneScore
+from su3d_bench.metrics.scoring import pack_scores
 from su3d_bench.reproducing.bundle import COMPARED, RECIPE, Unpacked, unpack
-from su3d_bench.reproducing.differences import Results, compared_all
+from su3d_bench.reproducing.differences import Results, compared_all, compared_json
 from su3d_bench.reproducing.recipe import parse_recipe
-from su3d_bench.reproducing.tables import compared_json
 from su3d_bench.runs.finished import FinishedRun, encoder_of, read_run
 from su3d_bench.runs.job import SceneJob
-from su3d_bench.runs.planning.plan import make_plan
+from su3d_bench.runs.plan import make_plan
 from su3d_bench.runs.scene import scores_again
+from su3d_bench.runs.verify import damaged_files, rules_of_run, why_not_counted
 
 TOLERANCE = 1e-9  # of a value on another machine
 OF_THE_VERIFIER = {"profile": "embedded", "executor": "auto", "offline": True, "pictures": False, "accept_poses": True}

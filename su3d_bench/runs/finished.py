@@ -33,13 +33,13 @@ from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.labels import labels_counted
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol, read_rules
+from su3d_bench.metrics.metric import SceneScore
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names, read_rules
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.scoring import SceneScore, unpack_scores
+from su3d_bench.metrics.scoring import unpack_scores
 from su3d_bench.predictions.formats import recognise
-from su3d_bench.runs.parts import Part, build_dataset, part_of
-from su3d_bench.runs.planning.scenes import (
+from su3d_bench.runs.job import Part, build_dataset, part_of
+from su3d_bench.runs.scenes import (
     cache_root,
     data_root,
     dataset_targets,

@@ -3,26 +3,84 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from su3d_bench.core import registry
-from su3d_bench.core.config import flatten
-from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_json, package_versions, source_digest
+from su3d_bench.core.config import Settings, flatten, resolve
+from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_file, digest_json, package_versions
 from su3d_bench.core.errors import StoreError
-from su3d_bench.core.interfaces import HasCaveat, HasInputs, HasOwnPerception, Method, ReadsMadeRooms
-from su3d_bench.core.types import SceneInfo
+from su3d_bench.core.interfaces import HasCaveat, HasInputs, HasOwnPerception, Method, ReadsMadeRooms, TakesTruth
+from su3d_bench.core.maps import Prediction
+from su3d_bench.core.types import GroundTruth, LabelSet, SceneInfo
+from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.perception.models.catalogue import STAND_IN, WEIGHTS_CAVEAT
+from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.scoring import Truth
+from su3d_bench.metrics.semantic.panoptic import told_truth
 from su3d_bench.perception.profiles import Perception, PerceptionConfig
-from su3d_bench.questions.reasoning.language_solver import answers_digest
-from su3d_bench.questions.refining.refined_names import refined_digest
-from su3d_bench.runs.own.watch import told
-from su3d_bench.runs.parts import Part
+from su3d_bench.questions.language_solver import answers_digest
+from su3d_bench.questions.refining import refined_digest
+from su3d_bench.runs.plugins import checked_dataset, checked_method, made, settings_model, told
 from su3d_bench.store.records import SealRecord
 from su3d_bench.store.run_folder import JobFolder
+
+
+@dataclass(frozen=True)
+class Part:
+    """A dataset or method of the run: its registry target, its own name, its resolved options as JSON."""
+
+    target: str
+    name: str
+    options: str
+
+
+def options_model(kind: str, target: str) -> Any:
+    """The model of the options of a dataset, or of the settings of a method."""
+    return settings_model(registry.load(kind, target), "Config" if kind == "method" else "Options")
+
+
+def part_of(kind: str, target: str, settings: Settings) -> Part:
+    """The dataset or method at ``target`` with what ``settings`` say of it."""
+    name = str(registry.load(kind, target).name)
+    return Part(target, name, resolve(settings, (kind, name), options_model(kind, target)).model_dump_json())
+
+
+def build_dataset(part: Part, data_root: Path) -> Any:
+    """The dataset of ``part``, reading below ``data_root``."""
+    dataset_class = registry.load("dataset", part.target)
+    return checked_dataset(made(dataset_class, data_root, dataset_class.Options.model_validate_json(part.options)))
+
+
+def build_method(part: Part) -> Any:
+    """A fresh method of ``part``."""
+    method_class = registry.load("method", part.target)
+    return checked_method(made(method_class, method_class.Config.model_validate_json(part.options)))
+
+
+def as_told(
+    part: Part, rules: ProtocolRules, truth: Truth, prediction: Prediction, first: Callable[[], LabelSet]
+) -> Prediction:
+    """``prediction``, a map of the method ``part``; that of a method that is told the truth is made anew where it must
+    be told another one under ``rules``.
+
+    So it is where ``truth`` names its classes otherwise than the ``first`` truth of the dataset, from which the map
+    came, and where stuff counts that has no instances. Of OpenLex3D's labels it is told the first synonyms.
+    """
+    method = build_method(part)
+    if isinstance(truth, OpenLexTruth):
+        truth = truth.by_first_synonym()
+    if not isinstance(method, TakesTruth) or not isinstance(truth, GroundTruth):
+        return prediction
+    told = told_truth(rules, truth)
+    if told is truth and truth.labels == first():
+        return prediction
+    method.receive_truth(told)
+    made_anew: Prediction = method.finish()
+    return made_anew
+
 
 # Settings of perception that move no number, or whose part that does is in perception's digest.
 NOT_IN_KEY = ("perception.cache", "perception.models.folder", "perception.models.paths", "perception.language.")
@@ -59,6 +117,11 @@ class SceneJob:
     accepts_poses: bool = False
     replaces: bool = False
     doubts: tuple[str, ...] | None = None
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """All methods, that of the ceiling last."""
+        return self.methods if self.ceiling is None else (*self.methods, self.ceiling)
 
     @property
     def scene_name(self) -> str:
@@ -119,7 +182,7 @@ def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
 
 def own_code(target: str) -> str | None:
     """A key of the file of somebody's own dataset or method, which is no part of the program's code."""
-    return source_digest(Path(target.rpartition(":")[0]))[:16] if ".py:" in target else None
+    return digest_file(Path(target.rpartition(":")[0]))[:16] if ".py:" in target else None
 
 
 def refuse_other_run(folder: JobFolder, key: Mapping[str, str], known_later: Sequence[str] = ()) -> None:
@@ -197,7 +260,5 @@ def caveat_of(method: Method, perception: Perception, scene: SceneInfo) -> str |
     dataset = registry.load("dataset", scene.dataset) if scene.dataset in registry.DATASETS else None
     is_made = scene.image_domain == "rendered-rooms" and isinstance(dataset, ReadsMadeRooms)
     made = f"made rooms in the layout of {scene.dataset}, not its scenes" if is_made else None
-    name = perception.encoder.name
-    weights = f"{WEIGHTS_CAVEAT} {name.removesuffix(STAND_IN)}" if name.endswith(STAND_IN) else None
-    parts = [made, weights, perception.caveat if is_seen_by_profile else None, own]
+    parts = [made, perception.caveat if is_seen_by_profile else None, own]
     return "; ".join(part for part in parts if part) or None

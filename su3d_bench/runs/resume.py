@@ -9,8 +9,16 @@ from typing import Any
 
 from su3d_bench.core.types import SceneInfo
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
-from su3d_bench.runs.job import JobInputs, MethodOutcome, SceneJob, config_key, stride_of
-from su3d_bench.runs.parts import Part, build_dataset, build_method
+from su3d_bench.runs.job import (
+    JobInputs,
+    MethodOutcome,
+    Part,
+    SceneJob,
+    build_dataset,
+    build_method,
+    config_key,
+    stride_of,
+)
 from su3d_bench.store.records import SealRecord
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
@@ -33,15 +41,14 @@ class FinishedScenes:
 
     def outcomes(self, job: SceneJob) -> tuple[MethodOutcome, ...] | None:
         """The outcomes of a scene, that of the ceiling last; None where a worker is needed, be it to say an error."""
-        parts = job.methods if job.ceiling is None else (*job.methods, job.ceiling)
-        folders = [RunFolder(job.folder).job(job.scene, part.name) for part in parts]
+        folders = [RunFolder(job.folder).job(job.scene, part.name) for part in job.parts]
         seals = [folder.seals() for folder in folders]
         if any("predict" not in seal or "score" not in seal for seal in seals):
             return None
         package = logging.getLogger("su3d_bench")
         package.addHandler(unheard := logging.NullHandler())  # what is said of a scene's data was said in its first run
         try:
-            outcomes = [self._outcome(job, *each) for each in zip(parts, folders, seals, strict=True)]
+            outcomes = [self._outcome(job, *each) for each in zip(job.parts, folders, seals, strict=True)]
         except Exception:  # noqa: BLE001 - a plug-in may raise anything; a worker tells it as ever
             return None
         finally:

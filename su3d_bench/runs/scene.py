@@ -23,30 +23,29 @@ from su3d_bench.core.interfaces import (
     Method,
     RendersFrames,
     SceneTools,
-    TakesDevice,
     TakesTools,
     TakesTruth,
     WarmsUp,
 )
 from su3d_bench.core.maps import Prediction, Proposals
 from su3d_bench.core.printing import one_line
-from su3d_bench.core.system.devices import device_for
 from su3d_bench.core.system.timing import MethodClock, device_memory_bytes, peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, ObjectBoxes, SceneInfo
 from su3d_bench.metrics.fitness import why_not_scorable
+from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.scoring import SceneScore, Truth, pack_scores, score_scene
+from su3d_bench.metrics.scoring import Truth, pack_scores, score_scene
 from su3d_bench.perception.language.client import ChatClient
 from su3d_bench.perception.language.reply_store import ReplyStore
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
-from su3d_bench.questions.reasoning.asking import MapSolver, by_language_model
-from su3d_bench.questions.refining.refined_names import refined_names
+from su3d_bench.questions.language_solver import MapSolver, by_language_model
+from su3d_bench.questions.refining import refined_names
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.reports.pictures.maps import draw_scene
-from su3d_bench.reports.tables.found import Unscored, not_scored_lines
-from su3d_bench.runs.executors.local import Event, Report
-from su3d_bench.runs.feeding import (
+from su3d_bench.reports.tables.run import Unscored, not_scored_lines
+from su3d_bench.runs.executors import Event, Report
+from su3d_bench.runs.frame_loop import (
     N_AHEAD,
     Feeding,
     FirstFrames,
@@ -57,9 +56,19 @@ from su3d_bench.runs.feeding import (
     true_proposals,
     warm_up,
 )
-from su3d_bench.runs.job import JobInputs, MethodOutcome, SceneJob, config_key, refuse_other_run, stride_of
-from su3d_bench.runs.parts import Part, as_told, build_dataset, build_method
-from su3d_bench.runs.planning.poses import REMARK, PosesContradicted, judged
+from su3d_bench.runs.job import (
+    JobInputs,
+    MethodOutcome,
+    Part,
+    SceneJob,
+    as_told,
+    build_dataset,
+    build_method,
+    config_key,
+    refuse_other_run,
+    stride_of,
+)
+from su3d_bench.runs.poses import REMARK, PosesContradicted, judged
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
@@ -74,17 +83,14 @@ def run_scene(job: SceneJob, report: Report) -> tuple[MethodOutcome, ...]:
         except PosesContradicted as error:
             return failed_outcomes(job, str(error).removeprefix(f"{job.scene}: "))
     scene = _Scene(job, report)
-    parts = job.methods if job.ceiling is None else (*job.methods, job.ceiling)
-    return tuple(_guarded(scene, part) for part in parts)
+    return tuple(_guarded(scene, part) for part in job.parts)
 
 
 @cache
-def _warm_up(part: Part, device: str) -> None:
+def _warm_up(part: Part) -> None:
     """Once a process for each method and its settings, where it asks for it."""
     scratch: Method = build_method(part)
     if isinstance(scratch, WarmsUp) and scratch.warms_up:
-        if isinstance(scratch, TakesDevice):
-            scratch.receive_device(device)
         warm_up(scratch)
 
 
@@ -276,10 +282,6 @@ class _Scene:
         if method.needs.frames:
             frames = self.dataset.frames(self.job.scene_name, info.stride)
             n = min(len(frames), self.job.limit or len(frames))
-        device = device_for(self.perception_config.models.device, self.job.index)
-        if isinstance(method, TakesDevice):
-            with clock.running("start"):
-                method.receive_device(device)
         if isinstance(method, TakesTools):
             tools = self._tools(method, perception, frames, n, clock)
             with clock.running("start"):
@@ -291,7 +293,7 @@ class _Scene:
             with clock.running("start"):
                 method.receive_truth(truth)
         self.says(part, "compiling the method")
-        _warm_up(part, device)
+        _warm_up(part)
         self.says(part, self.opening)
         start_memory_watch()
         feeding = Feeding(

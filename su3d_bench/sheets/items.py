@@ -1,4 +1,4 @@
-"""What a set of annotation sheets is: items without a word on who made them, the key kept apart, and answers.
+"""What a set of annotation sheets is: items without a word on who made them, the key kept apart, and how to judge.
 
 ``sheet.json`` goes to annotators, ``key.json`` does not. Ids begin with a letter, so that no spreadsheet takes one
 for a number.
@@ -6,17 +6,24 @@ for a number.
 
 from __future__ import annotations
 
+import json
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from su3d_bench.core.digests import digest_json
-from su3d_bench.core.errors import DataError, printable, reading
+from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.files.atomic import write_json
-from su3d_bench.core.system.files import file_bytes
+from su3d_bench.core.system.files import file_text
+from su3d_bench.formats.images import read_bytes
+from su3d_bench.formats.text_files import parsed_json
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 SCHEMA = 1
 SHEET_FILE, KEY_FILE = "sheet.json", "key.json"
@@ -26,7 +33,6 @@ SheetKind = Literal["retrieval", "annotation", "reasoning", "questions"]
 # Columns of a file of answers; others may follow and are for the reader alone.
 ANSWER_COLUMNS = ("sheet_id", "item_id", "annotator", "question", "answer", "check")
 RIGHT, WRONG, CANNOT_TELL = "right", "wrong", "cannot tell"
-JUDGEMENTS = (RIGHT, WRONG, CANNOT_TELL)
 ARGUABLE = "arguable"
 VERDICTS = (RIGHT, ARGUABLE, WRONG)  # of a question: what nobody can tell from pictures is at best arguable
 # The names that metrics/score_questions.py has for the merging of a mask.
@@ -53,70 +59,21 @@ class Ask(_Strict):
     meanings: tuple[str, ...] = ()
 
 
-LABEL_MEANINGS = ("a fitting name, general or special", "a name of something else", "the picture does not show it")
-ASKS: Mapping[SheetKind, tuple[Ask, ...]] = {
-    "retrieval": (
-        Ask(
-            "retrieval",
-            "Does the outlined object answer this?",
-            JUDGEMENTS,
-            ("the outlined object answers the text", "it does not", "the picture does not show it"),
-        ),
-    ),
-    "annotation": (
-        Ask("label 1", "Is label 1 right?", JUDGEMENTS, LABEL_MEANINGS),
-        Ask("label 2", "Is label 2 right?", JUDGEMENTS, LABEL_MEANINGS),
-        Ask(
-            "merging",
-            "How is the mask merged?",
-            MERGES,
-            (
-                "one whole object and little else",
-                "only a part: one thing taken for several",
-                "more than one thing taken for one",
-                "the picture does not show it",
-            ),
-        ),
-    ),
-    "reasoning": (
-        Ask(
-            "answer",
-            "Is the answer right?",
-            JUDGEMENTS,
-            ("the answer is true of this room", "it is not", "the picture does not show it"),
-        ),
-        Ask(
-            "objects",
-            "Are the objects it names right?",
-            JUDGEMENTS,
-            ("all of them, and none is missing", "one is wrong or missing", "the picture does not show it"),
-        ),
-    ),
-    "questions": (
-        Ask(
-            "sense",
-            "Does the question make sense, and do pictures of the room answer it?",
-            VERDICTS,
-            (
-                "it asks for something plain to see",
-                "it can be taken in two ways",
-                "it cannot be answered, or is absurd",
-            ),
-        ),
-        Ask(
-            "wording",
-            "Is its wording right English?",
-            VERDICTS,
-            ("as people say it", "understood, but said differently", "a word is wrong or missing"),
-        ),
-        Ask(
-            "answer",
-            "Is its answer right?",
-            VERDICTS,
-            ("all of it, and nothing is missing", "people would differ", "something is wrong or missing"),
-        ),
-    ),
-}
+@dataclass(frozen=True)
+class KindOfSheet(_Strict):
+    """What is asked on sheets of a kind, and the words on its page and pictures; ``guide``: what the pictures show."""
+
+    title: str
+    outlined: str
+    room: str
+    guide: tuple[str, ...]
+    asks: tuple[Ask, ...]
+
+
+KINDS_OF_SHEETS: Mapping[SheetKind, KindOfSheet] = TypeAdapter(dict[SheetKind, KindOfSheet]).validate_json(
+    json.dumps(tomllib.loads(file_text(Path(__file__).with_name("asks.toml"))))
+)
+ASKS: Mapping[SheetKind, tuple[Ask, ...]] = {name: kind.asks for name, kind in KINDS_OF_SHEETS.items()}
 
 
 @dataclass(frozen=True)
@@ -152,7 +109,6 @@ class Sheet(_Strict):
     asks: tuple[Ask, ...]
     items: tuple[SheetItem, ...]
     annotators: tuple[AnnotatorShare, ...]
-    schema_version: int = SCHEMA
 
     def ask(self, name: str) -> Ask:
         return next(ask for ask in self.asks if ask.name == name)
@@ -199,7 +155,6 @@ class JudgedRun:
     limit: int = 0
     changed: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
-    schema_version: int = SCHEMA
 
     def how_it_was_made(self) -> dict[str, Any]:
         """These fields, for what is made of the same run."""
@@ -245,72 +200,64 @@ def sheet_id_of(kind: SheetKind, seed: int, contents: Any) -> str:
 
 def write_sheet(folder: Path, sheet: Sheet) -> Path:
     """Write ``sheet.json`` into ``folder``; its path."""
-    write_json(folder / SHEET_FILE, asdict(sheet))
-    return folder / SHEET_FILE
+    return write_record(folder / SHEET_FILE, sheet)
 
 
 def write_key(folder: Path, key: Key) -> Path:
     """Write ``key.json`` into ``folder``; its path."""
-    write_json(folder / KEY_FILE, asdict(key))
-    return folder / KEY_FILE
+    return write_record(folder / KEY_FILE, key)
 
 
 def read_sheet(path: Path) -> Sheet:
     """The set in a ``sheet.json``; a ``DataError`` where the file is not as ``sheets make`` writes it."""
-    sheet = read_record(path, Sheet, SCHEMA, "sheets make", "make them again")
-    where = printable(str(path), 200)
-    known = [item.id for item in sheet.items]
-    if len(set(known)) != len(known):
-        raise DataError(f"{where}: two items have one id; make the sheets again")
-    names = {ask.name for ask in sheet.asks}
-    for item in sheet.items:
-        if not set(item.asks) <= names:
-            raise DataError(f"{where}: item '{printable(item.id, 40)}' asks what the sheet does not; make it again")
-        if item.check != item_check(sheet.id, item.id, item.text, item.asks, item.picture_digests):
-            raise DataError(f"{where}: item '{printable(item.id, 40)}' was changed; make the sheets again")
-    for share in sheet.annotators:
-        if not set(share.item_ids) <= set(known):
-            raise DataError(f"{where}: annotator '{printable(share.name, 40)}' has an unknown item; make it again")
-    return sheet
+    return read_record(path, Sheet, "sheets make")
 
 
 def read_key(path: Path) -> Key:
     """The key in a ``key.json``; a ``DataError`` where the file is not as ``sheets make`` writes it."""
-    key = read_record(path, Key, SCHEMA, "sheets make", "make them again")
-    for item in key.items:
-        if len(item.methods) != len(item.instance_ids):
-            raise DataError(
-                f"{printable(str(path), 200)}: item '{printable(item.id, 40)}' names {len(item.methods)} methods and "
-                f"{len(item.instance_ids)} instances; make the sheets again"
-            )
-    return key
+    return read_record(path, Key, "sheets make")
 
 
-Read = TypeVar("Read", bound="_Versioned")
+Record = TypeVar("Record", bound="DataclassInstance")
 
 
-class _Versioned(Protocol):
-    """What a file holds says of which form it is."""
+def write_record(path: Path, record: DataclassInstance) -> Path:
+    """Write a record as JSON with the digest of its content, by which a changed file is known; its path."""
+    content = asdict(record)
+    write_json(path, content | {"schema_version": SCHEMA, "digest": digest_json(content)})
+    return path
 
-    @property
-    def schema_version(self) -> int: ...
 
-
-def read_record(path: Path, kind: type[Read], schema: int, maker: str, again: str) -> Read:
-    """The value of a JSON file as the verb ``maker`` writes it; ``DataError`` where it is another."""
+def read_record(path: Path, kind: type[Record], maker: str) -> Record:
+    """The record of a JSON file as the verb ``maker`` writes it; ``DataError`` where it is another, or was changed."""
     where = printable(str(path), 200)
-    with reading(where, DataError):
-        if path.stat().st_size > MOST_BYTES:
-            raise DataError(f"{where}: has more than {MOST_BYTES >> 20} MiB; it is no file of su3d-bench {maker}")
-        content = file_bytes(path)
+    content = parsed_json(read_bytes(path, where, f"give what su3d-bench {maker} wrote", MOST_BYTES), where)
+    if not isinstance(content, dict) or "digest" not in content:
+        raise DataError(f"{where}: is no file that su3d-bench {maker} writes")
+    digest, schema = content.pop("digest"), content.pop("schema_version", None)
+    if schema != SCHEMA:
+        raise DataError(f"{where}: has schema {printable(str(schema), 20)}, this version reads {SCHEMA}; make it again")
+    if digest != digest_json(content):
+        raise DataError(f"{where}: was changed since su3d-bench {maker} wrote it; put it back, or make it again")
     try:
-        record = TypeAdapter(kind).validate_json(content, strict=True)
+        return TypeAdapter(kind).validate_json(json.dumps(content), strict=True)
     except ValidationError as error:
-        first = error.errors()[0]
-        place = printable(".".join(map(str, first["loc"])), 120) or "it"
-        if first["type"] == "missing" and len(first["loc"]) == 1:
-            raise DataError(f"{where}: is no file that su3d-bench {maker} writes: it has no '{place}'") from error
-        raise DataError(f"{where}: {place} is not as su3d-bench {maker} writes it; {again}") from error
-    if record.schema_version != schema:
-        raise DataError(f"{where}: has schema {record.schema_version}, this version reads {schema}; {again}")
-    return record
+        raise DataError(f"{where}: is no such file as su3d-bench {maker} writes ({_place(error)})") from error
+
+
+def _place(error: ValidationError) -> str:
+    return printable(".".join(map(str, error.errors()[0]["loc"])), 120)
+
+
+GUIDE = "how to judge"
+_ALONE = (
+    "Two seconds are usually enough; the first impression is what counts.",
+    "Judge alone, and do not talk about single items before all are done: how far people agree is itself a result.",
+)
+
+
+def guide_of(sheet: Sheet) -> tuple[str, ...]:
+    """The sentences that an annotator of a set reads first."""
+    is_open = any(CANNOT_TELL in ask.choices for ask in sheet.asks)
+    unsure = (f"'{CANNOT_TELL}' is for what the picture does not show; it is counted apart, and no fault of yours.",)
+    return (*KINDS_OF_SHEETS[sheet.kind].guide, *(unsure if is_open else ()), *_ALONE)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import math
 import os
 import re
@@ -15,12 +14,11 @@ from pathlib import Path
 
 from su3d_bench.core.digests import PACKAGE_ROOT
 from su3d_bench.core.errors import shown
-from su3d_bench.core.files.atomic import write_error
-from su3d_bench.core.files.locks import hold_folder
+from su3d_bench.core.files.atomic import remove_file
+from su3d_bench.core.files.locks import is_held
 
 MEGABYTE, GIGABYTE = 10**6, 10**9
 LARGE_BYTES = 20 * GIGABYTE  # of kept perception: a thousand scenes of 150 frames, and a tenth of a common disk
-MOST_ENTRIES = 10_000_000  # that are looked at
 _HEX = "[0-9a-f]"
 SMALL_BYTES = 1 << 16  # a kept kernel has about as many: a full disk takes none
 
@@ -108,8 +106,15 @@ class CacheEntry:
 
 def cache_entries(root: Path, kind: CacheKind) -> Iterator[CacheEntry]:
     """The files of ``kind`` below ``root``; what has another form, and what is behind a link, is passed over."""
-    for entry, _, _ in _walked(root, kind):
-        yield entry
+    top = root / kind.name
+    for place, folders, names in () if top.is_symlink() else os.walk(top):
+        folders.sort()
+        for path in (Path(place, name) for name in sorted(names)):
+            name = path.relative_to(top).as_posix()
+            with suppress(FileNotFoundError):  # gone meanwhile
+                status = path.lstat()
+                if stat.S_ISREG(status.st_mode) and kind.form.fullmatch(name):
+                    yield CacheEntry(name, status.st_size, status.st_mtime)
 
 
 def clear_cache(root: Path, kind: CacheKind, *, before: float = math.inf) -> tuple[int, int]:
@@ -117,57 +122,17 @@ def clear_cache(root: Path, kind: CacheKind, *, before: float = math.inf) -> tup
 
     Folders stay, for a run may be about to write there; so does what a living process holds.
     """
-    held: dict[str, int | None] = {}
+    top, held = root / kind.name, dict[str, bool]()
     n_files = n_bytes = 0
-    try:
-        for entry, folder, name in _walked(root, kind):
-            if entry.written >= before or (kind.name == "runs" and _hold(root, entry.name, held) is None):
-                continue
-            try:
-                os.unlink(name, dir_fd=folder)  # by the open folder, in whose place no link can come meanwhile
-            except OSError as error:
-                if error.errno == errno.ENOENT:
-                    continue
-                raise write_error(root / kind.name / entry.name, error) from error
-            n_files, n_bytes = n_files + 1, n_bytes + entry.n_bytes
-    finally:
-        for handle in held.values():
-            if handle is not None:
-                os.close(handle)
+    for entry in cache_entries(root, kind):
+        run = entry.name.partition("/")[0]
+        if kind.name == "runs" and run not in held:
+            held[run] = is_held(top / run)
+        if entry.written >= before or held.get(run, False):
+            continue
+        remove_file(top / entry.name)
+        n_files, n_bytes = n_files + 1, n_bytes + entry.n_bytes
     return n_files, n_bytes
-
-
-def _hold(root: Path, name: str, held: dict[str, int | None]) -> int | None:
-    """The lock of the run folder in which ``name`` lies; None where a run has it."""
-    run = name.partition("/")[0]
-    if run not in held:
-        try:
-            held[run] = hold_folder(root / "runs" / run)
-        except OSError:
-            held[run] = None
-    return held[run]
-
-
-def _walked(root: Path, kind: CacheKind) -> Iterator[tuple[CacheEntry, int, str]]:
-    """Each file of ``kind`` with its open folder and its name in that."""
-    top = root / kind.name
-    if top.is_symlink() or not top.is_dir():
-        return
-    n_seen = 0
-    for place, folders, names, handle in os.fwalk(top, follow_symlinks=False):
-        folders.sort()
-        below = Path(place).relative_to(top).as_posix()
-        for name in sorted(names):
-            n_seen += 1
-            if n_seen > MOST_ENTRIES:
-                return
-            path = name if below == "." else f"{below}/{name}"
-            try:
-                status = os.stat(name, dir_fd=handle, follow_symlinks=False)
-            except OSError:  # gone meanwhile
-                continue
-            if stat.S_ISREG(status.st_mode) and kind.form.fullmatch(path):
-                yield CacheEntry(path, status.st_size, status.st_mtime), handle, name
 
 
 def why_large(root: Path) -> str | None:
@@ -184,7 +149,7 @@ def why_large(root: Path) -> str | None:
         return None
     return (
         f"{shown(root)}: keeps about {size_text(n_bytes)} of perception; to keep what is young alone: "
-        "su3d-bench cache clear perception --older-than 30"
+        "su3d-bench dev cache clear perception --older-than 30"
     )
 
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import PredictionError, StoreError, counted
 from su3d_bench.core.files.atomic import read_npz, remove_file, replacing, write_npz
 from su3d_bench.core.files.scratch import row_blocks
+from su3d_bench.core.files.unpacking import DAMAGE
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
-from su3d_bench.core.system.damage import DAMAGE
 from su3d_bench.core.system.files import regular
 
 MOST_TEXTS = 1 << 20  # of one field; each becomes an object of its own

@@ -12,8 +12,14 @@ from hypothesis import strategies as st
 from su3d_bench.core.maps import Masks
 from su3d_bench.core.types import Int32Array, Int64Array
 from su3d_bench.metrics.attribution import masks as attribution
-from su3d_bench.metrics.attribution.masks import KINDS, LabelledMasks, ScoringRules, mend_scene, with_true_labels
-from su3d_bench.metrics.attribution.overlaps import Overlaps, measure_overlaps, true_instances
+from su3d_bench.metrics.attribution.masks import KINDS, mend_scene, with_true_labels
+from su3d_bench.metrics.attribution.overlaps import (
+    LabelledMasks,
+    Overlaps,
+    ScoringRules,
+    measure_overlaps,
+    true_instances,
+)
 from su3d_bench.metrics.instance import average_precision as instance_ap
 
 SIZE = 200  # points an instance
@@ -112,114 +118,12 @@ def test_mending_the_one_error_gives_a_perfect_score(kind: str) -> None:
     assert instance_ap.combine([mended.all]).ap == 1
 
 
-def test_a_merge_across_classes_is_a_merge_and_no_wrong_label() -> None:
-    masks, classes, scores = perfect()
-    masks[2:4], classes[2:4], scores[2:4] = [np.concatenate([masks[2], masks[3]])], [4], [0.9]
-    gain, n = gains(masks, classes, scores)
-    assert n["merged"] == 1
-    assert sum(n.values()) == 1
-    assert gain["merged"] > 0
-
-
-def test_a_small_thing_swallowed_by_a_mask_that_fits_a_large_one_is_merged() -> None:
-    values = np.concatenate([np.full(2000, 3001), np.full(120, 4002)])
-    both = LabelledMasks(Masks.of_sets([np.arange(2120)]), np.array([3]), np.ones(1))
-    mended = mend_scene(values, both, ScoringRules((3, 4)))
-    assert mended.n == dict.fromkeys(KINDS, 0) | {"merged": 1}
-    assert instance_ap.combine([mended.as_is]).ap50 == 0.5
-    assert instance_ap.combine([mended.alone["merged"]]).ap == 1
-
-
-def test_a_piece_that_another_mask_finds_is_not_found_twice() -> None:
-    masks, classes, scores = perfect()
-    masks[0] = np.concatenate([masks[0], masks[1]])  # instance 1 is found on its own as well
-    mended = mend_scene(truth(), labelled(masks, classes, scores), RULES)
-    assert mended.n["merged"] == 1
-    assert instance_ap.combine([mended.alone["merged"]]).ap == 1
-
-
-def test_what_is_left_of_a_merged_mask_goes_where_another_mask_finds_its_instance() -> None:
-    masks, classes, scores = perfect()
-    masks[3] = np.concatenate([masks[2], masks[3]])  # instance 2 of class 3, instance 3 of class 4
-    mended = mend_scene(truth(), labelled(masks, classes, scores), RULES)
-    assert mended.n == dict.fromkeys(KINDS, 0) | {"merged": 1}
-    assert instance_ap.combine([mended.alone["merged"]]).ap == 1
-
-
 def test_a_merged_mask_with_the_label_of_none_is_not_mended_by_cutting() -> None:
     masks, classes, scores = perfect()
     masks[0:2], classes[0:2], scores[0:2] = [np.concatenate([masks[0], masks[1]])], [5], [0.9]
     gain, n = gains(masks, classes, scores)
     assert set(n.values()) == {0}
     assert set(gain.values()) == {0.0}
-
-
-def test_a_wrong_label_on_what_a_merged_mask_finds_costs_nothing_by_itself() -> None:
-    masks, classes, scores = perfect()
-    masks[0:2] = [np.concatenate([points(0, 0.55, 0.45), points(1)]), points(1, 0.6)]
-    classes[0:2] = [3, 5]
-    _, n = gains(masks, classes, scores)
-    assert n == dict.fromkeys(KINDS, 0) | {"merged": 1}
-
-
-def test_what_is_wrong_in_mask_and_label_is_left_over() -> None:
-    masks, classes, scores = perfect()
-    masks[5], classes[5] = np.concatenate([points(5, 0.45), np.arange(1200, 1220, dtype=np.int32)]), 3
-    gain, n = gains(masks, classes, scores)
-    assert set(n.values()) == {0}
-    assert set(gain.values()) == {0.0}
-    assert instance_ap.combine([mend_scene(truth(), labelled(masks, classes, scores), RULES).all]).ap50 < 1
-
-
-def test_what_the_evaluator_ignores_is_no_background() -> None:
-    masks, classes, scores = perfect()
-    masks, classes, scores = [*masks, np.arange(1200, 1500, dtype=np.int32)], [*classes, 3], [*scores, 0.99]
-    gain, n = gains(masks, classes, scores)
-    assert n["background"] == 0
-    assert set(gain.values()) == {0.0}
-
-
-def test_a_mask_with_just_half_of_itself_and_of_an_instance_in_it_belongs_to_none() -> None:
-    masks, classes, scores = perfect()
-    blob = np.concatenate([points(0, 0.5), np.arange(1200, 1300, dtype=np.int32)])  # 100 of 200, and 100 void points
-    _, n = gains([*masks, blob], [*classes, 3], [*scores, 0.95])
-    assert n == dict.fromkeys(KINDS, 0) | {"background": 1}
-
-
-def test_what_a_merged_mask_has_outside_goes_with_the_instance_of_most_of_its_points() -> None:
-    masks, classes, scores = perfect()
-    both = np.concatenate([points(0), points(1), np.arange(1200, 1260, dtype=np.int32)])
-    mended = mend_scene(truth(), labelled([both, *masks[2:]], [3, *classes[2:]], [0.9, *scores[2:]]), RULES)
-    after = instance_ap.combine([mended.alone["merged"]])
-    assert mended.n["merged"] == 1
-    assert after.ap50 == 1
-    assert after.ap < 1  # 200 of 260 points: no match above an IoU of 0.77
-
-
-def test_half_of_an_instance_is_not_most_of_it() -> None:
-    masks, classes, scores = perfect()
-    both = np.concatenate([points(0, 0.5), points(1, 0.5)])
-    _, n = gains([both, *masks[2:]], [3, *classes[2:]], [0.9, *scores[2:]])
-    assert n == dict.fromkeys(KINDS, 0) | {"background": 1, "missed": 2}
-
-
-def test_what_is_left_of_two_equal_merged_masks_is_found_once() -> None:
-    masks, classes, scores = perfect()
-    both = np.concatenate([points(2), points(3, 0.8)])  # most of it is instance 2 of class 3, its label that of 3
-    masks[2:4], classes[2:4], scores[2:4] = [both, both], [4, 4], [0.99, 0.98]
-    mended = mend_scene(truth(), labelled(masks, classes, scores), RULES)
-    assert mended.n["merged"] == 2
-    assert instance_ap.combine([mended.as_is]).ap50 < 1
-    assert instance_ap.combine([mended.alone["merged"]]).ap50 == 1
-
-
-def test_a_mask_of_just_half_an_instance_matches_nothing_and_counts_by_its_points() -> None:
-    half, more = points(0, 0.5), np.concatenate([points(0, 0.6, 0.4), np.arange(1200, 1260, dtype=np.int32)])
-    overlaps = overlaps_of(truth(), labelled([half, more], [3, 3], [0.9, 0.9]), RULES)
-    assert overlaps.iou[:, 0].tolist() == [0.5, 120 / 260]
-    assert overlaps.parts[0].parts == (1, 0)
-    assert not overlaps.finds(0, 0)
-    assert not overlaps.is_found(0)
 
 
 def test_a_mask_is_a_part_where_it_raises_the_iou_and_a_duplicate_where_half_of_it_is_known() -> None:
@@ -231,33 +135,6 @@ def test_a_mask_is_a_part_where_it_raises_the_iou_and_a_duplicate_where_half_of_
     overlaps = overlaps_of(truth(), labelled([first, with_new, half_known, better], [3] * 4, [0.9] * 4), RULES)
     assert overlaps.parts[0].parts == (0, 3)
     assert overlaps.parts[0].duplicates == (2,)
-
-
-def test_the_best_part_is_the_match_of_the_right_class_then_any_match() -> None:
-    void = np.arange(1200, 1315, dtype=np.int32)
-    of_right_class, larger = points(0, 0.51), points(0, 0.6, 0.4)  # IoU 0.51 and 0.6
-    overlaps = overlaps_of(truth(), labelled([larger, of_right_class], [4, 3], [0.9, 0.9]), RULES)
-    assert overlaps.parts[0].parts == (1, 0)
-    match, no_match = points(0, 0.55), np.concatenate([points(0, 0.6, 0.4), void])  # 110 and 120 points, IoU 0.55, 0.38
-    overlaps = overlaps_of(truth(), labelled([no_match, match], [3, 4], [0.9, 0.9]), RULES)
-    assert overlaps.parts[0].parts == (1, 0)
-
-
-def test_instances_and_masks_count_from_the_minimum_size_on() -> None:
-    values = np.repeat([3001, 3002, 4001], [100, 99, 100])
-    masks = [np.arange(100), np.arange(99), np.arange(1)]
-    overlaps = overlaps_of(values, labelled([m.astype(np.int32) for m in masks], [3] * 3, [0.9] * 3), RULES)
-    assert [members.tolist() for members in overlaps.members] == [list(range(100)), list(range(199, 299))]
-    assert overlaps.is_large.tolist() == [True, False, False]
-    assert overlaps.inside[:, 0].tolist() == [1.0, 1.0, 1.0]
-    point = LabelledMasks(Masks.of_sets([np.zeros(1, np.int32)]), np.array([3]), np.ones(1))
-    assert overlaps_of(np.array([3001, 3002]), point, ScoringRules((3,), 1)).iou.tolist() == [[1.0, 0.0]]
-
-
-@pytest.mark.parametrize(("share", "is_merged"), [(0.5, False), (0.505, True)])
-def test_a_mask_is_merged_where_it_has_more_than_half_of_several_instances(share: float, is_merged: bool) -> None:
-    mask = np.concatenate([points(0), points(1, share)])
-    assert overlaps_of(truth(), labelled([mask], [3], [0.9]), RULES).is_merged.tolist() == [is_merged]
 
 
 SPLITS = {
@@ -280,21 +157,6 @@ def test_an_instance_is_split_where_its_parts_match_it_together_under_its_class(
     masks = [points(0, share, start) for share, start, _ in parts]
     predicted = labelled(masks, [class_id for *_, class_id in parts], [0.9] * len(parts))
     assert (0 in overlaps_of(truth(), predicted, RULES).split) == is_split
-
-
-def test_an_instance_that_a_merged_mask_finds_is_not_split() -> None:
-    halves, merged = [points(0, 0.5), points(0, 0.5, 0.5)], np.concatenate([points(0), points(1, 0.6)])
-    for masks, is_split in ((halves, True), ([*halves, merged], False)):
-        n = len(masks)
-        assert (0 in overlaps_of(truth(), labelled(masks, [3] * n, [0.9] * n), RULES).split) == is_split
-
-
-def test_what_leaves_the_iou_as_it_is_is_no_part() -> None:
-    first = points(0, 0.6)  # 120 of 200
-    # 40 points of the first, 30 new ones and 50 void: together 150 of 250
-    second = np.concatenate([points(0, 0.35, 0.4), np.arange(1200, 1250, dtype=np.int32)])
-    overlaps = overlaps_of(truth(), labelled([first, second], [3, 3], [0.9, 0.9]), RULES)
-    assert (overlaps.parts[0].parts, overlaps.parts[0].duplicates) == ((0,), ())
 
 
 def test_true_labels_are_those_of_the_instances_that_masks_share_most_points_with() -> None:
@@ -325,39 +187,12 @@ def confidences(counts: instance_ap.InstanceCounts) -> list[float]:
     return sorted(at_first)
 
 
-def test_of_merged_masks_the_surest_is_cut_and_the_others_are_dropped() -> None:
-    both = np.concatenate([points(0), points(1)])
-    mended = mend_scene(truth(), labelled([both, both], [3, 3], [0.5, 0.9]), RULES)
-    assert mended.n["merged"] == 2
-    assert confidences(mended.alone["merged"]) == [0.9, 0.9]
-
-
-def test_what_the_evaluator_does_not_count_is_no_duplicate() -> None:
-    masks, classes, scores = perfect()
-    _, n = gains([*masks, points(0, 0.45), points(0)], [*classes, 3, 0], [*scores, 0.9, 0.9])  # 90 points; no class
-    assert n["duplicate"] == 0
-
-
 def test_a_missed_instance_is_added_with_the_highest_confidence_of_the_scene() -> None:
     masks, classes, _ = with_error("missed")
     mended = mend_scene(truth(), labelled(masks, classes, [0.1, 0.2, 0.3, 0.4, 0.5]), RULES)
     assert confidences(mended.alone["missed"]) == [0.1, 0.2, 0.5]
     of_nothing = mend_scene(truth(), labelled([], [], []), RULES)
     assert confidences(of_nothing.alone["missed"]) == [1.0, 1.0, 1.0]
-
-
-def test_an_empty_prediction_misses_everything() -> None:
-    gain, n = gains([], [], [])
-    assert n == dict.fromkeys(KINDS, 0) | {"missed": len(CLASSES)}
-    assert gain == dict.fromkeys(KINDS, 0.0) | {"missed": 1.0}
-
-
-def test_without_classes_no_label_is_wrong() -> None:
-    values = np.where(truth() > 0, 1000 + truth() % 1000, 0)
-    masks, _, scores = with_error("mislabelled")
-    mended = mend_scene(values, labelled(masks, [1] * len(masks), scores), ScoringRules((1,)))
-    assert set(mended.n.values()) == {0}
-    assert instance_ap.combine([mended.as_is]).ap == 1
 
 
 @st.composite

@@ -18,16 +18,21 @@ from scored_room import ENCODER, NAMES, instances, noisy, room, truth_as_predict
 import su3d_bench.reports.tables.attribution
 from su3d_bench.analysis.attribution import attribute
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError
+from su3d_bench.core.errors import ConfigError, PredictionError, Su3dError
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.core.types import GroundTruth
-from su3d_bench.metrics.attribution import points as attribution_semantic
+from su3d_bench.metrics.attribution import masks as attribution_semantic
 from su3d_bench.metrics.attribution.arrays import EXPLAINED as EXPLAINED_KINDS
 from su3d_bench.metrics.attribution.arrays import scored_masks, scored_points
-from su3d_bench.metrics.attribution.masks import count_masks
-from su3d_bench.metrics.attribution.points import CAUSES, LabelledPoints, causes_of, mend_points, object_of_mask
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.attribution.masks import (
+    CAUSES,
+    LabelledPoints,
+    causes_of,
+    count_masks,
+    mend_points,
+    object_of_mask,
+)
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.scoring import score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.reports.tables.attribution import MEANINGS
@@ -114,10 +119,6 @@ def whole() -> tuple[list[np.ndarray], list[str]]:
     return [truth.mask(k) for k in range(len(truth))], list(NAMES)
 
 
-def test_the_truth_has_no_wrong_point() -> None:
-    assert causes(instances(room().points, *whole())) == {}
-
-
 def test_an_object_that_the_map_lacks_is_missing_geometry() -> None:
     masks, names = whole()
     kept = np.setdiff1d(np.arange(len(room().points)), masks[4])
@@ -143,31 +144,6 @@ def test_the_right_mask_under_a_wrong_name_is_a_wrong_label() -> None:
     masks, names = whole()
     names[4] = "sofa"
     assert causes(instances(room().points, masks, names)) == {"label": 150}
-
-
-def test_two_objects_of_one_class_in_one_mask_lose_no_point() -> None:
-    masks, names = whole()  # 1 and 2 are both chairs
-    masks[1:3], names[1:3] = [np.concatenate([masks[1], masks[2]])], ["chair"]
-    assert causes(instances(room().points, masks, names)) == {}
-
-
-def test_dense_features_have_wrong_labels_or_no_geometry() -> None:
-    truth, labelled = room(), truth_as_prediction(room(), with_labels=False)
-    assert labelled.features is not None
-    rows = labelled.features[np.maximum(truth.instance - 1, 0)]
-    rows[truth.instance == 5] = labelled.features[0]
-    assert causes(DenseFeatures(truth.points, rows.astype(np.float16))) == {"label": 150}
-
-
-def test_true_labels_name_every_mask_by_its_own_points() -> None:
-    masks, names = whole()
-    masks[3], masks[4] = np.sort(np.concatenate([masks[3], masks[4][:40]])), masks[4][40:]
-    names[3] = names[0] = "sofa"
-    found = scored_points(ROOM_RULES, room(), instances(room().points, masks, names), ENCODER)
-    mended = mend_points(found.points, found.is_counted)
-    assert mended.with_true_labels is not None
-    confusion = mended.with_true_labels.confusion
-    assert confusion.sum() - np.trace(confusion) == 40
 
 
 def row_of_points(*rows: tuple[int, int, int, float, bool]) -> LabelledPoints:
@@ -197,56 +173,11 @@ def test_a_mask_is_that_of_the_scored_points_near_it_alone() -> None:
     ]  # mask 0 is called 1 throughout
 
 
-def test_of_objects_with_equally_many_points_a_mask_belongs_to_the_one_with_the_lowest_number() -> None:
-    found = row_of_points(*((1, one, 0, 0.0, True) for one in (9, 4, 4, 9, 6)))
-    assert object_of_mask(found).tolist() == [4]
-    none, no_metres = np.zeros(0, np.int64), np.zeros(0)
-    nothing = LabelledPoints(none, none, np.zeros(0, bool), none, none, no_metres, no_metres)
-    assert object_of_mask(nothing).tolist() == []
-    assert mend_points(nothing, np.ones(2, bool)).n == dict.fromkeys(CAUSES, 0)
-
-
 def test_geometry_is_missing_beyond_five_centimetres_and_goes_before_all_else() -> None:
     wrong = row_of_points(*[(1, 7, 0, 0.0, True)] * 2, (1, 7, -1, np.inf, True), (1, 7, -1, np.inf, True))
     found = replace(wrong, map_distance_m=np.array([0.05, 0.051, 0.05, 0.051]))
     names = [CAUSES[cause] for cause in causes_of(found).tolist()]
     assert names == ["label", "geometry", "background", "geometry"]
-
-
-def test_the_first_mask_counts_as_any_other() -> None:
-    own, other = (0, 7, 0, 0.0, True), (1, 8, 0, 0.0, True)
-    assert causes_of(row_of_points(own, own, other)).tolist() == [-1, -1, CAUSES.index("association")]
-    mended = mend_points(row_of_points(own, other, other), np.ones(2, bool)).with_true_labels
-    assert mended is not None
-    assert mended.confusion[:2, :2].tolist() == [[0, 1], [0, 2]]
-    called_other = replace(row_of_points(own, own, other), predicted=np.ones(3, np.int64))
-    renamed = mend_points(called_other, np.ones(2, bool)).with_true_labels  # the first mask is of the first class
-    assert renamed is not None
-    assert renamed.confusion[:2, :2].tolist() == [[2, 0], [1, 0]]
-
-
-def test_where_neighbours_vote_the_mask_is_that_of_most_of_them() -> None:
-    rules = load_protocol("replica-hovsg")
-    assert rules.transfer.neighbours > 1
-    truth = replace(room(), variant=rules.ground_truth)
-    found = scored_points(rules, truth, truth_as_prediction(truth, with_labels=True), ENCODER).points
-    scored = found.is_scored & (truth.instance > 0)
-    assert scored.any()
-    assert (found.mask[scored] == truth.instance[scored] - 1).all()
-
-
-def test_what_has_no_instance_is_one_object_a_class_and_none_of_the_others() -> None:
-    truth = room()
-    without = np.isin(truth.instance, [1, 4, 8])  # the wall, the table, here of the fifth class, and the backpack
-    classes = np.where(truth.instance == 4, truth.labels.ids[4], truth.semantic).astype(np.int32)
-    truth = replace(truth, instance=np.where(without, 0, truth.instance).astype(np.int32), semantic=classes)
-    found = scored_points(ROOM_RULES, truth, truth_as_prediction(truth, with_labels=True), ENCODER).points
-    of_object = found.object_id[: 150 * len(NAMES)].reshape(len(NAMES), 150)  # the room's objects one after another
-    assert (of_object == of_object[:, :1]).all()
-    assert len(np.unique(of_object)) == len(NAMES)
-
-
-# the run
 
 
 # the run
@@ -259,7 +190,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scene_run, "build_perception", colour_perception)
         patch.chdir(folder)
-        for out, more in (("whole", []), ("dropped", ["--set", "collector.drop=1"]), ("part", ["--limit", "3"])):
+        for out, more in (("whole", []), ("dropped", ["--set", "collector.drop=1"])):
             words = ["run", "--scenes", f"{PAINTED}/[ab]", "--methods", COLLECTOR, "--no-pictures", "--jobs", "1"]
             protocols = ["--protocols", "rooms-semantic", "rooms-instance", "replica-mesh-ex6"]
             assert main([*words, *protocols, "--quiet", "--out", out, *more]) == 0
@@ -302,33 +233,12 @@ def test_values_gains_overlap_and_rest_add_up_to_one() -> None:
             assert value + gains + one["overlap"][name] + one["rest"][name] == pytest.approx(1, abs=1e-12)
 
 
-def test_values_are_those_of_the_run() -> None:
-    results = json.loads(Path("dropped/metrics.json").read_text())["results"]
-    found = attributed("dropped")
-    for one in results:
-        values = {name: one["result"]["metrics"][name] for name in one["headline"]}
-        assert found[one["protocol"]]["values"] == pytest.approx(values, abs=1e-12)
-
-
 def test_perfect_2d_masks_come_from_the_oracle_s_run() -> None:
     found = attributed("dropped", oracle=Path("oracle"))["rooms-instance"]
     assert found["stages"]["2D masks"] == {"AP": 1.0, "AP50": 1.0, "AP25": 1.0}
     assert found["stages"]["labels"] == found["values"]
     with pytest.raises(ConfigError, match="whole: has the profile 'embedded'; --oracle takes a run made with"):
         attributed("dropped", oracle=Path("whole"))
-
-
-def test_a_partial_run_is_marked() -> None:
-    found = attribute(Path("part"))
-    assert found.remarks == ("PARTIAL: only the first 3 frames of each scene",)
-
-
-def changed(name: str, source: str, file: str, old: str, new: str) -> Path:
-    shutil.copytree(source, name)
-    text = Path(name, file).read_text()
-    assert old in text
-    Path(name, file).write_text(text.replace(old, new))
-    return Path(name)
 
 
 def test_other_counts_than_the_run_s_are_refused() -> None:
@@ -338,12 +248,6 @@ def test_other_counts_than_the_run_s_are_refused() -> None:
         shutil.copy(Path("whole", here), Path("mixed", here))
     with pytest.raises(PredictionError, match="the counts of the run are not those that its prediction gives here"):
         attributed("mixed")
-
-
-def test_other_data_than_the_run_s_are_refused() -> None:
-    moved = changed("moved", "whole", "run.toml", "n_frames = 6", "n_frames = 5")
-    with pytest.raises(DataError, match="painted/a: its data are not those of the run; run it again"):
-        attributed(str(moved))
 
 
 ERRORS = [
@@ -360,22 +264,18 @@ def test_wrong_requests_are_one_line(more: dict[str, Any], message: str) -> None
     assert str(caught.value).startswith(message)
 
 
-def test_the_oracle_of_a_run_can_be_explained_too() -> None:
-    assert attributed("dropped", method="oracle")["rooms-semantic"]["values"] == {"mAcc": 1.0, "F-mIoU": 1.0}
-
-
 def test_the_command_prints_a_table_and_draws_the_plot(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["attribute", "dropped", "--oracle", "oracle", "--out", "plots/errors.png"]) == 0
+    assert main(["report", "attribution", "dropped", "--oracle", "oracle", "--out", "plots/errors.png"]) == 0
     text = capsys.readouterr().out
     row = next(line for line in text.splitlines() if line.startswith("| missed "))
     assert [cell.strip() for cell in row.strip("|").split("|")][:2] == ["missed", "2"]
     assert "| with true 2D masks |" in text
     picture = Path("plots/errors.png").read_bytes()
     assert picture.startswith(b"\x89PNG")
-    assert main(["attribute", "dropped", "--oracle", "oracle", "--out", "again.png", "--quiet"]) == 0
+    assert main(["report", "attribution", "dropped", "--oracle", "oracle", "--out", "again.png", "--quiet"]) == 0
     assert Path("again.png").read_bytes() == picture
     capsys.readouterr()
-    assert main(["attribute", "dropped", "--protocol", "rooms-instance", "--json"]) == 0
+    assert main(["report", "attribution", "dropped", "--protocol", "rooms-instance", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert [one["protocol"] for one in found["protocols"]] == ["rooms-instance"]
 

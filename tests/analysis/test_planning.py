@@ -14,15 +14,14 @@ from painted import colour_perception
 from places import SCENES
 from scored_room import noisy_scores
 
-import su3d_bench.analysis.side_numbers
+import su3d_bench.analysis.sides
 from su3d_bench.analysis.comparison import compare
 from su3d_bench.analysis.planning import plan
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import ConfigError
+from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.metrics.scoring import SceneScore, combine, pack_scores
-from su3d_bench.numerics.power import scenes_needed, variance_of
-from su3d_bench.numerics.statistics import sign_flip_test, t_quantile
+from su3d_bench.metrics.scoring import combine, pack_scores
+from su3d_bench.numerics.statistics import scenes_needed, sign_flip_test, variance_of
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.run_folder import RunFolder
 
@@ -97,7 +96,18 @@ def test_what_is_needed_follows_from_the_pseudo_values_of_the_runs(n_seeds: int)
 
 
 def test_the_command_prints_a_table_or_json(capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["plan", "seed-0", "seed-1", "--methods", *METHODS, "--points", "10", "--protocol", "rooms-instance"]
+    words = [
+        "report",
+        "power",
+        "seed-0",
+        "seed-1",
+        "--methods",
+        *METHODS,
+        "--points",
+        "10",
+        "--protocol",
+        "rooms-instance",
+    ]
     assert main(words) == 0
     text = capsys.readouterr().out
     assert "| AP " in text and "10 points" in text and "seed 0, 1" in text
@@ -105,19 +115,8 @@ def test_the_command_prints_a_table_or_json(capsys: pytest.CaptureFixture[str]) 
     assert "intervals over 3 scenes are rough" in text
     assert main([*words, "--json"]) == 0
     assert list(json.loads(capsys.readouterr().out)["protocols"]) == ["rooms-instance"]
-    assert main(["plan", "seed-0"]) == 0
+    assert main(["report", "power", "seed-0"]) == 0
     assert "how much seeds move the difference is not known" in capsys.readouterr().out
-
-
-def test_methods_that_do_not_differ_tell_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.copytree("seed-0", tmp_path / "run")
-    for scene in "abc":
-        jobs = [RunFolder(tmp_path / "run").job(f"painted/{scene}", method) for method in METHODS]
-        jobs[1].counts.write_bytes(jobs[0].counts.read_bytes())
-    found = plan([tmp_path / "run"], points=[1.0]).protocols["rooms-semantic"]["mAcc"]
-    assert (found.difference, found.interval, found.variance, found.needs) == (0.0, None, None, ())
-    assert main(["plan", str(tmp_path / "run")]) == 0
-    assert "no SD: the difference is the same in every scene and run" in capsys.readouterr().out
 
 
 REFUSED = {
@@ -138,17 +137,9 @@ def test_what_tells_nothing_is_refused_in_one_line(name: str, capsys: pytest.Cap
     words, message = REFUSED[name]
     if not Path("copied").exists():
         shutil.copytree("seed-0", "copied")
-    assert main(["plan", *words]) == 2
+    assert main(["report", "power", *words]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1
-
-
-def test_a_single_scene_is_refused(tmp_path: Path) -> None:
-    shutil.copytree("seed-0", tmp_path / "run")
-    for scene in "bc":
-        shutil.rmtree(RunFolder(tmp_path / "run").job(f"painted/{scene}", METHODS[0]).counts.parent)
-    with pytest.raises(ConfigError, match="1 scene is scored under rooms-semantic for both methods in every run"):
-        plan([tmp_path / "run"], points=[1.0])
 
 
 # comparisons of several seeds
@@ -178,34 +169,6 @@ def test_a_side_of_several_seeds_stands_for_their_mean_and_says_how_far_seeds_al
     assert found.test == sign_flip_test(alone[1] - alone[0])
 
 
-def test_the_interval_of_means_over_seeds_is_over_scenes() -> None:
-    n_inside = 0
-    for one in compare("seed-0,seed-1:collector", "seed-0,seed-1:collector@drop=1").protocols:
-        for metric, found in one.metrics.items():
-            pseudo = np.mean([pseudo_values_of(one.protocol, metric, seed) for seed in (0, 1)], axis=0)
-            half = t_quantile(0.975, N_SCENES - 1) * pseudo.std(ddof=1) / np.sqrt(N_SCENES)
-            assert found.interval is not None
-            expected = found.difference - half, found.difference + half
-            assert found.interval == pytest.approx((max(-1.0, expected[0]), min(1.0, expected[1])))
-            n_inside += -1 < expected[0] < expected[1] < 1
-    assert n_inside
-
-
-def test_the_table_of_several_seeds_has_their_spread_and_that_of_one_has_not(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    sides = ["seed-0:collector", "seed-1,seed-2:collector@drop=1"]
-    assert main(["compare", *sides, "--protocol", "rooms-instance", "--per-class"]) == 0
-    text = capsys.readouterr().out
-    ap = [values_of("rooms-instance", "AP", seed, 1)[0] for seed in (1, 2)]
-    row = next(line for line in text.splitlines() if line.startswith("| AP "))
-    assert row.rstrip("| ").endswith(f"- / {100 * np.std(ap, ddof=1):.1f}")
-    assert "the mean of A over 1 seed and of B over 2 seeds" in text
-    assert "settings that differ" not in text
-    assert main(["compare", "seed-0:collector", "seed-0:collector@drop=1"]) == 0
-    assert "SD of seeds" not in capsys.readouterr().out
-
-
 @pytest.mark.parametrize(
     ("sides", "message"),
     [
@@ -226,11 +189,5 @@ def test_runs_that_are_no_seeds_of_one_request_are_no_side(
     assert message in error and error.count("\n") == 1
 
 
-def test_a_folder_with_a_comma_in_its_name_is_one_run() -> None:
-    if not Path("one,two").exists():
-        shutil.copytree("seed-0", "one,two")
-    assert compare("one,two:collector", "seed-1:collector").left == "one,two"
-
-
 def test_the_examples_in_the_docstrings_run() -> None:
-    assert doctest.testmod(su3d_bench.analysis.side_numbers).failed == 0
+    assert doctest.testmod(su3d_bench.analysis.sides).failed == 0

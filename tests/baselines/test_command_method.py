@@ -5,32 +5,26 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from made_programs import MASKS, SCENE, SURFACE, fed, frames, method, program, refused
-from painted import INTRINSICS, ColourPerception, colour_perception
+from painted import ColourPerception, colour_perception
 from places import SCENES
 
-from su3d_bench.baselines.command.frames import FrameFolder, write_mesh
-from su3d_bench.baselines.command.method import Command, CommandConfig
-from su3d_bench.baselines.command.placeholders import check_placeholders
-from su3d_bench.baselines.command.prediction import as_prediction, class_names
+from su3d_bench.baselines.command.folders import FrameFolder, class_names
+from su3d_bench.baselines.command.method import Command, CommandConfig, check_placeholders
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import ConfigError, PredictionError
+from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.system.timing import Timer
-from su3d_bench.core.types import Surface
-from su3d_bench.datasets.recordings.meshes import read_surface
 from su3d_bench.datasets.rgbd.dataset import Rgbd
-from su3d_bench.predictions.base import VertexLabels, vertex_masks
+from su3d_bench.predictions.base import vertex_masks
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.runs.feeding import no_detections
+from su3d_bench.runs.frame_loop import no_detections
 
 
 def test_the_exported_folder_reads_back_as_the_frames_that_went_in(tmp_path: Path) -> None:
@@ -48,51 +42,6 @@ def test_the_exported_folder_reads_back_as_the_frames_that_went_in(tmp_path: Pat
         assert np.abs(one.depth_m - other.depth_m).max() <= 0.0005 + 1e-6
         assert np.array_equal(one.camera_to_world, other.camera_to_world)
         assert np.array_equal(one.intrinsics, other.intrinsics)
-
-
-def test_scene_toml_says_all_that_a_program_may_know(tmp_path: Path) -> None:
-    folder = FrameFolder(tmp_path, replace(SCENE, scene='a"b\n[x]'), surface=SURFACE)
-    folder.open()
-    for frame in frames():
-        folder.add(frame)
-    folder.close()
-    told = tomllib.loads((tmp_path / "scene.toml").read_text())
-    assert told["scene"] == 'a"b [x]'
-    assert (told["frames"], told["n_frames"], told["seed"], told["stride"]) == ([0, 1, 2], 3, 7, 1)
-    assert (told["width"], told["height"], told["fx"], told["cy"]) == (32, 24, INTRINSICS[0, 0], INTRINSICS[1, 2])
-    assert (told["mesh"], told["n_vertices"], told["depth_unit_m"]) == ("mesh.ply", 5, 0.001)
-    assert not told["intrinsics_differ"]
-    assert "instance" not in json.dumps(told)
-
-
-def test_intrinsics_that_change_are_written_for_each_frame(tmp_path: Path) -> None:
-    folder = FrameFolder(tmp_path, SCENE)
-    folder.open()
-    for frame in frames():
-        zoom = np.diag([1.0 + frame.index, 1.0, 1.0])
-        folder.add(replace(frame, intrinsics=frame.intrinsics @ zoom))
-    folder.close()
-    assert tomllib.loads((tmp_path / "scene.toml").read_text())["intrinsics_differ"]
-    assert np.loadtxt(tmp_path / "intrinsics" / "000002.txt")[0, 0] == 3 * INTRINSICS[0, 0]
-
-
-def test_depth_beyond_16_bits_of_millimetres_is_written_as_none(tmp_path: Path) -> None:
-    frame = frames(1)[0]
-    depth_m = np.array([[0.0, 1.2344], [65.535, 65.6]], np.float32)
-    depth_m = np.concatenate([depth_m, np.array([[np.nan, np.inf]], np.float32)])
-    folder = FrameFolder(tmp_path, SCENE)
-    folder.open()
-    folder.add(replace(frame, rgb=np.zeros((3, 2, 3), np.uint8), depth_m=depth_m))
-    told = cv2.imread(str(tmp_path / "depth" / "000000.png"), cv2.IMREAD_UNCHANGED)
-    assert told is not None
-    assert told.tolist() == [[0, 1234], [65535, 0], [0, 0]]
-
-
-def test_the_mesh_keeps_the_order_of_its_vertices(tmp_path: Path) -> None:
-    write_mesh(tmp_path / "mesh.ply", SURFACE)
-    back = read_surface(tmp_path / "mesh.ply", "mesh")
-    assert np.array_equal(back.vertices, SURFACE.vertices)
-    assert np.array_equal(back.triangles, SURFACE.triangles)
 
 
 def test_masks_over_the_mesh_become_instances_on_its_vertices(tmp_path: Path) -> None:
@@ -123,24 +72,6 @@ np.savez(out + "/prediction.npz", kind="Partition", points=points.astype("f4"),
     found = one.finish()
     assert found.points.tolist() == frames(1)[0].camera_to_world[:3, :3].T.astype(np.float32).tolist()
     one.close()
-
-
-def test_masks_without_points_are_refused_where_there_is_no_mesh(tmp_path: Path) -> None:
-    text = refused(method(tmp_path, MASKS, surface=None))
-    assert text.startswith("rooms/a b: command: its masks have no points of their own and the dataset has no mesh")
-
-
-def test_masks_over_another_number_of_points_are_refused(tmp_path: Path) -> None:
-    larger = Surface(np.zeros((6, 3), np.float32), np.zeros((0, 3), np.int32))
-    assert "its masks are over 5 points, the mesh has 6 vertices" in refused(method(tmp_path, MASKS, surface=larger))
-
-
-def test_labels_of_vertices_become_one_mask_a_class_and_none_where_there_is_no_class() -> None:
-    names = {4: "chair", 9: "wall"}
-    found = as_prediction(VertexLabels(np.array([9, 0, 4, 9, -1], np.int32)), SURFACE, names)
-    assert isinstance(found, Instances)
-    assert found.labels == ("chair", "wall")
-    assert [found.mask(k).tolist() for k in range(2)] == [[2], [0, 3]]
 
 
 def test_class_numbers_that_two_lists_read_differently_ask_for_a_protocol() -> None:
@@ -175,11 +106,6 @@ def test_a_program_that_takes_too_long_is_ended_and_its_last_line_told() -> None
     # a shell starts at once, however busy the machine is
     one = fed(Command(CommandConfig(command="echo loading >&2; sleep 60", shell=True, timeout_s=2.0)))
     assert "was ended after 2 s (timeout_s); its last line: loading" in refused(one)
-
-
-def test_a_program_that_is_not_there_is_named(tmp_path: Path) -> None:
-    one = fed(Command(CommandConfig(command=("./nowhere", "{output}"))))
-    assert "'./nowhere' cannot be started: No such file" in refused(one)
 
 
 def test_only_the_variables_that_are_allowed_reach_the_program(
@@ -262,37 +188,6 @@ def test_a_placeholder_that_a_shell_would_read_as_commands_is_refused(line: str,
     assert f"}}' stands {place}," in str(caught.value)
 
 
-@pytest.mark.parametrize("line", ["a \\'{scene}", "a 'b'{scene}'c'", 'a "b"\\"{scene}', "awk '{print}' {scene}"])
-def test_a_placeholder_beside_quotes_is_a_word(line: str) -> None:
-    check_placeholders(line, is_shell=True)
-
-
-def test_words_behind_the_program_of_an_interpreter_are_its_arguments() -> None:
-    for words in (
-        ["bash", "-c", 'a "$1"', "a", "{scene}"],
-        ["python", "run.py", "-c", "{scene}"],
-        ["mine", "-c", "{scene}"],
-    ):
-        check_placeholders(words, is_shell=False)
-
-
-def test_a_shells_line_that_no_other_can_split_is_one_that_runs(tmp_path: Path) -> None:
-    one = fed(Command(CommandConfig(command="true # it's " + "x" * 300 + " {output}", shell=True)))
-    assert one.inputs
-    assert "left nothing" in refused(one)
-
-
-def test_a_file_named_from_here_is_found_from_the_programs_own_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    program(tmp_path, MASKS)
-    monkeypatch.chdir(tmp_path)
-    one = fed(Command(CommandConfig(command=(sys.executable, "program.py", "{output}"))))
-    assert "file program.py" in one.inputs
-    assert _n_masks(one) == 2
-    one.close()
-
-
 def test_finish_midway_gives_the_map_of_the_frames_so_far_and_changes_nothing(tmp_path: Path) -> None:
     text = """
 import os, sys
@@ -327,11 +222,6 @@ def test_nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert list((tmp_path / "scratch").iterdir())
     one.close()
     assert not list((tmp_path / "scratch").iterdir())
-
-
-def test_without_a_program_there_is_no_method() -> None:
-    with pytest.raises(ConfigError, match="method 'command': no program is named"):
-        Command(CommandConfig())
 
 
 def test_another_version_of_the_program_is_another_run(tmp_path: Path) -> None:

@@ -16,19 +16,15 @@ from su3d_bench.baselines.sam3d.overlap import (
     cal_group,
     drop_small_groups,
     ensemble,
-    first_of_voxels,
-    groups_on_surface,
     match_pairs,
     merge,
     merge_regions,
-    nearest_points,
     next_level,
     numbered,
     renumber,
     voxelise,
     without_small_groups,
 )
-from su3d_bench.core.errors import DataError
 from su3d_bench.core.system.timing import Timer
 
 RULES = MergeRules()
@@ -82,63 +78,6 @@ def test_superpoints_take_the_originals_groups() -> None:
     assert ensemble(group, case["segIndices"], 20, 0.5).tolist() == case["out"].tolist()
 
 
-def test_a_voxel_keeps_its_first_point_in_the_order_of_the_fnv_keys() -> None:
-    # cells 2, 0, 2, 1 along x; the keys of (0,0,0), (1,0,0), (2,0,0) by hand in Python's whole numbers
-    points = row(12, 2, 10.5, 7)
-    keys = []
-    for x in (2, 0, 2, 1):
-        key = 14695981039346656037
-        for part in (x, 0, 0):
-            key = (key * 1099511628211) % 2**64 ^ part
-        keys.append(key)
-    expected = sorted({key: keys.index(key) for key in keys}.items())
-    assert first_of_voxels(points, 0.05).tolist() == [index for _, index in expected]
-
-
-def test_voxels_are_counted_from_the_lowest_of_the_cloud_but_cut_at_the_worlds_origin() -> None:
-    # 4 and 6 cm are apart although they are 2 cm from each other; -1 and 1 cm too
-    assert len(first_of_voxels(row(4, 6), 0.05)) == 2
-    assert len(first_of_voxels(row(-1, 1), 0.05)) == 2
-    assert len(first_of_voxels(row(6, 9), 0.05)) == 1
-    # moved by whole voxels, the same points survive
-    assert first_of_voxels(row(4, 6, 6), 0.05).tolist() == first_of_voxels(row(54, 56, 56), 0.05).tolist()
-
-
-def test_no_points_give_no_voxels() -> None:
-    assert len(voxelise(cloud([], []), 0.05)) == 0
-
-
-def test_a_group_that_loses_its_last_point_to_a_voxel_loses_its_views_and_leaves_a_gap() -> None:
-    found = voxelise(cloud(row(1, 2, 7), [0, 1, 2], [0, 1, 2], [10, 11, 12]), 0.05)
-    assert sorted(found.group.tolist()) == [0, 2]
-    assert (found.view_group.tolist(), found.views.tolist()) == ([0, 2], [10, 12])
-
-
-def test_small_groups_are_those_below_the_threshold() -> None:
-    assert drop_small_groups(np.repeat([0, 1, 2], [50, 49, 51]), 50).tolist() == [0] * 50 + [-1] * 49 + [2] * 51
-    assert drop_small_groups(ids(-1, -1), 5).tolist() == [-1, -1]
-    assert drop_small_groups(ids(), 5).tolist() == []
-
-
-def test_renumbering_keeps_the_order_of_ids_and_what_is_unlabelled() -> None:
-    assert renumber(ids(9, -1, 2, 9, 5)).tolist() == [2, -1, 0, 2, 1]
-    assert renumber(ids(-1, -1)).tolist() == [-1, -1]
-
-
-def test_a_pair_is_nearer_than_the_radius_and_equals_go_to_the_lowest_index() -> None:
-    points = np.array([[0.5, 0, 0], [0, 0, 0], [1, 0, 0], [0, 0, 0]])
-    queries = np.array([[0.25, 0, 0], [0, 0, 0], [1.5, 0, 0], [1.25, 0, 0]])
-    found = match_pairs(queries, points, 0.5)
-    # the first lies between points 0 and 1; the third is exactly 0.5 away, which is too far
-    assert list(zip(found.query.tolist(), found.other.tolist(), strict=True)) == [(0, 0), (1, 1), (3, 2)]
-
-
-def test_distances_are_those_of_float32() -> None:
-    # In float64 point 1 is nearer by 1e-9; in float32 both are at the same place, and the lower index wins.
-    points = np.array([[1.0 + 2e-9, 0, 0], [1.0 + 1e-9, 0, 0]])
-    assert match_pairs(np.array([[1.0, 0, 0]]), points, 0.075).other.tolist() == [0]
-
-
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from([0.02, 0.3, 1.0]), st.booleans())
 def test_the_grid_finds_what_brute_force_finds(seed: int, spread_m: float, is_coarse: bool) -> None:
@@ -149,18 +88,6 @@ def test_the_grid_finds_what_brute_force_finds(seed: int, spread_m: float, is_co
     found = match_pairs(queries, points, 0.075)
     expected = nearest_by_brute_force(queries, points, 0.075)
     assert list(zip(found.query.tolist(), found.other.tolist(), strict=True)) == expected
-
-
-@settings(max_examples=20, deadline=None)
-@given(st.integers(0, 10**6))
-def test_the_size_of_the_grids_cells_moves_no_result(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    queries, points = rng.normal(size=(20, 3)), np.round(rng.normal(size=(30, 3)) * 4) / 4
-    index, distance = nearest_points(queries, points, 0.6, 0.05)
-    other_index, other_distance = nearest_points(queries, points, 0.6, 0.7)
-    near = distance <= np.float32(0.6)
-    assert (near == (other_distance <= np.float32(0.6))).all()
-    assert (index[near] == other_index[near]).all() and (distance[near] == other_distance[near]).all()
 
 
 @settings(max_examples=60, deadline=None)
@@ -177,49 +104,10 @@ def test_cal_group_is_the_loop_over_pairs(seed: int, ratio: float) -> None:
     )
 
 
-def test_ids_are_shifted_beyond_the_others_and_stay_apart_without_pairs() -> None:
-    found = cal_group(ids(0, 4), ids(0, -1, 2), Pairs(ids(), ids()), 0.5)
-    assert found.group.tolist() == [5, -1, 7]
-    assert found.id_of_group.tolist() == [5, 6, 7]
-
-
-def test_an_unlabelled_point_takes_its_pairs_id_even_where_that_is_none_and_counts_for_nothing() -> None:
-    # points 0 and 1 inherit 3 and none; group 0 (points 2, 3) has no labelled pair, so it stays apart
-    found = cal_group(ids(3, -1), ids(-1, -1, 0, 0), Pairs(ids(0, 1, 2), ids(0, 1, 1)), 0.5)
-    assert found.group.tolist() == [3, -1, 4, 4]
-
-
-def test_half_of_the_smaller_group_joins_and_less_does_not() -> None:
-    other = np.repeat([0, 1], [4, 10])
-    group = np.repeat([0, 1], [4, 10])
-    # group 0 shares 2 of 4 with other 0; group 1 shares 4 of 10 with other 1
-    pairs = Pairs(ids(0, 1, 4, 5, 6, 7), ids(0, 1, 4, 5, 6, 7))
-    assert cal_group(other, group, pairs, 0.5).group.tolist() == [0] * 4 + [3] * 10
-
-
-def test_the_share_is_of_the_smaller_group_so_that_a_crumb_joins_a_wall() -> None:
-    wall, crumb = np.zeros(100, np.int64), ids(0, 0)
-    assert cal_group(wall, crumb, Pairs(ids(0), ids(50)), 0.5).group.tolist() == [0, 0]
-    assert cal_group(crumb, wall, Pairs(ids(50), ids(0)), 0.5).group.tolist() == [0] * 100
-
-
 def test_of_equal_overlaps_the_first_met_wins_not_the_lowest_id() -> None:
     other, group = ids(0, 0, 1, 1), ids(0, 0)
     assert cal_group(other, group, Pairs(ids(0, 1), ids(2, 0)), 0.5).group.tolist() == [1, 1]
     assert cal_group(other, group, Pairs(ids(0, 1), ids(0, 2)), 0.5).group.tolist() == [0, 0]
-
-
-def test_only_the_best_overlap_is_asked_for_its_share() -> None:
-    # Group 0 shares 3 of 10 with other 0 (too few) and 2 of 2 with other 1, which is never looked at.
-    other = np.repeat([0, 1], [10, 2])
-    found = cal_group(other, np.zeros(10, np.int64), Pairs(np.arange(5), ids(0, 1, 2, 10, 11)), 0.5)
-    assert found.group.tolist() == [2] * 10
-
-
-def test_the_share_is_compared_in_float32() -> None:
-    # 1 / 3 is below the threshold in float64 and equal to it in float32
-    found = cal_group(ids(0, 0, 0), ids(0, 0, 0), Pairs(ids(0), ids(0)), 1 / 3 + 1e-9)
-    assert found.group.tolist() == [0, 0, 0]
 
 
 SMALL = MergeRules(min_points=1)
@@ -255,14 +143,6 @@ def test_an_identity_of_the_first_call_is_lost_where_the_second_does_not_find_it
     assert dict(zip(merged.view_group.tolist(), merged.views.tolist(), strict=True)) == {0: 4, 1: 3}
 
 
-def test_a_group_of_inherited_points_alone_keeps_the_views_of_where_it_inherited() -> None:
-    # The knot inherits the line's id 0, which the line itself then loses; no mask of the knot's image went into it.
-    merged = line_and_knot([-1] * 10, ())
-    assert merged is not None
-    assert sorted(set(merged.group.tolist())) == [0, 1]
-    assert sorted(zip(merged.view_group.tolist(), merged.views.tolist(), strict=True)) == [(0, 3), (1, 3)]
-
-
 def test_the_second_call_counts_after_the_first_relabelled() -> None:
     # First: one row of 8. Second: halves of 4 over it. After the first call both halves are one group of 8, so the
     # first cloud's group shares 8 of 8 with it; counted before, its best would be a half with 4 of 4.
@@ -271,22 +151,6 @@ def test_the_second_call_counts_after_the_first_relabelled() -> None:
     back = match_pairs(first.points, second.points, 0.075)
     assert cal_group(forward.group, first.group, back, 1.0).group.tolist() == [0] * 8
     assert cal_group(second.group, first.group, back, 1.1).group.tolist() == [2] * 8
-
-
-def test_groups_of_the_first_cloud_join_through_one_of_the_second() -> None:
-    first = cloud(patch(8, 8), np.repeat([0, 1], 32), [0, 1], [5, 6])
-    second = cloud(patch(8, 8), np.zeros(64), [0], [7])
-    merged = merge(first, second, SMALL, Timer())
-    assert merged is not None and merged.n_groups == 1
-    assert sorted(merged.views.tolist()) == [5, 6, 7]
-
-
-def test_unlabelled_points_of_both_clouds_inherit() -> None:
-    first = cloud(patch(4, 4), [0] * 8 + [-1] * 8, [0], [0])
-    second = cloud(patch(4, 4), [-1] * 8 + [0] * 8, [0], [1])
-    merged = merge(first, second, SMALL, Timer())
-    assert merged is not None
-    assert set(merged.group.tolist()) == {0, 1}
 
 
 def test_groups_below_fifty_points_are_dropped_before_a_merge_from_a_cloud_that_stays_alone_too() -> None:
@@ -300,28 +164,6 @@ def test_groups_below_fifty_points_are_dropped_before_a_merge_from_a_cloud_that_
     assert merge(broken, broken, RULES, Timer()) is None
 
 
-@pytest.mark.parametrize("n", [0, 1, 2, 3, 5])
-def test_clouds_that_are_all_invalid_end_in_none(n: int) -> None:
-    broken = cloud(np.full((2, 3), np.nan), ids(0, 0))
-    assert merge_regions([broken] * n, RULES, Timer()) is None
-
-
-def test_an_odd_last_cloud_passes_a_level_unchanged() -> None:
-    clouds = [cloud(patch(2, 2, x=10 * i), [7, 7, 7, 7]) for i in range(3)]
-    level = next_level(clouds, RULES, Timer())
-    assert level[1] is clouds[2]
-    assert set(level[0].group.tolist()) == {-1}  # four points are too few, but those of the last stay for now
-    assert merge_regions(clouds[:1], RULES, Timer()) is clouds[0]
-
-
-def test_a_vertex_beyond_the_limit_has_no_group() -> None:
-    seen = cloud([[0, 0, 0], [1, 0, 0]], [3, -1])
-    vertices = np.array([[0.5, 0, 0], [0.75, 0, 0], [-0.5, 0, 0], [-0.75, 0, 0]], np.float32)
-    # halfway the lower index wins; nearest to an unlabelled point is unlabelled
-    assert groups_on_surface(seen, vertices, 0.5).tolist() == [3, -1, 3, -1]
-    assert groups_on_surface(cloud([], []), vertices, 0.5).tolist() == [-1] * 4
-
-
 def test_a_segment_takes_the_group_that_covers_half_of_the_smaller_and_else_keeps_its_own_id() -> None:
     group = np.repeat([0, 1, -1], [30, 25, 45])
     segments = np.repeat([70, 71, 99], [40, 15, 45])
@@ -329,10 +171,3 @@ def test_a_segment_takes_the_group_that_covers_half_of_the_smaller_and_else_keep
     assert ensemble(group, segments, 20, 0.5).tolist() == [0] * 40 + [1] * 15 + [99 + 2] * 45
     # group 1 has 25 vertices: below 26 it takes no part, and its segment keeps its id
     assert ensemble(group, segments, 26, 0.5).tolist() == [0] * 40 + [71 + 1] * 15 + [99 + 1] * 45
-
-
-@pytest.mark.parametrize("far", [np.inf, 2e6])
-def test_points_that_no_grid_can_hold_are_refused(far: float) -> None:
-    good, bad = np.zeros((2, 3)), np.array([[far, 0, 0]])
-    with pytest.raises(DataError, match="beyond 1e"):
-        match_pairs(good, bad, 0.075)

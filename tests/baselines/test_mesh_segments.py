@@ -75,24 +75,6 @@ def test_heap_sort_moves_equal_weights_as_gnus() -> None:
     assert edges[[0, 1, 39], 0].tolist() == [-2, -1, 37]
 
 
-def test_any_weights_are_sorted_and_none_is_lost() -> None:
-    rng = np.random.default_rng(3)
-    organ_pipe = np.concatenate([np.arange(500), np.arange(500)[::-1]])
-    for values in (rng.random(1), rng.random(17), np.zeros(1000), organ_pipe, rng.integers(0, 4, 3000)):
-        weights = values.astype(np.float32)
-        edges = np.stack([np.arange(len(weights))] * 2, axis=1).astype(np.int32)
-        sort_as_gnu(weights, edges)
-        assert np.array_equal(weights, np.sort(values.astype(np.float32)))
-        assert np.array_equal(np.sort(edges[:, 0]), np.arange(len(weights)))
-
-
-def test_weights_that_are_no_numbers_end_the_sort_all_the_same() -> None:
-    weights = np.where(np.arange(300) % 3 == 0, np.nan, np.arange(300) % 7).astype(np.float32)
-    edges = np.stack([np.arange(300)] * 2, axis=1).astype(np.int32)
-    sort_as_gnu(weights, edges)
-    assert np.array_equal(np.sort(edges[:, 0]), np.arange(300))
-
-
 def test_a_vertex_normal_is_the_running_mean_of_its_triangles() -> None:
     """A horizontal triangle, then a vertical one over the edge 0-1: the mean of (0,0,1) and (0,-1,0) at both."""
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
@@ -170,36 +152,3 @@ def test_segments_are_those_of_a_plain_reference_on_rough_sheets() -> None:
         segments = mesh_segments(vertices, triangles, threshold, min_vertices)
         lowest = {s: int(np.flatnonzero(segments == s)[0]) for s in np.unique(segments)}
         assert [lowest[s] for s in segments] == expected
-
-
-def test_a_flat_sheet_is_one_segment_and_a_step_makes_two() -> None:
-    flat = mesh_segments(*sheet([[0.0] * 12] * 12))
-    assert len(np.unique(flat)) == 1
-    step = mesh_segments(*sheet([[0.0] * 6 + [1.0] * 6] * 12))  # a riser of 1 m: its edges bend by more than 0.01
-    left, right = step.reshape(12, 12)[:, 0], step.reshape(12, 12)[:, -1]
-    assert len(np.unique(left)) == len(np.unique(right)) == 1
-    assert left[0] != right[0]
-
-
-def test_small_segments_join_a_neighbour_and_lone_vertices_stay() -> None:
-    vertices, triangles = sheet([[0.0] * 3 + [1.0] * 3] * 3)  # nine vertices a side
-    assert len(np.unique(mesh_segments(vertices, triangles, 0.01, 1))) > 1
-    assert len(np.unique(mesh_segments(vertices, triangles, 0.01, 20))) == 1
-    lonely = np.concatenate([vertices, [[9, 9, 9]]]).astype(np.float32)
-    assert mesh_segments(lonely, triangles)[-1] == len(vertices)
-
-
-def test_a_segment_is_named_after_a_vertex_in_it() -> None:
-    segments = mesh_segments(*rough_sheet(20))
-    assert np.array_equal(segments[segments], segments)
-
-
-def test_a_degenerate_triangle_breaks_nothing() -> None:
-    vertices, triangles = sheet([[0.0] * 6] * 6)
-    broken = np.concatenate([triangles, [[3, 3, 4], [0, 1, 2]]]).astype(np.int32)  # no area, both
-    segments = mesh_segments(vertices, broken)
-    assert segments.shape == (36,) and np.array_equal(segments[segments], segments)
-
-
-def test_a_mesh_without_triangles_has_a_segment_a_vertex() -> None:
-    assert mesh_segments(np.zeros((3, 3), np.float32), np.zeros((0, 3), np.int32)).tolist() == [0, 1, 2]

@@ -13,18 +13,18 @@ from prediction_files import write_openyolo3d
 from proposals_by_hand import made_proposals
 from pydantic import ValidationError
 
-from su3d_bench.baselines.openmask3d.features import FeatureMeans, crop_boxes, prompted_mask
 from su3d_bench.baselines.openmask3d.method import (
+    FeatureMeans,
+    MaskViews,
     OpenMask3D,
     OpenMask3DConfig,
     OpenMask3DSegment3D,
     OpenMask3DSegment3DConfig,
-)
-from su3d_bench.baselines.openmask3d.views import (
-    MaskViews,
     as_openmask3d,
     count_pixels,
+    crop_boxes,
     pixels_of_mask,
+    prompted_mask,
     swapped_intrinsics,
     visible_pixels,
 )
@@ -36,7 +36,7 @@ from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, Int64Array, SceneInfo, Surface
 from su3d_bench.metrics.matching.labelling import most_similar
 from su3d_bench.perception.regions import region_under
-from su3d_bench.runs.feeding import no_detections
+from su3d_bench.runs.frame_loop import no_detections
 
 WIDTH, HEIGHT, FOCAL = 12, 8, 10.0
 INTRINSICS = np.array([[FOCAL, 0, 0], [0, FOCAL, 0], [0, 0, 1]])
@@ -73,9 +73,6 @@ class TestProjection:
     def test_a_point_in_the_cameras_plane_falls_on_the_first_pixel(self) -> None:
         assert seen([(5, 5, 0)], frame(depth_m=0.0)) == [0] and seen([(5, 5, 0)], frame()) == [-1]
 
-    def test_points_are_taken_to_the_camera_by_its_pose(self) -> None:
-        assert seen([(1.0, 0, 1)], frame(x_m=0.5)) == [5]
-
     def test_the_centres_are_scaled_by_each_others_factor(self) -> None:
         """640 x 480 of 1296 x 968: fx floor(478.02) / 968, fy 640 / 1296, cx 479 / 967, cy 639 / 1295."""
         colour = np.array([[1000.0, 0, 967], [0, 1000, 1295], [0, 0, 1]])
@@ -104,21 +101,11 @@ class TestViews:
         assert count_pixels(pixels, proposals, WIDTH * HEIGHT).tolist() == [2, 2, 0, 0]
         assert pixels_of_mask(pixels, proposals.mask(0), WIDTH).tolist() == [[0, 0], [3, 0]]
 
-    def test_pixels_of_a_mask_come_row_by_row_as_x_and_y(self) -> None:
-        pixels = np.array([2 * WIDTH + 1, 5, -1, 5, WIDTH], np.int32)
-        assert pixels_of_mask(pixels, np.arange(5, dtype=np.int32), WIDTH).tolist() == [[5, 0], [0, 1], [1, 2]]
-
     def test_the_views_with_most_pixels_stay_and_of_equal_ones_the_earlier(self) -> None:
         views = MaskViews(2, 2)
         for position, counts in enumerate([(3, 0), (5, 0), (5, 1), (3, 1), (6, 1)]):
             views.add(position, np.array(counts))
         assert views.positions.tolist() == [[4, 1], [2, 3]] and views.n_pixels.tolist() == [[6, 5], [1, 1]]
-
-    def test_a_view_without_a_pixel_is_none(self) -> None:
-        views = MaskViews(1, 3)
-        views.add(0, np.array([0]))
-        views.add(1, np.array([4]))
-        assert views.positions.tolist() == [[1, -1, -1]]
 
 
 class Prompts:
@@ -154,20 +141,10 @@ class TestPrompts:
             assert {tuple(point) for point in points} <= {tuple(pixel) for pixel in PIXELS.tolist()}
         assert len({str(sorted(points)) for points in prompts.asked}) > 5
 
-    def test_a_mask_of_fewer_pixels_is_prompted_with_all_of_them(self) -> None:
-        prompts = Prompts([0.5] * 10)
-        prompted_mask(prompts, frame(), PIXELS[:3], 10, 5, np.random.default_rng(0))
-        assert all(sorted(points) == PIXELS[:3].tolist() for points in prompts.asked)
-
     def test_the_surest_round_wins_and_of_equal_ones_the_first(self) -> None:
         scores = [0.2, 0.7, 0.3, 0.9, 0.9, 0.1, 0.9, 0, 0, 0]
         best = prompted_mask(Prompts(scores), frame(), PIXELS, 10, 5, np.random.default_rng(0))
         assert best is not None and best.sum() == 4  # the fourth round
-
-    def test_a_view_whose_rounds_all_fail_is_not_used(self) -> None:
-        assert prompted_mask(Prompts([0.0] * 10), frame(), PIXELS, 10, 5, np.random.default_rng(0)) is None
-        empty = Prompts([0.9] * 10, empty=range(10))
-        assert prompted_mask(empty, frame(), PIXELS, 10, 5, np.random.default_rng(0)) is None
 
 
 class TestCrops:

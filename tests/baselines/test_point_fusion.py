@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from box_room import INTRINSICS, images, pose
 
-from su3d_bench.baselines.conceptfusion.pixel_features import picked
+from su3d_bench.baselines.conceptfusion.method import picked
 from su3d_bench.baselines.conceptfusion.point_fusion import ABSENT, PointFusion, View, alpha, normals_of, view_of
-from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Frame
 
 TOWARDS = np.array([0.0, 0.0, 1.0])
@@ -63,16 +61,6 @@ def test_a_pixel_without_depth_has_no_point_no_normal_and_makes_no_map_point() -
     assert fusion.insert(view, fusion.associate(view)).tolist() == [0, 3]
 
 
-def test_intrinsics_shrink_with_the_image_and_pixels_are_taken_by_floor() -> None:
-    depth_m = np.arange(1, 25, dtype=np.float32).reshape(4, 6)
-    intrinsics = np.array([[6.0, 0, 3], [0, 4.0, 2], [0, 0, 1]])
-    frame = Frame(0, 0.0, np.zeros((4, 6, 3), np.uint8), depth_m, np.eye(4), intrinsics)
-    view = view_of(frame, picked(4, 2), picked(6, 4), 0.6)
-    assert view.intrinsics.tolist() == [[4, 0, 2], [0, 2, 1], [0, 0, 1]]
-    assert view.points[:, 2].tolist() == [1, 2, 4, 5, 13, 14, 16, 17]
-    assert view.points[5].tolist() == [(1 - 2) / 4 * 14, 0.0, 14]
-
-
 @pytest.mark.parametrize(
     ("u", "pixel"), [(0.5, 0), (0.51, 1), (1.5, 2), (2.4, 2), (-0.0005, 0), (3.0005, 3), (-0.002, None), (3.002, None)]
 )
@@ -81,10 +69,6 @@ def test_a_map_point_goes_to_the_nearest_pixel_and_out_of_the_outermost_centres_
 ) -> None:
     matched = a_map((u, 0, 1)).associate(row_of_pixels())
     assert np.flatnonzero(matched != ABSENT).tolist() == ([] if pixel is None else [pixel])
-
-
-def test_points_behind_the_camera_match_nothing() -> None:
-    assert (a_map((0, 0, -1)).associate(row_of_pixels()) == ABSENT).all()
 
 
 def test_a_match_is_strictly_nearer_than_the_distance_and_within_the_angle() -> None:
@@ -116,48 +100,3 @@ def test_a_matched_point_moves_to_the_weighted_mean_and_its_normal_is_not_normal
     assert fusion.counts.tolist() == [0.75]
     assert fusion.insert(view, matched).tolist() == [1]
     assert fusion.points[1].tolist() == [1, 0, 1]
-
-
-def fused(transform: np.ndarray) -> tuple[PointFusion, list[list[int]]]:
-    fusion, matches = PointFusion(0.05, 20.0), []
-    for index in range(4):
-        rgb, depth_m = images(index)
-        frame = Frame(index, 0.0, rgb, depth_m.astype(np.float32), transform @ pose(index), INTRINSICS)
-        view = view_of(frame, picked(36, 30), picked(48, 40), 0.6)
-        matches.append(fusion.associate(view).tolist())
-        fusion.fuse(view, np.array(matches[-1]))
-        fusion.insert(view, np.array(matches[-1]))
-    return fusion, matches
-
-
-def test_poses_relative_to_the_first_frame_give_the_same_map_moved() -> None:
-    """gradslam moves the poses; which points match and how they count does not change."""
-    world, matches = fused(np.eye(4))
-    to_first = np.linalg.inv(pose(0))
-    relative, same = fused(to_first)
-    assert matches == same
-    assert sum(one != ABSENT for one in matches[3]) > 100
-    np.testing.assert_allclose(world.points @ to_first[:3, :3].T + to_first[:3, 3], relative.points, atol=1e-12)
-    np.testing.assert_allclose(world.counts, relative.counts, rtol=1e-12)
-
-
-def test_what_counts_is_the_distance_to_the_camera_not_the_place_in_the_world() -> None:
-    counts = []
-    for distance in (1.0, 2.0):
-        depth_m = np.full((2, 2), distance, np.float32)
-        camera = np.eye(4)
-        camera[2, 3] = 5.0 - distance  # the same wall at 5 m, seen from nearer or farther
-        frame = Frame(0, 0.0, np.zeros((2, 2, 3), np.uint8), depth_m, camera, np.diag([1e9, 1e9, 1.0]))
-        fusion = PointFusion(0.05, 20.0)
-        view = view_of(frame, picked(2, 2), picked(2, 2), 0.6)
-        fusion.insert(view, fusion.associate(view))
-        assert fusion.points[:, 2].tolist() == [5.0] * 4
-        counts.append(fusion.counts[0])
-    assert counts == pytest.approx([np.exp(-1 / 0.72), np.exp(-4 / 0.72)])
-
-
-def test_intrinsics_without_a_focal_length_are_one_line() -> None:
-    flat = np.diag([0.0, 1.0, 1.0])
-    frame = Frame(3, 0.0, np.zeros((2, 2, 3), np.uint8), np.ones((2, 2), np.float32), np.eye(4), flat)
-    with pytest.raises(DataError, match=r"^frame 3: the intrinsics .* have no focal length$"):
-        view_of(frame, picked(2, 2), picked(2, 2), 0.6)

@@ -7,28 +7,25 @@ from typing import Any
 
 import numpy as np
 import pytest
-from damage import damages, outcomes, truncations
-from prediction_files import TorchFile, write_openmask3d, write_openyolo3d, write_scannet_text
+from prediction_files import write_openmask3d, write_openyolo3d, write_scannet_text
 from proposals_by_hand import made_proposals
-from pydantic import ValidationError
 from test_mesh_segments import sheet
 
-from su3d_bench.baselines.openmask3d.components import (
-    density_clusters,
-    linked_within,
-    split_into_parts,
-    voted_by_segments,
-)
-from su3d_bench.baselines.openmask3d.proposal_files import digest_of_folder, read_proposals
-from su3d_bench.baselines.openmask3d.proposals import ProposalConfig, make_proposals
-from su3d_bench.baselines.openmask3d.segment_tree import SegmentTree, contacts_of, is_within, merge_cost, merge_tree
-from su3d_bench.baselines.openmask3d.surface_proposals import (
+from su3d_bench.baselines.openmask3d.proposals import (
     NodeChoice,
+    ProposalConfig,
     chosen_nodes,
     contrast,
+    density_clusters,
+    linked_within,
+    make_proposals,
+    read_proposals,
     segments_of,
+    split_into_parts,
     surface_proposals,
+    voted_by_segments,
 )
+from su3d_bench.baselines.openmask3d.segment_tree import SegmentTree, contacts_of, is_within, merge_cost, merge_tree
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.interfaces import SceneTools
 from su3d_bench.core.maps import Proposals
@@ -84,41 +81,6 @@ class TestFiles:
         with pytest.raises(PredictionError, match="'scannet-semantic-text' holds no masks over the mesh"):
             read_proposals(other, "room0", flat())
 
-    def test_a_scene_that_is_not_there_is_named(self, tmp_path: Path) -> None:
-        write_openyolo3d(tmp_path, SCENE)
-        with pytest.raises(PredictionError, match="has no prediction of scene 'room1'"):
-            read_proposals(tmp_path, "room1", flat())
-
-    def test_an_empty_list_is_no_proposal(self, tmp_path: Path) -> None:
-        (tmp_path / "room0.txt").write_text("")
-        assert len(read_proposals(tmp_path, "room0", flat())) == 0
-
-    def test_damaged_lists_and_matrices_are_refused_in_one_line_or_read(self, tmp_path: Path) -> None:
-        write_scannet_text(tmp_path / "text", SCENE)
-        write_openmask3d(tmp_path / "torch", SCENE, np.zeros((3, 4)))
-        for file in (tmp_path / "text" / "room0.txt", tmp_path / "torch" / "room0_masks.pt"):
-            content = file.read_bytes()
-
-            def read(damaged: bytes, file: Path = file) -> Proposals:
-                file.write_bytes(damaged)
-                found = read_proposals(file.parent, "room0", flat())
-                assert found.indices.max(initial=0) < 6 and len(found.indptr) == len(found) + 1
-                return found
-
-            copies = [*list(truncations(content))[:: max(1, len(content) // 30)], *damages(content, 120)]
-            n_read, n_refused = outcomes(read, iter(copies), must_name=file.parent.name, refusal=PredictionError)
-            assert n_refused > 30 and n_read + n_refused == len(copies)
-
-    def test_the_digest_moves_with_content_and_names_alone(self, tmp_path: Path) -> None:
-        write_scannet_text(tmp_path, SCENE)
-        first = digest_of_folder(tmp_path)
-        (tmp_path / "room0.txt").touch()
-        assert digest_of_folder(tmp_path) == first
-        mask = tmp_path / SCENE["files"][0]
-        mask.write_text(mask.read_text()[::-1].strip() + "\n")
-        assert digest_of_folder(tmp_path) != first
-        assert digest_of_folder(tmp_path / "missing") == digest_of_folder(tmp_path / "neither")
-
 
 class TestParts:
     ROW = np.array([(x, 0, 0) for x in (0.0, 0.9, 1.8, 3.0, 3.5, 9.0)])
@@ -137,10 +99,6 @@ class TestParts:
             points = (rng.random((300, 3)) * (2, 2, 0.3)).astype(np.float32)
             expected = DBSCAN(eps=eps_m, min_samples=min_points).fit_predict(points.astype(np.float64))
             assert density_clusters(points, eps_m, min_points).tolist() == expected.tolist()
-
-    def test_density_leaves_noise_out(self) -> None:
-        assert density_clusters(self.ROW.astype(np.float32), 0.95, 3).tolist() == [0, 0, 0, -1, -1, -1]
-        assert density_clusters(np.zeros((0, 3), np.float32), 0.95, 3).tolist() == []
 
     def test_each_part_is_a_mask_with_its_masks_score_the_best_first(self) -> None:
         proposals = made_proposals(self.ROW, [0, 1, 3, 4], [5], [1, 2], scores=[0.2, 0.9, 0.2])
@@ -211,11 +169,6 @@ class TestTree:
         assert merge_cost(5.0, 10, 10, 100) == pytest.approx(0.52 * 0.01 * 10)
         assert merge_cost(1.0, 10, 40, 400) == pytest.approx(0.12 * 0.76 * 20)
 
-    def test_parts_that_touch_nothing_are_roots(self) -> None:
-        vertices = np.array([[0, 0, 0], [5, 0, 0], [0, 5, 0]], np.float32)
-        tree = merge_tree(contacts_of(vertices, np.zeros((0, 3), np.int32), np.arange(3)))
-        assert tree.parent.tolist() == [-1, -1, -1] and sorted(tree.leaves.tolist()) == [0, 1, 2]
-
     def test_contrast_is_the_borders_bend_over_its_relative_length(self) -> None:
         """1250 patches of 4 cm² are 0.5 m²: full size; 50 of them count by the root of 0.04."""
         tree = SegmentTree(
@@ -262,11 +215,6 @@ class TestTree:
         found = surface_proposals(published, segments_of(published), NodeChoice(5, 1, 0.9, 0.5))
         assert sorted(len(mask) for mask in masks_of(found)) == [18, 18]
 
-    def test_a_mesh_in_the_wrong_unit_is_one_line(self) -> None:
-        vertices = np.array([[0, 0, 0], [1e9, 1e9, 1e9]], np.float32)
-        with pytest.raises(DataError, match=r"the mesh spans 1000000000 m; proposals .* need one in metres"):
-            contacts_of(vertices, np.zeros((0, 3), np.int32), np.arange(2))
-
 
 def tools(surface: Surface | None, truth: Proposals | None = None) -> SceneTools:
     def give() -> Surface:
@@ -278,32 +226,6 @@ def tools(surface: Surface | None, truth: Proposals | None = None) -> SceneTools
 
 
 class TestConfig:
-    def test_auto_is_files_where_a_folder_is_named_else_the_surface(self) -> None:
-        assert ProposalConfig().kind == "surface"
-        assert ProposalConfig.model_validate_json('{"proposals_folder": "masks"}').kind == "files"
-
-    @pytest.mark.parametrize(
-        ("text", "message"),
-        [
-            ('{"proposals": "files"}', "needs proposals_folder"),
-            ('{"proposals": "surface", "proposals_folder": "masks"}', "reads no proposals_folder"),
-            ('{"proposals": "oracle", "proposals_folder": "masks"}', "reads no proposals_folder"),
-            ('{"proposals": "mask3d"}', "proposals"),
-            ('{"part_kept_share": 0}', "part_kept_share"),
-        ],
-    )
-    def test_settings_that_contradict_each_other_are_refused(self, text: str, message: str) -> None:
-        with pytest.raises(ValidationError, match=message):
-            ProposalConfig.model_validate_json(text)
-
-    @pytest.mark.parametrize("kind", ["surface", "oracle"])
-    def test_without_a_mesh_the_error_names_the_proposals(self, kind: Any) -> None:
-        with pytest.raises(DataError) as caught:
-            make_proposals(ProposalConfig(proposals=kind), tools(None), "tum", "desk")
-        assert str(caught.value) == (
-            f"tum/desk: proposals '{kind}' lie on the scan's mesh: the dataset has no mesh; this method works on one"
-        )
-
     def test_true_proposals_are_carried_to_the_nearest_vertices_overlaps_included(self) -> None:
         truth = made_proposals(np.array([(0.1, 0, 0), (2.1, 0, 0), (4.9, 0, 0)]), [0, 1], [1, 2])
         found = make_proposals(ProposalConfig(proposals="oracle"), tools(flat(), truth), "rooms", "room0")
@@ -319,14 +241,3 @@ class TestConfig:
             config = ProposalConfig(proposals_folder=tmp_path, split_parts=split, part_eps_m=1.0)  # type: ignore[arg-type]
             assert masks_of(make_proposals(config, tools(surface), "rooms", "room0")) == expected
         assert config.caveat is None and list(config.inputs) == ["proposals"]
-
-    def test_proposals_from_the_surface_say_that_they_are_no_networks(self) -> None:
-        config = ProposalConfig(surface_min_points=20)
-        found = make_proposals(config, tools(box_on_a_floor()), "rooms", "room0")
-        assert len(found) > 0 and config.caveat == found.source and config.inputs == {}
-
-
-def test_a_tensor_with_scores_beside_another_tensor_is_no_matrix(tmp_path: Path) -> None:
-    file = TorchFile()
-    file.write(tmp_path / "room0.pt", file.tensor(np.ones((6, 3), np.float32)))
-    assert masks_of(read_proposals(tmp_path, "room0", flat())) == [list(range(6))] * 3

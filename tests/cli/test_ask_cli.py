@@ -1,10 +1,9 @@
-"""``su3d-bench ask`` and ``su3d-bench refine`` as whoever types them meets them."""
+"""``su3d-bench query ask`` and ``su3d-bench runs refine`` as whoever types them meets them."""
 
 from __future__ import annotations
 
 import itertools
 import json
-import shlex
 import subprocess
 import sys
 from dataclasses import replace
@@ -15,17 +14,17 @@ import pytest
 from chat_server import KEY, Answered, ChatServer, error
 from scored_room import instances
 
-from su3d_bench.cli.main import build_parser, main
+from su3d_bench.cli.main import main
 from su3d_bench.core.files.atomic import write_json
 from su3d_bench.core.maps import Instances
-from su3d_bench.questions.undesired import FilterConfig
-from su3d_bench.reports.pictures import answers as reasoning_picture
-from su3d_bench.reports.pictures.answers import SpokenOf, draw_reasoning
+from su3d_bench.questions.refining import FilterConfig
+from su3d_bench.reports.pictures import figures as reasoning_picture
+from su3d_bench.reports.pictures.figures import SpokenOf, draw_reasoning
 from su3d_bench.store.predictions import write_prediction
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 SCENE = "rooms/made"
-QUICK = ["backoff_s=0.001", "max_retries=1", "total_timeout_s=1.0", "max_failures_in_a_row=50"]
+QUICK = ["max_retries=1", "timeout_s=1.0", "max_failures_in_a_row=50"]
 
 
 def cube(x: float, y: float, z: float, side: float) -> np.ndarray:
@@ -85,7 +84,7 @@ def llm(server: ChatServer, *more: str) -> list[str]:
 
 
 def test_a_question_is_answered_with_ids_and_a_picture(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["ask", SCENE, "Which sink is closer to bed?"]) == 0
+    assert main(["query", "ask", SCENE, "Which sink is closer to bed?"]) == 0
     said = capsys.readouterr()
     assert said.out == "sink #30 is closest to bed #10: 1.79 m between centres; sink #20 2.77 m\n"
     picture = job.pictures / "ask-which-sink-is-closer-to-bed.png"
@@ -98,7 +97,7 @@ def test_the_answer_stands_before_the_picture_is_drawn(
 ) -> None:
     before: list[str] = []
     monkeypatch.setattr(reasoning_picture, "draw_reasoning", lambda *words: before.append(capsys.readouterr().out))
-    assert main(["ask", SCENE, "How many sinks are there?"]) == 0
+    assert main(["query", "ask", SCENE, "How many sinks are there?"]) == 0
     assert before == ["2: sink #20, sink #30\n"]
     assert capsys.readouterr().err.startswith("picture: ")
 
@@ -106,20 +105,20 @@ def test_the_answer_stands_before_the_picture_is_drawn(
 def test_a_misspelt_noun_gets_a_suggestion_and_a_word_that_nobody_saw_is_named(
     job: JobFolder, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["ask", SCENE, "Which sink is closer to the baed?"]) == 0
+    assert main(["query", "ask", SCENE, "Which sink is closer to the baed?"]) == 0
     said = capsys.readouterr()
     assert said.out == "I cannot settle this: the map has no 'baed'; did you mean 'bed'?\n"
     assert "never saw 'baed'" in said.err
-    assert main(["ask", SCENE, "How many benches are there?"]) == 0
+    assert main(["query", "ask", SCENE, "How many benches are there?"]) == 0
     said = capsys.readouterr()  # a thing that is known and not there is no slip of the pen
     assert (said.out, "never saw" in said.err) == ("0: the map has no 'benches'\n", False)
-    assert main(["ask", SCENE, "xqzzy"]) == 0
+    assert main(["query", "ask", SCENE, "xqzzy"]) == 0
     assert "never saw 'xqzzy'" in capsys.readouterr().err
 
 
 def test_json_tells_everything(job: JobFolder, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     out = tmp_path / "deep" / "answer.png"
-    words = ["ask", SCENE, "What is on the bed?", "--run", "runs/made", "--json", "--out", str(out)]
+    words = ["query", "ask", SCENE, "What is on the bed?", "--run", "runs/made", "--json", "--out", str(out)]
     assert main(words) == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["object_ids"], told["reference_ids"], told["is_settled"]) == ([40], [10], True)
@@ -128,7 +127,7 @@ def test_json_tells_everything(job: JobFolder, capsys: pytest.CaptureFixture[str
 
 
 def test_what_cannot_be_settled_is_said_and_not_drawn(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["ask", SCENE, "I am cold, what should I do?", "--out", "x.png"]) == 0
+    assert main(["query", "ask", SCENE, "I am cold, what should I do?", "--out", "x.png"]) == 0
     said = capsys.readouterr()
     assert said.out.startswith("I cannot settle this: ")
     assert "x.png: not drawn" in said.err
@@ -139,7 +138,7 @@ def test_what_cannot_be_settled_is_said_and_not_drawn(job: JobFolder, capsys: py
 def test_the_eye_decides_what_is_left(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
     answers = []
     for eye in (["-5", "1", "0"], ["5", "1", "0"]):
-        assert main(["ask", SCENE, "Is the bed left of the sink?", "--quiet", "--eye", *eye]) == 0
+        assert main(["query", "ask", SCENE, "Is the bed left of the sink?", "--quiet", "--eye", *eye]) == 0
         answers.append(capsys.readouterr().out.split(":")[0])
     assert answers == ["no", "yes"]
 
@@ -148,7 +147,7 @@ def test_the_eye_decides_what_is_left(job: JobFolder, capsys: pytest.CaptureFixt
 def test_a_model_answers_once_and_then_from_the_run(
     job: JobFolder, server: ChatServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["ask", SCENE, "Which sink is closer to bed?", "--json", *llm(server)]
+    words = ["query", "ask", SCENE, "Which sink is closer to bed?", "--json", *llm(server)]
     assert main(words) == 0
     first = capsys.readouterr().out
     assert json.loads(first)["object_ids"] == [30, 10]
@@ -166,11 +165,11 @@ def test_a_model_answers_once_and_then_from_the_run(
 def test_a_dry_run_says_what_it_would_cost_and_asks_nothing(
     job: JobFolder, server: ChatServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["ask", SCENE, "Where am I?", "--dry-run", "--solver", "llm"]) == 0
+    assert main(["query", "ask", SCENE, "Where am I?", "--dry-run", "--solver", "llm"]) == 0
     assert "1 requests, 0 of them answered before; 1 to send to gpt-4-1106-preview: about " in capsys.readouterr().out
-    assert main(["ask", SCENE, "Where am I?", "--dry-run", *llm(server)]) == 0
+    assert main(["query", "ask", SCENE, "Where am I?", "--dry-run", *llm(server)]) == 0
     assert "no price in the table" in capsys.readouterr().out
-    assert main(["ask", SCENE, "Where am I?", "--dry-run"]) == 0
+    assert main(["query", "ask", SCENE, "Where am I?", "--dry-run"]) == 0
     assert "nothing to pay" in capsys.readouterr().out
     assert server.n_asked == 0
     assert not Path("runs/made/language").exists()
@@ -183,7 +182,7 @@ def test_prices_and_budget_come_from_a_file(
         '[perception.language]\nbudget_usd = 0.000001\n[perception.language.prices."tiny"]\n'
         "input_usd = 1.0\noutput_usd = 1.0\n"
     )
-    assert main(["ask", SCENE, "Where am I?", *llm(server), "--config", "run.toml"]) == 3
+    assert main(["query", "ask", SCENE, "Where am I?", *llm(server), "--config", "run.toml"]) == 3
     assert "budget_usd = 1e-06 is reached" in capsys.readouterr().err
     assert server.n_asked == 0
 
@@ -191,26 +190,35 @@ def test_prices_and_budget_come_from_a_file(
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["ask", SCENE, " "], "the question is empty"),
-        (["ask", "rooms/none", "x"], "no run in runs/ holds rooms/none by opensu3d"),
-        (["ask", SCENE, "x", "--run", "runs/none"], "runs/none: holds no run; name the folder of one: su3d-bench run"),
-        (["ask", "rooms/mode", "x", "--run", "runs/made"], "of rooms/mode by opensu3d; did you mean 'rooms/made'?"),
-        (["query", SCENE, "x", "--run", "runs/made", "--method", "opensud"], "by opensud; did you mean 'opensu3d'?"),
-        (["query", SCENE, "x", "--run", "runs/made", "--method", "sam3d"], "by sam3d; the run has opensu3d"),
-        (["ask", SCENE, "x", "--names", "refined"], "has no labels n'; make them with su3d-bench refine"),
-        (["ask", SCENE, "x", "--solver", "lm"], "unknown --solver 'lm'; did you mean 'llm'?"),
-        (["ask", SCENE, "x", "--eye", "nan", "0", "0"], "expected three finite numbers of metres"),
-        (["ask", SCENE, "x", "--solver", "llm", "--offline"], "holds no reply to this ask request"),
+        (["query", "ask", SCENE, " "], "the question is empty"),
+        (["query", "ask", "rooms/none", "x"], "no run in runs/ holds rooms/none by opensu3d"),
         (
-            ["ask", SCENE, "x", "--solver", "llm", "--base-url", "http://a:b@c/v1"],
+            ["query", "ask", SCENE, "x", "--run", "runs/none"],
+            "runs/none: holds no run; name the folder of one",
+        ),
+        (
+            ["query", "ask", "rooms/mode", "x", "--run", "runs/made"],
+            "of rooms/mode by opensu3d; did you mean 'rooms/made'",
+        ),
+        (
+            ["query", "text", SCENE, "x", "--run", "runs/made", "--method", "opensud"],
+            "by opensud; did you mean 'opensu3d'?",
+        ),
+        (["query", "text", SCENE, "x", "--run", "runs/made", "--method", "sam3d"], "by sam3d; the run has opensu3d"),
+        (["query", "ask", SCENE, "x", "--names", "refined"], "has no labels n'; make them with su3d-bench runs refine"),
+        (["query", "ask", SCENE, "x", "--solver", "lm"], "unknown --solver 'lm'; did you mean 'llm'?"),
+        (["query", "ask", SCENE, "x", "--eye", "nan", "0", "0"], "expected three finite numbers of metres"),
+        (["query", "ask", SCENE, "x", "--solver", "llm", "--offline"], "holds no reply to this ask request"),
+        (
+            ["query", "ask", SCENE, "x", "--solver", "llm", "--base-url", "http://a:b@c/v1"],
             "--base-url: language.base_url = 'http://a:b@c/v1': holds a name, a password or a query; keys belong in",
         ),
         (
-            ["ask", SCENE, "x", "--solver", "llm", "--set", "perception.language.temprature=1"],
+            ["query", "ask", SCENE, "x", "--solver", "llm", "--set", "perception.language.temprature=1"],
             "unknown key 'temprature'; did you mean 'temperature'?",
         ),
         (
-            ["ask", SCENE, "x", "--solver", "llm", "--set", "perception.cache=false"],
+            ["query", "ask", SCENE, "x", "--solver", "llm", "--set", "perception.cache=false"],
             "only perception.language.KEY=VALUE is of use here",
         ),
     ],
@@ -229,21 +237,21 @@ def test_a_missing_key_is_one_line(
 ) -> None:
     pytest.importorskip("openai", reason="the models extra is not installed")
     monkeypatch.delenv("OPENAI_API_KEY")
-    assert main(["ask", SCENE, "x", "--solver", "llm"]) == 2
+    assert main(["query", "ask", SCENE, "x", "--solver", "llm"]) == 2
     assert "su3d-bench: $OPENAI_API_KEY is not set" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_labels_n_prime_by_vote_are_what_ask_uses(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["refine", "runs/made"]) == 0
+    assert main(["runs", "refine", "runs/made"]) == 0
     said = capsys.readouterr().out
     assert "rooms/made: 4 instances, 2 names changed" in said
     assert "10  bed -> sofa" in said
     assert "30  sink -> basin" in said
-    assert main(["ask", SCENE, "Where is the sofa?", "--json"]) == 0
+    assert main(["query", "ask", SCENE, "Where is the sofa?", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["object_ids"], told["names"]) == ([10], "labels n' by vote")
-    assert main(["ask", SCENE, "Where is the sofa?", "--names", "label"]) == 0
+    assert main(["query", "ask", SCENE, "Where is the sofa?", "--names", "label"]) == 0
     assert "I cannot settle this" in capsys.readouterr().out
 
 
@@ -251,7 +259,7 @@ def test_labels_n_prime_by_a_model_are_asked_for_once(
     job: JobFolder, server: ChatServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
     server.answer = lambda body: Answered("I'm sorry." if "basin" in body["messages"][1]["content"] else "furniture")
-    words = ["refine", "runs/made", "--refiner", "model", "--model", "tiny", "--base-url", server.url]
+    words = ["runs", "refine", "runs/made", "--refiner", "model", "--model", "tiny", "--base-url", server.url]
     assert main(words) == 0
     said = capsys.readouterr()
     assert "10  bed -> furniture" in said.out
@@ -267,10 +275,10 @@ def test_what_is_background_under_label_n_prime_is_left_out(
     job: JobFolder, server: ChatServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
     server.answer = lambda body: Answered("tile wall" if "basin" in body["messages"][1]["content"] else "furniture")
-    words = ["refine", "runs/made", "--refiner", "model", "--model", "tiny", "--base-url", server.url]
+    words = ["runs", "refine", "runs/made", "--refiner", "model", "--model", "tiny", "--base-url", server.url]
     assert main(words) == 0
     assert "30  left out: 'tile wall' is background" in capsys.readouterr().out
-    assert main(["ask", SCENE, "How many things are there?", "--json"]) == 0
+    assert main(["query", "ask", SCENE, "How many things are there?", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert (told["value"], told["object_ids"]) == (3, [10, 20, 40])
     assert told["names"] == "labels n' by tiny, without 1 that it leaves out"
@@ -287,11 +295,11 @@ def test_what_is_background_under_label_n_prime_is_left_out(
 def test_labels_n_prime_of_an_earlier_version_are_made_again(
     job: JobFolder, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["refine", "runs/made"]) == 0
+    assert main(["runs", "refine", "runs/made"]) == 0
     path = job.path / "refined_names.json"
     path.write_text(path.read_text().replace('"schema_version": 2', '"schema_version": 1'))
-    assert main(["ask", SCENE, "Where is the sofa?"]) == 2
-    assert "knows no filter of large background yet; give su3d-bench refine again" in capsys.readouterr().err
+    assert main(["query", "ask", SCENE, "Where is the sofa?"]) == 2
+    assert "knows no filter of large background yet; give su3d-bench runs refine again" in capsys.readouterr().err
 
 
 def test_a_refinement_over_a_failing_server_ends_complete(
@@ -299,7 +307,7 @@ def test_a_refinement_over_a_failing_server_ends_complete(
 ) -> None:
     server.answer = lambda body: error(500, "down")
     settings = [f"perception.language.{one}" for one in QUICK]
-    words = ["refine", "runs/made", "--refiner", "model", "--base-url", server.url, "--set", *settings]
+    words = ["runs", "refine", "runs/made", "--refiner", "model", "--base-url", server.url, "--set", *settings]
     assert main(words) == 0
     assert "label n stays for 4 instances: status 500: down; tried 2 times" in capsys.readouterr().err
     assert server.n_asked == 8
@@ -309,7 +317,7 @@ def test_a_refinement_over_a_failing_server_ends_complete(
 
 def test_a_map_without_names_of_views_cannot_be_refined(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
     write_prediction(job.prediction, replace(made_map(), view_names=None, view_scores=None))
-    assert main(["refine", "runs/made"]) == 2
+    assert main(["runs", "refine", "runs/made"]) == 2
     assert "keeps no names of views to choose from" in capsys.readouterr().err
 
 
@@ -318,22 +326,14 @@ def test_a_record_that_no_run_wrote_is_refused(
     job: JobFolder, capsys: pytest.CaptureFixture[str], record: object
 ) -> None:
     write_json(Path("runs/made/run.json"), record)
-    assert main(["refine", "runs/made"]) == 2
+    assert main(["runs", "refine", "runs/made"]) == 2
     assert "run.json is not as a run writes it" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("verb", ["ask", "refine"])
-def test_the_help_ends_with_two_examples_that_parse(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([verb, "--help"]) == 0
-    lines = capsys.readouterr().out.rstrip().splitlines()[-2:]
-    for line in lines:
-        assert build_parser().parse_args(shlex.split(line)[1:]).verb == verb
 
 
 def test_the_built_in_solver_loads_no_language_package(job: JobFolder) -> None:
     code = (
         "import sys; from su3d_bench.cli.main import main\n"
-        f"code = main(['ask', {SCENE!r}, 'How many fridges are there?', '--quiet'])\n"
+        f"code = main(['query', 'ask', {SCENE!r}, 'How many fridges are there?', '--quiet'])\n"
         "print('heavy:', sorted({'openai', 'torch', 'transformers', 'onnxruntime'} & set(sys.modules)), code)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
@@ -355,7 +355,7 @@ def test_nothing_is_written_through_a_link_in_place_of_a_jobs_folder(
     job.path.rename(elsewhere)
     job.path.symlink_to(elsewhere)
     before = {path: path.read_bytes() for path in elsewhere.rglob("*") if path.is_file()}
-    for words in (["refine", "runs/made"], ["ask", SCENE, "Where is the bed?"]):
+    for words in (["runs", "refine", "runs/made"], ["query", "ask", SCENE, "Where is the bed?"]):
         assert main(words) == 2
         assert capsys.readouterr().err.endswith(
             f"su3d-bench: {job.path}: is a link, and a run writes into folders of its own alone; remove it\n"

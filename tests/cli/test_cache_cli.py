@@ -16,7 +16,7 @@ from su3d_bench.perception.language.chat import ChatRequest, Reply
 from su3d_bench.perception.language.reply_store import ReplyStore
 from su3d_bench.perception.models.files import file_sha256
 from su3d_bench.perception.profiles import REPLIES
-from su3d_bench.runs.remote.scene import mirror_of
+from su3d_bench.runs.run_place import mirror_of
 from su3d_bench.store import caches
 from su3d_bench.store.run_folder import RunFolder
 
@@ -49,7 +49,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def held(capsys: pytest.CaptureFixture[str]) -> dict[str, int]:
     capsys.readouterr()
-    assert main(["cache", "list", "--json"]) == 0
+    assert main(["dev", "cache", "list", "--json"]) == 0
     return {row["kind"]: row["n_files"] for row in json.loads(capsys.readouterr().out)["kinds"]}
 
 
@@ -58,11 +58,11 @@ def test_every_kind_that_the_program_keeps_is_known_by_its_form(
 ) -> None:
     assert tuple(caches.KINDS) == KIND_NAMES
     assert held(capsys) == {"perception": 1, "model-digests": 1, "runs": 2, "replies": 1}
-    assert main(["cache", "list"]) == 0
+    assert main(["dev", "cache", "list"]) == 0
     text = capsys.readouterr().out
     assert str(cache) in text
     assert "1 file  written 0 hours to 0 hours ago" in text
-    assert main(["cache", "size", "--json"]) == 0
+    assert main(["dev", "cache", "list", "--json"]) == 0
     n_bytes = json.loads(capsys.readouterr().out)["n_bytes"]
     files = [path for path in cache.rglob("*") if path.is_file()]
     assert n_bytes == sum(path.stat().st_size for path in files) - len(FOREIGN) * len("mine")
@@ -72,13 +72,13 @@ def test_what_is_cleared_is_of_the_cache_alone_and_replies_only_by_name(
     cache: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = held(capsys)
-    assert main(["cache", "clear", "all", "--dry-run"]) == 0
+    assert main(["dev", "cache", "clear", "all", "--dry-run"]) == 0
     assert "perception: 1 file, 0.0 MB would be removed" in capsys.readouterr().out
     assert held(capsys) == before
-    assert main(["cache", "clear", "all"]) == 0
-    assert "su3d-bench cache clear replies removes them" in capsys.readouterr().err
+    assert main(["dev", "cache", "clear", "all"]) == 0
+    assert "su3d-bench dev cache clear replies removes them" in capsys.readouterr().err
     assert held(capsys) == {"perception": 0, "model-digests": 0, "runs": 0, "replies": 1}
-    assert main(["cache", "clear", "replies"]) == 0
+    assert main(["dev", "cache", "clear", "replies"]) == 0
     assert sum(held(capsys).values()) == 0
     assert sorted(path.relative_to(cache).as_posix() for path in cache.rglob("*") if path.is_file()) == sorted(FOREIGN)
 
@@ -91,12 +91,12 @@ def test_a_link_is_never_followed(cache: Path, tmp_path: Path, capsys: pytest.Ca
     (cache / "perception" / "cd").symlink_to(elsewhere)
     (cache / "perception" / "ef").mkdir(exist_ok=True)
     (cache / "perception" / "ef" / name).symlink_to(elsewhere / name)
-    assert main(["cache", "clear", "all"]) == 0
+    assert main(["dev", "cache", "clear", "all"]) == 0
     assert (elsewhere / name).read_text() == "precious"
     assert (cache / "perception" / "ef" / name).is_symlink()
     (cache / "perception").rename(cache / "was")
     (cache / "perception").symlink_to(elsewhere.parent)
-    assert main(["cache", "clear", "perception"]) == 0
+    assert main(["dev", "cache", "clear", "perception"]) == 0
     assert (elsewhere / name).read_text() == "precious"
 
 
@@ -104,11 +104,11 @@ def test_only_what_is_old_goes(cache: Path, capsys: pytest.CaptureFixture[str]) 
     old = FrameCache(cache).path(content_key("old"))
     assert old is not None
     write_bytes_at(old, time.time() - 40 * 86400)
-    assert main(["cache", "clear", "perception", "--older-than", "30"]) == 0
+    assert main(["dev", "cache", "clear", "perception", "--older-than", "30"]) == 0
     assert capsys.readouterr().out == "perception: 1 file, 0.0 MB removed\n"
     assert not old.exists()
     assert held(capsys)["perception"] == 1
-    assert main(["cache", "clear", "perception", "--older-than", "-1"]) == 2
+    assert main(["dev", "cache", "clear", "perception", "--older-than", "-1"]) == 2
     assert "--older-than -1: expected a number of days" in capsys.readouterr().err
 
 
@@ -120,7 +120,7 @@ def write_bytes_at(path: Path, written: float) -> None:
 
 def test_what_a_run_holds_stays(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with RunFolder(mirror_of("s3://bucket/run", cache)).locked():
-        assert main(["cache", "clear", "runs"]) == 0
+        assert main(["dev", "cache", "clear", "runs"]) == 0
     assert held(capsys)["runs"] == 2
 
 
@@ -129,7 +129,7 @@ def test_a_cache_that_is_not_there_is_empty(
 ) -> None:
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "none"))
     assert sum(held(capsys).values()) == 0
-    assert main(["cache", "clear", "all"]) == 0
+    assert main(["dev", "cache", "clear", "all"]) == 0
     assert not (tmp_path / "none").exists()
 
 
@@ -140,4 +140,4 @@ def test_a_large_cache_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(caches, "LARGE_BYTES", 100_000)
     line = caches.why_large(tmp_path)
     assert line is not None
-    assert "su3d-bench cache clear perception --older-than 30" in line
+    assert "su3d-bench dev cache clear perception --older-than 30" in line

@@ -27,7 +27,7 @@ COLLECTOR = f"{SCENES}/painted.py:Collector"
 RUN = ["run", "--scenes", f"{PAINTED}/*", "--methods", COLLECTOR, "--protocols", "rooms-semantic", "--no-pictures"]
 HEAVY = (
     "torch", "open3d", "open3d.cpu.pybind", "numba", "sklearn", "pandas", "matplotlib", "onnxruntime", "cv2", "scipy",
-    "transformers", "openai", "openpyxl", "psutil", "su3d_bench.predictions.formats", "su3d_bench.runs.planning.plan",
+    "transformers", "openai", "openpyxl", "psutil", "su3d_bench.predictions.formats", "su3d_bench.runs.plan",
 )  # fmt: skip
 # A tenth of a second is two thirds Python's own.
 AT_START = (*HEAVY, "numpy", "pydantic", "rich", "multiprocessing", "zipfile", "traceback", "difflib", "hashlib")
@@ -48,8 +48,8 @@ def verbs() -> dict[str, argparse.ArgumentParser]:
 @pytest.mark.parametrize(
     "words",
     [
-        ("run",), ("ablate",), ("evaluate",), ("compare",), ("attribute",), ("report", "tables"), ("report", "timing"),
-        ("report", "leaderboard"), ("sheets", "score"),
+        ("run",), ("ablate",), ("evaluate",), ("compare",), ("report", "attribution"), ("report", "tables"),
+        ("report", "timing"), ("report", "leaderboard"), ("sheets", "score"),
     ],
 )  # fmt: skip
 def test_every_verb_that_prints_tables_gives_them_in_every_format(words: tuple[str, ...]) -> None:
@@ -94,7 +94,7 @@ def test_the_module_is_the_command() -> None:
     assert (done.returncode, done.stdout) == (0, "su3d-bench 0.1.0\n")
 
 
-@pytest.mark.parametrize("verb", ["run", "evaluate", "query", "datasets", "methods", "protocols", "export", "report"])
+@pytest.mark.parametrize("verb", ["run", "evaluate", "query", "datasets", "methods", "protocols", "runs", "report"])
 def test_the_help_of_every_verb_ends_with_two_examples(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     parser = verbs()[verb]
     assert len(examples(parser)) == 2
@@ -102,7 +102,7 @@ def test_the_help_of_every_verb_ends_with_two_examples(verb: str, capsys: pytest
     assert capsys.readouterr().out.rstrip().endswith(examples(parser)[-1])
 
 
-@pytest.mark.parametrize("verb", ["run", "evaluate", "query", "datasets", "methods", "protocols", "export", "report"])
+@pytest.mark.parametrize("verb", ["run", "evaluate", "query", "datasets", "methods", "protocols", "runs", "report"])
 def test_the_examples_of_every_verb_parse(verb: str) -> None:
     for example in examples(verbs()[verb]):
         arguments = build_parser().parse_args(shlex.split(example)[1:])
@@ -122,7 +122,7 @@ def test_the_examples_of_verbs_that_only_tell_run(verb: str, capsys: pytest.Capt
 def test_methods_tell_their_settings_as_a_file_would_have_them(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["methods"]) == 0
     assert {line.partition(" ")[0] for line in capsys.readouterr().out.splitlines()} >= {"opensu3d", "oracle"}
-    assert main(["methods", "opensu3d"]) == 0
+    assert main(["methods", "show", "opensu3d"]) == 0
     text = capsys.readouterr().out
     assert "[method.opensu3d]" in text
     assert "top_m = 5" in text
@@ -169,14 +169,14 @@ def test_a_protocol_shows_every_rule(capsys: pytest.CaptureFixture[str]) -> None
         ([*RUN, "--set", "collector.drop=x"], "--set collector.drop: collector.drop = 'x': input should be a valid"),
         ([*RUN, "--stride", "-1"], "--stride: stride = -1: input should be greater than or equal to 0"),
         ([*RUN, "--config", "none.toml"], "none.toml: cannot read the configuration: No such file or directory"),
-        (["protocols", "shwo"], "protocols: unknown action 'shwo'; did you mean 'show'?"),
+        (["protocols", "shwo"], "protocols: unknown action 'shwo'; did you mean 'show'? known: list, show, "),
         (
             ["protocols", "show", "rooms-semantics"],
             "unknown protocol 'rooms-semantics'; did you mean 'rooms-semantic'?",
         ),
         (
             ["report", "runs/demo"],
-            "report: unknown action 'runs/demo'; known: tables, timing, html, samples, rerun, leaderboard, bundle, ",
+            "report: unknown action 'runs/demo'; known: tables, timing, html, samples, rerun, leaderboard, ",
         ),
         (
             ["report", "tables", "r", "--table", "VI"],
@@ -187,19 +187,25 @@ def test_a_protocol_shows_every_rule(capsys: pytest.CaptureFixture[str]) -> None
             "report tables: unknown --format 'docx'; known: text, markdown, latex, csv, html; see ",
         ),
         ([*RUN, "--solver", "me"], "run: unknown --solver 'me'; known: built-in, llm; see "),
-        (["methods", "orcle"], "unknown method 'orcle'; did you mean 'oracle'?"),
+        (["methods", "show", "orcle"], "unknown method 'orcle'; did you mean 'oracle'?"),
         (
-            ["query", f"{PAINTED}/a", "x"],
+            ["query", "text", f"{PAINTED}/a", "x"],
             f"no run in runs/ holds {PAINTED}/a by opensu3d; make one: su3d-bench run {PAINTED}/a --methods opensu3d",
         ),
-        (["query", "rooms/living0", "  "], "the text is empty; say what to look for"),
-        (["query", "rooms/living0", "x", "--top", "0"], "--top 0: at least 1 instance must be listed"),
+        (["query", "text", "rooms/living0", "  "], "the text is empty; say what to look for"),
+        (["query", "text", "rooms/living0", "x", "--top", "0"], "--top 0: at least 1 instance must be listed"),
         (
-            ["query", "rooms/living0", "x", "--run", "r"],
+            ["query", "text", "rooms/living0", "x", "--run", "r"],
             "r: holds no run; name the folder of one: su3d-bench runs list",
         ),
-        (["query", "a plant", "rooms/living0"], "'a plant' is no scene: the scene comes first, then the text; su3d-"),
-        (["ask", "A plant?", "rooms/living0"], "'A plant?' is no scene: the scene comes first, then the text; su3d-"),
+        (
+            ["query", "text", "a plant", "rooms/living0"],
+            "'a plant' is no scene: the scene comes first, then the text;",
+        ),
+        (
+            ["query", "ask", "A plant?", "rooms/living0"],
+            "'A plant?' is no scene: the scene comes first, then the text;",
+        ),
         (["run", "living0"], "no scene matches 'living0'; did you mean 'rooms/living0'?"),
         (["run", "--scenes", "livng0"], "no scene matches 'livng0'; did you mean 'rooms/living0'?"),
         (["ablate", "livi*", "--vary", "m=1"], "no scene matches 'livi*'; did you mean 'rooms/livi*'?"),
@@ -266,7 +272,7 @@ def test_an_internal_error_is_one_line_and_exit_code_4(
 
 def test_an_interrupt_says_whether_the_same_command_goes_on() -> None:
     on = {" ".join(verb) for verb, parser in every_verb() if parser.get_default("takes_up")}
-    fetch = ("fetch models", "fetch replica", "fetch scannet")
+    fetch = ("models fetch", "datasets fetch replica", "datasets fetch scannet")
     assert on == {"run", "ablate", "reproduce", "datasets make", "report html", *fetch}
 
 
@@ -320,7 +326,7 @@ def test_a_dry_run_over_a_finished_run_knows_what_is_done(capsys: pytest.Capture
 
 def test_the_same_request_has_the_same_folder_and_another_one_another() -> None:
     from su3d_bench.cli.run import settings_of
-    from su3d_bench.runs.planning.plan import make_plan
+    from su3d_bench.runs.plan import make_plan
 
     def folder(*more: str) -> Path:
         arguments = build_parser().parse_args([*RUN, *more])
@@ -356,7 +362,7 @@ def test_a_query_ranks_the_map_and_draws_it(
     monkeypatch.setattr(finished_run, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
     assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a"]) == 0
     capsys.readouterr()
-    words = ["query", "painted/a", "a red sofa", "--method", "collector"]
+    words = ["query", "text", "painted/a", "a red sofa", "--method", "collector"]
     before: list[str] = []
     draw = maps.draw_heat_map
 
@@ -388,5 +394,5 @@ def test_a_map_without_features_cannot_be_queried(
     monkeypatch.setattr(finished_run, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
     assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a", "--quiet"]) == 0
     capsys.readouterr()
-    assert main(["query", "painted/a", "sofa", "--method", "oracle"]) == 2
+    assert main(["query", "text", "painted/a", "sofa", "--method", "oracle"]) == 2
     assert "query: this map has no features to compare a text with" in capsys.readouterr().err

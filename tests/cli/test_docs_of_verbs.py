@@ -7,11 +7,11 @@ import shlex
 from pathlib import Path
 
 import pytest
+from fuzz_words import verbs
 from places import ROOT
 from verbs_page import MORE, PAGE, page
 
-from su3d_bench.baselines.command.placeholders import PLACEHOLDERS, variable_of
-from su3d_bench.cli.completion import verbs_of
+from su3d_bench.baselines.command.method import PLACEHOLDERS, variable_of
 from su3d_bench.cli.main import build_parser
 
 ENVIRONMENT = ROOT / "docs" / "running" / "environment.md"
@@ -27,7 +27,7 @@ def test_the_page_of_verbs_is_what_the_parser_says() -> None:
 
 
 def test_what_is_said_beside_the_help_is_of_verbs_that_exist() -> None:
-    assert set(MORE) <= {verb.path for verb in verbs_of(build_parser())}
+    assert set(MORE) <= {" ".join(words) for words, _ in verbs()}
 
 
 def test_links_of_the_page_lead_somewhere() -> None:

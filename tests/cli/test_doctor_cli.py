@@ -40,17 +40,17 @@ def lines(capsys: pytest.CaptureFixture[str]) -> dict[str, str]:
 
 
 def test_a_whole_machine_passes(machine: dict[str, Loaded], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["doctor"]) == 0
+    assert main(["dev", "doctor"]) == 0
     text = capsys.readouterr().out
     assert text.endswith("\nthe main job can run\n")
     assert "GPU by torch            NVIDIA H200, 150 GB" in text
     assert "computes by CUDA, CPU" in text
-    assert main(["doctor"]) == 0
+    assert main(["dev", "doctor"]) == 0
     found = lines(capsys)
     assert found["cache"].startswith(f"ok {tmp_path}/SU3D_CACHE: ")
     assert found["runs"].startswith(f"ok {tmp_path}/runs (to be made)")
     assert found["models"].startswith("note 0 of ")
-    assert main(["doctor", "--json"]) == 0
+    assert main(["dev", "doctor", "--json"]) == 0
     value = json.loads(capsys.readouterr().out)
     assert value["can_run"] is True
     assert {"Python", "open3d", "cache", "dataset rooms", "cores", "terminal"} <= {
@@ -65,14 +65,14 @@ def test_a_missing_system_library_is_named_with_its_package(
 ) -> None:
     fault = "OSError: libGL.so.1: cannot open shared object file: No such file or directory"
     machine |= {"": Loaded({"missing": ["libGL.so.1"]}), "open3d": Loaded(fault=fault)}
-    assert main(["doctor"]) == 1
+    assert main(["dev", "doctor"]) == 1
     text = capsys.readouterr().out
     assert "missing  libGL.so.1" in text
     assert "apt-get install libgl1" in text
     assert f"cannot be loaded: {fault}" in text
     assert text.endswith("the main job cannot run: 2 things missing\n")
     machine |= {"open3d": Loaded()}
-    assert main(["doctor"]) == 0
+    assert main(["dev", "doctor"]) == 0
     assert lines(capsys)["libGL.so.1"].startswith("note ")
 
 
@@ -80,10 +80,10 @@ def test_what_only_an_extra_needs_is_no_fault(
     machine: dict[str, Loaded], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(checks, "requirements", lambda: {"numpy": "", "no-such-package": "models"})
-    assert main(["doctor"]) == 0
+    assert main(["dev", "doctor"]) == 0
     assert lines(capsys)["no-such-package"].endswith("pip install 'su3d-bench[models]'")
     monkeypatch.setattr(checks, "requirements", lambda: {"no-such-package": ""})
-    assert main(["doctor"]) == 1
+    assert main(["dev", "doctor"]) == 1
 
 
 def test_a_folder_that_cannot_be_written_is_missing(
@@ -91,7 +91,7 @@ def test_a_folder_that_cannot_be_written_is_missing(
 ) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "file" / "cache"))
-    assert main(["doctor"]) == 1
+    assert main(["dev", "doctor"]) == 1
     assert "cannot be written" in lines(capsys)["cache"]
 
 

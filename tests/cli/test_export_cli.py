@@ -43,7 +43,7 @@ def run_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> str:
 
 def error_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     capsys.readouterr()
-    assert main(["export", *words, "--out", "never"]) == 2
+    assert main(["runs", "export", *words, "--out", "never"]) == 2
     answer = capsys.readouterr()
     assert answer.out == "" and not Path("never").exists()
     assert answer.err.count("\n") == 1
@@ -52,7 +52,9 @@ def error_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
 
 def test_a_run_is_exported_for_openlex3d(run_folder: str, capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
-    assert main(["export", run_folder, "--to", "openlex3d", "--method", "collector", "--out", "x/collector"]) == 0
+    assert (
+        main(["runs", "export", run_folder, "--to", "openlex3d", "--method", "collector", "--out", "x/collector"]) == 0
+    )
     assert capsys.readouterr().out == "2 scenes for openlex3d: x/collector\n"
     for scene in ("a", "b"):
         own = READERS["su3d-bench"].read(Path(f"r/scenes/painted.{scene}/collector/prediction.npz"), f"painted/{scene}")
@@ -63,7 +65,7 @@ def test_a_run_is_exported_for_openlex3d(run_folder: str, capsys: pytest.Capture
 
 
 def test_a_run_is_exported_for_scannet(run_folder: str, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["export", run_folder, "--to", "scannet", "--protocol", "rooms-instance"]
+    words = ["runs", "export", run_folder, "--to", "scannet", "--protocol", "rooms-instance"]
     capsys.readouterr()
     assert main([*words, "--method", "collector", "--out", "collector", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -81,7 +83,7 @@ def test_maps_of_an_interrupted_run_are_exported_too(run_folder: str, capsys: py
     Path("r/metrics.json").unlink()
     record = json.loads(Path("r/run.json").read_text())
     Path("r/run.json").write_text(json.dumps({**record, "status": "running", "data_digests": {}}))
-    words = ["export", run_folder, "--to", "scannet", "--protocol", "rooms-instance", "--method", "oracle"]
+    words = ["runs", "export", run_folder, "--to", "scannet", "--protocol", "rooms-instance", "--method", "oracle"]
     assert main([*words, "--out", "oracle"]) == 0
     assert sorted(file.name for file in Path("oracle").glob("*.txt")) == ["a.txt", "b.txt"]
 
@@ -104,7 +106,7 @@ def test_the_only_method_of_a_limited_run_is_meant_and_called_partial(
     assert main([*words, "--protocols", "rooms-instance", "--no-pictures", "--quiet"]) == 0
     capsys.readouterr()
     assert Path("part/scenes/painted.a/oracle/prediction.npz").is_file()  # the ceiling
-    assert main(["export", "part", "--to", "openlex3d", "--out", "x"]) == 0
+    assert main(["runs", "export", "part", "--to", "openlex3d", "--out", "x"]) == 0
     assert len(np.load("x/painted/a/embeddings.npy")) == 4
     assert "painted/a: partial: the map is of the first 2 updates of the scene\n" in capsys.readouterr().err
 
@@ -114,7 +116,7 @@ def test_predictions_of_other_programs_are_exported(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     write_scannet_text(Path("theirs"), TOY)
-    assert main(["export", "theirs", "--to", "scannet", "--out", "ours"]) == 0
+    assert main(["runs", "export", "theirs", "--to", "scannet", "--out", "ours"]) == 0
     theirs, ours = (read_text(Path(name), "scene0011_00") for name in ("theirs", "ours"))
     np.testing.assert_array_equal(theirs.indices, ours.indices)
     assert theirs.scores.tolist() == ours.scores.tolist()
@@ -157,15 +159,18 @@ def test_features_outside_of_a_run_are_not_named(run_folder: str, capsys: pytest
     assert "--text-features FILE.npz (names, features)" in error_of(capsys, *words)
     names = [entry.name for entry in RULES.classes]
     np.savez("texts.npz", names=np.array(names), features=colour_perception().encoder.encode_texts(names))
-    assert main(["export", *words, "--text-features", "texts.npz", "--out", "by-texts"]) == 0
-    assert main(["export", "r", *words[1:5], "--method", "collector", "--scenes", "painted/a", "--out", "by-run"]) == 0
+    assert main(["runs", "export", *words, "--text-features", "texts.npz", "--out", "by-texts"]) == 0
+    assert (
+        main(["runs", "export", "r", *words[1:5], "--method", "collector", "--scenes", "painted/a", "--out", "by-run"])
+        == 0
+    )
     assert Path("by-texts/a.txt").read_text() == Path("by-run/a.txt").read_text() != ""
     Path("a.npz").write_bytes(Path("r/scenes/painted.a/oracle/prediction.npz").read_bytes())
-    assert main(["export", *words, "--out", "named"]) == 0
+    assert main(["runs", "export", *words, "--out", "named"]) == 0
     assert Path("named/a.txt").read_text().count(" 76 1.0") == 1
 
 
 def test_nothing_is_written_into_a_folder_that_is_there(run_folder: str, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["export", run_folder, "--to", "openlex3d", "--method", "collector", "--out", "r"]
+    words = ["runs", "export", run_folder, "--to", "openlex3d", "--method", "collector", "--out", "r"]
     assert main(words) == 2
     assert "r: is there already; choose another folder with --out" in capsys.readouterr().err

@@ -75,7 +75,7 @@ def test_the_other_spelling_of_each_flag_is_understood_and_not_shown() -> None:
         (["evaluate", "p", "--protocol", "a", "--protocol=b"], "protocols", ["a", "b"]),
         (["compare", "a", "b", "--protocol", "x"], "protocols", ["x"]),
         (["run", "--method", "oracle", "--scene", "rooms/*"], "methods", ["oracle"]),
-        (["query", "rooms/living0", "x", "--methods", "oracle"], "method", "oracle"),
+        (["query", "text", "rooms/living0", "x", "--methods", "oracle"], "method", "oracle"),
         (["run", "--proto", "x"], "protocols", ["x"]),
     ],
 )
@@ -157,14 +157,14 @@ def test_what_a_run_has_written_is_never_the_place_of_an_answer(
     content = "seed = 0\n" if name == "run.toml" else "{}"
     file.write_text(content)
     for words in (
-        ["protocols", f"--json={file}"],
-        ["protocols", "--json", str(file)],
-        ["query", "rooms/living0", "plant", "--out", str(file)],
-        ["ask", "rooms/living0", "Which?", "--out", str(file)],
-        ["questions", "make", "--scenes", "rooms/living0", "--out", str(file)],
+        ["protocols", "list", f"--json={file}"],
+        ["protocols", "list", "--json", str(file)],
+        ["query", "text", "rooms/living0", "plant", "--out", str(file)],
+        ["query", "ask", "rooms/living0", "Which?", "--out", str(file)],
+        ["query", "make", "--scenes", "rooms/living0", "--out", str(file)],
         ["report", "tables", "runs/demo", "--out", str(file)],
         ["report", "html", "runs/demo", "--out", str(file)],
-        ["attribute", "runs/demo", "--out", str(file)],
+        ["report", "attribution", "runs/demo", "--out", str(file)],
         ["check", "--learn", "runs/demo", "--out", str(file)],
     ):
         assert main(words) == 2

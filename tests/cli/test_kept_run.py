@@ -76,11 +76,11 @@ SLIPS: dict[str, tuple[list[str], int, str]] = {
         f"{OTHER}method collector@drop=1 is new, protocol rooms-instance is not asked for now)",
     ),
     "another map": (
-        ["query", f"{PAINTED}/c", "a cup", "--run", "runs/demo"], 2,
+        ["query", "text", f"{PAINTED}/c", "a cup", "--run", "runs/demo"], 2,
         "su3d-bench: runs/demo: holds no map of",
     ),
     "words first": (
-        ["query", "a cup", "rooms/living0", "--run", "runs/demo"], 2,
+        ["query", "text", "a cup", "rooms/living0", "--run", "runs/demo"], 2,
         "su3d-bench: 'a cup' is no scene: the",
     ),
     "removed without a word": (["runs", "remove", "runs/demo"], 2, "su3d-bench: runs remove: nobody is there to be"),
@@ -106,8 +106,10 @@ SLIPS: dict[str, tuple[list[str], int, str]] = {
     "timing": (["report", "timing", "runs/demo", "--out", "timing"], 0, ""),
     "a reference": (["check", "--learn", "runs/demo", "--out", "reference.json"], 0, ""),
     "the gate": (["check", "runs/demo", "--against", "reference.json"], 0, ""),
-    "errors": (["attribute", "runs/demo", "--method", "collector"], 2, ""),
-    "exported": (["export", "runs/demo", "--to", "openlex3d", "--method", "collector", "--out", "exported"], 0, ""),
+    "errors": (["report", "attribution", "runs/demo", "--method", "collector"], 2, ""),
+    "exported": (
+        ["runs", "export", "runs/demo", "--to", "openlex3d", "--method", "collector", "--out", "exported"], 0, "",
+    ),
     "its predictions scored": (["evaluate", "runs/demo/scenes/painted.a", "--protocol", "rooms-instance"], 2, ""),
 }  # fmt: skip
 

@@ -11,8 +11,8 @@ from su3d_bench.cli.main import main
 from su3d_bench.core import registry
 from su3d_bench.core.config import Setting, Settings
 from su3d_bench.core.interfaces import MethodAbout
-from su3d_bench.reports.tables.papers.published import figures_of
-from su3d_bench.runs.planning.plan import make_plan
+from su3d_bench.reports.tables.paper import figures_of
+from su3d_bench.runs.plan import make_plan
 
 SYSTEMS = (
     "opensu3d",

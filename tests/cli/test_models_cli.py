@@ -11,16 +11,16 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from tiny_models import CLIP_DIM, write_tiny_clip
 
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.core.errors import ModelMissing, PredictionError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.evaluation.texts import encoder_for
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.perception.models.catalogue import MODELS, STAND_IN
+from su3d_bench.perception.models.catalogue import MODELS
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.loading import load_encoder
-from su3d_bench.perception.models.stand_ins.encoders import DIM, write_tiny_clip
 from su3d_bench.runs.finished import encoder_of
 from su3d_bench.store.run_folder import RunFolder
 
@@ -61,7 +61,6 @@ def test_the_examples_of_every_action_parse() -> None:
     for words in (
         "models list --json",
         "models check clip-vit-h-14 sam-vit-h",
-        "models export clip-vit-h-14 --out models/clip-vit-h-14-onnx",
         "models warm --profile paper --device cuda",
     ):
         assert build_parser().parse_args(words.split()).verb == "models"
@@ -99,7 +98,7 @@ def test_the_list_says_where_a_model_lies(found: Path, capsys: pytest.CaptureFix
     assert rows["clip-vit-b-32"]["found"] == {"transformers": str(found)}
     assert rows["clip-vit-b-32"]["missing"] is None
     assert rows["clip-vit-b-32"]["memory_mb"] == {"float32": 604, "float16": 302}
-    assert "su3d-bench fetch models clip-vit-h-14" in rows["clip-vit-h-14"]["missing"]
+    assert "su3d-bench models fetch clip-vit-h-14" in rows["clip-vit-h-14"]["missing"]
 
 
 @needs_models
@@ -134,12 +133,12 @@ def test_check_finds_weights_that_are_cut_short(found: Path, capsys: pytest.Capt
     [
         (["models", "check"], "none of the models is here"),
         (["models", "check", "clip-h"], "unknown model 'clip-h'"),
-        (["models", "warm", "clip-vit-b-32"], "run: su3d-bench fetch models clip-vit-b-32"),
+        (["models", "warm", "clip-vit-b-32"], "run: su3d-bench models fetch clip-vit-b-32"),
         (["models", "warm", "clip-vit-b"], "unknown encoder 'clip-vit-b'; did you mean 'clip-vit-b-32'?"),
         (["models", "warm", "embedded", "--device", "gpu"], "device = 'gpu': expected cpu, cuda or cuda:N"),
         (["models", "warm", "embedded", "--profile", "paper"], "give an encoder or --profile, not both"),
         (["models", "warm", "--profile", "papper"], "unknown profile 'papper'; did you mean 'paper'?"),
-        (["models", "warm"], "run: su3d-bench fetch models"),
+        (["models", "warm"], "run: su3d-bench models fetch"),
         (["models", "list", "--set", "perception.models.folder"], "expected KEY=VALUE"),
         (["models", "list", "--set", "perception.models.foldr=x"], "did you mean 'folder'?"),
     ],
@@ -152,37 +151,10 @@ def test_what_cannot_be_done_is_one_line(words: list[str], said: str, capsys: py
     assert len(err.splitlines()) == 1
 
 
-@needs_models
-def test_export_without_weights_or_of_a_model_that_is_not_exported_is_one_line(
-    home: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["models", "export", "clip-vit-h-14", "--out", str(home / "made")]) == 2
-    assert "run: su3d-bench fetch models clip-vit-h-14" in capsys.readouterr().err
-    assert main(["models", "export", "grounding-dino", "--out", str(home / "made")]) == 2
-    assert "'grounding-dino' is not exported by this program; known: clip-vit-h-14" in capsys.readouterr().err
-    assert not (home / "made").exists()
-
-
 def test_a_named_model_that_is_missing_is_what_to_fetch(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["models", "check", "sam-vit-h"]) == 1
     out = capsys.readouterr().out
     assert out.startswith("model 'sam-vit-h': not found below") and "run: su3d-bench fetch models sam-vit-h" in out
-
-
-@needs_models
-def test_an_export_is_found_checked_and_run(found: Path, home: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = home / "models" / "clip-vit-b-32-onnx"
-    assert main(["models", "export", "clip-vit-b-32", "--out", str(out)]) == 0
-    answer = capsys.readouterr().out
-    assert "image: torch and ONNX Runtime differ by at most" in answer
-    assert "text: torch and ONNX Runtime differ by at most" in answer
-    assert main(["models", "check", "clip-vit-b-32", "--json"]) == 0
-    assert [row["form"] for row in json.loads(capsys.readouterr().out)] == ["transformers", "onnx"]
-    assert main(["models", "warm", "clip-vit-b-32", "--set", "perception.models.runtime=onnx", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["what"] == "ViT-B-32/openai (stand-in)"
-    (out / "text.onnx").write_bytes(b"")
-    assert main(["models", "check", "clip-vit-b-32"]) == 1
-    assert "text.onnx: is not the file that the manifest describes" in capsys.readouterr().out
 
 
 @needs_models
@@ -191,7 +163,7 @@ def test_warm_tells_time_and_memory_and_the_digest_of_run_records(
 ) -> None:
     assert main(["models", "warm", "clip-vit-b-32"]) == 0
     out = capsys.readouterr().out
-    assert "ViT-B-32/openai (stand-in): loaded and first run" in out
+    assert "ViT-B-32/openai: loaded and first run" in out
     assert f"(process); digest {load_encoder(ModelsConfig(encoder='clip-vit-b-32')).digest[:12]}" in out
 
 
@@ -220,7 +192,7 @@ def test_a_query_reads_the_encoder_that_the_run_was_made_with(found: Path, home:
     encoder = encoder_of(_finished_run(home / "run", made.name, made.digest))
     # the text runs in float32, whatever the images ran in
     assert encoder.digest == load_encoder(ModelsConfig(encoder="clip-vit-b-32")).digest != made.digest
-    assert encoder.encode_texts(["chair"]).shape == (1, DIM)
+    assert encoder.encode_texts(["chair"]).shape == (1, CLIP_DIM)
 
 
 @needs_models
@@ -236,9 +208,9 @@ def test_a_query_over_features_of_other_weights_is_an_error(found: Path, home: P
 @needs_models
 def test_an_evaluation_names_features_with_the_protocols_encoder_where_it_is_here(tiny_clip: Path, home: Path) -> None:
     rules = load_protocol("replica-conceptgraphs-ex6")
-    assert "which is not here" in str(encoder_for(rules, DIM, None, is_own=False))
+    assert "which is not here" in str(encoder_for(rules, CLIP_DIM, None, is_own=False))
     shutil.copytree(tiny_clip, home / "models" / "clip-vit-h-14")
-    encoder = encoder_for(rules, DIM, None, is_own=False)
+    encoder = encoder_for(rules, CLIP_DIM, None, is_own=False)
     assert isinstance(encoder, Encoder)
-    assert encoder.name == f"{rules.encoder}{STAND_IN}"
+    assert encoder.name == rules.encoder
     assert "the features have 25 dimensions" in str(encoder_for(rules, 25, None, is_own=False))

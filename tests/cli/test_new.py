@@ -23,10 +23,10 @@ def results(folder: str) -> dict[tuple[str, str], dict[str, float]]:
 
 
 def test_method_dataset_and_protocol_run_together_as_they_are_written(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["new", "method", "merge_all.py"]) == 0
+    assert main(["methods", "new", "merge_all.py"]) == 0
     assert "su3d-bench methods check merge_all.py:MergeAll" in capsys.readouterr().out
-    assert main(["new", "dataset", "own/my_rooms.py"]) == 0
-    assert main(["new", "protocol", "mine.toml"]) == 0
+    assert main(["datasets", "new", "own/my_rooms.py"]) == 0
+    assert main(["protocols", "new", "mine.toml"]) == 0
     Path("mine.toml").write_text(Path("mine.toml").read_text().replace("rooms-instance", "replica-openmask3d"))
     scenes, methods = "own/my_rooms.py:MyRooms/*", "merge_all.py:MergeAll"
     assert main(["datasets", "check", scenes]) == 0
@@ -37,7 +37,7 @@ def test_method_dataset_and_protocol_run_together_as_they_are_written(capsys: py
 
 
 def test_the_method_runs_on_the_built_in_rooms() -> None:
-    assert main(["new", "method", "my_method.py"]) == 0
+    assert main(["methods", "new", "my_method.py"]) == 0
     words = [
         "--scenes",
         "rooms/living0",
@@ -56,27 +56,27 @@ def test_the_method_runs_on_the_built_in_rooms() -> None:
 
 
 def test_a_method_that_is_right_is_said_to_be(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["new", "method", "my_method.py"]) == 0
+    assert main(["methods", "new", "my_method.py"]) == 0
     assert main(["methods", "check", "my_method.py:MyMethod"]) == 0
     assert "instances, with features: nothing found wrong" in capsys.readouterr().out
     assert main(["methods", "check"]) == 2
-    assert main(["methods", "opensu3d", "sam3d"]) == 2
+    assert main(["methods", "show", "opensu3d", "sam3d"]) == 2
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["method", "there.py"], "is there already"),
-        (["method", "my_method.txt"], "must end in .py"),
-        (["protocol", "mine.py"], "must end in .toml"),
-        (["dataset", "3.py"], "no name can be made"),
+        (["methods", "new", "there.py"], "is there already"),
+        (["methods", "new", "my_method.txt"], "must end in .py"),
+        (["protocols", "new", "mine.py"], "must end in .toml"),
+        (["datasets", "new", "3.py"], "no name can be made"),
     ],
 )
 def test_nothing_is_overwritten_and_no_file_gets_another_form(
     words: list[str], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     Path("there.py").write_text("mine")
-    assert main(["new", *words]) == 2
+    assert main(words) == 2
     assert said in capsys.readouterr().err
     assert Path("there.py").read_text() == "mine"
     assert len(list(Path().iterdir())) == 1

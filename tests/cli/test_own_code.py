@@ -26,7 +26,7 @@ def _place(tmp_path: Path, rooms_data: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 def written(what: str, as_it_is: str, wrong: str) -> str:
     """The template with a mistake in it."""
-    assert main(["new", what, f"my_{what}.py"]) == 0
+    assert main([f"{what}s", "new", f"my_{what}.py"]) == 0
     text = Path(f"my_{what}.py").read_text()
     assert as_it_is in text
     Path(f"my_{what}.py").write_text(text.replace(as_it_is, wrong, 1))
@@ -242,10 +242,10 @@ def test_a_file_may_hold_dataclasses_and_is_read_anew_when_it_changed(capsys: py
     mine.write_text(
         mine.read_text().replace("import itertools\n", "import itertools\nfrom dataclasses import dataclass\n")
     )
-    assert main(["methods", METHOD]) == 0
+    assert main(["methods", "show", METHOD]) == 0
     mine.write_text(text.replace("stride: int = 40", "stride: int = 7"))
     capsys.readouterr()
-    assert main(["methods", METHOD]) == 0
+    assert main(["methods", "show", METHOD]) == 0
     assert "stride = 7" in capsys.readouterr().out
 
 
@@ -277,7 +277,7 @@ def test_a_truth_that_no_protocol_fits_is_said_to_be_so(capsys: pytest.CaptureFi
     Path("my_dataset.py").write_text(text.replace('"replica"', '"mine"'))
     words = ["run", "--scenes", DATASET, "--methods", "opensu3d", "--limit", "1", "--jobs", "1", "--no-pictures"]
     assert main([*words, "--profile", "oracle", "--out", "out"]) == 0
-    said = "my-dataset: no protocol fits its ground truth mesh-vertices with labels of 'mine'; su3d-bench new protocol"
+    said = "my-dataset: no protocol fits its ground truth mesh-vertices with labels of 'mine'; su3d-bench protocols new"
     assert said in capsys.readouterr().err
 
 

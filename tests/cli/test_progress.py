@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from su3d_bench.cli.shared.bars import NARROW_BAR, _Board, drawn_bars
-from su3d_bench.runs.executors.local import SCENE_DONE, Event
+from su3d_bench.runs.executors import SCENE_DONE, Event
 
 LONG = "rooms/a-scene-with-a-long-name-that-no-terminal-has-room-for"
 

@@ -13,7 +13,7 @@ import pytest
 from su3d_bench.cli.datasets import list as datasets
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.datasets.replica.dataset import Replica
-from su3d_bench.runs.planning.scenes import data_root
+from su3d_bench.runs.scenes import data_root
 
 SMALL = ["--set", "n_frames=3", "--set", "rooms.width=64", "--set", "height=48", "--set", "mesh_spacing_m=0.15"]
 MAKE = ["datasets", "make", "rooms", "--scenes", "bathroom0", *SMALL, "--jobs", "1"]
@@ -43,8 +43,7 @@ def test_list_tells_datasets_places_and_scenes_and_how_to_get_what_is_not_here(
     text = capsys.readouterr().out
     assert f"looked for in: {tmp_path / 'data' / 'Replica'}" in text
     assert (
-        "su3d-bench fetch replica frames brings them; set SU3D_DATA to where they are, or make rooms in this layout"
-        in text
+        "su3d-bench datasets fetch replica frames brings them; set SU3D_DATA to where they are, or make rooms" in text
     )
 
 

@@ -25,7 +25,7 @@ def _elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def make(protocol: str, out: str, *more: str) -> int:
-    return main(["texts", "make", "--protocol", protocol, "--encoder", "embedded", "--out", out, *more])
+    return main(["protocols", "texts", "--protocol", protocol, "--encoder", "embedded", "--out", out, *more])
 
 
 def test_texts_made_here_give_the_numbers_of_the_run_itself(
@@ -71,7 +71,7 @@ def test_the_texts_of_a_protocol_are_listed_one_a_line(capsys: pytest.CaptureFix
     assert (value["protocol"], value["encoder"]) == (TWO_PROMPTS, "ViT-H-14/laion2b_s32b_b79k")
     assert value["names"][0] == {"name": "background", "texts": lines[:2]}
     assert [text for entry in value["names"] for text in entry["texts"]] == lines
-    assert main(["texts", "make", "--protocol", TWO_PROMPTS, "--encoder", "embedded", "--out", "t.npz"]) == 0
+    assert main(["protocols", "texts", "--protocol", TWO_PROMPTS, "--encoder", "embedded", "--out", "t.npz"]) == 0
     with np.load("t.npz") as made:
         assert made["names"].tolist() == lines
 
@@ -104,9 +104,9 @@ def test_the_protocol_s_own_encoder_is_the_default_under_either_of_its_names(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     for more in ([], ["--encoder", "clip-vit-h-14"], ["--encoder", "ViT-H-14/laion2b_s32b_b79k"]):
-        assert main(["texts", "make", "--protocol", TWO_PROMPTS, "--out", "t.npz", *more]) == 2
+        assert main(["protocols", "texts", "--protocol", TWO_PROMPTS, "--out", "t.npz", *more]) == 2
         assert "model 'clip-vit-h-14': not found" in capsys.readouterr().err
-    assert main(["texts", "make", "--protocol", "query-ap", "--out", "t.npz", "--encoder", "su3d-embedded"]) == 2
+    assert main(["protocols", "texts", "--protocol", "query-ap", "--out", "t.npz", "--encoder", "su3d-embedded"]) == 2
     assert "has no texts of its own; give them with --queries FILE" in capsys.readouterr().err
     assert not Path("t.npz").exists()
 
@@ -126,20 +126,11 @@ REFUSED = [
 
 @pytest.mark.parametrize(("words", "message"), REFUSED)
 def test_what_cannot_be_encoded_is_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["texts", "make", "--out", "texts.npz", *words]) == 2
+    assert main(["protocols", "texts", "--out", "texts.npz", *words]) == 2
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
     assert not list(Path().glob("texts*"))
-
-
-def test_flags_of_the_texts_stand_with_names_alone(capsys: pytest.CaptureFixture[str]) -> None:
-    for words, message in (
-        (["--names"], "--names belongs to show NAME"),
-        (["show", "query-ap", "--queries", "q.txt"], "--queries belongs to show NAME --names"),
-    ):
-        assert main(["protocols", *words]) == 2
-        assert message in capsys.readouterr().err
 
 
 def test_a_file_of_a_run_stays_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:

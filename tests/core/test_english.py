@@ -13,7 +13,7 @@ from places import ROOT
 from su3d_bench.core.english import is_countable, is_plural, plural, singular, with_article, words
 from su3d_bench.perception.embedded.lexicon import SYNONYMS
 from su3d_bench.perception.embedded.naming import vocabulary
-from su3d_bench.questions.known_objects import plain_name
+from su3d_bench.questions.scene_map import plain_name
 
 
 def texts_in(value: Any) -> set[str]:
@@ -97,4 +97,4 @@ def test_the_program_has_one_function_for_the_article() -> None:
     found = {
         path for path in files if re.search(r"def \w*article|tuple\(.aeiou.\)\s*and|\ban? if ", path.read_text("utf-8"))
     }
-    assert {path.name for path in found} <= {"english.py", "audit_page.py", "second_looks.py"}  # these two are HTML's
+    assert {path.name for path in found} <= {"english.py", "page.py"}  # that one is HTML's

@@ -22,7 +22,6 @@ PACKAGES = ("su3d_bench", "baselines", "datasets", "reports")
 # The door; what looks at /proc alone; what a resource of the package hands out.
 OTHER_DOORS = {
     "su3d_bench/core/system/files.py", "su3d_bench/core/system/timing.py", "baselines/command/supervisor.py",
-    "su3d_bench/perception/models/onnx/ram_plus_program.py",  # runs where nothing of ours is
 }  # fmt: skip
 OWN_RESOURCE = 'files("su3d_bench.'
 READS_A_PATH = {"load", "memmap", "open_memmap", "fromfile", "loadtxt", "genfromtxt", "imread", "ZipFile", "File"}
@@ -79,7 +78,7 @@ def other_doors(name: str) -> Iterator[str]:
         call, is_method = ast.unparse(node.func), isinstance(node.func, ast.Attribute)
         own, last = ast.unparse(node).replace("'", '"').startswith(OWN_RESOURCE), call.rpartition(".")[2]
         opens = last == "open" and any(mode in ast.unparse(node) for mode in ("'r", "'rb'", "encoding="))
-        opens = opens and not call.startswith(("gzip", "os", "archive"))
+        opens = opens and not call.startswith(("gzip", "os", "archive", "tarfile"))
         by_library = last in READS_A_PATH and call.startswith(("np.", "numpy.", "cv2.", "zipfile.", "h5py.", "torch."))
         first = ast.unparse(node.args[0]) if node.args else ""
         by_library = by_library and not first.startswith(("regular", "io.", "stream", "buffer", "spill", "self._file"))
@@ -95,10 +94,8 @@ def other_doors(name: str) -> Iterator[str]:
         ("\n[" + ".".join(["a"] * 65) + "]", "a key of more than 64 parts"),
         (" . ".join(['"a b"'] * 30_000) + " = 1", "a key of more than 64 parts"),
         ("x = {" + ".".join(["'a'"] * 20_000) + " = 1}", "a key of more than 64 parts"),
-        ("x = " + "{a = " * 300 + "1" + "}" * 300, "nested more than 64 deep"),
-        ("x = " + "[" * 20_000, "nested more than 64 deep"),
-        ("x = " + "1" * 5000, "exceeds the limit"),
-        ("#" * 9_000_000, "has 9000000 characters, more than 8388608"),
+        ("x = " + "[" * 20_000, "cannot be read"),
+        ("x = " + "1" * 5000, "(?i)exceeds the limit"),
     ],
 )
 def test_toml_deeper_or_longer_than_use_is_one_line_at_once(text: str, reason: str, tmp_path: Path) -> None:

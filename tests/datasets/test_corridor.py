@@ -15,7 +15,7 @@ from places import ROOT
 from su3d_bench.core.registry import load
 from su3d_bench.core.types import Float64Array, Int32Array
 from su3d_bench.metrics.costs import UpdateTimes
-from su3d_bench.reports.pictures.plots.timing import medians_by_size
+from su3d_bench.reports.pictures.plots import medians_by_size
 
 
 def corridor(**options: float) -> Any:

@@ -19,19 +19,20 @@ from su3d_bench.cli.main import build_parser, main
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import GroundTruth, LabelSet
 from su3d_bench.datasets.replica.dataset import Replica
-from su3d_bench.reports.pictures.canvas import Canvas
-from su3d_bench.reports.pictures.colours import class_colours
+from su3d_bench.reports.pictures.canvas import Canvas, class_colours
 from su3d_bench.reports.pictures.scene import (
+    CAMERAS,
     CAPTION,
     HEADER,
     MARGIN,
     PANEL_HEIGHT,
     PANEL_WIDTH,
     WIDTH,
+    SceneLook,
     draw_scene_picture,
     facts_line,
+    look_at,
 )
-from su3d_bench.reports.pictures.scene_look import CAMERAS, SceneLook, look_at
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 from su3d_bench.datasets.scannet.dataset import ScanNet, ScannetOptions
 from su3d_bench.datasets.tum.dataset import Tum
 from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
-from su3d_bench.runs.feeding import surface_of
+from su3d_bench.runs.frame_loop import surface_of
 
 
 @pytest.fixture(scope="module")

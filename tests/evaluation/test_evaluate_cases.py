@@ -14,8 +14,8 @@ from places import CASES
 from prediction_files import scenes_of, write_scannet_text
 
 from su3d_bench.cli.main import main
-from su3d_bench.evaluation.evaluate import Request, evaluate
-from su3d_bench.evaluation.request import Confidences
+from su3d_bench.evaluation.evaluate import evaluate
+from su3d_bench.evaluation.result import Confidences, Request
 
 PROTOCOLS = {"inst": "scannet-instance", "replica": "replica-openmask3d", "scannet200": "scannet200-instance"}
 INSTANCE_CASES = sorted(path.stem for name in PROTOCOLS for path in CASES.glob(f"{name}*.json") if name != "scannet200")

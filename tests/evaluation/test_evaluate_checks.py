@@ -8,16 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 from damage import damages, outcomes, truncations
-from evaluated_text import CHAIR, TABLE, document, numbers, said, scene, write_texts, write_truth
+from evaluated_text import CHAIR, TABLE, numbers, said, scene, write_truth
 from prediction_files import (
     write_scannet_text,
 )
-from scored_room import ROOM
 
-from su3d_bench.core.errors import DataError, PredictionError
+from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import Masks
-from su3d_bench.evaluation.texts import read_text_features
-from su3d_bench.evaluation.truth import read_values
+from su3d_bench.evaluation.text_truth import read_values
 from su3d_bench.metrics.matching import checks
 from su3d_bench.metrics.matching.checks import check_cloud, mask_facts
 
@@ -45,31 +43,6 @@ def test_empty_double_and_foreign_masks_are_warned_of_with_their_index(tmp_path:
     )
     assert said(found, "every confidence is 1")
     assert found["duplicates"] == {"near": 3, "identical": 1}
-
-
-def test_two_lines_that_name_one_mask_file_are_told(tmp_path: Path) -> None:
-    write_truth(tmp_path / "gt")
-    write_scannet_text(tmp_path / "pred", scene([CHAIR], [5]) | {"files": ["masks/m.txt"]})
-    listed = tmp_path / "pred/scene0001_00.txt"
-    listed.write_text(listed.read_text() + "masks/m.txt 7 0.5\n")
-    remarks = document(tmp_path)["remarks"]
-    assert any(line.startswith("scene0001_00: 1 lines name a mask file again") for line in remarks)
-
-
-@pytest.mark.parametrize(
-    ("numbers", "line"),
-    [
-        ([901, 902, 902, 903], "1 of class 901, 1 of class 903; the first"),
-        ([901, 902, 902, 903, 904], "1 of class 901, 1 of class 903 and 1 class more; the first"),
-        ([901, 902, 902, 903, 904, 905], "1 of class 901, 1 of class 903 and 2 classes more; the first"),
-    ],
-)
-def test_of_classes_that_are_not_scored_the_three_most_frequent_are_named(numbers: list[int], line: str) -> None:
-    found = checks.class_warnings("a", ROOM, np.array(numbers, np.int32), np.zeros(len(numbers), np.int64))
-    n = len(numbers)
-    assert found == [
-        f"a: {n} of {n} masks have a class that is not scored and count for nothing: 2 of class 902, {line} is mask 0"
-    ]
 
 
 def test_facts_of_masks_are_exact() -> None:
@@ -100,52 +73,6 @@ BOX = np.array([[0.0, 0, 0], [6.4, 5, 2.5], [1, 1, 1]], np.float32)
 def test_a_cloud_in_other_units_or_elsewhere_is_refused(points: Any, line: str) -> None:
     with pytest.raises(PredictionError, match=line):
         check_cloud("a", points.astype(np.float32), BOX)
-
-
-METRE = np.array([[2.0, 2, 2], [3, 2.5, 2.5]], np.float32)
-NO_UNIT = "; is it of this scene\\?"
-
-
-@pytest.mark.parametrize(
-    ("ratio", "guess"),
-    [
-        (4000, NO_UNIT),
-        (3999, ": millimetres\\?"),
-        (251, ": millimetres\\?"),
-        (250, ": centimetres\\?"),
-        (26, ": centimetres\\?"),
-        (25, NO_UNIT),
-        (20.5, NO_UNIT),
-        (1 / 20.5, NO_UNIT),
-        (0.0041, NO_UNIT),
-        (0.0039, ": kilometres\\?"),
-        (0.000251, ": kilometres\\?"),
-        (0.000249, NO_UNIT),
-    ],
-)
-def test_a_unit_is_guessed_within_a_factor_of_four(ratio: float, guess: str) -> None:
-    with pytest.raises(PredictionError, match=f"spans .* m{guess} coordinates must be metres"):
-        check_cloud("a", (METRE * ratio).astype(np.float32), METRE)
-
-
-def test_a_cloud_of_a_twentieth_of_the_scene_or_of_twenty_is_looked_at_further() -> None:
-    assert check_cloud("a", METRE[1:], METRE) == []
-    assert check_cloud("a", METRE, METRE * 20 - 38) == []
-    far = METRE[:1] + np.array([20, 0, 0], np.float32)
-    assert check_cloud("a", np.concatenate([METRE, far]), METRE) == []
-    assert check_cloud("a", np.concatenate([METRE[:1], far]), METRE[:1]) == []  # a scene without extent is no measure
-
-
-def test_a_cloud_half_outside_is_doubted_and_one_that_fits_is_not() -> None:
-    assert check_cloud("a", BOX, BOX) == []
-    assert check_cloud("a", BOX[:0], BOX) == []
-    assert check_cloud("a", BOX, BOX[:0]) == []
-    moved = BOX + np.array([6, 4.5, 0], np.float32)
-    assert check_cloud("a", moved, BOX) == [
-        "a: only 33 % of the cloud lies in the box of the scene (the first outside is point 1); is the frame of "
-        "reference right?"
-    ]
-    assert check_cloud("a", np.concatenate([moved, moved[:1]]), BOX) == []  # half inside is enough
 
 
 @pytest.mark.parametrize("axis", range(3))
@@ -182,34 +109,3 @@ def test_every_damage_to_a_truth_file_is_one_error_with_its_name(tmp_path: Path)
         n_read, n_refused = outcomes(read, copies, must_name=file.name)
         assert n_refused > 0
         assert n_read > 0
-
-
-def test_every_damage_to_a_file_of_texts_is_one_error_with_its_name(tmp_path: Path) -> None:
-    file = tmp_path / "texts.npz"
-    write_texts(file, ["chair", "table"], {"chair": 1})
-    content = file.read_bytes()
-
-    def read(damaged: bytes) -> object:
-        file.write_bytes(damaged)
-        return read_text_features(file)
-
-    for copies in (truncations(content), damages(content)):
-        _, n_refused = outcomes(read, copies, must_name=file.name)
-        assert n_refused > 0
-
-
-@pytest.mark.parametrize(
-    ("arrays", "line"),
-    [
-        ({"names": np.array(["a"])}, "has no 'names' and 'features'"),
-        ({"names": np.array([1]), "features": np.ones((1, 2))}, "expected texts"),
-        ({"names": np.array(["a", "b"]), "features": np.ones((1, 2))}, "one finite row of features a name"),
-        ({"names": np.array(["a"]), "features": np.full((1, 2), np.nan)}, "one finite row of features a name"),
-        ({"names": np.array(["a", "a"]), "features": np.ones((2, 2))}, "'a' stands there twice"),
-        ({"names": np.array(["a"]), "features": np.ones((1, 2)), "encoder": np.array([1])}, "expected one text"),
-    ],
-)
-def test_a_file_of_texts_that_does_not_fit_is_refused(arrays: dict[str, Any], line: str, tmp_path: Path) -> None:
-    np.savez(tmp_path / "texts.npz", **arrays)
-    with pytest.raises(DataError, match=line):
-        read_text_features(tmp_path / "texts.npz")

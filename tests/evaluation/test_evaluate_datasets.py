@@ -8,16 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evaluated_text import said, scene, write_texts, write_truth
+from evaluated_text import said, write_texts
 from places import SCENES
-from prediction_files import (
-    write_scannet_text,
-)
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.datasets.openlex3d.labels import VISIBLE_NAME
-from su3d_bench.evaluation.evaluate import Request, evaluate
+from su3d_bench.evaluation.evaluate import evaluate
+from su3d_bench.evaluation.result import Request
 
 PAINTED = f"{SCENES}/painted.py:Painted"
 
@@ -65,31 +63,6 @@ def test_scenes_that_a_run_lost_count_as_missed_under_our_own_protocols(
         alone = run / "scenes/painted.a/oracle" / name
         found = evaluate(Request((alone,), dataset=PAINTED, protocols=BOTH)).to_json()["protocols"]
         assert found["rooms-instance"]["metrics"]["ap"] == 1.0  # each stands for its scene, a folder of scenes for all
-
-
-def test_masks_on_the_points_of_a_dataset_make_a_map_too(tmp_path: Path) -> None:
-    from painted import Painted
-
-    truth = Painted(tmp_path, Painted.Options()).ground_truth("a", "mesh-vertices")
-    masks = [np.flatnonzero(truth.instance == k) for k in (1, 2, 3)]
-    write_scannet_text(tmp_path / "pred", scene(masks, [20, 76, 80], name="a", n=len(truth.points)))
-    found = evaluate(Request((tmp_path / "pred",), dataset=PAINTED, protocols=BOTH, scenes=("a",))).to_json()
-    assert found["protocols"]["rooms-instance"]["metrics"]["ap"] == 1.0
-    assert found["protocols"]["rooms-semantic"]["metrics"]["macc"] == 1.0
-    assert found["protocols"]["rooms-instance"]["coverage"]["0.025"] == 1.0
-    (tmp_path / "labels").mkdir()
-    (tmp_path / "labels/a.txt").write_text("".join(f"{one}\n" for one in truth.semantic))
-    request = Request((tmp_path / "labels",), dataset=PAINTED, protocols=("rooms-semantic",), scenes=("a",))
-    assert evaluate(request).to_json()["protocols"]["rooms-semantic"]["metrics"]["miou"] == 1.0
-
-
-def test_a_map_of_its_own_points_needs_a_dataset(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = run_oracle(tmp_path, monkeypatch, "a", capsys)
-    write_truth(tmp_path / "gt", "a")
-    with pytest.raises(PredictionError, match="has points of its own, the ground truth has no coordinates"):
-        evaluate(Request((run,), dataset=PAINTED, ground_truth=tmp_path / "gt", protocols=("rooms-instance",)))
 
 
 # ---- OpenLex3D

@@ -10,7 +10,8 @@ import pytest
 from test_openlex3d_original import SAMPLED, metres, of_dataset, write_labels, write_objects
 
 from su3d_bench.core.errors import ConfigError, PredictionError
-from su3d_bench.evaluation.evaluate import Request, evaluate
+from su3d_bench.evaluation.evaluate import evaluate
+from su3d_bench.evaluation.result import Request
 from su3d_bench.formats.ply import PlyElement, write_ply
 
 HM3D, SCANNETPP = "00824", "0a76e06478"

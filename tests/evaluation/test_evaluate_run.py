@@ -10,17 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 from evaluated_text import scene
-from painted import Painted, colour_perception
+from painted import Painted
 from places import SCENES
 from prediction_files import write_openmask3d, write_scannet_text
 
 from su3d_bench import load_run
 from su3d_bench.cli.main import main
 from su3d_bench.core.digests import digest_file
-from su3d_bench.evaluation.as_run import AGAINST_THE_RULE
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run
 
 PAINTED = f"{SCENES}/painted.py:Painted"
@@ -101,7 +99,7 @@ def test_predictions_in_two_formats_go_through_every_verb_with_the_same_numbers(
     assert (of_ap["left"], of_ap["right"]) == (ap["mine"], ap["theirs"])
     assert [f"{RUN}:mine: {MINE}", f"{RUN}:theirs: {THEIRS}"] == compared["remarks"]
     for method, line in (("mine", MINE), ("theirs", THEIRS)):
-        explained = json.loads(answered(capsys, "attribute", RUN, "--method", method, "--json"))
+        explained = json.loads(answered(capsys, "report", "attribution", RUN, "--method", method, "--json"))
         assert explained["protocols"][0]["values"]["AP"] == ap[method]
         assert f"{method}: {line}" in explained["remarks"]
     latex = answered(capsys, "report", "tables", RUN, "--format", "latex", "--truth-scores", "--intervals")
@@ -121,12 +119,14 @@ def test_predictions_in_two_formats_go_through_every_verb_with_the_same_numbers(
     answered(capsys, *words, "--scenes", "painted/a", "--per-kind", "1")
     assert Path("sheets").is_dir()
     ranking = json.loads(
-        answered(capsys, "query", "painted/a", "sofa", "--run", RUN, "--method", "mine", "--out", "q.png", "--json")
+        answered(
+            capsys, "query", "text", "painted/a", "sofa", "--run", RUN, "--method", "mine", "--out", "q.png", "--json"
+        )
     )
     assert ranking["ranking"][0]["id"] == 1
-    planned = json.loads(answered(capsys, "plan", RUN, "--protocol", "rooms-instance", "--json"))
+    planned = json.loads(answered(capsys, "report", "power", RUN, "--protocol", "rooms-instance", "--json"))
     assert planned["remarks"] == [f"mine: {MINE}", f"theirs: {THEIRS}"]
-    answered(capsys, "export", RUN, "--method", "mine", "--to", "openlex3d", "--out", "clouds")
+    answered(capsys, "runs", "export", RUN, "--method", "mine", "--to", "openlex3d", "--out", "clouds")
     assert files_of(RUN) == before
     again = ["evaluate", f"{RUN}/scenes/painted.a/mine", "--dataset", PAINTED, *PROTOCOLS[:2], "--json", "again.json"]
     assert main([*again, "--quiet"]) == 0
@@ -173,21 +173,6 @@ def test_a_folder_of_something_else_is_refused_before_anything_is_scored(capsys:
     assert f"{RUN}: holds a run, and no evaluation of predictions made elsewhere" in capsys.readouterr().err
 
 
-def test_the_record_says_where_the_predictions_come_from() -> None:
-    assert both("--quiet") == 0
-    mine, theirs = read_run(Path(RUN)).record.predictions
-    assert (mine.method, mine.formats, mine.paths, mine.confidences) == (
-        "mine",
-        ("openmask3d",),
-        ("predA",),
-        "protocol",
-    )
-    read = {f"predA/a{end}": digest_file(Path(f"predA/a{end}")) for end in ("_masks.pt", "_openmask3d_features.npy")}
-    assert mine.files["painted/a"] == read
-    assert set(theirs.files["painted/b"]) == {"predB/b.txt", *(f"predB/masks/b_{k}.txt" for k in range(3))}
-    assert theirs.confidences == "file"
-
-
 @pytest.fixture
 def _texts() -> None:
     """Ground truth as text, in which a chair and a table lie, and predictions of it."""
@@ -211,57 +196,21 @@ def test_text_truth_makes_a_run_whose_errors_are_told_and_whose_verbs_say_what_i
     numbers = run.results["mine", "scannet-instance"].result
     assert numbers is not None and numbers.metrics["AP"] == known["ap"] and numbers.coverage == {}
     assert run.scenes == ("scannet/scene0001_00", "scannet/scene0001_01", "scannet/scene0002_00")
-    explained = json.loads(answered(capsys, "attribute", "runs/mine", "--json"))
+    explained = json.loads(answered(capsys, "report", "attribution", "runs/mine", "--json"))
     assert explained["protocols"][0]["values"]["AP"] == known["ap"]
     assert explained["protocols"][0]["causes"]["missed"]["n"] == 1
-    query = answered(capsys, "query", "scannet/scene0001_00", "chair", "--run", "runs/mine", "--method", "mine", code=2)
+    query = answered(
+        capsys, "query", "text", "scannet/scene0001_00", "chair", "--run", "runs/mine", "--method", "mine", code=2
+    )
     assert "is over the points of ground-truth files, which have no coordinates" in query
     sheets = answered(capsys, "sheets", "make", "runs/mine", "--kind", "annotation", "--out", "sheets", code=2)
     assert sheets.count("\n") == 1 and "is over the points of ground-truth files" in sheets
-    answered(capsys, "export", "runs/mine", "--to", "scannet", "--out", "exported")
+    answered(capsys, "runs", "export", "runs/mine", "--to", "scannet", "--out", "exported")
     assert main([*TEXTS[:1], "exported", *TEXTS[2:-2], "--json", "again.json", "--quiet"]) == 0
     again = json.loads(Path("again.json").read_text())["protocols"]["scannet-instance"]["metrics"]
     assert again == known
     Path("gt/scene0001_00.txt").write_text("0\n" * 600)
-    assert "is not the one of runs/mine" in answered(capsys, "attribute", "runs/mine", code=2)
-
-
-@pytest.mark.usefixtures("_texts")
-def test_a_scene_that_one_method_lacks_is_said_and_compared_over_the_others(capsys: pytest.CaptureFixture[str]) -> None:
-    write_scannet_text(Path("other"), scene([np.arange(180)], [5], name="scene0001_00"))
-    write_scannet_text(Path("other"), scene([np.arange(170)], [5], name="scene0001_01"))
-    words = ["evaluate", "--name", "mine=pred", "theirs=other", *TEXTS[2:]]
-    assert main(words) == 0
-    assert "- theirs is unscored on scannet/scene0002_00" in capsys.readouterr().out
-    compared = json.loads(answered(capsys, "compare", "runs/mine:mine", "runs/mine:theirs", "--json"))
-    assert compared["protocols"][0]["scenes"] == ["scannet/scene0001_00", "scannet/scene0001_01"]
-    answered(capsys, "check", "--learn", "runs/mine", "--out", "reference.json")
-    assert answered(capsys, "check", "runs/mine", "--against", "reference.json").startswith("passed")
-
-
-@pytest.mark.usefixtures("_texts")
-def test_an_own_protocol_in_a_file_scores_a_run_that_is_compared_and_explained(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    rules = 'name = "mine"\nversion = 1\nextends = "scannet-instance"\nmin_region_size = 10\n'
-    Path("mine.toml").write_text(rules)
-    words = ["evaluate", "--name", "mine=pred", "theirs=pred", "--ground-truth", "gt", "--protocol", "mine.toml"]
-    assert main([*words, "--out", "runs/own"]) == 0
-    assert "mine" in answered(capsys, "compare", "runs/own:mine", "runs/own:theirs")
-    assert "as it is" in answered(capsys, "attribute", "runs/own", "--method", "theirs")
-    assert "Protocol mine" in answered(capsys, "report", "tables", "runs/own", "--format", "latex")
-    answered(capsys, "report", "html", "runs/own", "--out", "page.html")
-
-
-def test_confidences_of_files_against_a_rule_are_said_and_explained(capsys: pytest.CaptureFixture[str]) -> None:
-    rules = 'name = "ones"\nversion = 1\nextends = "rooms-instance"\nconfidence = "ones"\n'
-    Path("ones.toml").write_text(rules)
-    words = ["evaluate", "predB", "--dataset", PAINTED, "--scenes", "[abc]", "--protocol", "ones.toml"]
-    assert main([*words, "--out", "runs/theirs"]) == 0
-    result = read_run(Path("runs/theirs")).results["theirs", "ones"]
-    assert result.confidences == AGAINST_THE_RULE and result.result is not None
-    explained = json.loads(answered(capsys, "attribute", "runs/theirs", "--json"))
-    assert explained["protocols"][0]["values"]["AP"] == result.result.metrics["AP"]
+    assert "is not the one of runs/mine" in answered(capsys, "report", "attribution", "runs/mine", code=2)
 
 
 def test_texts_of_a_file_name_the_features_and_must_be_there_to_explain(capsys: pytest.CaptureFixture[str]) -> None:
@@ -272,13 +221,13 @@ def test_texts_of_a_file_name_the_features_and_must_be_there_to_explain(capsys: 
     assert main([*words, "--text-features", "texts.npz", "--out", "runs/mine"]) == 0
     result = read_run(Path("runs/mine")).results["mine", "rooms-instance"]
     assert result.encoder == "theirs/v1" and result.result is not None
-    explained = json.loads(answered(capsys, "attribute", "runs/mine", "--json"))
+    explained = json.loads(answered(capsys, "report", "attribution", "runs/mine", "--json"))
     assert explained["protocols"][0]["values"]["AP"] == result.result.metrics["AP"]
-    told = answered(capsys, "query", "painted/a", "sofa", "--run", "runs/mine", "--method", "mine", code=2)
+    told = answered(capsys, "query", "text", "painted/a", "sofa", "--run", "runs/mine", "--method", "mine", code=2)
     assert "made by encoder theirs/v1" in told and "only texts of that one can be held against them" in told
     np.savez("texts.npz", names=np.array(names[::-1]), features=features)
     assert "texts.npz: is not the file that runs/mine was scored with" in answered(
-        capsys, "attribute", "runs/mine", code=2
+        capsys, "report", "attribution", "runs/mine", code=2
     )
 
 
@@ -296,9 +245,9 @@ PREDICTIONS = (
         (("compare", "runs/mine", "both.json:mine"), f"both.json: {NUMBERS_ALONE}"),
         (("compare", "pred", "runs/mine"), PREDICTIONS),
         (("compare", "nowhere", "runs/mine"), "nowhere: there is no such folder"),
-        (("attribute", "numbers.json"), f"numbers.json: {NUMBERS_ALONE}"),
-        (("attribute", "pred"), PREDICTIONS),
-        (("plan", "both.json"), f"both.json: {NUMBERS_ALONE}"),
+        (("report", "attribution", "numbers.json"), f"numbers.json: {NUMBERS_ALONE}"),
+        (("report", "attribution", "pred"), PREDICTIONS),
+        (("report", "power", "both.json"), f"both.json: {NUMBERS_ALONE}"),
         (("check", "numbers.json", "--against", "reference.json"), f"numbers.json: {NUMBERS_ALONE}"),
         (("sheets", "make", "pred", "--kind", "annotation", "--out", "sheets"), PREDICTIONS),
         (("report", "tables", "numbers.json"), f"numbers.json: {NUMBERS_ALONE}"),
@@ -315,7 +264,7 @@ PREDICTIONS = (
             ("report", "leaderboard", "pred"),
             "pred: holds no run below it; su3d-bench run writes one, and evaluate --out",
         ),
-        (("questions", "show", "nope.toml"), "nope.toml is missing; name a file of queries, TOML or CSV"),
+        (("query", "show", "nope.toml"), "nope.toml is missing; name a file of queries, TOML or CSV"),
     ],
     ids=lambda value: "-".join(value[:3]) if isinstance(value, tuple) else "",
 )
@@ -329,23 +278,3 @@ def test_what_is_no_run_is_refused_with_the_truth_and_what_makes_one(
     main(["check", "--learn", "runs/mine", "--out", "reference.json"])
     told = answered(capsys, *words, code=2)
     assert told.startswith(f"su3d-bench: {line}") and told.count("\n") == 1
-
-
-@pytest.mark.usefixtures("_texts")
-def test_one_run_is_one_run(capsys: pytest.CaptureFixture[str]) -> None:
-    main([*TEXTS, "--quiet"])
-    learnt = answered(capsys, "check", "--learn", "runs/mine", "--out", "reference.json")
-    assert learnt == "reference.json: 3 headline values from 1 run, 3 of them exact\n"
-
-
-def test_a_run_under_an_own_protocol_is_compared_and_explained(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    Path("own.toml").write_text('name = "own"\nversion = 1\nextends = "rooms-instance"\nmin_region_size = 10\n')
-    words = ["run", "--scenes", f"{PAINTED}/a", "--methods", "oracle", "--protocols", "own.toml", "--no-pictures"]
-    for folder in ("before", "after"):
-        assert main([*words, "--jobs", "1", "--out", f"runs/{folder}", "--quiet"]) == 0
-    assert "own (version 1)" in answered(capsys, "compare", "runs/before", "runs/after")
-    assert "as it is" in answered(capsys, "attribute", "runs/before")
-    answered(capsys, "report", "html", "runs/before", "--out", "page.html", "--no-maps")

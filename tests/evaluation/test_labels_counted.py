@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
-import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
@@ -12,28 +10,24 @@ import numpy as np
 import pytest
 from evaluated_text import CHAIR, TABLE, document, numbers, scene, write_truth
 from painted import WordEncoder
-from prediction_files import write_maskclustering, write_scannet_text
+from prediction_files import write_scannet_text
 
-import su3d_bench.evaluation.scoring
+import su3d_bench.evaluation.evaluate
 from su3d_bench.analysis.leaderboard import leaderboard
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import Instances, Masks
-from su3d_bench.evaluation.request import Request
-from su3d_bench.evaluation.scoring import Scoring
-from su3d_bench.metrics import labels
-from su3d_bench.metrics.fitness import ContentFacts, why_not_content, why_not_scorable
+from su3d_bench.evaluation.evaluate import Scoring
+from su3d_bench.metrics.fitness import ContentFacts
 from su3d_bench.metrics.labels import labels_counted, under_several_labels
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.predictions.base import ScenePrediction
-from su3d_bench.reports.tables.model import label_count_notes
 
 if TYPE_CHECKING:
     from su3d_bench.evaluation.truth import SceneTruths
 
 ONE = scene([CHAIR, TABLE], [5, 7])
 PAIRS = scene([CHAIR, CHAIR, TABLE, TABLE], [5, 6, 7, 4], [0.9, 0.4, 0.8, 0.3])
-INSTANCE = load_protocol("scannet-instance")
 
 
 def evaluated(folder: Path, name: str, written: dict[str, Any], *more: str) -> None:
@@ -43,10 +37,6 @@ def evaluated(folder: Path, name: str, written: dict[str, Any], *more: str) -> N
     words = ["evaluate", str(folder / f"pred-{name}"), "--ground-truth", str(folder / "gt"), "--quiet"]
     words += ["--protocols", *(more or ("scannet-instance",)), "--out", str(folder / "runs" / name), "--name", name]
     assert main(words) == 0
-
-
-def test_examples_are_true() -> None:
-    assert doctest.testmod(labels).attempted >= 3 and doctest.testmod(labels).failed == 0
 
 
 def test_a_mask_counts_as_under_several_labels_only_with_another_label() -> None:
@@ -75,22 +65,6 @@ def test_each_kind_of_protocol_says_of_how_many_labels_its_number_is(
     assert labels_counted(load_protocol(name), by_features=by_features, are_several=are_several) == said
 
 
-@pytest.mark.parametrize(
-    ("name", "taken"),
-    [
-        ("scannet-instance", "one label of a mask, or the top ones; never both in a ranking"),
-        ("openlex3d-topn", "the top 5 labels of features, or one label each; never both in a prediction or a ranking"),
-        ("scannet-semantic", "one label"),
-        ("class-agnostic-open3dis", "no label counts"),
-    ],
-)
-def test_a_protocol_says_which_it_takes(name: str, taken: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["protocols", "show", name]) == 0
-    assert f"labels taken                 {taken}\n" in capsys.readouterr().out
-    assert main(["protocols", "show", name, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["labels_taken"] == taken
-
-
 def test_masks_under_several_labels_are_told_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_truth(tmp_path / "gt")
     for written, expected in ((ONE, "one label"), (PAIRS, "the top labels of a mask")):
@@ -99,13 +73,6 @@ def test_masks_under_several_labels_are_told_and_said(tmp_path: Path, capsys: py
         assert main(["evaluate", str(tmp_path / "pred"), "--ground-truth", str(tmp_path / "gt"), "--quiet"]) == 0
         assert f"of each mask or point counts: {expected}" in capsys.readouterr().out
     assert numbers(tmp_path, "class-agnostic-open3dis")["labels"] is None
-
-
-def test_a_mask_that_is_there_twice_by_chance_makes_no_top_labels(tmp_path: Path) -> None:
-    write_truth(tmp_path / "gt")
-    masks = [CHAIR, CHAIR, TABLE, np.arange(400, 500), np.arange(450, 600)]
-    write_scannet_text(tmp_path / "pred", scene(masks, [5, 6, 7, 5, 5]))
-    assert numbers(tmp_path)["labels"] == "one label"
 
 
 def test_a_ranking_has_numbers_of_as_many_labels_and_names_the_others(
@@ -140,27 +107,6 @@ def test_a_comparison_of_one_label_with_several_is_refused(tmp_path: Path, capsy
     assert "is of one label and of the top labels of a mask" in capsys.readouterr().err
 
 
-def test_methods_of_one_run_that_differ_are_marked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_truth(tmp_path / "gt")
-    for name, written in (("a", ONE), ("b", PAIRS)):
-        write_scannet_text(tmp_path / name, written)
-    words = ["evaluate", "--name", *(f"{name}={tmp_path / name}" for name in "ab"), "--quiet"]
-    assert main([*words, "--ground-truth", str(tmp_path / "gt"), "--protocols", "scannet-instance"]) == 0
-    shown = capsys.readouterr().out
-    assert "MIXED LABELS: one label (a); the top labels of a mask (b): these numbers do not compare" in shown
-
-
-def test_a_run_that_does_not_say_is_told_by_its_rules_and_its_encoder(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        evaluated(tmp_path, name, ONE)
-    metrics = tmp_path / "runs/a/metrics.json"
-    value = json.loads(metrics.read_text())
-    for result in value["results"]:
-        del result["labels"]
-    metrics.write_text(json.dumps(value))
-    assert [[one.labels for one in board] for board in leaderboard(tmp_path / "runs").boards] == [["one label"] * 2]
-
-
 @pytest.mark.parametrize(("labels", "fits", "fails"), [("one", ONE, PAIRS), ("top-k", PAIRS, ONE)])
 def test_own_rules_may_take_one_of_the_two_alone(
     tmp_path: Path, labels: str, fits: dict[str, Any], fails: dict[str, Any]
@@ -175,27 +121,12 @@ def test_own_rules_may_take_one_of_the_two_alone(
         document(tmp_path, str(rules))
 
 
-def test_labels_belong_to_masks_with_classes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for parent in ("scannet-semantic", "class-agnostic-open3dis"):
-        rules = tmp_path / "mine.toml"
-        rules.write_text(f'extends = "{parent}"\nname = "mine"\nlabels = "one"\n')
-        assert main(["protocols", "show", str(rules)]) == 2
-        assert "labels: belongs to kind 'instance', where masks have classes" in capsys.readouterr().err
-
-
-def test_archives_of_pairs_are_told_too(tmp_path: Path) -> None:
-    write_truth(tmp_path / "gt")
-    write_maskclustering(tmp_path / "pred", PAIRS)
-    assert numbers(tmp_path)["labels"] == "the top labels of a mask"
-
-
 def test_scenes_with_one_label_beside_scenes_with_five_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     rules = load_protocol("openlex3d-topn")
-    scoring = Scoring(Request(()))
-    scoring._truths = cast("SceneTruths", SimpleNamespace(has_points=True))
-    scoring.tally.enter(rules)
+    truths = cast("SceneTruths", SimpleNamespace(has_points=True, why_not=lambda *_, **__: None))
+    scoring = Scoring(truths, [rules.name], None, file_confidences=False)
     monkeypatch.setattr(scoring, "_score_content", lambda *_: None)
-    monkeypatch.setattr(su3d_bench.evaluation.scoring, "encoder_for", lambda *_, **__: WordEncoder())
+    monkeypatch.setattr(su3d_bench.evaluation.evaluate, "encoder_for", lambda *_, **__: WordEncoder())
     points = np.zeros((4, 3), np.float32)
     ranked = Instances.of(points, [[0, 1], [2]], features=np.ones((2, 4)))
     named = Instances.of(points, [[0, 1], [2]], labels=["chair", "lamp"], features=np.ones((2, 4)))
@@ -205,27 +136,3 @@ def test_scenes_with_one_label_beside_scenes_with_five_are_refused(monkeypatch: 
 
     assert [scored("a", ranked), scored("b", ranked)] == [None, None]
     assert scored("c", named) == "gives one label of a point, and the top 5 labels in the scenes before; give all alike"
-
-
-def test_a_map_with_features_alone_gives_as_many_labels_as_are_asked() -> None:
-    points = np.zeros((4, 3), np.float32)
-    facts = ContentFacts.of(Instances.of(points, [[0, 1], [2]], features=np.ones((2, 4))))
-    assert not facts.are_several and why_not_content(INSTANCE, facts) is None
-
-
-def test_maps_of_runs_are_held_against_rules_that_take_one_of_the_two() -> None:
-    masks, points = [[0, 1], [0, 1], [2]], np.zeros((4, 3), np.float32)
-    one = Instances.of(points, masks, labels=["chair", "chair", "lamp"])
-    several = Instances.of(points, masks[:2], labels=["chair", "stool"])
-    nothing = Instances.of(points, [], labels=[])
-    takes = {labels: INSTANCE.model_copy(update={"labels": labels}) for labels in ("one", "top-k")}
-    for rules, fits, fails in ((takes["one"], one, several), (takes["top-k"], several, one)):
-        assert why_not_scorable(rules, fits) is None and why_not_scorable(rules, nothing) is None
-        assert str(why_not_scorable(rules, fails)).startswith("scannet-instance: takes ")
-    assert why_not_scorable(INSTANCE, one) is None and why_not_scorable(INSTANCE, several) is None
-
-
-def test_rows_of_other_numbers_of_labels_are_marked() -> None:
-    assert label_count_notes({"a": "one label", "b": "one label", "c": None}) == []
-    (line,) = label_count_notes({"a": "one label", "b": "the top 5 labels"})
-    assert line == "MIXED LABELS: one label (a); the top 5 labels (b): these numbers do not compare"

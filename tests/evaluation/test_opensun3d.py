@@ -13,11 +13,10 @@ import pytest
 from places import CASES
 from scored_room import instances
 
-from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, PredictionError
 from su3d_bench.core.types import GroundTruth, LabelSet
-from su3d_bench.evaluation.evaluate import Request, evaluate
-from su3d_bench.evaluation.request import ValuesForm
+from su3d_bench.evaluation.evaluate import evaluate
+from su3d_bench.evaluation.result import Request, ValuesForm
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.predictions.formats import recognise
@@ -127,15 +126,6 @@ def test_a_line_that_is_no_mask_is_named(
     assert message in str(raised.value)
 
 
-def test_lists_with_comments_and_wide_gaps_are_read_as_numpy_reads_them(tmp_path: Path) -> None:
-    for name in ("gt", "pred/masks"):
-        (tmp_path / name).mkdir(parents=True)
-    (tmp_path / "gt/a.txt").write_text("1\n" * 5 + "0\n" * 5)
-    (tmp_path / "pred/masks/a.txt").write_text("1\n" * 5 + "0\n" * 5)
-    (tmp_path / "pred/a.txt").write_text("# masks of a\n\nmasks/a.txt \t 0.5 # sure\n")
-    assert numbers(tmp_path, format=PROTOCOL)["metrics"] == {"ap": 1.0, "ap50": 1.0, "ap25": 1.0}
-
-
 # ---- what values of the truth are
 
 
@@ -160,19 +150,3 @@ def test_values_that_may_be_classes_or_instances_are_not_guessed(tmp_path: Path)
     for form, recall in forms:
         found = evaluate(replace(request, truth_values=form)).to_json()["protocols"]["class-agnostic-segment3d"]
         assert found["metrics"]["ap50"] == recall
-
-
-def test_numbers_of_objects_alone_serve_protocols_without_classes(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_values(tmp_path, np.repeat([0, 1, 2], 200), slice(200, 400))
-    words = ["evaluate", str(tmp_path / "pred"), "--ground-truth", str(tmp_path / "gt")]
-    assert main([*words, "--protocol", "class-agnostic-segment3d"]) == 2
-    assert "are class ids alone" in (refused := capsys.readouterr().err)
-    assert "where they are numbers of objects alone, say --truth-values numbers" in refused
-    assert main([*words, "--protocol", "class-agnostic-segment3d", "--truth-values", "numbers"]) == 0
-    for protocol in ("class-agnostic-open3dis", "scannet-instance"):
-        assert main([*words, "--protocol", protocol, "--truth-values", "numbers"]) == 2
-        assert "needs classes, and the values of the ground truth, 1 to 2, are numbers" in capsys.readouterr().err
-    assert main([*words[:2], "--dataset", "scannet", "--truth-values", "numbers"]) == 2
-    assert "--truth-values says what the texts of --ground-truth hold" in capsys.readouterr().err

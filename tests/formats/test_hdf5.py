@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-import zlib
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
-from damage import N_DAMAGES, damages, outcomes, truncations
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.formats import hdf5
@@ -20,7 +16,6 @@ from su3d_bench.formats.hdf5 import largest_column, read_rows, row_blocks
 NAME = "pc_points"
 WHERE = f"replica/room0: {NAME}.h5"
 ROWS = np.random.default_rng(0).random((40, 3)).astype(np.float32)
-GZIP: dict[str, Any] = {"chunks": (16, 3), "compression": "gzip", "shuffle": True}
 
 
 def write(folder: Path, data: np.ndarray = ROWS, name: str = NAME, **options: Any) -> Path:
@@ -31,25 +26,17 @@ def write(folder: Path, data: np.ndarray = ROWS, name: str = NAME, **options: An
     return path
 
 
-@pytest.mark.parametrize(
-    "options",
-    [{}, GZIP, {"chunks": (7, 2), "compression": "gzip"}, {"chunks": (40, 2)}, {"chunks": (7, 3), "shuffle": True}],
-    ids=str,
-)
-@pytest.mark.parametrize("dtype", ["<f2", ">f4", "<f4", "<f8"])
-def test_rows_come_back_as_they_were_written(tmp_path: Path, options: dict[str, Any], dtype: str) -> None:
+@pytest.mark.parametrize("dtype", ["f2", "f4", ">f8"])
+def test_rows_come_back_as_they_were_written(tmp_path: Path, dtype: str) -> None:
     data = ROWS.astype(dtype)
-    found = read_rows(write(tmp_path, data, **options), 3, WHERE)
+    found = read_rows(write(tmp_path, data), 3, WHERE)
     assert found.dtype == np.float32
     np.testing.assert_array_equal(found, data.astype(np.float32))
 
 
-@pytest.mark.parametrize("options", [{}, GZIP], ids=["contiguous", "chunked"])
-def test_a_large_table_comes_in_blocks(
-    tmp_path: Path, options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_large_table_comes_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hdf5, "BLOCK_BYTES", 16 * 12)
-    path = write(tmp_path, **options)
+    path = write(tmp_path)
     assert [len(block) for block in row_blocks(path, 3, WHERE)] == [16, 16, 8]
     np.testing.assert_array_equal(read_rows(path, 3, WHERE), ROWS)
 
@@ -119,17 +106,6 @@ def written(data: np.ndarray, **options: Any) -> Any:
     return lambda path: write(path.parent, data, **options)
 
 
-def stored(content: bytes) -> Any:
-    """A file of one compressed chunk, which holds 192 bytes, as ``content`` says it."""
-
-    def make(path: Path) -> None:
-        with h5py.File(path, "w") as file:
-            table = file.create_dataset(NAME, (16, 3), np.float32, chunks=(16, 3), compression="gzip")
-            table.id.write_direct_chunk((0, 0), content)
-
-    return make
-
-
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -147,19 +123,9 @@ def stored(content: bytes) -> Any:
         (written(ROWS[:, 0]), "has the shape (40,); expected (N, 3)"),
         (written(ROWS.astype(np.int32)), "holds values of type int32; expected float16"),
         (written(ROWS.astype(np.longdouble)), "expected float16, float32 or float64"),
-        (written(ROWS, compression="lzf"), "is compressed with the filter 32000 of HDF5; expected gzip"),
-        (written(ROWS, chunks=(16, 3), fletcher32=True), "is compressed with the filter 3 of HDF5"),
-        (
-            unwritten((10**12, 3), chunks=(1024, 3)),
-            "promises 1000000000000 rows of 3 values, 12000000000000 bytes, but",
-        ),
+        (written(ROWS, compression="gzip"), "is stored in chunks or compressed"),
+        (written(ROWS, chunks=(16, 3)), "is stored in chunks or compressed"),
         (unwritten((10**12, 3)), "promises 1000000000000 rows of 3 values"),
-        (unwritten((100, 3), chunks=(10, 3)), "the values from row 0 on are missing or damaged"),
-        (unwritten((10**9, 3), chunks=(10**8, 3)), "promises 1000000000 rows"),
-        (stored(bytes(10_000)), "the values from row 0 on are missing or damaged"),
-        (stored(zlib.compress(bytes(100_000), 9)), "the values from row 0 on are damaged"),
-        (stored(zlib.compress(bytes(191))), "the values from row 0 on are damaged"),
-        (stored(b"no stream of zlib"), "the values from row 0 on are damaged"),
     ],
 )
 def test_each_unfit_file_is_one_clear_line(tmp_path: Path, make: Any, message: str) -> None:
@@ -171,37 +137,3 @@ def test_each_unfit_file_is_one_clear_line(tmp_path: Path, make: Any, message: s
     assert line.startswith(WHERE)
     assert message in line
     assert "\n" not in line
-
-
-@pytest.mark.parametrize("options", [{}, GZIP], ids=["contiguous", "chunked"])
-def test_every_truncation_and_damage_is_read_or_refused_in_one_line(tmp_path: Path, options: dict[str, Any]) -> None:
-    path = write(tmp_path, **options)
-    content = path.read_bytes()
-
-    def read(damaged: bytes) -> None:
-        path.write_bytes(damaged)
-        read_rows(path, 3, WHERE)
-
-    assert outcomes(read, truncations(content), must_name=WHERE) == (0, len(content))
-    n_read, n_refused = outcomes(read, damages(content), must_name=WHERE)
-    assert n_read + n_refused == N_DAMAGES
-    assert min(n_read, n_refused) > 0.02 * N_DAMAGES
-
-
-def test_a_promise_without_data_is_refused_in_little_memory(tmp_path: Path) -> None:
-    """The library allocates outside of what Python can trace, so a process of its own is held to 600 MB."""
-    unwritten((10**12, 3), chunks=(4096, 3))(tmp_path / f"{NAME}.h5")
-    code = (
-        "import resource, sys\n"
-        "resource.setrlimit(resource.RLIMIT_AS, (600 << 20, 600 << 20))\n"
-        "from pathlib import Path\n"
-        "from su3d_bench.formats.hdf5 import read_rows\n"
-        "from su3d_bench.core.errors import DataError\n"
-        "try:\n    read_rows(Path(sys.argv[1]), 3, 'here')\n"
-        "except DataError as error:\n    print(error)\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path / f"{NAME}.h5")],
-        capture_output=True, text=True, timeout=120, env={"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
-    )  # fmt: skip
-    assert done.stdout.startswith("here: promises 1000000000000 rows"), done.stderr

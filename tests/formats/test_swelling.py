@@ -11,7 +11,6 @@ import gzip
 import io
 import struct
 import zipfile
-import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,21 +23,19 @@ from memory import bounded_addresses, peak_bytes, reset_peak
 
 from su3d_bench.core.errors import DataError, PredictionError, StoreError, Su3dError
 from su3d_bench.core.files.atomic import read_arrays
-from su3d_bench.core.files.unpacking import FREE_BYTES, MOST_RATIO, Allowance, UnpackingError
 from su3d_bench.core.system.damage import DAMAGE
 from su3d_bench.evaluation.texts import read_text_features
-from su3d_bench.formats.arrays import MOST_MEMBERS, column_members, run_members
-from su3d_bench.formats.hdf5 import read_rows
+from su3d_bench.formats.arrays import MOST_MEMBERS, run_members
 from su3d_bench.formats.images import decode_colour, decode_depth
 from su3d_bench.formats.numpy_files import read_npz
 from su3d_bench.formats.pcd import read_pcd_points
-from su3d_bench.formats.pickles.pickles import read_pickle_file
+from su3d_bench.formats.pickles import read_pickle_file
 from su3d_bench.formats.tables.csv_text import separated_rows
-from su3d_bench.formats.torch_zip import read_torch
+from su3d_bench.formats.torch_files import read_torch
 from su3d_bench.metrics.scoring import unpack_scores
 from su3d_bench.predictions.formats import READERS
 from su3d_bench.questions.files.queries import read_query_file
-from su3d_bench.store.predictions import prediction_arrays, prediction_from_arrays, read_prediction
+from su3d_bench.store.predictions import read_prediction
 
 MOST_GROWN = 320 * MIB
 LARGEST_BOMB = 4 * MIB
@@ -107,15 +104,6 @@ def test_an_npz_that_swells_is_refused_by_each_of_its_readers(tmp_path: Path, ki
     refused(lambda: read_text_features(path), DataError)
 
 
-def test_what_a_file_may_unpack_to_goes_by_its_size() -> None:
-    small, large = Allowance(10), Allowance(FREE_BYTES)
-    assert (small.n_bytes, large.n_bytes) == (FREE_BYTES, MOST_RATIO * FREE_BYTES)
-    small.spend(FREE_BYTES - 1)
-    small.spend(1)
-    with pytest.raises(UnpackingError, match="unpacks to more than 128 MiB, over 100 times its size"):
-        small.spend(1)
-
-
 def test_masks_that_pack_well_are_read(tmp_path: Path) -> None:
     masks = np.zeros((1 << 16, 600), np.bool_)
     masks[:1000, :5] = True
@@ -132,22 +120,13 @@ def test_a_torch_archive_whose_pickle_swells_is_refused(tmp_path: Path) -> None:
     assert "unpacks to more than" in refused(lambda: read_torch(path), PredictionError)
 
 
-def test_weights_of_a_model_that_are_compressed_are_refused(tmp_path: Path) -> None:
-    pytest.importorskip("torch", reason="the models extra is not installed")
-    from su3d_bench.perception.models.files import read_weights
-
-    path = kept(tmp_path, "a.pt", zip_of([Member("a/data.pkl", deflated(b"\x80\x02", 1500), 1500 * MIB)]))
-    assert "is compressed" in refused(lambda: read_weights(path), DataError)
-
-
 @pytest.mark.parametrize(
     ("first", "n", "byte", "told"),
     [
         (b"\x80\x04\x8e" + struct.pack("<Q", 1500 * MIB), 1500, 0, "unpacks to more than"),  # one payload
-        (b"\x80\x04X" + struct.pack("<I", 100 * MIB) + "\U0001f600".encode(), 102, ord("a"), "unpacks to more than"),
-        (b"\x80\x04", 64, ord("]"), "takes more than 1000000 operations"),
-        (b"\x80\x04", 64, ord("("), "takes more than 1000000 operations"),
-        (b"\x80\x04N", 64, 0x94, "takes more than 1000000 operations"),  # remembered again and again
+        (b"\x80\x04", 64, ord("]"), "takes too many operations"),
+        (b"\x80\x04", 64, ord("("), "takes too many operations"),
+        (b"\x80\x04N", 64, 0x94, "takes too many operations"),  # remembered again and again
     ],
 )
 def test_a_gzipped_pickle_that_swells_is_refused(tmp_path: Path, first: bytes, n: int, byte: int, told: str) -> None:
@@ -164,7 +143,7 @@ def a_map_of_one_cloud(n_objects: int) -> bytes:
     )
     array += b"X\x01\x00\x00\x00CtR"
     one = b"}X\x06\x00\x00\x00pcd_np" + array + b"sq\x01"
-    return b"\x80\x04}X\x07\x00\x00\x00objects(" + one + b"h\x01" * (n_objects - 1) + b"lsq\x02."
+    return b"\x80\x04}X\x07\x00\x00\x00objects](" + one + b"h\x01" * (n_objects - 1) + b"esq\x02."
 
 
 def test_objects_that_share_one_cloud_are_counted_as_often_as_they_stand_there(tmp_path: Path) -> None:
@@ -174,45 +153,6 @@ def test_objects_that_share_one_cloud_are_counted_as_often_as_they_stand_there(t
     path.write_bytes(gzip.compress(a_map_of_one_cloud(2_000), 1))
     said = refused(lambda: READERS["conceptgraphs"].read(path, "pcd_x"), PredictionError)
     assert "unpacks to more than" in said
-
-
-def write_table(path: Path, shape: tuple[int, int], chunks: tuple[int, int]) -> None:
-    import h5py
-
-    with h5py.File(path, "w") as file:
-        table = file.create_dataset(path.stem, shape, "f2", chunks=chunks, compression="gzip", fillvalue=0)
-        packed = zlib.compress(bytes(chunks[0] * chunks[1] * 2), 9)
-        for top in range(0, shape[0], chunks[0]):
-            table.id.write_direct_chunk((top, 0), packed)
-
-
-def test_an_hdf5_table_that_swells_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "pc_points.h5"
-    write_table(path, (100_000_000, 3), (2_000_000, 3))
-    assert path.stat().st_size < LARGEST_BOMB
-    assert "promises 100000000 rows" in refused(lambda: read_rows(path, 3, "here"), DataError)
-
-
-def test_the_chunks_of_a_table_are_found_in_one_pass(tmp_path: Path) -> None:
-    from su3d_bench.formats import hdf5
-
-    class OneByOne:
-        """A table that counts how often it is asked for one chunk's place, which passes over all of them."""
-
-        def __init__(self, table: Any) -> None:
-            self._table, self.n_asked, self.id = table, 0, self
-            self.shape, self.chunks, self.dtype = table.shape, table.chunks, table.dtype
-
-        def __getattr__(self, name: str) -> Any:
-            self.n_asked += name == "get_chunk_info_by_coord"
-            return getattr(self._table.id, name)
-
-    path = tmp_path / "pc_points.h5"
-    write_table(path, (50, 3), (1, 3))
-    with hdf5._open_table(path, "here") as table:
-        watched = OneByOne(table)
-        assert sum(len(block) for block in hdf5._chunked_blocks(watched, "here")) == 50
-    assert watched.n_asked == 0
 
 
 @pytest.mark.parametrize(
@@ -231,10 +171,6 @@ def test_an_image_that_swells_is_refused_before_it_is_decoded(
     made = content()
     assert len(made) < LARGEST_BOMB
     assert "not a readable" in refused(lambda: decode(made, "here"), DataError)
-
-
-def test_a_progressive_image_of_some_scans_is_read() -> None:
-    assert decode_colour(jpeg_of_scans(64, 48, 2), "here").shape == (48, 64, 3)
 
 
 def test_compressed_points_that_swell_are_refused(tmp_path: Path) -> None:
@@ -256,11 +192,6 @@ def test_runs_of_points_have_a_bound_together(n: int, tmp_path: Path) -> None:
     assert "points together" in said
 
 
-def test_a_matrix_of_ones_has_a_bound() -> None:
-    ones = np.broadcast_to(np.ones((), np.bool_), (1 << 20, 1000))
-    assert "points together" in refused(lambda: column_members(ones, "here"), PredictionError)
-
-
 def test_rows_of_text_have_a_bound(tmp_path: Path) -> None:
     text = "a\n" + "\n" * (3 * MIB)
     assert "more than 200000 rows" in refused(lambda: separated_rows(text), csv.Error)
@@ -268,22 +199,6 @@ def test_rows_of_text_have_a_bound(tmp_path: Path) -> None:
     assert "4000000 cells" in refused(lambda: separated_rows(wide), csv.Error)
     path = kept(tmp_path, "queries.csv", text.encode())
     assert "not CSV" in refused(lambda: read_query_file(path), DataError)
-
-
-def test_texts_of_a_prediction_have_a_bound() -> None:
-    from prediction_files import own_instances
-
-    arrays = prediction_arrays(own_instances())
-    arrays["names"] = np.full(2 << 20, "\u4e00")
-    assert "'names' holds 2097152 texts" in refused(lambda: prediction_from_arrays(arrays, "here"), PredictionError)
-
-
-def test_masks_of_an_image_have_a_bound_in_pixels() -> None:
-    from su3d_bench.perception.stored.source import check_masks
-
-    check_masks(400, (968, 1296), "here")
-    for n, shape in ((2001, (4, 4)), (500, (968, 1296))):
-        assert f"has {n} regions" in refused(lambda n=n, shape=shape: check_masks(n, shape, "here"), DataError)  # type: ignore[misc]
 
 
 def test_a_member_is_read_whole_and_with_its_checksum(tmp_path: Path) -> None:

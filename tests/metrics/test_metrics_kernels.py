@@ -9,7 +9,7 @@ import pytest
 
 from su3d_bench.core.types import BoolArray, Float64Array
 from su3d_bench.metrics.instance import precision_recall, resampling
-from su3d_bench.metrics.instance.average_precision import THRESHOLDS, InstanceCounts, combine, combine_each
+from su3d_bench.metrics.instance.average_precision import THRESHOLDS, InstanceCounts, combine
 from su3d_bench.metrics.instance.precision_recall import average_precision, average_precisions, dots
 from su3d_bench.metrics.instance.resampling import MANY_ROWS
 
@@ -86,20 +86,6 @@ def test_every_curve_of_many_has_the_bits_of_the_curve_by_itself(levels: int) ->
     assert found.table[1].tolist() == [0.0] * len(THRESHOLDS)
     assert np.isnan(found.table[2]).all()
     assert 0 < found.ap < 1
-
-
-@pytest.mark.parametrize("at_once", [1, 700, 3000])
-def test_curves_formed_in_portions_are_those_formed_together(at_once: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(precision_recall, "ROWS_AT_ONCE", at_once)
-    counts = many(np.random.default_rng(3), 5000, 50)
-    assert np.array_equal(combine([counts]).table, one_by_one(counts), equal_nan=True)
-
-
-def test_scenes_side_by_side_are_those_alone() -> None:
-    rng = np.random.default_rng(5)
-    scenes = [many(rng, n, 9) for n in (6000, 40, 0, 900)]
-    for each, alone in zip(combine_each(scenes), scenes, strict=True):
-        assert np.array_equal(each.table, one_by_one(alone), equal_nan=True)
 
 
 def test_a_wanted_cell_without_rows_is_zero_and_an_unwanted_one_no_number() -> None:

@@ -8,22 +8,23 @@ import numpy as np
 import pytest
 import scipy.stats
 
-import su3d_bench.numerics.power
-from su3d_bench.numerics.power import (
+import su3d_bench.numerics.statistics
+from su3d_bench.numerics.statistics import (
+    ALPHA,
     LEAST_SCENES,
     MOST_SCENES,
     Variance,
     crossed_interval,
     power_of,
     scenes_needed,
+    sign_flip_test,
     variance_of,
     variance_range,
 )
-from su3d_bench.numerics.statistics import ALPHA, sign_flip_test
 
 
 def test_the_examples_in_the_docstrings_run() -> None:
-    assert doctest.testmod(su3d_bench.numerics.power).failed == 0
+    assert doctest.testmod(su3d_bench.numerics.statistics).failed == 0
 
 
 def drawn(rng: np.random.Generator, n_seeds: int, n_scenes: int, mean: float = 0.0) -> np.ndarray:

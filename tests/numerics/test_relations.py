@@ -24,8 +24,8 @@ from su3d_bench.numerics.relations import (
     is_left_of,
     may_be_between,
 )
-from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
-from su3d_bench.questions.reasoning.solver import Solver
+from su3d_bench.questions.scene_map import MapObject, SceneMap
+from su3d_bench.questions.solver import Solver
 
 FLOOR = box(-5, -5, -0.1, 10, 10, 0.1)
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import doctest
 import math
 from itertools import permutations
 
 import numpy as np
 import pytest
 
-from su3d_bench.numerics import shares as module
-from su3d_bench.numerics.shares import EXACT_STEPS, N_ORDERS, choices, shares
+from su3d_bench.numerics.statistics import EXACT_STEPS, N_ORDERS, choices, shares
 
 
 def drawn_values(n_steps: int, seed: int = 1) -> list[float]:
@@ -62,8 +60,3 @@ def test_drawn_shares_lie_about_those_of_all_orders_as_their_errors_say() -> Non
 
 def test_no_step_has_no_share() -> None:
     assert (shares(0, lambda bits: 1.0), choices(0)) == ([], [0])
-
-
-def test_the_examples_hold() -> None:
-    found = doctest.testmod(module)
-    assert found.attempted and not found.failed

@@ -1,4 +1,4 @@
-"""What a run computes on a torch device, beside the CPU: whole maps, labels and cosines, the embedded encoder."""
+"""What a run computes on a torch device, beside the CPU: labels and cosines, the embedded encoder."""
 
 from __future__ import annotations
 
@@ -6,33 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_opensu3d_pipeline import SCENE, TWINS, contents, look
 from torch_devices import TORCH_ON_CPU, needs_torch, on_each_device
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.system.timing import Timer
 from su3d_bench.metrics.matching.labelling import cosines, most_similar
-from su3d_bench.opensu3d.config import Density, OpenSU3DConfig
-from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
-
-
-@on_each_device
-@pytest.mark.parametrize("density", ["scene", "frame", "all"])
-def test_a_map_fused_on_a_device_is_that_of_the_cpu_byte_for_byte(device: str, density: Density) -> None:
-    config = OpenSU3DConfig(border_px=1, border_reference_width=0, density=density)
-    views = [look(TWINS, index, x) for index, x in enumerate([0.0, 0.5, -0.5, 0.2])]
-    maps = []
-    for where in ("cpu", device):
-        method = OpenSU3D(config)
-        method.receive_device(where)
-        method.start(SCENE)
-        for frame, detections in views:
-            method.update(frame, detections, Timer())
-        maps.append(method.finish())
-        method.close()
-    assert len(maps[0].ids) == 2
-    assert contents(maps[0]) == contents(maps[1])
 
 
 @on_each_device
@@ -48,34 +26,6 @@ def test_a_device_chooses_the_labels_of_the_cpu_where_classes_are_equally_near_t
     assert (chosen[:50] == 3).all() and (chosen[9000:9101] == 0).all()
     one = text[:1]
     np.testing.assert_array_equal(most_similar(features, one, device), np.zeros(len(features)))
-
-
-@needs_torch
-def test_a_block_in_which_every_choice_is_clear_is_not_computed_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(_: object) -> None:
-        raise AssertionError
-
-    text, features = np.eye(4), np.eye(4)[[2, 0, 3]]
-    expected = most_similar(features, text)
-    monkeypatch.setattr(
-        "su3d_bench.metrics.matching.labelling._normalised", lambda rows: rows if len(rows) == 4 else refuse(rows)
-    )
-    assert most_similar(features, text, TORCH_ON_CPU).tolist() == expected.tolist() == [2, 0, 3]
-    with pytest.raises(AssertionError):  # a tie is
-        most_similar(np.ones((3, 4)), text, TORCH_ON_CPU)
-
-
-@needs_torch
-def test_a_choice_as_clear_as_the_gap_is_sure_and_one_less_clear_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    from su3d_bench.metrics.matching import kernels
-
-    directions = kernels.directions_on(TORCH_ON_CPU, np.eye(3))  # cosines of 1 and 0
-    monkeypatch.setattr(kernels, "SURE_GAP", 1.0)
-    chosen = kernels.sure_most_similar(directions, directions)
-    assert chosen is not None
-    assert chosen.tolist() == [0, 1, 2]
-    monkeypatch.setattr(kernels, "SURE_GAP", np.nextafter(1.0, 2.0))
-    assert kernels.sure_most_similar(directions, directions) is None
 
 
 @on_each_device
@@ -100,13 +50,6 @@ def test_the_embedded_encoder_gives_the_features_of_the_cpu_on_a_device(device: 
     np.testing.assert_allclose(there.encode_texts(texts), here.encode_texts(texts), rtol=0, atol=tolerance)
 
 
-def test_features_made_on_a_gpu_have_a_digest_of_their_own_and_the_space_of_the_cpu() -> None:
-    here, there = EmbeddedEncoder(), EmbeddedEncoder(device="cuda:1")
-    assert here.digest != there.digest == EmbeddedEncoder(device="cuda:0").digest
-    assert here.is_same_space(there.digest) and there.is_same_space(here.digest)
-    assert not here.is_same_space("0" * 64)
-
-
 @needs_torch
 def test_a_run_on_a_gpu_that_is_not_here_ends_before_any_work_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -119,31 +62,3 @@ def test_a_run_on_a_gpu_that_is_not_here_ends_before_any_work_in_one_line(
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "device 'cuda': torch sees no GPU here; use --device cpu" in error
     assert not (tmp_path / "run").exists()
-
-
-@needs_torch
-def test_a_run_hands_its_device_to_the_method_and_writes_the_same_bytes(
-    tmp_path: Path, rooms_data: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from su3d_bench.opensu3d.kernels import voxel_map_torch as device_kernels
-
-    monkeypatch.setenv("SU3D_DATA", str(rooms_data))
-    words = ["run", "--scenes", "rooms/living0", "--profile", "oracle", "--limit", "2", "--no-pictures", "--quiet"]
-    words += ["--protocols", "rooms-semantic", "--jobs", "1", "--set", "rooms.width=160", "rooms.height=120"]
-    words += ["rooms.mesh_spacing_m=0.1", "perception.cache=false"]
-    n_made = 0
-
-    class Counted(device_kernels.DeviceVoxelMap):
-        def __init__(self, eps: float, device: str, density: Density) -> None:
-            nonlocal n_made
-            n_made += 1
-            super().__init__(eps, device, density)
-
-    monkeypatch.setattr(device_kernels, "DeviceVoxelMap", Counted)
-    predictions = []
-    for name in ("cpu", TORCH_ON_CPU):
-        monkeypatch.setattr("su3d_bench.runs.scene.device_for", lambda device, index, name=name: name)
-        assert main([*words, "--out", str(tmp_path / name)]) == 0
-        predictions.append(next((tmp_path / name).glob("scenes/*/opensu3d/prediction.npz")).read_bytes())
-        assert (n_made > 0) == (name == TORCH_ON_CPU)
-    assert predictions[0] == predictions[1]

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
-from su3d_bench.core.errors import DataError
 from su3d_bench.core.geometry import back_project, valid_depth
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame
 from su3d_bench.opensu3d.config import OpenSU3DConfig
@@ -38,11 +36,6 @@ def test_back_projection_is_the_equation_pixel_by_pixel_in_row_major_order() -> 
         in_camera = float(depth_m[v, u]) * np.linalg.inv(INTRINSICS) @ np.array([u, v, 1.0])
         expected.append((pose() @ np.append(in_camera, 1.0))[:3])
     np.testing.assert_allclose(back_project(depth_m, INTRINSICS, pose(), pixels), expected, atol=1e-12)
-
-
-def test_intrinsics_without_an_inverse_are_refused() -> None:
-    with pytest.raises(DataError, match="cannot be inverted"):
-        back_project(random_depth(), np.zeros((3, 3)), pose(), np.ones((24, 32), np.bool_))
 
 
 def test_zero_nan_negative_and_out_of_range_depth_is_dropped() -> None:

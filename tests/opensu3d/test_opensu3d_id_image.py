@@ -37,11 +37,6 @@ def test_the_ring_of_a_small_mask_erases_the_large_one_around_it_and_no_other_pi
     assert (image.owner[distance_squared > 0] == 0).all()
 
 
-def test_a_square_ring_reaches_its_width_in_the_corners() -> None:
-    masks = np.stack([rectangle(slice(0, 40), slice(0, 60)), rectangle(slice(20, 21), slice(30, 31))])
-    assert np.count_nonzero(paint(masks, 3, "square").ids == NO_DETECTION) == 7 * 7 - 1
-
-
 def test_two_instances_never_touch() -> None:
     rng = np.random.default_rng(0)
     masks = np.stack([rectangle(slice(r, r + 12), slice(c, c + 15)) for r, c in rng.integers(0, 40, (9, 2))])
@@ -49,20 +44,6 @@ def test_two_instances_never_touch() -> None:
     for shift in [(0, 1), (1, 0), (0, 2), (2, 0), (1, 1), (-1, 1)]:
         other = np.roll(image, shift, (0, 1))
         assert not ((image >= 0) & (other >= 0) & (image != other)).any()
-
-
-def test_rings_change_the_ids_alone_and_are_clipped_at_the_image() -> None:
-    rng = np.random.default_rng(1)
-    masks = np.stack([rectangle(slice(r, r + 12), slice(c, c + 15)) for r, c in rng.integers(0, 40, (9, 2))])
-    with_rings, without = paint(masks, 4, "square"), paint(masks, 0, "square")
-    np.testing.assert_array_equal(with_rings.owner, without.ids)
-    in_ids = with_rings.ids != NO_DETECTION
-    np.testing.assert_array_equal(with_rings.ids[in_ids], with_rings.owner[in_ids])
-
-
-def test_without_masks_no_pixel_has_a_detection() -> None:
-    assert (paint(np.zeros((0, 4, 6), np.bool_), 3, "disc").ids == NO_DETECTION).all()
-    assert (paint(np.zeros((2, 4, 6), np.bool_), 3, "disc").owner == NO_DETECTION).all()
 
 
 @pytest.mark.parametrize(("width", "reference", "expected"), [(1200, 1200, 20), (640, 1200, 11), (640, 0, 20)])

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
-from su3d_bench.core.errors import DataError
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.system.timing import Timer
-from su3d_bench.core.types import Detections, Float32Array, Frame, SceneInfo
-from su3d_bench.opensu3d.config import Density, OpenSU3DConfig
+from su3d_bench.core.types import Detections, Frame, SceneInfo
+from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
-from su3d_bench.runs.feeding import Feeding, ReadAhead
 
 SCENE = SceneInfo("made", "wall", 4, 1, "rendered-rooms")
 WIDTH, HEIGHT, FOCAL = 160, 120, 120.0
@@ -102,13 +97,6 @@ def test_two_objects_of_one_class_are_never_swapped() -> None:
         assert np.argmax(np.asarray(found.features)[k]) == k + 1
 
 
-def test_every_view_of_an_instance_is_traced_to_its_image_and_detection() -> None:
-    views = [look(TWINS, 40 * i, x, hidden=hidden) for i, (x, hidden) in enumerate([(0.0, ()), (0.1, (1,)), (0.2, ())])]
-    found = run(views).finish()
-    rows = [found.views[found.view_indptr[k] : found.view_indptr[k + 1]].tolist() for k in range(2)]
-    assert rows == [[[0, 0], [80, 0]], [[0, 1], [40, 0], [80, 1]]]
-
-
 def test_name_and_score_come_from_the_views() -> None:
     plates = {1: TWINS[1]}
     views = [
@@ -172,11 +160,6 @@ def test_clusters_near_the_largest_split_off_with_the_views_that_hit_them_and_th
     assert len(run([(frame, together)], CONFIG.model_copy(update={"split_fraction": 0.95})).finish()) == 1
 
 
-def test_a_segment_of_fewer_points_than_a_cluster_needs_is_noise() -> None:
-    found = run([look({1: Plate((0.0, 0.05), (0.0, 0.05)), 2: TWINS[1]}, 0)]).finish()
-    assert found.ids.tolist() == [2]
-
-
 def test_finishing_midway_changes_nothing() -> None:
     views = [look(TWINS, i, x) for i, x in enumerate([0.0, 0.3, -0.3])]
     undisturbed = contents(run(views).finish())
@@ -190,78 +173,6 @@ def test_finishing_midway_changes_nothing() -> None:
         assert contents(method.finish()) == midway[-1]
     assert midway[-1] == undisturbed
     assert midway[0] == contents(run(views[:1]).finish())
-
-
-DENSITIES: tuple[Density, ...] = ("scene", "frame", "all")
-OBJECTS = {  # 0.3 m apart, so that a cluster lies on one alone
-    key: Plate((-1.0 + 0.8 * column, -0.55 + 0.8 * column), (-0.8 + 0.7 * row, -0.4 + 0.7 * row))
-    for key, (column, row) in enumerate([(c, r) for c in range(3) for r in range(2)], start=1)
-}
-
-
-def on_object(points: Float32Array) -> set[int]:
-    """The plates of OBJECTS on which ``points`` lie."""
-    return {
-        key
-        for key, plate in OBJECTS.items()
-        if ((points[:, :2] > np.array([plate.x[0], plate.y[0]]) - 0.03)
-            & (points[:, :2] < np.array([plate.x[1], plate.y[1]]) + 0.03)).all(axis=1).any()
-    }  # fmt: skip
-
-
-def random_view(rng: np.random.Generator, index: int) -> tuple[Frame, Detections]:
-    """A look at some plates, cut by others that stand before them, with masks that join several."""
-    before = {9: Plate((-1.3, rng.uniform(-1.2, 0.6)), (-0.9, 0.9), 1.5)} if rng.random() < 0.4 else {}
-    shown = {key: plate for key, plate in OBJECTS.items() if rng.random() < 0.8}
-    frame, single = look({**shown, **before}, index, rng.uniform(-0.3, 0.3), hidden=(9,))
-    part = rng.integers(0, 3, len(single))
-    masks = [single.masks[part == k].any(axis=0) for k in np.unique(part)]
-    rows = np.unique(part, return_index=True)[1]
-    return frame, Detections(
-        index,
-        np.array(masks, np.bool_).reshape(-1, HEIGHT, WIDTH),
-        single.boxes[rows],
-        rng.uniform(0.1, 0.9, len(rows)).astype(np.float32),
-        tuple(single.names[row] for row in rows),
-        ("",) * len(rows),
-        single.crop_ratios,
-        single.crop_features[rows],
-        single.global_feature,
-    )
-
-
-@pytest.mark.parametrize(
-    ("density", "n_sequences"),
-    [("scene", 6), ("frame", 3), ("all", 3), *(pytest.param(rule, 70, marks=pytest.mark.proof) for rule in DENSITIES)],
-)
-def test_no_id_names_two_objects_however_often_a_map_is_asked_for(density: Density, n_sequences: int) -> None:
-    """More than 200 random sequences as proof; a mask joins plates, which clustering parts again, at once or later."""
-    n_split = 0
-    for seed in range(n_sequences):
-        rng = np.random.default_rng(seed)
-        views = [random_view(rng, index) for index in range(5)]
-        config = CONFIG.model_copy(update={"density": density, "dbscan_min_points": int(rng.integers(2, 30))})
-        asked = OpenSU3D(config)
-        asked.start(SCENE)
-        named: dict[int, set[int]] = {}
-        for frame, detections in views:
-            asked.update(frame, detections, Timer())
-            found = asked.finish()
-            assert len(set(found.ids.tolist())) == len(found)
-            n_split += int((found.ids > 1_000_000).sum())
-            for k, own in enumerate(found.ids.tolist()):
-                objects = on_object(found.points[found.mask(k)])
-                assert len(objects) == 1
-                assert named.setdefault(own, objects) == objects, f"sequence {seed}: id {own} names two objects"
-        assert contents(found) == contents(run(views, config).finish())
-    assert n_split > n_sequences
-
-
-def test_an_instance_that_is_not_split_bears_the_id_of_its_segment_and_the_parts_of_others_tell_theirs() -> None:
-    together = random_view(np.random.default_rng(0), 0)
-    assert run([look(TWINS, 0), look(TWINS, 1, 0.3)]).finish().ids.tolist() == [1, 2]
-    found = run([together]).finish()
-    assert {own % 1_000_000 for own in found.ids.tolist()} <= set(range(1, 4))
 
 
 def test_what_a_ring_swallows_and_what_lies_too_far_is_counted_and_said(caplog: pytest.LogCaptureFixture) -> None:
@@ -282,40 +193,6 @@ def test_what_a_ring_swallows_and_what_lies_too_far_is_counted_and_said(caplog: 
     method = run([look(TWINS, 0)])
     method.close()
     assert method.losses == {} and len(caplog.records) == 2
-
-
-def test_a_row_of_an_update_has_what_it_left_out() -> None:
-    frame, detections = look(TWINS, 0)
-    method = OpenSU3D(CONFIG.model_copy(update={"depth_max": 2.5}))
-    method.start(SCENE)
-    perception = SimpleNamespace(detect=lambda frame, needs, timer: detections)
-    feeding = Feeding("made/wall", method, perception, lambda event: None)  # type: ignore[arg-type]
-    with ReadAhead([frame], 1) as frames:
-        feeding.up_to(1, frames, 1)
-    (row,) = csv.DictReader(feeding.updates_text().splitlines())
-    assert (row["n_swallowed"], row["n_too_far"]) == ("0", str(np.count_nonzero(frame.depth_m > 2.5)))
-    assert int(row["n_too_far"]) > 0
-
-
-def test_views_name_the_rows_that_detections_had_before_others_were_left_out() -> None:
-    frame, detections = look(TWINS, 0)
-    later = replace(detections, rows=np.array([4, 9]))
-    found = run([(frame, later), look(TWINS, 1)]).finish()
-    assert found.views.tolist() == [[0, 4], [1, 0], [0, 9], [1, 1]]
-
-
-def test_rings_as_background_with_background_dropped_are_refused_in_one_line() -> None:
-    with pytest.raises(ValidationError, match="set border_pixels to 'drop' or 'owner'"):
-        OpenSU3DConfig(background_pixels="drop")
-    assert OpenSU3DConfig(background_pixels="drop", border_pixels="drop").border_pixels == "drop"
-
-
-def test_start_forgets_the_scene_before() -> None:
-    method = run([look(TWINS, 0), look(TWINS, 1, 0.4)])
-    method.start(SCENE)
-    assert (method.n_points, method.n_instances) == (0, 0)
-    method.update(*look(TWINS, 0), Timer())
-    assert contents(method.finish()) == contents(run([look(TWINS, 0)]).finish())
 
 
 def test_points_of_no_instance_are_in_the_map_and_in_no_mask() -> None:
@@ -345,32 +222,3 @@ def test_a_ring_keeps_out_of_the_matching_and_falls_to_its_owner_to_no_instance_
         assert (owner[is_ring] == (0 if choice == "owner" else -1)).all()
     assert n_points["owner"] == n_points["background"] > 100
     assert n_points["drop"] == 0
-
-
-def test_images_without_detections_or_depth_are_no_error() -> None:
-    frame, _ = look(TWINS, 3)
-    empty = Frame(3, 0.1, frame.rgb, np.zeros_like(frame.depth_m), frame.camera_to_world, frame.intrinsics)
-    method = run([look({}, 0), (empty, look(TWINS, 3)[1]), look(TWINS, 4)])
-    assert method.n_instances == 2
-    assert method.finish().views.tolist() == [[4, 0], [4, 1]]
-
-
-def test_each_update_times_its_four_stages() -> None:
-    timer = Timer()
-    method = run([])
-    method.update(*look(TWINS, 0), timer)
-    assert list(timer.take()) == ["backproject", "match", "track", "insert"]
-    assert run([]).postprocess_ms is None
-    method.finish()
-    assert (method.postprocess_ms or 0) > 0
-
-
-def test_detections_of_another_frame_or_size_or_without_a_crop_ratio_are_refused() -> None:
-    frame, detections = look(TWINS, 0)
-    with pytest.raises(DataError, match="frame 0: the detections are those of frame 7"):
-        run([(frame, look(TWINS, 7)[1])])
-    with pytest.raises(DataError, match="features of crop ratio 2"):
-        run([(frame, detections)], OpenSU3DConfig(scheme="scheme4"))
-    small = Frame(0, 0.0, frame.rgb[::2], frame.depth_m[::2], frame.camera_to_world, frame.intrinsics)
-    with pytest.raises(DataError, match="masks are 160x120 and the image is 160x60"):
-        run([(small, detections)])

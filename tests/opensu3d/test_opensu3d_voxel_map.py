@@ -59,46 +59,6 @@ def test_matching_gives_the_pairs_of_a_kd_tree_on_lattices(
     np.testing.assert_array_equal(map_of(placed, eps).nearest(asked), kd_tree_pairs(placed, asked, eps))
 
 
-@settings(max_examples=150, deadline=None)
-@given(
-    st.lists(st.tuples(*[st.floats(-0.1, 0.1)] * 3), min_size=1, max_size=40),
-    st.lists(st.tuples(*[st.floats(-0.1, 0.1)] * 3), min_size=1, max_size=40),
-)
-def test_matching_gives_the_pairs_of_a_kd_tree_on_any_floats(
-    points: list[tuple[float, ...]], queries: list[tuple[float, ...]]
-) -> None:
-    placed, asked = np.array(points, np.float64), np.array(queries, np.float64)
-    np.testing.assert_array_equal(map_of(placed).nearest(asked), kd_tree_pairs(placed, asked))
-
-
-def test_a_point_at_exactly_eps_does_not_match() -> None:
-    filled = map_of(np.array([[0.25, 0.0, 0.0]]), eps=0.25)
-    assert filled.nearest(np.zeros((1, 3))).tolist() == [-1]
-    assert filled.nearest(np.array([[np.nextafter(0.0, 1.0), 0.0, 0.0]])).tolist() == [-1]  # rounds to eps
-    assert filled.nearest(np.array([[1e-9, 0.0, 0.0]])).tolist() == [0]
-
-
-def test_of_equally_near_points_the_lowest_index_matches() -> None:
-    points = np.array([[0.015, 0, 0], [-0.01, 0, 0], [0, 0.01, 0], [-0.01, 0, 0]])
-    assert map_of(points).nearest(np.zeros((1, 3))).tolist() == [1]
-
-
-def test_an_empty_map_matches_nothing() -> None:
-    assert VoxelMap(EPS).nearest(np.zeros((4, 3))).tolist() == [-1] * 4
-    assert VoxelMap(EPS).nearest(np.zeros((0, 3))).shape == (0,)
-
-
-def test_matching_is_the_same_after_the_map_has_grown_many_times() -> None:
-    rng = np.random.default_rng(5)
-    points = rng.uniform(-4, 4, (40_000, 3))
-    grown = VoxelMap(0.1, "all")
-    for part in np.array_split(points, 17):
-        grown.insert(part, np.ones(len(part), np.int32))
-    queries = rng.uniform(-4, 4, (3000, 3))
-    np.testing.assert_array_equal(grown.points, points)
-    np.testing.assert_array_equal(grown.nearest(queries), map_of(points, 0.1).nearest(queries))
-
-
 @pytest.mark.parametrize("n_threads", [2, 3, 64])
 def test_matching_is_the_same_on_any_number_of_threads(n_threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(6)
@@ -175,20 +135,6 @@ def test_the_map_is_the_list_of_points_from_which_those_that_go_are_deleted(
     assert found == expected
 
 
-@pytest.mark.parametrize("density", ["scene", "frame", "all"])
-def test_an_insert_writes_into_no_point_but_those_that_it_places(density: Density) -> None:
-    rng = np.random.default_rng(4)
-    filled = VoxelMap(EPS, density)
-    filled.insert(rng.uniform(0, 2, (60_000, 3)) * [1, 1, 0.1], rng.integers(0, 9, 60_000).astype(np.int32))
-    points, ids = filled.points.copy(), filled.ids.copy()
-    new_points, new_ids = rng.uniform(0, 0.3, (900, 3)) * [1, 1, 0.1], rng.integers(0, 9, 900).astype(np.int32)
-    placed = filled.insert(new_points, new_ids)
-    untouched = np.setdiff1d(np.arange(len(ids)), placed)
-    np.testing.assert_array_equal(filled.points[untouched], points[untouched])
-    np.testing.assert_array_equal(filled.ids[untouched], ids[untouched])
-    assert (len(untouched) < len(ids)) == (density == "scene")
-
-
 def test_of_equally_near_points_the_one_that_came_first_matches_wherever_it_is_kept() -> None:
     filled = VoxelMap(EPS)
     filled.insert(np.array([[0.012, 0, 0], [-0.01, 0, 0]]), np.array([1, 2], np.int32))
@@ -232,12 +178,6 @@ def test_matching_and_counting_visit_as_much_in_a_small_map_as_in_a_large_one() 
         visits.append((voxels, blocks))
     assert visits[0][0] == visits[1][0] <= 27.1 * len(queries)
     assert max(visits[0][1], visits[1][1]) <= 13 * 13 * 1
-
-
-def test_the_bytes_of_a_map_are_those_of_its_arrays() -> None:
-    filled = map_of(np.random.default_rng(0).uniform(0, 9, (20_000, 3)))
-    assert filled.n_bytes > 20_000 * (3 * 8 + 4 + 8 + 4)  # a point, its id, its age and the next one of its voxel
-    assert filled.n_bytes > VoxelMap(EPS).n_bytes
 
 
 def test_a_point_that_is_not_finite_or_far_out_is_refused() -> None:

@@ -19,7 +19,7 @@ from su3d_bench.perception.language.captioner import DESCRIBE
 from su3d_bench.store.predictions import read_prediction
 
 pytestmark = needs_models
-TOTAL_S = 3.0  # after it a hung connection is given up; long enough for good answers on a busy machine
+TIMEOUT_S = 1.5  # after it a hung connection is given up; long enough for good answers on a busy machine
 N_TRIES = 2
 
 
@@ -47,7 +47,7 @@ class FailingModel:
             "good": Answered(f"`thing {number}':`A thing with the number {number}.'"),
             "refusal": Answered("I'm sorry, I can't help with that."),
             "malformed": Answered(raw=b'{"choices": [{"message": '),
-            "429": error(429, "slow down", Retry_After="0"),
+            "429": error(429, "slow down"),
             "500": error(500, "out of order"),
             "hung": Answered(wait_s=60.0),
         }
@@ -69,7 +69,7 @@ class Finished:
 
     def run(self, folder: str, *words: str) -> int:
         settings = ["perception.paper.captions=model", f"perception.language.base_url={self.server.url}"]
-        settings += [f"perception.language.total_timeout_s={TOTAL_S}", "perception.language.backoff_s=0.01"]
+        settings += [f"perception.language.timeout_s={TIMEOUT_S}"]
         settings += [f"perception.language.max_retries={N_TRIES - 1}", "perception.language.max_failures_in_a_row=50"]
         settings += ["perception.language.max_concurrent=8", "perception.language.key_variable=SU3D_TEST_KEY"]
         return main(paper_words(self._models, self.root / folder, "rooms/living0", settings, *words))
@@ -108,7 +108,7 @@ def test_captions_of_the_model_are_in_the_map_and_the_taggers_where_it_gave_none
 
 def test_fallbacks_and_their_reasons_are_in_the_log_and_in_the_record(made: Finished) -> None:
     log, record = made.file("log.txt").read_text(), (made.root / "first" / "run.json").read_text()
-    for reason in ("the model refused", "is no chat completion", "status 500: out of order", "no whole answer within"):
+    for reason in ("the model refused", "is no chat completion", "status 500: out of order", "no answer within"):
         assert reason in log, reason
         assert reason in record, reason
 
@@ -116,7 +116,8 @@ def test_fallbacks_and_their_reasons_are_in_the_log_and_in_the_record(made: Fini
 def test_every_picture_is_asked_about_once_and_again_only_where_no_answer_came(made: Finished) -> None:
     assert made.model.n_sent("good") == made.model.n_sent("refusal") == {1}
     assert made.model.n_sent("429") == {2}
-    for kind in ("malformed", "500", "hung"):
+    assert made.model.n_sent("malformed") == {1}
+    for kind in ("500", "hung"):
         assert made.model.n_sent(kind) == {N_TRIES}
 
 

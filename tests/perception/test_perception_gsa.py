@@ -9,16 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from damage import damages, outcomes
 from perception_fakes import CountingEncoder, still_life
 from PIL import Image
 
-from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError
+from su3d_bench.core.errors import ConfigError, DataError, PredictionError
 from su3d_bench.core.system.timing import Timer
-from su3d_bench.core.types import Float32Array, Frame, PerceptionNeeds, SceneInfo
+from su3d_bench.core.types import Float32Array, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.crops import crop_window
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
-from su3d_bench.perception.stored.gsa_files import GsaFiles
+from su3d_bench.perception.stored_masks import GsaFiles
 
 SCENE = SceneInfo("replica", "room0", n_frames=1, stride=1, image_domain="camera")
 PATTERN = "{scene}/gsa_detections_none/frame{index}.pkl.gz"
@@ -80,12 +79,6 @@ def test_a_mask_of_one_pixels_width_stays_and_a_box_turned_round_goes(tmp_path: 
     assert (crop_window(found.regions.boxes[0], 1.0, 160, 120) == [33, 10, 34, 69]).all(), "and can be cut out"
 
 
-def test_a_box_beyond_the_image_is_bounded(tmp_path: Path) -> None:
-    write(tmp_path, detections(xyxy=np.array([[-1e300, -50, 60, 80], [90, 50, 1e300, 90], [1, 1, 5, 5]])))
-    found = GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)
-    np.testing.assert_array_equal(found.regions.boxes, [[-160, -50, 60, 80], [90, 50, 320, 90]])
-
-
 def test_a_frame_without_detections_has_no_regions(tmp_path: Path) -> None:
     empty = {key: np.zeros(0) for key in ("xyxy", "confidence", "class_id", "mask")}
     write(tmp_path, detections(**empty, image_crops=[], image_feats=[], text_feats=[]))
@@ -96,19 +89,6 @@ def test_a_frame_without_detections_has_no_regions(tmp_path: Path) -> None:
 def perception(folder: Path, encoder: CountingEncoder) -> Perception:
     config = PerceptionConfig.model_validate({"stored": {"folder": folder, "detections": PATTERN}})
     return build_perception("stored", config, scene=SCENE, cache_root=folder / "c", mesh=None, encoder=encoder)
-
-
-def test_every_method_can_be_fed_from_them(tmp_path: Path) -> None:
-    write(tmp_path, detections())
-    fed = perception(tmp_path, CountingEncoder())
-    found = fed.detect(FRAME, PerceptionNeeds(crop_ratios=(0.8, 1.0), name_features=True), Timer())
-    assert found.names == ("item", "coffee table")
-    assert found.captions == ("an item in a scene", "a coffee table in a scene")
-    assert found.crop_features.shape[:2] == (2, 2) and found.name_features is not None
-    assert found.score_scale == "published"
-    mask, share = fed.regions().mask_at(FRAME, np.array([[25, 45], [30, 60]]))
-    np.testing.assert_array_equal(mask, masks()[0])
-    assert share == 1
 
 
 def test_their_features_count_where_the_run_has_the_encoder_and_the_crops_that_made_them(tmp_path: Path) -> None:
@@ -128,27 +108,14 @@ def test_their_features_count_where_the_run_has_the_encoder_and_the_crops_that_m
     assert unpadded.crop_features[:, 0].argmax(axis=1).tolist() == [7, 7]
 
 
-def test_the_digest_moves_with_the_files(tmp_path: Path) -> None:
-    write(tmp_path, detections())
-    before = perception(tmp_path, CountingEncoder()).digest
-    write(tmp_path, detections(confidence=np.array([0.96, 1, 0.9])))
-    assert perception(tmp_path, CountingEncoder()).digest != before
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"mask": masks()[:, :-1]}, r"masks are \(3, 119, 160\), the frame has height 120 and width 160"),
-        ({"mask": masks()[:2]}, r"and 3 detections"),
         ({"class_id": np.array([0, 2, 0])}, "class number 2; 'classes' has 2 names"),
-        ({"class_id": np.array([0, -1, 0])}, "class number -1"),
-        ({"class_id": np.array([0.0, 1.0, 0.0])}, "3 class numbers of type float64"),
-        ({"classes": ["item", ""]}, "a class has an empty name"),
         ({"classes": "item"}, "'classes' is no list of names"),
         ({"xyxy": np.zeros((2, 4))}, r"xyxy is \(2, 4\)"),
-        ({"xyxy": np.full((3, 4), np.nan)}, "boxes of finite numbers"),
         ({"confidence": np.array([np.nan, 1, 1])}, "a confidence is not finite"),
-        ({"confidence": None}, "'confidence' is no array of numbers"),
         ({"confidence": np.ones(2001)}, "has 2001 regions"),
         ({"image_feats": np.ones((3, 8))}, r"image_feats are \(3, 8\); expected 3 rows of length 1"),
     ],
@@ -170,26 +137,6 @@ def test_a_frame_without_a_file_and_a_folder_without_files_are_named(tmp_path: P
         GsaFiles(tmp_path, "../frame{index}.pkl.gz", SCENE)
 
 
-def test_damaged_files_are_read_or_refused_in_one_line(tmp_path: Path) -> None:
-    small = Frame(40, 0.0, FRAME.rgb[:6, :8], FRAME.depth_m[:6, :8], FRAME.camera_to_world, FRAME.intrinsics)
-    content = detections(mask=np.ones((3, 6, 8), bool), image_crops=[], xyxy=np.tile([0.0, 0, 8, 6], (3, 1)))
-    path = write(tmp_path, content)
-    files = GsaFiles(tmp_path, PATTERN, SCENE)
-    plain, packed = pickle.dumps(content, 4), path.read_bytes()
-
-    def read(damaged: bytes) -> object:
-        path.write_bytes(damaged)
-        return files.frame(small)
-
-    def read_inner(damaged: bytes) -> object:
-        return read(gzip.compress(damaged, 1))
-
-    for one, copies in ((read_inner, damages(plain, 400)), (read, damages(packed, 100))):
-        n_read, n_refused = outcomes(one, copies, must_name="frame000040.pkl.gz", refusal=Su3dError)
-        assert n_read + n_refused > 0 and n_refused > 10
-    assert outcomes(read_inner, iter([plain]), must_name="") == (1, 0)
-
-
 class Calling:
     def __reduce__(self) -> Any:
         return (exec, ("raise AssertionError('code of a file was run')",))
@@ -202,13 +149,3 @@ def test_a_file_that_asks_for_code_is_refused(tmp_path: Path) -> None:
     write(tmp_path, [1, 2])
     with pytest.raises(DataError, match="holds a list"):
         GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)
-
-
-def test_a_file_cut_short_is_one_line(tmp_path: Path) -> None:
-    small = detections(image_crops=[])
-    path = write(tmp_path, small)
-    content = path.read_bytes()
-    for cut in (0, 1, 10, len(content) // 2, len(content) - 1):
-        path.write_bytes(content[:cut])
-        with pytest.raises((DataError, PredictionError)):
-            GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)

@@ -1,4 +1,4 @@
-"""Which profile a name stands for, what it says of itself, names and captions."""
+"""Which profile a name stands for, names and captions, what is background, and crops around detections."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from perception_fakes import CountingEncoder, still_life
-from pydantic import ValidationError
 
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import ImageDomain, PerceptionNeeds, SceneInfo
-from su3d_bench.perception.detections import regions_to_keep
+from su3d_bench.opensu3d.config import OpenSU3DConfig
+from su3d_bench.perception.crops import crop_images, crop_window, mask_boxes
+from su3d_bench.perception.detections import is_background, regions_to_keep
 from su3d_bench.perception.embedded.naming import (
     Namer,
     NamingConfig,
     colour_word,
-    scene_caption,
     vocabulary,
 )
 from su3d_bench.perception.profiles import PerceptionConfig, build_perception, resolve_profile
@@ -66,11 +66,6 @@ def test_the_digest_moves_with_parameters_and_not_with_the_cache(tmp_path: Path)
     assert digest() == digest(oracle={"noise": {"erode_px": 3}})
 
 
-def test_unknown_parameters_are_refused() -> None:
-    with pytest.raises(ValidationError, match="min_regoin_px"):
-        PerceptionConfig.model_validate({"segmenter": {"min_regoin_px": 4}})
-
-
 def test_embedded_detections_are_named_captioned_and_scored(tmp_path: Path) -> None:
     built = build_perception(
         "embedded",
@@ -100,14 +95,6 @@ def test_regions_of_background_names_and_of_too_large_boxes_are_left_out() -> No
     assert regions_to_keep(["brick wall", "cup", "cup"], boxes, (50, 100), by_head).tolist() == [2]
 
 
-def test_captions_name_the_colour_where_it_is_known() -> None:
-    assert scene_caption("chair", "green") == "a green chair in a scene"
-    assert scene_caption("chair", "orange") == "an orange chair in a scene"
-    assert scene_caption("blinds", "white") == "white blinds in a scene"
-    assert scene_caption("indoor-plant") == "an indoor-plant in a scene"
-    assert scene_caption("") == "an object in a scene"
-
-
 def test_colour_words_are_those_of_the_pixels_under_the_mask() -> None:
     frame = still_life()
     assert colour_word(frame.rgb, frame.depth_m == 2.0) == "red"
@@ -127,6 +114,89 @@ def test_a_feature_is_named_after_the_nearest_text_with_its_softmax_share() -> N
     assert namer.name(texts[:0]).names == ()
 
 
-def test_the_vocabulary_holds_each_name_once_and_the_structure_of_rooms() -> None:
-    words = vocabulary()
-    assert len(set(words)) == len(words) >= 50 and {"wall", "floor", "ceiling", "chair"} <= set(words)
+NAMES = OpenSU3DConfig().background_names
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        # RAM's tags
+        "wall", "city wall", "glass wall", "tile wall", "wood wall", "floor", "dance floor", "forest floor",
+        "glass floor",
+        "hardwood floor", "kitchen floor", "wood floor", "tile flooring", "ceiling", "roof", "tile roof",
+        "training ground",
+        # and what else is said
+        "walls", "brick wall", "the floor", "false ceiling", "flooring", "White Wall", "the brick walls", "floors",
+        "a wall", "ground", "roofing", "laminate flooring", "dropped ceiling", "wall of bricks", "ceiling with beams",
+        "part of a wall", "wall section", "Floor surface", "wall and floor", "floor, wall", "wall (white)", "wall 2",
+        "floor near the door",
+    ],
+)  # fmt: skip
+def test_names_of_walls_floors_and_ceilings_are_background(name: str) -> None:
+    assert is_background(name, NAMES)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        # RAM's tags
+        "wall clock", "wall lamp", "wallpaper", "floor fan", "floor mat", "floor plan", "floor window", "ceiling fan",
+        "roof garden", "ground squirrel", "playground", "fairground", "seawall", "brickwork",
+        # and what else is said
+        "floor lamp", "wall-cabinet", "wall plug", "wall art", "ceiling light", "picture on wall",
+        "painting on the wall",
+        "rug on the floor", "floor to ceiling window", "floor-to-ceiling curtains", "wall-to-wall carpet",
+        "wall mounted tv",
+        "floor and rug", "coffee grounds", "video wall", "wallet", "background", "corner of the room",
+        "wall hanging", "",
+    ],
+)  # fmt: skip
+def test_what_hangs_or_stands_there_stays(name: str) -> None:
+    assert not is_background(name, NAMES)
+
+
+def test_a_name_of_several_words_is_matched_as_a_whole() -> None:
+    assert is_background("white base cabinets", ("base-cabinet",))
+    assert not is_background("cabinet", ("base-cabinet",))
+    assert not is_background("wall", ("",))
+
+
+@pytest.mark.parametrize(
+    ("box", "ratio", "expected"),
+    [
+        ((10, 20, 30, 40), 1.0, (10, 20, 30, 40)),
+        ((10, 20, 30, 40), 0.8, (12, 22, 28, 38)),
+        ((10, 20, 30, 40), 1.2, (8, 18, 32, 42)),
+        ((10, 20, 31, 41), 2.0, (0, 10, 42, 50)),  # -0.5 clips, 41.5 rounds up, 51.5 clips
+        ((10, 20, 13, 24), 0.5, (11, 21, 12, 23)),  # 10.75..12.25 rounds to 11..12
+        ((10, 20, 11, 21), 0.1, (10, 20, 11, 21)),  # 10.45..10.55 rounds to 10..11
+        ((10, 20, 12, 22), 0.1, (11, 21, 12, 22)),  # 10.9..11.1 would be empty: one pixel
+        ((98, 48, 100, 50), 0.1, (99, 49, 100, 50)),  # an empty window at the far border stays inside
+        ((0, 0, 100, 50), 4.0, (0, 0, 100, 50)),
+    ],
+)
+def test_a_crop_is_the_box_scaled_about_its_centre_clipped_and_rounded(
+    box: tuple[float, ...], ratio: float, expected: tuple[int, ...]
+) -> None:
+    assert tuple(crop_window(box, ratio, width=100, height=50)) == expected
+
+
+def test_a_whole_pixel_box_at_ratio_one_is_returned_as_it_is() -> None:
+    generator = np.random.default_rng(0)
+    for _ in range(200):
+        x0, x1 = np.sort(generator.choice(641, 2, replace=False))
+        y0, y1 = np.sort(generator.choice(481, 2, replace=False))
+        assert tuple(crop_window((x0, y0, x1, y1), 1.0, 640, 480)) == (x0, y0, x1, y1)
+
+
+def test_a_crop_holds_the_pixels_of_its_window() -> None:
+    rgb = np.arange(6 * 8 * 3, dtype=np.uint8).reshape(6, 8, 3)
+    (crop,) = crop_images(rgb, np.array([[2, 1, 6, 5]], np.float32), 0.5)
+    assert np.array_equal(crop, rgb[2:4, 3:5])
+
+
+def test_mask_boxes_are_tight_with_exclusive_ends() -> None:
+    masks = np.zeros((2, 6, 8), bool)
+    masks[0, 1:3, 4:7] = True
+    assert mask_boxes(masks).tolist() == [[4, 1, 7, 3], [0, 0, 0, 0]]
+    assert mask_boxes(masks[:0]).shape == (0, 4)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,16 +9,14 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from damage import N_DAMAGES, damages, outcomes, truncations
 from perception_fakes import CountingEncoder, still_life
 
-from su3d_bench.core.config import Setting, Settings, resolve
 from su3d_bench.core.errors import ConfigError, DataError
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import PerceptionNeeds, SceneInfo
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
-from su3d_bench.perception.stored.label_images import LabelImages, read_names
-from su3d_bench.perception.stored.source import StoredConfig
+from su3d_bench.perception.stored import StoredConfig
+from su3d_bench.perception.stored_masks import LabelImages, read_names
 
 SCENE = SceneInfo("rgbd", "desk", n_frames=1, stride=1, image_domain="camera")
 PATTERN = "frame-{index}.segm.png"
@@ -59,23 +56,11 @@ def test_each_value_above_zero_is_one_region_by_ascending_value(tmp_path: Path, 
     np.testing.assert_array_equal(found.boxes, [[90, 50, 120, 90], [20, 40, 60, 80]])
 
 
-def test_values_of_sixteen_bits_are_told_apart(tmp_path: Path) -> None:
-    image = labels(np.uint16)
-    image[labels() == 48] = 132 + 256
-    write_image(tmp_path, image)
-    assert images(tmp_path).regions(still_life(40)).values == (132, 388)
-
-
 def test_an_image_of_zeros_has_no_region(tmp_path: Path) -> None:
     write_image(tmp_path, np.zeros((120, 160), np.uint8))
     found = images(tmp_path).regions(still_life(40))
     assert found.values == () and found.masks.shape == (0, 120, 160) and found.boxes.shape == (0, 4)
     assert len(perception(tmp_path, tmp_path).detect(still_life(40), PerceptionNeeds(), Timer())) == 0
-
-
-def test_a_pattern_names_dataset_and_scene(tmp_path: Path) -> None:
-    write_image(tmp_path / "rgbd.desk")
-    assert images(tmp_path, "{dataset}.{scene}/" + PATTERN).regions(still_life(40)).values == (48, 132)
 
 
 @pytest.mark.parametrize(("file", "text"), [("names.toml", '132 = "box"\n'), ("names.json", '{"132": "box"}')])
@@ -90,25 +75,6 @@ def test_named_values_keep_their_name_and_score_and_the_encoder_names_the_others
     assert found.names == (guessed.names[0], "box") and found.captions[1] == "a red box in a scene"
     assert found.scores[0] == guessed.scores[0] < 1.0 == found.scores[1]
     assert found.crop_features.shape == (2, 2, 8)
-
-
-def test_background_names_are_left_out_as_everywhere(tmp_path: Path) -> None:
-    write_image(tmp_path)
-    (tmp_path / "names.toml").write_text('48 = "Wall"\n132 = "box"\n')
-    needs = PerceptionNeeds(background_names=("wall",))
-    assert perception(tmp_path, tmp_path, "names.toml").detect(still_life(40), needs, Timer()).names == ("box",)
-
-
-def test_the_digest_moves_with_images_and_names(tmp_path: Path) -> None:
-    write_image(tmp_path)
-    (tmp_path / "names.toml").write_text('48 = "book"\n')
-    digests = [perception(tmp_path, tmp_path).digest, perception(tmp_path, tmp_path, "names.toml").digest]
-    (tmp_path / "names.toml").write_text('48 = "cup"\n')
-    digests.append(perception(tmp_path, tmp_path, "names.toml").digest)
-    write_image(tmp_path, labels() // 2)
-    digests.append(perception(tmp_path, tmp_path).digest)
-    assert len(set(digests)) == 4
-    assert perception(tmp_path, tmp_path).digest == digests[-1]
 
 
 @pytest.mark.parametrize(
@@ -146,14 +112,11 @@ def test_missing_and_doubled_images_are_said(tmp_path: Path) -> None:
     ("pattern", "names", "message"),
     [
         ("frame.png", None, r"perception\.stored\.images = 'frame\.png': expected one {index} in the file's name"),
-        ("{index}/{index}.png", None, "expected one {index} in the file's name"),
-        ("frame{number}{index}.png", None, r"no other braces but {dataset} and {scene}"),
         (
             "../{index}.png",
             None,
             r"rgbd/desk: perception\.stored\.images: '\.\.' leads out of .*; name files inside it",
         ),
-        ("/etc/{index}.png", None, "'/etc' leads out of"),
         (PATTERN, "none.toml", r"none\.toml cannot be read: No such file"),
     ],
 )
@@ -178,12 +141,8 @@ def test_an_image_that_links_out_of_the_folder_is_refused(tmp_path: Path) -> Non
     [
         ("names.toml", "48", "not a TOML or JSON table of names by value"),
         ("names.json", "[" * 100_000, "not a TOML or JSON table of names by value"),
-        ("names.json", "[]", "not a table; expected names by value"),
         ("names.toml", 'book = "48"', "'book' is no value of a label image; expected 1 to 65535"),
-        ("names.toml", '0 = "book"', "'0' is no value of a label image"),
         ("names.toml", '70000 = "book"', "'70000' is no value of a label image"),
-        ("names.toml", "48 = 1", "the name of 48 is '1'; expected a short text"),
-        ("names.toml", '48 = " "', "the name of 48 is ' '; expected a short text"),
         ("names.json", '{"48": "a\\nb"}', "the name of 48 is"),
     ],
 )
@@ -193,40 +152,3 @@ def test_what_is_wrong_with_the_names_is_said(tmp_path: Path, file: str, text: s
         read_names(tmp_path / file, "rgbd/desk")
     assert str(caught.value).startswith(f"rgbd/desk: {file}") and message in str(caught.value)
     assert "\n" not in str(caught.value)
-
-
-def test_names_without_images_are_an_error_of_the_configuration() -> None:
-    settings = Settings((Setting(("perception", "stored", "names"), "a.toml", "--set perception.stored.names"),))
-    with pytest.raises(ConfigError, match=r"names are given to the values of label images; set stored\.images too"):
-        resolve(settings, ("perception",), PerceptionConfig)
-
-
-def test_every_damaged_label_image_is_read_or_refused_with_one_line(tmp_path: Path) -> None:
-    path = write_image(tmp_path)
-    content = path.read_bytes()
-    source = images(tmp_path)
-
-    def read(damaged: bytes) -> None:
-        path.write_bytes(damaged)
-        source.regions(still_life(40))
-
-    n_read, n_refused = outcomes(read, truncations(content), must_name="frame-0040.segm.png")
-    assert n_read == 0 and n_refused == len(content)
-    n_read, n_refused = outcomes(read, damages(content), must_name="frame-0040.segm.png")
-    assert n_refused > 0.95 * N_DAMAGES
-
-
-@pytest.mark.parametrize("file", ["names.toml", "names.json"])
-def test_every_damaged_table_of_names_is_read_or_refused_with_one_line(tmp_path: Path, file: str) -> None:
-    table = {"48": "book", "132": "box of things"}
-    path = tmp_path / file
-    lines = "".join(f'{key} = "{name}"\n' for key, name in table.items())
-    content = (json.dumps(table) if file.endswith("json") else lines).encode()
-
-    def read(damaged: bytes) -> None:
-        path.write_bytes(damaged)
-        read_names(path, "rgbd/desk")
-
-    for copies in (truncations(content), damages(content)):
-        _, n_refused = outcomes(read, copies, must_name=file)
-        assert n_refused > 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -227,19 +226,6 @@ def test_positions_in_the_list_of_classes_become_class_ids() -> None:
     assert labelled.class_ids.tolist() == [RULES.scored[0].id, RULES.scored[2].id, 0]
 
 
-def test_masks_without_points_or_class_are_left_out_and_told(tmp_path: Path) -> None:
-    made = vertex_masks(
-        "x", [np.array(one, np.int32) for one in ([], [1], [2])], 4, class_numbers=np.array([3, 0, 5], np.int32)
-    )
-    remarks = write_scannet(masks_as_they_are(made), "a", tmp_path)
-    assert remarks == (
-        "1 of 3 masks have no point of the ground truth and were left out",
-        "1 of 3 masks have none of the classes and were left out",
-    )
-    assert (tmp_path / "a.txt").read_text() == "pred_mask/a_002.txt 5 1.0\n"
-    assert [file.name for file in (tmp_path / "pred_mask").iterdir()] == ["a_002.txt"]
-
-
 def test_what_scannets_list_cannot_hold_is_refused() -> None:
     dense = DenseFeatures(np.zeros((1, 3), np.float32), np.ones((1, 2), np.float16))
     for content in (dense, VertexLabels(np.zeros(3, np.int32))):
@@ -275,34 +261,3 @@ def test_a_folder_is_filled_whole_or_not_at_all(tmp_path: Path) -> None:
     with whole_folder(tmp_path / "empty") as folder:
         (folder / "y").write_text("2")
     assert (tmp_path / "empty/y").read_text() == "2"
-
-
-def test_all_files_of_an_export_are_on_the_disk_before_it_has_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    done: list[tuple[str, str]] = []
-    replace, sync = os.replace, os.fsync
-
-    def noting_sync(handle: int) -> None:
-        done.append(("sync", Path(os.readlink(f"/proc/self/fd/{handle}")).name))
-        sync(handle)
-
-    def noting_replace(source: Path, target: Path) -> None:
-        done.append(("rename", Path(target).name))
-        replace(source, target)
-
-    with whole_folder(tmp_path / "out") as folder:
-        write_openlex(a_map([[0, 1], [2]]), folder / "s")
-        monkeypatch.setattr(os, "fsync", noting_sync)
-        monkeypatch.setattr(os, "replace", noting_replace)
-    at = done.index(("rename", "out"))
-    assert {("sync", name) for name in ("point_cloud.pcd", "index.npy", "embeddings.npy", "s")} <= set(done[:at])
-
-
-def test_a_disk_that_refuses_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(StoreError, match="cannot write"), whole_folder(tmp_path / "file/out"):
-        pass
-    with pytest.raises(StoreError, match=r"cannot write .*: No space left"), whole_folder(tmp_path / "out"):
-        raise OSError(28, "No space left on device")
-    assert [file.name for file in tmp_path.iterdir()] == ["file"]

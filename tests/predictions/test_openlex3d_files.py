@@ -9,18 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from damage import N_DAMAGES, damages, outcomes, truncations
 from open_scene import ENCODER, OBJECTS, PROMPTS, instances_with
 from test_openlex3d_original import write_visible
 
-from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.openlex3d.labels import OpenLexFiles, read_categories, read_prompts, read_queries
 from su3d_bench.datasets.openlex3d.points import LabelledPoints, face_corners_of
 from su3d_bench.datasets.openlex3d.release import categories_truth, queries_truth
 from su3d_bench.datasets.replica.mesh_truth import AnnotatedMesh
 from su3d_bench.formats.ply import ListColumn
-from su3d_bench.formats.text_files import MAX_TEXT_BYTES
-from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels
 from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
@@ -66,20 +63,6 @@ def test_the_three_files_of_a_scene_are_read(tmp_path: Path) -> None:
     assert files.prompts() == PROMPTS
     assert files.objects() == OBJECTS
     assert files.queries("all") == (TextQuery("chair", (7,)), TextQuery("pot", (31, 12)), TextQuery("chair", (7,)))
-
-
-@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
-def test_prompts_are_lines_however_they_end(tmp_path: Path, end: str) -> None:
-    path = tmp_path / "prompts.txt"
-    path.write_bytes(end.join(["a b", "", "c"]).encode())
-    assert read_prompts(path, WHERE) == ("a b", "", "c")
-
-
-def test_an_object_may_have_no_clutter(tmp_path: Path) -> None:
-    path = tmp_path / "categories.json"
-    sample = {"object_id": 3, "labels": {"image_attributes": {"synonyms": ["a"], "depictions": [], "vis_sim": []}}}
-    path.write_text(json.dumps({"dataset": {"samples": [sample]}}))
-    assert read_categories(path, WHERE) == {3: ObjectLabels(("a",))}
 
 
 # ---- from files to a score
@@ -177,58 +160,8 @@ def test_a_file_that_cannot_be_used_is_told_in_one_line(
     assert len(told) < 500 and told.isprintable()
 
 
-def test_an_object_that_stands_twice_with_other_labels_is_told(tmp_path: Path) -> None:
-    first, second = (json.loads(edited(synonyms=[word]))["dataset"]["samples"][0] for word in "ab")
-    told = refusal(tmp_path, read_categories, json.dumps({"dataset": {"samples": [first, second]}}))
-    assert "sample 1: object 7 stands there twice with other labels; keep one of them" in told
-
-
-def test_files_that_are_missing_or_too_large_are_told(tmp_path: Path) -> None:
-    with pytest.raises(GroundTruthMissing, match=r"replica/room0: gt_categories\.json: is not there; expected"):
-        OpenLexFiles(tmp_path, "replica", "room0").objects()
-    files = written(tmp_path)
-    with pytest.raises(GroundTruthMissing, match=r"replica/room0: gt_visible_cloud\.pcd: is not there; expected"):
-        files.visible_points()
-    write_visible(tmp_path / "replica/room0", np.array([[0, 0, 0], [np.nan, 0, 0]]))
-    with pytest.raises(DataError, match=r"replica/room0: gt_visible_cloud\.pcd: point 1 is at \[nan, 0.0, 0.0\]"):
-        files.visible_points()
-    large = tmp_path / "large"
-    with large.open("wb") as file:
-        file.truncate(MAX_TEXT_BYTES + 1)
-    with pytest.raises(DataError, match="has more than 64 MiB"):
-        read_prompts(large, WHERE)
-    (tmp_path / "latin").write_bytes(b"caf\xe9\n")
-    with pytest.raises(DataError, match="byte 3 is not UTF-8"):
-        read_prompts(tmp_path / "latin", WHERE)
-    with pytest.raises(DataError, match="cannot be read"):
-        read_prompts(tmp_path, WHERE)
-
-
 @pytest.mark.parametrize("name", ["..", "", "a/b", "a\\b", "a\0b"])
 def test_a_name_that_leaves_its_folder_is_refused(tmp_path: Path, name: str) -> None:
     for dataset, scene in ((name, "room0"), ("replica", name)):
         with pytest.raises(DataError, match="is no name of a dataset or scene"):
             OpenLexFiles(tmp_path, dataset, scene)
-
-
-@pytest.mark.parametrize(
-    ("read", "content"),
-    [
-        (read_categories, edited()),
-        (read_queries, json.dumps(QUERIES)),
-        (read_prompts, "\n".join(PROMPTS[:8])),
-    ],
-    ids=["categories", "queries", "prompts"],
-)
-def test_every_truncation_and_random_damage_is_read_or_one_error(tmp_path: Path, read: Reader, content: str) -> None:
-    path = tmp_path / "file"
-
-    def read_damaged(damaged: bytes) -> object:
-        path.write_bytes(damaged)
-        return read(path, WHERE)
-
-    plain = content.encode()
-    cut = outcomes(read_damaged, truncations(plain), must_name=WHERE)
-    hurt = outcomes(read_damaged, damages(plain), must_name=WHERE)
-    assert sum(cut) == len(plain) and sum(hurt) == N_DAMAGES
-    assert hurt[1] > 0.05 * N_DAMAGES

@@ -9,7 +9,7 @@ import pytest
 from places import ROOT
 
 from su3d_bench.cli.main import build_parser
-from su3d_bench.metrics.protocols.files import protocol_names
+from su3d_bench.metrics.protocols.loading import protocol_names
 from su3d_bench.predictions.formats import READERS
 
 PAGE = (ROOT / "docs/evaluate.md").read_text(encoding="utf-8")

@@ -4,19 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-import pickle
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from damage import N_DAMAGES, damages, outcomes, truncations
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from prediction_files import (
     FEATURES,
-    OURS,
     TOY,
     TorchFile,
     own_instances,
@@ -24,15 +18,10 @@ from prediction_files import (
     torch_text,
     write_openmask3d,
     write_sam3d,
-    write_scannetpp_json,
-    written_in,
 )
 
-from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.files.atomic import write_npz
-from su3d_bench.core.maps import DenseFeatures, Partition
-from su3d_bench.predictions.formats import READERS
-from su3d_bench.store.predictions import prediction_arrays, write_prediction
+from su3d_bench.store.predictions import prediction_arrays
 
 # ---- what is wrong in a text list
 
@@ -137,56 +126,6 @@ def test_each_fault_of_an_archive_of_masks_is_one_line(tmp_path: Path, arrays: d
     assert text.startswith(f"{tmp_path}/s.npz") and message in text
 
 
-def pickled(kind: str) -> bytes:
-    """The inside of a torch file that is well formed and no prediction."""
-    file = TorchFile()
-    two_runs = b"](}(" + torch_text("length") + b"K\x09" + torch_text("counts")
-    wrong = {
-        "number": b"K\x05",
-        "empty dict": b"}",
-        "ins number": b"}" + torch_text("ins") + b"K\x05s",
-        "ins of numbers": b"}" + torch_text("ins") + b"](K\x01es",
-        "odd runs": b"}" + torch_text("ins") + two_runs + torch_text("1 2 3") + b"ues",
-        "words": b"}" + torch_text("ins") + two_runs + torch_text("one 2") + b"ues",
-        "from zero": b"}" + torch_text("ins") + two_runs + torch_text("0 2") + b"ues",
-        "beyond": b"}" + torch_text("ins") + two_runs + torch_text("8 3") + b"ues",
-        "overlap": b"}" + torch_text("ins") + two_runs + torch_text("1 3 3 1") + b"ues",
-        "huge": b"}" + torch_text("ins") + two_runs + torch_text("1 999999999999999999999999") + b"ues",
-        "pair": b"K\x01K\x02\x86",
-        "many": b"(" + b"N" * 5 + b"t",
-        "text": torch_text("x"),
-    }
-    del file
-    return wrong[kind]
-
-
-@pytest.mark.parametrize(
-    ("format", "kind", "message"),
-    [
-        ("open3dis", "number", "without 'ins'"),
-        ("open3dis", "empty dict", "without 'ins'"),
-        ("open3dis", "ins number", "'ins' is 5"),
-        ("open3dis", "ins of numbers", "mask 0 is 1"),
-        ("open3dis", "odd runs", "expected pairs of start and length"),
-        ("open3dis", "words", "the runs are no numbers"),
-        ("open3dis", "from zero", "run of 2 points from 0 on"),
-        ("open3dis", "beyond", "run of 3 points from 8 on, of 9 points"),
-        ("open3dis", "overlap", "run of 1 points from 3 on"),
-        ("open3dis", "huge", "the runs are no numbers"),
-        ("openyolo3d", "pair", "the masks are 1; expected a matrix"),
-        ("openyolo3d", "many", "holds a tuple; expected masks and scores, or"),
-        ("openins3d", "text", "expected a sparse tensor"),
-        ("openmask3d", "text", "the masks are a str; expected a matrix"),
-        ("sam3d", "text", "expected one group number a point"),
-    ],
-)
-def test_each_fault_of_a_torch_file_is_one_line(tmp_path: Path, format: str, kind: str, message: str) -> None:
-    suffix = ".pth" if format in {"open3dis", "sam3d"} else ".pt"
-    TorchFile().write(tmp_path / f"s{suffix}", pickled(kind))
-    text = refused(tmp_path, "s", format)
-    assert text.startswith(f"{tmp_path}/s{suffix}") and message in text
-
-
 def test_wrong_shapes_in_torch_files_are_refused(tmp_path: Path) -> None:
     file = TorchFile()
     file.write(tmp_path / "a.pt", file.tensor(MASKS) + file.tensor(np.ones(4, np.float32)) + b"\x86")
@@ -235,112 +174,4 @@ def test_each_fault_of_our_own_file_is_one_line(tmp_path: Path, changes: dict[st
     assert text.startswith(f"{tmp_path}/prediction.npz: ") and message in text
 
 
-POINTS = np.zeros((3, 3), np.float32)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (
-            Partition(POINTS, np.array([0, -1, 2]), np.ones((2, 4), np.float32)),
-            "3 points, 3 instance numbers to 2 and 2 features",
-        ),
-        (Partition(POINTS, np.array([0, -2, 1]), np.ones((2, 4), np.float32)), "3 points, 3 instance numbers to 1"),
-        (Partition(POINTS, np.array([0, 1]), np.ones((2, 4), np.float32)), "3 points, 2 instance numbers"),
-        (DenseFeatures(POINTS, np.ones((2, 4), np.float16)), "3 points and 2 features"),
-    ],
-)
-def test_parts_and_features_that_do_not_go_with_their_points_are_refused(
-    tmp_path: Path, content: Any, message: str
-) -> None:
-    write_prediction(tmp_path / "prediction.npz", content)
-    assert message in refused(tmp_path / "prediction.npz", "prediction", "su3d-bench")
-
-
 # ---- damage
-
-
-def scene_name(format: str) -> str:
-    return "replica/scene0011_00" if format == "su3d-bench" else "scene0011_00"
-
-
-def files_to_damage(folder: Path, format: str) -> list[Path]:
-    """The files of a prediction that can be hurt: what the scene is read from, and what that refers to."""
-    files = list(READERS[format].scenes(folder).values())
-    return files + sorted(folder.glob("pred_mask/*_0.txt")) + sorted(folder.glob("*.npy"))
-
-
-@pytest.mark.parametrize("format", OURS)
-def test_cut_predictions_are_read_or_refused_but_nothing_else(tmp_path: Path, format: str) -> None:
-    folder = written_in(tmp_path, format)
-    for file in files_to_damage(folder, format):
-        content = file.read_bytes()
-        n_read, n_refused = outcomes(
-            reading(folder, format, file), truncations(content), must_name=file.name, refusal=PredictionError
-        )
-        assert n_refused > 0
-        assert n_read == 0 or file.suffix == ".txt"  # a shorter list is a list, too
-        file.write_bytes(content)
-
-
-@pytest.mark.parametrize("format", OURS)
-def test_damaged_predictions_are_read_or_refused_but_nothing_else(tmp_path: Path, format: str) -> None:
-    folder = written_in(tmp_path, format)
-    for file in files_to_damage(folder, format):
-        content = file.read_bytes()
-        n_read, n_refused = outcomes(
-            reading(folder, format, file), damages(content), must_name=file.name, refusal=PredictionError
-        )
-        assert n_read + n_refused == N_DAMAGES and n_refused > 0.1 * N_DAMAGES
-        file.write_bytes(content)
-
-
-def reading(folder: Path, format: str, file: Path) -> Callable[[bytes], object]:
-    def read_bytes(content: bytes) -> object:
-        file.write_bytes(content)
-        READERS[format].recognise(folder)
-        return READERS[format].read(folder, scene_name(format))
-
-    return read_bytes
-
-
-def test_damaged_run_lengths_are_read_or_refused_but_nothing_else(tmp_path: Path) -> None:
-    write_scannetpp_json(tmp_path, TOY)
-    file = tmp_path / "masks/scene0011_00_0.json"
-    content = file.read_bytes()
-    for copies in (truncations(content), damages(content)):
-        outcomes(reading(tmp_path, "scannet-text", file), copies, must_name=file.name, refusal=PredictionError)
-
-
-ARRAYS = st.builds(
-    lambda shape, kind, fill: np.full(shape, fill).astype(kind),
-    st.sampled_from([(), (0,), (2,), (3,), (2, 3), (3, 2), (3, 3), (0, 3), (2, 0), (2, 2, 2)]),
-    st.sampled_from(["?", "i8", "u1", "f2", "f8", "U3", "S2"]),
-    st.sampled_from([0, 1, 7]),
-)
-LEAVES = st.none() | st.booleans() | st.integers(-3, 9) | st.floats() | st.text(max_size=3) | ARRAYS
-ANYTHING = st.recursive(
-    LEAVES,
-    lambda inner: (
-        st.lists(inner, max_size=3)
-        | st.tuples(inner, inner)
-        | st.fixed_dictionaries({"length": inner, "counts": inner})
-        | st.fixed_dictionaries({"ins": inner}, optional={"conf": inner, "final_class": inner})
-    ),
-    max_leaves=8,
-)
-
-
-@settings(max_examples=500, deadline=None)
-@given(value=ANYTHING, format=st.sampled_from(["open3dis", "openyolo3d", "openins3d", "openmask3d", "sam3d"]))
-def test_torch_files_of_any_values_are_read_or_refused_but_nothing_else(
-    tmp_path_factory: pytest.TempPathFactory, value: object, format: str
-) -> None:
-    folder = tmp_path_factory.getbasetemp()
-    file = folder / ("any.pth" if format in {"open3dis", "sam3d"} else "any.pt")
-    TorchFile().write(file, pickle.dumps(value, 2)[2:-1])
-    READERS[format].recognise(file)
-    try:
-        READERS[format].read(file, "any")
-    except PredictionError as error:
-        assert "\n" not in str(error) and len(str(error)) < 600  # noqa: PT017 - either outcome is right

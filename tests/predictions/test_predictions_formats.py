@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ from prediction_files import (
     TOY,
     TorchFile,
     own_instances,
-    refused,
     runs,
     scenes_of,
     torch_text,
@@ -36,7 +34,6 @@ from prediction_files import (
 
 from su3d_bench.core.errors import ConfigError, PredictionError
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
-from su3d_bench.formats import text_integers
 from su3d_bench.formats.arrays import run_members
 from su3d_bench.formats.text_integers import integer_lines
 from su3d_bench.metrics.instance.average_precision import last_line_of_each_mask_file
@@ -143,26 +140,6 @@ def test_a_folder_as_mask3d_and_segment3d_export_it_is_read(tmp_path: Path) -> N
 def test_masks_of_scannetpp_are_read_from_run_lengths(tmp_path: Path) -> None:
     write_scannetpp_json(tmp_path, TOY)
     assert_masks(masks_of(read(tmp_path, TOY["name"])), TOY["masks"], TOY["labels"], TOY["scores"])
-
-
-@pytest.mark.parametrize("file_end", ["\n", ""])
-@pytest.mark.parametrize("digits", ["01", "02", "0 1", "0 255", "0 -1", "00 01"])
-def test_masks_of_any_integers_mean_zero_or_not(tmp_path: Path, digits: str, file_end: str) -> None:
-    zero, one = digits.split() if " " in digits else list(digits)
-    write_scannet_text(tmp_path, TOY)
-    for mask, file in zip(TOY["masks"], TOY["files"], strict=True):
-        for line_end in ("\n", "\r\n"):
-            text = line_end.join(one if member else zero for member in mask) + file_end.replace("\n", line_end)
-            (tmp_path / file).write_bytes(text.encode())
-    assert_masks(masks_of(read(tmp_path, TOY["name"])), TOY["masks"], TOY["labels"], TOY["scores"])
-
-
-def test_empty_lists_are_scenes_without_masks(tmp_path: Path) -> None:
-    (tmp_path / "scene0000_00.txt").write_text("")
-    content = masks_of(read(tmp_path, "scene0000_00"))
-    assert len(content) == 0 and content.n_points is None
-    write_scannet_text(tmp_path, TOY)
-    assert sorted(recognise(tmp_path).scenes(tmp_path)) == ["scene0000_00", "scene0011_00"]
 
 
 def test_the_official_answer_in_the_folder_is_no_scene(tmp_path: Path) -> None:
@@ -353,38 +330,7 @@ def test_a_path_in_no_format_or_in_two_is_an_error_that_says_so(tmp_path: Path) 
         recognise(tmp_path, "maskclusterin")
 
 
-@pytest.mark.parametrize("format", OURS)
-def test_a_scene_that_is_not_there_is_named(tmp_path: Path, format: str) -> None:
-    folder = written_in(tmp_path, format)
-    assert "has no prediction of scene 'scene9999_00'" in refused(folder, "scene9999_00", format)
-
-
 # ---- integers a line
-
-
-def test_numbers_of_any_length_and_with_zeros_before_them_are_read_digit_by_digit() -> None:
-    numbers = [
-        n for digits in range(1, 19) for n in (10 ** (digits - 1), 10**digits - 1, 123456789012345678 % 10**digits)
-    ]
-    for texts in ([str(n) for n in numbers], [f"{n:018d}" for n in numbers], ["7", "0000000000", "12345678", "5"]):
-        content = "".join(f"{text}\n" for text in texts).encode()
-        values = text_integers._plain_numbers(content)
-        assert values is not None and values.tolist() == [int(text) for text in texts]
-
-
-def test_examples_of_integer_lines_are_true() -> None:
-    assert doctest.testmod(text_integers) == (0, 2)
-
-
-@settings(max_examples=300, deadline=None)
-@given(
-    values=st.lists(st.integers(-(10**17), 10**17) | st.integers(0, 9) | st.integers(0, 99999), max_size=30),
-    line_end=st.sampled_from(["\n", "\r\n"]),
-    is_ended=st.booleans(),
-)
-def test_integer_lines_are_what_python_reads(values: list[int], line_end: str, is_ended: bool) -> None:
-    text = line_end.join(map(str, values)) + (line_end if values and is_ended else "")
-    assert integer_lines(text.encode(), "x").tolist() == values
 
 
 @settings(max_examples=300, deadline=None)

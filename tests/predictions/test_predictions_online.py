@@ -7,9 +7,7 @@ three maps), ESAM at 188fc6d (``mask_to_color``), OnlineAnySeg at 152466e (``exp
 
 from __future__ import annotations
 
-import pickle
 import shutil
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +16,8 @@ import pytest
 from cloud_files import write_esam, write_object, write_onlineanyseg, write_ovo, write_rayfronts
 from places import CASES
 from prediction_files import TorchFile, refused, torch_text
-from same_values import assert_same
 
-from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
-from su3d_bench.formats.torch_stream import read_torch_of_either_form
 from su3d_bench.predictions.formats import READERS, recognise
 
 FILES = CASES / "online_maps"
@@ -67,11 +62,6 @@ def test_both_maps_of_rayfronts_that_can_be_saved_are_features_of_places(tmp_pat
     assert isinstance(content, DenseFeatures)
     np.testing.assert_array_equal(content.points, known[f"{name}_xyz"])
     np.testing.assert_array_equal(content.features, known[f"{name}_feat"].astype(np.float16))
-
-
-def test_occupied_voxels_alone_say_what_is_missing(tmp_path: Path) -> None:
-    shutil.copy(FILES / "occ_voxel_map.pt", tmp_path / "room0.pt")
-    assert "which voxels are occupied and no features" in refused(tmp_path, "room0", "rayfronts")
 
 
 def test_masks_of_onlineanyseg_lie_on_its_own_points_with_a_feature_each(tmp_path: Path) -> None:
@@ -210,52 +200,3 @@ def test_each_fault_of_results_of_esam_and_onlineanyseg_is_one_line(tmp_path: Pa
 
 
 # ---- the older form of torch.save
-
-
-def test_what_torch_writes_in_its_older_form_is_read_to_the_last_value(tmp_path: Path) -> None:
-    torch = pytest.importorskip("torch", reason="torch is not installed: the committed file alone proves the layout")
-    whole = torch.arange(12).reshape(3, 4)
-    value = {"a": whole, "part": whole[1:, ::2], "n": 3, "list": [whole.half(), np.arange(3.0)], "none": None}
-    value |= {"brain": whole.to(torch.bfloat16) / 3, "empty": torch.zeros(0, 4)}
-    torch.save(value, tmp_path / "x", _use_new_zipfile_serialization=False)
-    found: Any = read_torch_of_either_form(tmp_path / "x")
-    table = np.arange(12).reshape(3, 4)
-    assert_same(found["part"], table[1:, ::2])
-    assert_same(found["list"], [table.astype(np.float16), np.arange(3.0)])
-    assert_same(found["brain"], value["brain"].float().numpy())
-    assert found["empty"].shape == (0, 4) and found["none"] is None and found["n"] == 3
-    torch.save(value["brain"], tmp_path / "y")
-    assert_same(read_torch_of_either_form(tmp_path / "y"), value["brain"].float().numpy())
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        (struct.pack("<q", 6), struct.pack("<q", 7), "has 7 values in storage"),
-        (struct.pack("<q", 6), struct.pack("<q", -1), "has -1 values in storage"),
-        (pickle.dumps(1001, 2), pickle.dumps(1002, 2), "a form of torch.save that is not known"),
-        (pickle.dumps(["0"], 2), pickle.dumps(["1"], 2), "does not name each storage once"),
-        (pickle.dumps(["0"], 2), pickle.dumps([], 2), "does not name each storage once"),
-        (b"ctorch\nFloat", b"cposix\nsystem\nctorch\nFloat", "asks for 'posix.system'"),
-    ],
-)
-def test_each_fault_of_the_older_form_is_one_line(tmp_path: Path, old: bytes, new: bytes, message: str) -> None:
-    file = TorchFile(is_stream=True)
-    file.write(tmp_path / "x", file.value(np.arange(6, dtype=np.float32)))
-    content = (tmp_path / "x").read_bytes()
-    head, found, tail = content.rpartition(old)
-    assert found
-    (tmp_path / "x").write_bytes(head + new + tail)
-    with pytest.raises(PredictionError) as caught:
-        read_torch_of_either_form(tmp_path / "x")
-    assert message in str(caught.value) and str(caught.value).startswith(f"{tmp_path}/x: ")
-
-
-def test_bytes_behind_the_last_storage_and_other_files_are_refused(tmp_path: Path) -> None:
-    file = TorchFile(is_stream=True)
-    file.write(tmp_path / "x", file.value(np.arange(6, dtype=np.float32)))
-    (tmp_path / "y").write_bytes((tmp_path / "x").read_bytes() + b"\0")
-    (tmp_path / "z").write_bytes(b"")
-    for name, message in (("y", "has more bytes behind its end"), ("z", "no file of torch.save")):
-        with pytest.raises(PredictionError, match=message):
-            read_torch_of_either_form(tmp_path / name)

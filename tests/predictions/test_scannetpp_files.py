@@ -16,7 +16,7 @@ from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import DenseFeatures
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.predictions.base import Reader, VertexLabels, VertexMasks, vertex_masks
+from su3d_bench.predictions.base import VertexLabels, VertexMasks, vertex_masks
 from su3d_bench.predictions.export import (
     LabelledMasks,
     _runs_json,
@@ -75,14 +75,6 @@ def test_ranked_classes_are_recognised_by_their_commas(text: str, rows: list[lis
     assert np.column_stack([content.class_ids, content.further]).tolist() == rows
 
 
-def test_one_class_a_line_is_read_as_scannetpps_where_it_is_named(tmp_path: Path) -> None:
-    (tmp_path / "0a7cc12c0e.txt").write_text("3\n0\n")
-    assert recognise(tmp_path).name == "scannet-semantic-text"
-    content = READERS["scannetpp-semantic"].read(tmp_path, "0a7cc12c0e").content
-    assert isinstance(content, VertexLabels)
-    assert (content.class_ids.tolist(), content.further, content.numbering) == ([3, 0], None, "line")
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -100,49 +92,6 @@ def test_what_is_no_line_of_classes_is_named(text: str, message: str, tmp_path: 
     with pytest.raises(PredictionError) as raised:
         READERS["scannetpp-semantic"].read(tmp_path, "0a7cc12c0e")
     assert message in str(raised.value)
-
-
-def refusal_of(reader: Reader, folder: Path) -> str | None:
-    """What is said of the files in ``folder``; None where they can be read."""
-    try:
-        reader.read(folder, "0a7cc12c0e")
-    except PredictionError as error:
-        return str(error)
-    return None
-
-
-def test_damage_gives_one_line_or_a_prediction(tmp_path: Path) -> None:
-    """Two thousand damages of each kind of file."""
-    rng = np.random.default_rng(0)
-    files = {
-        "scannetpp-semantic": b"".join(b"%d,%d,%d\n" % tuple(rng.integers(0, 100, 3)) for _ in range(12)),
-        "scannetpp": b"predicted_masks/a.json 3 0.5\npredicted_masks/a.json 4 0.25\n",
-        "mask": _runs_json(np.array([1, 2, 5, 6, 7], np.int32), 12),
-    }
-    write_list(tmp_path, "")
-    for kind, whole in files.items():
-        (tmp_path / "0a7cc12c0e.txt").write_bytes(files["scannetpp" if kind == "mask" else kind])
-        (tmp_path / "predicted_masks/a.json").write_bytes(files["mask"])
-        place = tmp_path / ("predicted_masks/a.json" if kind == "mask" else "0a7cc12c0e.txt")
-        reader, n_refused = READERS["scannetpp" if kind == "mask" else kind], 0
-        for _ in range(2000):
-            damaged = bytearray(whole)
-            for _ in range(int(rng.integers(1, 4))):
-                at = int(rng.integers(0, len(damaged) + 1))
-                match int(rng.integers(0, 3)):
-                    case 0:
-                        damaged[at : at + int(rng.integers(1, 9))] = b""
-                    case 1:
-                        damaged[at:at] = rng.integers(0, 256, int(rng.integers(1, 5)), dtype=np.uint8).tobytes()
-                    case _:
-                        damaged[at : at + 1] = rng.choice(
-                            [b"9" * 30, b",", b"\n", b"-", b"\0", b" ", b"{", b"e9"]
-                        ).tobytes()
-            place.write_bytes(bytes(damaged))
-            refusal = refusal_of(reader, tmp_path)
-            n_refused += refusal is not None
-            assert refusal is None or refusal.isprintable()
-        assert n_refused > 200
 
 
 # ---- writing

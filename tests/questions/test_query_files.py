@@ -12,12 +12,10 @@ from damage import damages, outcomes, truncations
 from replica_scene import QUADS, TWO_OBJECTS, write_original, write_render
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import ConfigError, DataError
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.datasets.replica.dataset import Replica
-from su3d_bench.evaluation.evaluate import Request, evaluate
 from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
-from su3d_bench.questions.files.queries import read_query_file
+from su3d_bench.questions.query_files import read_query_file
 
 TOML = """[[query]]
 scene = "replica/room0"
@@ -31,47 +29,6 @@ objects = [6]
 """
 CSV = 'scene,text,objects\nroom0,a place to sit,1\nreplica/room0,"something to eat at",6\n'
 QUERIES = {"room0": (TextQuery("a place to sit", (1,)), TextQuery("something to eat at", (6,)))}
-
-
-@pytest.mark.parametrize(("name", "content"), [("q.toml", TOML), ("q.csv", CSV)])
-def test_both_forms_give_the_queries_of_each_scene(tmp_path: Path, name: str, content: str) -> None:
-    (tmp_path / name).write_text(content)
-    assert read_query_file(tmp_path / name) == QUERIES
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "line"),
-    [
-        ("q.toml", "query = 3", r"q\.toml: expected tables \[\[query\]\]"),
-        ("q.toml", TOML.replace("text", "words"), "q.toml: query 1: expected the keys scene, text, objects"),
-        ("q.toml", TOML.replace("[1]", '["1"]'), "q.toml: query 1: 'objects' must be a list of instance ids"),
-        ("q.toml", TOML.replace("[1]", "[]"), "q.toml: query 1: 'objects' must name at least one"),
-        ("q.toml", TOML.replace("[1]", "[4, 4]"), "q.toml: query 1: an object stands there twice"),
-        ("q.toml", TOML + TOML, "q.toml: query 3: the query 'a place to sit' stands there twice for replica/room0"),
-        ("q.toml", TOML.replace('"a place', '"\\u001b[2Ja place'), "q.toml: query 1: 'scene' and 'text' must be words"),
-        ("q.csv", CSV.replace("text", "words"), "q.csv: the first line must be scene,text,objects"),
-        ("q.csv", CSV.replace(",1\n", ",one\n"), "q.csv: row 2: 'objects' must be instance ids"),
-        ("q.csv", CSV.replace(",1\n", "\n"), "q.csv: row 2: has 2 columns"),
-        ("q.csv", "scene,text,objects\n", "q.csv: holds no query"),
-    ],
-)
-def test_what_is_no_query_is_one_line(tmp_path: Path, name: str, content: str, line: str) -> None:
-    (tmp_path / name).write_text(content)
-    with pytest.raises(DataError, match=line):
-        read_query_file(tmp_path / name)
-
-
-@pytest.mark.parametrize(("name", "content"), [("q.toml", TOML), ("q.csv", CSV)])
-def test_damaged_files_are_read_or_refused_in_one_line(tmp_path: Path, name: str, content: str) -> None:
-    path = tmp_path / name
-
-    def read(damaged: bytes) -> object:
-        path.write_bytes(damaged)
-        return read_query_file(path)
-
-    for copies in (truncations(content.encode()), damages(content.encode())):
-        _, n_refused = outcomes(read, copies, must_name=name)
-        assert n_refused > 20
 
 
 def write_map(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -95,51 +52,23 @@ def write_map(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     np.savez(folder / "texts.npz", names=np.array(["a place to sit", "something to eat at"]), features=texts)
 
 
-def request(folder: Path, queries: str) -> Request:
-    (folder / "q.toml").write_text(queries)
-    return Request(
-        (folder / "maps",),
-        dataset="replica",
-        text_features=folder / "texts.npz",
-        protocols=("query-ap",),
-        queries=folder / "q.toml",
-    )
+@pytest.mark.parametrize(("name", "content"), [("q.toml", TOML), ("q.csv", CSV)])
+def test_both_forms_give_the_queries_of_each_scene(tmp_path: Path, name: str, content: str) -> None:
+    (tmp_path / name).write_text(content)
+    assert read_query_file(tmp_path / name) == QUERIES
 
 
-def test_a_map_answers_queries_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_map(tmp_path, monkeypatch)
-    found = evaluate(request(tmp_path, TOML)).to_json()["protocols"]["query-ap"]
-    assert found["metrics"] == {"ap": 1.0, "ap50": 1.0, "ap25": 1.0}
-    swapped = TOML.replace("[1]", "[0]").replace("[6]", "[1]").replace("[0]", "[6]")
-    found = evaluate(request(tmp_path, swapped)).to_json()["protocols"]["query-ap"]
-    # each right mask ranks behind the wrong one of its query: recall 1 at precision a half
-    assert found["metrics"]["ap"] == pytest.approx(0.25)
-    assert any("what the truth itself would score is not known: how well" in line for line in found["warnings"])
+@pytest.mark.parametrize(("name", "content"), [("q.toml", TOML), ("q.csv", CSV)])
+def test_damaged_files_are_read_or_refused_in_one_line(tmp_path: Path, name: str, content: str) -> None:
+    path = tmp_path / name
 
+    def read(damaged: bytes) -> object:
+        path.write_bytes(damaged)
+        return read_query_file(path)
 
-def test_queries_need_a_dataset_its_objects_and_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_map(tmp_path, monkeypatch)
-    with pytest.raises(DataError, match=r"room0: query 'something to eat at' names object 7; the ground truth has 2"):
-        evaluate(request(tmp_path, TOML.replace("[6]", "[7]")))
-    missing = Request((tmp_path / "maps",), dataset="replica", protocols=("query-ap",))
-    with pytest.raises(ConfigError, match="needs --queries FILE"):
-        evaluate(missing)
-    (tmp_path / "gt").mkdir()
-    (tmp_path / "gt/room0.txt").write_text("20001\n" * 9)
-    with pytest.raises(ConfigError, match="--queries needs the objects of a dataset"):
-        evaluate(Request((tmp_path / "maps",), ground_truth=tmp_path / "gt", protocols=("replica-openmask3d",),
-                         queries=tmp_path / "q.toml"))  # fmt: skip
-
-
-def test_the_command_line_takes_a_file_of_queries(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_map(tmp_path, monkeypatch)
-    (tmp_path / "q.csv").write_text(CSV)
-    words = ["evaluate", str(tmp_path / "maps"), "--dataset", "replica", "--protocol", "query-ap"]
-    files = ["--queries", str(tmp_path / "q.csv"), "--text-features", str(tmp_path / "texts.npz")]
-    assert main([*words, *files]) == 0
-    assert "100.0" in capsys.readouterr().out
+    for copies in (truncations(content.encode()), damages(content.encode())):
+        _, n_refused = outcomes(read, copies, must_name=name)
+        assert n_refused > 20
 
 
 def test_sentences_of_scanrefer_and_nr3d_are_held_against_boxes(
@@ -172,4 +101,4 @@ def test_sentences_of_scanrefer_and_nr3d_are_held_against_boxes(
     words = ["evaluate", str(tmp_path / "maps"), "--dataset", "replica", "--queries", str(tmp_path / "broken.json")]
     assert main(words) == 2
     told = capsys.readouterr().err
-    assert told.count("\n") == 1 and "has no 'description'" in told
+    assert told.count("\n") == 1 and "broken.json: entry 1" in told

@@ -10,9 +10,8 @@ from bedroom_map import bedroom, box, thing
 
 from su3d_bench.perception.language.chat import ChatRequest, Reply
 from su3d_bench.perception.language.config import LanguageConfig
-from su3d_bench.questions.reasoning.language_solver import LanguageSolver, by_relevance, context_for, system_prompt
-from su3d_bench.questions.reasoning.question_words import Phrase, read_question
-from su3d_bench.questions.reasoning.scene_map import SceneMap
+from su3d_bench.questions.language_solver import LanguageSolver, by_relevance, context_for, system_prompt
+from su3d_bench.questions.scene_map import SceneMap
 
 
 class Said:
@@ -69,9 +68,3 @@ def test_a_model_that_refuses_leaves_the_question_unsettled(text: str) -> None:
     found = LanguageSolver(bedroom(), Said(text), LanguageConfig()).answer("Which sink is closer to bed?")
     assert not found.is_settled
     assert found.text.startswith("I cannot settle this: gpt-4-1106-preview: ")
-
-
-def test_a_question_in_words_is_read() -> None:
-    read = read_question("What is the distance between sofa with blanket and door?")
-    assert read is not None
-    assert (read.kind, read.subject.relation, read.other) == ("distance", "with", Phrase("door"))

@@ -54,10 +54,6 @@ def test_retrieval_ranks_by_cosine_whatever_the_length_of_the_features() -> None
     assert north.order.tolist() == [0, 1, 2, 3]  # 2 and 3 are equal: the order of the map
 
 
-def test_retrieval_from_an_empty_map_is_an_empty_ranking() -> None:
-    assert rank(instances_with(np.zeros((0, 2))), "east", TwoWords()).order.shape == (0,)
-
-
 def test_retrieval_without_comparable_features_is_refused() -> None:
     with pytest.raises(PredictionError, match="no features"):
         rank(instances_with(None), "east", TwoWords())
@@ -93,9 +89,3 @@ def test_where_every_point_is_equally_similar_none_is_found() -> None:
     for n, features in ((0, np.zeros((0, 2))), (3, np.zeros((3, 2))), (3, np.ones((3, 2)))):
         dense = DenseFeatures(np.zeros((n, 3), np.float32), features.astype(np.float16))
         assert points_found(dense, ["east"], TwoWords()).sizes.tolist() == [0]
-
-
-def test_features_of_other_dimensions_than_the_encoders_are_refused() -> None:
-    dense = DenseFeatures(np.zeros((1, 3), np.float32), np.ones((1, 5), np.float16))
-    with pytest.raises(PredictionError, match="5 dimensions and encoder 'two-words' gives 2"):
-        points_found(dense, ["east"], TwoWords())

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.types import Frame, GroundTruth, LabelSet, WholeObject
-from su3d_bench.questions.known_objects import known_objects
+from su3d_bench.questions.scene_map import known_objects
 from su3d_bench.questions.sight import LEAST_SHARE, colour_word, sights
 
 HEIGHT, WIDTH, FOCAL = 60, 80, 80.0
@@ -92,13 +92,6 @@ def test_what_ends_where_the_image_ends_is_cut(aside: float, is_cut: bool) -> No
     assert not known_objects(truth, 1, [WholeObject(1, "chair", box)], seen).objects[0].is_cut  # its box is known
 
 
-def test_a_name_that_another_ends_with_is_not_asked_for() -> None:
-    _, truth = seen_by_one_camera()
-    box = np.array([[0, 0, 0], [1, 1, 1]], float)
-    whole = [WholeObject(1, "cabinet", box), WholeObject(2, "base cabinet", box)]
-    assert [thing.is_asked for thing in known_objects(truth, 1, whole).objects] == [False, True]
-
-
 @pytest.mark.parametrize(
     ("rgb", "word"),
     [
@@ -109,8 +102,3 @@ def test_a_name_that_another_ends_with_is_not_asked_for() -> None:
 )  # fmt: skip
 def test_the_colours_of_the_rooms_have_their_words(rgb: tuple[int, int, int], word: str) -> None:
     assert colour_word(np.tile(np.array(rgb, np.float64), (100, 1))) == word
-
-
-def test_an_object_of_many_colours_has_no_word() -> None:
-    half = np.tile([200.0, 40.0, 40.0], (50, 1))
-    assert colour_word(np.concatenate([half, half[:, ::-1]])) == ""

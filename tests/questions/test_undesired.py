@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import Instances
-from su3d_bench.opensu3d.config import OpenSU3DConfig
-from su3d_bench.questions.undesired import FilterConfig, undesired
+from su3d_bench.questions.refining import FilterConfig, undesired
 
 
 def plan_of(*sides_m: tuple[float, float]) -> Instances:
@@ -19,12 +15,6 @@ def plan_of(*sides_m: tuple[float, float]) -> Instances:
     corners = np.array([[0, 0, 0], [10, 10, 2]], np.float32)
     masks = [np.array([2 * k, 2 * k + 1]) for k in range(len(clouds))]
     return Instances.of(np.concatenate([*clouds, corners]), masks)
-
-
-def test_the_settings_are_those_of_the_filter_in_images() -> None:
-    config = FilterConfig()
-    assert config.background_names == OpenSU3DConfig().background_names
-    assert config.max_map_fraction == OpenSU3DConfig().max_box_fraction == 0.95
 
 
 @pytest.mark.parametrize("name", ["wall", "walls", "Wall", "hardwood floor", "the ground", "false ceiling", "roof"])
@@ -47,16 +37,3 @@ def test_a_box_that_covers_the_map_from_above_is_left_out() -> None:
     )
     assert undesired(made, ("rug",) * 3, FilterConfig(max_map_fraction=1.0)) == ("", "", "")
     assert undesired(made, ("rug",) * 3, FilterConfig(max_map_fraction=0.05))[2] != ""
-
-
-def test_a_map_whose_boxes_do_not_fit_is_refused() -> None:
-    with pytest.raises(PredictionError, match=r"boxes \(2, 2, 3\) for 1 instances"):
-        undesired(replace(plan_of((1, 1)), boxes=np.zeros((2, 2, 3), np.float32)), ("rug",), FilterConfig())
-    unknown = replace(plan_of((1, 1)), boxes=np.full((1, 2, 3), np.nan, np.float32))
-    assert undesired(unknown, ("rug",), FilterConfig()) == ("",)
-
-
-def test_a_map_without_points_or_area_leaves_nothing_out_for_its_size() -> None:
-    assert undesired(Instances.of(np.zeros((0, 3), np.float32), []), (), FilterConfig()) == ()
-    line = Instances.of(np.array([[0, 0, 0], [1, 0, 0]], np.float32), [np.array([0, 1])])
-    assert undesired(line, ("rope",), FilterConfig()) == ("",)

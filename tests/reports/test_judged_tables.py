@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +13,12 @@ from simulated_annotators import RATES, SCHEMES, annotation_set, answered, reaso
 
 from su3d_bench.analysis.tables import check_paper, measured_results
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import ConfigError
-from su3d_bench.reports.tables.judged import KINDS, judged_table, sheet_tables
+from su3d_bench.reports.tables.judged import judged_table
+from su3d_bench.reports.tables.latex import latex
 from su3d_bench.reports.tables.model import Measured
-from su3d_bench.reports.tables.papers.latex import latex
-from su3d_bench.reports.tables.papers.paper import Shown
-from su3d_bench.sheets.judging.answers import check_answers
-from su3d_bench.sheets.judging.scores import score, write_scores
+from su3d_bench.reports.tables.paper import Shown
+from su3d_bench.sheets.answers import check_answers
+from su3d_bench.sheets.scores import score, write_scores
 
 LABELS = [
     ("right", "right", "well-merged"),
@@ -103,38 +102,6 @@ def test_table_v_has_a_row_for_each_label(folders: tuple[Path, Path], capsys: py
     ]
 
 
-@pytest.mark.parametrize(
-    ("warning", "label"),
-    [
-        ("every scene: n': the vote of the names of 5 views, no language model", "(n' is a vote)"),
-        ("replica/a: n': the model gpt-4 of su3d-bench refine, names of 5 views", "(n' by the model gpt-4)"),
-        ("no label n': the map keeps no names of views", "(n')"),
-    ],
-)
-def test_the_row_of_label_n_prime_says_who_made_it(warning: str, label: str) -> None:
-    values = {"label n": 0.7, "label n'": 0.8, "well-merged": 0.5, "well-merged n'": 0.6}
-    row = replace(by_truth("opensu3d", "annotation", "replica", **values), warnings=(warning,))
-    table = judged_table("V", [row], Shown(), with_published=True)
-    assert [(one.label, [cell.text for cell in one.cells[:2]]) for one in table.rows[:2]] == [
-        ("opensu3d: direct label (n), ground truth", ["0.700", "0.500"]),
-        (f"opensu3d: refined label {label}, ground truth", ["0.800", "0.600"]),
-    ]
-    assert [[cell.text for cell in one.cells[:2]] for one in table.rows if one.is_reported] == [
-        ["0.83", "0.87"],
-        ["0.87", "0.88"],
-    ]
-
-
-def test_people_and_ground_truth_stand_apart_in_one_table(folders: tuple[Path, Path]) -> None:
-    people = measured_results([folders[0]])
-    truth = by_truth(SCHEMES[0], "retrieval", "rooms", instance=0.99, affordance=0.9, property=0.8, relative=0.1)
-    table = judged_table("IV", [truth, *people], Shown(), with_published=False)
-    assert [(row.label, row.group) for row in table.rows] == [
-        *((f"{one}, people", "people") for one in SCHEMES),
-        (f"{SCHEMES[0]}, ground truth", "ground truth"),
-    ]
-
-
 def test_both_datasets_stand_in_one_table_of_eight_columns_with_the_papers_digits() -> None:
     values = {"instance": 0.8, "affordance": 0.7, "property": 0.6, "relative": 0.5}
     n = {f"n_{kind}": 40.0 + k for k, kind in enumerate(values)}
@@ -148,38 +115,6 @@ def test_both_datasets_stand_in_one_table_of_eight_columns_with_the_papers_digit
     assert [cell.text for cell in reported[-1].cells] == ["0.8", "0.9", "0.9", "0.6", "0.9", "0.7", "0.7", "0.7"]
     assert reported[0].mark == "a, b" and sum(note.startswith("[") for note in table.notes) == 2
     assert table.caption.endswith("; not the paper's set-up: other scenes, perception, judges.")
-
-
-def test_a_part_that_one_dataset_lacks_is_a_dash_there() -> None:
-    def values(label: float, refined: float, merged: float) -> dict[str, float]:
-        return {"label n": label, "label n'": refined, "well-merged": merged, "well-merged n'": merged}
-
-    rows = [
-        by_truth("opensu3d", "annotation", "replica", **values(0.5, 0.6, 0.7)),
-        by_truth("sam3d", "annotation", "scannet", **values(0.4, 0.4, 0.9)),
-    ]
-    table = judged_table("V", rows, Shown(), with_published=True)
-    assert [[cell.text for cell in row.cells] for row in table.rows] == [
-        ["0.500", "0.700", "-", "-"],
-        ["0.600", "0.700", "-", "-"],
-        ["-", "-", "0.400", "0.900"],
-        ["-", "-", "0.400", "0.900"],
-        ["0.83", "0.87", "0.75", "0.85"],
-        ["0.87", "0.88", "0.84", "0.87"],
-    ]
-
-
-def test_a_best_of_one_of_four_over_none_is_not_marked_and_a_clear_one_is() -> None:
-    def both(other: float) -> list[bool]:
-        rows = [by_truth("opensu3d", "retrieval", "replica", **dict.fromkeys(KINDS, value)) for value in (0.25, other)]
-        rows[0] = replace(rows[0], method="sam3d", per_scene={scene: {} for scene in SCENES[1:]})
-        one = {SCENES[0]: dict.fromkeys(KINDS, 0.5)} | {scene: dict.fromkeys(KINDS, 0.0) for scene in SCENES[1:]}
-        rows[0] = replace(rows[0], per_scene=one)
-        table = judged_table("IV", rows, Shown(), with_published=False)
-        return [row.cells[0].is_best for row in table.rows]
-
-    assert both(0.0) == [False, False]
-    assert both(0.9) == [False, True]
 
 
 def test_reasoning_has_its_scores_above_the_papers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -206,44 +141,6 @@ def test_reasoning_has_its_scores_above_the_papers(tmp_path: Path, capsys: pytes
     assert len(checks) == 2 and [check.fault for check in checks if check.fault] == []
 
 
-def test_what_people_judged_says_how_the_maps_were_made_and_what_the_encoder_was_trained_on(tmp_path: Path) -> None:
-    sheet, key = retrieval_set(40)
-    remark = "relative: the pattern is that of training captions"
-    made = replace(
-        key,
-        profile="embedded",
-        encoder="rooms-encoder",
-        limit=9,
-        changed={SCHEMES[0]: ("eps = 0.05",)},
-        remarks=(remark,),
-    )
-    scores = score(sheet, made, check_answers(sheet, answered(sheet, made, {"ann": 0.0})).judgements)
-    write_scores(tmp_path, scores)
-    table = judged_table("IV", measured_results([tmp_path]), Shown(), with_published=False)
-    assert table.caption.endswith("other scenes, frames, settings, perception.")
-    assert any(note.endswith(remark) for note in table.notes)
-    assert any("perception embedded, encoder rooms-encoder" in note for note in table.notes)
-    assert any(note.endswith(f"{SCHEMES[0]}: with eps = 0.05") for note in table.notes)
-    assert remark in sheet_tables(asdict(scores))[0].notes
-
-
-@pytest.mark.parametrize(
-    ("who", "differs"),
-    [("the vote of 5 views", True), ("the model gpt-4-1106-preview of su3d-bench refine", False)],
-)
-def test_a_caption_says_that_labels_are_of_another_language_model(who: str, differs: bool) -> None:
-    values = {"label n": 0.7, "label n'": 0.8, "well-merged": 0.5, "well-merged n'": 0.6}
-    row = replace(by_truth("opensu3d", "annotation", "replica", **values), warnings=(f"every scene: n': {who}",))
-    caption = judged_table("V", [replace(row, profile="paper")], Shown(), with_published=False).caption
-    assert ("language model" in caption) is differs
-
-
-def test_without_judged_rows_the_message_says_what_makes_them() -> None:
-    with pytest.raises(ConfigError) as caught:
-        judged_table("V", [measured()], Shown(), with_published=True)
-    assert "needs protocol rooms-annotation" in str(caught.value) and "sheets of kind annotation" in str(caught.value)
-
-
 def test_a_paper_with_peoples_numbers_is_checked_against_their_scores(
     folders: tuple[Path, Path], tmp_path: Path
 ) -> None:
@@ -260,11 +157,3 @@ def test_a_paper_with_peoples_numbers_is_checked_against_their_scores(
     assert [check.fault for check in checks if check.fault] == []
     paper.write_text(latex(tables).replace("& 0.900", "& 0.901"))
     assert sum(check.fault is not None for check in check_paper(paper)) == 4
-
-
-def test_scores_alone_give_a_table_of_all_that_was_judged(
-    folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
-) -> None:
-    tables = told(capsys, str(folders[1] / "scores.json"))
-    assert [one["name"] for one in tables] == ["rooms-annotation-people"]
-    assert tables[0]["columns"][:3] == ["label n", "label n'", "well-merged"]

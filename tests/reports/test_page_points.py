@@ -15,7 +15,6 @@ from su3d_bench.reports.page import maps as html_map
 from su3d_bench.reports.page.maps import (
     NO_TRUTH_NEAR,
     NOT_SCORED,
-    box_in_view,
     index_plane,
     nearest_classes,
     nearest_colours,
@@ -67,13 +66,6 @@ def test_places_read_back_within_half_a_step_at_every_size(scale: float) -> None
     assert about["depth"] <= 16  # a page counts cells in sixteen bits
 
 
-def test_an_empty_map_packs_and_reads_back() -> None:
-    cloud = thinned(np.zeros((0, 3), np.float32), 5)
-    about, planes = unpacked(pack_map(cloud, {"owner": index_plane(np.zeros(0, np.int64))}, {"classes": []}))
-    assert about["n"] == 0
-    assert planes["owner"].size == 0
-
-
 def test_of_masks_that_overlap_the_smaller_one_is_seen() -> None:
     prediction = Instances(
         points=np.zeros((4, 3), np.float32),
@@ -105,20 +97,3 @@ def test_a_point_that_no_frame_saw_is_grey() -> None:
     assert found is not None
     assert found.tolist() == [[10, 20, 30], [128, 128, 128]]
     assert nearest_colours(seen, Candidates(seen[:0]), colours[:0]) is None
-
-
-def test_a_box_in_a_view_is_where_the_points_project() -> None:
-    intrinsics = np.array([[100.0, 0, 50], [0, 100.0, 40], [0, 0, 1]])
-    points = np.array([[0, 0, 2], [0.5, 0.4, 2], [0, 0, -1], [9, 0, 2]], np.float32)
-    assert box_in_view(points, np.eye(4), intrinsics, 100, 80) == [0.5, 0.5, 0.75, 0.75]
-    assert box_in_view(points[2:], np.eye(4), intrinsics, 100, 80) is None
-
-
-def test_the_grid_is_the_finest_that_leaves_few_enough_points() -> None:
-    line = np.zeros((40_000, 3), np.float32)
-    line[:, 0] = np.linspace(0, 400, len(line))  # unlike a surface, so that the first guess of a spacing is far off
-    for points, most in ((line, 900), (surface(60_000, 4), 5_000)):
-        cloud = thinned(points, most)
-        assert len(cloud.rows) <= most
-        finer = np.unique(np.floor(points / np.float64(cloud.spacing_m / html_map.COARSER)), axis=0)
-        assert len(finer) > most

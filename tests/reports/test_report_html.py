@@ -19,22 +19,20 @@ from packed_maps import unpacked
 from painted import Painted, WordEncoder
 from painted_runs import COLLECTOR, painted_page, painted_run
 
-from su3d_bench.analysis.page import instances as page_instances
 from su3d_bench.analysis.page import maps as page_maps
-from su3d_bench.analysis.page.instances import MOST_STEPS, Growth
-from su3d_bench.analysis.page.truths import same_objects
-from su3d_bench.cli.main import main
+from su3d_bench.analysis.page import numbers as page_numbers
+from su3d_bench.analysis.page import scene as page_scene
+from su3d_bench.analysis.page.scene import same_objects
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks
 from su3d_bench.core.types import GroundTruth, LabelSet
 from su3d_bench.reports.page import maps as html_map
-from su3d_bench.reports.page import numbers as html_data
 from su3d_bench.reports.page import page as html_page
 from su3d_bench.reports.page.maps import (
     NO_TRUTH_NEAR,
     NOT_SCORED,
 )
 from su3d_bench.reports.page.page import page_html
-from su3d_bench.reports.pictures import scene_look
+from su3d_bench.reports.pictures import scene as scene_look
 from su3d_bench.store.predictions import read_prediction, write_prediction
 
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(1)>&\"'<!--"
@@ -112,21 +110,6 @@ def test_confusions_errors_times_and_comparisons_are_there_for_every_method(page
     assert set(found["timing"][0]["series"]) == {"painted/a", "painted/b"}
 
 
-def test_the_confusion_of_the_page_gives_the_mean_accuracy_of_the_record(page: str) -> None:
-    found = data_of(page)
-    cells = np.array(found["confusions"][1]["cells"])
-    recalls = [
-        cells[(cells[:, 0] == k) & (cells[:, 1] == k), 2].sum() / cells[cells[:, 0] == k, 2].sum()
-        for k in np.unique(cells[:, 0])
-    ]
-    shown = next(one for one in found["results"] if one["protocol"] == "rooms-semantic" and one["method"].endswith("3"))
-    assert np.mean(recalls) == pytest.approx(shown["result"]["metrics"]["mAcc"], abs=1e-12)
-
-
-def test_the_same_run_gives_the_same_bytes(run: Path, page: str, tmp_path: Path) -> None:
-    assert painted_page(run, tmp_path / "again.html") == page
-
-
 def test_nothing_may_run_or_be_loaded_but_what_stands_in_the_page(page: str) -> None:
     found = elements(page)
     policy = next(value for name, value in found.attributes if name == "content" and value and "default-src" in value)
@@ -148,18 +131,6 @@ def test_no_text_of_a_run_is_markup() -> None:
     assert json.loads(found.content["data"]) == {"name": HOSTILE, HOSTILE: 1}
     assert json.loads(found.content["scene-0"]) == {"name": HOSTILE}
     assert found.content["title"] == HOSTILE
-
-
-def test_control_characters_of_a_record_do_not_reach_the_page(run: Path, tmp_path: Path) -> None:
-    changed = tmp_path / "run"
-    shutil.copytree(run, changed)
-    metrics = json.loads((changed / "metrics.json").read_text())
-    metrics["results"][0]["caveat"] = f"{HOSTILE}\x1b[31m\u202e"
-    (changed / "metrics.json").write_text(json.dumps(metrics))
-    text = painted_page(changed, tmp_path / "page.html", "--no-maps", "--no-errors")
-    assert data_of(text)["results"][0]["caveat"] == f"{HOSTILE}\\x1b[31m\\u202e"
-    assert "\x1b" not in text
-    assert "\u202e" not in text
 
 
 def test_a_map_reads_back_with_its_instances_colours_and_truth(run: Path, page: str) -> None:
@@ -233,28 +204,6 @@ def test_a_mask_is_an_object_of_the_truth_where_they_share_more_than_half() -> N
     assert found == {2: lamp, 3: chair, 4: chair}  # half is not more than half
 
 
-def test_a_run_without_masks_to_score_knows_the_objects_of_its_truth_too(tmp_path: Path) -> None:
-    run = painted_run(tmp_path / "run", "--protocols", "rooms-semantic")
-    about, _ = unpacked(elements(painted_page(run, tmp_path / "page.html", "--no-errors")).content["map-0"])
-    assert about["beside"] == {"truth": 0, "objects": 4}
-    assert {one["name"]: one["object"]["place"] for one in about["instances"]} == {
-        "chair": 0, "sofa": 1, "table": 2, "wall": 3,
-    }  # fmt: skip
-
-
-def test_missed_objects_are_as_many_as_the_errors_of_that_name(run: Path, page: str) -> None:
-    errors = {one["method"]: one["protocols"] for one in data_of(page)["errors"]}
-    counted: dict[str, int] = {}
-    for k, listed in enumerate(data_of(page)["maps"]):
-        about, _ = unpacked(elements(page).content[f"map-{k}"])
-        counted[listed["method"]] = counted.get(listed["method"], 0) + len(about["beside"]["missed"])
-    said = {
-        method: next(one["causes"]["missed"]["n"] for one in protocols if one["protocol"] == "rooms-instance")
-        for method, protocols in errors.items()
-    }
-    assert counted == said
-
-
 def test_an_instance_is_born_at_the_update_of_its_first_view(run: Path, page: str) -> None:
     about, _ = unpacked(elements(page).content["map-0"])
     stored = read_prediction(run / "scenes" / "painted.a" / "collector" / "prediction.npz")
@@ -264,30 +213,6 @@ def test_an_instance_is_born_at_the_update_of_its_first_view(run: Path, page: st
     assert about["growth"]["held"][-1] == len(stored)
     first = [stored.views[stored.view_indptr[k] : stored.view_indptr[k + 1], 0].min() for k in range(len(stored))]
     assert [one["born"] for one in about["instances"]] == first
-
-
-def test_a_growth_of_many_updates_has_few_steps_and_its_last() -> None:
-    frames = [40 * k for k in range(2000)]
-    places = np.unique(np.linspace(0, 1999, MOST_STEPS).round().astype(np.int64))
-    growth = Growth(frames, places, {})
-    assert growth.step_of([40 * 1999]) == len(places) - 1
-    for place in (0, 1, 3, 777):
-        step = growth.step_of([40 * place, 40 * 1999])
-        assert step is not None
-        assert places[step] >= place
-        assert step == 0 or places[step - 1] < place
-    assert growth.step_of([41]) is None
-
-
-def test_similarities_are_those_of_the_asked_texts(run: Path, tmp_path: Path) -> None:
-    text = painted_page(run, tmp_path / "page.html", "--queries", "chair", "table", "--no-errors")
-    about, _ = unpacked(elements(text).content["map-0"])
-    assert about["queries"] == ["chair", "table"]
-    stored = read_prediction(run / "scenes" / "painted.a" / "collector" / "prediction.npz")
-    assert stored.features is not None
-    features = stored.features / np.linalg.norm(stored.features, axis=1, keepdims=True)
-    expected = features.astype(np.float64) @ WordEncoder().encode_texts(["chair", "table"]).T
-    assert np.abs(np.array([one["similarity"] for one in about["instances"]]) / 1000 - expected).max() <= 0.0006
 
 
 def test_dense_features_have_a_class_a_point_and_no_instance(run: Path, tmp_path: Path) -> None:
@@ -329,33 +254,8 @@ def test_what_cannot_be_shown_is_a_reason_on_the_page(run: Path, tmp_path: Path)
 
 
 @pytest.mark.parametrize(
-    ("words", "expected"),
-    [
-        (["{missing}"], "holds no run.json"),
-        (["{run}", "--most-megabytes", "0"], "--most-megabytes 0: must be above 0"),
-    ],
-)
-def test_a_wrong_request_is_one_line(
-    run: Path, tmp_path: Path, words: list[str], expected: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    asked = [word.format(missing=tmp_path / "none", run=run) for word in words]
-    assert main(["report", "html", *asked, "--out", str(tmp_path / "page.html")]) != 0
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert expected in lines[-1]
-    assert not (tmp_path / "page.html").exists()
-
-
-def test_a_page_answers_in_json(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    text = painted_page(run, tmp_path / "page.html", "--json", "--no-errors", "--title", "A <b> title")
-    told = json.loads(capsys.readouterr().out)
-    assert told["n_bytes"] == len(text.encode())
-    assert told["n_maps"] == 4
-    assert elements(text).content["title"] == "A <b> title"
-
-
-@pytest.mark.parametrize(
     "module",
-    [html_data, html_map, html_page, page_instances, page_maps, scene_look],
+    [html_map, html_page, page_maps, page_numbers, page_scene, scene_look],
     ids=lambda module: module.__name__,
 )
 def test_the_examples_in_docstrings_hold(module: Any) -> None:

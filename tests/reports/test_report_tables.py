@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 from dataclasses import replace
-from typing import Any
 
 import pytest
 from measured_rows import SCENES, measured, measured_instances
@@ -14,14 +13,9 @@ from su3d_bench.core.errors import ConfigError
 from su3d_bench.formats.tables.table import Table
 from su3d_bench.reports.tables.ablation import SweepRow, ablation_table
 from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
+from su3d_bench.reports.tables.latex import latex
 from su3d_bench.reports.tables.model import Measured
-from su3d_bench.reports.tables.papers.latex import latex
-from su3d_bench.reports.tables.papers.paper import (
-    Shown,
-    paper_table,
-    protocol_table,
-    selection_tables,
-)
+from su3d_bench.reports.tables.paper import Shown, paper_table, protocol_table
 
 SEMANTIC = "replica-openmask3d-semantic"
 
@@ -49,54 +43,11 @@ def test_measured_and_reported_rows_never_stand_without_a_mark() -> None:
     assert {line["kind"] for line in lines if line["text"] in {"42.6", "40.9"}} == {"reported"}
 
 
-def test_published_rows_can_be_left_out() -> None:
-    (table,) = paper_table("II", [measured()], Shown(), with_published=False)
-    assert len(table.rows) == 1
-
-
-def test_intervals_scores_of_the_truth_and_scenes_are_shown_on_request() -> None:
-    table = protocol_table([measured()], Shown(intervals=True, ceilings=True, scenes_count=True), [])
-    assert table.columns == ("mAcc", "F-mIoU", "mAcc (truth)", "F-mIoU (truth)", "scenes")
-    assert texts(table) == [["opensu3d", "40.0 [35.0, 45.0]", "20.0", "98.0", "100.0", "8"]]
-    assert protocol_table([measured()], Shown(), []).columns == ("mAcc", "F-mIoU")
-
-
-def test_missing_scenes_and_partial_runs_are_shown_unasked() -> None:
-    few = {scene: values for scene, values in measured().per_scene.items() if scene != SCENES[3]}
-    seven = measured(per_scene=few, failed=(SCENES[3],))
-    table = protocol_table([seven, measured("sam3d", 0.5)], Shown(), [])
-    assert [row[-1] for row in texts(table)] == ["7/8", "8"]
-    assert f"opensu3d: INCOMPLETE: failed on {SCENES[3]}" in table.notes
-    partial = protocol_table([measured(limit=20)], Shown(), [])
-    assert texts(partial)[0][-1] == "8 partial"
-    assert "opensu3d: PARTIAL: only the first 20 frames of each scene" in partial.notes
-
-
-def test_a_method_that_failed_has_a_row_and_one_that_cannot_be_scored_a_note() -> None:
-    empty: dict[str, Any] = {"metrics": {"mAcc": None, "F-mIoU": None}, "per_scene": {}, "ceilings": {}}
-    failed = measured("conceptgraphs", failed=SCENES, **empty)
-    unfit = measured("conceptfusion", unscored=SCENES, **empty)
-    table = protocol_table([unfit, failed, measured(), measured("sam3d", 0.5)], Shown(), [])
-    assert [row[0] for row in texts(table)] == ["conceptgraphs", "opensu3d", "sam3d"]
-    assert texts(table)[0] == ["conceptgraphs", "-", "-", "0/8"]
-    assert best(table)[2][:2] == [True, True]
-    assert "not scored under this protocol: conceptfusion" in table.notes
-    assert any(note.startswith("conceptgraphs: INCOMPLETE: failed on") for note in table.notes)
-    with pytest.raises(ConfigError, match="scored none of conceptfusion"):
-        protocol_table([unfit], Shown(), [])
-
-
 def test_rows_of_different_scenes_are_not_compared() -> None:
     few = {scene: values for scene, values in measured().per_scene.items() if scene != SCENES[3]}
     table = protocol_table([measured(per_scene=few), measured("sam3d", 0.5)], Shown(), [])
     assert not any(map(any, best(table)))
     assert any("different scenes" in note for note in table.notes)
-
-
-def test_the_caveat_of_the_perception_stands_beneath() -> None:
-    table = protocol_table([measured(caveat="masks from the truth"), measured("sam3d", 0.5)], Shown(), [])
-    assert "opensu3d: masks from the truth" in table.notes
-    assert "all measured rows: perception embedded, encoder rooms-encoder" in table.notes
 
 
 def test_the_best_is_marked_in_each_column_and_equal_ones_together() -> None:
@@ -126,37 +77,6 @@ def test_only_a_significant_best_is_marked_on_request() -> None:
     assert best(protocol_table(unclear, Shown(), [])) == [[False, False], [True, True]]
 
 
-def test_three_scenes_can_make_nothing_significant_and_the_note_says_so() -> None:
-    three = {scene: measured().per_scene[scene] for scene in SCENES[:3]}
-    more = {scene: {"mAcc": 0.9, "F-mIoU": 0.9} for scene in SCENES[:3]}
-    rows = [measured(per_scene=three, n_planned=3), measured("sam3d", 0.9, per_scene=more, n_planned=3)]
-    table = protocol_table(rows, Shown(only_significant=True), [])
-    assert not any(map(any, best(table)))
-    assert any("with so few scenes no difference can have p < 0.05 (the least is 0.5)" in note for note in table.notes)
-
-
-def test_one_method_of_two_runs_is_told_apart_by_the_run() -> None:
-    table = protocol_table([measured(), measured(run="runs/second", accuracy=0.5)], Shown(), [])
-    assert [row.label for row in table.rows] == ["opensu3d (first)", "opensu3d (second)"]
-    same = protocol_table([measured(run="a/x"), measured(run="b/x")], Shown(), [])
-    assert [row.label for row in same.rows] == ["opensu3d (a/x)", "opensu3d (b/x)"]
-
-
-def test_a_metric_may_be_chosen_and_an_undefined_one_is_a_dash() -> None:
-    table = protocol_table([measured()], Shown(metrics=("mIoU", "mAcc")), [])
-    assert texts(table) == [["opensu3d", "-", "40.0"]]
-    assert table.rows[0].cells[0].origin is None
-    with pytest.raises(ConfigError, match="has no metric 'mAc'; did you mean 'mAcc'"):
-        protocol_table([measured()], Shown(metrics=("mAc",)), [])
-
-
-def test_a_metric_that_one_row_alone_has_is_a_dash_in_the_others() -> None:
-    """People judge label n' of the methods that have one."""
-    without = measured("oracle", 0.3, metrics={"mAcc": 0.3})
-    (table,) = selection_tables([measured(), without], Shown(), with_published=False)
-    assert [cell.text for cell in table.rows[1].cells][:2] == ["30.0", "-"]
-
-
 def test_the_papers_protocol_is_taken_where_it_is_there_and_others_say_that_they_are_not_it() -> None:
     own = measured(protocol="rooms-semantic")
     (table,) = paper_table("II", [own, measured()], Shown(), with_published=False)
@@ -181,13 +101,6 @@ def test_the_papers_protocol_is_taken_where_it_is_there_and_others_say_that_they
     assert other.caption.endswith("rooms-semantic; not the paper's set-up: other protocol, perception.")
     with pytest.raises(ConfigError, match="Table III: needs AP, AP50, AP25"):
         paper_table("III", [own], Shown(), with_published=False)
-
-
-def test_every_protocol_of_a_selection_has_a_table_of_its_own() -> None:
-    names = ("rooms-semantic", "replica-conceptgraphs-ex6")
-    tables = selection_tables([measured(protocol=name) for name in names], Shown(), with_published=True)
-    assert [table.name for table in tables] == list(names)
-    assert [any(row.is_reported for row in table.rows) for table in tables] == [False, True]
 
 
 SWEEP = [
@@ -225,45 +138,3 @@ def test_table_i_holds_each_row_against_the_methods_own_with_holms_correction() 
         "Ablation of single parameters on replica, replica-openmask3d-semantic and replica-openmask3d; not the "
         "paper's set-up: other perception."
     )
-
-
-def test_table_i_marks_no_best_that_does_not_differ() -> None:
-    rows = swept(SCENES, own=0.4, m1=0.4001, k1=0.45)
-    mixed = {scene: {"mAcc": 0.4 + (0.2 if k % 2 else -0.1), "F-mIoU": 0.2} for k, scene in enumerate(SCENES)}
-    rows = [
-        replace(row, per_scene=mixed) if (row.method, row.kind) == (SWEEP[0].method, "semantic") else row
-        for row in rows
-    ]
-    table = ablation_table(rows, SWEEP, Shown(), with_published=False)
-    assert [row.cells[0].is_best for row in table.rows] == [False, False, False, True]
-    assert [row.cells[2].is_best for row in table.rows] == [True, False, False, True]  # 0.0001 in every scene alike
-
-
-def test_table_i_marks_nothing_where_no_difference_could_be_told_and_says_so_once() -> None:
-    table = ablation_table(swept(SCENES[:6], own=0.4, m1=0.3, k1=0.45), SWEEP, Shown(), with_published=False)
-    assert not any(map(any, best(table)))  # 2 / 2**6 is below 0.05, twice that is not
-    assert sum("No best is marked" in note for note in table.notes) == 1
-    assert any("(the least is 0.062)" in note for note in table.notes)
-
-
-def test_table_i_names_what_is_missing_and_compares_nothing_with_a_row_that_is_not_there() -> None:
-    found = swept(SCENES, own=0.4, m1=0.3, k1=0.45)
-    alone = ablation_table(found, SWEEP[:1], Shown(), with_published=False)
-    assert alone.rows[0].cells[0].beside == "" and any("none is compared" in note for note in alone.notes)
-    with pytest.raises(ConfigError, match="Table I: no scores of gone"):
-        ablation_table(found, [SweepRow("m", "1", "gone")], Shown(), with_published=False)
-    with pytest.raises(ConfigError, match="Table I: needs AP, AP50, AP25"):
-        ablation_table([measured()], SWEEP, Shown(), with_published=False)
-    few = [
-        replace(row, per_scene={SCENES[0]: row.per_scene[SCENES[0]]}) if row.method == SWEEP[0].method else row
-        for row in found
-    ]
-    other = ablation_table(few, SWEEP, Shown(), with_published=False)
-    assert any("different scenes" in note for note in other.notes) and not any(map(any, best(other)))
-    (half, *_) = ablation_table(
-        [replace(row, protocol="mine") if row.kind == "semantic" else row for row in found],
-        SWEEP,
-        Shown(),
-        with_published=False,
-    ).caption.split(".")
-    assert "mine and replica-openmask3d; not the paper's set-up: other protocol, perception" in half

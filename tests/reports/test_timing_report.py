@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,13 +14,9 @@ from painted import colour_perception
 from places import SCENES
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import DataError
-from su3d_bench.core.system.timing import peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.costs import UpdateTimes, pooled, summarise
 from su3d_bench.numerics.statistics import growth_exponent
-from su3d_bench.reports.pictures.plots.timing import POINTS, UPDATES, _anytime, _memory, _stages, _update_cost
-from su3d_bench.reports.tables.timing import AnytimePoint
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run, read_update_times
 from su3d_bench.store.records import MapCost
@@ -64,11 +59,6 @@ def test_a_noisy_constant_is_called_constant_and_a_noisy_root_grows() -> None:
     assert root is not None and root.low < 0.5 < root.high and root.words == "grows"
 
 
-def test_nothing_is_said_of_growth_where_the_map_hardly_grew() -> None:
-    assert growth_exponent(np.linspace(100, 150, 50), np.ones(50)) is None
-    assert growth_exponent(np.array([1.0, 10.0, 100.0]), np.ones(3)) is None
-
-
 def test_percentiles_leave_the_first_updates_out_and_the_share_counts_them() -> None:
     total = np.array([100.0, 50.0, 10.0, 10.0, 20.0, 30.0])
     summary = summarise([times(total, match_ms=total / 2, frame=np.arange(0, 60, 10.0))], warm_up=2)
@@ -84,21 +74,6 @@ def test_updates_of_several_scenes_are_pooled_without_the_first_of_each() -> Non
     first, second = times(np.array([9.0, 1.0, 2.0])), times(np.array([8.0, 3.0]))
     assert pooled([first, second], "total", 1).tolist() == [1.0, 2.0, 3.0]
     assert pooled([], "total", 1).tolist() == []
-
-
-def test_a_single_update_stands_for_one_frame() -> None:
-    summary = summarise([times(np.array([250.0]), frame=np.array([7.0]))], warm_up=0)
-    assert (summary.updates_per_s, summary.frames_per_s) == (4.0, 4.0)
-    without_indices = summarise([times(np.array([100.0, 100.0, 50.0]))], warm_up=0)
-    assert without_indices.frames_per_s == without_indices.updates_per_s == 12.0
-
-
-def test_a_scene_whose_map_has_no_size_says_nothing_of_growth_with_it() -> None:
-    grows = times(np.linspace(1.0, 10.0, 12), n_points=np.linspace(10.0, 100.0, 12))
-    alone = stages_of(summarise([grows], warm_up=0))["total"].against_points
-    both = stages_of(summarise([times(np.full(12, 500.0)), grows], warm_up=0))["total"].against_points
-    assert both == alone
-    assert alone.exponent == pytest.approx(1.0)
 
 
 def test_sizes_are_the_largest_over_scenes_and_the_finish_that_of_the_last_maps() -> None:
@@ -120,12 +95,6 @@ def test_the_share_of_the_map_is_what_is_neither_reading_nor_perception() -> Non
     np.testing.assert_array_equal(one.ms("map"), 2.0)
 
 
-def test_a_stage_that_only_some_scenes_have_counts_as_zero_in_the_others() -> None:
-    summary = summarise([times(np.ones(5), match_ms=np.ones(5)), times(np.ones(5))], warm_up=0)
-    assert stages_of(summary)["match"].share == 0.5
-    assert stages_of(summary)["match"].n == 10
-
-
 def test_a_run_records_sizes_memory_and_the_cost_of_every_map(run: Path) -> None:
     (first, second) = read_update_times(read_run(run), "collector")
     assert [first.scene, second.scene] == ["painted/a", "painted/b"]
@@ -145,12 +114,6 @@ def test_the_maps_midway_are_scored_and_their_numbers_stand_in_the_metrics(run: 
     assert coverage[0] <= coverage[1] <= results[0]["result"]["metrics"]["mAcc"]
 
 
-def test_a_run_with_other_shares_is_another_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = [*WORDS[:-2], "0.25", "--out", str(run)]
-    assert main(words) == 2
-    assert "anytime was [0.5, 0.1], now [0.25]" in capsys.readouterr().err
-
-
 def test_the_report_prints_tables_and_writes_them_with_plots(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -168,120 +131,3 @@ def test_the_report_prints_tables_and_writes_them_with_plots(
     for name in ("update-cost", "update-course", "memory", "stages", "anytime"):
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
         assert (tmp_path / f"{name}.pdf").read_bytes().startswith(b"%PDF")
-
-
-@pytest.mark.parametrize("tells", [False, True])
-def test_the_size_of_maps_is_drawn_where_a_method_tells_it(tells: bool) -> None:
-    columns = {"rss_bytes": np.linspace(1e7, 2e7, 8), "n_points": np.linspace(10, 80, 8)}
-    columns |= {"map_bytes": np.linspace(1e5, 8e5, 8)} if tells else {}
-    panels = _memory([[times(np.ones(8), **columns)]]).axes
-    assert [axes.get_ylabel() for axes in panels] == [*["MiB of the map"] * tells, "MiB of the process"]
-    assert all(axes.lines for axes in panels)
-
-
-METHODS = ("opensu3d", "conceptgraphs-detector", "openmask3d-segment3d", "sam3d@incremental", "oracle")
-
-
-def drawn(n_methods: int, cost_ms: tuple[float, float]) -> list[Any]:
-    """The figures of several methods of long names, as wide costs as they may be."""
-    sizes = np.linspace(5e4, 3e5, 40)
-    made = []
-    for k, name in enumerate(METHODS[:n_methods]):
-        total = np.linspace(*cost_ms, 40) * (k + 1)
-        one = times(total, n_points=sizes, rss_bytes=np.linspace(1e9, 2e9, 40), map_bytes=sizes * 16, match_ms=total)
-        made.append([replace(one, method=name)])
-    points = [AnytimePoint("r", name, "rooms-instance", share, 9.0 * share, {"AP": share, "AP50": None})
-              for name in METHODS[:n_methods] for share in (0.5, 1.0)]  # fmt: skip
-    figures = [_update_cost(made, 0, POINTS), _update_cost(made, 0, UPDATES), _memory(made), _stages(made, 0)]
-    return [*figures, _anytime(points)]
-
-
-@pytest.mark.parametrize(
-    ("cost_ms", "n_methods"), [((0.4, 60.0), 5), ((14.0, 18.0), 1), ((900.0, 40_000.0), 2), ((7.0, 7.0), 1)]
-)
-def test_a_plot_has_a_sentence_as_title_plain_numbers_and_room_for_its_words(
-    cost_ms: tuple[float, float], n_methods: int
-) -> None:
-    figures = drawn(n_methods, cost_ms)
-    for figure in figures:
-        figure.draw_without_rendering()
-        whole = figure.bbox
-        for axes in figure.axes:
-            title = axes.get_title(loc="left")
-            assert len(title.split()) > 4
-            labels = [label.get_text() for axis in (axes.xaxis, axes.yaxis) for label in axis.get_ticklabels()]
-            assert not any("$" in text or "^" in text or re.search(r"\de[+-]?\d", text) for text in [*labels, title])
-            box = axes.get_tightbbox()
-            assert whole.x0 - 1 <= box.x0, "nothing of a panel is cut off"
-            assert box.x1 <= whole.x1 + 1, "nothing of a panel is cut off"
-            assert box.y1 <= whole.y1 + 1, "nothing of a panel is cut off"
-            assert axes.lines or axes.patches, "no panel is empty"
-        boxes = [axes.get_tightbbox() for axes in figure.axes]
-        for k, one in enumerate(boxes):
-            assert not any(one.shrunk(0.98, 0.98).overlaps(other) for other in boxes[:k]), "panels stand apart"
-    for figure in figures[:2]:
-        for axes in figure.axes:
-            for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
-                assert sum(low <= place <= high for place in axis.get_ticklocs()) >= 2
-
-
-def test_the_markers_of_the_memory_stand_whole() -> None:
-    axes = _memory([[times(np.ones(40), rss_bytes=np.linspace(1e9, 2e9, 40))]]).axes[0]
-    assert axes.get_ylim()[1] > 1.01 * np.max(np.asarray(axes.lines[0].get_ydata()))
-
-
-def test_the_title_of_a_plot_says_what_its_lines_show() -> None:
-    sizes = np.linspace(5e4, 3e5, 60)
-    grows = replace(times(sizes / 1e3, n_points=sizes, match_ms=sizes / 1e3), method="one")
-    constant = replace(times(np.full(60, 9.0), n_points=sizes, match_ms=np.full(60, 9.0)), method="two")
-    (axes,) = _update_cost([[grows], [constant]], 0, POINTS).axes
-    title = " ".join(axes.get_title(loc="left").split())
-    assert title == "With the points of the map, the cost of an update grows for one; stays constant for two"
-
-
-def test_the_report_answers_in_json(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["report", "timing", str(run), "--json"]) == 0
-    (method,) = json.loads(capsys.readouterr().out)["methods"]
-    assert (method["method"], method["n_updates"]) == ("collector", 12)
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["--methods", "colector"], "did you mean 'collector'"),
-        (["--warm-up", "-1"], "--warm-up is a count from 0"),
-        (["--camera-rate", "0"], "--camera-rate a number above 0"),
-        (["--methods", "oracle"], "no update was timed"),
-    ],
-)
-def test_a_wrong_request_is_one_line(
-    run: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["report", "timing", str(run), *words]) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.count("\n") == 1
-
-
-@pytest.mark.parametrize("text", ["update,total_ms\n1,x\n", "update,total_ms\n1\n", "update,total_ms\n0,nan\n", "\x00"])
-def test_a_damaged_table_of_updates_is_one_line(run: Path, tmp_path: Path, text: str) -> None:
-    import shutil
-
-    shutil.copytree(run, tmp_path / "run")
-    job = read_run(tmp_path / "run").folder.job("painted/a", "collector")
-    job.updates.write_text(text)
-    if "total_ms" not in text:
-        assert [one.scene for one in read_update_times(read_run(tmp_path / "run"), "collector")] == ["painted/b"]
-        return
-    with pytest.raises(DataError, match=r"painted/a: updates\.csv: .*; run the same command again to mend it"):
-        read_update_times(read_run(tmp_path / "run"), "collector")
-
-
-def test_the_memory_watch_forgets_what_was_held_before() -> None:
-    block = np.ones(30_000_000)
-    with_block = peak_memory_bytes()
-    del block
-    start_memory_watch()
-    after = peak_memory_bytes()
-    if with_block is None or after is None:
-        pytest.skip("this system does not tell a process its peak memory")
-    assert after < with_block - 100_000_000

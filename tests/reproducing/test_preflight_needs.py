@@ -15,10 +15,10 @@ from su3d_bench.reproducing.recipe import load_recipe
 ROOM = ["--set", "n_frames=8", "width=64", "height=48", "mesh_spacing_m=0.2"]
 
 
-def missing_meshes(methods: tuple[str, ...], out: Path) -> list[Need]:
+def missing_meshes(methods: tuple[str, ...]) -> list[Need]:
     asked = Asked("embedded", "embedded", scenes={"replica": ("replica/bedroom0",)}, values={})
     (run,) = asked_runs(load_recipe("openmask3d"), load_recipe("openmask3d").chosen(["replica"]), asked)
-    return [need for need in preflight([replace(run, methods=methods)], out).needs if need.kind == "mesh"]
+    return [need for need in preflight([replace(run, methods=methods)]).needs if need.kind == "mesh"]
 
 
 def test_a_scan_without_its_mesh_is_missing_for_methods_that_cannot_do_without(
@@ -29,11 +29,11 @@ def test_a_scan_without_its_mesh_is_missing_for_methods_that_cannot_do_without(
     words = ["datasets", "make", "rooms", "--layout", "replica", "--scenes", "bedroom0", *ROOM, "--quiet"]
     assert main([*words, "--out", str(tmp_path / "data")]) == 0
     both = ("openmask3d", "sam3d", "conceptgraphs")
-    assert missing_meshes(both, tmp_path / "out") == []
+    assert missing_meshes(both) == []
     (tmp_path / "data/Replica/bedroom0_mesh.ply").unlink()
-    (need,) = missing_meshes((*both, "sam3d@ensemble"), tmp_path / "out")
-    assert need.is_required and not need.is_here and need.how == "su3d-bench fetch replica"
+    (need,) = missing_meshes((*both, "sam3d@ensemble"))
+    assert need.is_required and not need.is_here and need.how == "su3d-bench datasets fetch replica"
     assert need.name == "replica/bedroom0: the scan's mesh"
     assert "bedroom0_mesh.ply is missing" in need.remark
     assert need.remark.endswith("openmask3d, sam3d@ensemble cannot do without")
-    assert missing_meshes(("sam3d", "conceptgraphs"), tmp_path / "out") == []
+    assert missing_meshes(("sam3d", "conceptgraphs")) == []

@@ -5,10 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from tiny_models import needs_models
 
 from su3d_bench.cli.main import main
-from su3d_bench.cli.reproduce import rehearsal
 from su3d_bench.core.errors import Su3dError
 from su3d_bench.reproducing.asked import Asked, asked_runs, plan_of
 from su3d_bench.reproducing.preflight import preflight
@@ -23,31 +21,6 @@ def out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name in ("SU3D_DATA", "SU3D_MODELS", "SU3D_CACHE", "HF_HUB_CACHE"):
         monkeypatch.setenv(name, str(tmp_path / "none"))
     return tmp_path / "out"
-
-
-@needs_models
-def test_a_rehearsal_has_the_papers_profile_with_the_models_that_its_tables_need(
-    out: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main([*WORDS, "--out", str(out)]) == 0
-    said = capsys.readouterr()
-    assert said.err.startswith("rehearsal: the profile 'paper' with tiny networks of random weights")
-    assert {path.name for path in (out / "models").iterdir() if not path.name.startswith(".")} == {
-        "clip-vit-l-14-336", "grounding-dino", "ram-plus-onnx", "sam-vit-h",
-    }  # fmt: skip
-    assert "everything that is required is here" in said.out
-
-
-def test_without_the_extras_the_embedded_profile_is_rehearsed_and_the_first_line_says_so(
-    out: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(rehearsal, "find_spec", lambda name: None if name == "onnx" else name)
-    assert main([*WORDS, "--out", str(out)]) == 0
-    said = capsys.readouterr().err
-    assert said.startswith("rehearsal: the profile 'embedded' in place of 'paper': onnx is not installed (pip install")
-    assert not (out / "models").exists()
-    assert main([*WORDS, "--out", str(out), "--profile", "paper"]) == 2
-    assert "--rehearse --profile paper: onnx is not installed" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("device", ["gpu", "cuda:99"])
@@ -66,7 +39,7 @@ def test_the_device_reaches_every_run_and_the_preflight(out: Path) -> None:
     asked = Asked("embedded", "embedded", device="cuda:99", values={})
     runs = asked_runs(recipe, recipe.experiments, asked)
     assert {run.dataset for run in runs} == {"replica", "scannet"}
-    assert any(need.kind == "GPU memory" for need in preflight(runs, out).needs)
+    assert any(need.kind == "GPU memory" for need in preflight(runs).needs)
     for run in runs:
         with pytest.raises(Su3dError, match="device 'cuda:99'"):
             plan_of(run, out)

@@ -13,9 +13,9 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.config import Settings
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.reproducing.predictions import Given, named_predictions
+from su3d_bench.reproducing.asked import named_predictions
 from su3d_bench.reproducing.recipe import load_recipe
-from su3d_bench.runs.parts import build_dataset, part_of
+from su3d_bench.runs.job import build_dataset, part_of
 
 ROOM = ["--rooms", "bedroom0", "--room-settings", "n_frames=20", "width=160", "height=120", "mesh_spacing_m=0.1"]
 WORDS = ["reproduce", "hovsg", "--rehearse", *ROOM, "--jobs", "1", "--limit", "1", "--quiet"]
@@ -74,9 +74,3 @@ def test_what_predictions_cannot_be_taken_is_one_line(
     filled = [[text.format(tmp_path, name=tmp_path.name) for text in texts] for texts in (predictions, features)]
     with pytest.raises(ConfigError, match=said):
         named_predictions(load_recipe("ovo").experiments, *filled)
-
-
-def test_each_method_has_its_folder_and_the_texts_of_its_encoder(tmp_path: Path) -> None:
-    (tmp_path / "a").mkdir()
-    given = named_predictions(load_recipe("ovo").experiments, [f"HOV-SG={tmp_path}", f"OpenNeRF={tmp_path / 'a'}"])
-    assert given == {"HOV-SG": Given(tmp_path), "OpenNeRF": Given(tmp_path / "a")}

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.reports.tables.papers.published import figures_of, published
+from su3d_bench.reports.tables.paper import figures_of, published
 from su3d_bench.reproducing.asked import Asked, asked_runs, method_of_row
 from su3d_bench.reproducing.differences import Results
 from su3d_bench.reproducing.recipe import Experiment, load_recipe, recipe_names
@@ -49,25 +49,6 @@ def test_opensu3ds_recipe_has_every_figure_that_is_printed_in_its_paper() -> Non
     printed = [figure for one in load_recipe("opensu3d").experiments for figure in one.printed()]
     assert [figure for figure in published() if figure.table is not None and figure not in printed] == []
     assert figures_of(table="I") == printed[:9]
-
-
-def test_rows_of_a_sweep_are_the_variants_that_it_makes() -> None:
-    (sweep, *_) = load_recipe("opensu3d").experiments
-    rows = {figure.row: method_of_row(sweep, figure.method, figure.row) for figure in sweep.printed()}
-    assert rows["m=1"] == "opensu3d@top_m=1"
-    assert rows["m=5"] == rows["k=3"] == rows["ratios=0.8,1,1.2"] == "opensu3d"
-    assert rows["ratios=0.1,1,1.1"] == "opensu3d@crop_ratios=[0.1,1,1.1]"
-
-
-def test_tables_of_other_encoders_are_other_runs(tmp_path: Path) -> None:
-    recipe = load_recipe("opensu3d")
-    runs = asked_runs(recipe, recipe.chosen(["II", "III"]), Asked())
-    assert [(run.name, run.encoder) for run in runs] == [
-        ("replica", "clip-vit-h-14"),
-        ("replica-clip-vit-l-14-336", "clip-vit-l-14-336"),
-    ]
-    (one,) = asked_runs(recipe, recipe.chosen(["II", "III"]), Asked(encoder="embedded"))
-    assert one.folder(tmp_path) == tmp_path / "runs" / "replica"
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,9 @@ from painted import colour_perception
 from places import SCENES
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import ConfigError, StoreError
+from su3d_bench.core.errors import ConfigError
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.runs.planning.ablation import ablation_rows, read_rows
+from su3d_bench.runs.ablation import ablation_rows, read_rows
 
 PAINTED = f"{SCENES}/painted.py"
 
@@ -26,22 +26,6 @@ def test_the_papers_sweep_has_its_nine_rows_and_the_default_is_the_method_itself
     assert rows[0].method == "opensu3d@top_m=1"
     assert rows[5].method == "opensu3d@crop_ratios=[0.8,1.0,1.2,1.4,1.6]"
     assert len({row.method for row in rows}) == 7
-
-
-def test_a_grid_has_every_combination() -> None:
-    rows = ablation_rows("opensu3d", ["m=1,5", "overlap_rule=smaller-segment,as-printed"], is_grid=True)
-    assert [row.value for row in rows] == [
-        "1 x smaller-segment",
-        "1 x as-printed",
-        "5 x smaller-segment",
-        "5 x as-printed",
-    ]
-    assert [row.method for row in rows] == [
-        "opensu3d@top_m=1,overlap_rule=smaller-segment",
-        "opensu3d@top_m=1,overlap_rule=as-printed",
-        "opensu3d",
-        "opensu3d@top_m=5,overlap_rule=as-printed",
-    ]
 
 
 @pytest.mark.parametrize(
@@ -61,11 +45,6 @@ def test_a_wrong_sweep_is_one_line(vary: list[str], message: str) -> None:
         ablation_rows("opensu3d", vary, is_grid=False)
 
 
-def test_one_setting_cannot_have_two_values_at_once() -> None:
-    with pytest.raises(ConfigError, match="varied twice"):
-        ablation_rows("opensu3d", ["k=1", "ratios=[1.0]"], is_grid=True)
-
-
 def test_a_sweep_is_one_run_with_its_rows_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(scene_run, "build_perception", colour_perception)
     words = ["ablate", "--method", f"{PAINTED}:Collector", "--vary", "stride=1,2", "drop=0,1", "--no-pictures"]
@@ -75,22 +54,3 @@ def test_a_sweep_is_one_run_with_its_rows_beside_it(tmp_path: Path, monkeypatch:
     assert [row.method for row in rows] == ["collector", "collector@stride=2", "collector", "collector@drop=1"]
     results = json.loads((tmp_path / "out" / "metrics.json").read_text())["results"]
     assert [one["method"] for one in results] == ["collector", "collector@stride=2", "collector@drop=1"]
-
-
-def test_other_methods_stand_beside_a_sweep_in_one_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    words = ["ablate", "--method", f"{PAINTED}:Collector", "--vary", "drop=0,1", "--no-pictures", "--jobs", "1"]
-    words += ["--beside", f"{PAINTED}:Collector", f"{PAINTED}:Collector@noise_m=0.1"]
-    words += ["--scenes", f"{PAINTED}:Painted/a", "--protocols", "rooms-semantic"]
-    assert main([*words, "--out", str(tmp_path / "out")]) == 0
-    assert [row.method for row in read_rows(tmp_path / "out")] == ["collector", "collector@drop=1"]
-    results = json.loads((tmp_path / "out" / "metrics.json").read_text())["results"]
-    assert [one["method"] for one in results] == ["collector", "collector@drop=1", "collector@noise_m=0.1"]
-
-
-def test_a_run_that_is_no_sweep_says_so(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match="ablate --vary"):
-        read_rows(tmp_path)
-    (tmp_path / "ablation.json").write_text('{"rows": [1]}')
-    with pytest.raises(StoreError, match="run the sweep again"):
-        read_rows(tmp_path)

@@ -13,10 +13,9 @@ from painted import colour_perception
 from places import SCENES
 
 from su3d_bench.cli.main import main
-from su3d_bench.runs import feeding as scene_feeding
+from su3d_bench.runs import frame_loop as scene_feeding
 from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.runs.planning.ablation import read_rows
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 PAINTED = f"{SCENES}/painted.py:Painted"
@@ -175,19 +174,6 @@ def test_a_replacement_that_is_killed_midway_goes_on_where_it_was(monkeypatch: p
     assert run("a", "--seed", "1", out="whole") == 0
     assert Path("out/metrics.json").read_bytes() == Path("whole/metrics.json").read_bytes()
     assert not list(Path("out").rglob("*.unfinished"))
-
-
-def test_a_sweep_grows_by_its_rows(capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["ablate", f"{PAINTED}/a", "--method", COLLECTOR, "--protocols", "rooms-semantic", *REST, "--out", "out"]
-    assert main([*words, "--vary", "drop=0,1"]) == 0
-    assert main([*words, "--vary", "stride=1,2"]) == 2
-    assert main([*words, "--vary", "stride=1,2", "--extend"]) == 0
-    assert [row.method for row in read_rows(Path("out"))] == [
-        "collector", "collector@drop=1", "collector", "collector@stride=2"
-    ]  # fmt: skip
-    assert record("run.json")["methods"] == ["collector", "collector@drop=1", "collector@stride=2"]
-    assert main([*words, "--vary", "drop=0,2", "--replace"]) == 0
-    assert [row.method for row in read_rows(Path("out"))] == ["collector", "collector@drop=2"]
 
 
 DAMAGE: dict[str, Callable[[bytes], bytes]] = {

@@ -46,12 +46,3 @@ def test_a_run_ends_with_its_pictures_and_commands_that_are_true_for_it(capsys: 
     )
     assert query[2] in {"chair", "sofa", "table", "lamp", "plant", "book", "floor", "wall"}
     assert main(compare) == 0 and main([*html, "--no-maps", "--no-errors", "--quiet"]) == 0
-
-
-def test_a_run_of_one_method_is_learnt_from_and_a_quiet_one_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    lines = lines_of(capsys, "--methods", COLLECTOR, "--no-pictures", "--out", "one")
-    *_, last = commands_in(lines)
-    assert not any(line.startswith("pictures: ") for line in lines)
-    assert last == ["check", "--learn", "one", "--out", "reference.json"] and main(last) == 0
-    capsys.readouterr()
-    assert lines_of(capsys, "--methods", COLLECTOR, "--no-pictures", "--out", "one", "--quiet") == []

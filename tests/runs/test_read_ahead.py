@@ -9,7 +9,7 @@ from waiting import wait_until
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Frame
-from su3d_bench.runs.feeding import ReadAhead
+from su3d_bench.runs.frame_loop import ReadAhead
 
 N_FRAMES = 40
 
@@ -62,15 +62,6 @@ def test_no_more_frames_are_read_than_may_wait() -> None:
             assert len(frames.begun) == n_taken + 3
 
 
-def test_without_any_ahead_each_frame_is_read_when_it_is_asked_for() -> None:
-    frames = Watched()
-    with ReadAhead(frames, N_FRAMES, n_ahead=0) as ahead:
-        for n_taken in range(3):
-            settle(ahead)
-            assert len(frames.begun) == n_taken
-            assert ahead.next_frame().index == n_taken
-
-
 def test_the_first_frame_is_read_before_any_other_begins() -> None:
     frames, is_over = Watched(lambda _: is_over.wait(10) and None), threading.Event()
     with ReadAhead(frames, N_FRAMES) as ahead:
@@ -80,12 +71,6 @@ def test_the_first_frame_is_read_before_any_other_begins() -> None:
         is_over.set()
         ahead.next_frame()
         wait_until(lambda: sorted(frames.begun) == [0, 1, 2])
-
-
-def test_frames_are_read_side_by_side_while_one_is_in_use() -> None:
-    both = threading.Barrier(2)
-    with ReadAhead(Watched(lambda i: i and both.wait(10) and None), 5) as ahead:
-        assert [ahead.next_frame().index for _ in range(5)] == [0, 1, 2, 3, 4]
 
 
 def test_a_broken_frame_fails_when_it_is_asked_for_and_not_before() -> None:
@@ -110,21 +95,3 @@ def test_leaving_early_ends_the_threads_and_reads_nothing_more(n_taken: int) -> 
     n_begun = len(frames.begun)
     assert n_begun <= min(n_taken + 2, N_FRAMES)
     assert len(frames.begun) == n_begun
-
-
-def test_an_error_of_who_uses_the_frames_ends_the_threads_too() -> None:
-    def use() -> None:
-        with ReadAhead(Watched(), N_FRAMES) as ahead:
-            ahead.next_frame()
-            raise RuntimeError("the method failed")
-
-    with pytest.raises(RuntimeError, match="the method failed"):
-        use()
-    assert threads() == 0
-
-
-def test_no_frames_start_no_thread() -> None:
-    frames = Watched()
-    with ReadAhead(frames, 0):
-        assert threads() == 0
-    assert frames.begun == []

@@ -1,16 +1,14 @@
 from __future__ import annotations
 
-import doctest
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 from su3d_bench.core.types import PerceptionNeeds, SceneInfo
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.reports.tables import warnings
-from su3d_bench.reports.tables.run import headline, markdown_table
+from su3d_bench.reports.tables.run import markdown_table
 from su3d_bench.runs.job import caveat_of
-from su3d_bench.runs.runner import confidences_of
+from su3d_bench.runs.summary import confidences_of
 from su3d_bench.store.records import NumbersRecord
 
 
@@ -47,57 +45,12 @@ def test_a_row_shows_value_interval_ceiling_scenes_and_coverage() -> None:
     assert cells == ["opensu3d", "40.8 [38.9, 42.6]", "31.2", "97.1 / 100.0", "8", "99.1 / 99.8 / 100.0"]
 
 
-def test_a_headline_reads_as_the_house_style_has_it() -> None:
-    one = result(headline=["mAcc"])
-    assert headline(one) == "mAcc 40.8 [38.9, 42.6] (8 scenes, truth's score 97.1)"
-
-
-def test_columns_line_up_as_plain_text() -> None:
-    lines = [line for line in table(result(), result("oracle")).splitlines() if line.startswith("|")]
-    assert len({len(line) for line in lines}) == 1
-    assert len(lines) == 4
-
-
 def test_missing_scenes_are_counted_and_named() -> None:
     few = result()["result"] | {"n_scenes": 7}
     text = table(result(result=few, failed=["rooms/c"], caveat="labels mean little here"))
     assert "| 7/8 " in text
     assert "- INCOMPLETE: opensu3d failed on rooms/c" in text
     assert "- opensu3d: labels mean little here" in text
-
-
-def test_a_partial_run_is_shouted() -> None:
-    assert "**rooms-semantic (version 2): PARTIAL, only the first 3 frames of each scene**" in table(
-        result(), is_partial=True
-    )
-    assert "PARTIAL" not in table(result())
-
-
-def test_a_warning_of_many_scenes_stands_once() -> None:
-    assert table(result()).count("3 classes have no points") == 1
-    assert "- opensu3d: 3 classes have no points (rooms/a, rooms/b)" in table(result())
-
-
-def test_the_masks_that_scenes_are_warned_of_are_added_up() -> None:
-    lines = ["a: 1 of 4 masks has no point: it counts for nothing", "b: 2 of 6 masks have no point: they count for"]
-    scored = result()["result"] | {"warnings": [*lines, "a: 1 class has no points", "b: 2 classes have no points"]}
-    notes = [line for line in table(result(result=scored)).splitlines() if line.startswith("- opensu3d")]
-    assert notes == [
-        "- opensu3d: 3 of 10 masks have no point (a, b)",
-        "- opensu3d: 1 class has no points (a)",
-        "- opensu3d: 2 classes have no points (b)",
-    ]
-
-
-def test_what_was_not_measured_is_a_dash() -> None:
-    text = table(result(result=None, ceiling=None, unscored=["rooms/a"]), result(method="other"))
-    row = next(line for line in text.splitlines() if line.startswith("| opensu3d"))
-    assert [cell.strip() for cell in row.strip("|").split("|")] == ["opensu3d", "-", "-", "-", "0/8", "-"]
-    assert "- opensu3d is unscored on rooms/a" in text
-
-
-def test_no_protocol_is_said() -> None:
-    assert table() == "no protocol scores these scenes\n"
 
 
 def test_made_rooms_in_anothers_layout_are_said_to_be_such() -> None:
@@ -133,17 +86,3 @@ def test_where_confidences_come_from_is_told_by_the_protocol_or_seen_in_the_pred
     assert confidences_of(own, numbers("d/a", "d/b")) == "the same for all instances of a scene"
     assert confidences_of(own, numbers("every scene")) == "the same for all instances of a scene"
     assert confidences_of(own, numbers("d/a")) == "computed by the method"
-
-
-def test_a_mix_of_confidences_is_shouted_and_one_kind_is_said() -> None:
-    ones, own = "the same for all instances of a scene", "computed by the method"
-    mixed = table(result("a", confidences=ones), result("b", confidences=own), result("c", confidences=ones))
-    assert f"- MIXED CONFIDENCES: {ones} (a, c); {own} (b): these average precisions do not compare" in mixed
-    alike = table(result("a", confidences=ones), result("b", confidences=ones), result("c", confidences=None))
-    assert f"- confidences: {ones}" in alike and "MIXED" not in alike
-    assert "onfidences" not in table(result("a"), result("b", confidences=None))
-
-
-def test_the_examples_hold() -> None:
-    found = doctest.testmod(warnings)
-    assert found.attempted and not found.failed

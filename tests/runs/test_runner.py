@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import csv
 import json
-import os
-import subprocess
-import tomllib
 from pathlib import Path
 from typing import Any
 
 import pytest
 from painted import ColourPerception, colour_perception
-from painted_runs import PAINTED, in_process, job, metrics, run, words
+from painted_runs import job, metrics, run, words
 from places import SCENES
 
 from su3d_bench.cli.main import main
-from su3d_bench.runs import feeding as scene_feeding
+from su3d_bench.runs import frame_loop as scene_feeding
 from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import scene as scene_run
 
@@ -50,39 +46,6 @@ def test_perfect_perception_gives_a_perfect_score_and_its_ceiling() -> None:
             assert one["ceiling"][name] == 1.0
 
 
-def test_a_method_that_misses_an_object_scores_less_under_the_same_ceiling() -> None:
-    assert run("--set", "collector.drop=1") == 0
-    semantic = metrics()["results"][0]
-    assert semantic["result"]["metrics"]["mAcc"] < 1.0
-    assert semantic["ceiling"]["mAcc"] == 1.0
-
-
-def test_the_order_of_scenes_and_their_repetition_change_nothing_but_the_order() -> None:
-    assert run(scenes="[ab]") == 0
-    first = metrics()
-    scenes = ["--scenes", f"{PAINTED}/b", f"{PAINTED}/a", f"{PAINTED}/[ab]"]
-    assert run(*scenes, out="other") == 0
-    second = metrics("other")
-    assert second["scenes"] == ["painted/b", "painted/a"]
-    assert first["results"] == second["results"]
-
-
-def test_updates_hold_a_row_a_frame_with_its_stages() -> None:
-    assert run("--set", "painted.n_frames=5", "--stride", "2", scenes="a") == 0
-    rows = list(csv.DictReader((job() / "updates.csv").open()))
-    assert [row["frame"] for row in rows] == ["0", "2", "4"]
-    assert list(rows[0])[:5] == ["update", "frame", "n_detections", "n_points", "n_instances"]
-    assert list(rows[0])[5:] == ["rss_bytes", "decode_ms", "segment_ms", "collect_ms", "method_ms", "total_ms"]
-    assert [int(row["n_points"]) for row in rows] == [768, 1536, 2304]
-
-
-def test_metrics_hold_no_path_date_or_time() -> None:
-    assert run() == 0
-    text = Path("out/metrics.json").read_text()
-    assert str(SCENES) not in text
-    assert "202" not in text.replace("0.", "")
-
-
 def test_the_same_command_again_does_nothing_and_gives_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
     assert run() == 0
     before = Path("out/metrics.json").read_bytes()
@@ -110,14 +73,6 @@ def test_a_damaged_file_is_made_again(name: str) -> None:
     assert run(scenes="a") == 0
     assert Path("out/metrics.json").read_bytes() == before
     assert (job() / "counts.npz").read_bytes() == counts
-
-
-def test_other_protocols_score_the_same_predictions_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert run(scenes="a") == 0
-    made = (job() / "prediction.npz").stat().st_mtime_ns
-    assert run("--protocols", "replica-mesh-ex6", "--replace", scenes="a") == 0
-    assert [one["protocol"] for one in metrics()["results"]] == ["replica-mesh-ex6"]
-    assert (job() / "prediction.npz").stat().st_mtime_ns == made
 
 
 PLUG_IN = (SCENES / "painted.py").read_text().splitlines()
@@ -190,62 +145,6 @@ def test_a_scene_without_truth_runs_unscored(capsys: pytest.CaptureFixture[str])
     assert Path("out/metrics.json").read_bytes() == before
 
 
-def test_a_limit_marks_the_run_partial_in_every_table(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("--limit", "2") == 0
-    text = capsys.readouterr().out
-    assert text.count("PARTIAL, only the first 2 frames of each scene") == 2
-    assert metrics()["is_partial"] is True
-    assert json.loads(Path("out/run.json").read_text())["is_partial"] is True
-
-
-def test_resolved_values_say_where_they_came_from_and_run_again() -> None:
-    Path("my.toml").write_text("[method.collector]\nstride = 2\n")
-    assert run("--config", "my.toml", "--set", "painted.n_frames=5", scenes="a") == 0
-    text = Path("out/run.toml").read_text()
-    assert "stride = 2  # my.toml:2\n" in text
-    assert "n_frames = 5  # --set painted.n_frames\n" in text
-    assert "drop = 0  # default\n" in text
-    assert tomllib.loads(text)["method"]["collector"] == {"stride": 2, "drop": 0, "noise_m": 0.0}
-    assert main(["run", "--config", "out/run.toml", "--out", "again"]) == 0
-    assert Path("out/metrics.json").read_bytes() == Path("again/metrics.json").read_bytes()
-
-
-def test_pictures_are_drawn_and_vouched_for() -> None:
-    assert run("--pictures", scenes="a") == 0
-    pictures = {path.name for path in (job() / "pictures").iterdir()}
-    assert pictures == {"instances.png", "classes.png"}
-    (job() / "pictures" / "classes.png").unlink()
-    assert run("--pictures", scenes="a") == 0
-    assert (job() / "pictures" / "classes.png").is_file()
-
-
-def test_progress_shows_scenes_and_frames_on_a_terminal_only() -> None:
-    ours, theirs = os.openpty()
-    slow = in_process("--set", "painted.frame_ms=60", "--jobs", "2", out="tty")
-    with subprocess.Popen(slow, stdout=subprocess.PIPE, stderr=theirs, text=True) as process:
-        os.close(theirs)
-        shown = b"".join(iter(lambda: read_some(ours), b"")).decode()
-        assert process.stdout is not None
-        assert process.stdout.read().startswith("**rooms-semantic")
-    assert "scenes" in shown
-    assert "painted/a collector" in shown
-    assert "/s, 4 instances" in shown and "scoring 1 of " in shown
-    assert "4 instances" in shown
-    quiet = subprocess.run(slow, capture_output=True, text=True)
-    lines = quiet.stderr.splitlines()
-    end = lines.index("run folder: tty")
-    assert all("the camera hardly moves" in line for line in lines[:end])
-    assert all(" su3d-bench " in line for line in lines[end + 1 :])
-
-
-def read_some(descriptor: int) -> bytes:
-    """What a pseudo terminal holds; nothing once its other end is closed."""
-    try:
-        return os.read(descriptor, 65536)
-    except OSError:
-        return b""
-
-
 def test_scenes_whose_names_differ_in_a_slash_have_a_map_each(capsys: pytest.CaptureFixture[str]) -> None:
     twins = ["run", "--scenes", f"{SCENES}/twins.py:Twins/*", *words()[3:]]
     assert main(twins) == 0
@@ -256,18 +155,9 @@ def test_scenes_whose_names_differ_in_a_slash_have_a_map_each(capsys: pytest.Cap
     assert main(twins) == 0
     capsys.readouterr()
     assert (
-        main(["export", "out", "--to", "scannet", "--scenes", "twins/a/b", "--method", "collector", "--out", "x"]) == 2
+        main(
+            ["runs", "export", "out", "--to", "scannet", "--scenes", "twins/a/b", "--method", "collector", "--out", "x"]
+        )
+        == 2
     )
     assert "scene 'a/b': cannot be the name of a file" in capsys.readouterr().err
-
-
-def test_a_scene_is_exported_under_its_own_name(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run", "--scenes", f"{SCENES}/twins.py:Twins/a_b", *words()[3:]]) == 0
-    capsys.readouterr()
-    assert main(["export", "out", "--to", "openlex3d", "--method", "collector", "--out", "x"]) == 0
-    assert [path.name for path in Path("x/twins").iterdir()] == ["a_b"]
-
-
-def test_a_protocol_named_twice_counts_once() -> None:
-    assert main([*words(scenes="a"), "--protocols", "rooms-semantic", "rooms-semantic"]) == 0
-    assert [one["protocol"] for one in metrics()["results"]] == ["rooms-semantic"]

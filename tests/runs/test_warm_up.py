@@ -6,20 +6,9 @@ import pytest
 
 from su3d_bench.core import registry
 from su3d_bench.core.interfaces import TakesTools, WarmsUp
-from su3d_bench.runs.feeding import warm_up
+from su3d_bench.runs.frame_loop import warm_up
 
 WARMED = [name for name in registry.METHODS if isinstance(registry.load("method", name), WarmsUp)]
-
-
-def test_the_methods_that_fuse_frames_ask_for_it() -> None:
-    assert WARMED == [
-        "opensu3d",
-        "conceptfusion",
-        "conceptfusion-sam",
-        "conceptgraphs",
-        "conceptgraphs-detector",
-        "sam3d",
-    ]
 
 
 @pytest.mark.parametrize("name", WARMED)

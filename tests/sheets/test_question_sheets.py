@@ -7,30 +7,22 @@ import json
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from made_sheets import PAINTED, RUN
-from painted import LABELS, Painted, colour_perception
-from PIL import Image
+from made_sheets import PAINTED
+from painted import LABELS, Painted
 from simulated_annotators import SET_ID
 
 from su3d_bench.analysis.tables import measured_results
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import DataError, GroundTruthMissing
-from su3d_bench.questions.files.files import read_questions
-from su3d_bench.questions.files.left_out import read_left_out
+from su3d_bench.questions.generated import generate_questions
 from su3d_bench.questions.model import MADE_KINDS, REASONING, question_id
-from su3d_bench.questions.reasoning.answers import Answer
-from su3d_bench.questions.reasoning.generated import GeneratedQuestion, generate_questions
+from su3d_bench.questions.query_files import read_left_out
 from su3d_bench.questions.truths import fullest_truth, scene_objects
-from su3d_bench.reports.tables.judged import sheet_tables
-from su3d_bench.runs import finished as finished_run
-from su3d_bench.runs import scene as scene_run
+from su3d_bench.sheets.answers import Judgement, check_key
+from su3d_bench.sheets.drafts import question_drafts
 from su3d_bench.sheets.items import (
     ARGUABLE,
     ASKS,
@@ -46,13 +38,8 @@ from su3d_bench.sheets.items import (
     write_key,
     write_sheet,
 )
-from su3d_bench.sheets.judging.answers import Judgement, check_key
-from su3d_bench.sheets.judging.scores import OF_ALL_KINDS, Scores, read_scores, score
-from su3d_bench.sheets.judging.verdicts import WHOLE, whole_verdicts
-from su3d_bench.sheets.making import question_drafts as question_drafts_module
-from su3d_bench.sheets.making.drawing import SceneDrafts, draw_all, draw_scene
-from su3d_bench.sheets.making.question_drafts import question_drafts
-from su3d_bench.sheets.making.truth_source import TruthSource, truth_of_addresses, truth_of_run
+from su3d_bench.sheets.scores import OF_ALL_KINDS, WHOLE, Scores, read_scores, score, whole_verdicts
+from su3d_bench.sheets.sources import TruthSource, truth_of_addresses
 
 SCENE = f"{PAINTED}/a"
 PARTS = tuple(ask.name for ask in ASKS["questions"])
@@ -76,14 +63,6 @@ def painted_objects() -> Any:
 
 
 # Made
-
-
-def test_what_a_no_was_held_against_is_outlined(source: TruthSource, monkeypatch: pytest.MonkeyPatch) -> None:
-    denied = GeneratedQuestion("Is there a lamp on the sofa?", "is on", Answer("no: the map has none", value=False))
-    monkeypatch.setattr(question_drafts_module, "generate_questions", lambda objects, n_each: (denied,))
-    (draft,) = [one for one in question_drafts(source, "painted/a", 1) if one.question_kind == "is on"]
-    assert draft.text.endswith("Answer: no") and not draft.rows
-    assert [draft.names[row] for row in draft.others] == ["sofa"]
 
 
 def test_each_kind_and_template_is_asked_with_the_answer_of_the_truth(source: TruthSource) -> None:
@@ -111,40 +90,6 @@ def test_each_kind_and_template_is_asked_with_the_answer_of_the_truth(source: Tr
     assert not any(one.automatic for one in drafts)
 
 
-def test_the_map_of_a_truth_has_every_instance_of_it(source: TruthSource) -> None:
-    found, truth = source.instances("painted/a"), source.truth("painted/a")
-    assert found.names == LABELS.names and found.ids.tolist() == [1, 2, 3, 4]
-    assert [truth.instance[found.mask(k)].tolist() for k in range(4)] == [
-        [k + 1] * int((truth.instance == k + 1).sum()) for k in range(4)
-    ]
-
-
-def test_what_is_left_out_makes_room_for_others_of_its_kind(source: TruthSource) -> None:
-    before = question_drafts(source, "painted/a", 2)
-    gone = {next(one.question_id for one in before if one.question_kind == kind) for kind in ("instance", "nearest")}
-    after = question_drafts(source, "painted/a", 2, gone)
-    assert not gone & {one.question_id for one in after}
-    kinds = [Counter(one.question_kind for one in drafts) for drafts in (before, after)]
-    assert kinds[0] - kinds[1] == Counter({"nearest": 1}) and not kinds[1] - kinds[0]
-
-
-def test_the_objects_that_answer_are_outlined_in_a_frame(source: TruthSource) -> None:
-    drafts = question_drafts(source, "painted/a", 1)
-    (answered, *_) = [one for one in drafts if one.question_kind == "nearest"]
-    assert answered.others and not set(answered.others) & set(answered.rows)
-    (picture,) = draw_all(source, [answered], 1)
-    pixels = np.asarray(Image.open(BytesIO(picture)).convert("RGB")).astype(int)
-    assert (np.abs(pixels - [255, 64, 200]).sum(axis=2) < 60).mean() > 0.001
-    again = draw_scene(SceneDrafts(source.opener, {0: answered}), lambda event: None)
-    assert again == {0: picture}
-
-
-def test_scenes_are_drawn_side_by_side_as_one_after_the_other() -> None:
-    both = truth_of_addresses([SCENE, f"{PAINTED}/b"])
-    drafts = [question_drafts(both, scene, 1)[0] for scene in both.scenes]
-    assert draw_all(both, drafts, 2) == draw_all(both, drafts, 1)
-
-
 def test_sheets_of_questions_need_no_run(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["sheets", "make", "--kind", "questions", "--scenes", SCENE, "--jobs", "1", "--per-kind", "1"]
     assert main([*words, "--annotators", "2", "--overlap", "1", "--out", "out", "--json"]) == 0
@@ -160,64 +105,6 @@ def test_sheets_of_questions_need_no_run(capsys: pytest.CaptureFixture[str]) -> 
     Path("gone.csv").write_text(f"question_id\n{listed}\n")
     assert main([*words, "--leave-out", "gone.csv", "--out", "without", "--quiet"]) == 0
     assert listed not in {one.question_id for one in read_key(Path("without-key/key.json")).items}
-
-
-def test_sheets_of_a_run_may_have_questions_among_the_kinds(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    monkeypatch.setattr(finished_run, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
-    assert main(RUN) == 0
-    words = ["sheets", "make", "run", "--jobs", "1", "--per-kind", "1", "--quiet", "--kind"]
-    assert main([*words, "annotation", "questions", "--out", "both"]) == 0
-    assert main([*words, "questions", "--out", "alone"]) == 0
-    for name in ("sheet.json", "annotator-1/sheet.html"):
-        assert Path("both/questions", name).read_bytes() == Path("alone", name).read_bytes()
-    key = read_key(Path("alone-key/key.json"))
-    assert (key.run, read_key(Path("both-key/annotation/key.json")).run) == ("run", "run")
-    assert truth_of_run(Path("run")).opener().scenes == ("painted/a",)
-    Path("asked.csv").write_text(
-        "scene,text,objects,kind\npainted/a,chair,1,instance\npainted/a,sofa,2,instance\n"
-        "painted/a,How many chairs are there?,,reasoning\npainted/a,How many sofas are there?,,reasoning\n"
-    )
-    gone = [
-        question_id("painted/a", "instance", "sofa"),
-        question_id("painted/a", REASONING, "How many chairs are there?"),
-    ]
-    Path("gone.csv").write_text("\n".join(["question_id", *gone]))
-    more = ["retrieval", "reasoning", "--questions", "asked.csv", "--leave-out", "gone.csv", "--out", "less"]
-    assert main([*words, *more]) == 0
-    shown = [
-        {one.text.split("\n")[0] for one in read_sheet(Path("less", kind, "sheet.json")).items} for kind in more[:2]
-    ]
-    assert shown == [{"chair"}, {"How many sofas are there?"}]
-
-
-@pytest.mark.parametrize(
-    ("words", "line"),
-    [
-        (["--kind", "questions"], "needs --scenes"),
-        (["--kind", "questions", "retrieval", "--scenes", SCENE], "RUN: name the folder of a run"),
-        (["--kind", "retrieval", "--scenes", SCENE], "RUN: name the folder of a run"),
-        (["--kind", "questions", "--scenes", SCENE, "--questions", "paper"], "--questions: sheets of kind questions"),
-        (["--kind", "questions", "--scenes", SCENE, "--methods", "x"], "--methods: no method has a part"),
-        (["--kind", "questions", "--scenes", SCENE, "--solver", "llm"], "add --kind reasoning"),
-        (["--kind", "questions", "--scenes", "rooms/nowhere*"], "no scene matches 'rooms/nowhere*'"),
-        (["--kind", "questions", "--scenes", SCENE, "--leave-out", "none.csv"], "none.csv is missing"),
-        (["run", "--kind", "annotation", "--leave-out", "none.csv"], "--leave-out: annotation sheets"),
-    ],
-)
-def test_what_cannot_be_asked_is_one_line(words: list[str], line: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["sheets", "make", *words, "--out", "out"]) == 2
-    told = capsys.readouterr().err
-    assert line in told and len(told.splitlines()) == 1
-    assert not Path("out").exists()
-
-
-def test_a_scene_without_truth_is_refused(source: TruthSource, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(type(source.dataset("painted/a")), "variants", ())
-    with pytest.raises(GroundTruthMissing, match="painted/a: the dataset has no ground truth"):
-        question_drafts(source, "painted/a", 1)
 
 
 # Scored
@@ -279,34 +166,6 @@ def test_shares_of_right_are_counted_by_kind_of_question() -> None:
     assert [shares["instance", part] for part in PARTS] == [1.0, 0.5, 1.0]
 
 
-def test_annotators_agree_on_parts_and_on_the_whole() -> None:
-    _, _, found = scored()
-    equal = {one.ask: (one.agreement.n_equal, one.agreement.n_items) for one in found.agreements}
-    assert equal == {"sense": (3, 4), "wording": (4, 4), "answer": (3, 4), WHOLE: (3, 4)}
-    assert found.annotators == {"ann": 12, "bob": 12} and found.n_judged == 4
-
-
-def test_what_is_disputed_or_wrong_is_looked_at_again() -> None:
-    _, _, found = scored()
-    assert [(one.item_id, one.ask, one.reason) for one in found.second_looks] == [
-        ("item-0001", "wording", "not right"),
-        ("item-0002", "answer", "not right"),
-        ("item-0003", "sense", "annotators disagree"),
-        ("item-0003", "answer", "annotators disagree"),
-    ]
-
-
-def test_tables_have_a_row_for_each_kind() -> None:
-    _, _, found = scored()
-    tables = {one.name: one for one in sheet_tables(asdict(found))}
-    assert list(tables) == ["questions-rooms", "agreement", "pairs"]
-    table = tables["questions-rooms"]
-    assert table.head == "kind" and table.columns == ("sense", "wording", "answer", WHOLE, ARGUABLE)
-    assert [row.label for row in table.rows] == ["instance (people)", "closer (people)", "all (people)"]
-    assert [row.label for row in tables["agreement"].rows] == [*PARTS, WHOLE]
-    assert not any("ground truth" in note.lower() for note in table.notes)
-
-
 @pytest.fixture
 def answered(tmp_path: Path) -> tuple[Key, list[str]]:
     """The files of two annotators, and the words that score them."""
@@ -345,46 +204,3 @@ def test_what_not_everybody_calls_right_is_written_for_leave_out(
     assert main([*words[:2], "--key", "key", "--disputed", "x.csv"]) == 2
     assert "--disputed: lists what people say" in capsys.readouterr().err
     assert not Path("x.csv").exists()
-
-
-def test_disputed_questions_are_not_made_again(capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["questions", "make", "--scenes", SCENE, "--per-kind", "2", "--out"]
-    assert main([*words, "all.toml"]) == 0
-    before = read_questions(Path("all.toml"))
-    gone = before[0]
-    Path("gone.csv").write_text(f"\ufeffkind;question_id\r\n{gone.kind};{gone.id}\r\n;\r\n", newline="")
-    assert main([*words, "rest.toml", "--leave-out", "gone.csv"]) == 0
-    assert "1 left out" in capsys.readouterr().err
-    after = read_questions(Path("rest.toml"))
-    assert gone not in after and len(after) == len(before)  # another one takes its place
-
-
-@pytest.mark.parametrize(
-    ("content", "told"),
-    [
-        ("", "the first line must name one column question_id"),
-        ("id\n3f6958fff541\n", "the first line must name one column question_id"),
-        ("question_id,question_id\n", "the first line must name one column question_id"),
-        ("question_id\n1.2E+11\n", "row 2: '1.2E+11' is no id of a question"),
-        ("text,question_id\nchair\n", "row 2: '' is no id of a question"),
-        ('question_id\n"3f69', "not CSV"),
-        ("question_id\n\x1b[2J\n", "row 2: '\\x1b[2J' is no id of a question"),
-    ],
-)
-def test_a_list_that_is_none_is_refused(content: str, told: str) -> None:
-    Path("gone.csv").write_text(content)
-    with pytest.raises(DataError) as caught:
-        read_left_out(Path("gone.csv"))
-    assert told in str(caught.value) and "\x1b" not in str(caught.value)
-
-
-def test_an_empty_list_leaves_out_nothing() -> None:
-    Path("gone.csv").write_text("question_id,text\n\n,\n")
-    assert read_left_out(Path("gone.csv")) == frozenset()
-    with pytest.raises(DataError, match="is missing"):
-        read_left_out(Path("none.csv"))
-
-
-def test_one_question_of_a_template_is_asked_where_its_answers_are_yes_and_no() -> None:
-    kinds = [Counter(one.kind for one in generate_questions(painted_objects(), n_each=n)) for n in (1, 2)]
-    assert set(kinds[0]) == set(kinds[1]) and set(kinds[0].values()) == {1}

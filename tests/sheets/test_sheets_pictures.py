@@ -3,38 +3,29 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass, replace
-from inspect import signature
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from made_sheets import HOSTILE, drafts_of
+from made_sheets import drafts_of
 from painted import colour_perception
 from PIL import Image
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Frame
-from su3d_bench.questions.files.files import figure_texts
-from su3d_bench.reports.pictures.colours import SCALES, scale_stops, similarity_colours
+from su3d_bench.questions.question_files import figure_texts
 from su3d_bench.reports.pictures.items import (
-    ItemParts,
-    Panel,
     best_view,
-    compose,
     mask_in_frame,
-    png_bytes,
     seen_in,
-    title_lines,
-    zoomed,
 )
 from su3d_bench.runs import finished as finished_run
-from su3d_bench.runs.executors.local import run_processes
-from su3d_bench.sheets.making.drawing import Artist, SceneDrafts, _lost, draw_all, draw_scene
-from su3d_bench.sheets.making.run_source import RunSource
+from su3d_bench.runs.executors import run_processes
+from su3d_bench.sheets.drawing import Artist, SceneDrafts, _lost, draw_all, draw_scene
+from su3d_bench.sheets.sources import RunSource
 
 TEXTS = tuple(f"thing {k}" for k in range(12))
 
@@ -50,60 +41,6 @@ def test_the_picture_of_an_item_is_small_and_shows_the_object(painted_source: Ru
     is_outline = (np.abs(picture - [255, 64, 200]).sum(axis=2) < 60).mean()
     assert is_outline > 0.001
     assert content == Artist(painted_source).draw(draft)
-
-
-@dataclass(frozen=True)
-class Shown:
-    """One map under any name, in the frames of a run."""
-
-    source: RunSource
-    a_map: Instances
-    opener: Any = None
-
-    def instances(self, scene: str, method: str) -> Instances:
-        return self.a_map
-
-    def frames(self, scene: str) -> tuple[Frame, ...]:
-        return self.source.frames(scene)
-
-
-@pytest.mark.parametrize("kind", ["retrieval", "annotation", "reasoning"])
-def test_a_picture_shows_nothing_of_a_map_but_what_is_judged(painted_source: RunSource, kind: Any) -> None:
-    whole = painted_source.instances("painted/a", "collector")
-    masks = [whole.mask(row) for row in range(len(whole))]
-    in_parts = [masks[1], *(part for mask in (masks[0], *masks[2:]) for part in np.array_split(mask, 7))]
-    ids = [400 + 3 * k for k in range(len(in_parts))]
-    other = Instances.of(whole.points, in_parts, names=tuple(f"other {k}" for k in ids), ids=ids)
-    draft = replace(drafts_of(kind, ["sofa"])[0], scene="painted/a", methods=("collector",), names=())
-    one = Artist(Shown(painted_source, whole)).draw(replace(draft, rows=(1,)))
-    assert one == Artist(Shown(painted_source, other)).draw(replace(draft, rows=(0,)))
-
-
-def test_frames_are_the_same_whatever_the_method(painted_source: RunSource) -> None:
-    assert "method" not in signature(painted_source.frames).parameters
-
-
-@pytest.mark.parametrize("text", HOSTILE)
-def test_hostile_titles_make_a_picture_of_the_usual_size(text: str) -> None:
-    grey = Panel("panel", np.full((30, 40, 3), 120, np.uint8), np.zeros((30, 40), bool))
-    picture = compose(ItemParts((text, text), None, grey, grey))
-    assert picture.shape[1] == 960 and 700 < picture.shape[0] < 1000
-
-
-def test_a_question_of_two_lines_stands_above_its_answer_and_what_is_too_long_ends_in_dots() -> None:
-    question = "Which pile of books is closest to the tissue paper, measured between centres?"
-    whole = title_lines((question, "Answer: book A is closest: 0.70 m between centres; " + "book B 1.71 m; " * 3))
-    assert [is_first for _, is_first in whole] == [True, True, False, False]
-    assert " ".join(text for text, is_first in whole if is_first) == question
-    cut = title_lines(("Is it?", "yes " * 200))
-    assert len(cut) == 4 and cut[-1][0].endswith("...") and all(len(text) <= 88 for text, _ in cut)
-
-
-def test_an_arrow_is_spoken_of_where_one_is_drawn(painted_source: RunSource) -> None:
-    draft = replace(drafts_of("reasoning", ["sofa"])[0], scene="painted/a", methods=("collector",), rows=(1,), names=())
-    for one, is_drawn in ((draft, True), (replace(draft, names=("chair", "sofa", "", "")), False)):
-        place = Artist(painted_source).parts(one).place
-        assert (place.ring is not None and place.eye is not None) == is_drawn == ("arrow" in place.title)
 
 
 def frame_of(depth_m: np.ndarray, x_m: float = 0.0) -> Frame:
@@ -135,28 +72,7 @@ def test_a_mask_in_a_frame_holds_what_lies_nearest_to_the_instance() -> None:
     assert mask[:, :9].all() and not mask[:, 11:].any()
 
 
-def test_a_zoom_is_around_the_object_and_within_the_picture() -> None:
-    mask = np.zeros((300, 400), bool)
-    mask[280:298, 5:20] = True
-    part = zoomed(Panel("", np.zeros((300, 400, 3), np.uint8), mask))
-    assert part.mask is not None and part.mask.sum() == mask.sum()
-    assert part.picture.shape[0] == 72
-
-
-def test_heat_scales_end_where_they_say() -> None:
-    assert [scale_stops(one).shape for one in SCALES] == [(256, 3)] * 2
-    lightness = scale_stops("cividis").astype(float) @ [0.2126, 0.7152, 0.0722]
-    assert (np.diff(lightness) > -1).all()  # read by lightness alone
-    assert similarity_colours(np.array([1.0, 1.0])).tolist() == [similarity_colours(np.array([1.0]))[0].tolist()] * 2
-    assert similarity_colours(np.zeros(0)).shape == (0, 3)
-
-
-def test_a_picture_of_many_colours_becomes_a_small_png() -> None:
-    noise = np.random.default_rng(0).integers(0, 255, (200, 200, 3)).astype(np.uint8)
-    assert Image.open(io.BytesIO(png_bytes(noise))).mode == "P"
-
-
-@pytest.mark.parametrize("suffix", ["pdf", "png", "svg"])
+@pytest.mark.parametrize("suffix", ["pdf", "svg"])
 def test_a_figure_has_its_words_as_text(
     painted_folder: Path, suffix: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -178,11 +94,7 @@ def test_a_figure_has_its_words_as_text(
         assert question in (painted_folder / "answer.svg").read_text()
         assert main([*words, "--figure", "schemes", "--out", "schemes.svg"]) == 0
         assert all(text in (painted_folder / "schemes.svg").read_text() for text in figure_texts("schemes"))
-        assert main([*words, "--what", "labels", "--figure", "schemes", "--out", "x.svg"]) == 2
-        assert main([*words, "--what", "labels", "--queries", "a", "--out", "x.svg"]) == 2
-        assert main([*words, "--out", "x.svg"]) == 2
         assert main([*words, "--queries", "a", "--out", "x.gif"]) == 2
-        assert "unknown form" in capsys.readouterr().err
 
 
 def test_scenes_drawn_in_processes_give_the_pictures_in_order(painted_source: RunSource, painted_folder: Path) -> None:

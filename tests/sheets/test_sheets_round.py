@@ -13,13 +13,11 @@ import cv2
 import numpy as np
 import openpyxl
 import pytest
-from chromium import Chromium, find_chromium
-from waiting import wait_until
 
 from su3d_bench.cli.main import main
+from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.items import CANNOT_TELL, Key, Sheet, SheetKind
-from su3d_bench.sheets.making.drafts import Draft
-from su3d_bench.sheets.making.sets import PAGE, TABLE, WORKBOOK, Origin, make_sheets, write_sheets
+from su3d_bench.sheets.sets import TABLE, WORKBOOK, Origin, make_sheets, write_sheets
 
 HOSTILE = '=HYPERLINK("x") <script>alert(1)</script> \u202eabc " , ; \U0001f600'
 
@@ -111,35 +109,3 @@ def test_what_people_fill_in_comes_back_as_scores(
     page = (out / "second_looks.html").read_text()
     assert f"../sheets/{kind}/pictures/item-" in page and "<script" not in page
     assert "\u202e" not in page + (out / "second_looks.csv").read_text()
-
-
-@pytest.mark.skipif(find_chromium() is None, reason="no browser: install chromium")
-def test_a_page_answered_by_keyboard_over_a_reload_is_scored(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    png = cv2.imencode(".png", np.zeros((4, 4, 3), np.uint8))[1].tobytes()
-    made = make_sheets("annotation", drafts("annotation", 5), [png] * 5, Origin("r", "0", ("opensu3d",), "t"))
-    write_sheets(made, tmp_path / "sheets", tmp_path / "sheets-key")
-    truth = {one.id: one.automatic for one in made.key.items}
-    items = {one.id: one for one in made.sheet.items}
-    keys = [
-        str(made.sheet.ask(ask).choices.index(truth[item][ask]) + 1)
-        for item in made.sheet.annotators[0].item_ids
-        for ask in items[item].asks
-    ]
-    down = tmp_path / "down"
-    down.mkdir()
-    with Chromium(tmp_path / "profile") as browser:
-        browser.open(tmp_path / "sheets" / "annotator-1" / PAGE)
-        browser.press(*keys[:7])
-        browser.reload(until="document.getElementById('count').textContent.startsWith('7 of ')")
-        browser.press(*keys[7:])
-        browser.downloads_to(down)
-        browser.run("document.getElementById('export').click()")
-        files = wait_until(lambda: list(down.glob("*.csv")), "nothing was exported")
-        assert browser.faults() == []
-    assert main(["sheets", "score", str(files[0]), "--key", str(tmp_path / "sheets-key"), "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    values = {(one["judge"], one["metric"]): (one["value"], one["n_items"]) for one in found["cells"]}
-    assert len(values) == 16 and found["second_looks"] == []
-    assert all(values["people", metric] == values["automatic", metric] for _, metric in values)

@@ -23,9 +23,14 @@ from site_text import ROOT_PAGES
 import su3d_bench
 from su3d_bench.core import registry
 from su3d_bench.core.config import flatten
-from su3d_bench.metrics.protocols.files import protocol_names, remarks_of, rules_files
-from su3d_bench.metrics.protocols.loading import load_protocol, not_comparable_with
-from su3d_bench.reports.tables.papers.published import figures_of
+from su3d_bench.metrics.protocols.loading import (
+    load_protocol,
+    not_comparable_with,
+    protocol_names,
+    remarks_of,
+    rules_files,
+)
+from su3d_bench.reports.tables.paper import figures_of
 
 TAGS = {"p", "div", "table", "thead", "tbody", "tr", "th", "td", "code", "a", "details", "summary", "pre"}
 

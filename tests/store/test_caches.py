@@ -48,10 +48,10 @@ def test_one_folder_that_takes_files_is_enough(tmp_path: Path, monkeypatch: pyte
 
 def test_the_folders_are_those_that_numba_tries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     code = (
-        "from su3d_bench.numerics import cells\n"
+        "from su3d_bench.numerics import clusters\n"
         "from numba.core.caching import UserProvidedCacheLocator as told, InTreeCacheLocator as own\n"
         "from numba.core.caching import UserWideCacheLocator as wide\n"
-        "print(*(one(lambda: 0, cells.__file__).get_cache_path() for one in (told, own, wide)), sep='\\n')"
+        "print(*(one(lambda: 0, clusters.__file__).get_cache_path() for one in (told, own, wide)), sep='\\n')"
     )
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "told"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "wide"))

@@ -18,9 +18,9 @@ from box_room import INTRINSICS, images, pose
 from painted import colour_perception
 from places import ROOT, SCENES
 
-from su3d_bench.baselines.conceptfusion import feature_table
-from su3d_bench.baselines.conceptfusion.feature_table import FeatureTable
+from su3d_bench.baselines.conceptfusion import point_fusion as feature_table
 from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig
+from su3d_bench.baselines.conceptfusion.point_fusion import FeatureTable
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError, StoreError
 from su3d_bench.core.files.atomic import npz_bytes
@@ -112,7 +112,7 @@ def test_features_lie_in_a_file_without_a_name(tmp_path: Path, monkeypatch: pyte
 def test_a_killed_run_leaves_no_scratch_behind(tmp_path: Path) -> None:
     code = (
         "import os, signal, sys, numpy as np\n"
-        "from su3d_bench.baselines.conceptfusion.feature_table import FeatureTable\n"
+        "from su3d_bench.baselines.conceptfusion.point_fusion import FeatureTable\n"
         "table = FeatureTable(64, 'disk')\n"
         "table.append(np.ones((1, 64), np.float16), np.zeros(5000, np.int32), np.ones(5000))\n"
         "assert table.features().sum() == 5000 * 64\n"
@@ -306,5 +306,5 @@ def test_a_run_of_both_is_scored_resumed_and_mended(in_folder: Path, capsys: pyt
 def test_a_query_of_a_dense_map_is_one_clear_line(in_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("--no-pictures") == 0
     capsys.readouterr()
-    assert main(["query", "painted/a", "chair", "--run", "out", "--method", "conceptfusion"]) != 0
+    assert main(["query", "text", "painted/a", "chair", "--run", "out", "--method", "conceptfusion"]) != 0
     assert "has one feature a point and no instances" in capsys.readouterr().err

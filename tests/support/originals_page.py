@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from made_documents import cell, write_or_check
 from places import ROOT
 
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.originals import Original, original_of
+from su3d_bench.metrics.protocols.loading import Original, original_of, protocol_names
 
 PAGE = ROOT / "docs" / "numbers" / "originals.md"
 HEAD = """# Whose evaluation each protocol repeats

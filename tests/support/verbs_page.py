@@ -48,29 +48,29 @@ MORE = {
     "report rerun": "A recording a scene with frames, masks, maps, truth and the map's growth, for rerun's "
     "viewer: [running/rerun.md](running/rerun.md).",
     "report bundle": "Anybody scores it anew by `report verify`; a registry takes it in.",
-    "registry add": "By the rule of `report verify`; rows that mix rules, data, encoders or names are refused: "
+    "dev registry add": "By the rule of `report verify`; rows that mix rules, data, encoders or names are refused: "
     "[running/registry.md](running/registry.md).",
-    "registry build": "Rankings with intervals of values and ranks, a page a method and a scene, from the disk.",
+    "dev registry build": "Rankings with intervals of values and ranks, a page a method and a scene, from the disk.",
     "check": "The gate for CI: [running/ci-gate.md](running/ci-gate.md), `action.yml`.",
-    "ask": "By the built-in solver or a language model: [reasoning.md](questions/reasoning.md).",
-    "questions": "From the ground truth of any dataset; `--protocols rooms-retrieval` scores maps by such. "
-    "`questions audit` draws a sample as contact sheets: [human-evaluation.md](questions/human-evaluation.md).",
+    "query ask": "By the built-in solver or a language model: [reasoning.md](questions/reasoning.md).",
+    "query make": "`--protocols rooms-retrieval` scores maps by such: [objects.md](questions/objects.md).",
+    "query audit": "What people look for: [human-evaluation.md](questions/human-evaluation.md).",
     "sheets make": "Blind sheets with pictures, as an offline page, a workbook and a CSV: "
     "[human-evaluation.md](questions/human-evaluation.md).",
     "sheets score": "The paper's Tables IV and V with agreement: [human-evaluation.md](questions/human-evaluation.md).",
     "compare": "Exact sign-flip test with the smallest p that so many scenes allow, corrected where much is "
     "compared, and the paired difference with its interval; other data, rules or encoders are "
     "refused: [statistics.md](numbers/statistics.md).",
-    "plan": "At 80 % power, from the variance of finished runs: [statistics.md](numbers/statistics.md).",
-    "attribute": "Merged, split, duplicate, mislabelled, background, missed; geometry, association, label.",
+    "report power": "At 80 % power, from the variance of finished runs: [statistics.md](numbers/statistics.md).",
+    "report attribution": "Merged, split, duplicate, mislabelled, background, missed; geometry, association, label.",
     "datasets check": "Names what is missing, damaged or contradictory, and whether frames and ground truth meet: "
     "[datasets.md](datasets.md).",
     "datasets make": "In the exact layout of Replica, ScanNet (`.sens` or exported) or TUM: "
     "[datasets.md](datasets.md).",
     "models list": "Where files are looked for, sizes, licences: [methods/models.md](methods/models.md).",
-    "cache list": "What is kept, and the variable that says where: [running/environment.md](running/environment.md).",
-    "doctor": "What each line means: [running/environment.md](running/environment.md).",
-    "completion": "For bash, zsh and fish: [running/environment.md](running/environment.md).",
+    "dev cache list": "What is kept, and which variable says where: [environment.md](running/environment.md).",
+    "dev doctor": "What each line means: [running/environment.md](running/environment.md).",
+    "dev completion": "For bash, zsh and fish: [running/environment.md](running/environment.md).",
 }
 
 

@@ -7,15 +7,17 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Literal
 
-from su3d_bench.analysis.gate.costs import busy_remark, cost_findings, cost_numbers, why_no_cost
 from su3d_bench.analysis.gate.reference import (
-    SCHEMA,
     MethodResult,
     Reference,
     Value,
     Values,
+    busy_remark,
+    cost_findings,
+    cost_numbers,
     differing_keys,
     settings_of,
+    why_no_cost,
     wrong_files,
 )
 from su3d_bench.core.english import plural
@@ -91,12 +93,6 @@ def _remarks(run: FinishedRun, reference: Reference) -> Iterator[str]:
     others += [name for name in run.protocols if name not in reference.protocols]
     if others:
         yield f"the reference does not know, so that nothing holds: {', '.join(printable(name, 80) for name in others)}"
-    if reference.schema_version != SCHEMA:
-        yield (
-            "the reference is of an older version, whose costs are not those that are judged now: no cost is judged, "
-            "learn it again"
-        )
-        return
     for method in run.methods:
         if method in known and method not in reference.costs and (reason := why_no_cost(run, method)):
             yield f"{printable(method, 80)}: no cost is judged: it {reason}"
@@ -104,7 +100,7 @@ def _remarks(run: FinishedRun, reference: Reference) -> Iterator[str]:
 
 def _costs_not_learnt(run: FinishedRun, reference: Reference) -> Iterator[Finding]:
     known = {result.method for result in reference.results}
-    for method in run.methods if reference.schema_version == SCHEMA else ():
+    for method in run.methods:
         if method in known and method not in reference.costs and why_no_cost(run, method) is None:
             text = "the reference holds none and the run measured it; learn a new reference"
             yield Finding("missing", f"{printable(method, 80)} / cost", text)

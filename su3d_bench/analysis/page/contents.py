@@ -4,25 +4,31 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
-
-from su3d_bench.analysis.attribution import Explained, MendedJob, explained_of
-from su3d_bench.analysis.page.errors import errors_of, packed, unpacked
+from su3d_bench.analysis.matched import Explained, explained_of
 from su3d_bench.analysis.page.gallery import GalleryOfScene, SceneGallery, photos_of_each
-from su3d_bench.analysis.page.kept import Piece, piece, state_of_counts, state_of_job, state_of_run
+from su3d_bench.analysis.page.kept import (
+    Job,
+    Made,
+    Piece,
+    errors_of,
+    load_scene,
+    piece,
+    save_scene,
+    state_of_counts,
+    state_of_scene,
+)
 from su3d_bench.analysis.page.maps import MapOfRun, PageMap, PageScene, Spaces, page_scene, points_of_each
 from su3d_bench.analysis.page.numbers import are_all_read, is_scored, page_numbers, scored_maps
-from su3d_bench.analysis.page.scene_data import SceneData
+from su3d_bench.analysis.page.scene import SceneData
 from su3d_bench.core.errors import DataError, Su3dError, printable
 from su3d_bench.core.files.atomic import is_file
 from su3d_bench.metrics.attribution.arrays import LookedAt
-from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report, run_inline, run_processes
+from su3d_bench.runs.executors import SCENE_DONE, Event, Report, run_inline, run_processes
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 QUERIES = (
@@ -35,10 +41,6 @@ QUERIES = (
     "a place to store things",
     "something to eat or drink from",
 )
-Kept = TypeVar("Kept")
-Job = tuple[int, str]  # index of the run, method
-_SCENES: TypeAdapter[PageScene] = TypeAdapter(PageScene)
-_GALLERIES: TypeAdapter[SceneGallery] = TypeAdapter(SceneGallery)
 
 
 @dataclass(frozen=True)
@@ -82,34 +84,16 @@ class Contents:
 
 @dataclass(frozen=True)
 class Asked:
-    """What is needed of one scene and was not kept: the ``errors`` of some jobs, the scene with its ``maps``, and the
-    gallery of the errors of the jobs in ``shown``."""
+    """What is needed of one scene: the maps of some jobs, the errors of some, and where all of it is kept."""
 
     scene: str
-    errors: Mapping[Job, Piece]
     maps: tuple[Job, ...]
-    page: Piece | None
-    shown: tuple[Job, ...]
-    gallery: Piece | None
-
-    @property
-    def explained(self) -> list[Job]:
-        """The jobs whose errors are looked at."""
-        return list(dict.fromkeys([*self.errors, *self.shown]))
+    explained: tuple[Job, ...]
+    place: Piece
 
     @property
     def n_steps(self) -> int:
-        return len(self.explained) + len(self.maps) + bool(self.shown)
-
-
-@dataclass
-class Made:
-    """What was made of one scene; the errors of a job are a text where they cannot be had."""
-
-    scene: str
-    errors: dict[Job, MendedJob | str] = field(default_factory=dict)
-    page: PageScene | None = None
-    gallery: SceneGallery | None = None
+        return len(self.explained) + len(self.maps) + bool(self.explained)
 
 
 @dataclass(frozen=True)
@@ -120,6 +104,7 @@ class Batch:
     queries: tuple[str, ...]
     most_points: int
     most_photos: int
+    with_gallery: bool
     scenes: tuple[Asked, ...]
 
 
@@ -142,23 +127,20 @@ def page_contents(
     explained = _explained(runs) if wishes.with_errors and are_all_read(runs) else {}
     told = [job for job, one in explained.items() if isinstance(one, Explained)]
     most_photos = photos_of_each(len({scene for index, _ in told for scene in runs[index].scenes}), len(told))
-    made, asked = _kept(runs, maps, told, wishes, most_photos)
-    begin(Amount(len(asked), sum(one.n_steps for one in asked), len(made) - len(asked)))
-    for fresh in _all_made(Batch(folders, wishes.queries, most_points, most_photos, tuple(asked)), wishes.jobs, report):
-        made[fresh.scene].errors.update(fresh.errors)
-        made[fresh.scene].page = made[fresh.scene].page or fresh.page
-        made[fresh.scene].gallery = made[fresh.scene].gallery or fresh.gallery
+    wanted = _wanted(runs, maps, told, [wishes.queries, most_points, most_photos, wishes.with_gallery])
+    made = {one.scene: kept for one in wanted if (kept := load_scene(one.place, one.scene, runs)) is not None}
+    asked = [one for one in wanted if one.scene not in made]
+    begin(Amount(len(asked), sum(one.n_steps for one in asked), len(made)))
+    batch = Batch(folders, wishes.queries, most_points, most_photos, wishes.with_gallery, tuple(asked))
+    made |= {one.scene: one for one in _all_made(batch, wishes.jobs, report)}
+    made = {one.scene: made[one.scene] for one in wanted}
     errors = []
     for (index, method), one in explained.items():
-        of_scenes = {
-            scene: made[scene].errors[index, method]
-            for scene in runs[index].scenes
-            if scene in made and (index, method) in made[scene].errors
-        }
+        job = index, method
+        of_scenes = {scene: made[scene].errors[job] for scene in made if job in made[scene].errors}
         errors.append({**errors_of(one, method, of_scenes), "run": index})  # which has the name of the run
-    pages = {scene: made[scene].page for scene in dict.fromkeys(scene for _, _, scene, _ in maps)}
+    shown = tuple(one.page for one in made.values() if one.page is not None)
     galleries = tuple(one.gallery for one in made.values() if one.gallery is not None and one.gallery.of_methods)
-    shown = tuple(page for page in pages.values() if page is not None)
     return Contents(page_numbers(runs, errors), shown, galleries, most_points)
 
 
@@ -174,63 +156,28 @@ def _explained(runs: Sequence[FinishedRun]) -> dict[Job, Explained | str]:
     return explained
 
 
-def _kept(
-    runs: Sequence[FinishedRun],
-    maps: Sequence[MapOfRun],
-    explained: Sequence[Job],
-    wishes: Wishes,
-    most_photos: int,
-) -> tuple[dict[str, Made], list[Asked]]:
-    """What was made of the scenes before, and what is yet to be made."""
-    most_points = points_of_each(len(maps), wishes.most_bytes)
-    shown = {scene: [one for one in maps if one[2] == scene] for scene in dict.fromkeys(one[2] for one in maps)}
+def _wanted(
+    runs: Sequence[FinishedRun], maps: Sequence[MapOfRun], explained: Sequence[Job], wishes: Sequence[Any]
+) -> list[Asked]:
+    """What is needed of each scene; those with maps first."""
+    shown: dict[str, list[Job]] = {}
+    for index, _, scene, method in maps:
+        shown.setdefault(scene, []).append((index, method))
     counted_jobs: dict[str, list[Job]] = {}
     for index, method in explained:
         for scene in runs[index].scenes:
             if is_file(runs[index].folder.job(scene, method).counts):
                 counted_jobs.setdefault(scene, []).append((index, method))
-    made, asked = {}, []
+    asked = []
     for scene in dict.fromkeys([*shown, *counted_jobs]):
-        made[scene] = Made(scene)
-        state = cache(partial(_state, runs, scene))
-        places = {
-            job: piece(runs[job[0]], ("errors", scene, job[1]), state(job)) for job in counted_jobs.get(scene, ())
-        }
-        for job, place in places.items():
-            mended = None if (content := place.load()) is None else unpacked(content, runs[job[0]].rules)
-            if mended is not None:
-                made[scene].errors[job] = mended
-        of_maps = [(index, method) for index, _, _, method in shown.get(scene, ())]
-        place_of_page = None
-        if of_maps:
-            made_from = [[[*job, state(job)] for job in of_maps], list(wishes.queries), most_points]
-            place_of_page = piece(runs[of_maps[0][0]], ("maps", scene), made_from)
-            made[scene].page = _read(_SCENES, place_of_page)
-        told = tuple(places) if wishes.with_gallery else ()
-        place_of_gallery = None
-        if told:
-            # what an error costs depends on the counts of every scene
-            counts = [[*job, state(job), state_of_counts(runs[job[0]], job[1])] for job in told]
-            place_of_gallery = piece(runs[told[0][0]], ("gallery", scene), [counts, most_photos])
-            made[scene].gallery = _read(_GALLERIES, place_of_gallery)
-        to_make = {job: place for job, place in places.items() if job not in made[scene].errors}
-        to_draw = () if made[scene].page is not None else tuple(of_maps)
-        to_show = () if made[scene].gallery is not None else told
-        if to_make or to_draw or to_show:
-            asked.append(Asked(scene, to_make, to_draw, place_of_page, to_show, place_of_gallery))
-    return made, asked
-
-
-def _state(runs: Sequence[FinishedRun], scene: str, job: Job) -> list[Any]:
-    index, method = job
-    return [state_of_run(runs[index], scene), state_of_job(runs[index], scene, method)]
-
-
-def _read(form: TypeAdapter[Kept], place: Piece) -> Kept | None:
-    content = place.load()
-    with suppress(ValidationError):
-        return None if content is None else form.validate_json(content)
-    return None
+        of_maps, of_errors = shown.get(scene, []), counted_jobs.get(scene, [])
+        jobs = dict.fromkeys([*of_maps, *of_errors])
+        # what an error costs depends on the counts of every scene
+        counts = [state_of_counts(runs[index], method) for index, method in of_errors]
+        states = [[index, *state_of_scene(runs[index], scene, method)] for index, method in jobs]
+        place = piece(runs[next(iter(jobs))[0]], scene, [of_maps, of_errors, states, counts, *wishes])
+        asked.append(Asked(scene, tuple(of_maps), tuple(of_errors), place))
+    return asked
 
 
 def _all_made(batch: Batch, jobs: int, report: Report) -> list[Made]:
@@ -278,27 +225,23 @@ def _make_scene(
         tell(f"errors of {printable(method, 60)}")
         run, of_job = runs[index], explained(index, method)
         try:
-            looked_at = of_job.look_at(asked.scene, partial(data.truth_of_run, run), partial(spaces.encoder, run))
+            found = of_job.matched(asked.scene, partial(data.truth_of_run, run), partial(spaces.encoder, run))
+            looked_at = {one.rules.name: one.looked_at for one in found}
             seen[index, method] = looked_at
-            if (index, method) in asked.errors:
-                mended = of_job.mended(asked.scene, looked_at)
-                made.errors[index, method] = mended
-                asked.errors[index, method].save(packed(mended, run.rules))
-            if (index, method) in asked.shown:
+            made.errors[index, method] = of_job.mended(asked.scene, looked_at)
+            if batch.with_gallery:
                 gallery.add(index, of_job, looked_at)
         except Su3dError as error:
             made.errors[index, method] = str(error)
             gallery.lack()
-    if asked.shown:
+    if asked.explained and batch.with_gallery:
         tell("photos of errors")
-        made.gallery = gallery.finish(_dataset_of(runs[asked.shown[0][0]], asked.scene), data)
-        if asked.gallery is not None and made.gallery.is_whole:
-            asked.gallery.save(_GALLERIES.dump_json(made.gallery))
+        made.gallery = gallery.finish(_dataset_of(runs[asked.explained[0][0]], asked.scene), data)
     if asked.maps:
         maps = [(index, runs[index], asked.scene, method) for index, method in asked.maps]
         made.page = page_scene(asked.scene, maps, spaces, data, batch.most_points, tell, seen)
-        if asked.page is not None and made.page.is_whole:
-            asked.page.save(_SCENES.dump_json(made.page))
+    if made.is_whole:
+        save_scene(asked.place, made, runs)
     report(Event(asked.scene, SCENE_DONE, asked.n_steps, asked.n_steps))
     return made
 

@@ -6,20 +6,27 @@ import base64
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
-from su3d_bench.analysis.inputs import Inputs
-from su3d_bench.analysis.page.instances import Growth, fed_frames, frames_of, growth_of, instance_data
-from su3d_bench.analysis.page.scene_data import MOST_LOOKED_AT, SKETCH_WIDTH, SceneData
-from su3d_bench.analysis.page.truths import (
+from su3d_bench.analysis.matched import Inputs
+from su3d_bench.analysis.page.scene import (
+    MOST_LOOKED_AT,
+    SKETCH_WIDTH,
     Beside,
+    Growth,
+    SceneData,
+    SceneReader,
     Seen,
     ShownTruths,
+    fed_frames,
+    frames_of,
+    growth_of,
+    instance_data,
     instances_of,
     judged_objects,
     same_objects,
@@ -28,7 +35,7 @@ from su3d_bench.analysis.page.truths import (
 from su3d_bench.core.errors import ConfigError, Su3dError, printable, printable_json
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
-from su3d_bench.core.types import Float32Array, Frame, GroundTruth, Int64Array
+from su3d_bench.core.types import Float32Array, Frame, Int64Array
 from su3d_bench.metrics.attribution.arrays import LookedAt, SceneOfMasks
 from su3d_bench.metrics.matching.labelling import (
     candidate_classes,
@@ -53,9 +60,9 @@ from su3d_bench.reports.page.maps import (
     point_owners,
     thinned,
 )
-from su3d_bench.reports.pictures.colours import class_colours
-from su3d_bench.reports.pictures.scene_look import SEEN_POINTS, seen_points
-from su3d_bench.runs.finished import FinishedRun, OtherDataError
+from su3d_bench.reports.pictures.canvas import class_colours
+from su3d_bench.reports.pictures.scene import SEEN_POINTS, seen_points
+from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.predictions import read_prediction
 
 MOST_POINTS, LEAST_POINTS = 60_000, 3_000  # of one map: what a phone draws at once, what still shows a room
@@ -67,7 +74,6 @@ GREY_SHARE = 0.01  # of the points may stay without a colour when there are fram
 EVERY = 8  # of the points is asked whether it was seen
 THUMBNAIL_WIDTH, JPEG_QUALITY = 240, 62
 MapOfRun = tuple[int, FinishedRun, str, str]
-Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
@@ -183,7 +189,7 @@ class _Scene:
         self._maps = maps
         self._spaces = spaces
         self._data = data
-        self._remarks: list[str] = []
+        self._reader = SceneReader(maps[0][1], scene, data)
         self._frame_of: dict[int, Frame | None] = {}
         self._shown_truths = ShownTruths()
 
@@ -208,7 +214,7 @@ class _Scene:
                 content = self._pack(run, prediction, clouds[index, method], frames, seen, growth, beside)
             made.append(PageMap(index, printable(scene, 200), printable(method, 200), content, reason, truth))
         thumbnails = tuple((index, _jpeg(frame)) for index, frame in frames.items())
-        remarks = tuple(printable(line) for line in dict.fromkeys(self._remarks))
+        remarks = tuple(self._reader.remarks)
         truths = tuple(self._shown_truths.packed(most_points, seen))
         return PageScene(printable(self._scene, 200), thumbnails, tuple(made), truths, remarks)
 
@@ -219,44 +225,19 @@ class _Scene:
         except Su3dError as error:
             return printable(str(error))
 
-    def _had(self, what: str, make: Callable[[], Made]) -> Made | None:
-        """What ``make`` gives; None and a remark where it cannot be had."""
-        try:
-            return make()
-        except Su3dError as error:
-            self._remarks.append(f"{what}: {error}")
-            return None
-
-    @cached_property
-    def _dataset(self) -> Any:
-        """The dataset where its data are those of the runs, else None."""
-        try:
-            return self._maps[0][1].dataset(self._scene)
-        except OtherDataError:
-            self._remarks.append("its data here are not those of the run: no colours, views and truth")
-        except Su3dError as error:
-            self._remarks.append(f"no colours, views and truth: {error}")
-        return None
-
-    @cached_property
-    def _sequence(self) -> Sequence[Frame]:
-        frames = None
-        if self._dataset is not None:
-            frames = self._had("no views", lambda: self._data.sequence(self._dataset))
-        return () if frames is None else frames
-
     def _frame(self, index: int, width: int) -> Frame | None:
         """Frame ``index`` of the full sequence, read once; None where it is not there. ``width`` pixels are enough."""
         if index not in self._frame_of:
-            is_there = 0 <= index < len(self._sequence)
-            frame = self._had("no views", lambda: self._data.frame(self._dataset, index, width)) if is_there else None
+            frame = None
+            if 0 <= index < len(self._reader.sequence):
+                frame = self._reader.had("no views", lambda: self._data.frame(self._reader.dataset, index, width))
             self._frame_of[index] = frame if frame is not None and frame.index == index else None
         return self._frame_of[index]
 
     def _seen(self, clouds: Sequence[Float32Array]) -> Seen | None:
         """What the methods saw: in the frames shown, and in as many more as show nearly all of ``clouds``."""
         fed = [index for _, run, scene, method in self._maps for index in fed_frames(run, scene, method)]
-        places = self._data.in_turn(self._dataset, fed) if len(self._sequence) else []
+        places = self._data.in_turn(self._reader.dataset, fed) if len(self._reader.sequence) else []
         unseen = np.concatenate([np.zeros((0, 3), np.float32), *(points[::EVERY] for points in clouds)])
         few = GREY_SHARE * len(unseen)
         unseen = _not_near([frame for frame in self._frame_of.values() if frame is not None], unseen)
@@ -283,7 +264,7 @@ class _Scene:
         fitting = (run.rules(name) for name in run.protocols if not why_not_shown(run, name, prediction))
         judging = next(fitting, None)
         rules = shown_rules(run) if judging is None else judging
-        truth = None if rules is None else self._truth(rules)
+        truth = None if rules is None else self._reader.truth(rules)
         if rules is None or truth is None or not len(truth.points):
             return None
         about = {"truth": self._shown_truths.place(truth), "objects": len(instances_of(truth))}
@@ -303,13 +284,8 @@ class _Scene:
             same = same_objects(truth, seen.overlaps.predicted.masks)
             return {"protocol": rules.name, **judged_objects(truth, seen.overlaps)}, same
 
-        judged, same = self._had("no missed objects", partial(judged_by, judging)) or ({}, {})
+        judged, same = self._reader.had("no missed objects", partial(judged_by, judging)) or ({}, {})
         return Beside(variant, about | judged, same)
-
-    def _truth(self, rules: ProtocolRules) -> GroundTruth | None:
-        if self._dataset is None:
-            return None
-        return self._had("no truth", lambda: self._data.truth(self._dataset, rules.ground_truth))
 
     def _pack(
         self,
@@ -322,7 +298,7 @@ class _Scene:
         beside: Beside | None,
     ) -> str:
         rules = shown_rules(run)
-        truth = None if rules is None else self._truth(rules)
+        truth = None if rules is None else self._reader.truth(rules)
         planes: dict[str, Any] = {"owner": index_plane(point_owners(prediction, cloud.rows))}
         colours = None if seen is None else nearest_colours(cloud.points, *seen)
         if colours is not None:
@@ -361,14 +337,14 @@ class _Scene:
     def _classes(
         self, run: FinishedRun, rules: ProtocolRules, prediction: Prediction, truth: Int64Array | None, cloud: Cloud
     ) -> Int64Array | None:
-        return self._had("no classes", lambda: shown_classes(run, rules, prediction, truth, cloud, self._spaces))
+        return self._reader.had("no classes", lambda: shown_classes(run, rules, prediction, truth, cloud, self._spaces))
 
     def _similarity(self, run: FinishedRun, prediction: Prediction) -> Any:
         """The cosine (K, Q) of each instance with each query; None where the map has no features."""
         features = prediction.features
         if features is None or not len(features) or not self._spaces.queries:
             return None
-        texts = self._had("no similarities", lambda: self._spaces.texts(run))
+        texts = self._reader.had("no similarities", lambda: self._spaces.texts(run))
         return cosines(features, texts) if texts is not None and texts.shape[1] == features.shape[1] else None
 
 

@@ -8,19 +8,90 @@ from contextlib import suppress
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
+
 from su3d_bench.analysis.comparison import compare
-from su3d_bench.analysis.side_numbers import SideNumbers
-from su3d_bench.analysis.sides import Side
+from su3d_bench.analysis.sides import Side, SideNumbers
 from su3d_bench.core.config import KeyPath
 from su3d_bench.core.errors import ConfigError, Su3dError, printable_json
-from su3d_bench.metrics.costs import summarise
+from su3d_bench.core.types import Float64Array, Int64Array
+from su3d_bench.metrics.costs import MAP, TOTAL, MethodSummary, StageSummary, UpdateTimes, summarise
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, concatenate
-from su3d_bench.reports.page.numbers import confusion_cells, series_of, summary_data
-from su3d_bench.reports.tables.found import Found, Unscored, not_scored_lines
+from su3d_bench.numerics.statistics import Growth
+from su3d_bench.reports.tables.run import Found, Unscored, not_scored_lines
 from su3d_bench.runs.finished import FinishedRun, read_update_times
-from su3d_bench.runs.found import found_in, without_score
+from su3d_bench.runs.summary import found_in, without_score
 from su3d_bench.store.records import ResultRecord, plain
+
+MOST_BINS = 160  # points of a line: more than a plot has room for
+DIGITS = 4  # of a time
+
+
+def confusion_cells(confusion: Int64Array) -> list[list[int]]:
+    """Rows (true class, predicted class, points) of what is not 0; a predicted class -1 is none of the classes.
+
+    >>> confusion_cells(np.array([[3, 0, 1], [0, 2, 0]]))
+    [[0, 0, 3], [0, -1, 1], [1, 1, 2]]
+    """
+    n_classes = len(confusion)
+    return [
+        [int(true), int(called) if called < n_classes else -1, int(confusion[true, called])]
+        for true, called in np.argwhere(confusion)
+    ]
+
+
+def series_of(times: UpdateTimes) -> dict[str, Any]:
+    """The course of a scene's updates as means of ``per`` updates each, in ms, with the map's points where known."""
+    per = max(1, -(-len(times) // MOST_BINS))
+    series: dict[str, Any] = {"per": per, "n": len(times)}
+    series |= {stage: _binned(times.ms(stage), per) for stage in (TOTAL, MAP)}
+    if "n_points" in times.columns:
+        series["points"] = [int(value) for value in _binned(times.columns["n_points"], per)]
+    return series
+
+
+def _binned(values: Float64Array, per: int) -> list[float]:
+    starts = np.arange(0, len(values), per)
+    sums = np.add.reduceat(values, starts) if len(values) else values
+    sizes = np.diff(np.append(starts, len(values)))
+    return [short(value) for value in sums / sizes]
+
+
+def short(value: float) -> float:
+    """``value`` with ``DIGITS`` digits, which is more than a plot or a table shows.
+
+    >>> short(12.34567)
+    12.35
+    """
+    return float(f"{value:.{DIGITS}g}")
+
+
+def summary_data(summary: MethodSummary) -> dict[str, Any]:
+    """A method's costs; times in ms, null where nothing was measured."""
+    shown = {name: value for name, value in vars(summary).items() if name not in ("run", "frames_per_s")}
+    numbers = {name: _number(value) if isinstance(value, float) else value for name, value in shown.items()}
+    return numbers | {"stages": [_stage_data(stage) for stage in summary.stages]}
+
+
+def _stage_data(stage: StageSummary) -> dict[str, Any]:
+    numbers: Mapping[str, float] = {"first": stage.first, "p50": stage.p50, "p95": stage.p95, "max": stage.worst}
+    return {
+        "name": stage.name,
+        **{name: _number(value) for name, value in numbers.items()},
+        "share": _number(stage.share),
+        "by_points": _growth_data(stage.against_points),
+        "by_updates": _growth_data(stage.against_frames),
+    }
+
+
+def _growth_data(growth: Growth | None) -> dict[str, Any] | None:
+    return None if growth is None else {**asdict(growth), "words": growth.words}
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None or not np.isfinite(value) else short(value)
+
 
 MOST_PAIRS = 40  # pairs of methods that are compared: all of nine methods, and a few seconds
 # Jobs (a scene under a method) up to which each is read. The courses and comparisons of more take minutes to make and
@@ -28,8 +99,8 @@ MOST_PAIRS = 40  # pairs of methods that are compared: all of nine methods, and 
 MOST_JOBS = 500
 MOST_MAPS = 16  # of a page of more jobs: two scenes under eight methods
 LEFT_OUT = (
-    "what each job's own files say is left out: errors (su3d-bench attribute), confusions, times (report timing), "
-    f"comparisons (compare) and all maps but those of the first scenes, at most {MOST_MAPS}"
+    "what each job's own files say is left out: errors (su3d-bench report attribution), confusions, times (report "
+    f"timing), comparisons (compare) and all maps but those of the first scenes, at most {MOST_MAPS}"
 )
 # Of a record of results: what the page says elsewhere, or not at all.
 NOT_SHOWN = ("encoder_digest", "anytime")

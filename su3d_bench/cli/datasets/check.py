@@ -17,10 +17,10 @@ from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, co
 from su3d_bench.core.types import WorldUp
 from su3d_bench.datasets.checks import Inspection, TruthVariant, inspect
 from su3d_bench.datasets.checks_of_frames import Finding
-from su3d_bench.runs.executors.local import Event
-from su3d_bench.runs.own.trial import try_dataset
-from su3d_bench.runs.parts import build_dataset, part_of
-from su3d_bench.runs.planning.scenes import data_root, dataset_targets, expand_scenes
+from su3d_bench.runs.executors import Event
+from su3d_bench.runs.job import build_dataset, part_of
+from su3d_bench.runs.scenes import data_root, dataset_targets, expand_scenes
+from su3d_bench.runs.trial import try_dataset
 
 MOST_OF_A_KIND = 10  # findings of one kind that are printed; --json has all
 

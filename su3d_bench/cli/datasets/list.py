@@ -9,8 +9,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from su3d_bench.cli.fetch import replica, scannet
+from su3d_bench.cli.new import add_new
 from su3d_bench.cli.shared.answers import answer_either
-from su3d_bench.cli.shared.flags import add_group, add_settings, add_verb
+from su3d_bench.cli.shared.flags import add_group, add_modules, add_settings, add_verb
 from su3d_bench.core.errors import EXIT_DONE
 
 LAYOUTS = (
@@ -31,12 +33,12 @@ def add_parser(verbs: Any) -> None:
     actions = add_group(
         verbs,
         "datasets",
-        "List the datasets and their scenes, check or show scenes, or make rooms on disk.",
-        "list|check|show|make",
+        "List the datasets and their scenes, check, show or fetch scenes, make rooms on disk, or write a dataset.",
         (
             "su3d-bench datasets list",
             "su3d-bench datasets make rooms --scenes rooms/living0 --layout replica --out data",
         ),
+        lists=True,
     )
     parser = add_verb(
         actions,
@@ -49,6 +51,17 @@ def add_parser(verbs: Any) -> None:
     _add_check(actions)
     _add_show(actions)
     _add_make(actions)
+    add_modules(
+        actions,
+        "fetch",
+        "Fetch published data: shown first, resumed, checked, unpacked where it is looked for.",
+        (replica, scannet),
+        (
+            "su3d-bench datasets fetch replica --dry-run",
+            "su3d-bench datasets fetch scannet --script download-scannet.py",
+        ),
+    )
+    add_new(actions, "dataset")
 
 
 def _later(name: str) -> Callable[[argparse.Namespace], int]:

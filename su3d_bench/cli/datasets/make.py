@@ -20,9 +20,9 @@ from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, nearest
 from su3d_bench.core.files.atomic import make_folder
 from su3d_bench.datasets.layouts import LAYOUTS
 from su3d_bench.datasets.writing import SceneTarget, finish_scene, plan_scenes, write_frames
-from su3d_bench.runs.executors.local import Event, Report, run_inline, run_processes
-from su3d_bench.runs.parts import Part, build_dataset, part_of
-from su3d_bench.runs.planning.scenes import data_root, expand_scenes
+from su3d_bench.runs.executors import Event, Report, run_inline, run_processes
+from su3d_bench.runs.job import Part, build_dataset, part_of
+from su3d_bench.runs.scenes import data_root, expand_scenes
 from su3d_bench.store.run_folder import RunFolder
 
 FRAMES_A_UNIT = 400  # a quarter of a room: enough that building the room anew in each process does not matter

@@ -10,9 +10,8 @@ from su3d_bench.cli.datasets.check import chosen_scenes, up_text
 from su3d_bench.cli.shared.answers import answer, answer_json, file_name_of_scene
 from su3d_bench.cli.shared.bars import progress
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, printable, printable_json
-from su3d_bench.reports.pictures.scene import draw_scene_picture, facts_line
-from su3d_bench.reports.pictures.scene_look import look_at
-from su3d_bench.runs.executors.local import Event
+from su3d_bench.reports.pictures.scene import draw_scene_picture, facts_line, look_at
+from su3d_bench.runs.executors import Event
 
 
 def show(arguments: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""``su3d-bench doctor``: whether this machine has what the program needs, line by line, and what to do where not."""
+"""``su3d-bench dev doctor``: whether this machine has what the program needs, and what to do where not."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def add_parser(verbs: Any) -> None:
         verbs,
         "doctor",
         "Look at libraries, GPU, data, models, folders and cores; exit code 1 where the main job cannot run.",
-        ("su3d-bench doctor", "su3d-bench doctor --json doctor.json"),
+        ("su3d-bench dev doctor", "su3d-bench dev doctor --json doctor.json"),
         call,
         uses_all_cores=True,  # computes nothing, and shows what is set of threads
     )

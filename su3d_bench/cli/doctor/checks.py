@@ -104,7 +104,7 @@ def _gpus(tried: Mapping[str, Loaded]) -> Iterator[Check]:
 def _folders() -> Iterator[Check]:
     from su3d_bench.cli.datasets.list import data_root
     from su3d_bench.core.files.scratch import scratch_folder
-    from su3d_bench.runs.planning.scenes import cache_root
+    from su3d_bench.runs.scenes import cache_root
     from su3d_bench.store.caches import KINDS, cache_entries, size_text
 
     named = os.environ.get("SU3D_DATA") or ""

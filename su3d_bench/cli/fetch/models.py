@@ -1,4 +1,4 @@
-"""``su3d-bench fetch models``: foundation models by name, or all that a profile loads."""
+"""``su3d-bench models fetch``: foundation models by name, or all that a profile loads."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 from su3d_bench.cli.fetch.asking import add_fetch_flags, fetch_planned, sources_of
 from su3d_bench.cli.shared.flags import add_settings, add_verb
 
-NAME = "models"
+NAME = "fetch"
 
 
 def add_parser(actions: Any) -> None:
@@ -17,8 +17,8 @@ def add_parser(actions: Any) -> None:
         NAME,
         "Fetch foundation models into $SU3D_MODELS: from the Hugging Face hub, or where their authors publish them.",
         (
-            "su3d-bench fetch models --for paper --accept MIT Apache-2.0",
-            "su3d-bench fetch models sam-vit-h --dry-run",
+            "su3d-bench models fetch --for paper --accept MIT Apache-2.0",
+            "su3d-bench models fetch sam-vit-h --dry-run",
         ),
         call,
         takes_up=True,

@@ -1,4 +1,4 @@
-"""``su3d-bench fetch replica``: the rendered frames and the annotated meshes."""
+"""``su3d-bench datasets fetch replica``: the rendered frames and the annotated meshes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def add_parser(actions: Any) -> None:
         actions,
         NAME,
         "Fetch Replica into $SU3D_DATA: NICE-SLAM's RGB-D frames, and the annotated meshes of the release.",
-        ("su3d-bench fetch replica --dry-run", "su3d-bench fetch replica frames --accept replica"),
+        ("su3d-bench datasets fetch replica --dry-run", "su3d-bench datasets fetch replica frames --accept replica"),
         call,
         takes_up=True,
     )
@@ -27,6 +27,6 @@ def add_parser(actions: Any) -> None:
 
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.fetching.bringing import plan_replica
-    from su3d_bench.runs.planning.scenes import data_root
+    from su3d_bench.runs.scenes import data_root
 
     return fetch_planned(arguments, plan_replica(sources_of(arguments), arguments.parts, data_root()))

@@ -1,4 +1,4 @@
-"""``su3d-bench fetch scannet``: scans, by the script or the link that whoever signed the terms was given."""
+"""``su3d-bench datasets fetch scannet``: scans, by the script or the link that whoever signed the terms was given."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def add_parser(actions: Any) -> None:
         NAME,
         "Fetch scans of ScanNet into $SU3D_DATA by your own official script or link, or say how to sign its terms.",
         (
-            "su3d-bench fetch scannet --script download-scannet.py",
-            "su3d-bench fetch scannet val --from https://example.org/scannet --accept scannet",
+            "su3d-bench datasets fetch scannet --script download-scannet.py",
+            "su3d-bench datasets fetch scannet val --from https://example.org/scannet --accept scannet",
         ),
         call,
         takes_up=True,
@@ -48,7 +48,7 @@ def add_parser(actions: Any) -> None:
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.fetching.scannet import fetch_by_script, fetch_from, how_to_sign, plan_scans
     from su3d_bench.fetching.sources import built_in
-    from su3d_bench.runs.planning.scenes import data_root
+    from su3d_bench.runs.scenes import data_root
 
     source, root = built_in().named("scannet"), data_root()
     scans = plan_scans(arguments.scans, root)

@@ -1,4 +1,4 @@
-"""``su3d-bench new``: a method, a dataset, a protocol or a registry of one's own that runs as it stands."""
+"""The sub-verbs ``new``: a method, a dataset, a protocol or a registry of one's own that runs as it stands."""
 
 from __future__ import annotations
 
@@ -26,22 +26,26 @@ NEXT = {
     "method": ("methods check {at}", "run --scenes rooms/living0 --methods {at}"),
     "dataset": ("datasets check '{at}/*'", "run --scenes '{at}/*' --profile oracle"),
     "protocol": ("protocols show {at}", "run --scenes rooms/living0 --protocols {at}"),
-    REGISTRY: ("registry add BUNDLE --to {at}", "registry build {at} --out site"),
+    REGISTRY: ("dev registry add BUNDLE --to {at}", "dev registry build {at} --out site"),
 }
 
 
-def add_parser(verbs: Any) -> None:
+def add_new(actions: Any, what: str) -> None:
+    """The sub-verb ``new`` of methods, datasets, protocols and registries."""
+    group = {REGISTRY: "dev registry"}.get(what, f"{what}s")
+    place = "my-registry" if what == REGISTRY else f"my_{what}{SUFFIX[what]}"
     parser = add_verb(
-        verbs,
+        actions,
         "new",
-        "Write a method, a dataset, a protocol or a registry of results that runs as it stands, to begin from.",
-        ("su3d-bench new method my_method.py", "su3d-bench new registry my-registry"),
+        f"Write a {what} of your own that works as it is, to begin from.",
+        (f"su3d-bench {group} new {place}", f"su3d-bench {group} new {place} --json"),
         call,
     )
-    parser.add_argument("what", choices=(*SUFFIX, REGISTRY))
-    parser.add_argument(
-        "file", type=Path, metavar="FILE", help="to write; its name becomes the name in it. Of a registry a folder"
-    )
+    parser.set_defaults(what=what)
+    if what == REGISTRY:
+        parser.add_argument("file", type=Path, metavar="DIR", help="the folder to write")
+    else:
+        parser.add_argument("file", type=Path, metavar="FILE", help="to write; its name becomes the name in it")
 
 
 def call(arguments: argparse.Namespace) -> int:
@@ -52,12 +56,12 @@ def call(arguments: argparse.Namespace) -> int:
     if what == REGISTRY:
         return _new_registry(file, arguments)
     if file.suffix != SUFFIX[what]:
-        raise ConfigError(f"new {what}: {file} must end in {SUFFIX[what]}, such as my_{what}{SUFFIX[what]}")
+        raise ConfigError(f"{what}s new: {file} must end in {SUFFIX[what]}, such as my_{what}{SUFFIX[what]}")
     words = re.findall(r"[A-Za-z0-9]+", file.stem)
     if not words or words[0][0].isdigit():
-        raise ConfigError(f"new {what}: no name can be made of '{file.stem}'; such as: my_{what}{SUFFIX[what]}")
+        raise ConfigError(f"{what}s new: no name can be made of '{file.stem}'; such as: my_{what}{SUFFIX[what]}")
     if file.exists():
-        raise ConfigError(f"new {what}: {file} is there already; name another file, nothing is overwritten")
+        raise ConfigError(f"{what}s new: {file} is there already; name another file, nothing is overwritten")
     name, class_name = "-".join(words).lower(), "".join(word[0].upper() + word[1:] for word in words)
     template = file_text(Path(__file__).parent / f"my_{what}{SUFFIX[what]}")
     text = template.replace(f"My{what.capitalize()}", class_name).replace(f"my-{what}", name)
@@ -80,13 +84,13 @@ def _new_registry(folder: Path, arguments: argparse.Namespace) -> int:
 
     name = Path(os.path.abspath(folder)).name
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", name):
-        raise ConfigError(f"new registry: '{name}' is no name for a repository; such as: my-registry")
+        raise ConfigError(f"dev registry new: '{name}' is no name for a repository; such as: my-registry")
     taken = next(
         (path for path in map(folder.joinpath, (*REGISTRY_FILES.values(), KEPT)) if os.path.lexists(path)), None
     )
     if taken is not None or (os.path.lexists(folder) and not folder.is_dir()):
         raise ConfigError(
-            f"new registry: {taken or folder} is there already; name another folder, nothing is overwritten"
+            f"dev registry new: {taken or folder} is there already; name another folder, nothing is overwritten"
         )
     for source, place in REGISTRY_FILES.items():
         text = file_text(Path(__file__).parent / "my_registry" / source)

@@ -1,4 +1,4 @@
-"""``su3d-bench registry add``: a bundle scored anew and taken into a registry, or refused with its reasons."""
+"""``su3d-bench dev registry add``: a bundle scored anew and taken into a registry, or refused with its reasons."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def add_parser(actions: Any) -> None:
         NAME,
         "Score bundles anew and take them into a registry; exit code 1 where one is refused, with its reasons.",
         (
-            "su3d-bench registry add bundle.zip --to my-registry --name opensu3d-rooms",
-            "su3d-bench registry add bundles/mine.zip",
+            "su3d-bench dev registry add bundle.zip --to my-registry --name opensu3d-rooms",
+            "su3d-bench dev registry add bundles/mine.zip",
         ),
         call,
     )

@@ -1,4 +1,4 @@
-"""``su3d-bench registry build``: the site of a registry."""
+"""``su3d-bench dev registry build``: the site of a registry."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def add_parser(actions: Any) -> None:
         NAME,
         "Make a static site of a registry's bundles; exit code 1 where something in it can stand in no ranking.",
         (
-            "su3d-bench registry build my-registry --out site",
-            'su3d-bench registry build . --out site --title "Maps of rooms" --bundles-at https://example.org/bundles',
+            "su3d-bench dev registry build my-registry --out site",
+            'su3d-bench dev registry build . --out site --title "Maps of rooms" --bundles-at https://example.org/bundles',
         ),
         call,
     )

@@ -5,6 +5,8 @@ from __future__ import annotations
 from types import ModuleType
 from typing import Any
 
+from su3d_bench.cli import attribute as report_attribution
+from su3d_bench.cli import plan as report_power
 from su3d_bench.cli.report import bundle as report_bundle
 from su3d_bench.cli.report import html as report_html
 from su3d_bench.cli.report import leaderboard as report_leaderboard
@@ -23,6 +25,8 @@ SUB_VERBS: tuple[ModuleType, ...] = (
     report_samples,
     report_rerun,
     report_leaderboard,
+    report_attribution,
+    report_power,
     report_bundle,
     report_verify,
 )
@@ -32,7 +36,7 @@ def add_parser(verbs: Any) -> None:
     add_modules(
         verbs,
         "report",
-        "Make tables and pages from finished runs, and check a paper against them.",
+        "Make tables, pages and archives from finished runs, and check a paper against them.",
         SUB_VERBS,
         (
             "su3d-bench report tables runs/my-run --format latex --table II",

@@ -15,7 +15,7 @@ from su3d_bench.core.errors import EXIT_DONE, ConfigError, counted, printable
 
 if TYPE_CHECKING:
     from su3d_bench.analysis.page.contents import Amount
-    from su3d_bench.runs.executors.local import Event
+    from su3d_bench.runs.executors import Event
 
 NAME = "html"
 MEGABYTE = 10**6
@@ -114,7 +114,7 @@ class _Progress:
             self._task = self._bars.add_task("page", total=amount.n_steps, remark="")
 
     def report(self, event: Event) -> None:
-        from su3d_bench.runs.executors.local import SCENE_DONE
+        from su3d_bench.runs.executors import SCENE_DONE
 
         self._done[event.unit] = event.done
         n_done, is_scene = sum(self._done.values()), event.label == SCENE_DONE

@@ -44,10 +44,10 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.analysis.page.maps import Spaces
     from su3d_bench.analysis.timeline import SceneTimeline, refuse_nothing
     from su3d_bench.core.files.atomic import make_folder, replacing
-    from su3d_bench.reports.timeline.rrd import rerun_sdk, write_rrd
-    from su3d_bench.runs.executors.local import Event
+    from su3d_bench.reports.timeline import Recording, rerun_sdk
+    from su3d_bench.runs.executors import Event
     from su3d_bench.runs.finished import read_run
-    from su3d_bench.sheets.making.run_source import chosen_of
+    from su3d_bench.sheets.sources import chosen_of
     from su3d_bench.store.run_folder import refuse_records
 
     if arguments.stride is not None and arguments.stride < 1:
@@ -67,8 +67,8 @@ def call(arguments: argparse.Namespace) -> int:
         def tell(scene: str, done: int, total: int) -> None:
             report(Event(scene, "frames", done, total))
 
-        drawn = ((one.scene, one.records(partial(tell, one.scene))) for one in timelines)
-        write_rrd(drawn, methods, stream, sdk)
+        for one in timelines:
+            one.write(Recording(sdk, one.scene, methods, stream), partial(tell, one.scene))
         refuse_nothing(timelines, run.name)
     for one in timelines:
         for line in one.remarks:

@@ -70,9 +70,8 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def _tables(arguments: argparse.Namespace) -> list[Table]:
-    from su3d_bench.analysis.paper_tables import numbered_tables
-    from su3d_bench.analysis.tables import choose, found_tables, measured_results, refuse_unscored
-    from su3d_bench.reports.tables.papers.paper import Shown, selection_tables
+    from su3d_bench.analysis.tables import choose, found_tables, measured_results, numbered_tables, refuse_unscored
+    from su3d_bench.reports.tables.paper import Shown, selection_tables
 
     shown = Shown(
         metrics=tuple(arguments.metrics),

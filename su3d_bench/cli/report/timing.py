@@ -76,7 +76,7 @@ def _write(
     arguments: argparse.Namespace, files: dict[str, str], times: list[list[UpdateTimes]], anytime: list[Any]
 ) -> None:
     from su3d_bench.core.files.atomic import make_folder, write_text
-    from su3d_bench.reports.pictures.plots.timing import draw_timing
+    from su3d_bench.reports.pictures.plots import draw_timing
 
     show()  # the plots take longer than the tables
     make_folder(arguments.out)

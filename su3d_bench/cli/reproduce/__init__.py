@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from su3d_bench.reproducing.preflight import Preflight
     from su3d_bench.reproducing.recipe import Experiment, Recipe
 
-VARIABLES = ("SU3D_DATA", "SU3D_MODELS")  # where a rehearsal's own data and models lie
+VARIABLES = ("SU3D_DATA",)  # where a rehearsal's own data lie
 OF_A_RUN = ("jobs", "limit", "solver", "offline", "executor", "ray_address", "gpus_per_job", "retries", "slurm")
 
 
@@ -40,12 +40,9 @@ def add_parser(verbs: Any) -> None:
     )
     parser.add_argument("--table", nargs="+", default=[], metavar="NAME", help="these experiments alone (default: all)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where all goes (default: reproduced/<recipe>)")
-    parser.add_argument("--dry-run", action="store_true", help="say what is missing and what it will cost, and end")
+    parser.add_argument("--dry-run", action="store_true", help="say what is missing and how large it is, and end")
     parser.add_argument(
-        "--probe", action="store_true", help="first measure what updates cost here, a few of each method"
-    )
-    parser.add_argument(
-        "--rehearse", action="store_true", help="the same on rooms made in the same layouts, with tiny networks"
+        "--rehearse", action="store_true", help="the same on rooms made in the same layouts, with embedded perception"
     )
     parser.add_argument("--rooms", nargs="+", metavar="ROOM", help="of a rehearsal (default: the recipe's)")
     parser.add_argument(
@@ -97,17 +94,17 @@ def call(arguments: argparse.Namespace) -> int:
     if not arguments.rehearse:
         return _reproduce(recipe, experiments, _asked(arguments), out, arguments)
     from su3d_bench.cli.reproduce.rehearsal import places, rehearsed
-    from su3d_bench.reproducing.probe import environment
+    from su3d_bench.reproducing.asked import environment
 
     asked = rehearsed(recipe, experiments, _asked(arguments), out, arguments)
-    with environment(**places(out, asked)):
+    with environment(**places(out)):
         return _reproduce(recipe, experiments, asked, out, arguments)
 
 
 def _check_device(arguments: argparse.Namespace) -> None:
     """Raise before anything is made or weighed where there is no such GPU; a cluster's machines have theirs."""
     from su3d_bench.core.system.devices import DEVICE, EXPECTED_DEVICE, device_for
-    from su3d_bench.runs.executors.choose import ELSEWHERE
+    from su3d_bench.runs.executors import ELSEWHERE
 
     if arguments.device is None:
         return
@@ -139,16 +136,12 @@ def _asked(arguments: argparse.Namespace) -> Asked:
 def _reproduce(
     recipe: Recipe, experiments: Sequence[Experiment], asked: Asked, out: Path, arguments: argparse.Namespace
 ) -> int:
-    from su3d_bench.reproducing.asked import asked_runs
-    from su3d_bench.reproducing.predictions import evaluate_predictions, named_predictions
+    from su3d_bench.reproducing.asked import asked_runs, evaluate_predictions, named_predictions
     from su3d_bench.reproducing.preflight import preflight
 
     runs = asked_runs(recipe, experiments, asked)
     named = named_predictions(experiments, arguments.predictions, arguments.text_features)
-    known = preflight(runs, out)
-    if not known.missing and arguments.probe:
-        _probe(runs, out, arguments)
-        known = preflight(runs, out)
+    known = preflight(runs)
     if arguments.dry_run:
         _show(known, arguments)
         return EXIT_CHECK_FAILED if known.missing else EXIT_DONE
@@ -170,21 +163,15 @@ def _reproduce(
     return EXIT_DONE
 
 
-def _probe(runs: Sequence[AskedRun], out: Path, arguments: argparse.Namespace) -> None:
-    from su3d_bench.reproducing.probe import probe
-
-    remark(f"unit costs of this machine: {probe(runs, out)}", quiet=arguments.quiet)
-
-
 def _show(known: Preflight, arguments: argparse.Namespace) -> None:
-    from su3d_bench.reproducing.tables import preflight_tables
+    from su3d_bench.reproducing.preflight import preflight_tables
 
     if not answer_json(arguments, known.to_json()):
         answer_document(formatted(preflight_tables(known), arguments))
 
 
 def _say(known: Preflight, arguments: argparse.Namespace) -> None:
-    from su3d_bench.reproducing.tables import summary
+    from su3d_bench.reproducing.preflight import summary
 
     for line in summary(known):
         remark(line, quiet=arguments.quiet)
@@ -210,10 +197,8 @@ def _answer(
     """The tables on stdout and in ``tables.md``, every cell in ``compared.json``, pictures, and the archive."""
     from su3d_bench.core.files.atomic import write_json
     from su3d_bench.reproducing.bundle import write_bundle
-    from su3d_bench.reproducing.differences import Results, compared_all
-    from su3d_bench.reproducing.pictures import draw_queries
+    from su3d_bench.reproducing.differences import Results, compared_all, compared_json, draw_queries, result_tables
     from su3d_bench.reproducing.recipe import recipe_bytes
-    from su3d_bench.reproducing.tables import compared_json, result_tables
 
     results = Results(tuple(folders))
     cells = compared_all(experiments, results)

@@ -34,12 +34,12 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.core.config import DEFAULT_SOURCE
     from su3d_bench.core.errors import StoreError, printable, printable_json
     from su3d_bench.formats.tables.table import percent
-    from su3d_bench.runs.planning.held import held_run
+    from su3d_bench.runs.existing import existing_run
 
     entry = run_entry(arguments.run)
     asked: dict[str, str] = {}
     with suppress(StoreError):  # a damaged run.toml tells nothing
-        held = held_run(arguments.run)
+        held = existing_run(arguments.run)
         for path, value in () if held is None else held.values.items():
             if held is not None and held.remarks.get(path) != DEFAULT_SOURCE:
                 asked[".".join(path)] = json.dumps(value, ensure_ascii=False, default=str)

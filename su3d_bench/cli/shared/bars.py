@@ -13,7 +13,7 @@ from su3d_bench.core.printing import Door, one_line, stream_behind
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-    from su3d_bench.runs.executors.local import Event, Report
+    from su3d_bench.runs.executors import Event, Report
 
 MOST_OF_A_BAR = 80  # characters of its words
 
@@ -89,7 +89,7 @@ class _Board:
         self._tasks: dict[tuple[str, str], TaskID] = {}
 
     def report(self, event: Event) -> None:
-        from su3d_bench.runs.executors.local import SCENE_DONE
+        from su3d_bench.runs.executors import SCENE_DONE
 
         self._bars.update(self._scenes, remark=event.doing if event.label == SCENE_DONE else "")
         if event.label == SCENE_DONE:

@@ -39,19 +39,27 @@ def add_verb(
     return parser
 
 
-def add_modules(verbs: Any, name: str, summary: str, modules: Sequence[ModuleType], examples: tuple[str, str]) -> None:
-    """A verb whose sub-verbs are ``modules`` with ``NAME`` and ``add_parser(actions)``."""
-    actions = add_group(verbs, name, summary, "|".join(module.NAME for module in modules), examples)
+def add_modules(
+    verbs: Any,
+    name: str,
+    summary: str,
+    modules: Sequence[ModuleType],
+    examples: tuple[str, str],
+    *,
+    lists: bool = False,
+) -> None:
+    """A verb whose sub-verbs are ``modules`` with ``add_parser(actions)``."""
+    actions = add_group(verbs, name, summary, examples, lists=lists)
     for module in modules:
         module.add_parser(actions)
 
 
 def add_group(
-    verbs: Any, name: str, summary: str, actions: str, examples: tuple[str, str]
+    verbs: Any, name: str, summary: str, examples: tuple[str, str], *, lists: bool = False
 ) -> argparse._SubParsersAction[argparse.ArgumentParser]:
-    """The sub-verbs' parsers of a verb such as ``datasets``; ``actions`` names them, ``list|check``."""
+    """The sub-verbs' parsers of a verb such as ``datasets``, which given alone does its ``list`` if it ``lists``."""
     parser = _parser(verbs, name, summary, examples)
-    return parser.add_subparsers(dest="action", metavar=actions, required=True)
+    return parser.add_subparsers(dest="action", metavar="VERB", required=not lists)
 
 
 def _parser(verbs: Any, name: str, summary: str, examples: tuple[str, str]) -> argparse.ArgumentParser:
@@ -88,10 +96,10 @@ def check_scene_first(verb: str, scene: str, text: str) -> None:
     import shlex
 
     from su3d_bench.core.errors import ConfigError
-    from su3d_bench.runs.planning.scenes import looks_like_scene
+    from su3d_bench.runs.scenes import looks_like_scene
 
     if not looks_like_scene(scene) and looks_like_scene(text):
-        command = shlex.join(["su3d-bench", verb, text, scene])
+        command = shlex.join(["su3d-bench", *verb.split(), text, scene])
         raise ConfigError(f"'{scene}' is no scene: the scene comes first, then the text; {command}")
 
 

@@ -27,7 +27,7 @@ def answer_estimate(arguments: argparse.Namespace, client: ChatClient, requests:
 
 def answer_nothing_to_pay(arguments: argparse.Namespace, who: str) -> int:
     """Say that ``who`` asks no language model; the exit code."""
-    from su3d_bench.perception.language.spending import Estimate
+    from su3d_bench.perception.language.client import Estimate
 
     nothing = Estimate(n_requests=0, n_stored=0, input_tokens=0, output_tokens=0, usd=0.0, models=())
     answer_either(arguments, nothing.to_json(), f"{who} asks no model: nothing to pay")

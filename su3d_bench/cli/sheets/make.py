@@ -17,14 +17,13 @@ if TYPE_CHECKING:
 
     from su3d_bench.core.interfaces import Encoder
     from su3d_bench.perception.language.chat import ChatRequest
+    from su3d_bench.questions.language_solver import AskMap
     from su3d_bench.questions.model import Question
-    from su3d_bench.questions.reasoning.asking import AskMap
+    from su3d_bench.sheets.drafts import Draft
+    from su3d_bench.sheets.drawing import PictureSource
     from su3d_bench.sheets.items import SheetKind
-    from su3d_bench.sheets.making.drafts import Draft
-    from su3d_bench.sheets.making.drawing import PictureSource
-    from su3d_bench.sheets.making.run_source import RunSource
-    from su3d_bench.sheets.making.sets import Origin
-    from su3d_bench.sheets.making.truth_source import TruthSource
+    from su3d_bench.sheets.sets import Origin
+    from su3d_bench.sheets.sources import RunSource, TruthSource
 
 NAME = "make"
 QUESTIONS: Final = "questions"  # the kind that needs no method, and so no run
@@ -93,15 +92,15 @@ def add_parser(actions: Any) -> None:
         "--solver",
         choices=("built-in", "llm"),
         default="built-in",
-        help="who answers in reasoning sheets: geometry alone (default), or a language model, as in su3d-bench ask",
+        help="who answers in reasoning sheets: geometry alone (default), or a language model, as in query ask",
     )
     add_language_flags(parser)
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.files.left_out import read_left_out
+    from su3d_bench.questions.query_files import read_left_out
     from su3d_bench.runs.finished import read_run
-    from su3d_bench.sheets.making.run_source import RunSource
+    from su3d_bench.sheets.sources import RunSource
 
     _check(arguments)
     left_out = frozenset[str]() if arguments.leave_out is None else read_left_out(arguments.leave_out)
@@ -185,7 +184,7 @@ def _judgeable(source: RunSource, kind: SheetKind, is_quiet: bool) -> RunSource:
 
 
 def _truth(arguments: argparse.Namespace) -> TruthSource:
-    from su3d_bench.sheets.making.truth_source import truth_of_addresses, truth_of_run
+    from su3d_bench.sheets.sources import truth_of_addresses, truth_of_run
 
     if arguments.run is None:
         return truth_of_addresses(arguments.scenes)
@@ -196,9 +195,9 @@ def _questions(
     truth: TruthSource, left_out: Collection[str], arguments: argparse.Namespace
 ) -> tuple[dict[SheetKind, list[Draft]], Origin]:
     """The questions that people judge, and where they come from; what is counted together stands for methods."""
-    from su3d_bench.sheets.judging.scores import OF_ALL_KINDS
-    from su3d_bench.sheets.making.question_drafts import question_drafts
-    from su3d_bench.sheets.making.sets import Origin, check_split
+    from su3d_bench.sheets.drafts import question_drafts
+    from su3d_bench.sheets.scores import OF_ALL_KINDS
+    from su3d_bench.sheets.sets import Origin, check_split
 
     n_most = arguments.per_kind or PER_KIND[QUESTIONS]
     drafts = [draft for scene in truth.scenes for draft in question_drafts(truth, scene, n_most, left_out)]
@@ -217,8 +216,8 @@ def _drafts(
     import numpy as np
 
     from su3d_bench.metrics.questions.score import relative_remark
-    from su3d_bench.sheets.making.drafts import annotation_drafts, questions_of, reasoning_drafts, retrieval_drafts
-    from su3d_bench.sheets.making.sets import check_split
+    from su3d_bench.sheets.drafts import annotation_drafts, questions_of, reasoning_drafts, retrieval_drafts
+    from su3d_bench.sheets.sets import check_split
 
     source = next(iter(sources.values()))
     random = np.random.default_rng(arguments.seed)
@@ -251,7 +250,7 @@ def _drafts(
 
 def _ask_map(source: RunSource, encoder: Encoder | None, arguments: argparse.Namespace) -> tuple[AskMap, str]:
     """Who answers the questions of reasoning sheets, and how the key calls them."""
-    from su3d_bench.questions.reasoning.asking import BUILT_IN, built_in, by_language_model
+    from su3d_bench.questions.language_solver import BUILT_IN, built_in, by_language_model
 
     if arguments.solver != "llm":
         return built_in(encoder), BUILT_IN
@@ -261,7 +260,7 @@ def _ask_map(source: RunSource, encoder: Encoder | None, arguments: argparse.Nam
 
 def _estimate(source: RunSource, left_out: Collection[str], arguments: argparse.Namespace) -> int:
     """Tell what asking the language model would cost at the most."""
-    from su3d_bench.sheets.making.drafts import reasoning_drafts, requests_into
+    from su3d_bench.sheets.drafts import reasoning_drafts, requests_into
 
     client, config = chat_client(arguments, source.run.folder)
     given = _given(source, arguments)
@@ -274,7 +273,7 @@ def _estimate(source: RunSource, left_out: Collection[str], arguments: argparse.
 
 def _given(source: RunSource, arguments: argparse.Namespace) -> Sequence[Question] | None:
     """The questions of a file or of the paper; None where they are made from the ground truth."""
-    from su3d_bench.questions.files.files import paper_queries, read_questions
+    from su3d_bench.questions.question_files import paper_queries, read_questions
 
     if arguments.questions == "generated":
         return None
@@ -293,8 +292,8 @@ def _drawn(
 ) -> dict[SheetKind, list[bytes]]:
     """The pictures of all drafts."""
     from su3d_bench.cli.shared.bars import progress
-    from su3d_bench.runs.executors.local import Event
-    from su3d_bench.sheets.making.drawing import draw_all
+    from su3d_bench.runs.executors import Event
+    from su3d_bench.sheets.drawing import draw_all
 
     flat = [draft for of_kind in drafts.values() for draft in of_kind]
     with progress(1, is_quiet=arguments.quiet, last_step="writing") as report:
@@ -309,7 +308,7 @@ def _drawn(
 
 
 def _origin(kind: SheetKind, source: RunSource, made_by: str) -> Origin:
-    from su3d_bench.sheets.making.sets import Origin
+    from su3d_bench.sheets.sets import Origin
 
     rules = {rules.name for scene in source.scenes if (rules := source.rules(scene, kind)) is not None}
     run = source.run
@@ -334,7 +333,7 @@ def _write(
     arguments: argparse.Namespace,
 ) -> list[dict[str, Any]]:
     """Write a set of each kind, several of them each into a folder of its name; what was written."""
-    from su3d_bench.sheets.making.sets import make_sheets, write_sheets
+    from su3d_bench.sheets.sets import make_sheets, write_sheets
 
     apart = arguments.key or arguments.out.with_name(f"{arguments.out.name}-key")
     written_sets = []

@@ -43,12 +43,12 @@ def add_parser(actions: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.files.files import figure_texts
-    from su3d_bench.reports.pictures.colours import scale_stops
+    from su3d_bench.questions.question_files import figure_texts
+    from su3d_bench.reports.pictures.canvas import scale_stops
     from su3d_bench.reports.pictures.figures import draw_grid
     from su3d_bench.runs.finished import read_run
-    from su3d_bench.sheets.making.figures import Figures
-    from su3d_bench.sheets.making.run_source import RunSource
+    from su3d_bench.sheets.figures import Figures
+    from su3d_bench.sheets.sources import RunSource
 
     of_figure = () if arguments.figure is None else figure_texts(arguments.figure)
     texts = [*of_figure, *(query.strip() for query in arguments.queries)]

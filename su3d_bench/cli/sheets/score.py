@@ -12,7 +12,7 @@ from su3d_bench.cli.shared.flags import add_table_format, add_verb
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, counted
 
 if TYPE_CHECKING:
-    from su3d_bench.sheets.judging.scores import Scores
+    from su3d_bench.sheets.scores import Scores
 
 NAME = "score"
 SHOWN_FAULTS = 200  # lines; the number of all is told
@@ -60,10 +60,9 @@ def call(arguments: argparse.Namespace) -> int:
 
     from su3d_bench.formats.tables.table import Prose
     from su3d_bench.reports.tables.judged import sheet_tables
+    from su3d_bench.sheets.answers import check_answers, check_key, read_answers
     from su3d_bench.sheets.items import KEY_FILE, read_key, read_sheet
-    from su3d_bench.sheets.judging.answers import check_answers, check_key, read_answers
-    from su3d_bench.sheets.judging.scores import score
-    from su3d_bench.sheets.judging.verdicts import disputed_csv
+    from su3d_bench.sheets.scores import disputed_csv, score
 
     key_file = arguments.key / KEY_FILE if arguments.key.is_dir() else arguments.key
     key = read_key(key_file)
@@ -136,11 +135,10 @@ def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
     from dataclasses import asdict
 
     from su3d_bench.core.files.atomic import make_folder, write_text
-    from su3d_bench.reports.sheet.second_looks import second_looks_csv, second_looks_page
     from su3d_bench.reports.tables.formats import FORMATS
     from su3d_bench.reports.tables.judged import sheet_tables
     from su3d_bench.sheets.items import PICTURES
-    from su3d_bench.sheets.judging.scores import write_scores
+    from su3d_bench.sheets.scores import second_looks_csv, second_looks_page, write_scores
 
     make_folder(folder)
     content = asdict(scores)
@@ -149,8 +147,8 @@ def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
     for suffix, form in (("md", "markdown"), ("csv", "csv"), ("html", "html")):
         write_text(folder / f"tables.{suffix}", FORMATS[form](tables))
     pictures = Path(os.path.relpath((sheet_folder / PICTURES).resolve(), folder.resolve())).as_posix()
-    write_text(folder / "second_looks.csv", second_looks_csv(content["second_looks"]))
-    write_text(folder / "second_looks.html", second_looks_page(content["second_looks"], pictures, scores.sheet_id))
+    write_text(folder / "second_looks.csv", second_looks_csv(scores.second_looks))
+    write_text(folder / "second_looks.html", second_looks_page(scores.second_looks, pictures, scores.sheet_id))
 
 
 def _looks_line(scores: Scores) -> str:

@@ -11,10 +11,8 @@ import io
 import json
 import math
 import os
-import struct
 import sys
 import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from functools import lru_cache
@@ -25,15 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import StoreError, reading
-from su3d_bench.core.files.locks import SHARED, beside, clear_unfinished, new_file, own_file
-from su3d_bench.core.files.unpacking import Allowance, allowance_of, check_member, member_bytes
+from su3d_bench.core.files.locks import clear_unfinished, new_file
+from su3d_bench.core.files.unpacking import DAMAGE, Allowance, allowance_of, check_member
 from su3d_bench.core.printing import escaped_json
-from su3d_bench.core.system.damage import DAMAGE
 from su3d_bench.core.system.files import file_text, opened
 
-MAGIC_1_0 = b"\x93NUMPY\x01\x00"
-SMALL_BYTES = 1 << 16  # of an array that is read whole before its header is looked at
-ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 REASONS = {
     errno.ENOSPC: "the disk is full; free some space and run the same command again",
     errno.EDQUOT: "the disk quota is used up; free some space and run the same command again",
@@ -65,26 +59,31 @@ def make_folder(path: Path) -> None:
 @contextmanager
 def replacing(path: Path) -> Iterator[IO[bytes]]:
     """A stream whose bytes take the place of ``path`` at the end, whole or not at all."""
-    unfinished = None
     try:
-        unfinished, handle = new_file(path)
-        with _stream(unfinished, handle) as stream:
+        with filling(path, is_durable=True) as stream:
+            yield stream
+    except OSError as error:
+        raise write_error(path, error) from error
+
+
+@contextmanager
+def filling(path: Path, *, is_durable: bool = False) -> Iterator[IO[bytes]]:
+    """As ``replacing``, for what can be made again: an ``OSError`` where the disk refuses, and no wait for the disk."""
+    if not is_durable:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        clear_unfinished(path.parent)
+    place, handle = new_file(path)
+    try:
+        with open(place, "wb", opener=lambda *_: handle) as stream:  # whoever writes files by name finds one
             yield stream
             stream.flush()
-            os.fsync(stream.fileno())
-            os.replace(unfinished, path)
-    except BaseException as error:
-        if unfinished is not None:
-            with suppress(OSError):  # a read-only disk refuses even to remove what is not there
-                unfinished.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise write_error(path, error) from error
+            if is_durable:
+                os.fsync(handle)
+            os.replace(place, path)
+    except BaseException:
+        with suppress(OSError):  # a read-only disk refuses even to remove what is not there
+            place.unlink(missing_ok=True)
         raise
-
-
-def _stream(place: Path, handle: int) -> IO[bytes]:
-    """The open file ``handle`` as a stream that knows its name, for whoever writes files by name."""
-    return open(place, "wb", opener=lambda *_: handle)
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -117,12 +116,7 @@ def write_json(path: Path, value: Any) -> None:
 def npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     """An .npz archive without pickle whose bytes depend on the arrays alone."""
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        for name, array in arrays.items():
-            member = io.BytesIO()
-            np.lib.format.write_array(member, np.asarray(array), version=(1, 0), allow_pickle=False)
-            entry = zipfile.ZipInfo(f"{name}.npy", date_time=ZIP_EPOCH)
-            archive.writestr(entry, member.getvalue())
+    np.savez(buffer, allow_pickle=False, **arrays)  # which dates every member 1980-01-01
     return buffer.getvalue()
 
 
@@ -158,102 +152,37 @@ def read_json(path: Path) -> Any:
 def read_arrays(source: Path | IO[bytes]) -> dict[str, NDArray[Any]]:
     """The plain arrays of an .npz file; raises one of ``DAMAGE`` for anything else.
 
-    As ``numpy.load``, but a header that promises more than its member holds is damage, and no terabyte to allocate,
-    and so is an archive that unpacks to far more than it is.
+    Three times as fast as ``numpy.load`` for the thirty small arrays of a scene's counts, of which a run has thousands;
+    and a header that promises more than its member holds is damage, no terabyte to allocate.
     """
-    held = source.getvalue() if isinstance(source, io.BytesIO) else None
     whole = opened(source) if isinstance(source, Path) else nullcontext(source)
     with whole as stream, zipfile.ZipFile(stream) as archive:
-        allowance, members = allowance_of(archive), archive.infolist()
-        arrays = {info.filename.removesuffix(".npy"): _array(archive, info, held, allowance) for info in members}
-    for name, array in arrays.items():
-        if array.dtype.kind == "U" and array.size:
-            codes = array.reshape(-1).view(np.dtype(np.uint32).newbyteorder(array.dtype.byteorder))
-            if codes.max() > sys.maxunicode:
-                raise ValueError(f"{name}: holds what is no text")
-    return arrays
+        allowance = allowance_of(archive)
+        return {info.filename.removesuffix(".npy"): _array(archive, info, allowance) for info in archive.infolist()}
 
 
-def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, held: bytes | None, allowance: Allowance) -> NDArray[Any]:
-    """``held``: the bytes of the archive where they are in memory."""
-    if info.file_size <= SMALL_BYTES:
-        content = member_bytes(archive, info, allowance) if held is None else _small_member(held, info, allowance)
-        if content.startswith(MAGIC_1_0):
-            return _small_array(content, info.filename)
+def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, allowance: Allowance) -> NDArray[Any]:
     check_member(info, allowance)
     with archive.open(info) as member:
-        version = np.lib.format.read_magic(member)
-        if version not in ((1, 0), (2, 0)):
-            raise ValueError(f"{info.filename}: .npy of version {version}")
-        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, _, dtype = header(member)
-        if math.prod(shape) * _item_bytes(dtype) != info.file_size - member.tell():
-            raise ValueError(f"{info.filename}: holds other than the {shape} that it promises")
-        member.seek(0)
-        array: NDArray[Any] = np.lib.format.read_array(member, allow_pickle=False)
-        return array
-
-
-def _small_member(held: bytes, info: zipfile.ZipInfo, allowance: Allowance) -> bytes:
-    """What ``member_bytes`` gives, without the five objects that ``zipfile`` makes for each member."""
-    check_member(info, allowance)
-    start = info.header_offset
-    signature, flags, method, n_name, n_extra = struct.unpack_from("<4s2xHH16xHH", held, start)
-    if signature != b"PK\x03\x04" or flags & 1 or method != info.compress_type:
-        raise zipfile.BadZipFile(f"{info.filename}: its two headers differ, or it is encrypted")
-    start += 30 + n_name + n_extra
-    packed = held[start : start + info.compress_size]
-    if method == zipfile.ZIP_DEFLATED:
-        packed = zlib.decompressobj(-15).decompress(packed, SMALL_BYTES + 1)
-    if len(packed) != info.file_size or zlib.crc32(packed) != info.CRC:
-        raise zipfile.BadZipFile(f"{info.filename}: is not whole")
-    return packed
-
-
-def _item_bytes(dtype: np.dtype[Any]) -> int:
-    """How long one item is; NumPy makes texts of no length one character long."""
-    return dtype.itemsize or 1
-
-
-def _small_array(content: bytes, name: str) -> NDArray[Any]:
-    """The array of a .npy file in memory; a run has thousands of files with few and equal headers."""
-    start = 10 + int.from_bytes(content[8:10], "little")
-    shape, is_fortran, dtype = _header_1_0(content[:start])
-    if dtype.hasobject or math.prod(shape) * _item_bytes(dtype) != len(content) - start:
-        raise ValueError(f"{name}: holds other than the {shape} of {dtype} that it promises")
+        content = member.read(info.file_size)
+    n_length = {b"\x01\x00": 2, b"\x02\x00": 4}[content[6:8]]
+    start = 8 + n_length + int.from_bytes(content[8 : 8 + n_length], "little")
+    shape, is_fortran, dtype = _header(content[:start])
+    # NumPy makes texts of no length one character long.
+    if dtype.hasobject or math.prod(shape) * (dtype.itemsize or 1) != len(content) - start:
+        raise ValueError(f"{info.filename}: holds other than the {shape} of {dtype} that it promises")
     if start == len(content):
         return np.empty(shape, dtype)
-    return np.frombuffer(content, dtype, offset=start).reshape(shape, order="F" if is_fortran else "C").copy("K")
+    array = np.frombuffer(content, dtype, offset=start)
+    if dtype.kind == "U" and array.view(np.dtype(np.uint32).newbyteorder(dtype.byteorder)).max() > sys.maxunicode:
+        raise ValueError(f"{info.filename}: holds what is no text")
+    return array.reshape(shape, order="F" if is_fortran else "C").copy("K")
 
 
 @lru_cache(maxsize=1024)
-def _header_1_0(content: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+def _header(content: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     stream = io.BytesIO(content)
-    np.lib.format.read_magic(stream)
-    header: tuple[tuple[int, ...], bool, np.dtype[Any]] = np.lib.format.read_array_header_1_0(stream)
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    header: tuple[tuple[int, ...], bool, np.dtype[Any]] = read(stream)
     return header
-
-
-@contextmanager
-def filling(path: Path) -> Iterator[IO[bytes] | None]:
-    """A stream whose bytes become ``path`` at the end; None where another process is writing that file just now.
-
-    All processes write it under one name, so that they meet. Raises ``OSError`` where the disk refuses.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    clear_unfinished(path.parent)
-    unfinished = beside(path, SHARED)
-    handle = own_file(unfinished, os.O_RDWR | os.O_CREAT)
-    if handle is None:
-        yield None
-        return
-    with _stream(unfinished, handle) as stream:
-        try:
-            stream.truncate(0)
-            yield stream
-            stream.flush()
-            os.replace(unfinished, path)
-        except BaseException:
-            with suppress(OSError):
-                unfinished.unlink(missing_ok=True)
-            raise

@@ -3,7 +3,7 @@
 While ``page.html`` is written it lies beside its place as ``.page.html.<12 hexadecimal digits>.unfinished``; so does a
 folder. Whoever makes a folder ready to write into (``make_folder``) removes what bears such a name there and is held
 by nobody. Other names, links and what a living process holds are left alone, and so is everything on a disk without
-locks, which cannot tell the living from the dead.
+locks. (``filelock`` 4.2 leaves a lock file in every folder, and without flock(2) its lock outlives its process.)
 """
 
 from __future__ import annotations
@@ -14,13 +14,12 @@ import os
 import re
 import secrets
 import shutil
+import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import partial
 from pathlib import Path
 
 FORM = re.compile(r"\..*\.[0-9a-f]{12}\.unfinished", re.DOTALL)
-SHARED = "0" * 12  # in the name of what several processes would write alike, so that they meet
 MOST_NAME_BYTES = 200  # of the name that is written; with the rest it stays within the 255 of common disks
 LOCK_FILE = ".lock"
 # What a lock on a folder itself gets from network disks, which lock files that are open for writing only: flock(2).
@@ -37,51 +36,29 @@ def is_unfinished(name: str) -> bool:
     return FORM.fullmatch(name) is not None
 
 
-def beside(path: Path, token: str | None = None) -> Path:
-    """Where ``path`` lies while it is written: another place at each call, unless a ``token`` is given."""
+def beside(path: Path) -> Path:
+    """Where ``path`` lies while it is written: another place at each call."""
     start = os.fsencode(path.name)[:MOST_NAME_BYTES].decode(errors="ignore")
-    return path.with_name(f".{start}.{token or secrets.token_hex(6)}.unfinished")
+    return path.with_name(f".{start}.{secrets.token_hex(6)}.unfinished")
 
 
 def new_file(path: Path) -> tuple[Path, int]:
     """An unfinished file for ``path``: its place, and the file open for writing, which holds the lock."""
     while True:  # another process may clear the file in the moment between its making and its lock
         place = beside(path)
-        handle = own_file(place, os.O_RDWR | os.O_CREAT | os.O_EXCL)
-        if handle is not None:
-            return place, handle
-
-
-def own_file(place: Path, flags: int, *, is_sure: bool = False) -> int | None:
-    """The file at ``place``, open with its lock; None where another process has it, or has taken it away.
-
-    On a disk without locks it is ours unless we must be ``is_sure``.
-    """
-    handle = os.open(place, flags | os.O_NOFOLLOW, 0o666)
-    try:
-        is_ours = _take(handle)
-        if (is_ours or (is_ours is None and not is_sure)) and os.path.samestat(os.fstat(handle), place.lstat()):
-            return handle
-    except FileNotFoundError:
-        pass
-    except BaseException:
-        os.close(handle)
-        raise
-    os.close(handle)
-    return None
-
-
-def _take(handle: int) -> bool | None:
-    """Whether the lock of an open file is ours now; None where its disk has none."""
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError as error:
-        if error.errno not in NO_LOCKS:
+        handle = os.open(place, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW, 0o666)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if place.exists():
+                return place, handle
+        except BlockingIOError:
+            pass
+        except OSError as error:
+            if error.errno in NO_LOCKS:
+                return place, handle
+            os.close(handle)
             raise
-        return None
-    return True
+        os.close(handle)
 
 
 def hold_folder(folder: Path, *, waits: bool = False) -> int:
@@ -90,18 +67,18 @@ def hold_folder(folder: Path, *, waits: bool = False) -> int:
     Raises ``BlockingIOError`` where another process has it, unless this one ``waits``.
     """
     operation = fcntl.LOCK_EX if waits else fcntl.LOCK_EX | fcntl.LOCK_NB
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        fcntl.flock(handle, operation)
-        return handle
+        return _locked(os.open(folder, os.O_RDONLY | os.O_DIRECTORY), operation)
     except OSError as error:
-        os.close(handle)
         if error.errno not in NO_FOLDER_LOCKS:
             raise
-    handle = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+    return _locked(os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666), operation)
+
+
+def _locked(handle: int, operation: int = fcntl.LOCK_EX | fcntl.LOCK_NB) -> int:
     try:
         fcntl.flock(handle, operation)
-    except OSError:
+    except BaseException:
         os.close(handle)
         raise
     return handle
@@ -128,19 +105,19 @@ def is_held(folder: Path) -> bool:
 @contextmanager
 def unfinished_folder(path: Path) -> Iterator[Path]:
     """A folder in which ``path`` is written, gone at the end of the block unless it was renamed by then."""
-    place, handle = held_folder(partial(_made_beside, path))
+
+    def made() -> Path:
+        place = beside(path)
+        place.mkdir()
+        return place
+
+    place, handle = held_folder(made)
     try:
         yield place
     finally:
         shutil.rmtree(place, ignore_errors=True)
         if handle is not None:
             os.close(handle)
-
-
-def _made_beside(path: Path) -> Path:
-    place = beside(path)
-    place.mkdir()
-    return place
 
 
 def held_folder(make: Callable[[], Path]) -> tuple[Path, int | None]:
@@ -183,27 +160,19 @@ def bring_to_disk(path: Path) -> None:
 def clear_unfinished(folder: Path) -> None:
     """Remove what killed processes left unfinished in ``folder``."""
     with suppress(OSError):  # what cannot be cleared is no fault of what is written next
-        with os.scandir(folder) as entries:
-            left = [entry for entry in entries if is_unfinished(entry.name)]
-        for entry in left:
-            _remove_abandoned(entry)
+        for name in filter(is_unfinished, os.listdir(folder)):
+            with suppress(OSError):  # held, gone meanwhile, somebody else's, or on a disk without locks
+                remove_unheld(folder / name)
 
 
-def remove_unheld(folder: Path) -> None:
-    """Remove a folder; raises ``OSError`` where a living process holds it, or where nobody can tell."""
-    handle = hold_folder(folder)
-    try:
-        shutil.rmtree(folder, ignore_errors=True)
-    finally:
+def remove_unheld(place: Path) -> None:
+    """Remove a file or folder; raises ``OSError`` where a living process holds it, or where nobody can tell."""
+    mode = place.lstat().st_mode
+    if stat.S_ISDIR(mode):
+        handle = hold_folder(place)
+        shutil.rmtree(place, ignore_errors=True)
         os.close(handle)
-
-
-def _remove_abandoned(entry: os.DirEntry[str]) -> None:
-    with suppress(OSError):  # held, gone meanwhile, somebody else's, or on a disk without locks
-        if entry.is_dir(follow_symlinks=False):
-            remove_unheld(Path(entry))
-        elif entry.is_file(follow_symlinks=False):
-            held = own_file(Path(entry), os.O_RDWR, is_sure=True)
-            if held is not None:
-                os.unlink(entry)
-                os.close(held)
+    elif stat.S_ISREG(mode):
+        handle = _locked(os.open(place, os.O_RDWR | os.O_NOFOLLOW))
+        place.unlink()
+        os.close(handle)

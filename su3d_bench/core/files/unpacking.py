@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import io
+import struct
+import tokenize
 import zipfile
+import zlib
 
 from su3d_bench.core.errors import printable
 
@@ -12,6 +15,21 @@ FREE_BYTES = 128 << 20
 # Beyond that so many bytes for one of the file; deflate alone reaches 1032. The masks above pack to a 95th.
 MOST_RATIO = 100
 PIECE = 1 << 20
+# What readers raise on a damaged file, an .npz above all.
+DAMAGE = (
+    OSError,
+    EOFError,
+    ValueError,
+    KeyError,
+    TypeError,
+    OverflowError,
+    SyntaxError,
+    RuntimeError,  # zipfile's, of a compression unknown to it
+    tokenize.TokenError,
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+)
 ENCRYPTED = 0x1
 LEAST_ZIP = 22  # bytes of an archive without members
 METHODS = frozenset({zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED})  # the others unpack without a bound

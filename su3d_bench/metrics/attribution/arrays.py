@@ -16,8 +16,8 @@ import numpy as np
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.core.types import BoolArray, GroundTruth, Int64Array
-from su3d_bench.metrics.attribution import masks as instances
-from su3d_bench.metrics.attribution import points as semantic
+from su3d_bench.metrics.attribution import masks as corrections
+from su3d_bench.metrics.attribution.masks import LabelledPoints
 from su3d_bench.metrics.attribution.overlaps import (
     LabelledMasks,
     Overlaps,
@@ -25,7 +25,6 @@ from su3d_bench.metrics.attribution.overlaps import (
     measure_overlaps,
     true_instances,
 )
-from su3d_bench.metrics.attribution.points import LabelledPoints
 from su3d_bench.metrics.attribution.singles import Pool, SingleError, single_mask_errors, single_point_errors
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
@@ -78,8 +77,8 @@ def scored_points(
         mask, _ = transfer_votes(rules, prediction, called.classes, called.targets, called.is_wanted, of_masks=True)
     # a mask is part of the map: only beyond it can more of the map be nearer
     map_distance_m = called.distance_m.copy()
-    far = np.flatnonzero(called.is_wanted & (called.distance_m > semantic.NEAR_M))
-    map_distance_m[far], _ = transfer.nearest(prediction.points, called.targets[far], semantic.NEAR_M)
+    far = np.flatnonzero(called.is_wanted & (called.distance_m > corrections.NEAR_M))
+    map_distance_m[far], _ = transfer.nearest(prediction.points, called.targets[far], corrections.NEAR_M)
     points = LabelledPoints(
         true_class=called.true_class,
         predicted=called.predicted,
@@ -98,7 +97,7 @@ def _object_ids(rules: ProtocolRules, truth: GroundTruth) -> Int64Array:
     return np.where(instance > 0, instance, instance.max(initial=0) + 2 + class_index_of_ids(rules, truth.semantic))
 
 
-MendedScene = instances.Mended | semantic.MendedPoints
+MendedScene = corrections.Mended | corrections.MendedPoints
 Errors = tuple[int, Sequence[SingleError]]
 
 
@@ -125,7 +124,7 @@ class LookedAt(Protocol):
 
 
 class SceneOfMasks:
-    """A scene as an evaluator of masks sees it."""
+    """A scene as an evaluator of masks sees it; ``evaluated``: the truth's values, the masks and the rules."""
 
     def __init__(
         self, rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
@@ -134,6 +133,7 @@ class SceneOfMasks:
         self.points: transfer.Points = truth.points
         self.instance = truth.instance.astype(np.int64)
         self._values, self._masks, self._scoring = scored_masks(rules, truth, prediction, encoder)
+        self.evaluated = self._values, self._masks, self._scoring
         self._has_classes = rules.class_agnostic is None
         self._names = {entry.id: entry.name for entry in rules.classes}
 
@@ -142,11 +142,11 @@ class SceneOfMasks:
         return measure_overlaps(true_instances(self._values, self._scoring), self._masks, self._scoring)
 
     def mended(self) -> MendedScene:
-        mended = instances.mend_scene(self._values, self._masks, self._scoring, self.overlaps)
+        mended = corrections.mend_scene(self._values, self._masks, self._scoring, self.overlaps)
         if not self._has_classes:
             return mended
-        relabelled = instances.with_true_labels(self.overlaps)
-        return replace(mended, with_true_labels=instances.count_masks(self._values, relabelled, self._scoring))
+        relabelled = corrections.with_true_labels(self.overlaps)
+        return replace(mended, with_true_labels=corrections.count_masks(self._values, relabelled, self._scoring))
 
     def errors(self, rules: ProtocolRules, counts: Any, others: Sequence[Any], most: int) -> Errors:
         pool = Pool[InstanceCounts](InstanceMetric(rules), counts, others, instance_ap.concatenate)
@@ -158,22 +158,24 @@ class SceneOfMasks:
         return self._names.get(number, NO_CLASS) if self._has_classes else "object"
 
 
-class _SceneOfPoints:
+class SceneOfPoints:
+    """A scene as an evaluator of points sees it; ``scored`` are the points that count."""
+
     def __init__(
         self, rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
     ) -> None:
-        self._scored = scored_points(rules, truth, prediction, encoder)
-        self.points: transfer.Points = self._scored.positions
-        number = self._scored.points.object_id
+        self.scored = scored_points(rules, truth, prediction, encoder)
+        self.points: transfer.Points = self.scored.positions
+        number = self.scored.points.object_id
         self.instance = np.where(number <= truth.instance.max(initial=0), number, 0)
         self._names = [entry.name for entry in rules.classes]
 
     def mended(self) -> MendedScene:
-        scored = self._scored
-        return semantic.mend_points(scored.points, scored.is_counted, has_masks=scored.has_masks)
+        scored = self.scored
+        return corrections.mend_points(scored.points, scored.is_counted, has_masks=scored.has_masks)
 
     def errors(self, rules: ProtocolRules, counts: Any, others: Sequence[Any], most: int) -> Errors:
-        scored = self._scored
+        scored = self.scored
         pool = Pool[SemanticCounts](SemanticMetric(rules), counts, others, confusion.concatenate)
         return single_point_errors(scored.points, scored.is_counted, pool, has_masks=scored.has_masks, most=most)
 
@@ -184,6 +186,6 @@ class _SceneOfPoints:
 # Of each kind the causes of its errors, and what looks at a scene.
 Look = Callable[[ProtocolRules, GroundTruth, Prediction, Encoder | None], LookedAt]
 EXPLAINED: dict[str, tuple[tuple[str, ...], Look]] = {
-    "instance": (instances.KINDS, SceneOfMasks),
-    "semantic": (semantic.CAUSES, _SceneOfPoints),
+    "instance": (corrections.KINDS, SceneOfMasks),
+    "semantic": (corrections.CAUSES, SceneOfPoints),
 }

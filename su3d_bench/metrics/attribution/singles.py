@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.types import BoolArray, Int64Array
-from su3d_bench.metrics.attribution.masks import MaskError, find_errors, repaired
+from su3d_bench.metrics.attribution.masks import CAUSES, LabelledPoints, MaskError, causes_of, find_errors, repaired
 from su3d_bench.metrics.attribution.overlaps import LabelledMasks, Overlaps, ScoringRules
-from su3d_bench.metrics.attribution.points import CAUSES, LabelledPoints, causes_of
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.average_precision import InstanceCounts

@@ -14,9 +14,8 @@ import numpy as np
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances
-from su3d_bench.core.places import UP, Floor, Places, Room
-from su3d_bench.core.types import Float64Array, GroundTruth, Int64Array
-from su3d_bench.metrics.graphs.overlaps import (
+from su3d_bench.core.types import UP, Float64Array, Floor, GroundTruth, Int64Array, Places, Room
+from su3d_bench.metrics.graphs.objects import (
     THRESHOLDS,
     Cloud,
     best_pairs,

@@ -18,7 +18,7 @@ from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.average_precision import InstanceAP, InstanceCounts
 from su3d_bench.metrics.instance.resampling import resampled_ap
 from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.matching.duplicates import duplicate_pairs
+from su3d_bench.metrics.matching.checks import duplicate_pairs
 from su3d_bench.metrics.matching.labelling import (
     candidate_classes,
     class_index_of_ids,

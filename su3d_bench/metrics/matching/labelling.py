@@ -14,7 +14,7 @@ from su3d_bench.core.files.scratch import row_blocks
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Prediction
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array
-from su3d_bench.metrics.matching.remembered import remembered
+from su3d_bench.metrics.matching.nearest import remembered
 from su3d_bench.metrics.protocols.model import ProtocolRules
 
 CPU = "cpu"

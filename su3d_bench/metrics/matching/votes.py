@@ -12,8 +12,7 @@ import numpy as np
 
 from su3d_bench.core.maps import Masks
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
-from su3d_bench.metrics.matching.nearest import Points, row_ids
-from su3d_bench.metrics.matching.remembered import is_remembering, remembered
+from su3d_bench.metrics.matching.nearest import Points, is_remembering, remembered, row_ids
 
 _MAX_CELLS = 4_000_000  # neighbours held at once
 _MOST_KEPT = 12_000_000  # neighbours kept, of 16 bytes each, where they may be asked for again

@@ -13,7 +13,7 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, GroundTruth, Int64Array, LabelSet
-from su3d_bench.metrics.open_vocabulary.object_means import ObjectCounts
+from su3d_bench.metrics.open_vocabulary.query_ap import ObjectCounts
 from su3d_bench.metrics.protocols.kinds import CATEGORIES
 
 SPACE = "openlex3d"

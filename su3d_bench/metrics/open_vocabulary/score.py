@@ -18,10 +18,9 @@ from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, has_every_label, text_features
 from su3d_bench.metrics.matching.votes import transfer_each_mask
 from su3d_bench.metrics.metric import Metric, Pooled, SceneScore
-from su3d_bench.metrics.open_vocabulary import object_means, openlex3d, query_ap
-from su3d_bench.metrics.open_vocabulary.object_means import ObjectCounts
+from su3d_bench.metrics.open_vocabulary import openlex3d, query_ap
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
-from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
+from su3d_bench.metrics.open_vocabulary.query_ap import ObjectCounts, QueryTruth
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.score import has_feature
 
@@ -65,11 +64,11 @@ class CategoriesMetric(Metric[ObjectCounts]):
         return {"values": len(self.rules.value_names)}
 
     def pooled(self, counts: Sequence[ObjectCounts]) -> Pooled:
-        means = object_means.combine(counts)
+        means = query_ap.combine(counts)
         return Pooled(dict(zip(self.rules.value_names, means.tolist(), strict=True)))
 
     def resampled(self, counts: Sequence[ObjectCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
-        values = object_means.resampled(counts, weights)
+        values = query_ap.resampled(counts, weights)
         return dict(zip(self.rules.value_names, values.T, strict=True))
 
 

@@ -3,19 +3,125 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Partition
-from su3d_bench.core.types import Float64Array, Int64Array
+from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, text_features
-from su3d_bench.metrics.metric import Metric, Pooled, SceneScore, Values, n_predictions
+from su3d_bench.metrics.metric import Arrays, Counts, Metric, Pooled, SceneScore, Values, n_predictions
 from su3d_bench.metrics.protocols.model import PresenceRules
-from su3d_bench.metrics.questions import presence_counts
-from su3d_bench.metrics.questions.presence_counts import SAMPLINGS, PresenceCounts
-from su3d_bench.metrics.questions.truths import AskedThing, PresenceTruth
+from su3d_bench.metrics.questions.score import AskedThing, PresenceTruth
+
+SAMPLINGS = ("random", "popular", "adversarial")  # POPE's, of things that are not there
+MEASURES = ("precision", "recall", "F1", "accuracy", "yes-rate", "AUROC")
+_MAX_CELLS = 4_000_000  # of a (resamples, questions) block: 32 MB of float64
+
+
+@dataclass(frozen=True)
+class PresenceCounts(Counts):
+    """What one scene, or several, adds: a row for each question.
+
+    ``sampling`` (Q,) int64 is its place among ``SAMPLINGS``; ``is_there`` (Q,) and ``says_yes`` (Q,) are what is true
+    and what the map says; ``similarity`` (Q,) float64 is that of the best instance with the text, -1 in an empty map.
+    """
+
+    stored_as = "presence"
+    arrays: ClassVar[Arrays] = {
+        "sampling": ("i", ("rows",)),
+        "is_there": ("b", ("rows",)),
+        "says_yes": ("b", ("rows",)),
+        "similarity": ("f", ("rows",)),
+    }
+
+    sampling: Int64Array
+    is_there: BoolArray
+    says_yes: BoolArray
+    similarity: Float64Array
+
+    def contradiction(self) -> str | None:
+        """Samplings that there are not, and similarities that no cosine has."""
+        if self.sampling.max(initial=-1) >= len(SAMPLINGS):
+            return f"'sampling' counts beyond the {len(SAMPLINGS)} samplings"
+        if not (np.abs(self.similarity) <= 1 + 1e-6).all():  # NaN too
+            return "'similarity' has values that are no cosines"
+        return None
+
+
+def measured(counts: Sequence[PresenceCounts], weights: Int64Array) -> dict[str, Float64Array]:
+    """Each measure of each sampling (R,) over the scenes drawn ``weights`` (R, S) times, as ``F1 random``.
+
+    NaN where it is a share of nothing; where nothing that is there is said to be, F1 is 0, of which POPE's script makes
+    an error.
+
+    >>> said = np.array([True, False, True, False])
+    >>> mine = PresenceCounts(np.zeros(4, np.int64), np.array([True, True, False, False]), said, np.arange(4) / 4)
+    >>> values = measured([mine], np.ones((1, 1), np.int64))
+    >>> values["F1 random"].tolist(), values["AUROC random"].tolist(), values["yes-rate popular"].tolist()
+    ([0.5], [0.0], [nan])
+    """
+    answer: dict[str, Float64Array] = {}
+    for place, sampling in enumerate(SAMPLINGS):
+        rows = [_of_sampling(of_scene, place) for of_scene in counts]
+        values = _shares(rows, weights) | {"AUROC": _auroc(rows, weights)}
+        answer |= {f"{name} {sampling}": values[name] for name in MEASURES}
+    return answer
+
+
+def _of_sampling(counts: PresenceCounts, place: int) -> PresenceCounts:
+    mine = counts.sampling == place
+    return PresenceCounts(*(getattr(counts, name)[mine] for name in PresenceCounts.arrays))
+
+
+def _shares(rows: Sequence[PresenceCounts], weights: Int64Array) -> dict[str, Float64Array]:
+    def total(kept: list[BoolArray]) -> Float64Array:
+        whole: Float64Array = (weights @ np.array([int(one.sum()) for one in kept], np.int64)).astype(np.float64)
+        return whole
+
+    true_yes = total([row.is_there & row.says_yes for row in rows])
+    false_yes = total([~row.is_there & row.says_yes for row in rows])
+    true_no = total([~row.is_there & ~row.says_yes for row in rows])
+    false_no = total([row.is_there & ~row.says_yes for row in rows])
+    n = true_yes + false_yes + true_no + false_no
+    precision, recall = _ratio(true_yes, true_yes + false_yes), _ratio(true_yes, true_yes + false_no)
+    f1 = np.where(true_yes > 0, _ratio(2 * precision * recall, precision + recall), 0.0)
+    return {
+        "precision": precision,
+        "recall": recall,
+        "F1": np.where(true_yes + false_no > 0, f1, np.nan),
+        "accuracy": _ratio(true_yes + true_no, n),
+        "yes-rate": _ratio(true_yes + false_yes, n),
+    }
+
+
+def _auroc(rows: Sequence[PresenceCounts], weights: Int64Array) -> Float64Array:
+    similarity = np.concatenate([row.similarity for row in rows])
+    if not len(similarity):
+        return np.full(len(weights), np.nan)
+    order = np.argsort(similarity, kind="stable")
+    scene = np.repeat(np.arange(len(rows)), [len(row.similarity) for row in rows])[order]
+    is_there = np.concatenate([row.is_there for row in rows])[order]
+    first = np.flatnonzero(np.append(True, np.diff(similarity[order]) > 0))  # of those that are equal
+    areas = np.empty(len(weights))
+    step = max(1, _MAX_CELLS // len(order))
+    for start in range(0, len(weights), step):
+        drawn = weights[start : start + step][:, scene].astype(np.float64)
+        n_there = np.add.reduceat(drawn * is_there, first, axis=1)
+        n_absent = np.add.reduceat(drawn * ~is_there, first, axis=1)
+        n_below = np.cumsum(n_absent, axis=1) - n_absent
+        n_won = (n_there * (n_below + 0.5 * n_absent)).sum(axis=1)
+        areas[start : start + step] = _ratio(n_won, n_there.sum(axis=1) * n_absent.sum(axis=1))
+    return areas
+
+
+def _ratio(part: Float64Array, whole: Float64Array) -> Float64Array:
+    answer: Float64Array = np.divide(part, whole, out=np.full(part.shape, np.nan), where=whole > 0)
+    return answer
+
 
 NOWHERE = -1.0  # the similarity of a text with the best instance of an empty map
 _NOT_KNOWN = (
@@ -73,11 +179,11 @@ class PresenceMetric(Metric[PresenceCounts]):
         """The measures of each sampling, and beside them how many things were asked for, ``n_<sampling>``."""
         sampling = np.concatenate([of_scene.sampling for of_scene in counts])
         n_asked: Values = {f"n_{name}": int((sampling == place).sum()) for place, name in enumerate(SAMPLINGS)}
-        values = presence_counts.measured(counts, np.ones((1, len(counts)), np.int64))
+        values = measured(counts, np.ones((1, len(counts)), np.int64))
         return Pooled({name: float(value[0]) for name, value in values.items()} | n_asked)
 
     def resampled(self, counts: Sequence[PresenceCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
-        return presence_counts.measured(counts, weights)
+        return measured(counts, weights)
 
 
 def relevancies(cosine: Float64Array, canonical: Float64Array, rules: PresenceRules) -> Float64Array:

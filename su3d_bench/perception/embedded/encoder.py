@@ -17,12 +17,11 @@ from su3d_bench.core.errors import ModelMissing
 from su3d_bench.core.system.devices import require
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Float32Array, UInt8Array
-from su3d_bench.perception.embedded.text import TOKENIZER_VERSION, token_ids, unknown_words
-from su3d_bench.perception.models.encoders.image_transform import check_image
-from su3d_bench.perception.models.onnx.session import open_session
+from su3d_bench.perception.embedded.text import DIM, TOKENIZER_VERSION, token_ids, unknown_words
+from su3d_bench.perception.models.encoders.images import check_image
+from su3d_bench.perception.models.onnx import open_session
 
 IMAGE_SIZE = 64
-DIM = 128
 IMAGE_FILE = "image.onnx"
 TEXT_FILE = "text.onnx"
 PREPROCESSING_VERSION = "1"
@@ -63,7 +62,7 @@ class EmbeddedEncoder:
     name = "su3d-embedded"
     dim = DIM
     trained_on = "rooms that the program rendered, other ones than the built-in"
-    # questions/generator.py asks for "cushion on a sofa"; captions.py tells of "cushion on sofa", of the same relations
+    # questions/generator.py asks for "cushion on a sofa", the training said "cushion on sofa", of the same relations
     relative_remark = (
         "relation words and the pattern of these queries are those of the captions that the embedded encoder was "
         "trained on"
@@ -130,7 +129,7 @@ class EmbeddedEncoder:
 
     def unseen_words(self, text: str) -> tuple[str, ...]:
         """The words of ``text`` that stood in none of the training's captions, of which only spellings are known."""
-        from su3d_bench.perception.embedded.captions import trained_words
+        from su3d_bench.perception.embedded.lexicon import trained_words
 
         return unknown_words(text, trained_words())
 
@@ -154,8 +153,5 @@ class EmbeddedEncoder:
     def _path(self, name: str) -> Path:
         path = self._folder / name
         if not path.is_file():
-            raise ModelMissing(
-                f"encoder '{self.name}': there is no {path}; reinstall the package, or train the towers anew with: "
-                f"python -m su3d_bench.perception.embedded.training.train --out {self._folder}"
-            )
+            raise ModelMissing(f"encoder '{self.name}': there is no {path}; reinstall the package")
         return path

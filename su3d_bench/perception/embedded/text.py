@@ -21,6 +21,7 @@ WORD_ROWS = 2048
 GRAM_ROWS = 2048
 N_ROWS = WORD_ROWS + GRAM_ROWS
 PADDING = 0
+DIM = 128  # of the space that both towers of the embedded encoder map to
 TOKENIZER_VERSION = "1"
 
 _ARTICLES = frozenset({"a", "an", "the"})

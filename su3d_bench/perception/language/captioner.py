@@ -17,7 +17,7 @@ from su3d_bench.perception.embedded.naming import scene_caption
 from su3d_bench.perception.language.chat import ChatRequest, Reply, fitted
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.perception.language.config import LanguageConfig
-from su3d_bench.perception.language.parsing import described, is_refusal
+from su3d_bench.perception.language.parsing import CaptionForm, described, is_refusal
 
 # opensu3d.tex, section III-A.
 DESCRIBE = "Give name and description to the object. Output e.g. `name':`description'"
@@ -78,6 +78,7 @@ class Captioner:
                 temperature=config.temperature,
                 seed=config.seed,
                 image_detail=config.image_detail,
+                form=CaptionForm,
             )
             for crop in crops
         ]

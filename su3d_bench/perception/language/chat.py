@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.core.digests import digest_bytes, digest_json
 from su3d_bench.core.types import UInt8Array
@@ -60,7 +60,10 @@ def fitted(rgb: UInt8Array, most_px: int) -> Image:
 
 @dataclass(frozen=True)
 class ChatRequest:
-    """One question; ``key`` addresses it by content, the server that answers left aside."""
+    """One question; ``key`` addresses it by content, the server that answers left aside.
+
+    ``form``: the JSON that is asked of a server which can be held to a schema.
+    """
 
     purpose: Purpose
     model: str
@@ -71,10 +74,12 @@ class ChatRequest:
     temperature: float = 0.0
     seed: int | None = 0
     image_detail: str = "auto"
+    form: type[BaseModel] | None = None
 
     def record(self) -> dict[str, Any]:
         """The request as it is stored: images by their digest."""
-        return {
+        schema = {} if self.form is None else {"schema": self.form.model_json_schema()}
+        return schema | {
             "model": self.model,
             "system": self.system,
             "text": self.text,
@@ -102,6 +107,9 @@ class ChatRequest:
             "temperature": self.temperature,
             "max_tokens": self.max_answer_tokens,
         }
+        if self.form is not None:
+            schema = {"name": self.form.__name__, "strict": True, "schema": self.form.model_json_schema()}
+            body["response_format"] = {"type": "json_schema", "json_schema": schema}
         return body if self.seed is None else body | {"seed": self.seed}
 
     @property
@@ -118,7 +126,7 @@ def n_tokens(text: str) -> int:
 
 @dataclass(frozen=True)
 class Reply:
-    """What came of a request: ``text``, or the reason of a ``failure`` that retries did not mend.
+    """What came of a request: ``text``, or the reason of a ``failure``.
 
     ``dropped`` names the parameters that the server would not take; ``was_stored``: nobody was asked.
     """

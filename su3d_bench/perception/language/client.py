@@ -1,19 +1,34 @@
-"""Asking language models: each question once, with pauses and retries, within the budget, and kept with the run."""
+"""Asking language models: each question once, within the budget, and kept with the run."""
 
 from __future__ import annotations
 
+import os
+import re
+import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
 from time import monotonic, sleep
-from typing import Protocol
+from typing import Any, Protocol
+from urllib.parse import urlsplit
 
-from su3d_bench.core.errors import ModelMissing, StoreError
-from su3d_bench.perception.language.chat import ChatRequest, Reply
-from su3d_bench.perception.language.config import LanguageConfig
+from pydantic import BaseModel, Field, ValidationError
+
+from su3d_bench.core.errors import ConfigError, ModelMissing, RunIncomplete, StoreError, printable
+from su3d_bench.core.system.devices import require
+from su3d_bench.perception.language.chat import ChatRequest, Reply, n_tokens
+from su3d_bench.perception.language.config import LanguageConfig, check_address
 from su3d_bench.perception.language.reply_store import ReplyStore
-from su3d_bench.perception.language.spending import Estimate, Spending, estimate_of
-from su3d_bench.perception.language.transport import GiveUp, Transport, TryAgain
+
+HOSTED = "https://api.openai.com/v1"
+NO_KEY = "none"  # servers on one's own machine ask for no key, the client library for any text
+MOST_TOKENS = 100_000_000  # of one request; no model reads or writes so many
+OPTIONAL_PARAMETERS = ("seed", "temperature", "max_tokens", "response_format")
+PLACE = "(key)"
+SHORTEST_KEY = 8  # what is shorter is no secret: "none", "EMPTY", "test"
+KEY_LIKE = re.compile(r"\b(?:sk|pk|key|gsk|hf)[-_][A-Za-z0-9_\-*]{6,}", re.IGNORECASE)
 
 
 class LanguageModel(Protocol):
@@ -38,7 +53,7 @@ class ChatClient:
         self._store = store
         self._offline = offline
         self._ask_failed_again = ask_failed_again
-        self._transport = Transport(config)
+        self._server = Server(config)
         self._pace = _Pace(config.requests_per_minute)
         self._lock = threading.Lock()
         self._locks: dict[str, threading.Lock] = {}
@@ -77,7 +92,7 @@ class ChatClient:
                 )
             reply = self._send(request)
             self._sent.add(request.key)
-            return self._store.save(request, reply, self._transport.server, replace=self._ask_failed_again)
+            return self._store.save(request, reply, self._server.name, replace=self._ask_failed_again)
 
     def _known(self, request: ChatRequest) -> Reply | None:
         reply = self._store.load(request.key)
@@ -91,37 +106,22 @@ class ChatClient:
         return estimate_of(self._config, to_send, len(different) - len(to_send))
 
     def _send(self, request: ChatRequest) -> Reply:
-        wait_s = self._config.backoff_s
-        for attempt in range(self._config.max_retries + 1):
-            self._pace.wait()
+        self._pace.wait()
+        with self.spending.reserved(request) as replies:
             try:
-                with self.spending.reserved(request) as replies:
-                    replies.append(self._transport.send(request))
-            except GiveUp as refused:
-                self._count(failed=False)  # the server is there and has spoken
-                return Reply("", failure=str(refused))
-            except TryAgain as failed:
-                if failed.wait_s is not None and failed.wait_s > self._config.max_wait_s:
-                    return self._failed(f"{failed}; it asks to wait {failed.wait_s:.0f} s", failed)
-                if attempt == self._config.max_retries:
-                    return self._failed(f"{failed}; tried {attempt + 1} times", failed)
-                sleep(wait_s if failed.wait_s is None else failed.wait_s)
-                wait_s = min(2 * wait_s, self._config.max_wait_s)
+                reply = self._server.send(request)
+                replies.append(reply)
+            except _Failed as failed:
+                reply = Reply("", failure=str(failed))
+                most = self._config.max_failures_in_a_row
+                if self._count(failed=failed.is_down) >= most:
+                    raise ModelMissing(
+                        f"{self._server.name}: {most} requests failed one after the other "
+                        f"({failed}); answers so far are kept: run the same command again when the server works"
+                    ) from None
             else:
                 self._count(failed=False)
-                return replies[0]
-        raise AssertionError("the last attempt returns")
-
-    def _failed(self, reason: str, last: TryAgain) -> Reply:
-        server = self._transport.server
-        if not last.is_answered:
-            raise ModelMissing(f"{server}: cannot be reached ({reason}); start the server or name another --base-url")
-        if self._count(failed=True) >= self._config.max_failures_in_a_row:
-            raise ModelMissing(
-                f"{server}: {self._config.max_failures_in_a_row} requests failed one after the other ({reason}); what "
-                "was answered is kept: give the same command again when the server is well"
-            )
-        return Reply("", failure=reason)
+        return reply
 
     def _count(self, *, failed: bool) -> int:
         with self._lock:
@@ -145,3 +145,323 @@ class _Pace:
             start = max(now, self._next)
             self._next = start + self._gap_s
         sleep(start - now)
+
+
+# ---- the server
+
+
+class _Failed(Exception):
+    """A request was not answered; ``is_down``: for a reason that may lie with the server and not with the request."""
+
+    def __init__(self, reason: str, *, is_down: bool) -> None:
+        super().__init__(reason)
+        self.is_down = is_down
+
+
+class _TooLarge(Exception):
+    pass
+
+
+class _Message(BaseModel):
+    content: str | None = None
+    refusal: str | None = None
+
+
+class _Choice(BaseModel):
+    message: _Message
+    finish_reason: str | None = None
+
+
+class _Usage(BaseModel):
+    prompt_tokens: int = Field(default=0, ge=0, le=MOST_TOKENS)
+    completion_tokens: int = Field(default=0, ge=0, le=MOST_TOKENS)
+
+
+class _Completion(BaseModel):
+    """What is read of a chat completion."""
+
+    model: str = ""
+    choices: list[_Choice] = Field(min_length=1)
+    usage: _Usage | None = None
+
+
+class Server:
+    """One OpenAI-compatible server; the client library, which retries, is loaded for the first request."""
+
+    def __init__(self, config: LanguageConfig) -> None:
+        self._config = config
+        self._address = _address_of(config)
+        self._key = _key_of(config)
+        self._lock = threading.Lock()
+        self._client: Any = None
+        self._dropped: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Host and port."""
+        return printable(urlsplit(self._address).netloc, 200)
+
+    def send(self, request: ChatRequest) -> Reply:
+        """The answer; parameters that the server refuses by name are left out, and stay so.
+
+        Raises ``_Failed``, and ``ModelMissing`` where no request can be answered: no server, no key, no such model.
+        """
+        with self._lock:
+            self._client = self._client or self._connected()
+        while True:
+            dropped = self._dropped
+            refused = self._post(_without(request.body(), dropped))
+            if isinstance(refused, str):
+                if refused in dropped:
+                    raise _Failed(f"the server refuses '{refused}'", is_down=False)
+                with self._lock:
+                    self._dropped = (*self._dropped, refused)
+                continue
+            return self._reply(request, refused, dropped)
+
+    def _connected(self) -> Any:
+        openai = require("openai", "a language model")
+        if not self._key and self._address == HOSTED:
+            raise ModelMissing(
+                f"${self._config.key_variable} is not set: put the key of {self.name} there, or name a server of "
+                "your own with --base-url"
+            )
+        return openai.OpenAI(
+            api_key=self._key or NO_KEY,
+            base_url=self._address,
+            max_retries=self._config.max_retries,
+            timeout=self._config.timeout_s,
+            default_headers={"Accept-Encoding": "identity"},
+            http_client=openai.DefaultHttpxClient(
+                event_hooks={"response": [_bounded(self._config.max_answer_bytes)]}, follow_redirects=False
+            ),
+        )
+
+    def _post(self, body: dict[str, Any]) -> bytes | str:
+        """The answer's content, or the name of an optional parameter that the server refuses."""
+        import openai
+
+        n_tries = self._config.max_retries + 1
+        try:
+            content: bytes = self._client.chat.completions.with_raw_response.create(**body).content
+        except openai.APIStatusError as error:
+            return self._refused_parameter(error)
+        except openai.APITimeoutError:
+            raise _Failed(
+                f"no answer within {self._config.timeout_s:g} s; tried {n_tries} times", is_down=True
+            ) from None
+        except _TooLarge as error:
+            raise _Failed(f"the answer is {error}", is_down=False) from None
+        except openai.OpenAIError as error:
+            reason = self._shown(str(error.__cause__ or error), 120)
+            if type(error.__cause__).__name__ in ("ConnectError", "UnsupportedProtocol"):
+                raise ModelMissing(
+                    f"{self.name}: cannot be reached ({reason}); start the server or name another --base-url"
+                ) from None
+            raise _Failed(f"the connection failed: {reason}; tried {n_tries} times", is_down=True) from None
+        return content
+
+    def _refused_parameter(self, error: Any) -> str:
+        status, told = int(error.status_code), error.body
+        message = told.get("message") if isinstance(told, dict) else None
+        message = self._shown(message if isinstance(message, str) else str(error))
+        if status in (401, 403):
+            raise ModelMissing(
+                f"{self.name}: refuses the key in ${self._config.key_variable} (status {status}); set the right one"
+            ) from None
+        if status == 404:
+            raise ModelMissing(
+                f"{self.name}: knows no such model or address (status 404: {message}); name the model with --model "
+                "and the server with --base-url, which usually ends with /v1"
+            ) from None
+        if status == 429 and getattr(error, "code", "") == "insufficient_quota":
+            raise ModelMissing(
+                f"{self.name}: the account has no quota left ({message}); top it up, then ask again"
+            ) from None
+        if status in (400, 422):
+            named = next((name for name in OPTIONAL_PARAMETERS if re.search(rf"\b{name}\b", message)), None)
+            if named is not None:
+                return named
+        is_down = status == 429 or status >= 500
+        tried = f"; tried {self._config.max_retries + 1} times" if is_down else ""
+        raise _Failed(f"status {status}: {message}{tried}", is_down=is_down) from None
+
+    def _reply(self, request: ChatRequest, content: bytes, dropped: tuple[str, ...]) -> Reply:
+        try:
+            completion = _Completion.model_validate_json(content)
+        except ValidationError:
+            said = self._shown(content[:200].decode("utf-8", "replace"), 60)
+            raise _Failed(f"the server's answer is no chat completion: '{said}'", is_down=True) from None
+        choice = completion.choices[0]
+        answer = (choice.message.content or choice.message.refusal or "").encode("utf-8", "replace").decode()
+        answer = self._without_key(answer)
+        usage = completion.usage or _Usage(prompt_tokens=request.n_input_tokens, completion_tokens=n_tokens(answer))
+        finish, model = self._shown(choice.finish_reason or "", 40), self._shown(completion.model)
+        return Reply(answer, finish, model, usage.prompt_tokens, usage.completion_tokens, dropped)
+
+    def _without_key(self, text: str) -> str:
+        return text.replace(self._key, PLACE) if len(self._key) >= SHORTEST_KEY else text
+
+    def _shown(self, text: str, limit: int = 200) -> str:
+        """What a server says, fit for a message or a record: without the key or what looks like one."""
+        return printable(KEY_LIKE.sub(PLACE, self._without_key(text)), limit)
+
+
+def _address_of(config: LanguageConfig) -> str:
+    address = config.base_url
+    if not address and (address := os.environ.get("OPENAI_BASE_URL", "")):
+        try:
+            check_address(address)
+        except ValueError as error:
+            raise ConfigError(f"$OPENAI_BASE_URL: {error}") from error
+    return address.rstrip("/") or HOSTED
+
+
+def _key_of(config: LanguageConfig) -> str:
+    key = os.environ.get(config.key_variable, "").strip()
+    if not all("!" <= character <= "~" for character in key):
+        raise ConfigError(f"${config.key_variable}: holds characters that no key has; set it again")
+    return key
+
+
+def _without(body: dict[str, Any], dropped: tuple[str, ...]) -> dict[str, Any]:
+    """``body`` without what the server refused; newer models take the cap of the answer under another name."""
+    kept = {name: value for name, value in body.items() if name not in dropped}
+    if "max_tokens" in dropped:
+        kept["max_completion_tokens"] = body["max_tokens"]
+    return kept
+
+
+def _bounded(most_bytes: int) -> Callable[[Any], None]:
+    """A hook that ends the reading of a response beyond ``most_bytes``, and of one that is packed, with an error."""
+
+    def hook(response: Any) -> None:
+        if response.headers.get("content-encoding", "identity") not in ("", "identity"):
+            raise _TooLarge("packed")
+        body = response.stream
+        # The client library has its own choice of httpx or httpx2.
+        base = sys.modules[type(response).__module__.partition(".")[0]].SyncByteStream
+
+        class Bounded(base):  # type: ignore[misc, valid-type]
+            def __iter__(self) -> Iterator[bytes]:
+                n = 0
+                for chunk in body:
+                    n += len(chunk)
+                    if n > most_bytes:
+                        raise _TooLarge(f"larger than {most_bytes:,} bytes")
+                    yield chunk
+
+            def close(self) -> None:
+                body.close()
+
+        response.stream = Bounded()
+
+    return hook
+
+
+# ---- what asking costs
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What ``n_requests`` different requests would cost at most; ``usd`` is None where a model has no price."""
+
+    n_requests: int
+    n_stored: int
+    input_tokens: int
+    output_tokens: int
+    usd: float | None
+    models: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self) | {"models": list(self.models)}
+
+    def line(self) -> str:
+        """The estimate for people."""
+        to_send = self.n_requests - self.n_stored
+        cost = "no price in the table" if self.usd is None else f"at most {self.usd:.4f} USD"
+        models = ", ".join(self.models) or "no model"
+        return (
+            f"{self.n_requests} requests, {self.n_stored} of them answered before; {to_send} to send to {models}: "
+            f"about {self.input_tokens:,} tokens in, at most {self.output_tokens:,} out, {cost}"
+        )
+
+
+def cost_usd(config: LanguageConfig, model: str, input_tokens: int, output_tokens: int) -> float | None:
+    """US dollars by the price table; None where it has no such model."""
+    price = config.prices.get(model)
+    if price is None:
+        return None
+    return (input_tokens * price.input_usd + output_tokens * price.output_usd) / 1e6
+
+
+def estimate_of(config: LanguageConfig, to_send: Sequence[ChatRequest], n_stored: int) -> Estimate:
+    """The most that sending ``to_send`` can cost, beside ``n_stored`` requests that have replies."""
+    costs = [cost_usd(config, request.model, request.n_input_tokens, request.max_answer_tokens) for request in to_send]
+    known = [cost for cost in costs if cost is not None]
+    return Estimate(
+        n_requests=len(to_send) + n_stored,
+        n_stored=n_stored,
+        input_tokens=sum(request.n_input_tokens for request in to_send),
+        output_tokens=sum(request.max_answer_tokens for request in to_send),
+        usd=sum(known) if len(known) == len(costs) else None,
+        models=tuple(dict.fromkeys(request.model for request in to_send)),
+    )
+
+
+class Spending:
+    """What was spent so far, with the cap of the configuration; may be used from several threads."""
+
+    def __init__(self, config: LanguageConfig) -> None:
+        self._config = config
+        self._lock = threading.Lock()
+        self._reserved_tokens = 0
+        self._reserved_usd = 0.0
+        self.tokens = 0
+        self.usd = 0.0
+
+    @contextmanager
+    def reserved(self, request: ChatRequest) -> Iterator[list[Reply]]:
+        """Holds what ``request`` may cost; the block puts the reply into the list that it gets.
+
+        A ``RunIncomplete`` where the cap would be passed. A request without a reply is counted by its input.
+        """
+        tokens = request.n_input_tokens + request.max_answer_tokens
+        usd = self._cost(request.model, request.n_input_tokens, request.max_answer_tokens)
+        with self._lock:
+            self._check(tokens, usd)
+            self._reserved_tokens += tokens
+            self._reserved_usd += usd
+        replies: list[Reply] = []
+        try:
+            yield replies
+        finally:
+            spent_in = replies[0].input_tokens if replies else request.n_input_tokens
+            spent_out = replies[0].output_tokens if replies else 0
+            with self._lock:
+                self._reserved_tokens -= tokens
+                self._reserved_usd -= usd
+                self.tokens += spent_in + spent_out
+                self.usd += self._cost(request.model, spent_in, spent_out)
+
+    def _cost(self, model: str, input_tokens: int, output_tokens: int) -> float:
+        cost = cost_usd(self._config, model, input_tokens, output_tokens)
+        if cost is None and self._config.budget_usd:
+            raise ConfigError(
+                f"budget_usd is set and model '{model}' has no price; add [perception.language.prices.\"{model}\"] "
+                "with input_usd and output_usd, or cap budget_tokens"
+            )
+        return cost or 0.0
+
+    def _check(self, tokens: int, usd: float) -> None:
+        cap = self._config
+        if cap.budget_tokens and self.tokens + self._reserved_tokens + tokens > cap.budget_tokens:
+            raise RunIncomplete(
+                f"language: budget_tokens = {cap.budget_tokens:,} is reached ({self.tokens:,} spent); what was "
+                "answered is kept: raise the cap and run the same command again"
+            )
+        if cap.budget_usd and self.usd + self._reserved_usd + usd > cap.budget_usd:
+            raise RunIncomplete(
+                f"language: budget_usd = {cap.budget_usd:g} is reached ({self.usd:.4f} USD spent); what was answered "
+                "is kept: raise the cap and run the same command again"
+            )

@@ -46,11 +46,8 @@ class LanguageConfig(BaseModel):
     image_detail: Literal["auto", "low", "high"] = "auto"
     # A larger crop is scaled down: OpenAI's models see the shorter side of an image at 768 pixels at most.
     max_image_px: int = Field(default=768, ge=32, le=4096)
-    connect_timeout_s: Seconds = 10.0
-    total_timeout_s: Seconds = 120.0
-    max_retries: int = Field(default=4, ge=0, le=20)
-    backoff_s: Seconds = 1.0  # doubled at every retry
-    max_wait_s: Seconds = 60.0  # a server that asks for a longer pause has refused
+    timeout_s: Seconds = 120.0  # without a byte of the answer
+    max_retries: int = Field(default=4, ge=0, le=20)  # of the client library, with growing pauses
     max_answer_bytes: int = Field(default=1_000_000, ge=1000, le=100_000_000)
     requests_per_minute: float = Field(default=0.0, ge=0, allow_inf_nan=False)
     max_concurrent: int = Field(default=4, ge=1, le=64)

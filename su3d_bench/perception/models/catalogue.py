@@ -19,8 +19,6 @@ FormName = Literal["transformers", "open_clip", "original", "onnx"]
 
 HUB = "https://huggingface.co"
 ONNX_MANIFEST = "manifest.json"
-STAND_IN = " (stand-in)"  # ends the name of an encoder whose weights cannot be the published ones
-WEIGHTS_CAVEAT = "weights: tiny stand-ins of"
 _HUB_WEIGHTS = "model.safetensors | pytorch_model.bin"
 _CLIP_FILES = (_HUB_WEIGHTS, "config.json", "preprocessor_config.json", "tokenizer.json | vocab.json + merges.txt")
 _OPEN_CLIP_FILES = ("open_clip_model.safetensors | open_clip_pytorch_model.bin",)  # open_clip brings its own words
@@ -68,7 +66,7 @@ class ModelEntry:
 
     @property
     def fetched(self) -> ModelForm:
-        """The form that ``su3d-bench fetch models`` brings: a publisher's one file where it is read, else the hub's."""
+        """The form that ``su3d-bench models fetch`` brings: a publisher's one file where it is read, else the hub's."""
         originals = [form for form in self.forms if form.form == "original" and form.is_read]
         return originals[0] if originals else self.forms[0]
 
@@ -98,7 +96,7 @@ def _original(
 
 
 def _exported(name: str, size_mb: int) -> ModelForm:
-    return ModelForm("onnx", (ONNX_MANIFEST,), f"su3d-bench models export {name} --out DIR", size_mb)
+    return ModelForm("onnx", (ONNX_MANIFEST,), f"python tools/export_onnx.py {name} --out DIR", size_mb)
 
 
 # On what each was trained, with where that was read.
@@ -268,7 +266,7 @@ _ENTRIES = (
             ModelForm(
                 "onnx",
                 ("ram_plus.onnx", "ram_tag_list.txt"),
-                "su3d-bench models export ram-plus --checkout DIR --environment DIR --out DIR",
+                "python tools/export_onnx.py ram-plus --checkout DIR --python PYTHON --out DIR",
                 1370,
             ),
         ),
@@ -295,6 +293,5 @@ def model_entry(name: str, kind: Kind | None = None) -> ModelEntry:
 
 
 def encoder_known_as(name: str | None) -> ModelEntry | None:
-    """The encoder that protocols and run records call ``name``, or for which such a one stands in."""
-    known_as = (name or "").removesuffix(STAND_IN)
-    return next((entry for entry in _ENTRIES if entry.known_as == known_as and entry.kind == "encoder"), None)
+    """The encoder that protocols and run records call ``name``."""
+    return next((entry for entry in _ENTRIES if name and entry.known_as == name and entry.kind == "encoder"), None)

@@ -11,7 +11,7 @@ from su3d_bench.core.system.devices import DEVICE, EXPECTED_DEVICE
 from su3d_bench.perception.models.catalogue import MODELS
 from su3d_bench.perception.models.masks.automatic_masks import AutomaticMaskConfig
 from su3d_bench.perception.models.masks.grounded_sam import GroundedConfig
-from su3d_bench.perception.models.onnx.session import Provider
+from su3d_bench.perception.models.onnx import Provider
 
 EMBEDDED = "embedded"
 Precision = Literal["auto", "float32", "float16", "bfloat16"]
@@ -83,7 +83,7 @@ class PaperConfig(BaseModel):
 
     ``tagger`` ``auto``: RAM++ through its package, else exported, else the likeliest ``n_tags`` words of ``words``, a
     text file (our own list where it is not set). ``grounded`` and ``automatic`` hold for methods that ask for no
-    settings of their own. ``segmenter``: which SAM; ``sam_runtime`` ``onnx``: as exported by ``models export``.
+    settings of their own. ``segmenter``: which SAM; ``sam_runtime`` ``onnx``: as exported by ``tools/export_onnx.py``.
     ``captions`` ``model``: names and captions of crops are asked of the vision model of ``perception.language``.
     """
 

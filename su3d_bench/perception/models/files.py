@@ -11,23 +11,27 @@ import json
 import os
 import pickle
 import stat
-from collections.abc import Iterator, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
+
+from pydantic import TypeAdapter, ValidationError
 
 from su3d_bench.core.digests import digest_bytes, digest_file
 from su3d_bench.core.errors import ConfigError, DataError, ModelMissing, PredictionError, StoreError, converted
 from su3d_bench.core.files.atomic import make_folder, read_json, write_json
-from su3d_bench.core.system.devices import require
+from su3d_bench.core.system.devices import make_deterministic, require, require_transformers
 from su3d_bench.core.system.files import file_text, regular
-from su3d_bench.formats.torch_zip import check_stored
+from su3d_bench.formats.torch_files import check_stored
 from su3d_bench.perception.models.catalogue import STAND_IN, FormName, ModelEntry, ModelForm, model_entry
 
 DEFAULT_FOLDER = "~/.cache/su3d-bench/models"
 DIGEST_FOLDER = "model-digests"
+Checked = TypeVar("Checked")
+Loaded = TypeVar("Loaded")
 LARGEST_SETTINGS = 2**24  # bytes; a tokenizer.json of 256,000 words has 2**23
-STAND_IN_SHARE = 0.1  # int8 would be a quarter of float32
 PICKLED = {".bin", ".pt", ".pth", ".ckpt"}
 # Beside the weights, what may move an answer.
 _SETTINGS = (
@@ -59,22 +63,6 @@ class ModelFiles:
         """SHA-256 by file name of the weights and of every file of settings beside them."""
         names = dict.fromkeys((self.weights.name, *_SETTINGS))
         return {name: file_sha256(self.folder / name) for name in names if (self.folder / name).is_file()}
-
-    @property
-    def is_stand_in(self) -> bool:
-        """Whether the weights take less than a tenth of the published ones': no copy of those, in whatever precision.
-
-        Nothing beside the weights says so, thus nothing that is left out or put there can hide it.
-        """
-        weights = [self.weights]
-        if self.form.form == "onnx":
-            weights = [path for path in self.folder.iterdir() if path.is_file()]
-        return sum(path.stat().st_size for path in weights) < STAND_IN_SHARE * self.form.size_mb * 1e6
-
-    @property
-    def known_as(self) -> str:
-        """What protocols and run records call an encoder of these weights."""
-        return self.entry.known_as + (STAND_IN if self.is_stand_in else "")
 
     def wrong_digests(self) -> list[str]:
         """A line for each file whose digest is not the published one."""
@@ -197,7 +185,7 @@ def _lacking(form: ModelForm, folder: Path) -> list[str]:
 def what_to_fetch(entry: ModelEntry, forms: Sequence[ModelForm]) -> str:
     """What to do for one of ``forms`` of ``entry``: the command that brings or makes it, else its files and address."""
     if entry.fetched in forms:
-        return f"run: su3d-bench fetch models {entry.name} ({entry.fetched.size_mb / 1000:.1f} GB)"
+        return f"run: su3d-bench models fetch {entry.name} ({entry.fetched.size_mb / 1000:.1f} GB)"
     if forms[0].form == "onnx":
         return f"run: {forms[0].source}"
     names = ", ".join(_names(requirement)[0] for requirement in forms[0].files)
@@ -312,11 +300,38 @@ def read_settings(path: Path) -> dict[str, Any]:
     return content
 
 
-def bounded(error: BaseException, limit: int = 160) -> str:
+def checked(kind: type[Checked], values: Mapping[str, Any], where: object) -> Checked:
+    """``kind`` of the ``values`` that a file gave; raises ``DataError`` with the first that is none."""
+    try:
+        return TypeAdapter(kind).validate_json(json.dumps(values), strict=True)
+    except ValidationError as error:
+        fault = error.errors()[0]
+        place = ".".join(str(part) for part in fault["loc"])
+        raise DataError(f"{where}: {place} is {bounded(str(fault['input']), 40)}: {fault['msg']}") from error
+
+
+def bounded(error: object, limit: int = 160) -> str:
     """What ``error`` says, as one printable line of at most ``limit`` characters."""
     text = "".join(character if character.isprintable() else " " for character in str(error))
     text = " ".join(text.split())
     return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+# A worker segments one scene after another; a segmenter, a detector and a tagger stay in memory.
+MOST_KEPT = 3
+_kept: OrderedDict[tuple[object, ...], object] = OrderedDict()
+
+
+def kept(files: ModelFiles, place: tuple[str, ...], load: Callable[[], Loaded]) -> Loaded:
+    """What ``load`` makes of ``files`` at ``place``, from memory where they are unchanged since it was last asked."""
+    status = files.weights.stat()
+    key = (files.entry.name, str(files.weights), status.st_size, status.st_mtime_ns, *place)
+    if key not in _kept:
+        while len(_kept) >= MOST_KEPT:
+            _kept.popitem(last=False)
+        _kept[key] = load()
+    _kept.move_to_end(key)
+    return cast("Loaded", _kept[key])
 
 
 def load_pretrained(files: ModelFiles, model_class: Any, **more: Any) -> Any:
@@ -346,3 +361,21 @@ def load_pretrained(files: ModelFiles, model_class: Any, **more: Any) -> Any:
             f"{files.entry.name}; {what_to_fetch(files.entry, (files.form,))}"
         )
     return model
+
+
+def load_class(files: ModelFiles, class_name: str) -> Any:
+    """The model of transformers' class ``class_name``; a ``DataError`` where the folder holds another."""
+    transformers = require_transformers(f"model '{files.entry.name}'")
+    model_class = getattr(transformers, class_name)
+    model_type = read_settings(files.folder / "config.json").get("model_type")
+    if model_type != model_class.config_class.model_type:
+        wanted = model_class.config_class.model_type
+        raise DataError(f"{files.folder}: model_type is {str(model_type)[:40]!r}; '{files.entry.name}' is {wanted!r}")
+    return load_pretrained(files, model_class)
+
+
+def on_device(model: Any, device: str, precision: str) -> Any:
+    """``model`` in evaluation mode on ``device`` in ``precision``."""
+    torch = require("torch", f"device '{device}'")
+    make_deterministic(device)
+    return model.eval().to(device=device, dtype=getattr(torch, precision))

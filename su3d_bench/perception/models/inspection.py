@@ -17,11 +17,11 @@ from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Frame, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.models.catalogue import PROFILE_MODELS, ModelEntry, model_entry
 from su3d_bench.perception.models.config import ModelsConfig
-from su3d_bench.perception.models.encoders import towers_onnx, towers_transformers
+from su3d_bench.perception.models.encoders import towers
 from su3d_bench.perception.models.files import PICKLED, ModelFiles, locate, read_settings, read_weights
-from su3d_bench.perception.models.masks import sam_onnx
+from su3d_bench.perception.models.masks.sam import SamManifest
 from su3d_bench.perception.models.masks.tagging import wrong_tagger
-from su3d_bench.perception.models.onnx.manifest import OnnxManifest, wrong_files
+from su3d_bench.perception.models.onnx import OnnxManifest, wrong_files
 
 WARM_TEXT = "a chair in a scene"
 
@@ -62,7 +62,7 @@ def problems_of(files: ModelFiles) -> list[str]:
             return problems + _problems_of_export(files)
         if files.form.form == "transformers":
             if files.entry.kind == "encoder":
-                towers_transformers.read_spec(files, "original")
+                towers.transformers_spec(files, "original")
             else:
                 read_settings(files.folder / "config.json")
         if files.weights.suffix in PICKLED or files.weights.suffix == ".safetensors":
@@ -75,11 +75,11 @@ def problems_of(files: ModelFiles) -> list[str]:
 def _problems_of_export(files: ModelFiles) -> list[str]:
     if files.entry.kind == "tagger":
         return wrong_tagger(files)
-    read = towers_onnx.read_manifest if files.entry.kind == "encoder" else sam_onnx.read_sam_manifest
-    manifest: OnnxManifest = read(files.weights)
+    kind: type[OnnxManifest] = towers.EncoderManifest if files.entry.kind == "encoder" else SamManifest
+    manifest = kind.read(files.weights)
     wrong = wrong_files(manifest, files.folder)
     if manifest.name != files.entry.name:
-        wrong.append(f"{files.folder}: holds '{manifest.name}', not '{files.entry.name}'; mend models.paths")
+        wrong.append(f"{files.folder}: holds '{manifest.name}', not '{files.entry.name}'; correct models.paths")
     return wrong
 
 

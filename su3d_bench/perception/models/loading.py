@@ -1,22 +1,37 @@
-"""From the configuration to an encoder that is ready; its towers are read when the first feature is asked for."""
+"""From the configuration to encoders and to the networks of the profile ``paper``, each read when it is first used."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import lru_cache, partial
+from importlib.util import find_spec
 from typing import Any
 
-from su3d_bench.core.errors import ConfigError
+from su3d_bench.core.errors import ConfigError, DataError, ModelMissing
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.system.devices import CPU, device_for, precision_for, require, require_installed
-from su3d_bench.perception.cache import FrameCache
+from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.models.catalogue import FormName, model_entry
-from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, Runtime
-from su3d_bench.perception.models.encoders import towers_onnx, towers_open_clip, towers_transformers
+from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, PaperConfig, Runtime
+from su3d_bench.perception.models.encoders import towers
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec, FoundationEncoder, Towers
-from su3d_bench.perception.models.encoders.text_tokens import Tokeniser, read_tokeniser
-from su3d_bench.perception.models.files import ModelFiles, locate
-from su3d_bench.perception.models.onnx.session import Provider
+from su3d_bench.perception.models.encoders.texts import Tokeniser, read_tokeniser
+from su3d_bench.perception.models.files import ModelFiles, kept, locate
+from su3d_bench.perception.models.masks.grounded_sam import Networks
+from su3d_bench.perception.models.masks.grounding_dino import load_grounding_dino
+from su3d_bench.perception.models.masks.sam import Sam, SamNetwork, load_onnx_sam, load_sam
+from su3d_bench.perception.models.masks.tagging import (
+    RAM_TAG_LIST,
+    OnnxRamTagger,
+    RamTagger,
+    Tagger,
+    WordTagger,
+    load_ram,
+    read_word_list,
+    wrong_tagger,
+)
+from su3d_bench.perception.models.onnx import Provider, open_session
 
 FORM_OF_RUNTIME: Mapping[Runtime, FormName] = {"torch": "transformers", "open_clip": "open_clip", "onnx": "onnx"}
 PACKAGES_OF_RUNTIME: Mapping[Runtime, tuple[str, ...]] = {
@@ -77,12 +92,12 @@ def _torch_encoder(
         return {"runtime": config.runtime, "files": files.digests(), "precision": precision, "device": kind}
 
     if config.runtime == "open_clip":
-        spec = towers_open_clip.read_spec(files, config.transform)
-        tokeniser: Callable[[], Tokeniser] = partial(towers_open_clip.read_tokeniser, files)
+        spec = towers.open_clip_spec(files, config.transform)
+        tokeniser: Callable[[], Tokeniser] = partial(towers.open_clip_tokeniser, files)
     else:
-        spec = towers_transformers.read_spec(files, config.transform)
+        spec = towers.transformers_spec(files, config.transform)
         tokeniser = _tokeniser_of(files, spec)
-    return FoundationEncoder(files.known_as, spec, load_towers, tokeniser, identity, cache, device)
+    return FoundationEncoder(files.entry.known_as, spec, load_towers, tokeniser, identity, cache, device)
 
 
 def _onnx_encoder(
@@ -90,31 +105,132 @@ def _onnx_encoder(
 ) -> FoundationEncoder:
     provider: Provider = config.provider or ("cpu" if config.device == "cpu" else "cuda")
     device_index = 0 if provider == "cpu" else int(device_for(config.device, job_index).partition(":")[2])
-    manifest = towers_onnx.read_manifest(files.weights)
+    manifest = towers.EncoderManifest.read(files.weights)
     if manifest.name != files.entry.name:
-        raise ConfigError(f"{files.folder}: holds '{manifest.name}', not '{files.entry.name}'; mend models.paths")
-    spec = towers_onnx.read_spec(files, config.transform)
+        raise ConfigError(f"{files.folder}: holds '{manifest.name}', not '{files.entry.name}'; correct models.paths")
+    spec = towers.onnx_spec(files, config.transform)
 
     def identity() -> Mapping[str, Any]:
         return {"runtime": "onnx", "files": dict(manifest.files), "provider": provider}
 
     load_towers = partial(_onnx_towers, files, provider, device_index, config.batch)
     device = CPU if provider == "cpu" else f"cuda:{device_index}"
-    return FoundationEncoder(files.known_as, spec, load_towers, _tokeniser_of(files, spec), identity, cache, device)
+    tokeniser = _tokeniser_of(files, spec)
+    return FoundationEncoder(files.entry.known_as, spec, load_towers, tokeniser, identity, cache, device)
 
 
 # A worker makes a new encoder for each method and scene; the towers, gigabytes of them, are kept.
 @lru_cache(maxsize=1)
 def _torch_towers(files: ModelFiles, runtime: Runtime, device: str, precision: str, batch: int) -> Towers:
     if runtime == "open_clip":
-        return towers_open_clip.OpenClipTowers(towers_open_clip.load_model(files), device, precision, batch)
-    return towers_transformers.TransformersTowers(towers_transformers.load_model(files), device, precision, batch)
+        return towers.OpenClipTowers(towers.load_open_clip(files), device, precision, batch)
+    return towers.TransformersTowers(towers.load_transformers(files), device, precision, batch)
 
 
 @lru_cache(maxsize=1)
 def _onnx_towers(files: ModelFiles, provider: Provider, device_index: int, batch: int) -> Towers:
-    return towers_onnx.OnnxTowers(files, provider, device_index, batch)
+    return towers.OnnxTowers(files, provider, device_index, batch)
 
 
 def _tokeniser_of(files: ModelFiles, spec: EncoderSpec) -> Callable[[], Tokeniser]:
     return partial(read_tokeniser, files.folder, spec.tokens, spec.n_tokens, spec.pad_id, spec.n_words)
+
+
+PAPER_ENCODER, DETECTOR, TAGGER = "clip-vit-h-14", "grounding-dino", "ram-plus"
+PACKAGES = ("torch", "transformers")
+_SAM_FORMS: tuple[FormName, ...] = ("transformers", "original")
+
+
+def load_networks(config: PaperConfig, models: ModelsConfig, encoder: Encoder, job_index: int = 0) -> Networks:
+    """Tagger, detector and segmenter as configured.
+
+    Raises ``ModelMissing`` for a package or file that is not here, before anything heavy is read.
+    """
+    for package in PACKAGES:
+        require(package, "profile 'paper'")
+    sam = _locate_sam(config, models)
+    detector = _locate(models, DETECTOR, ("transformers",))
+    device = device_for(models.device, job_index)
+    precision = precision_for(models.precision, device)
+    # What moves a number is the kind of device, not which of several.
+    digests = [content_key(device.partition(":")[0], precision)]
+    digests += [text for files in (sam, detector) for pair in sorted(files.digests().items()) for text in pair]
+    if config.sam_runtime == "onnx":
+        provider: Provider = models.provider or ("cpu" if device == "cpu" else "cuda")
+        index = 0 if provider == "cpu" else int(device.partition(":")[2] or 0)
+        digests.append(provider)
+
+        def network() -> SamNetwork:
+            return kept(sam, (provider, str(index)), lambda: load_onnx_sam(sam, provider, index))
+    else:
+
+        def network() -> SamNetwork:
+            return load_sam(sam, device, precision)
+
+    return Networks(
+        _tagger(config, models, encoder, device),
+        lambda: load_grounding_dino(detector, device, precision),
+        lambda: Sam(network()),
+        content_key(*digests),
+    )
+
+
+def is_front_end_here(config: PaperConfig, models: ModelsConfig) -> bool:
+    """Whether the profile can run: packages, encoder, detector and segmenter are here; tags can do without RAM++."""
+    try:
+        _check_networks(config, models)
+    except (ModelMissing, ConfigError):
+        return False
+    return True
+
+
+def check_front_end(config: PaperConfig, models: ModelsConfig) -> None:
+    """Raises ``ModelMissing`` for the first package or file that is not here; nothing heavy is imported or read."""
+    _check_networks(config, models)
+    if config.tagger == "ram":
+        require_installed("ram", "tagger 'ram'")
+        _locate(models, TAGGER, ("original",))
+    elif config.tagger == "ram-onnx":
+        _locate(models, TAGGER, ("onnx",))
+
+
+def _check_networks(config: PaperConfig, models: ModelsConfig) -> None:
+    for package in PACKAGES:
+        require_installed(package, "profile 'paper'")
+    if models.encoder != EMBEDDED:
+        check_encoder(models, models.encoder or PAPER_ENCODER)
+    _locate_sam(config, models)
+    _locate(models, DETECTOR, ("transformers",))
+
+
+def _locate(models: ModelsConfig, name: str, forms: tuple[FormName, ...]) -> ModelFiles:
+    return locate(name, forms, path=models.paths.get(name), folder=models.folder)
+
+
+def _locate_sam(config: PaperConfig, models: ModelsConfig) -> ModelFiles:
+    return _locate(models, config.segmenter, ("onnx",) if config.sam_runtime == "onnx" else _SAM_FORMS)
+
+
+def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, device: str) -> Tagger:
+    """The tagger that is asked for, or with ``auto`` the first that is here."""
+    if config.tagger == "ram" or (config.tagger == "auto" and find_spec("ram") is not None):
+        with _passed_over(config.tagger):
+            require("ram", "tagger 'ram'")
+            files = _locate(models, TAGGER, ("original",))
+            digests = [text for pair in sorted(files.digests().items()) for text in pair]
+            # RAM++'s own code mixes float32 in, so it runs in float32 wherever it runs.
+            load = partial(kept, files, (device,), partial(load_ram, files, device))
+            return RamTagger(load, device, content_key(*digests))
+    if config.tagger in ("ram-onnx", "auto"):
+        with _passed_over(config.tagger):
+            files = _locate(models, TAGGER, ("onnx",))
+            if wrong := wrong_tagger(files):
+                raise DataError(wrong[0])
+            tags = read_word_list(files.folder / RAM_TAG_LIST)
+            return OnnxRamTagger(partial(open_session, files.weights), tags, content_key(*files.digests().values()))
+    return WordTagger(encoder, read_word_list(config.words), config.n_tags)
+
+
+def _passed_over(tagger: str) -> AbstractContextManager[None]:
+    """A model that is not here is an error where it was asked for by its name."""
+    return suppress(ModelMissing) if tagger == "auto" else nullcontext()

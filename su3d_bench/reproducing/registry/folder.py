@@ -8,15 +8,102 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from su3d_bench.analysis.leaderboard import Entry, Refused, in_order, ranked
+from su3d_bench.analysis.leaderboard import Refused, in_order, ranked
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, counted, printable, reading, shown
 from su3d_bench.core.files.atomic import make_folder, replacing
 from su3d_bench.core.system.files import opened
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.reproducing.bundle import PIECE
-from su3d_bench.reproducing.registry.mixing import why_not_beside
 from su3d_bench.reproducing.registry.rows import Row, rows_of_bundle
 from su3d_bench.reproducing.verifying import verify_bundle
+
+N_DIGITS = 12  # of a digest, in a message
+
+
+def why_not_beside(row: Row, held: Sequence[Row]) -> str | None:
+    """Why ``row`` cannot stand in a registry that holds the rows ``held``, with what to do; None where it can."""
+    for other in held:
+        fault = (
+            _rules(row, other) or _data(row, other) or _encoder(row, other) or _name(row, other) or _labels(row, other)
+        )
+        if fault is not None:
+            return f"{row.what}: {fault}"
+    return None
+
+
+def _rules(row: Row, other: Row) -> str | None:
+    mine, theirs = row, other
+    if mine.protocol != theirs.protocol or (mine.version, mine.digest) == (theirs.version, theirs.digest):
+        return None
+    return (
+        f"its protocol is version {mine.version}, digest {mine.digest[:N_DIGITS]}, that of {_where(other)} is version "
+        f"{theirs.version}, digest {theirs.digest[:N_DIGITS]}; score it again by those rules, or begin another registry"
+    )
+
+
+def _data(row: Row, other: Row) -> str | None:
+    theirs = dict(other.data)
+    for scene, digest in row.data:
+        if theirs.get(scene, digest) != digest:
+            return (
+                f"its data of {scene} have the digest {digest[:N_DIGITS]}, those of {_where(other)} "
+                f"{theirs[scene][:N_DIGITS]}; run it on the same data, settings of the dataset included"
+            )
+    return None
+
+
+def _encoder(row: Row, other: Row) -> str | None:
+    """Features are compared with those of texts: under a protocol that names an encoder, of one encoder alone."""
+    if row.protocol != other.protocol or None in (row.encoder, other.encoder):
+        return None
+    if not _names_encoder(row.protocol):
+        return None
+    if row.encoder != other.encoder:
+        return (
+            f"its features are of the encoder {row.encoder}, those of {_where(other)} of {other.encoder}, and the "
+            "protocol is of one encoder; run it with that one"
+        )
+    mine, theirs = ({one.model: one.files for one in each.weights if one.files} for each in (row, other))
+    for model in mine.keys() & theirs.keys():
+        if model_is_encoder(model) and mine[model] != theirs[model]:
+            return f"its weights of {model} are not those of {_where(other)} (other SHA-256); run it with the same file"
+    return None
+
+
+def model_is_encoder(model: str) -> bool:
+    """Whether a model of the catalogue encodes crops and texts."""
+    from su3d_bench.perception.models.catalogue import MODELS
+
+    return model in MODELS and MODELS[model].kind == "encoder"
+
+
+def _names_encoder(protocol: str) -> bool:
+    try:
+        return protocol in protocol_names() and load_protocol(protocol).encoder is not None
+    except ConfigError:  # somebody's own rules, which their run keeps
+        return False
+
+
+def _name(row: Row, other: Row) -> str | None:
+    if row.ranking != other.ranking or row.method.casefold() != other.method.casefold():
+        return None
+    return (
+        f"that name is taken by {_where(other)} over the same scenes; give the variant its own name, such as "
+        f"{row.method.partition('@')[0]}@KEY=VALUE, or remove the other bundle first"
+    )
+
+
+def _labels(row: Row, other: Row) -> str | None:
+    mine, theirs = row, other
+    if mine.ranking != theirs.ranking or mine.is_ceiling or theirs.is_ceiling or mine.labels == theirs.labels:
+        return None
+    return f"is of {mine.labels}, {_where(other)} of {theirs.labels}; score it with as many labels"
+
+
+def _where(row: Row) -> str:
+    return f"{row.method} in {row.bundle.name}.zip"
+
 
 BUNDLES = "bundles"
 SUFFIX = ".zip"
@@ -45,7 +132,7 @@ def bundle_files(folder: Path) -> list[Path]:
     A ``ConfigError`` where it is no folder.
     """
     if not folder.is_dir():
-        raise ConfigError(f"{shown(folder)}: is no folder; begin a registry with: su3d-bench new registry DIR")
+        raise ConfigError(f"{shown(folder)}: is no folder; begin a registry with: su3d-bench dev registry new DIR")
     place = folder / BUNDLES if (folder / BUNDLES).is_dir() else folder
     try:
         files = sorted(place / name for name in os.listdir(place) if name.lower().endswith(SUFFIX))
@@ -65,7 +152,7 @@ def read_registry(folder: Path) -> Registry:
     files = bundle_files(folder)
     if not files and not (folder / BUNDLES).is_dir():
         raise ConfigError(
-            f"{shown(folder)}: holds no bundle; bring one in with: su3d-bench registry add BUNDLE --to DIR"
+            f"{shown(folder)}: holds no bundle; bring one in with: su3d-bench dev registry add BUNDLE --to DIR"
         )
     rows: list[Row] = []
     refused: list[Refused] = []
@@ -92,14 +179,9 @@ def _read(file: Path) -> tuple[list[Row], list[Refused]]:
 
 def _boards(rows: Sequence[Row]) -> Iterator[tuple[Row, ...]]:
     """The rankings by protocol, those of the most scenes first."""
-    rankings = sorted({row.entry.ranking for row in rows}, key=lambda key: (key[0], -len(key[2]), key))
+    rankings = sorted({row.ranking for row in rows}, key=lambda key: (key[0], -len(key[2]), key))
     for ranking in rankings:
-        mine = {id(row.entry): row for row in rows if row.entry.ranking == ranking}
-        entries: tuple[Entry, ...] = in_order([row.entry for row in mine.values()])
-        with_ranks = ranked(entries)
-        yield tuple(
-            replace(mine[id(entry)], entry=with_rank) for entry, with_rank in zip(entries, with_ranks, strict=True)
-        )
+        yield ranked(in_order([row for row in rows if row.ranking == ranking]))
 
 
 @dataclass(frozen=True)
@@ -184,9 +266,7 @@ def _place(registry: Path, file: Path, rows: Sequence[Row], name: str | None) ->
         name = file.name[: -len(SUFFIX)] if file.name.lower().endswith(SUFFIX) else file.name
         if name == _ANY and rows:
             first = rows[0]
-            name = (
-                f"{first.bundle.recipe or re.sub('[^A-Za-z0-9._-]+', '-', first.entry.run)}-{first.bundle.sha256[:8]}"
-            )
+            name = f"{first.bundle.recipe or re.sub('[^A-Za-z0-9._-]+', '-', first.run)}-{first.bundle.sha256[:8]}"
     if not _NAME.fullmatch(name):
         raise ConfigError(
             f"'{printable(name, 100)}' cannot be the name of a bundle: letters, digits, '.', '_' and '-' alone; choose "

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import shlex
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from su3d_bench.analysis.leaderboard import Entry, Refused, entries_of
+from su3d_bench.analysis.leaderboard import RankingRow, Refused, entries_of
+from su3d_bench.core.config import DEFAULT_SOURCE, MOVES_NO_NUMBER, KeyPath, RunConfig, toml_value
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError, StoreError, Su3dError, printable, reading, shown
 from su3d_bench.core.files.scratch import TemporaryFolder
@@ -15,9 +18,61 @@ from su3d_bench.metrics.costs import MAP, TOTAL, WARM_UP, summarise
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.perception.models.catalogue import MODELS, encoder_known_as
 from su3d_bench.reproducing.bundle import MANIFEST, RUNS, Unpacked, unpack
-from su3d_bench.reproducing.registry.commands import command_of
+from su3d_bench.runs.existing import existing_run
 from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
 from su3d_bench.store.run_folder import JOBS, RECORDS
+
+UNKNOWN = "not known: run.toml is not whole"
+MOST_CHARACTERS = 2000
+
+
+def command_of(run: FinishedRun, method: str) -> str:
+    """A line for a shell that does what gave the rows of ``method``: ``run`` of it alone, or ``evaluate``.
+
+    What moves no number is left out, and so is what nobody asked for.
+    """
+    if method in run.made_elsewhere:
+        return printable(_evaluation(run, method), MOST_CHARACTERS)
+    held = existing_run(run.folder.path)
+    if held is None or not held.is_known:
+        return UNKNOWN
+    asked = {path: value for path, value in held.values.items() if held.remarks.get(path) != DEFAULT_SOURCE}
+    words = ["su3d-bench", "run", *_flags(asked, run, method), *_settings(asked, method)]
+    return printable(shlex.join(words), MOST_CHARACTERS)
+
+
+def _flags(asked: Mapping[KeyPath, Any], run: FinishedRun, method: str) -> Iterator[str]:
+    scenes = asked.get(("scenes",)) or run.scenes
+    yield from ("--scenes", *map(str, scenes), "--methods", method)
+    for name in RunConfig.model_fields:
+        value = asked.get((name,))
+        if name in ("scenes", "methods") or name in MOVES_NO_NUMBER or value is None:
+            continue
+        yield f"--{name.replace('_', '-')}"
+        yield from map(str, value) if isinstance(value, list | tuple) else (str(value),)
+
+
+def _settings(asked: Mapping[KeyPath, Any], method: str) -> Iterator[str]:
+    """``--set`` of what was asked of this method, the datasets and perception; a variant's name says its own."""
+    base = method.partition("@")[0]
+    pairs = []
+    for path, value in asked.items():
+        if len(path) > 2 and path[0] in ("method", "dataset"):
+            if path[0] == "dataset" or (path[1] == base == method):
+                pairs.append(f"{'.'.join(path[1:])}={toml_value(value)}")
+        elif len(path) > 1 and path[0] == "perception":
+            pairs.append(f"{'.'.join(path)}={toml_value(value)}")
+    if pairs:
+        yield from ("--set", *pairs)
+
+
+def _evaluation(run: FinishedRun, method: str) -> str:
+    record, truth = run.made_elsewhere[method], run.record.ground_truth
+    words = ["su3d-bench", "evaluate", *record.paths]
+    if truth is not None and truth.dataset is not None:
+        words += ["--dataset", truth.dataset]
+    return shlex.join([*words, "--protocols", *run.protocols])
+
 
 NOT_SAID = "not said"
 TOLD_THE_TRUTH = "none: it was told the truth"
@@ -46,18 +101,17 @@ class Weights:
     files: tuple[tuple[str, str], ...] = ()
 
 
-@dataclass(frozen=True)
-class Row:
+@dataclass(frozen=True, kw_only=True)
+class Row(RankingRow):
     """A method of a run under a protocol.
 
     ``update_s`` and ``map_s``: the median over its frames after the first ones of a scene, with perception and without;
     None where no frame was timed. ``encoder``: whose features named the instances, None where the method did.
-    ``of_scenes``: scene -> a value for each headline metric.
+    ``values_of_scenes``: scene -> a value for each headline metric.
     """
 
     bundle: BundleFacts
-    entry: Entry
-    of_scenes: tuple[tuple[str, tuple[float | None, ...]], ...]
+    values_of_scenes: tuple[tuple[str, tuple[float | None, ...]], ...]
     update_s: float | None
     map_s: float | None
     n_updates: int
@@ -74,13 +128,13 @@ class Row:
 
     @property
     def what(self) -> str:
-        return f"{self.entry.method} / {self.entry.protocol}"
+        return f"{self.method} / {self.protocol}"
 
     @property
     def trained_on(self) -> str:
         """What all weights were trained on, in a line."""
         known = [f"{one.model}: {one.trained_on}" for one in self.weights]
-        return self.said_trained_on or "; ".join(known) or (TOLD_THE_TRUTH if self.entry.is_ceiling else NOT_SAID)
+        return self.said_trained_on or "; ".join(known) or (TOLD_THE_TRUTH if self.is_ceiling else NOT_SAID)
 
 
 def rows_of_bundle(file: Path) -> tuple[list[Row], list[Refused]]:
@@ -153,7 +207,7 @@ def is_plain(name: str) -> bool:
     return printable(name, 120) == name and name.strip(". ") != "" and "/" not in name
 
 
-def _row(run: FinishedRun, entry: Entry, unpacked: Unpacked, bundle: BundleFacts) -> Row:
+def _row(run: FinishedRun, entry: RankingRow, unpacked: Unpacked, bundle: BundleFacts) -> Row:
     record = run.results[entry.method, entry.protocol]
     assert record.result is not None  # or it were no entry
     times = read_update_times(run, entry.method)
@@ -161,9 +215,9 @@ def _row(run: FinishedRun, entry: Entry, unpacked: Unpacked, bundle: BundleFacts
     per_scene = record.result.per_scene
     is_elsewhere = entry.method in run.made_elsewhere
     return Row(
+        **vars(entry),
         bundle=bundle,
-        entry=entry,
-        of_scenes=tuple(
+        values_of_scenes=tuple(
             (scene, tuple(per_scene[scene].get(metric) for metric in entry.headline)) for scene in entry.scenes
         ),
         update_s=_seconds(stages[TOTAL].p50) if stages else None,

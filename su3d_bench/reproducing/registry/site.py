@@ -11,9 +11,8 @@ from su3d_bench.core.errors import ConfigError, printable, shown, some
 from su3d_bench.core.files.atomic import is_file, make_folder, read_json, remove_file, write_json, write_text
 from su3d_bench.core.files.locks import is_unfinished
 from su3d_bench.formats.tables.table import NOT_MEASURED, Cell, Prose, Table, TableRow, is_count, with_interval
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.reports.registry.page import PAGE, page_html, page_name
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
+from su3d_bench.reports.page.page import PAGE, page_name, registry_page_html
 from su3d_bench.reports.tables.model import confidence_notes, few_scenes
 from su3d_bench.reproducing.registry.folder import SUFFIX, Registry
 from su3d_bench.reproducing.registry.rows import Row
@@ -35,13 +34,13 @@ def write_site(registry: Registry, out: Path, title: str = TITLE, bundles_at: st
     earlier = _earlier_pages(out)
     address = _checked_address(bundles_at)
     value = _value(registry, title, address)
-    pages = {INDEX: page_html("index", title, _index(value), [_plain_tables(registry)])}
+    pages = {INDEX: registry_page_html("index", title, _index(value), [_plain_tables(registry)])}
     for method in value["methods"]:
         data = _method_page(value, method["name"])
-        pages[method["page"]] = page_html("method", method["name"], {**data, "registry": title})
+        pages[method["page"]] = registry_page_html("method", method["name"], {**data, "registry": title})
     for scene in value["scenes"]:
         data = _scene_page(value, scene)
-        pages[scene["page"]] = page_html("scene", scene["name"], {**data, "registry": title})
+        pages[scene["page"]] = registry_page_html("scene", scene["name"], {**data, "registry": title})
     for folder in ("", METHODS, SCENES):
         make_folder(out / folder)
     # first of all, so that the site is known for one however this ends
@@ -93,14 +92,14 @@ def _value(registry: Registry, title: str, address: str | None) -> dict[str, Any
     """All of the site as plain values; links lead from the root of the site."""
     boards = [_board(board, address) for board in registry.boards]
     rows = registry.rows
-    digests = {scene: digest for row in rows for scene, digest in row.entry.data}
+    digests = {scene: digest for row in rows for scene, digest in row.data}
     return {
         "title": title,
         "n_bundles": registry.n_bundles,
         "boards": boards,
         "methods": [
-            {"name": name, "page": _page(METHODS, name), "n_rows": sum(row.entry.method == name for row in rows)}
-            for name in sorted({row.entry.method for row in rows})
+            {"name": name, "page": _page(METHODS, name), "n_rows": sum(row.method == name for row in rows)}
+            for name in sorted({row.method for row in rows})
         ],
         "scenes": [
             {"name": name, "page": _page(SCENES, name), "digest": digest} for name, digest in sorted(digests.items())
@@ -110,7 +109,7 @@ def _value(registry: Registry, title: str, address: str | None) -> dict[str, Any
 
 
 def _board(board: Sequence[Row], address: str | None) -> dict[str, Any]:
-    first = board[0].entry
+    first = board[0]
     known = load_protocol(first.protocol) if first.protocol in protocol_names() else None
     return {
         "protocol": first.protocol,
@@ -127,14 +126,14 @@ def _board(board: Sequence[Row], address: str | None) -> dict[str, Any]:
 
 def _notes(board: Sequence[Row]) -> Iterator[str]:
     """What must stand beneath a ranking."""
-    first = board[0].entry
-    rivals = [row for row in board if not row.entry.is_ceiling]
-    yield from confidence_notes({f"{row.entry.method} of {row.bundle.name}": row.entry.confidences for row in rivals})
-    yield from dict.fromkeys(f"labels: {row.entry.labels}" for row in rivals if row.entry.labels)
+    first = board[0]
+    rivals = [row for row in board if not row.is_ceiling]
+    yield from confidence_notes({f"{row.method} of {row.bundle.name}": row.confidences for row in rivals})
+    yield from dict.fromkeys(f"labels: {row.labels}" for row in rivals if row.labels)
     encoders = dict.fromkeys(row.encoder for row in rivals if row.encoder)
     if len(encoders) > 1:
         yield f"features of several encoders, which the protocol leaves open: {some(list(encoders), 6)}"
-    if any(row.entry.ranks for row in board):
+    if any(row.ranks for row in board):
         yield (
             f"rank: from which to which a row may go by {first.headline[0]}, with 95 % for all rows together: sign-"
             "flip tests of all pairs, of their means over scenes, corrected by Holm"
@@ -148,21 +147,20 @@ def _notes(board: Sequence[Row]) -> Iterator[str]:
 
 
 def _row(row: Row, address: str | None) -> dict[str, Any]:
-    entry = row.entry
     file = f"{row.bundle.name}{SUFFIX}"
     return {
-        "method": entry.method,
-        "page": _page(METHODS, entry.method),
-        "values": list(entry.values),
-        "intervals": [None if one is None else list(one) for one in entry.intervals],
-        "ranks": None if entry.ranks is None else list(entry.ranks),
-        "is_ceiling": entry.is_ceiling,
-        "of_scenes": {scene: list(values) for scene, values in row.of_scenes},
+        "method": row.method,
+        "page": _page(METHODS, row.method),
+        "values": list(row.values),
+        "intervals": [None if one is None else list(one) for one in row.intervals],
+        "ranks": None if row.ranks is None else list(row.ranks),
+        "is_ceiling": row.is_ceiling,
+        "of_scenes": {scene: list(values) for scene, values in row.values_of_scenes},
         "update_s": row.update_s,
         "map_s": row.map_s,
         "n_updates": row.n_updates,
         "hardware": row.hardware,
-        "profile": entry.profile,
+        "profile": row.profile,
         "encoder": row.encoder,
         "trained_on": row.trained_on,
         "weights": [
@@ -174,7 +172,7 @@ def _row(row: Row, address: str | None) -> dict[str, Any]:
         "warnings": list(row.warnings),
         "code": row.code,
         "commit": row.commit,
-        "run": entry.run,
+        "run": row.run,
         "bundle": {
             **{key: getattr(row.bundle, key) for key in ("sha256", "n_bytes", "program", "recipe")},
             "file": file,
@@ -219,18 +217,18 @@ def _plain_tables(registry: Registry) -> Table | Prose:
     """What the first page shows where no script runs."""
     rows = [
         TableRow(
-            row.entry.method,
+            row.method,
             (
-                Cell(row.entry.protocol),
+                Cell(row.protocol),
                 Cell(_headline(row)),
-                Cell(NOT_MEASURED if row.entry.ranks is None else " to ".join(map(str, row.entry.ranks))),
-                Cell(str(len(row.entry.scenes))),
+                Cell(NOT_MEASURED if row.ranks is None else " to ".join(map(str, row.ranks))),
+                Cell(str(len(row.scenes))),
                 Cell(NOT_MEASURED if row.update_s is None else f"{row.update_s:.3g}"),
                 Cell(row.hardware),
                 Cell(row.trained_on),
                 Cell(f"{row.bundle.name}{SUFFIX} {row.bundle.sha256}"),
             ),
-            group=row.entry.protocol,
+            group=row.protocol,
         )
         for row in registry.rows
     ]
@@ -243,5 +241,5 @@ def _plain_tables(registry: Registry) -> Table | Prose:
 def _headline(row: Row) -> str:
     return ", ".join(
         f"{name} {value:g}" if is_count(name) and value is not None else f"{name} {with_interval(value, interval)}"
-        for name, value, interval in zip(row.entry.headline, row.entry.values, row.entry.intervals, strict=True)
+        for name, value, interval in zip(row.headline, row.values, row.intervals, strict=True)
     )

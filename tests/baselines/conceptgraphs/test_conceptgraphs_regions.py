@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from conceptgraphs_scene import DIMENSION, HEIGHT, QUIET, SCENE, WIDTH, Plate, block, look
-from perception_fakes import CountingEncoder, still_life
+from conceptgraphs_scene import DIMENSION, HEIGHT, QUIET, WIDTH, Plate, block, look
 
-from su3d_bench.baselines.conceptgraphs.clouds import bounding_box, density_clusters, largest_cluster, voxel_average
-from su3d_bench.baselines.conceptgraphs.config import MappingConfig
-from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs
-from su3d_bench.baselines.conceptgraphs.regions import LiftedRegion, kept_regions, lift, subtract_contained
-from su3d_bench.core.errors import DataError
+from su3d_bench.baselines.conceptgraphs.objects import (
+    LiftedRegion,
+    MappingConfig,
+    bounding_box,
+    density_clusters,
+    kept_regions,
+    largest_cluster,
+    lift,
+    subtract_contained,
+    voxel_average,
+)
 from su3d_bench.core.geometry import back_project
-from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections
-from su3d_bench.perception.profiles import PerceptionConfig, build_perception
 
 RNG = np.random.default_rng(3)
 LEFT = Plate((-0.5, 0.0))
@@ -43,16 +45,6 @@ def test_voxel_averages_are_those_of_open3d() -> None:
     assert sorted(map(tuple, ours)) == sorted(map(tuple, np.asarray(theirs.points)))
 
 
-def test_the_grid_moves_with_the_cloud_so_that_averaging_again_moves_points() -> None:
-    points = RNG.random((500, 3))
-    assert voxel_average(points + 0.037, 0.1) == pytest.approx(voxel_average(points, 0.1) + 0.037)
-    along_x = np.array([[5.0, 0, 0], [5.012, 0, 0], [5.028, 0, 0], [5.04, 0, 0]])
-    once = voxel_average(along_x, 0.025)
-    assert once[:, 0].tolist() == pytest.approx([5.006, 5.028, 5.04])
-    assert voxel_average(once, 0.025)[:, 0].tolist() == pytest.approx([5.006, 5.034])
-    assert voxel_average(np.zeros((0, 3)), 0.1).shape == (0, 3)
-
-
 def row_of_points(n: int, start: float, step: float = 0.01) -> np.ndarray:
     return np.stack([start + step * np.arange(n), np.zeros(n), np.zeros(n)], axis=1)
 
@@ -67,16 +59,6 @@ def test_density_clusters_are_those_of_open3d(min_points: int) -> None:
         theirs = np.asarray(cloud.cluster_dbscan(eps, min_points))
         assert density_clusters(points, eps, min_points).tolist() == theirs.tolist()
     assert density_clusters(np.zeros((0, 3)), 0.1, 10).tolist() == []
-
-
-def test_the_largest_cluster_stays() -> None:
-    small, large = row_of_points(11, 0.0), row_of_points(12, 1.0)
-    assert largest_cluster(np.concatenate([small, large]), 0.1, 10).tolist() == large.tolist()
-
-
-def test_of_equal_clusters_the_one_that_comes_first_stays() -> None:
-    first, second = row_of_points(12, 1.0), row_of_points(12, 0.0)
-    assert largest_cluster(np.concatenate([first, second]), 0.1, 10).tolist() == first.tolist()
 
 
 def test_a_cloud_without_a_cluster_of_five_stays_whole() -> None:
@@ -124,35 +106,6 @@ def test_masks_below_25_pixels_are_left_out_and_below_10_whatever_is_configured(
     assert not is_kept(region(9), config)
 
 
-def test_masks_below_the_confidence_are_left_out() -> None:
-    assert is_kept(region(score=0.95))
-    assert not is_kept(region(score=0.949))
-
-
-def test_scores_on_a_scale_of_their_own_have_a_threshold_of_their_own() -> None:
-    unsure = replace(region(score=0.3), score_scale="own")
-    assert is_kept(unsure)
-    assert not is_kept(unsure, MappingConfig(own_scale_conf_threshold=0.5))
-    assert not is_kept(region(score=0.3))
-
-
-def test_scores_of_the_embedded_profile_are_on_a_scale_of_their_own(tmp_path: Path) -> None:
-    encoder = CountingEncoder()
-    profile = build_perception(
-        "embedded", PerceptionConfig(), scene=SCENE, cache_root=tmp_path, mesh=None, encoder=encoder
-    )
-    found = profile.detect(still_life(), ConceptGraphs().needs, Timer())
-    assert len(found) > 0
-    assert found.score_scale == "own"
-
-
-def test_boxes_above_half_the_image_are_left_out_but_not_background() -> None:
-    half, more = (0, 0, 48, 72), (0, 0, 49, 72)
-    assert is_kept(region(box=half))
-    assert not is_kept(region(box=more))
-    assert is_kept(region(box=more), background=True)
-
-
 def boxes_and_masks(*boxes: tuple[int, int, int, int]) -> tuple[np.ndarray, np.ndarray]:
     masks = np.zeros((len(boxes), 40, 40), np.bool_)
     for mask, (x0, y0, x1, y1) in zip(masks, boxes, strict=True):
@@ -175,23 +128,6 @@ def test_containment_is_less_than_070_of_the_container_and_more_than_080_of_the_
     assert cut((0, 0, 10, 10), (0, 0, 3, 23)) == 0  # 30 of 69 is no 0.8
     assert cut((0, 0, 10, 10), (6, 0, 11, 5)) == 0  # 20 of 25: not above 0.8
     assert cut((0, 0, 20, 20), (11, 0, 21, 10)) == 90  # 90 of 100
-
-
-def test_masks_are_cut_one_after_the_other_with_what_is_left_of_them() -> None:
-    # the middle box holds 6 / 6.5 of the inner one and lies in the outer one, which holds only 5 / 6.5 of the inner one
-    boxes, masks = boxes_and_masks((0, 0, 25, 25), (14, 5, 25, 17), (21, 6, 25, 8))
-    boxes[1], boxes[2] = (14, 5, 26, 17), (20, 6, 26.5, 8)
-    outer_first = subtract_contained(boxes, masks)
-    assert not outer_first[0][masks[1]].any()  # the middle one was whole when it was cut out of the outer one
-    order = [1, 0, 2]
-    middle_first = subtract_contained(boxes[order], masks[order])
-    assert middle_first[1][masks[2]].all()  # now it had lost the inner one, which thus stays in the outer one
-
-
-def test_a_box_without_area_contains_nothing_and_is_in_nothing() -> None:
-    boxes, masks = boxes_and_masks((0, 0, 20, 20), (5, 5, 15, 15))
-    boxes[1] = 5, 5, 5, 5
-    assert subtract_contained(boxes, masks).tolist() == masks.tolist()
 
 
 def lifted(plates: list[Plate], config: MappingConfig = QUIET, index: int = 0, seed: int = 0) -> list[LiftedRegion]:
@@ -228,18 +164,3 @@ def test_a_region_of_fewer_than_16_points_with_depth_is_left_out() -> None:
     assert len(list(lift(replace(frame, depth_m=depth), np.array([0]), detections.masks, noisy, 0))) == 1
     depth[rows[15], columns[15]] = np.nan
     assert not list(lift(replace(frame, depth_m=depth), np.array([0]), detections.masks, noisy, 0))
-
-
-def test_a_region_whose_box_is_below_one_cubic_centimetre_is_left_out() -> None:
-    flat = np.full((HEIGHT, WIDTH), 1.5, np.float32)
-    frame, detections = look([LEFT])
-    assert len(lifted([LEFT])) == 1
-    assert not list(lift(replace(frame, depth_m=flat), np.array([0]), detections.masks, QUIET, 0))
-
-
-def test_masks_of_another_size_than_the_image_are_refused() -> None:
-    frame, detections = look([LEFT])
-    with pytest.raises(DataError, match="frame 0: masks are 90x72 and the image is 96x72"):
-        ConceptGraphs().update(frame, replace(detections, masks=detections.masks[:, :, :90]), Timer())
-    with pytest.raises(DataError, match="frame 3: the detections are those of frame 0"):
-        ConceptGraphs().update(replace(frame, index=3), detections, Timer())

@@ -20,7 +20,7 @@ from su3d_bench.datasets.recordings.pose_convention import judge_scene
 from su3d_bench.datasets.recordings.world_up import guess_up
 from su3d_bench.datasets.rgbd.dataset import Rgbd
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
-from su3d_bench.reports.pictures.scene_look import look_at
+from su3d_bench.reports.pictures.scene import look_at
 
 UP_AXES: tuple[UpAxis, ...] = ("x", "-x", "y", "-y", "z", "-z")
 TILTED = np.array([[1, 0, 0, 0], [0, 0.6, 0.8, 0], [0, -0.8, 0.6, 0], [0, 0, 0, 1]])  # looks down by 53 degrees

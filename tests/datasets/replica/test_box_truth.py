@@ -15,9 +15,9 @@ from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing
 from su3d_bench.core.types import LabelSet, ObjectBoxes, OrientedBox
 from su3d_bench.datasets.checks import inspect
 from su3d_bench.datasets.replica.dataset import Replica
-from su3d_bench.perception.oracle.segmenter import OracleConfig, OracleSegmenter
+from su3d_bench.perception.oracle import OracleConfig, OracleSegmenter
 from su3d_bench.questions.truths import questions_of
-from su3d_bench.reports.pictures.scene_look import look_at
+from su3d_bench.reports.pictures.scene import look_at
 
 INFO = "replica_v1/room_0/habitat/info_semantic.json"
 THICK_M = 0.1
@@ -116,7 +116,7 @@ def test_a_scene_without_frames_can_be_looked_at_and_not_run(root: Path, capsys:
         assert main([*words.split(), "--quiet"]) == 0
     assert main(["datasets", "check", "replica/room0", "--quiet"]) == 0
     assert "warning       no frames; expected traj.txt" in capsys.readouterr().out
-    assert main(["questions", "make", "--scenes", "replica/room0", "--out", "a.toml", "--quiet"]) == 0
+    assert main(["query", "make", "--scenes", "replica/room0", "--out", "a.toml", "--quiet"]) == 0
     assert main(["run", "--scenes", "replica/room0", "--jobs", "1", "--quiet", "--out", "out"]) == 3
     assert "no frames; expected traj.txt and results/" in capsys.readouterr().err
 

@@ -39,8 +39,8 @@ from su3d_bench.datasets.scannet.folders import PAPER_SCENES, find_scans, split_
 from su3d_bench.datasets.scannet.frames import read_walk
 from su3d_bench.datasets.scannet.labels import TABLE_NAME
 from su3d_bench.formats.images import UInt16Array
-from su3d_bench.runs.parts import Part
-from su3d_bench.runs.planning.scenes import expand_scenes
+from su3d_bench.runs.job import Part
+from su3d_bench.runs.scenes import expand_scenes
 
 
 @pytest.mark.parametrize(

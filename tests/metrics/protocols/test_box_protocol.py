@@ -5,20 +5,18 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from su3d_bench.core.errors import ConfigError, DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float64Array, GroundTruth, LabelSet, ObjectBoxes, OrientedBox
 from su3d_bench.datasets.replica.boxes import box_truth
 from su3d_bench.metrics.fitness import ContentFacts, TruthFacts, why_not_content, why_not_truth
-from su3d_bench.metrics.instance.box_counts import THRESHOLDS, BoxCounts, count_boxes
-from su3d_bench.metrics.instance.box_overlap import box_iou, shared_volume, smallest_box
+from su3d_bench.metrics.instance.boxes import THRESHOLDS, BoxCounts, box_iou, count_boxes, shared_volume, smallest_box
 from su3d_bench.metrics.metric import SceneScore
-from su3d_bench.metrics.protocols.loading import load_protocol, read_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, score_scene, unpack_scores
 
@@ -401,23 +399,3 @@ def test_boxes_are_scored_against_datasets_that_have_them_and_by_maps_with_class
     assert "needs classes" in str(why_not_content(RULES, ContentFacts("instances", 1)))
     assert "one feature a point" in str(why_not_content(RULES, ContentFacts("dense", 1, 8)))
     assert why_not_content(RULES, ContentFacts("instances", 1, 8)) is None
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ('box_axes = "own"', "box_axes"),
-        ("thresholds = [0.25, 0.5, 0.75]", "kind 'boxes' takes [0.25, 0.5]"),
-        ("[transfer]\ncap_m = 0.05", "kind 'boxes' transfers nothing"),
-        ('class_agnostic = "scored"', "class_agnostic: belongs to kind 'instance'"),
-    ],
-)
-def test_rules_that_boxes_do_not_have_are_refused(tmp_path: Path, line: str, message: str) -> None:
-    path = tmp_path / "mine.toml"
-    path.write_text(f'extends = "replica-boxes"\nname = "mine"\n{line}\n')
-    with pytest.raises(ConfigError) as caught:
-        read_protocol(path)
-    assert message in str(caught.value)
-    path.write_text('extends = "replica-openmask3d"\nname = "mine"\nbox_axes = "truth"\n')
-    with pytest.raises(ConfigError, match="box_axes: kinds 'boxes' and 'grounding' need it"):
-        read_protocol(path)

@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scored_room import ENCODER, ID, instances, nothing, room, truth_as_prediction
 
-from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
-from su3d_bench.metrics.protocols.kinds import ObjectChainRules
-from su3d_bench.metrics.protocols.loading import load_protocol, read_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.chains import TAGS, ChainedText, Place, judge_chains
 from su3d_bench.metrics.scoring import combine, pack_scores, plain_json, score_scene, unpack_scores
-from su3d_bench.questions.chains.made import chain_truth, chains_of
-from su3d_bench.questions.files.queries import query_truth
+from su3d_bench.questions.chains import chain_truth, chains_of
 from su3d_bench.questions.generator import generate
-from su3d_bench.questions.known_objects import known_objects
 from su3d_bench.questions.model import new_question
+from su3d_bench.questions.query_files import query_truth
+from su3d_bench.questions.scene_map import known_objects
 
 RULES = load_protocol("beacon3d")
 TRUTH = room()
@@ -110,20 +107,3 @@ def test_an_object_with_fewer_than_three_texts_of_its_own_is_not_asked_for() -> 
     tags = {case.text.partition(" ")[0]: sorted(case.tags - CLASS) for case in chains_of(asked, objects)}
     assert (tags["red"], tags["large"], len(tags)) == (["appearance"], ["geometry"], 3)
     assert chains_of(asked[1:], objects) == ()  # nothing coarser
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ('questions = "dataset"', "kind 'object-chains' takes 'generated', or queries of a file"),
-        ('questions = "generated"', "min_region_size"),
-        ('box_axes = "world"', "box_axes: kinds 'boxes' and 'grounding' need it, others take none"),
-    ],
-)
-def test_rules_that_do_not_fit_the_kind_are_one_line(line: str, message: str, tmp_path: Path) -> None:
-    path = tmp_path / "mine.toml"
-    path.write_text(f'extends = "beacon3d"\nname = "mine"\n{line}\n')
-    with pytest.raises(ConfigError, match=message) as error:
-        read_protocol(path)
-    assert "\n" not in str(error.value)
-    assert isinstance(RULES, ObjectChainRules)

@@ -13,17 +13,16 @@ from scannet_scan import SCAN
 from scannet_scans import write_scan
 from scored_room import ENCODER, instances, nothing, room, truth_as_prediction
 
-from su3d_bench.core.errors import ConfigError, DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.scannet.dataset import ScanNet
 from su3d_bench.datasets.scannet.labels import TABLE_NAME
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
-from su3d_bench.metrics.protocols.loading import load_protocol, read_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.grounding import aligned, box_iou, choose, in_group
 from su3d_bench.metrics.scoring import combine, pack_scores, plain_json, score_scene, unpack_scores
-from su3d_bench.questions.files.datasets import read_foreign_queries
-from su3d_bench.questions.files.groups import scanrefer_groups
-from su3d_bench.questions.files.queries import query_truth
+from su3d_bench.questions.query_files import query_truth, scanrefer_groups
+from su3d_bench.questions.question_files import read_foreign_queries
 
 RULES = load_protocol("grounding")
 PROBLEMS = json.loads((CASES / "grounding01_scanrefer.json").read_text())["problems"]
@@ -84,22 +83,6 @@ def test_sentences_are_read_from_the_files_of_scanrefer_and_nr3d(tmp_path: Path)
     (tmp_path / "v1_questions_val.json").write_text(json.dumps({"questions": [asked]}))
     with pytest.raises(DataError, match="SQA3D names no objects"):
         read_foreign_queries(tmp_path / "v1_questions_val.json")
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ('box_axes = "truth"', "box_axes: kind 'grounding' takes 'world' or 'aligned'"),
-        ("[transfer]\ncap_m = 0.05", "transfer.cap_m: kind 'grounding' transfers nothing"),
-        ("min_region_size = 5", "min_region_size, thresholds and confidence belong to kind"),
-    ],
-)
-def test_wrong_rules_are_told_in_one_line(line: str, message: str, tmp_path: Path) -> None:
-    path = tmp_path / "mine.toml"
-    path.write_text(f'extends = "grounding"\nname = "mine"\n{line}\n')
-    with pytest.raises(ConfigError) as caught:
-        read_protocol(path)
-    assert message in str(caught.value)
 
 
 # ---- groups

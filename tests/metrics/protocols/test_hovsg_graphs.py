@@ -15,11 +15,17 @@ from places import CASES
 from su3d_bench.baselines.oracle import Oracle
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.maps import Instances
-from su3d_bench.core.places import Floor, Places, Room
-from su3d_bench.core.types import GroundTruth, LabelSet
+from su3d_bench.core.types import Floor, GroundTruth, LabelSet, Places, Room
 from su3d_bench.datasets.hm3dsem.dataset import Hm3dSem
-from su3d_bench.metrics.graphs.objects import FEW_LABELS, MatchedObjects
-from su3d_bench.metrics.graphs.overlaps import Cloud, covered_share, larger_share, voxel_ids, voxel_means
+from su3d_bench.metrics.graphs.objects import (
+    FEW_LABELS,
+    Cloud,
+    MatchedObjects,
+    covered_share,
+    larger_share,
+    voxel_ids,
+    voxel_means,
+)
 from su3d_bench.metrics.graphs.places import NEEDS_PLACES, PlaceCounts, floor_bounds
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ClassEntry

@@ -28,7 +28,6 @@ from su3d_bench.core.maps import DenseFeatures, Partition, Prediction
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.open_vocabulary import openlex3d, score
-from su3d_bench.metrics.open_vocabulary.object_means import ObjectCounts, combine, concatenate, resampled
 from su3d_bench.metrics.open_vocabulary.openlex3d import (
     ObjectLabels,
     OpenLexTruth,
@@ -40,6 +39,7 @@ from su3d_bench.metrics.open_vocabulary.openlex3d import (
     ranked_labels,
     scored_objects,
 )
+from su3d_bench.metrics.open_vocabulary.query_ap import ObjectCounts, combine, concatenate, resampled
 from su3d_bench.metrics.open_vocabulary.score import voxel_means
 from su3d_bench.metrics.protocols.kinds import CATEGORIES
 from su3d_bench.metrics.protocols.loading import load_protocol

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.metrics.protocols.files import protocol_names
-from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.protocols.mixtures import NAMING, UNMOVED, Mixtures, differing
 from su3d_bench.metrics.protocols.model import ProtocolRules
 

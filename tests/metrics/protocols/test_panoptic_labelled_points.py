@@ -20,9 +20,8 @@ from su3d_bench.core.types import GroundTruth
 from su3d_bench.evaluation.scoring import score_on_truth
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine
-from su3d_bench.metrics.semantic import panoptic_score
-from su3d_bench.metrics.semantic.panoptic_quality import PanopticCounts
-from su3d_bench.metrics.semantic.panoptic_score import count_segments, told_truth
+from su3d_bench.metrics.semantic import panoptic
+from su3d_bench.metrics.semantic.panoptic import PanopticCounts, count_segments, told_truth
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run
 
@@ -96,7 +95,7 @@ def test_the_truth_that_is_told_has_an_instance_for_each_class_without_one_where
         told_truth(RULES, room()) is not None
         and told_truth(RULES, room()).instance.tolist() == room().instance.tolist()
     )
-    assert doctest.testmod(panoptic_score).failed == 0
+    assert doctest.testmod(panoptic).failed == 0
 
 
 def test_stuff_without_instances_is_whole_in_the_score_of_the_truth_beside_an_evaluation() -> None:

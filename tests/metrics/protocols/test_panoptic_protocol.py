@@ -16,13 +16,12 @@ from places import CASES
 from scored_room import ENCODER, ID, instances, noisy, noisy_scores, nothing, room, truth_as_prediction
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import ConfigError, DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.core.maps import Masks
-from su3d_bench.metrics.protocols.loading import load_protocol, read_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, score_scene, unpack_scores
-from su3d_bench.metrics.semantic import panoptic_quality as panoptic
-from su3d_bench.metrics.semantic.panoptic_quality import PanopticCounts, Rule, Segments
-from su3d_bench.metrics.semantic.panoptic_score import count_segments
+from su3d_bench.metrics.semantic import panoptic
+from su3d_bench.metrics.semantic.panoptic import PanopticCounts, Rule, Segments, count_segments
 
 RULES = load_protocol("rooms-panoptic")
 KITTI = load_protocol("scannet-panoptic-oneformer3d")
@@ -191,24 +190,6 @@ def test_counts_survive_their_file_and_impossible_ones_are_refused() -> None:
     for iou in (np.full_like(counts.iou, 9.0), np.full_like(counts.iou, np.nan)):
         with pytest.raises(DataError, match="'iou' of class 0"):
             PanopticCounts.checked(arrays | {"iou": iou})
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ('stuff = ["walls"]', "stuff: 'walls' is no scored class; did you mean 'wall'?"),
-        ("stuff = []", "stuff: kind 'panoptic' needs the classes that are no things"),
-        ("min_region_size = 5", "min_region_size, thresholds and confidence belong to kind"),
-        ('metric = "scannet"', "kind 'panoptic' needs metric 'panopticapi' or 'semantic-kitti'"),
-        ('headline = ["AP"]', "headline: a protocol of kind 'panoptic' has PQ, SQ, RQ, PQ things"),
-    ],
-)
-def test_wrong_rules_are_told_in_one_line(line: str, message: str, tmp_path: Path) -> None:
-    path = tmp_path / "mine.toml"
-    path.write_text(f'extends = "rooms-panoptic"\nname = "mine"\n{line}\n')
-    with pytest.raises(ConfigError) as caught:
-        read_protocol(path)
-    assert message in str(caught.value)
 
 
 def test_the_splits_are_those_that_are_named() -> None:

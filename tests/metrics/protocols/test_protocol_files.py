@@ -9,8 +9,15 @@ import pytest
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.metrics.protocols.files import HEADING, protocol_names, read_remarks, remarks_of, rules_file
-from su3d_bench.metrics.protocols.loading import load_protocol, not_comparable_with
+from su3d_bench.metrics.protocols.loading import (
+    HEADING,
+    load_protocol,
+    not_comparable_with,
+    protocol_names,
+    read_remarks,
+    remarks_of,
+    rules_file,
+)
 
 
 def edited(tmp_path: Path, base: str, old: str, new: str) -> str:
@@ -118,6 +125,41 @@ def test_a_file_that_cannot_be_used_is_told_in_one_line(
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("base", "line", "message"),
+    [
+        ("replica-boxes", "thresholds = [0.25, 0.5, 0.75]", "kind 'boxes' takes [0.25, 0.5]"),
+        ("replica-boxes", 'class_agnostic = "scored"', "class_agnostic: belongs to kind 'instance'"),
+        ("grounding", 'box_axes = "truth"', "box_axes: kind 'grounding' takes 'world' or 'aligned'"),
+        ("grounding", "[transfer]\ncap_m = 0.05", "transfer.cap_m: kind 'grounding' transfers nothing"),
+        ("rooms-presence", "[presence]\nrelevancy = 1.5", "presence.relevancy: input should be less than 1, not 1.5"),
+        (
+            "rooms-presence",
+            "[presence]\ncanonicals = []",
+            "unknown key 'presence.canonicals'; did you mean 'canonical'?",
+        ),
+        ("rooms-presence", 'questions = "dataset"', "questions: kind 'presence' takes 'generated'"),
+        ("rooms-relations", 'predicates = ["on", "on"]', "predicates: each may stand there once"),
+        ("rooms-relations", 'predicates = ["beside"]', "predicates: boxes do not tell 'beside', but on, under"),
+        ("beacon3d", 'questions = "dataset"', "kind 'object-chains' takes 'generated', or queries of a file"),
+        ("rooms-panoptic", 'stuff = ["walls"]', "stuff: 'walls' is no scored class; did you mean 'wall'?"),
+        ("rooms-panoptic", "min_region_size = 5", "min_region_size, thresholds and confidence belong to kind"),
+        ("rooms-panoptic", 'headline = ["AP"]', "headline: a protocol of kind 'panoptic' has PQ, SQ, RQ, PQ things"),
+        ("rooms-reasoning", 'prompt = "{}"', "prompt: kind 'reasoning' compares no features"),
+        ("rooms-retrieval", "per_kind = -1", "per_kind"),
+        ("replica-openmask3d", 'box_axes = "truth"', "box_axes: kinds 'boxes' and 'grounding' need it"),
+    ],
+)
+def test_rules_that_do_not_fit_a_kind_are_refused_in_one_line(
+    base: str, line: str, message: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(f'extends = "{base}"\nname = "mine"\n{line}\n')
+    with pytest.raises(ConfigError) as caught:
+        load_protocol(str(path))
+    assert message in str(caught.value) and "\n" not in str(caught.value)
+
+
 def test_the_remarks_of_a_file_stand_beside_the_rules_that_they_speak_of(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(
@@ -136,7 +178,7 @@ def test_the_remarks_of_a_file_stand_beside_the_rules_that_they_speak_of(tmp_pat
     }
 
 
-@pytest.mark.parametrize("name", protocol_names())
+@pytest.mark.parametrize("name", {load_protocol(name).kind: name for name in protocol_names()}.values())
 def test_show_prints_every_rule_with_what_its_file_says_of_it(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["protocols", "show", name]) == 0
     text = capsys.readouterr().out

@@ -27,9 +27,14 @@ from su3d_bench.metrics.fitness import (
     why_not_truth,
 )
 from su3d_bench.metrics.instance.average_precision import MIN_REGION_SIZE, THRESHOLDS
-from su3d_bench.metrics.protocols.files import protocol_names, rules_file
 from su3d_bench.metrics.protocols.kinds import RULES_OF_KIND
-from su3d_bench.metrics.protocols.loading import load_protocol, not_comparable_with, protocols_for
+from su3d_bench.metrics.protocols.loading import (
+    load_protocol,
+    not_comparable_with,
+    protocol_names,
+    protocols_for,
+    rules_file,
+)
 from su3d_bench.metrics.protocols.model import Kind, MetricName, ProtocolRules
 from su3d_bench.metrics.scoring import METRICS
 

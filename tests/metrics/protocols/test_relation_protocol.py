@@ -10,26 +10,24 @@ from typing import Any
 
 import numpy as np
 import pytest
-from damage import damages, outcomes
 from places import CASES
 from replica_scene import QUADS, TWO_OBJECTS, write_original, write_render, write_scene_graphs
 from scored_room import ENCODER, nothing, room, truth_as_prediction
 
 from su3d_bench.baselines.oracle import Oracle
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, PredictionError
+from su3d_bench.core.errors import DataError, GroundTruthMissing, PredictionError
 from su3d_bench.core.maps import Instances, Prediction
 from su3d_bench.core.types import GroundTruth, LabelSet, TrueGraph
 from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.metrics.protocols.kinds import GEOMETRIC
-from su3d_bench.metrics.protocols.loading import load_protocol, read_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ClassEntry
-from su3d_bench.metrics.relations.counts import RelationCounts
-from su3d_bench.metrics.relations.graphs import geometric_edges
+from su3d_bench.metrics.relations import RelationCounts, geometric_edges
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, plain_json, score_scene, unpack_scores
 from su3d_bench.numerics.relations import RELATIONS
 from su3d_bench.predictions.formats import recognise
-from su3d_bench.predictions.online.fross import scene_graph
+from su3d_bench.predictions.objects import scene_graph
 from su3d_bench.store.predictions import read_prediction, write_prediction
 
 MADE = json.loads((CASES / "relations01_replicassg.json").read_text())
@@ -257,25 +255,6 @@ def test_each_fault_of_a_scene_graph_is_one_line(tmp_path: Path, change: dict[st
     assert "predictions_x.pkl: room_0" in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_objects_that_share_their_points_are_refused(tmp_path: Path) -> None:
-    cloud = np.zeros((200_000, 3))
-    path = write_graphs(tmp_path / "predictions_x.pkl", {"room_0": graph() | {"pcd": [cloud] * 20_000}})
-    with pytest.raises(PredictionError, match="room_0"):
-        recognise(path, None).read(path, "room_0")
-
-
-def test_damaged_scene_graphs_are_read_or_refused_in_one_line(tmp_path: Path) -> None:
-    path = write_graphs(tmp_path / "predictions_x.pkl", {"room_0": graph()})
-    reader = recognise(path, None)
-
-    def read(damaged: bytes) -> object:
-        path.write_bytes(damaged)
-        return [reader.read(path, scene) for scene in reader.scenes(path)]
-
-    _, n_refused = outcomes(read, damages(path.read_bytes()), must_name="predictions_x.pkl", refusal=PredictionError)
-    assert n_refused > 20
-
-
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
@@ -293,20 +272,3 @@ def test_damaged_scene_graphs_are_read_or_refused_in_one_line(tmp_path: Path) ->
 def test_a_map_with_a_broken_graph_is_refused(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(PredictionError, match=message):
         replace(Instances.of(np.zeros((1, 3), np.float32), [[0]]), **fields)
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ('predicates = ["beside"]', "predicates: boxes do not tell 'beside', but on, under"),
-        ('predicates = ["on", "on"]', "predicates: each may stand there once"),
-        ("[transfer]\nevaluation_voxel_m = 0.02", "transfer.cap_m: kind 'relations' needs one, and no evaluation"),
-        ('box_axes = "world"', "box_axes: kinds 'boxes' and 'grounding' need it"),
-    ],
-)
-def test_wrong_rules_of_relations_are_told_in_one_line(line: str, message: str, tmp_path: Path) -> None:
-    path = tmp_path / "mine.toml"
-    path.write_text(f'extends = "rooms-relations"\nname = "mine"\n{line}\n')
-    with pytest.raises(ConfigError) as caught:
-        read_protocol(path)
-    assert message in str(caught.value)

@@ -17,19 +17,26 @@ from su3d_bench.core.maps import Partition
 from su3d_bench.evaluation.scoring import facts_of, score_on_objects
 from su3d_bench.metrics.fitness import why_not_content, why_not_scorable
 from su3d_bench.metrics.instance.score import covered_objects
-from su3d_bench.metrics.protocols.files import rules_file
-from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for, read_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for, rules_file
 from su3d_bench.metrics.questions import shares
-from su3d_bench.metrics.questions.score import are_objects_right, first_instances, is_answer_right
+from su3d_bench.metrics.questions.score import (
+    AskedText,
+    GivenAnswer,
+    ReasoningTruth,
+    RetrievalTruth,
+    TrueAnswer,
+    are_objects_right,
+    first_instances,
+    is_answer_right,
+)
 from su3d_bench.metrics.questions.shares import ShareCounts
-from su3d_bench.metrics.questions.truths import AskedText, GivenAnswer, ReasoningTruth, RetrievalTruth, TrueAnswer
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, plain_json, score_scene, unpack_scores
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.predictions.base import vertex_masks
 from su3d_bench.questions import truths
 from su3d_bench.questions.sight import Sight
 from su3d_bench.questions.truths import question_truth
-from su3d_bench.runs.planning.plan import protocols_of_run
+from su3d_bench.runs.plan import protocols_of_run
 
 RULES = load_protocol("rooms-retrieval")
 REASONING = load_protocol("rooms-reasoning")
@@ -196,26 +203,6 @@ def test_questions_that_a_dataset_knows_itself_are_asked(tmp_path: Path, all_is_
 
 
 @pytest.mark.parametrize(
-    ("name", "old", "new", "line"),
-    [
-        ("rooms-retrieval", 'questions = "generated"', "", "questions: kinds 'retrieval', 'reasoning' and"),
-        ("replica-retrieval", 'synonyms = "lexicon"', "", "synonyms: kind 'annotation' and generated questions need"),
-        ("rooms-retrieval", DRAWN, 'questions = "dataset"\nper_kind = 3', "per_kind: belongs to generated questions"),
-        ("rooms-annotation", "[merging]", "[answers]", "answers"),
-        ("rooms-reasoning", "distance_m = 0.25", "distance_n = 0.25", "unknown key 'answers.distance_n'; did you mean"),
-        ("rooms-reasoning", "cap_m = 0.05", "", "transfer.cap_m: kind 'reasoning' needs one"),
-        ("rooms-reasoning", "aggregate", 'prompt = "{}"\naggregate', "prompt: kind 'reasoning' compares no features"),
-    ],
-)
-def test_rules_that_do_not_fit_their_kind_are_refused(tmp_path: Path, name: str, old: str, new: str, line: str) -> None:
-    text = rules_file(name).read_text()
-    assert old in text
-    (tmp_path / "own.toml").write_text(text.replace(old, new, 1))
-    with pytest.raises(ConfigError, match=line.replace("[", r"\[")):
-        read_protocol(tmp_path / "own.toml")
-
-
-@pytest.mark.parametrize(
     ("value", "given", "is_right"),
     [
         (2, 2, True), (2, 3, False), (True, True, True), (True, 1, False), (2.0, 2.24, True), (2.0, 2.26, False),
@@ -280,7 +267,7 @@ def test_a_run_scores_variants_under_the_protocols_of_questions(
     words = (
         "run --scenes rooms/bathroom0 --methods opensu3d@scheme1 opensu3d@scheme4 --profile oracle --limit 3 --jobs 1"
     )
-    words += " --no-pictures --quiet --set rooms.width=160 --set rooms.height=120 --set rooms.n_frames=200"
+    words += " --no-pictures --quiet --set rooms.width=160 --set rooms.height=120 --set rooms.n_frames=80"
     words += " --protocols rooms-retrieval rooms-annotation rooms-reasoning --out"
     assert main([*words.split(), str(tmp_path / "run")]) == 0
     metrics = json.loads((tmp_path / "run/metrics.json").read_text())["results"]

@@ -1,11 +1,11 @@
-"""The embedded encoder as it is shipped."""
+"""The embedded encoder as it is shipped, its tokenizer, and the tool that trains it."""
 
 from __future__ import annotations
 
+import doctest
 import hashlib
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,18 +13,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from su3d_bench.core.errors import DataError, ModelMissing
-from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.errors import ModelMissing
 from su3d_bench.core.types import UInt8Array
+from su3d_bench.datasets.rooms.classes import MATERIALS
 from su3d_bench.perception.embedded import encoder as embedded_encoder
-from su3d_bench.perception.embedded.encoder import (
+from su3d_bench.perception.embedded import lexicon
+from su3d_bench.perception.embedded import text as embedded_text
+from su3d_bench.perception.embedded.encoder import IMAGE_FILE, IMAGE_SIZE, TEXT_FILE, EmbeddedEncoder, log_size, shrink
+from su3d_bench.perception.embedded.text import (
     DIM,
-    IMAGE_FILE,
-    IMAGE_SIZE,
-    TEXT_FILE,
-    EmbeddedEncoder,
-    log_size,
-    shrink,
+    N_IDS,
+    N_ROWS,
+    N_WORDS,
+    PADDING,
+    fnv1a,
+    token_ids,
 )
 
 FOLDER = Path(embedded_encoder.__file__).parent / "weights"
@@ -41,10 +44,6 @@ def images() -> list[UInt8Array]:
     rng = np.random.default_rng(0)
     sizes = ((1, 1), (3, 200), (64, 64), (200, 3), (480, 640), (57, 91), (100, 40))
     return [rng.integers(0, 256, (*size, 3), dtype=np.uint8) for size in sizes]
-
-
-def test_it_is_an_encoder(encoder: EmbeddedEncoder) -> None:
-    assert isinstance(encoder, Encoder)
 
 
 def test_features_are_unit_float32_of_the_documented_shape(encoder: EmbeddedEncoder, images: list[UInt8Array]) -> None:
@@ -65,13 +64,6 @@ def test_a_feature_does_not_depend_on_its_batch(encoder: EmbeddedEncoder, images
     assert np.array_equal(np.concatenate([encoder.encode_texts([text]) for text in TEXTS]), texts)
 
 
-def test_another_session_gives_the_same_bits(encoder: EmbeddedEncoder, images: list[UInt8Array]) -> None:
-    other = EmbeddedEncoder()
-    assert np.array_equal(other.encode_images(images), encoder.encode_images(images))
-    assert np.array_equal(other.encode_texts(TEXTS), encoder.encode_texts(TEXTS))
-    assert other.digest == encoder.digest
-
-
 def test_apparent_size_is_kept(encoder: EmbeddedEncoder) -> None:
     small = np.full((20, 20, 3), 130, np.uint8)
     large = np.full((400, 400, 3), 130, np.uint8)
@@ -89,33 +81,11 @@ def test_shrinking_averages_an_axis_even_where_the_other_grows() -> None:
     assert shrink(stripes)[0, 0, 0] == 100
 
 
-def test_order_of_words_and_hyphens_reach_the_features(encoder: EmbeddedEncoder) -> None:
-    forward, back = encoder.encode_texts(["plant on table", "table on plant"])
-    assert float(forward @ back) < 0.9
-    one, other = encoder.encode_texts(["a tv-screen in a scene", "the TV screen in a scene"])
-    assert np.array_equal(one, other)
-
-
 def test_missing_weights_are_named(tmp_path: Path) -> None:
     with pytest.raises(ModelMissing, match=rf"there is no .*{IMAGE_FILE}; reinstall the package"):
         EmbeddedEncoder(tmp_path).encode_images([np.zeros((4, 4, 3), np.uint8)])
     with pytest.raises(ModelMissing, match=TEXT_FILE):
         EmbeddedEncoder(tmp_path).encode_texts(["chair"])
-
-
-def test_a_wrong_image_is_an_error(encoder: EmbeddedEncoder) -> None:
-    with pytest.raises(DataError, match=r"image 0: \(4, 4\) uint8; expected"):
-        encoder.encode_images([np.zeros((4, 4), np.uint8)])
-    with pytest.raises(DataError, match="not empty"):
-        encoder.encode_images([np.zeros((0, 4, 3), np.uint8)])
-
-
-def test_digest_moves_with_either_tower(encoder: EmbeddedEncoder, tmp_path: Path) -> None:
-    for name in (IMAGE_FILE, TEXT_FILE):
-        shutil.copy(FOLDER / name, tmp_path / name)
-    assert EmbeddedEncoder(tmp_path).digest == encoder.digest
-    shutil.copy(FOLDER / TEXT_FILE, tmp_path / IMAGE_FILE)
-    assert EmbeddedEncoder(tmp_path).digest != encoder.digest
 
 
 def test_model_card_describes_the_shipped_files(encoder: EmbeddedEncoder) -> None:
@@ -153,3 +123,77 @@ def test_the_encoder_leaves_no_file_behind_not_even_for_its_makers(tmp_path: Pat
     )
     assert done.stdout == "(1, 128)\n"
     assert list(tmp_path.rglob("*")) == []
+
+
+def test_examples_in_docstrings_run() -> None:
+    assert doctest.testmod(embedded_text).failed == 0
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("tv-screen", "tv screen"),
+        ("Indoor-Plant", "indoor plants"),
+        ("an image of a chair", "image of the chair"),
+        ("computer's picture", "computers picture"),
+        ("shelves", "shelf"),
+    ],
+)
+def test_spellings_of_one_thing_have_the_same_ids(one: str, other: str) -> None:
+    ids = token_ids([one, other])
+    assert np.array_equal(ids[0], ids[1])
+
+
+@pytest.mark.parametrize(
+    ("one", "other"), [("plant on table", "table on plant"), ("glass", "glas"), ("cup", "cups of tea"), ("pan", "pot")]
+)
+def test_different_texts_have_different_ids(one: str, other: str) -> None:
+    ids = token_ids([one, other])
+    assert not np.array_equal(ids[0], ids[1])
+
+
+def test_words_that_no_caption_holds_are_named() -> None:
+    encoder = EmbeddedEncoder()
+    captions = ["A couch on the wooden table", "bowl next to a lamp in scene", "something to type with", "tv-screens"]
+    assert [encoder.unseen_words(text) for text in captions] == [()] * 4
+    assert encoder.unseen_words('"Xqzzy", plant; xqzzy') == ("Xqzzy", "xqzzy")
+    assert encoder.unseen_words("\u6905\u5b50") == ("\u6905\u5b50",)
+    assert encoder.unseen_words("the") == ("the",)  # nothing that it reads
+
+
+def test_the_words_for_materials_are_those_of_the_rooms() -> None:
+    assert lexicon.MATERIALS == MATERIALS
+
+
+def test_ids_have_the_documented_shape_and_range() -> None:
+    ids = token_ids(["chair", "", "one two three four five six seven eight nine ten " * 3])
+    assert ids.shape == (3, N_WORDS, N_IDS)
+    assert ids.dtype == np.int64
+    assert (ids[1] == PADDING).all()
+    assert (ids[2, :, 0] != PADDING).all()
+    assert ids.min() >= 0
+    assert ids.max() < N_ROWS
+    assert token_ids([]).shape == (0, N_WORDS, N_IDS)
+
+
+def test_hash_is_fnv1a() -> None:
+    # Test vectors of the FNV reference, http://www.isthe.com/chongo/tech/comp/fnv
+    assert fnv1a("") == 0x811C9DC5
+    assert fnv1a("a") == 0xE40C292C
+    assert fnv1a("foobar") == 0xBF9CF968
+
+
+@pytest.mark.slow
+def test_training_runs_from_rooms_to_model_card(tmp_path: Path) -> None:
+    for package in ("torch", "onnx"):
+        pytest.importorskip(package, reason="the models extra is not installed")
+    import train_encoder
+
+    options = "--rooms 1 --held-out-rooms 1 --frames-per-room 1 --minutes 2 --max-steps 2 --jobs 1"
+    assert train_encoder.main(["--out", str(tmp_path), *options.split()]) == 0
+    card = json.loads((tmp_path / "model_card.json").read_text())
+    assert card["training"]["steps"] == 2
+    assert card["digest"] == EmbeddedEncoder(tmp_path).digest
+    assert card["largest_difference_from_torch"] < 1e-5
+    assert "python tools/train_encoder.py" in (tmp_path / "model_card.md").read_text()
+    assert EmbeddedEncoder(tmp_path).encode_texts(["a chair"]).shape == (1, 128)

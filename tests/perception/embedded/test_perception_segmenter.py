@@ -1,13 +1,18 @@
-"""The RGB-D segmenter on scenes of boxes and planes whose regions are known."""
+"""The RGB-D segmenter on scenes of boxes and planes whose regions are known; its graph against SciPy and NumPy."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 from perception_fakes import still_life
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, Int32Array, Regions, UInt8Array
-from su3d_bench.perception.embedded.segmenter.segmenter import RgbdSegmenter, SegmenterConfig
+from su3d_bench.perception.embedded.join_rules import SegmenterConfig
+from su3d_bench.perception.embedded.kernels import connected, sum_rows
+from su3d_bench.perception.embedded.segmenter import RgbdSegmenter
+from su3d_bench.perception.embedded.surface_graph import border_pairs
 
 K: Float64Array = np.array([[260.0, 0, 159.5], [0, 260.0, 119.5], [0, 0, 1]])
 WIDTH, HEIGHT = 320, 240
@@ -85,16 +90,6 @@ def test_a_box_of_the_table_s_colour_is_found_by_shape() -> None:
     assert best_iou(objects(frame), ids == LEFT) > 0.8
 
 
-def test_a_box_on_a_box_is_a_region_of_its_own() -> None:
-    boxes: dict[int, Box] = {
-        LEFT: ((-0.25, 0.6, 0.0), (0.25, 1.0, 0.15)),
-        RIGHT: ((-0.08, 0.72, 0.15), (0.08, 0.88, 0.25)),
-    }
-    frame, ids = view(boxes, {TABLE: GREY, LEFT: RED, RIGHT: BLUE})
-    regions = objects(frame)
-    assert best_iou(regions, ids == LEFT) > 0.85 and best_iou(regions, ids == RIGHT) > 0.85
-
-
 def test_coplanar_regions_are_told_apart_by_colour() -> None:
     frame = still_life()
     picture = np.zeros(frame.depth_m.shape, bool)
@@ -107,16 +102,6 @@ def test_the_wall_is_no_object_but_a_part() -> None:
     wall = (frame.depth_m == 3.0) & (frame.rgb[..., 0] == 205)
     assert best_iou(objects(frame), wall) < 0.1
     assert best_iou(RgbdSegmenter(SegmenterConfig(), "parts").segment(frame), wall) > 0.9
-
-
-def test_a_region_of_ten_by_ten_pixels_is_kept() -> None:
-    frame = still_life()
-    patch = np.s_[95:105, 20:30]
-    frame.rgb[patch] = 240, 200, 40
-    frame.depth_m[patch] = 2.95
-    truth = np.zeros(frame.depth_m.shape, bool)
-    truth[patch] = True
-    assert best_iou(objects(frame, min_region_px=60), truth) > 0.6
 
 
 def test_a_small_patch_flush_with_the_wall_is_its_pattern_and_a_large_one_an_object() -> None:
@@ -163,12 +148,6 @@ def test_masks_do_not_overlap_boxes_fit_and_scores_are_shares() -> None:
             assert (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1) == (x0, y0, x1, y1)
 
 
-def test_the_same_frame_gives_the_same_bytes() -> None:
-    frame, _ = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE})
-    first, second = objects(frame), objects(frame)
-    assert first.masks.tobytes() == second.masks.tobytes() and first.scores.tobytes() == second.scores.tobytes()
-
-
 def test_wide_frames_are_segmented_at_a_fraction_of_their_size() -> None:
     frame, ids = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE})
     regions = objects(frame, max_width=160, min_region_px=60)
@@ -176,23 +155,29 @@ def test_wide_frames_are_segmented_at_a_fraction_of_their_size() -> None:
     assert best_iou(regions, ids == LEFT) > 0.8
 
 
-def test_sizes_that_no_fraction_divides_are_covered() -> None:
-    frame, _ = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE})
-    odd = Frame(0, 0.0, frame.rgb[:239, :317].copy(), frame.depth_m[:239, :317].copy(), np.eye(4), K)
-    parts = RgbdSegmenter(SegmenterConfig(max_width=160, min_region_px=1), "parts").segment(odd)
-    assert parts.masks.any(axis=0).all()
+@pytest.mark.parametrize(("n", "n_links"), [(1, 0), (5, 0), (40, 12), (40, 60), (300, 900)])
+def test_components_are_counted_by_their_first_nodes(n: int, n_links: int) -> None:
+    a, b = np.random.default_rng(n_links).integers(0, n, (2, n_links))
+    links = coo_matrix((np.ones(n_links, np.int8), (a, b)), shape=(n, n))
+    n_components, expected = connected_components(links, directed=False)
+    component, found = connected(a, b, n)
+    assert found == n_components
+    assert component.tolist() == expected.tolist()
 
 
-def test_parameters_and_level_move_the_digest() -> None:
-    configs = [SegmenterConfig(), SegmenterConfig(min_region_px=99)]
-    digests = {RgbdSegmenter(c, level).digest for c in configs for level in ("objects", "parts")}
-    assert len(digests) == 4
+def test_sums_of_rows_are_added_in_their_order() -> None:
+    rng = np.random.default_rng(1)
+    values, label = rng.normal(0, 1e6, (500, 3)), rng.integers(0, 7, 500)
+    expected = np.stack([np.bincount(label, column, 8) for column in values.T], axis=1)
+    assert np.array_equal(sum_rows(label, values, 8), expected)
+    assert np.array_equal(sum_rows(label[:0], values[:0], 2), np.zeros((2, 3)))
 
 
-def test_coarser_parameters_give_fewer_regions() -> None:
-    frame, _ = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE}, noise=40)
-    fine, coarse = (
-        RgbdSegmenter(SegmenterConfig(min_region_px=20, superpixel_scale=scale, parts_caution=caution), "parts")
-        for scale, caution in ((2, 9), (60, 0))
-    )
-    assert len(fine.segment(frame).boxes) > len(coarse.segment(frame).boxes)
+def test_pairs_along_rows_come_before_those_along_columns() -> None:
+    labels = np.array([[2, 0, 0], [2, 2, 1]], np.int32)
+    contrast = np.arange(12, dtype=np.float32).reshape(2, 2, 3)
+    low, high, contrasts, depths = border_pairs(labels, contrast, -contrast)
+    assert list(zip(low.tolist(), high.tolist(), strict=True)) == [(0, 2), (1, 2), (0, 2), (0, 1)]
+    assert contrasts.tolist() == [0, 4, 7, 8]
+    assert depths.tolist() == [0, -4, -7, -8]
+    assert all(len(column) == 0 for column in border_pairs(labels[:1, :1], contrast[:, :1, :1], contrast[:, :1, :1]))

@@ -1,27 +1,34 @@
-"""Boxes and images on their way into and out of foundation models, on cases worked out by hand."""
+"""Boxes, automatic masks and images of foundation models, by hand and against transformers' own functions."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
+from tiny_models import blocks, tiny_sam
 
-from su3d_bench.core.types import Float32Array
-from su3d_bench.perception.models.encoders.model_images import (
-    normalised,
-    resized,
+from su3d_bench.core.types import BoolArray, Float32Array
+from su3d_bench.perception.models.encoders.images import (
     size_with_longest_side,
     size_with_shortest_side,
 )
-from su3d_bench.perception.models.masks.box_suppression import box_overlaps, corners_of, suppress
+from su3d_bench.perception.models.masks.automatic_masks import (
+    AutomaticMaskConfig,
+    AutomaticMasks,
+    Crop,
+    crops_of,
+    is_cut_by_crop,
+    point_grid,
+    stability,
+    without_small_parts,
+)
+from su3d_bench.perception.models.masks.grounding_dino import box_overlaps, corners_of, suppress
+from su3d_bench.perception.models.masks.sam import Sam, TorchSam
 
 
 def boxes_of(*rows: tuple[float, ...]) -> Float32Array:
     return np.array(rows, np.float32).reshape(-1, 4)
-
-
-def test_centre_and_size_become_corners_in_pixels() -> None:
-    np.testing.assert_array_equal(corners_of(boxes_of((0.5, 0.5, 1, 1)), 10, 20), boxes_of((0, 0, 20, 10)))
-    np.testing.assert_array_equal(corners_of(boxes_of((0.25, 0.5, 0.5, 0.2)), 10, 20), boxes_of((0, 4, 10, 6)))
 
 
 def test_boxes_become_pixels_before_corners_as_in_the_original() -> None:
@@ -36,12 +43,6 @@ def test_overlap_is_intersection_over_union() -> None:
     assert np.isnan(box_overlaps(boxes_of((1, 1, 1, 4))[0], boxes_of((1, 1, 1, 4)))[0])
 
 
-def test_the_better_of_two_overlapping_boxes_stays_and_its_victim_shields_nobody() -> None:
-    # The second beats the first (IoU 0.6), which would have beaten the third (IoU 0.6); second and third share 1/3.
-    boxes = boxes_of((0, 0, 8, 1), (2, 0, 10, 1), (-2, 0, 6, 1))
-    assert suppress(boxes, np.array([0.8, 0.9, 0.7], np.float32), 0.5).tolist() == [1, 2]
-
-
 def test_an_overlap_of_exactly_the_threshold_is_no_reason_to_go() -> None:
     boxes = boxes_of((0, 0, 10, 10), (0, 0, 5, 10))
     scores = np.array([0.9, 0.8], np.float32)
@@ -49,12 +50,6 @@ def test_an_overlap_of_exactly_the_threshold_is_no_reason_to_go() -> None:
     assert suppress(boxes, scores, 0.49).tolist() == [0]
     # Unless float32 has it a little above, as of 0.4, the paper's threshold.
     assert suppress(boxes_of((0, 0, 10, 10), (0, 0, 4, 10)), scores, 0.4).tolist() == [0]
-
-
-def test_of_equal_scores_the_first_wins_and_boxes_without_area_overlap_nothing() -> None:
-    boxes = boxes_of((0, 0, 4, 4), (0, 0, 4, 4), (1, 1, 1, 3), (1, 1, 1, 3))
-    assert suppress(boxes, np.ones(4, np.float32), 0.3).tolist() == [0, 2, 3]
-    assert suppress(np.zeros((0, 4), np.float32), np.zeros(0, np.float32), 0.3).tolist() == []
 
 
 def test_suppression_equals_its_definition_on_random_boxes() -> None:
@@ -87,26 +82,88 @@ def test_sizes_follow_the_originals_rules(
     assert size_with_shortest_side(*size, 800, 1333) == shortest
 
 
-def test_the_shorter_side_is_that_of_transformers_and_the_longer_half_the_ratio_of_sides_off_at_most() -> None:
-    from transformers.image_transforms import get_size_with_aspect_ratio
-
-    random = np.random.default_rng(0)
-    largest = 0.0
-    for height, width in random.integers(30, 3000, (2000, 2)).tolist():
-        ours = size_with_shortest_side(height, width, 800, 1333)
-        theirs = get_size_with_aspect_ratio((height, width), 800, 1333)
-        assert min(ours) == min(theirs)
-        off, ratio = abs(max(ours) - max(theirs)), max(height, width) / min(height, width)
-        assert off <= 1 + ratio / 2
-        largest = max(largest, off)
-    assert largest > 15
+def mask_of(rows: str) -> BoolArray:
+    return np.array([[character == "#" for character in row] for row in rows.split()])
 
 
-def test_an_image_of_the_wanted_size_is_not_touched_and_grey_is_minus_the_mean() -> None:
-    image = np.full((4, 6, 3), 255, np.uint8)
-    assert resized(image, 4, 6) is image
-    white = normalised(image)
-    assert white.shape == (3, 4, 6)
-    np.testing.assert_allclose(
-        white[:, 0, 0], [(1 - 0.485) / 0.229, (1 - 0.456) / 0.224, (1 - 0.406) / 0.225], rtol=1e-6
-    )
+def test_crops_and_points_equal_those_of_transformers() -> None:
+    from transformers.models.sam.image_processing_pil_sam import _build_point_grid, _generate_per_layer_crops
+
+    for height, width, n_layers in ((680, 1200, 2), (101, 57, 1), (480, 640, 0), (333, 1000, 3)):
+        boxes, layers = _generate_per_layer_crops(n_layers, 512 / 1500, (height, width))
+        mine = crops_of(height, width, n_layers, 512 / 1500)
+        assert [list(crop.box) for crop in mine] == boxes
+        assert [crop.layer for crop in mine] == layers
+    np.testing.assert_array_equal(point_grid(12), _build_point_grid(12))
+
+
+def test_stability_is_the_share_of_pixels_that_keep_their_side() -> None:
+    import torch
+    from transformers.models.sam.image_processing_pil_sam import _compute_stability_score
+
+    # Above 1: two pixels; above -1: four. At exactly the thresholds a pixel counts as below.
+    logits = torch.tensor([[[3.0, 1.5, 1.0], [-0.5, -1.0, -2.0]]])
+    assert stability(logits, 1.0).tolist() == [0.5]
+    assert np.isnan(stability(torch.full((1, 2, 2), -9.0), 1.0).numpy()).all()
+    noise = torch.randn(20, 9, 11, generator=torch.Generator().manual_seed(0)) * 2
+    assert torch.equal(stability(noise, 1.0), _compute_stability_score(noise, 0.0, 1))
+
+
+def test_which_boxes_a_crop_cuts_equals_transformers() -> None:
+    import torch
+    from transformers.models.sam.image_processing_pil_sam import _is_box_near_crop_edge
+
+    random = np.random.default_rng(1)
+    inside = np.sort(random.integers(0, 200, (500, 2, 2)), axis=1).reshape(-1, 4).astype(np.float32)
+    crop = Crop((90, 15, 290, 215), 1)
+    boxes = inside + np.array([90, 15, 90, 15], np.float32)
+    theirs = _is_box_near_crop_edge(torch.from_numpy(inside), list(crop.box), [0, 0, 300, 400]).numpy()
+    assert is_cut_by_crop(boxes, crop, 400, 300).tolist() == theirs.tolist()
+    assert 0 < theirs.mean() < 1
+
+
+def test_small_holes_are_filled_and_small_islands_go() -> None:
+    mask = mask_of("######.. #.####.# ######.. ###..#.. ###..#.. ######..")
+    filled, had_holes = without_small_parts(mask, 4, "holes")
+    assert had_holes and filled[1, 1] and not filled[3, 3], "one hole has one pixel, the other four"
+    clean, had_islands = without_small_parts(filled, 4, "islands")
+    assert had_islands and not clean[1, 7] and clean[:, :6].sum() == 32
+
+
+def test_a_mask_of_small_islands_keeps_the_largest_and_counts_as_changed() -> None:
+    kept, changed = without_small_parts(mask_of("##..#. ......"), 5, "islands")
+    assert changed
+    np.testing.assert_array_equal(kept, mask_of("##.... ......"))
+    alone, changed = without_small_parts(mask_of("##.... ......"), 5, "islands")
+    assert changed, "as in the original: a small part was found, although it stays"
+    np.testing.assert_array_equal(alone, mask_of("##.... ......"))
+    # Corner to corner is one part.
+    assert not without_small_parts(mask_of("#. .#"), 2, "islands")[1]
+    assert not without_small_parts(mask_of(".. .."), 2, "islands")[1]
+
+
+def test_what_passes_the_filters_is_what_transformers_lets_pass() -> None:
+    import torch
+    from transformers.models.sam.image_processing_pil_sam import SamImageProcessorPil, _normalize_coordinates
+
+    rgb = blocks(40, 60)
+    side = {"height": 64, "width": 64}
+    processor = SamImageProcessorPil(size={"longest_edge": 64}, pad_size=side)
+    inputs = processor(rgb, return_tensors="pt")
+    points = point_grid(5) * np.array([60, 40])
+    prompts = torch.from_numpy(_normalize_coordinates(64, points, (40, 60))).float()[None, :, None]
+    with torch.inference_mode():
+        answer = tiny_sam()(pixel_values=inputs["pixel_values"], input_points=prompts, multimask_output=True)
+    logits = processor.post_process_masks(
+        answer.pred_masks, inputs["original_sizes"], inputs["reshaped_input_sizes"], binarize=False
+    )[0]
+    # Random weights give logits below 1, so the offset is small.
+    settings: dict[str, Any] = {"pred_iou_thresh": 0.75, "stability_score_thresh": 0.3, "stability_score_offset": 0.2}
+    rle, scores, boxes = processor.filter_masks(logits, answer.iou_scores[0], (40, 60), [0, 0, 60, 40], **settings)
+    config = AutomaticMaskConfig(points_per_side=5, points_per_batch=25, box_nms_thresh=1.0, **settings)
+    found = AutomaticMasks(Sam(TorchSam(tiny_sam())), config).regions(rgb)
+    assert 3 < len(rle) < 75
+    assert len(found.masks) == len(rle), "with an overlap of 1 allowed nothing but the filters acts"
+    order = np.argsort(-scores.numpy(), kind="stable")
+    np.testing.assert_allclose(found.scores, np.clip(scores.numpy()[order], 0, 1), atol=1e-4)
+    np.testing.assert_allclose(found.boxes, boxes.numpy()[order], atol=1)

@@ -31,25 +31,6 @@ def test_batches_are_halved_when_the_memory_runs_out() -> None:
     assert batches.size == 3
 
 
-@needs_models
-def test_an_image_that_does_not_fit_alone_is_an_error_in_one_line() -> None:
-    import torch
-
-    def work(batch: Any) -> Float32Array:
-        raise torch.OutOfMemoryError("CUDA out of memory")
-
-    with pytest.raises(ConfigError, match="no memory for a batch of 1"):
-        Batches(4).run(range(3), work)
-
-
-def test_an_error_of_the_network_is_not_taken_for_want_of_memory() -> None:
-    def work(batch: Any) -> Float32Array:
-        raise RuntimeError("shapes do not fit")
-
-    with pytest.raises(RuntimeError, match="shapes"):
-        Batches(4).run(range(3), work)
-
-
 def test_jobs_take_the_gpus_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     torch = pytest.importorskip("torch", reason="torch is not installed")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)

@@ -5,25 +5,22 @@ from __future__ import annotations
 import json
 import pickle
 import shutil
-import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from tiny_models import needs_models, noise_images
+from tiny_models import needs_models, noise_images, write_tiny_clip, write_tiny_siglip
 
-from su3d_bench.core.errors import ConfigError, DataError, ModelMissing
+from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import Float32Array, Int64Array
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.models.config import ModelsConfig
-from su3d_bench.perception.models.encoders import towers_transformers
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec, FoundationEncoder, unit_rows
-from su3d_bench.perception.models.encoders.image_transform import ImageTransform
-from su3d_bench.perception.models.files import ModelFiles, read_weights
+from su3d_bench.perception.models.encoders.images import ImageTransform
+from su3d_bench.perception.models.files import read_weights
 from su3d_bench.perception.models.loading import load_encoder
-from su3d_bench.perception.models.stand_ins.encoders import DIM, write_tiny_clip, write_tiny_siglip
 
 TEXTS = ("chair", "a red cup on the table", "chair", "zebra")
 RAW = EncoderSpec(3, 4, 10, "clip", None, ImageTransform(4))
@@ -85,34 +82,6 @@ def test_a_feature_does_not_depend_on_the_rest_of_its_batch(folder: Path, name: 
 
 
 @needs_models
-def test_half_precision_on_the_cpu_only_where_it_is_asked_for(folder: Path) -> None:
-    full = load_encoder(config(folder))
-    half = load_encoder(config(folder, precision="bfloat16"))
-    difference = np.abs(full.encode_images(noise_images(3)) - half.encode_images(noise_images(3))).max()
-    assert 0 < difference < 0.1
-    assert half.digest != full.digest
-
-
-@needs_models
-def test_the_older_form_of_weights_gives_the_same_features(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    # A product of matrices rounds by where its factors lie in memory, and one of the two forms is mapped from its file.
-    load_model = towers_transformers.load_model
-
-    def aligned(files: ModelFiles) -> Any:
-        model = load_model(files)
-        for weights in model.parameters():
-            weights.data = weights.data.clone()
-        return model
-
-    monkeypatch.setattr(towers_transformers, "load_model", aligned)
-    write_tiny_clip(tmp_path / "clip-vit-h-14", weights="pytorch_model.bin")
-    older, newer = load_encoder(config(tmp_path)), load_encoder(config(folder))
-    assert np.array_equal(older.encode_images(noise_images(2)), newer.encode_images(noise_images(2)))
-
-
-@needs_models
 def test_the_digest_moves_with_all_that_moves_a_feature(folder: Path, tmp_path: Path) -> None:
     digest = load_encoder(config(folder)).digest
     assert load_encoder(config(folder, batch=4)).digest == digest
@@ -138,14 +107,6 @@ def test_an_encoder_knows_its_own_digest_of_another_device(folder: Path, tmp_pat
     write_tiny_clip(tmp_path / "clip-vit-h-14", seed=1)
     assert not here.is_same_space(load_encoder(config(tmp_path)).digest)
     assert not here.is_same_space(load_encoder(config(folder, transform="transformers")).digest)
-
-
-@needs_models
-def test_the_towers_are_read_once_however_many_encoders_are_made(folder: Path) -> None:
-    first, second = load_encoder(config(folder)), load_encoder(config(folder))
-    first.encode_images(noise_images(1))
-    second.encode_images(noise_images(1))
-    assert first._towers is second._towers  # type: ignore[attr-defined]
 
 
 class _CountingTowers:
@@ -213,27 +174,6 @@ def test_a_weights_file_that_holds_code_is_refused(tmp_path: Path, name: str) ->
 
 
 @needs_models
-def test_an_encoder_folder_with_a_payload_is_refused_before_it_is_loaded(folder: Path, tmp_path: Path) -> None:
-    import torch
-
-    target = tmp_path / "clip-vit-h-14"
-    shutil.copytree(folder / "clip-vit-h-14", target)
-    (target / "model.safetensors").unlink()
-    torch.save({"a": _Payload()}, target / "pytorch_model.bin")
-    with pytest.raises(DataError, match="can run code"):
-        load_encoder(config(tmp_path)).encode_images(noise_images(1))
-
-
-@needs_models
-def test_weights_of_another_model_are_an_error_and_never_random(folder: Path, tmp_path: Path) -> None:
-    target = tmp_path / "clip-vit-h-14"
-    shutil.copytree(folder / "clip-vit-h-14", target)
-    shutil.copy(folder / "siglip-base-224" / "model.safetensors", target / "model.safetensors")
-    with pytest.raises(DataError, match=r"model\.safetensors: (lacks \d+ tensors|cannot be loaded)"):
-        load_encoder(config(tmp_path)).encode_images(noise_images(1))
-
-
-@needs_models
 def test_damaged_weights_are_one_line(folder: Path, tmp_path: Path) -> None:
     target = tmp_path / "clip-vit-h-14"
     shutil.copytree(folder / "clip-vit-h-14", target)
@@ -265,48 +205,3 @@ def test_a_configuration_without_sense_is_refused_before_anything_is_made(
     (target / "config.json").write_text(json.dumps(content | change))
     with pytest.raises(DataError, match=said):
         load_encoder(config(tmp_path))
-
-
-@needs_models
-def test_settings_of_a_size_that_no_model_has_are_not_read(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("su3d_bench.perception.models.files.LARGEST_SETTINGS", 3000)
-    for name in ("config.json", "preprocessor_config.json", "merges.txt"):
-        target = Path(shutil.copytree(folder / "clip-vit-h-14", tmp_path / name / "clip-vit-h-14"))
-        (target / name).write_text((target / name).read_text() + " " * 3000)
-        with pytest.raises(DataError, match=f"{name}: has .* bytes; a model's settings have at most 3000"):
-            load_encoder(config(tmp_path / name)).encode_texts(["chair"])
-
-
-@needs_models
-def test_a_damaged_tokenizer_is_one_line(folder: Path, tmp_path: Path) -> None:
-    for name, file in (("clip-vit-h-14", "vocab.json"), ("siglip-base-224", "tokenizer.json")):
-        target = tmp_path / name
-        shutil.copytree(folder / name, target)
-        (target / file).write_text("{}")
-        with pytest.raises(DataError, match="tokenizer"):
-            load_encoder(config(tmp_path, name)).encode_texts(["chair"])
-
-
-def test_a_setting_that_would_do_nothing_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="the embedded encoder has its own"):
-        load_encoder(ModelsConfig(runtime="onnx"))
-    with pytest.raises(ValueError, match="provider belongs to runtime"):
-        ModelsConfig(provider="cpu")
-    with pytest.raises(ValueError, match="does not run on device"):
-        ModelsConfig(runtime="onnx", provider="cuda")
-    with pytest.raises(ValueError, match="exported encoders are float32"):
-        ModelsConfig(runtime="onnx", precision="float16")
-
-
-@needs_models
-def test_without_transformers_one_line_names_the_extra(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "transformers", None)
-    with pytest.raises(ModelMissing, match=r"needs the package 'transformers': pip install 'su3d-bench\[models\]'"):
-        load_encoder(config(folder))
-
-
-@needs_models
-def test_the_space_of_the_tiny_encoder_is_known_without_its_weights(folder: Path) -> None:
-    assert load_encoder(config(folder)).dim == DIM

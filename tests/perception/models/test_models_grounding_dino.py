@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from tiny_models import DINO_PX, blocks
+from tiny_models import DINO_PX, blocks, tiny_dino, tiny_tokenizer
 
 from su3d_bench.core.types import Float32Array
 from su3d_bench.perception.models.masks.grounding_dino import (
@@ -16,10 +15,8 @@ from su3d_bench.perception.models.masks.grounding_dino import (
     BoxConfig,
     GroundingDino,
     is_in_phrase,
-    tag_of,
     text_prompt,
 )
-from su3d_bench.perception.models.stand_ins.detector import tiny_dino, tiny_tokenizer
 
 RGB = blocks(40, 60)
 TAGS = ("cat", "coffee table", "sofa")
@@ -33,17 +30,6 @@ def tokenizer(tmp_path_factory: pytest.TempPathFactory) -> Any:
 @pytest.fixture(scope="module")
 def detector(tokenizer: Any) -> GroundingDino:
     return GroundingDino(tiny_dino(), tokenizer, *DINO_PX)
-
-
-def test_a_prompt_closes_every_tag_with_a_full_stop() -> None:
-    assert text_prompt(["Cat", " coffee  table", "T.V."]) == "cat. coffee table. t v."
-
-
-def test_a_phrase_stands_for_itself_then_for_the_first_tag_in_it() -> None:
-    tags = ["table", "coffee table", "cat"]
-    assert tag_of("coffee table", tags) == "coffee table"
-    assert tag_of("black coffee table", tags) == "table"
-    assert tag_of("dog", tags) is None
 
 
 def test_tokens_above_the_threshold_name_a_box_but_not_the_ends_of_the_text() -> None:
@@ -158,33 +144,7 @@ def test_a_box_may_be_called_by_a_whole_tag_and_go_where_it_stands_for_none(toke
     np.testing.assert_allclose(found.scores, [0.9, 0.3, 0.25])
 
 
-def test_boxes_are_suppressed_as_they_are_and_not_as_the_image_cuts_them(tokenizer: Any) -> None:
-    # Both reach beyond the left edge; inside they cover the same, outside one is twice as wide: IoU 1/2 and not 1.
-    probabilities = np.zeros((2, 8), np.float32)
-    probabilities[:, 1] = 0.9, 0.8
-    centres = np.array([[0.0, 0.5, 0.5, 1.0], [-0.25, 0.5, 1.0, 1.0]], np.float32)
-    found = Told(tokenizer, probabilities, centres).detect(RGB, ["cat"], BoxConfig(nms_iou=0.6))
-    np.testing.assert_array_equal(found.boxes, [[-15, 0, 15, 40], [-45, 0, 15, 40]])
-
-
 def test_tags_that_one_text_cannot_hold_are_asked_for_in_a_second(tokenizer: Any) -> None:
     told = Told(tokenizer, PROBABILITIES, CENTRES, longest_text=7)
     told.detect(RGB, ["cat", "coffee table", "sofa", "lamp", "book"], BoxConfig())
     assert told.texts == ["cat. coffee table.", "sofa. lamp.", "book."]
-
-
-def test_without_tags_nothing_is_asked(tokenizer: Any) -> None:
-    told = Told(tokenizer, PROBABILITIES, CENTRES)
-    found = told.detect(RGB, ["", " . "], BoxConfig())
-    assert told.texts == [] and found.names == () and found.boxes.shape == (0, 4)
-
-
-def test_presets_hold_the_published_values() -> None:
-    paper = BoxConfig()
-    assert (paper.box_threshold, paper.text_threshold, paper.nms_iou, paper.names) == (0.25, 0.25, 0.4, "phrase")
-    other = CONCEPTGRAPHS_BOXES
-    assert (other.box_threshold, other.text_threshold, other.nms_iou, other.names) == (0.2, 0.2, 0.5, "first-word")
-
-
-def test_a_tokenizer_is_read_from_its_words(tokenizer: Any, tmp_path: Path) -> None:
-    assert tokenizer("cat. sofas.")["input_ids"] == [101, 200, 1012, 206, 208, 1012, 102]

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from tiny_models import noise_images
 
-from su3d_bench.core.errors import DataError, ModelMissing
+from su3d_bench.core.errors import ModelMissing
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.perception.models.config import ModelsConfig
-from su3d_bench.perception.models.encoders.image_transform import ImageTransform
+from su3d_bench.perception.models.encoders.images import ImageTransform
 from su3d_bench.perception.models.loading import load_encoder
 
 pytestmark = pytest.mark.skipif(
@@ -108,38 +108,13 @@ def test_features_are_those_of_the_weights_in_the_file(tmp_path: Path, made: lis
         texts = torch.nn.functional.normalize(model.encode_text(_tokens(["a chair", "b"])), dim=1).numpy()
     assert np.allclose(encoder.encode_images(noise_images(3)), images, atol=1e-6)
     assert np.allclose(encoder.encode_texts(["a chair", "b"]), texts, atol=1e-6)
-    assert (made, encoder.dim, encoder.name) == (["ViT-H-14"], DIM, "ViT-H-14/laion2b_s32b_b79k (stand-in)")
+    assert (made, encoder.dim, encoder.name) == (["ViT-H-14"], DIM, "ViT-H-14/laion2b_s32b_b79k")
 
 
 def test_openais_weights_are_run_with_the_activation_they_were_trained_with(tmp_path: Path, made: list[str]) -> None:
     _write(tmp_path, "clip-vit-l-14-336")
     _encoder(tmp_path, "clip-vit-l-14-336").encode_texts(["chair"])
     assert made == ["ViT-L-14-336-quickgelu"]
-
-
-def test_a_checkpoint_of_another_architecture_is_refused(tmp_path: Path, made: list[str]) -> None:
-    import torch
-    from safetensors.torch import save_file
-
-    _write(tmp_path, "clip-vit-h-14")
-    weights = tmp_path / "clip-vit-h-14" / "open_clip_model.safetensors"
-
-    save_file({"visual.weight": torch.zeros(DIM, 3)}, weights)
-    with pytest.raises(DataError, match=r"open_clip_model\.safetensors: is no ViT-H-14"):
-        _encoder(tmp_path).encode_texts(["chair"])
-
-
-def test_an_open_clip_too_old_for_an_architecture_is_one_line(tmp_path: Path, made: list[str]) -> None:
-    _write(tmp_path, "clip-vit-b-32")
-    with pytest.raises(DataError, match="open_clip 0 knows no 'ViT-B-32-quickgelu'; install a newer one"):
-        _encoder(tmp_path, "clip-vit-b-32")
-
-
-def test_the_runtime_moves_the_digest_and_the_seed_of_the_weights_too(tmp_path: Path, made: list[str]) -> None:
-    _write(tmp_path / "a", "clip-vit-h-14", seed=0)
-    _write(tmp_path / "b", "clip-vit-h-14", seed=1)
-    assert _encoder(tmp_path / "a").digest != _encoder(tmp_path / "b").digest
-    assert _encoder(tmp_path / "a").digest != _encoder(tmp_path / "a", transform="transformers").digest
 
 
 def test_without_open_clip_one_line_names_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,29 +9,27 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_models import blocks, needs_models
+from tiny_models import N_TOKENS, blocks, needs_models, write_clip_tokenizer
 
 from su3d_bench.core.types import BoolArray
 from su3d_bench.perception.crops import mask_boxes
-from su3d_bench.perception.models.encoders.model_images import (
+from su3d_bench.perception.models.encoders.images import (
     normalised_bytes,
     resized,
     size_with_longest_side,
     size_with_shortest_side,
 )
-from su3d_bench.perception.models.encoders.plain_text import plain_text, without_marks
+from su3d_bench.perception.models.encoders.texts import plain_text, without_marks
 from su3d_bench.perception.models.masks.automatic_masks import (
     AutomaticMaskConfig,
     AutomaticMasks,
     point_grid,
     to_last_pixel,
 )
-from su3d_bench.perception.models.masks.box_suppression import suppress
 from su3d_bench.perception.models.masks.grounded_sam import GROUNDED_MASKS, GroundedConfig
-from su3d_bench.perception.models.masks.grounding_dino import tag_of, tag_of_first_word
+from su3d_bench.perception.models.masks.grounding_dino import suppress, tag_of, tag_of_first_word
 from su3d_bench.perception.models.masks.sam import Prompts, Sam, as_shares_of_float32
 from su3d_bench.perception.models.masks.tagging import RAM_PX, ram_pixels
-from su3d_bench.perception.models.stand_ins.encoders import N_TOKENS, write_clip_tokenizer
 
 CASES: dict[str, Any] = json.loads((Path(__file__).parents[2] / "cases/front_end.json").read_text())
 
@@ -82,7 +80,7 @@ def test_texts_in_a_broken_encoding_stay_broken() -> None:
 
 @needs_models
 def test_the_mark_of_a_texts_end_does_not_end_a_text(tmp_path: Path) -> None:
-    from su3d_bench.perception.models.encoders.text_tokens import read_tokeniser
+    from su3d_bench.perception.models.encoders.texts import read_tokeniser
 
     write_clip_tokenizer(tmp_path)
     words = json.loads((tmp_path / "vocab.json").read_text())

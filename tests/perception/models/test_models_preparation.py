@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_models import needs_models, noise_images
+from tiny_models import CLIP_PX, N_TOKENS, needs_models, noise_images, write_clip_tokenizer
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.perception.models.encoders.image_transform import CLIP_MEAN, CLIP_STD, ImageTransform, read_transform
-from su3d_bench.perception.models.encoders.text_tokens import canonical_text
-from su3d_bench.perception.models.stand_ins.encoders import IMAGE_SIZE, N_TOKENS, write_clip_tokenizer
+from su3d_bench.perception.models.encoders.images import ImageTransform, read_transform
+from su3d_bench.perception.models.encoders.texts import canonical_text
 
 
 def test_the_window_of_the_centre_crop_is_rounded_as_each_library_does() -> None:
@@ -27,29 +26,13 @@ def test_the_window_of_the_centre_crop_is_rounded_as_each_library_does() -> None
     assert np.array_equal(np.rint(other[0, 0, 0] * 255), [10, 20, 30, 40])
 
 
-def test_pixels_are_divided_by_255_then_normalised_in_float32() -> None:
-    image = np.full((4, 4, 3), 200, np.uint8)
-    expected = (np.float32(200) / np.float32(255) - np.float32(CLIP_MEAN[1])) / np.float32(CLIP_STD[1])
-    pixels = ImageTransform(4).pixels([image])
-    assert pixels.dtype == np.float32
-    assert (pixels[0, 1] == expected).all()
-
-
-def test_squash_stretches_both_sides_and_crops_nothing() -> None:
-    image = np.zeros((8, 32, 3), np.uint8)
-    image[:, :16] = 255
-    pixels = ImageTransform(8, "squash", (0.5,) * 3, (0.5,) * 3).pixels([image])
-    assert (pixels[0, 0, :, :3] == 1).all()
-    assert (pixels[0, 0, :, 5:] == -1).all()
-
-
 @needs_models
 def test_clip_images_are_prepared_as_transformers_prepares_them_to_the_bit() -> None:
     from transformers.models.clip.image_processing_pil_clip import CLIPImageProcessorPil
 
-    side = {"height": IMAGE_SIZE, "width": IMAGE_SIZE}
-    theirs = CLIPImageProcessorPil(size={"shortest_edge": IMAGE_SIZE}, crop_size=side)
-    ours = ImageTransform(IMAGE_SIZE, convention="transformers")
+    side = {"height": CLIP_PX, "width": CLIP_PX}
+    theirs = CLIPImageProcessorPil(size={"shortest_edge": CLIP_PX}, crop_size=side)
+    ours = ImageTransform(CLIP_PX, convention="transformers")
     random = np.random.default_rng(5)
     for _ in range(40):
         image = random.integers(0, 256, (*random.integers(1, 90, 2), 3), dtype=np.uint8)
@@ -61,23 +44,11 @@ def test_clip_images_are_prepared_as_transformers_prepares_them_to_the_bit() -> 
 def test_siglip_images_are_prepared_as_transformers_prepares_them_to_the_bit() -> None:
     from transformers.models.siglip.image_processing_pil_siglip import SiglipImageProcessorPil
 
-    theirs = SiglipImageProcessorPil(size={"height": IMAGE_SIZE, "width": IMAGE_SIZE})
-    ours = ImageTransform(IMAGE_SIZE, "squash", (0.5,) * 3, (0.5,) * 3, convention="transformers")
+    theirs = SiglipImageProcessorPil(size={"height": CLIP_PX, "width": CLIP_PX})
+    ours = ImageTransform(CLIP_PX, "squash", (0.5,) * 3, (0.5,) * 3, convention="transformers")
     for image in noise_images(5):
         answer = theirs(images=[image], return_tensors="np", input_data_format="channels_last")["pixel_values"]
         assert np.array_equal(ours.pixels([image]), answer), image.shape
-
-
-def test_dividing_by_255_and_multiplying_by_its_inverse_give_the_same_float32() -> None:
-    values = np.arange(256, dtype=np.uint8)
-    multiplied = (values.astype(np.float64) * (1 / 255)).astype(np.float32)
-    assert np.array_equal(values.astype(np.float32) / np.float32(255), multiplied)
-
-
-def test_the_two_conventions_agree_where_the_windows_do() -> None:
-    images = [image for image in noise_images(5) if image.shape[0] == image.shape[1]]
-    other = ImageTransform(IMAGE_SIZE, convention="transformers")
-    assert np.array_equal(ImageTransform(IMAGE_SIZE).pixels(images), other.pixels(images))
 
 
 def test_a_processor_file_of_either_age_gives_the_transform(tmp_path: Path) -> None:
@@ -99,14 +70,10 @@ def test_a_processor_file_of_either_age_gives_the_transform(tmp_path: Path) -> N
         ({"do_normalize": False}, "do_normalize is False"),
         ({"rescale_factor": 1}, "rescale_factor is 1"),
         ({"size": {"longest_edge": 9}}, "expected a shortest edge"),
-        ({"crop_size": 100}, "expected a shortest edge"),
-        ({"size": 10**9, "crop_size": 10**9}, "expected a shortest edge"),
-        ({"image_std": [0, 1, 1]}, "above 0"),
-        ({"image_mean": ["a", 1, 1]}, "expected three numbers"),
-        ({"image_mean": [10**400, 1, 1]}, "expected three numbers"),
-        ({"image_std": [1, float("nan"), 1]}, "expected three numbers"),
-        ({"rescale_factor": 10**400}, "rescale_factor is 1000"),
-        ({"resample": "cubic"}, "0 to 5"),
+        ({"image_std": [0, 1, 1]}, r"std\.0 is 0"),
+        ({"image_mean": [10**400, 1, 1]}, r"mean\.0 is "),
+        ({"image_std": [1, float("nan"), 1]}, r"std\.1 is nan"),
+        ({"resample": "cubic"}, "resample is cubic"),
     ],
 )
 def test_a_processor_file_that_asks_for_another_recipe_is_refused(
@@ -128,7 +95,7 @@ def test_siglip_texts_lose_capitals_and_punctuation() -> None:
 
 @needs_models
 def test_long_texts_are_cut_and_keep_their_end(tmp_path: Path) -> None:
-    from su3d_bench.perception.models.encoders.text_tokens import read_tokeniser
+    from su3d_bench.perception.models.encoders.texts import read_tokeniser
 
     write_clip_tokenizer(tmp_path)
     words = json.loads((tmp_path / "vocab.json").read_text())
@@ -142,7 +109,7 @@ def test_long_texts_are_cut_and_keep_their_end(tmp_path: Path) -> None:
 
 @needs_models
 def test_a_tokenizer_of_another_model_is_refused(tmp_path: Path) -> None:
-    from su3d_bench.perception.models.encoders.text_tokens import read_tokeniser
+    from su3d_bench.perception.models.encoders.texts import read_tokeniser
 
     write_clip_tokenizer(tmp_path)
     with pytest.raises(DataError, match="the text tower knows 20 words"):

@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from tiny_models import blocks, frame_of
+from perception_fakes import CountingEncoder
+from tiny_models import SAM_PX, blocks, frame_of, tiny_sam
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float32Array, UInt8Array
-from su3d_bench.perception.models.catalogue import model_entry
-from su3d_bench.perception.models.files import ModelFiles
-from su3d_bench.perception.models.masks import sam_onnx
 from su3d_bench.perception.models.masks.grounded_sam import Networks, SamRegions
-from su3d_bench.perception.models.masks.sam import Prompts, Sam, TorchSam
+from su3d_bench.perception.models.masks.sam import Prompts, Sam, TorchSam, fill_sam, sam_names
 from su3d_bench.perception.models.masks.tagging import WordTagger
-from su3d_bench.perception.models.pretrained import fill_sam, sam_config, sam_names
-from su3d_bench.perception.models.stand_ins.segmenter import IMAGE_PX, tiny_sam
 
 RGB = blocks(40, 60)
 BOXES = np.array([[5, 5, 30, 30], [0, 0, 60, 40], [22.5, 3.25, 41, 39]], np.float32)
@@ -33,8 +28,8 @@ def sam() -> Sam:
 def processor() -> Any:
     from transformers.models.sam.image_processing_pil_sam import SamImageProcessorPil
 
-    side = {"height": IMAGE_PX, "width": IMAGE_PX}
-    return SamImageProcessorPil(size={"longest_edge": IMAGE_PX}, pad_size=side)
+    side = {"height": SAM_PX, "width": SAM_PX}
+    return SamImageProcessorPil(size={"longest_edge": SAM_PX}, pad_size=side)
 
 
 @pytest.mark.parametrize("size", [(40, 60), (61, 37), (64, 64), (200, 130)])
@@ -42,7 +37,7 @@ def test_the_image_goes_in_as_transformers_prepares_it(size: tuple[int, int]) ->
     seen: list[Float32Array] = []
 
     class Looking:
-        image_px = IMAGE_PX
+        image_px = SAM_PX
 
         def embed(self, pixels: Float32Array) -> Any:
             seen.append(pixels)
@@ -66,7 +61,7 @@ def transformers_masks(multiple: bool, **prompt: Any) -> tuple[BoolArray, Float3
     images = processor()
     inputs = images(RGB, return_tensors="pt")
     asked = {
-        name: torch.from_numpy(_normalize_coordinates(IMAGE_PX, values, (40, 60), name == "input_boxes")).float()[None]
+        name: torch.from_numpy(_normalize_coordinates(SAM_PX, values, (40, 60), name == "input_boxes")).float()[None]
         for name, values in prompt.items()
     }
     with torch.inference_mode():
@@ -98,69 +93,6 @@ def test_single_masks_of_boxes_and_of_points_are_those_of_transformers(sam: Sam)
     assert (mask != theirs[0, 0]).mean() < 1e-3
 
 
-def test_the_same_batch_gives_the_same_bytes_and_another_batch_nearly_the_same_logits(sam: Sam) -> None:
-    image = sam.look(RGB)
-    random = np.random.default_rng(0)
-    points = random.uniform(0, 40, (12, 1, 2)).astype(np.float32)
-    labels = np.ones((12, 1), np.int64)
-    whole, scores = sam.decode(image, Prompts(points, labels), is_single=False)
-    again, _ = sam.decode(image, Prompts(points, labels), is_single=False)
-    assert whole.numpy().tobytes() == again.numpy().tobytes()
-    for k in range(12):
-        one, score = sam.decode(image, Prompts(points[k : k + 1], labels[:1]), is_single=False)
-        np.testing.assert_allclose(one[0].numpy(), whole[k].numpy(), atol=1e-3)
-        np.testing.assert_allclose(score[0].numpy(), scores[k].numpy(), atol=1e-3)
-    masks = [Sam(sam.network, batch).from_boxes(image, BOXES, is_single=False)[0] for batch in (1, 2, 64)]
-    assert (masks[0] != masks[2]).mean() < 1e-3
-    assert (masks[1] != masks[2]).mean() < 1e-3
-
-
-def test_prompts_are_halved_where_the_memory_runs_out_and_stay_so(sam: Sam) -> None:
-    import torch
-
-    asked = []
-
-    class Short:
-        """SAM on a device that holds two prompts."""
-
-        image_px = IMAGE_PX
-
-        def embed(self, pixels: Float32Array) -> Any:
-            return sam.network.embed(pixels)
-
-        def decode(self, embedding: Any, prompts: Prompts, is_single: bool) -> tuple[Any, Any]:
-            asked.append(len(prompts))
-            if len(prompts) > 2:
-                raise torch.OutOfMemoryError("CUDA out of memory")
-            return sam.network.decode(embedding, prompts, is_single)
-
-    short, boxes = Sam(Short()), np.concatenate([BOXES, BOXES[:2]])
-    masks, scores = short.from_boxes(short.look(RGB), boxes, is_single=False)
-    theirs, predicted = Sam(sam.network, 2).from_boxes(sam.look(RGB), boxes, is_single=False)
-    assert masks.tobytes() == theirs.tobytes() and scores.tobytes() == predicted.tobytes()
-    short.from_boxes(short.look(RGB), boxes, is_single=False)
-    assert asked == [5, 2, 2, 1, 2, 2, 1]
-
-
-def test_masks_of_no_boxes_are_none(sam: Sam) -> None:
-    masks, scores = sam.from_boxes(sam.look(RGB), np.zeros((0, 4), np.float32), is_single=False)
-    assert masks.shape == (0, 40, 60)
-    assert scores.shape == (0,)
-
-
-class OneColour:
-    """An encoder of two numbers."""
-
-    name = digest = "one colour"
-    dim = 2
-
-    def encode_images(self, images: Any) -> Float32Array:
-        return np.tile(np.array([0.6, 0.8], np.float32), (len(images), 1))
-
-    def encode_texts(self, texts: Any) -> Float32Array:
-        return np.tile(np.array([0.6, 0.8], np.float32), (len(texts), 1))
-
-
 def test_regions_on_demand_look_at_each_frame_once() -> None:
     looks: list[UInt8Array] = []
 
@@ -170,7 +102,7 @@ def test_regions_on_demand_look_at_each_frame_once() -> None:
             return super().look(rgb)
 
     counting = Counting(TorchSam(tiny_sam()))
-    encoder = OneColour()
+    encoder = CountingEncoder()
     networks = Networks(WordTagger(encoder, ("cat",), 1), lambda: None, lambda: counting, "tiny")  # type: ignore[arg-type, return-value]
     regions = SamRegions(networks, encoder)
     first, second = frame_of(RGB), frame_of(blocks(40, 60, seed=1), index=1)
@@ -181,46 +113,7 @@ def test_regions_on_demand_look_at_each_frame_once() -> None:
     assert (masks[0][0] != masks[2][0]).any()
     empty, score = regions.mask_at(first, np.zeros((0, 2), np.int64))
     assert not empty.any() and empty.shape == (40, 60) and score == 0
-    np.testing.assert_allclose(regions.encode_regions(first, masks[0][0], np.array([[0, 0, 9, 9]])), [[0.6, 0.8]])
-
-
-@pytest.fixture(scope="module")
-def exported(tmp_path_factory: pytest.TempPathFactory) -> ModelFiles:
-    entry = model_entry("sam-vit-h", "segmenter")
-    folder = tmp_path_factory.mktemp("sam-vit-h-onnx")
-    source = tmp_path_factory.mktemp("sam-vit-h")
-    tiny_sam().save_pretrained(source)
-    files = ModelFiles(entry, entry.form("transformers"), source, source / "model.safetensors")
-    manifest = sam_onnx.export_sam(files, folder)
-    assert [one.output for one in manifest.parity] == ["embedding", "logits", "iou"]
-    assert max(one.max_abs_difference for one in manifest.parity) < 1e-3
-    return ModelFiles(entry, entry.form("onnx"), folder, folder / "manifest.json")
-
-
-def test_the_exported_network_gives_the_masks_of_torch(sam: Sam, exported: ModelFiles) -> None:
-    other = Sam(sam_onnx.load_onnx_sam(exported))
-    assert other.network.image_px == IMAGE_PX
-    mine, theirs = sam.look(RGB), other.look(RGB)
-    for is_single in (False, True):
-        a, scores = sam.from_boxes(mine, BOXES, is_single)
-        b, other_scores = other.from_boxes(theirs, BOXES, is_single)
-        np.testing.assert_allclose(scores, other_scores, atol=1e-3)
-        assert (a != b).mean() < 2e-3
-    points = np.array([[[10, 12]], [[33, 20]]], np.float32)
-    prompts = Prompts(points, np.array([[1], [0]]))
-    logits, predicted = sam.decode(mine, prompts, is_single=False)
-    other_logits, other_predicted = other.decode(theirs, prompts, is_single=False)
-    np.testing.assert_allclose(logits.numpy(), other_logits.numpy(), atol=1e-3)
-    np.testing.assert_allclose(predicted.numpy(), other_predicted.numpy(), atol=1e-3)
-
-
-def test_an_exported_file_that_was_changed_is_refused(exported: ModelFiles, tmp_path: Path) -> None:
-    for path in exported.folder.iterdir():
-        (tmp_path / path.name).write_bytes(path.read_bytes())
-    (tmp_path / "decoder.onnx").write_bytes(b"not what was written")
-    changed = ModelFiles(exported.entry, exported.form, tmp_path, tmp_path / "manifest.json")
-    with pytest.raises(DataError, match=r"decoder\.onnx: is not the file that the manifest describes"):
-        sam_onnx.load_onnx_sam(changed)
+    assert regions.encode_regions(first, masks[0][0], np.array([[0, 0, 9, 9]])).shape == (1, 8)
 
 
 ORIGINAL_NAMES = {
@@ -274,10 +167,3 @@ def test_a_checkpoint_fills_every_weight_or_is_refused() -> None:
     state.pop("mask_decoder.iou_token.weight")
     with pytest.raises(DataError, match=r"sam\.pth: is no checkpoint of this SAM: .*iou_token"):
         fill_sam(SamModel(tiny_sam().config), state, "sam.pth")
-
-
-def test_the_published_sizes_are_the_originals() -> None:
-    tower = sam_config("sam-vit-h").vision_config
-    assert (tower.hidden_size, tower.num_hidden_layers, tower.num_attention_heads) == (1280, 32, 16)
-    assert (tower.image_size, tower.window_size, tower.mlp_dim) == (1024, 14, 5120)
-    assert list(tower.global_attn_indexes) == [7, 15, 23, 31]

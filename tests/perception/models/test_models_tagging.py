@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from tiny_models import blocks
 
-from su3d_bench.core.errors import DataError, ModelMissing
+from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.perception.embedded.naming import vocabulary
 from su3d_bench.perception.models.catalogue import model_entry
@@ -27,7 +27,6 @@ from su3d_bench.perception.models.masks.tagging import (
     WordTagger,
     chosen_tags,
     load_ram,
-    ram_pixels,
     read_word_list,
 )
 
@@ -57,11 +56,6 @@ def test_the_likeliest_words_are_those_that_some_part_of_the_image_shows() -> No
     assert tagger.tags(image) == ("blue", "red")
     assert WordTagger(ByColour(), ("green", "blue", "red"), n_tags=9).tags(image) == ("blue", "red", "green")
     assert tagger.caveat is not None and "RAM++ is not here" in tagger.caveat
-
-
-def test_words_in_another_order_or_number_are_another_tagger() -> None:
-    digests = {WordTagger(ByColour(), words, n).digest for words in (("a", "b"), ("b", "a")) for n in (1, 2)}
-    assert len(digests) == 4
 
 
 def test_tags_that_contain_a_stop_word_go_and_added_ones_come_last() -> None:
@@ -124,14 +118,6 @@ def test_an_exported_tagger_names_what_its_list_holds() -> None:
         OnnxRamTagger(lambda: session, ("bed", "lamp", "room"), "digest").tags(RGB)
 
 
-def test_images_are_squeezed_to_a_square_for_ram() -> None:
-    pixels = ram_pixels(np.full((10, 30, 3), 255, np.uint8))
-    assert pixels.shape == (3, RAM_PX, RAM_PX)
-    np.testing.assert_allclose(
-        pixels[:, 5, 5], [(1 - 0.485) / 0.229, (1 - 0.456) / 0.224, (1 - 0.406) / 0.225], rtol=1e-5
-    )
-
-
 @pytest.fixture
 def ram_package(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     """A package ``ram`` with the published interface and a network of one layer; what it is asked for."""
@@ -189,20 +175,3 @@ def test_the_published_package_gets_its_weights_as_plain_tensors(
     tensors["vision_multi.bias"] = torch.tensor([-1.0, -1.0])
     silent = ram_files(tmp_path, tensors)
     assert RamTagger(lambda: load_ram(silent, "cpu"), "cpu", "digest").tags(RGB) == ()
-
-
-def test_weights_that_lack_a_part_of_ram_are_refused(ram_package: list[dict[str, Any]], tmp_path: Path) -> None:
-    import torch
-
-    files = ram_files(tmp_path, {"vision_multi.weight": torch.zeros(2, 3)})
-    with pytest.raises(DataError, match=r"lacks 1 tensors, such as tagging_head\.bias; run: su3d-bench fetch"):
-        load_ram(files, "cpu")
-
-
-def test_without_the_package_ram_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "ram", None)
-    files = ram_files(tmp_path, {})
-    with pytest.raises(
-        ModelMissing, match=r"its package is not installed; run .* or set perception\.paper\.tagger to words"
-    ):
-        load_ram(files, "cpu")

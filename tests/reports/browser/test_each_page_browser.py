@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from chromium import Chromium, find_chromium
+from chromium import find_chromium
 from looks import CHECKS, complaints, unfold
 from made_pages import PAGES, WRITERS, browser_for_pages
 from places import ROOT
@@ -14,25 +13,18 @@ from places import ROOT
 needs_browser = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
 
 
-@pytest.fixture(scope="module", params=PAGES)
-def opened(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Chromium, Path]]:
-    """The page, made once, in a browser of its own."""
-    page = PAGES[request.param](tmp_path_factory.mktemp("page"))
-    folder = tmp_path_factory.mktemp("profile")
-    with browser_for_pages(folder) as browser:
-        browser.downloads_to(folder)
-        yield browser, page
-
-
 @needs_browser
-@pytest.mark.parametrize("check", CHECKS)
-def test_each_page(opened: tuple[Chromium, Path], check: str) -> None:
-    browser, page = opened
-    browser.open(page)
-    unfold(browser)
-    found = CHECKS[check](browser)
-    assert not found, f"{page.name} {check}: not so\n" + "\n".join(found)
-    assert complaints(browser) == [], "no request leaves a page, and nothing is complained of"
+@pytest.mark.parametrize("name", PAGES)
+def test_each_page(name: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    page = PAGES[name](tmp_path_factory.mktemp("page"))
+    with browser_for_pages(tmp_path) as browser:
+        browser.downloads_to(tmp_path)
+        for check, find in CHECKS.items():
+            browser.open(page)
+            unfold(browser)
+            found = find(browser)
+            assert not found, f"{page.name} {check}: not so\n" + "\n".join(found)
+        assert complaints(browser) == [], "no request leaves a page, and nothing is complained of"
 
 
 def test_the_list_of_pages_is_whole() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -61,51 +60,6 @@ def test_a_filter_leaves_the_rows_that_hold_its_text(browser: Chromium) -> None:
     assert column(browser, "classes", 0) == everything
 
 
-def test_one_choice_of_protocol_and_its_metric_change_all_tables(browser: Chromium) -> None:
-    assert options(browser, "scenes", "Protocol") == ["rooms-semantic", "rooms-instance"]
-    choose(browser, "scenes", "Protocol", "rooms-instance")
-    assert options(browser, "scenes", "Metric")[:3] == ["AP", "AP50", "AP25"]
-    assert options(browser, "classes", "Column")[:3] == ["AP", "AP50", "AP25"]
-    assert "missed" in text_of(browser, "#errors tbody")
-    before = text_of(browser, "#scenes caption")
-    choose(browser, "scenes", "Metric", "AP25")
-    assert text_of(browser, "#scenes caption") != before
-    choose(browser, "errors", "Metric", "AP50")
-    assert "AP50" in text_of(browser, "#errors caption")
-    choose(browser, "scenes", "Protocol", "rooms-semantic")
-    assert "geometry" in text_of(browser, "#errors tbody")
-
-
-def test_errors_are_told_of_each_method_of_each_run(browser: Chromium) -> None:
-    heads = browser.run("[...document.querySelectorAll('#errors thead th')].map((one) => one.innerText)")
-    assert heads[1:] == options(browser, "confusion", "Method")
-    assert "undefined" not in "".join(heads)
-
-
-def test_the_confusion_is_of_the_chosen_method(browser: Chromium) -> None:
-    methods = options(browser, "confusion", "Method")
-    assert len(methods) == 3
-    choose(browser, "confusion", "Method", methods[1])
-    noisy = text_of(browser, "#confusion table")
-    choose(browser, "confusion", "Method", methods[0])
-    assert text_of(browser, "#confusion table") != noisy
-    assert text_of(browser, "#confusion .confusion .same") == "100"
-
-
-def test_the_timing_plot_follows_its_three_choices(browser: Chromium) -> None:
-    plot = "document.querySelector('#timing .wide svg')"
-    line = f"{plot}.querySelector('path').getAttribute('d') + {plot}.textContent"
-    seen = [browser.run(line)]
-    for label, text in (("Time of", "the whole update"), ("Against", "points of the map"), ("Scene", "painted/b")):
-        choose(browser, "timing", label, text)
-        seen.append(browser.run(line))
-    assert len(set(seen)) == 4
-    choose(browser, "timing", "Stages of", options(browser, "timing", "Stages of")[1])
-    assert "total" in text_of(browser, "#timing")
-    choose(browser, "timing", "Metric", "F-mIoU")
-    assert "F-mIoU in per cent" in text_of(browser, "#timing")
-
-
 def test_swapping_the_sides_turns_the_sign(browser: Chromium) -> None:
     sides = options(browser, "compare", "A")
     choose(browser, "compare", "A", next(one for one in sides if "noise" not in one and "one" in one))
@@ -118,33 +72,6 @@ def test_swapping_the_sides_turns_the_sign(browser: Chromium) -> None:
     choose(browser, "compare", "A", sides[0])
     choose(browser, "compare", "B", sides[0])
     assert "Choose two different sides" in text_of(browser, "#compare [role=status]")
-
-
-def test_settings_unfold_and_filter(browser: Chromium) -> None:
-    browser.run("document.querySelectorAll('#provenance details').forEach((one) => { one.open = true; })")
-    assert "rooms-semantic" in text_of(browser, "#provenance details")
-    assert "painted/a" in text_of(browser, "#provenance details")
-
-
-def test_a_table_says_that_its_best_is_bold_where_something_is(browser: Chromium) -> None:
-    tables = "[...document.querySelectorAll('#summary table, #scenes table, #classes table')]"
-    said = browser.run(f"{tables}.map((one) => one.caption.innerText.includes('bold'))")
-    assert said == browser.run(f"{tables}.map((one) => !!one.querySelector('td.best'))")
-    assert True in said
-    assert "bold" not in browser.run(
-        "[...document.querySelectorAll('#summary > p.intro')].map((p) => p.innerText).join()"
-    )
-
-
-def test_all_classes_of_a_confusion_can_be_seen(browser: Chromium) -> None:
-    assert options(browser, "confusion", "Classes") == ["the 18 largest", "all"]
-    choose(browser, "confusion", "Classes", "all")
-    assert "all " in text_of(browser, "#confusion caption")
-
-
-def test_rows_on_other_scenes_have_no_best_and_those_of_one_scene_do(browser: Chromium) -> None:
-    assert browser.run("document.querySelectorAll('#summary td.best').length") == 0
-    assert browser.run("document.querySelectorAll('#scenes td.best').length") > 0
 
 
 def test_every_control_has_a_name_and_the_page_no_sideways_scroll_on_a_phone(
@@ -164,40 +91,6 @@ def test_every_control_has_a_name_and_the_page_no_sideways_scroll_on_a_phone(
 
 
 # Every control of the page, by its section, kind and name; column headers and rows of tables apart.
-CONTROLS = {
-    *(("nav", "a", name) for name in (*MIDDLE_SECTIONS, GALLERY, "Summary", "Maps", "Provenance")),
-    ("skip", "a", "Skip to the numbers"),
-    *(("maps", "select", name) for name in ("Scene", "Map", "Beside", "Colour by", "Text")),
-    *(("maps", "button", name) for name in ("Zoom in", "Zoom out", "Whole map")),
-    *(("maps", "input", name) for name in ("Cut above", "Grown to", "Missed objects", "Near walls fade")),
-    ("maps", "input", "Filter instances"),
-    ("maps", "canvas", "3D view of the map"),  # the one beside, before there is any
-    ("maps", "canvas", "3D view"),
-    ("scenes", "select", "Protocol"),
-    ("scenes", "select", "Metric"),
-    ("scenes", "input", "Filter scenes"),
-    ("classes", "select", "Protocol"),
-    ("classes", "select", "Column"),
-    ("classes", "input", "Filter classes"),
-    ("confusion", "select", "Protocol"),
-    ("confusion", "select", "Method"),
-    ("confusion", "select", "Classes"),
-    ("confusion", "input", "Filter classes"),
-    ("errors", "select", "Protocol"),
-    ("errors", "select", "Metric"),
-    *(("gallery", "select", name) for name in ("Protocol", "Metric", "Method", "Scene", "Kind", "Called")),
-    ("gallery", "select", "Class, true or called"),
-    *(("gallery", "button", name) for name in ("Back", "Show all", "Show more")),
-    *(("timing", "select", name) for name in ("Scene", "Time of", "Against", "Stages of", "Protocol", "Metric")),
-    ("compare", "select", "A"),
-    ("compare", "select", "B"),
-    ("compare", "button", "Swap"),
-    ("summary", "summary", "3 more remarks"),
-    ("summary", "summary", "What the columns mean"),
-    ("provenance", "summary", "Rules and data"),
-    ("provenance", "summary", "Settings"),
-    ("provenance", "input", "Filter settings"),
-}
 # Operates the k-th control of a kind in a section, and says whether it could: a choice of one cannot be changed.
 OPERATE = """(part, kind, k) => {
   const one = document.querySelectorAll(`${part} ${kind}`)[k];
@@ -211,22 +104,6 @@ OPERATE = """(part, kind, k) => {
   } else one.click();
   return true;
 }"""
-
-
-def names_of_controls(browser: Chromium) -> set[tuple[str, str, str]]:
-    found = browser.run(
-        "[...document.querySelectorAll('a[href], button, select, input, textarea, summary, canvas')]"
-        ".filter((one) => !one.matches('button.sort, button.to-gallery, a.to-map'))"
-        ".map((one) => [one.closest('section')?.id || one.closest('nav')?.id || one.className, one.localName,"
-        " (one.labels?.[0]?.textContent || one.getAttribute('aria-label')"
-        " || one.textContent).trim()])"
-    )
-    return {(part, kind, re.sub(r" \(\d+\)$| of .* by .*", "", name)) for part, kind, name in found}
-
-
-def test_the_list_of_controls_is_whole(browser: Chromium) -> None:
-    open_maps(browser)
-    assert names_of_controls(browser) == CONTROLS
 
 
 @pytest.mark.parametrize("part", ["summary", *(name.lower() for name in MIDDLE_SECTIONS), "provenance", "maps"])
@@ -255,24 +132,3 @@ def test_each_control_of_a_section_changes_what_it_shows(browser: Chromium, part
             else:
                 browser.until(f"{shown} !== {json.dumps(before)}")
     assert n_operated > 0
-
-
-def test_each_link_leads_to_its_section(browser: Chromium) -> None:
-    for link in ("#nav a", "a.skip"):
-        for k in range(browser.run(f"document.querySelectorAll('{link}').length")):
-            target = browser.run(f"document.querySelectorAll('{link}')[{k}].hash")
-            browser.run(f"document.querySelectorAll('{link}')[{k}].click()")
-            browser.until(f"location.hash === {json.dumps(target)}")
-            place = f"document.querySelector({json.dumps(target)}).getBoundingClientRect()"
-            assert browser.run(f"{place}.top < innerHeight && {place}.bottom > 0"), target
-
-
-def test_the_maps_do_not_take_the_address_back_from_where_somebody_went(browser: Chromium) -> None:
-    open_maps(browser)
-    browser.run("history.replaceState(null, '', location.pathname)")
-    choose(browser, "maps", "Colour by", options(browser, "maps", "Colour by")[-1])
-    browser.until("location.hash.startsWith('#maps?')")
-    choose(browser, "maps", "Colour by", options(browser, "maps", "Colour by")[0])
-    browser.run("document.querySelector('#nav a[href=\"#errors\"]').click()")
-    browser.run("new Promise((done) => setTimeout(done, 600))")  # longer than the address waits for a pause
-    assert browser.run("location.hash") == "#errors"

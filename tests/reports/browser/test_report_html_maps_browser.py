@@ -10,7 +10,7 @@ import chromium
 import pytest
 from chromium import Chromium, find_chromium
 from looks import complaints
-from runs_page import SELECT, choose, column, headers, open_maps, options, picture, press, text_of, type_into
+from runs_page import SELECT, choose, column, headers, open_maps, options, picture, press, text_of
 
 pytestmark = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
 
@@ -45,21 +45,6 @@ def test_every_colouring_draws_another_picture_and_says_what_it_means(browser: C
     assert headers(browser, "maps") == ["Instance", "Score", "Points"]
 
 
-def test_keys_turn_move_zoom_and_bring_the_whole_map_back(browser: Chromium) -> None:
-    open_maps(browser)
-    press(browser, "#maps canvas", "Home")
-    whole = picture(browser)
-    seen = [whole]
-    for key in ("ArrowLeft", "ArrowUp", "+", "-", "-"):
-        press(browser, "#maps canvas", key)
-        seen.append(picture(browser))
-    browser.call("Input.dispatchKeyEvent", {"type": "keyDown", "key": "ArrowRight", "modifiers": 8})
-    seen.append(picture(browser))
-    assert len(set(seen)) >= 6  # zooming in and out again gives one picture twice
-    press(browser, "#maps canvas", "Home")
-    assert picture(browser) == whole
-
-
 def pointer(browser: Chromium, kind: str, x: float, y: float, **more: Any) -> None:
     values = {"type": kind, "x": x, "y": y, "button": "left", "buttons": 1, "clickCount": 1, **more}
     browser.call("Input.dispatchMouseEvent", values)
@@ -91,71 +76,6 @@ def test_the_mouse_turns_moves_zooms_and_picks(browser: Chromium) -> None:
     pointer(browser, "mouseReleased", x, y)
     browser.until("document.querySelector('#maps .detail h3') !== null")
     assert browser.run("document.querySelectorAll('#maps tr[aria-selected=true]').length") == 1
-
-
-def test_an_instance_shows_its_name_class_scores_and_view(browser: Chromium) -> None:
-    open_maps(browser)
-    press(browser, "#maps canvas", "Escape", "n")
-    first = text_of(browser, "#maps .detail h3")
-    shown = text_of(browser, "#maps .detail")
-    for what in ("Class (rooms-semantic)", "Truth there", "Score", "Points", "Seen in", "Most like", "Frame"):
-        assert what in shown
-    browser.until("document.querySelector('#maps .detail img').naturalWidth > 0")
-    press(browser, "#maps canvas", "n")
-    assert text_of(browser, "#maps .detail h3") != first
-    press(browser, "#maps canvas", "p")
-    assert text_of(browser, "#maps .detail h3") == first
-    press(browser, "#maps canvas", "Escape")
-    assert browser.run("document.querySelector('#maps .detail h3') === null")
-    press(browser, "#maps .side tbody tr", "Enter")
-    assert text_of(browser, "#maps .detail h3") == column(browser, "maps", 0)[0]
-
-
-def test_fingers_turn_and_zoom(browser: Chromium) -> None:
-    open_maps(browser)
-    press(browser, "#maps canvas", "Home")
-    x, y = middle(browser)
-
-    def touch(kind: str, *places: tuple[float, float]) -> None:
-        points = [{"x": place[0], "y": place[1], "id": k} for k, place in enumerate(places)]
-        browser.call("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
-
-    seen = [picture(browser)]
-    touch("touchStart", (x, y))
-    touch("touchMove", (x + 40, y + 10))
-    touch("touchEnd")
-    seen.append(picture(browser))
-    touch("touchStart", (x - 20, y), (x + 20, y))
-    touch("touchMove", (x - 60, y), (x + 60, y))
-    touch("touchEnd")
-    seen.append(picture(browser))
-    assert len(set(seen)) == 3
-
-
-def test_the_cut_takes_points_away_and_buttons_zoom(browser: Chromium) -> None:
-    open_maps(browser)
-    press(browser, "#maps canvas", "Escape", "Home")
-    seen = [picture(browser)]
-    type_into(browser, "#maps input[type=range]", "30")
-    seen.append(picture(browser))
-    type_into(browser, "#maps input[type=range]", "100")
-    for title in ("Zoom in", "Zoom out", "Zoom out"):
-        browser.run(f"document.querySelector('#maps button[title=\"{title}\"]').click()")
-        seen.append(picture(browser))
-    assert len(set(seen)) >= 4
-
-
-def test_another_map_and_scene_are_read_when_they_are_chosen(browser: Chromium) -> None:
-    open_maps(browser)
-    first = picture(browser)
-    assert len(options(browser, "maps", "Map")) == 3
-    choose(browser, "maps", "Map", next(one for one in options(browser, "maps", "Map") if "noise" in one))
-    label = "document.querySelector('#maps canvas').getAttribute('aria-label')"
-    browser.until(f"{label}.includes('noise')")
-    assert picture(browser) != first
-    choose(browser, "maps", "Scene", "painted/b")
-    browser.until(f"{label}.includes('painted/b') && {label}.includes('noise')")
-    assert len(options(browser, "maps", "Map")) == 2
 
 
 def test_without_webgl_the_page_says_so_and_keeps_its_numbers(

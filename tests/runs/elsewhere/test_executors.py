@@ -12,8 +12,8 @@ import psutil
 import pytest
 
 from su3d_bench.core.errors import StoreError
-from su3d_bench.runs.executors import ray
-from su3d_bench.runs.executors.local import ENDING_S, ONE_THREAD, Event, Report, run_inline, run_processes
+from su3d_bench.runs import clusters
+from su3d_bench.runs.executors import ENDING_S, ONE_THREAD, Event, Report, run_processes
 
 
 def work(unit: str, report: Report) -> str:
@@ -49,20 +49,11 @@ def in_processes(units: list[str], jobs: int = 2) -> list[str]:
     return list(run_processes(work, units, lambda event: None, jobs=jobs, lost=lost))
 
 
-def test_inline_and_processes_give_the_same_outcomes_and_events() -> None:
-    events: list[Event] = []
-    inline = list(run_inline(work, ["a", "b", "c"], events.append))
-    n_inline = len(events)
-    spawned = list(run_processes(work, ["a", "b", "c"], events.append, jobs=2, lost=lost))
-    assert sorted(inline) == sorted(spawned) == ["A", "B", "C"]
-    assert sorted(event.unit for event in events[:n_inline]) == sorted(event.unit for event in events[n_inline:])
-
-
 WATCHED = """
 import signal
 from multiprocessing import util
 from operator import is_not
-from su3d_bench.runs.executors.local import run_processes
+from su3d_bench.runs.executors import run_processes
 
 spawn = util.spawnv_passfds
 
@@ -116,35 +107,10 @@ def test_an_interrupt_ends_workers_that_do_not_hear_of_it_too() -> None:
     assert len(pids) == 1 and not psutil.pid_exists(pids[0])
 
 
-def test_a_bug_in_a_worker_shows_its_traceback() -> None:
-    with pytest.raises(RuntimeError, match=r"(?s)a worker failed:.*KeyError: 'a mistake'"):
-        in_processes(["bug"])
-
-
 def test_workers_hold_libraries_to_one_thread_and_the_parent_keeps_its_own() -> None:
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     assert in_processes(["threads"]) == [" ".join("1" for _ in ONE_THREAD)]
     assert {name: os.environ.get(name) for name in ONE_THREAD} == before
-
-
-def test_each_unit_has_a_process_of_its_own() -> None:
-    pids = in_processes(["pid", "pid", "pid"])
-    assert len({*pids, str(os.getpid())}) == 4
-
-
-def test_inline_holds_loaded_libraries_to_one_thread_and_lets_go() -> None:
-    import cv2
-    import numpy  # noqa: F401 - loads the BLAS that is counted
-    from threadpoolctl import threadpool_info
-
-    def count(unit: str, report: Report) -> list[int]:
-        return [cv2.getNumThreads(), *(pool["num_threads"] for pool in threadpool_info())]
-
-    before = cv2.getNumThreads()
-    (counts,) = run_inline(count, ["a"], lambda event: None)
-    assert set(counts) == {1}
-    assert cv2.getNumThreads() == before
-    assert sys.modules["cv2"] is cv2
 
 
 def test_a_task_of_ray_that_is_asked_to_end_says_so_and_is_no_failure() -> None:
@@ -152,4 +118,4 @@ def test_a_task_of_ray_that_is_asked_to_end_says_so_and_is_no_failure() -> None:
         os.kill(os.getpid(), signal.SIGTERM)
         signal.pause()
 
-    assert ray._on_node(work, "a", {}) == (ray.ENDED, "SIGTERM")
+    assert clusters._on_node(work, "a", {}) == (clusters.ENDED, "SIGTERM")

@@ -78,17 +78,6 @@ def test_a_folder_of_somebody_else_is_refused_and_left_alone(capsys: pytest.Capt
     assert [path.name for path in Path("out").iterdir()] == [".notes.tmp"]
 
 
-def test_a_run_takes_an_empty_folder_and_its_own_and_deletes_nothing_that_is_not_its(tmp_path: Path) -> None:
-    Path("out").mkdir()
-    Path("out/.run.toml.0123456789ab.unfinished").write_text("killed before its first file")
-    assert run(scenes="a") == 0
-    Path("out/.notes.tmp").write_text("theirs")
-    Path("out/scenes/painted.a/collector/.notes.tmp").write_text("theirs")
-    assert run(scenes="a") == 0
-    assert {path.name for path in Path("out").rglob(".*")} == {".notes.tmp"}
-    assert len(list(Path("out").rglob(".notes.tmp"))) == 2
-
-
 @pytest.mark.parametrize(
     ("more", "line"),
     [

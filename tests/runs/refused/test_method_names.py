@@ -10,10 +10,9 @@ from painted import colour_perception
 from places import SCENES
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.config import Settings
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.runs.planning.plan import make_plan, named_method
+from su3d_bench.runs.plan import named_method
 
 PAINTED = f"{SCENES}/painted.py"
 
@@ -34,16 +33,6 @@ def test_values_are_toml_and_lists_may_hold_commas() -> None:
     assert " " not in method.name
 
 
-def test_a_file_may_have_an_at_sign_before_its_class(tmp_path: Path) -> None:
-    folder = tmp_path / "me@home"
-    folder.mkdir()
-    (folder / "mine.py").write_text(
-        "from su3d_bench.baselines.oracle import Oracle\nclass Mine(Oracle):\n    name = 'mine'\n"
-    )
-    assert named_method(f"{folder}/mine.py:Mine").name == "mine"
-    assert named_method(f"{folder}/mine.py:Mine@x=1").name == "mine@x=1"
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -58,21 +47,6 @@ def test_a_file_may_have_an_at_sign_before_its_class(tmp_path: Path) -> None:
 def test_a_wrong_variant_is_one_line(text: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         named_method(text)
-
-
-def test_a_variant_takes_its_base_settings_then_its_own(tmp_path: Path) -> None:
-    from su3d_bench.core.config import Setting
-
-    asked = Settings((Setting(("scenes",), ["rooms/living0"], "x"), Setting(("methods",), ["opensu3d@top_m=1"], "x")))
-    words = ["opensu3d.top_m=7", "opensu3d.eps=0.03"]
-    plan = make_plan(asked, words, tmp_path / "run")
-    options = json.loads(plan.jobs[0].methods[0].options)
-    assert (options["top_m"], options["eps"]) == (1, 0.03)
-
-
-def test_an_unknown_key_of_a_variant_names_where_it_was_asked_for(tmp_path: Path) -> None:
-    words = ["run", "--scenes", "rooms/living0", "--methods", "opensu3d@top_n=1", "--out", str(tmp_path / "x")]
-    assert main([*words, "--dry-run"]) == 2
 
 
 def test_variants_stand_side_by_side_and_run_toml_repeats_them(

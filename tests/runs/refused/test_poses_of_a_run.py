@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +14,8 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.config import Setting, Settings, write_toml
 from su3d_bench.core.geometry import turn_to_z
 from su3d_bench.core.types import Float64Array
-from su3d_bench.datasets.recordings import pose_convention
-from su3d_bench.runs.planning import poses
-from su3d_bench.runs.planning.plan import make_plan
-from su3d_bench.runs.scene import run_scene
+from su3d_bench.runs import poses
+from su3d_bench.runs.plan import make_plan
 
 MAKE = "datasets make rooms --layout replica --scenes bathroom0 office0 --jobs 1 --quiet"
 SMALL = ["--set", "n_frames=40", "--set", "width=96", "--set", "height=72", "--set", "mesh_spacing_m=0.1"]
@@ -75,31 +72,6 @@ def test_accepted_poses_are_a_warning_in_table_log_and_record_and_a_resumed_run_
     assert capsys.readouterr().out == table and Path("out/metrics.json").read_bytes() == metrics
 
 
-def test_poses_that_depth_confirms_are_run_without_a_word(root: Path) -> None:
-    assert main(RUN.split()) == 0
-    assert json.loads(Path("out/run.json").read_text())["warnings"] == []
-
-
-def test_frames_that_tell_nothing_are_a_warning_beside_the_numbers(
-    root: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    spoil(root, lambda matrices: np.repeat(matrices[:1], len(matrices), axis=0))
-    assert main(RUN.split()) == 0
-    doubt = "poses and depth could not be checked: no two of the frames looked at see the same, at most "
-    assert doubt in capsys.readouterr().out
-    assert any(doubt in line for line in json.loads(Path("out/run.json").read_text())["warnings"])
-
-
-def test_a_still_camera_does_not_tell_a_pose_from_its_inverse() -> None:
-    shares = np.tile([1.0, 1.0, *[0.0] * (len(pose_convention.READINGS) - 2)], (4, 1))
-    doubt = pose_convention._doubt(shares)
-    assert doubt is not None and doubt.startswith("the frames do not tell the poses from their inverses: the camera ")
-    shares[0, :2], shares[1, :2] = (0.9, 0.1), (0.1, 0.4)
-    assert "only 1 of 2 pairs of frames agree better as the poses are read" in str(pose_convention._doubt(shares))
-    shares[:, :2] = 0.9, 0.1
-    assert pose_convention._doubt(shares) is None
-
-
 def test_one_of_several_scenes_names_how_many_there_are_and_made_rooms_are_not_looked_at(
     root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -111,15 +83,6 @@ def test_one_of_several_scenes_names_how_many_there_are_and_made_rooms_are_not_l
     monkeypatch.setattr(poses, "judge_scene", lambda *words: pytest.fail("looked at a made room"))
     plan = make_plan(Settings((Setting(("scenes",), ("rooms/living0",), ""),)))
     assert poses.judged(plan.jobs)[0].doubts == ()
-
-
-def test_a_worker_with_data_of_its_own_looks_itself(root: Path) -> None:
-    spoil(root, inverted)
-    plan = make_plan(Settings((Setting(("scenes",), ("replica/bathroom0",), ""),)), out=Path("elsewhere"))
-    (outcome,) = run_scene(plan.jobs[0], lambda event: None)
-    assert outcome.error is not None and outcome.error.startswith(CONTRADICTED)
-    (job,) = poses.judged([replace(plan.jobs[0], accepts_poses=True)])
-    assert job.doubts is not None and job.doubts[0].startswith(CONTRADICTED)
 
 
 def test_a_world_whose_up_is_not_z_is_a_warning_of_a_run(root: Path) -> None:

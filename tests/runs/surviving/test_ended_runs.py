@@ -15,7 +15,7 @@ from typing import Any
 import psutil
 import pytest
 from places import SCENES
-from waiting import wait_until
+from waiting import hear_signals, wait_until
 
 from su3d_bench.core.system.endings import Ended, ending_in_order
 
@@ -54,7 +54,8 @@ class Started:
         environment = os.environ | {"TMPDIR": str(self.scratch), "SU3D_CACHE": str(place / "cache")}
         self.log = place / "log"
         with self.log.open("wb") as log:
-            streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": log, "stderr": log} | how
+            streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": log, "stderr": log}
+            streams |= {"preexec_fn": hear_signals} | how
             self.run = subprocess.Popen(words, env=environment, **streams)
         try:
             wait_until(lambda: self.run.poll() is not None or len(list(self.marks.iterdir())) >= n_programs)
@@ -114,8 +115,19 @@ def started(tmp_path: Path) -> Iterator[Any]:
         one.close()
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT], ids=lambda n: n.name)
-@pytest.mark.parametrize("executor", EXECUTORS)
+@pytest.mark.parametrize(
+    ("executor", "number"),
+    [
+        ("processes", signal.SIGKILL),
+        ("processes", signal.SIGHUP),
+        ("inline", signal.SIGTERM),
+        ("inline", signal.SIGINT),
+        pytest.param("processes", signal.SIGTERM, marks=pytest.mark.proof),
+        pytest.param("processes", signal.SIGINT, marks=pytest.mark.proof),
+        pytest.param("inline", signal.SIGKILL, marks=pytest.mark.proof),
+        pytest.param("inline", signal.SIGHUP, marks=pytest.mark.proof),
+    ],
+)
 def test_a_run_ended_by_a_signal_leaves_no_program_and_no_folder(
     started: Any, executor: str, number: signal.Signals
 ) -> None:
@@ -135,7 +147,7 @@ def test_a_run_ended_by_a_signal_leaves_no_program_and_no_folder(
     assert "Traceback" not in run.log.read_text()
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM], ids=lambda n: n.name)
+@pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.proof)])
 def test_a_worker_ended_by_a_signal_leaves_no_program_and_its_scene_alone_fails(
     started: Any, number: signal.Signals
 ) -> None:
@@ -152,6 +164,7 @@ def test_a_worker_ended_by_a_signal_leaves_no_program_and_its_scene_alone_fails(
     assert run.log.read_text().count(how) >= 2
 
 
+@pytest.mark.proof
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL], ids=lambda n: n.name)
 def test_a_signal_to_everything_in_a_job_leaves_nothing(started: Any, number: signal.Signals) -> None:
     run = started("processes", start_new_session=True)
@@ -160,7 +173,7 @@ def test_a_signal_to_everything_in_a_job_leaves_nothing(started: Any, number: si
     run.assert_nothing_is_left()
 
 
-@pytest.mark.parametrize("executor", EXECUTORS)
+@pytest.mark.parametrize("executor", ["processes", pytest.param("inline", marks=pytest.mark.proof)])
 def test_a_terminal_that_is_closed_ends_the_run_in_order(started: Any, executor: str) -> None:
     ours, theirs = pty.openpty()
     run = started(executor, stdin=theirs, stdout=theirs, stderr=theirs, preexec_fn=_own_terminal)
@@ -175,6 +188,7 @@ def _own_terminal() -> None:
     import fcntl
     import termios
 
+    hear_signals()
     os.setsid()
     fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 

@@ -10,14 +10,12 @@ import signal
 import subprocess
 import time
 from contextlib import suppress
-from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 from painted import colour_perception
 from painted_runs import in_process, job, metrics, run
-from waiting import wait_until
+from waiting import hear_signals, wait_until
 
 from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import scene as scene_run
@@ -28,17 +26,6 @@ def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     for module in (scene_run, finished_scenes):
         monkeypatch.setattr(module, "build_perception", colour_perception)
     monkeypatch.chdir(tmp_path)
-
-
-def test_a_read_only_folder_is_one_line(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    # Root may write anywhere, so the refusal is made here instead of by permissions.
-    def refuse(self: Path, *_: Any, **__: Any) -> None:
-        raise PermissionError(13, "Permission denied", str(self))
-
-    monkeypatch.setattr(Path, "mkdir", refuse)
-    assert run() == 2
-    line = "su3d-bench: cannot write out: the folder is read-only; choose another with --out"
-    assert capsys.readouterr().err.splitlines()[-1] == line
 
 
 def test_a_full_disk_is_one_line_and_the_run_resumes(
@@ -85,9 +72,9 @@ def test_a_killed_worker_fails_its_scene_alone() -> None:
 
 def test_an_interrupt_ends_cleanly_and_the_run_resumes() -> None:
     command = in_process("--jobs", "2", "--set", "painted.frame_ms=500")
-    # a shell ignores interrupts for what it runs in the background, and children inherit that
-    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=heard)
+    process = subprocess.Popen(
+        command, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=hear_signals
+    )
     wait_until(job("a").exists)
     os.killpg(process.pid, signal.SIGINT)
     _, error = process.communicate(timeout=20)
@@ -103,7 +90,7 @@ def test_killed_at_any_moment_and_taken_up_again_it_gives_the_same_bytes() -> No
     whole_s = time.monotonic() - started
     expected = Path("whole/metrics.json").read_bytes()
     moments = random.Random(0)
-    for k in range(10):
+    for k in range(4):
         command = in_process(*slow, "--jobs", "2" if k % 3 == 0 else "1")
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         with suppress(subprocess.TimeoutExpired):

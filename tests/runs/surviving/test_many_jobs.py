@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,21 +10,14 @@ import pytest
 from painted import colour_perception
 from places import SCENES
 
-from su3d_bench.analysis.page import numbers as page_sources
-from su3d_bench.analysis.page.contents import Wishes, page_contents
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import DataError
 from su3d_bench.core.files import atomic
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import resampling
-from su3d_bench.metrics.scoring import pack_scores, unpack_scores
-from su3d_bench.numerics.statistics import growth_exponent
-from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import runner
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.runs.executors.choose import run_units
-from su3d_bench.runs.finished import read_run
+from su3d_bench.runs.executors import run_units
 from su3d_bench.store import run_folder as store
 
 WORDS = ["run", "--scenes", f"{SCENES}/painted.py:Painted/*", "--methods", f"{SCENES}/painted.py:Collector"]
@@ -80,23 +72,6 @@ def test_a_scene_with_a_damaged_file_is_no_finished_one(
     monkeypatch.setattr(runner, "run_units", seen)
     assert main([*WORDS, *PROTOCOLS, "--jobs", "1"]) == 0
     assert asked == ["painted/a"]
-
-
-@pytest.mark.parametrize("scenes", ["a"])
-def test_pictures_that_were_not_asked_for_before_are_drawn(finished: Path) -> None:
-    assert not list(finished.glob("scenes/*/*/pictures/*"))
-    words = [word for word in PROTOCOLS if word != "--no-pictures"]
-    assert main([*WORDS, *words, "--scenes", f"{SCENES}/painted.py:Painted/a", "--jobs", "1"]) == 0
-    n_jobs = len(list(finished.glob("scenes/*/*/done.json")))
-    assert n_jobs == 2
-    assert len({path.parent for path in finished.glob("scenes/*/*/pictures/*.png")}) == n_jobs
-
-
-def test_listing_the_jobs_reads_each_seal_twice(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    reads = count_seals_read(monkeypatch)
-    assert main([*WORDS, *PROTOCOLS, "--dry-run"]) == 0
-    n_jobs = len(list(finished.glob("scenes/*/collector/done.json")))
-    assert 0 < len(reads) <= 2 * n_jobs
 
 
 def count_seals_read(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
@@ -154,68 +129,3 @@ def test_compiled_curves_give_the_same_bits(
         found[many] = [*(one.table for one in (together, *each)), values, *drawn.values()]
     for plain, compiled in zip(*found.values(), strict=True):
         np.testing.assert_array_equal(plain, compiled)
-
-
-def test_ap_of_each_scene_is_that_of_the_scene_alone() -> None:
-    rng = np.random.default_rng(4)
-    counts = [made_scene(rng, 30, True) for _ in range(4)]
-    for one, each in zip(counts, instance_ap.combine_each(counts), strict=True):
-        np.testing.assert_array_equal(instance_ap.combine([one]).table, each.table)
-
-
-def test_growth_by_running_sums_is_that_of_the_rows_drawn() -> None:
-    rng = np.random.default_rng(8)
-    sizes = np.cumsum(rng.integers(1, 90, 403)).astype(np.float64)
-    costs = sizes**0.4 * np.exp(rng.normal(0, 0.3, 403))
-    x, y, n, length = np.log(sizes), np.log(costs), 403, 20
-    starts = np.random.default_rng(0).integers(0, n - length + 1, (1000, 21))
-    rows = (starts[:, :, None] + np.arange(length)).reshape(1000, -1)[:, :n]
-    slopes = [np.polyfit(x[drawn], y[drawn], 1)[0] for drawn in rows]
-    growth = growth_exponent(sizes, costs)
-    assert growth is not None
-    expected = [np.polyfit(x, y, 1)[0], *np.percentile(slopes, [2.5, 97.5])]
-    np.testing.assert_allclose([growth.exponent, growth.low, growth.high], expected, rtol=0, atol=1e-11)
-
-
-def test_counts_with_a_changed_byte_are_damaged_or_the_same() -> None:
-    rng = np.random.default_rng(3)
-    score = {"p": unpack_scores(_packed(rng))["p"]}
-    packed = pack_scores(score)
-    for place in range(0, len(packed), 41):
-        changed = packed[:place] + bytes([packed[place] ^ 0x55]) + packed[place + 1 :]
-        try:
-            found = unpack_scores(changed)
-        except DataError:
-            continue
-        assert pack_scores(found) == packed
-
-
-def _packed(rng: np.random.Generator) -> bytes:
-    from su3d_bench.metrics.metric import SceneScore
-
-    return pack_scores({"p": SceneScore("p", 1, made_scene(rng, 30, False), 3, 9, np.zeros(3, np.int64), ())})
-
-
-def test_the_page_of_many_jobs_holds_the_records_and_says_what_it_lacks(
-    finished: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def no_encoder(run: Any, device: str) -> Any:
-        raise AssertionError("nothing is scored again")
-
-    monkeypatch.setattr(finished_run, "encoder_of", no_encoder)
-    whole = page_contents([finished], Wishes(with_errors=False, with_maps=False)).numbers
-    assert whole["left_out"] is None
-    assert whole["timing"]
-    monkeypatch.setattr(page_sources, "MOST_JOBS", 1)
-    monkeypatch.setattr(page_sources, "MOST_MAPS", 1)
-    page = page_contents([finished], Wishes(with_maps=False)).numbers
-    assert page["results"] == whole["results"]
-    assert page["runs"] == whole["runs"]
-    assert [page[part] for part in ("confusions", "errors", "timing", "comparisons")] == [[], [], [], []]
-    assert page["left_out"].startswith(f"{len(planned(finished))} jobs, more than 1: ")
-    assert len(page_sources.scored_maps([read_run(finished)])) == 1
-
-
-def planned(run: Path) -> list[tuple[str, str]]:
-    record = json.loads((run / "run.json").read_text())
-    return [(scene, method) for scene in record["scenes"] for method in record["methods"]]

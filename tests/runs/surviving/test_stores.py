@@ -8,15 +8,14 @@ import fsspec
 import pytest
 from painted import colour_perception
 from replica_scene import CHAIR, TABLE, write_original, write_render
-from test_clusters import COLLECTOR, PAINTED, assert_equal_runs, deterministic_files, run
+from test_clusters import PAINTED, assert_equal_runs, deterministic_files, run
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, StoreError
-from su3d_bench.runs import feeding as scene_feeding
+from su3d_bench.runs import frame_loop as scene_feeding
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.runs.planning.scenes import data_root
-from su3d_bench.runs.remote.data import files_of_scenes
-from su3d_bench.runs.remote.folder import RemoteFolder
+from su3d_bench.runs.remote_store import RemoteFolder
+from su3d_bench.runs.scenes import data_root
 
 URL = "memory://bucket/runs/one"
 TWO = ("--scenes", f"{PAINTED}/[ad]", "--jobs", "1")
@@ -93,14 +92,6 @@ def test_a_file_that_arrived_cut_short_is_not_taken_for_whole(store: Any, tmp_pa
     assert_equal_runs("local", brought(URL, tmp_path / "came"))
 
 
-def test_another_run_in_the_store_is_refused_by_name(store: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(*TWO, out=URL) == 0
-    capsys.readouterr()
-    assert run(*TWO, "--seed", "5", out=URL) == 2
-    line = f"su3d-bench: {URL}: holds another run (seed was 0, now 5); --replace puts this one in its place"
-    assert capsys.readouterr().err.startswith(line)
-
-
 def test_a_run_in_a_store_is_extended_and_replaced_from_any_machine(
     store: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -125,15 +116,6 @@ def assert_equal_files(one: Path, other: Path) -> None:
         {path.relative_to(at): path.read_bytes() for path in at.rglob("*") if path.is_file()} for at in (one, other)
     )
     assert first == second
-
-
-def test_workers_of_their_own_reach_a_store_too(tmp_path: Path) -> None:
-    url = (tmp_path / "shared").as_uri()
-    base = ["run", "--scenes", f"{PAINTED}/[ad]", "--methods", COLLECTOR, "--protocols", "rooms-semantic", "--quiet"]
-    common = [*base, "--no-pictures", "--set", "collector.noise_m=0.02", "painted.frame_ms=50"]
-    assert main([*common, "--jobs", "1", "--out", "local"]) == 0
-    assert main([*common, "--executor", "processes", "--jobs", "2", "--out", url]) == 0
-    assert_equal_runs("local", tmp_path / "shared")
 
 
 def test_scenes_of_a_data_root_in_a_store_are_fetched_one_by_one(
@@ -169,32 +151,6 @@ def test_scenes_of_a_data_root_in_a_store_are_fetched_one_by_one(
     assert {"Replica/room0/traj.txt", "replica_v1/room_0/habitat/mesh_semantic.ply"} <= first
 
 
-def test_files_are_told_apart_by_the_scene_that_they_are_named_after() -> None:
-    names = [
-        "scannet/scans/scene0000_00/scene0000_00.sens",
-        "scannet/scans/scene0000_01/scene0000_01.sens",
-        "scannet/scans/scene0000_00/scene0000_00_vh_clean_2.ply",
-        "scannet/scannetv2-labels.combined.tsv",
-        "tum/rgbd_dataset_freiburg1_desk/rgb.txt",
-        "tum/rgbd_dataset_freiburg1_desk2/rgb.txt",
-        "Replica/room0_mesh.ply",
-        "replica_v1/room_0/habitat/mesh_semantic.ply",
-        "Replica/cam_params.json",
-    ]
-    sizes = dict.fromkeys(names, 1)
-    scans = files_of_scenes(sizes, ["scene0000_00", "scene0000_01"])
-    assert list(scans["scene0000_00"]) == [names[3], names[0], names[2]]
-    assert list(scans["scene0000_01"]) == [names[3], names[1]]
-    assert list(files_of_scenes(sizes, ["freiburg1_desk"])["freiburg1_desk"]) == [names[5], names[4]]
-    assert list(files_of_scenes(sizes, ["room0"])["room0"]) == [names[8], names[6], names[7]]
-
-
-def test_scenes_that_differ_in_separators_alone_have_all_files_that_may_be_theirs() -> None:
-    sizes = {"mine/a_b.ply": 1, "mine/a-b/depth.png": 2, "mine/c.ply": 3}
-    both = {"mine/a_b.ply": 1, "mine/a-b/depth.png": 2}
-    assert files_of_scenes(sizes, ["a_b", "a-b", "c"]) == {"a_b": both, "a-b": both, "c": {"mine/c.ply": 3}}
-
-
 @pytest.mark.parametrize("name", ["scenes/../../evil", "scenes/a\\b", "scenes/a\x1b[2J", "scenes//x"])
 def test_a_name_that_leads_out_of_the_store_is_refused(
     name: str, store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -202,9 +158,3 @@ def test_a_name_that_leads_out_of_the_store_is_refused(
     monkeypatch.setattr(type(store), "find", lambda *_, **__: {f"/bucket/runs/one/{name}": {"size": 1}})
     with pytest.raises(StoreError, match="which is no name of a file; remove it"):
         RemoteFolder(URL).files()
-
-
-def test_a_store_of_an_unknown_kind_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(*TWO, out="zz://x/y") == 2
-    error = capsys.readouterr().err
-    assert error == "su3d-bench: zz://x/y: Protocol not known: zz; such as s3://bucket/folder\n"

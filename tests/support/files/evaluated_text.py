@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from prediction_files import write_openmask3d
 
-from su3d_bench.evaluation.evaluate import Request, evaluate
+from su3d_bench.evaluation.evaluate import evaluate
+from su3d_bench.evaluation.result import Request
 
 N = 600
 CHAIR, TABLE = np.arange(200), np.arange(200, 400)  # the objects of the small scene; the other points are void

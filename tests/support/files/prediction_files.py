@@ -293,3 +293,7 @@ def refused(path: Path, scene: str, format: str) -> str:
     message = str(caught.value)
     assert "\n" not in message and len(message) < 600
     return message
+
+
+def scene_name(format: str) -> str:
+    return "replica/scene0011_00" if format == "su3d-bench" else "scene0011_00"

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-from fuzz_mutations import mutated
 from memory import peak_bytes, reset_peak
+from mutations import mutated
 
 from su3d_bench.core.errors import GroundTruthMissing, Su3dError
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -27,7 +26,6 @@ class Answered:
     raw: bytes | None = None
     kind: str = "application/json"
     wait_s: float = 0.0
-    drip_s: float = 0.0
     usage: tuple[int, int] | None = (10, 5)
     finish: str = "stop"
     model: str | None = None
@@ -35,7 +33,8 @@ class Answered:
 
 def error(status: int, message: str = "no", code: str | None = None, **headers: str) -> Answered:
     raw = json.dumps({"error": {"message": message, "code": code, "type": "x"}}).encode()
-    return Answered(status=status, raw=raw, headers={name.replace("_", "-"): value for name, value in headers.items()})
+    given = {name.replace("_", "-"): value for name, value in headers.items()}
+    return Answered(status=status, raw=raw, headers={"retry-after-ms": "1", **given})
 
 
 def completion(body: Body, answered: Answered) -> bytes:
@@ -107,12 +106,8 @@ class ChatServer:
             for name, value in answered.headers.items():
                 handler.send_header(name, value)
             handler.end_headers()
-            step = 1 if answered.drip_s else len(content) or 1
-            for start in range(0, len(content), step):
-                handler.wfile.write(content[start : start + step])
-                handler.wfile.flush()
-                if answered.drip_s and self.stop.wait(answered.drip_s):
-                    return
+            handler.wfile.write(content)
+            handler.wfile.flush()
         except OSError:
             pass
 
@@ -132,21 +127,12 @@ def chat_server() -> Iterator[ChatServer]:
 
 
 def quick_config(server: ChatServer | None = None, **changes: Any) -> LanguageConfig:
-    """A configuration whose pauses take no time."""
+    """A configuration for tests: short waits, and one retry."""
     values: dict[str, Any] = {
         "base_url": "http://127.0.0.1:9/v1" if server is None else server.url,
         "key_variable": "SU3D_TEST_KEY",
-        "connect_timeout_s": 0.5,
-        "total_timeout_s": 5.0,
-        "max_retries": 2,
-        "backoff_s": 0.001,
-        "max_wait_s": 0.5,
+        "timeout_s": 5.0,
+        "max_retries": 1,
         "max_failures_in_a_row": 50,
     }
     return LanguageConfig(**(values | changes))
-
-
-def seconds_of(call: Callable[[], Any]) -> float:
-    start = time.monotonic()
-    call()
-    return time.monotonic() - start

@@ -1,23 +1,29 @@
-"""Images and words with which tests run the tiny networks of ``perception.models.stand_ins``."""
+"""Tiny networks with random weights in the forms in which the published ones come, and images to run them on."""
 
 from __future__ import annotations
 
+import json
+import string
 from collections.abc import Sequence
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from su3d_bench.core.system.devices import require, require_transformers
 from su3d_bench.core.types import Frame, UInt8Array
-from su3d_bench.perception.models.stand_ins.detector import write_detector
-from su3d_bench.perception.models.stand_ins.segmenter import tiny_sam
+from su3d_bench.perception.models.encoders.images import CLIP_MEAN, CLIP_STD
+from su3d_bench.perception.models.masks.tagging import RAM_PX, RAM_TAG_LIST
 
 needs_models = pytest.mark.skipif(
     find_spec("torch") is None or find_spec("transformers") is None,
     reason="torch and transformers are not installed: pip install 'su3d-bench[models]'",
 )
 DINO_PX = (48, 80)
+SAM_PX = 64
 
 
 def write_models(root: Path) -> Path:
@@ -25,6 +31,15 @@ def write_models(root: Path) -> Path:
     tiny_sam().save_pretrained(root / "sam-vit-h")
     (root / "sam-vit-h" / "preprocessor_config.json").write_text("{}")
     write_detector(root / "grounding-dino")
+    return root
+
+
+def write_fetched(root: Path) -> Path:
+    """Tiny networks in the folders of the models that are fetched for the papers, RAM++ as its export."""
+    write_models(root)
+    for name, seed in (("clip-vit-h-14", 14), ("clip-vit-l-14-336", 336)):
+        write_tiny_clip(root / name, seed, n_tokens=77)  # as published, so that no text is cut
+    write_tagger(root / "ram-plus-onnx", [word for word in DINO_WORDS if word.isalpha() and len(word) > 1])
     return root
 
 
@@ -64,3 +79,251 @@ def noise_images(n: int, seed: int = 0) -> list[UInt8Array]:
         + random.integers(0, 128, 3, dtype=np.uint8)
         for k in range(n)
     ]
+
+
+# ---- SAM
+
+
+@cache
+def tiny_sam() -> Any:
+    """``transformers``' SamModel of two layers, one of them global, and an image of 64 px; random throughout."""
+    import torch
+
+    transformers = require_transformers("a tiny SAM")
+    torch.manual_seed(1)
+    config = transformers.SamConfig(
+        vision_config={
+            "hidden_size": 16, "output_channels": 8, "num_hidden_layers": 2, "num_attention_heads": 2,
+            "image_size": SAM_PX, "patch_size": 8, "window_size": 3, "global_attn_indexes": [1],
+            "num_pos_feats": 4, "initializer_range": 0.05,
+        },
+        prompt_encoder_config={"hidden_size": 8, "image_size": SAM_PX, "patch_size": 8, "mask_input_channels": 4},
+        mask_decoder_config={"hidden_size": 8, "mlp_dim": 16, "num_attention_heads": 2, "iou_head_hidden_dim": 8},
+    )  # fmt: skip
+    model = transformers.SamModel(config)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            if parameter.dim() > 1:  # weights that carry signals on; as initialised all images look the same
+                parameter.normal_(0, 1.5 / parameter[0].numel() ** 0.5)
+    return model.eval()
+
+
+# ---- GroundingDINO
+
+# Where transformers' GroundingDINO expects its marks, those of bert-base-uncased.
+_MARKS = {0: "[PAD]", 100: "[UNK]", 101: "[CLS]", 102: "[SEP]", 103: "[MASK]", 1012: ".", 1029: "?"}
+_N_WORDS, _FIRST_WORD = 1100, 200
+DINO_WORDS = (
+    "cat", "dog", "table", "coffee", "chair", "lamp", "sofa", "book", "##s", "wall", "floor", "window", "a", "item",
+)  # fmt: skip
+
+
+@cache
+def tiny_dino(n_queries: int = 10, n_tokens: int = 32) -> Any:
+    """``transformers``' GroundingDINO with small towers; texts of at most ``n_tokens`` tokens."""
+    import torch
+
+    transformers = require_transformers("a stand-in of GroundingDINO")
+    torch.manual_seed(2)
+    tower: dict[str, Any] = {
+        "embed_dim": 8, "depths": [1, 1, 1, 1], "num_heads": [1, 1, 2, 2], "window_size": 4, "image_size": 64,
+        "out_features": ["stage2", "stage3", "stage4"],
+    }  # fmt: skip
+    config = transformers.GroundingDinoConfig(
+        backbone_config=transformers.SwinConfig(**tower),
+        text_config=transformers.BertConfig(
+            hidden_size=16, num_hidden_layers=1, num_attention_heads=2, intermediate_size=32, vocab_size=_N_WORDS,
+            max_position_embeddings=max(64, n_tokens),
+        ),
+        num_queries=n_queries, encoder_layers=1, decoder_layers=2, encoder_ffn_dim=32, decoder_ffn_dim=32, d_model=32,
+        encoder_attention_heads=4, decoder_attention_heads=4, encoder_n_points=2, decoder_n_points=2,
+        max_text_len=n_tokens,
+    )  # fmt: skip
+    model = transformers.GroundingDinoForObjectDetection(config)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(torch.randn_like(parameter) * 0.1)
+    return model.eval()
+
+
+def write_vocabulary(folder: Path, words: Sequence[str] = DINO_WORDS) -> Path:
+    """``vocab.txt`` of the tiny tokenizer: bert's marks in their places, some words, and nothing else of use."""
+    named = {_FIRST_WORD + k: word for k, word in enumerate(words)} | _MARKS
+    lines = [named.get(k, f"[unused{k}]") for k in range(_N_WORDS)]
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "vocab.txt"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def tiny_tokenizer(folder: Path, words: Sequence[str] = DINO_WORDS) -> Any:
+    transformers = require_transformers("a stand-in of GroundingDINO")
+    return transformers.BertTokenizer(vocab=str(write_vocabulary(folder, words)))
+
+
+def write_detector(folder: Path, model: Any = None, words: Sequence[str] = DINO_WORDS) -> Path:
+    """``model`` (``tiny_dino()``) with its tokenizer as the hub's repository has them."""
+    (model or tiny_dino()).save_pretrained(str(folder))
+    (folder / "preprocessor_config.json").write_text("{}")
+    tiny_tokenizer(folder, words).save_pretrained(str(folder))
+    write_vocabulary(folder, words)
+    return folder
+
+
+# ---- encoders
+
+CLIP_WORDS = (
+    "chair",
+    "table",
+    "lamp",
+    "a",
+    "the",
+    "in",
+    "scene",
+    "red",
+    "cup",
+    "image",
+    "of",
+    "an",
+    "on",
+    "tv",
+    "screen",
+)
+N_TOKENS = 16
+CLIP_PX = 32
+CLIP_DIM = 24
+
+
+def write_tiny_clip(folder: Path, seed: int = 0, weights: str = "model.safetensors", n_tokens: int = N_TOKENS) -> Path:
+    """A CLIP of two layers as transformers saves it; ``weights`` may be ``pytorch_model.bin``, the older form."""
+    import torch
+
+    transformers = require_transformers("a stand-in of CLIP")
+    torch.manual_seed(seed)
+    n_words = write_clip_tokenizer(folder)
+    layers = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4}
+    config = transformers.CLIPConfig(
+        vision_config={**layers, "image_size": CLIP_PX, "patch_size": 8},
+        text_config={
+            **layers,
+            "vocab_size": n_words,
+            "max_position_embeddings": n_tokens,
+            "bos_token_id": n_words - 2,
+            "eos_token_id": n_words - 1,
+            "pad_token_id": n_words - 1,
+        },
+        projection_dim=CLIP_DIM,
+    )
+    model: Any = transformers.CLIPModel(config)
+    _spread(model)
+    model.save_pretrained(str(folder))
+    if weights != "model.safetensors":
+        torch.save(model.state_dict(), folder / weights)
+        (folder / "model.safetensors").unlink()
+    size = {"shortest_edge": CLIP_PX}
+    crop = {"height": CLIP_PX, "width": CLIP_PX}
+    _write_preprocessor(folder, {"size": size, "crop_size": crop, "do_center_crop": True})
+    return folder
+
+
+def write_tiny_siglip(folder: Path, seed: int = 0) -> Path:
+    """A SigLIP of two layers as transformers saves it, with a ``tokenizer.json`` of whole words."""
+    import torch
+
+    tokenizers = require("tokenizers", "a stand-in of SigLIP")
+
+    transformers = require_transformers("a stand-in of SigLIP")
+    torch.manual_seed(seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    words = {word: k for k, word in enumerate(["<unk>", "</s>", *CLIP_WORDS])}
+    tokenizer = tokenizers.Tokenizer(tokenizers.models.WordLevel(words, unk_token="<unk>"))
+    tokenizer.pre_tokenizer = tokenizers.pre_tokenizers.Whitespace()
+    tokenizer.save(str(folder / "tokenizer.json"))
+    layers = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4}
+    config = transformers.SiglipConfig(
+        vision_config={**layers, "image_size": CLIP_PX, "patch_size": 8},
+        text_config={**layers, "vocab_size": len(words), "max_position_embeddings": N_TOKENS, "pad_token_id": 1},
+    )
+    model: Any = transformers.SiglipModel(config)
+    _spread(model)
+    model.save_pretrained(str(folder))
+    half = [0.5, 0.5, 0.5]
+    size = {"height": CLIP_PX, "width": CLIP_PX}
+    _write_preprocessor(
+        folder, {"size": size, "image_mean": half, "image_std": half, "image_processor_type": "SiglipImageProcessor"}
+    )
+    return folder
+
+
+def _spread(model: Any) -> None:
+    """Larger random weights than a fresh model has, so that different inputs give clearly different features."""
+    import torch
+
+    with torch.no_grad():
+        for parameter in model.parameters():
+            if parameter.ndim > 1:
+                parameter.normal_(0.0, 0.2)
+
+
+def write_clip_tokenizer(folder: Path) -> int:
+    """``vocab.json`` and ``merges.txt`` of letters and ``CLIP_WORDS``; returns the number of words."""
+    folder.mkdir(parents=True, exist_ok=True)
+    letters = string.ascii_lowercase + string.digits + "-"
+    vocabulary = [*letters, *(f"{letter}</w>" for letter in letters)]
+    merges: list[str] = []
+    for word in CLIP_WORDS:
+        left = word[0] if len(word) > 1 else ""
+        for place, letter in enumerate(word[1:], start=1):
+            right = f"{letter}</w>" if place == len(word) - 1 else letter
+            merges.append(f"{left} {right}")
+            left += right
+            vocabulary.append(left)
+    vocabulary = list(dict.fromkeys(vocabulary))
+    vocabulary += ["<|startoftext|>", "<|endoftext|>"]
+    (folder / "vocab.json").write_text(json.dumps({word: k for k, word in enumerate(vocabulary)}))
+    (folder / "merges.txt").write_text("#version: 0.2\n" + "\n".join(dict.fromkeys(merges)) + "\n")
+    (folder / "tokenizer_config.json").write_text(json.dumps({"tokenizer_class": "CLIPTokenizer"}))
+    return len(vocabulary)
+
+
+def _write_preprocessor(folder: Path, settings: dict[str, object]) -> None:
+    usual = {"image_mean": list(CLIP_MEAN), "image_std": list(CLIP_STD), "resample": 3, "do_resize": True}
+    (folder / "preprocessor_config.json").write_text(json.dumps(usual | settings))
+
+
+# ---- RAM++ as it is exported
+
+RAM_FILE = "ram_plus.onnx"
+_CELL_PX = 96
+_N_SEEN = 3 * (RAM_PX // _CELL_PX) ** 2  # mean colours of 4 x 4 cells
+_OPSET, _IR_VERSION = 17, 8  # that any ONNX Runtime reads which the project takes
+
+
+def write_tagger(folder: Path, tags: Sequence[str], seed: int = 0) -> Path:
+    """A network that answers ``image`` (1, 3, 384, 384) with ``tag`` (1, T): 1 for some of ``tags``, by colours."""
+    onnx = require("onnx", "a stand-in of RAM++")
+    helper, numpy_helper, kinds = onnx.helper, onnx.numpy_helper, onnx.TensorProto
+    random = np.random.default_rng(seed)
+    weight = (random.normal(size=(_N_SEEN, len(tags))) / _N_SEEN**0.5).astype(np.float32)
+    bias = (random.normal(size=len(tags)) * 0.5).astype(np.float32)
+    nodes = [
+        helper.make_node("AveragePool", ["image"], ["cells"], kernel_shape=[_CELL_PX] * 2, strides=[_CELL_PX] * 2),
+        helper.make_node("Flatten", ["cells"], ["seen"]),
+        helper.make_node("Gemm", ["seen", "weight", "bias"], ["logits"]),
+        helper.make_node("Greater", ["logits", "zero"], ["is_there"]),
+        helper.make_node("Cast", ["is_there"], ["tag"], to=kinds.FLOAT),
+    ]
+    constants = {"weight": weight, "bias": bias, "zero": np.zeros(1, np.float32)}
+    graph = helper.make_graph(
+        nodes,
+        "ram_plus",
+        [helper.make_tensor_value_info("image", kinds.FLOAT, [1, 3, RAM_PX, RAM_PX])],
+        [helper.make_tensor_value_info("tag", kinds.FLOAT, [1, len(tags)])],
+        [numpy_helper.from_array(value, name) for name, value in constants.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR_VERSION)
+    onnx.checker.check_model(model)
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / RAM_FILE).write_bytes(model.SerializeToString())
+    (folder / RAM_TAG_LIST).write_text("\n".join(tags) + "\n")
+    return folder

@@ -16,7 +16,7 @@ from su3d_bench.core.types import Float64Array, GroundTruth, LabelSet
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine, score_scene
-from su3d_bench.metrics.semantic.panoptic_quality import QUALITIES
+from su3d_bench.metrics.semantic.panoptic import QUALITIES
 
 Scene = dict[str, Any]
 Problem = list[Scene]

@@ -1,30 +1,21 @@
 """What a person could not read, reach or use of a page in a browser; each check gives lines that say where and what.
 
 A check takes the browser with the page open and leaves it as a person with the defaults of a desktop sees it. What it
-looks at is the page as ``unfold`` leaves it; ``operated`` goes on from there through every control.
+looks at is the page as ``unfold`` leaves it.
 """
 
 from __future__ import annotations
 
-import base64
-import io
-import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from chromium import Chromium
-from PIL import Image
-
-from su3d_bench.core.types import UInt8Array
 
 SCRIPT = Path(__file__).with_name("looks.js").read_text(encoding="utf-8")
 PHONE, DESKTOP = (390, 844), (1300, 900)
 LEAST_TARGET, LEAST_TEXT = 24, 12  # px on a phone: WCAG 2.5.8; what is smaller is not read at arm's length
-MOST_ALIKE = 2  # of the headers or rows of one table, how many are operated
-MOST_ROUNDS = 5
 IDLE_MS = 400
 MOST_FRAMES = 6  # that a page at rest may ask for in that time
 # A page is at rest once its sections are made and its views are drawn.
@@ -79,56 +70,21 @@ def seen_as(
         show({}, "", DESKTOP)
 
 
-def screen(browser: Chromium) -> UInt8Array:
-    """What the screen shows, (height, width, 3)."""
-    shot = base64.b64decode(browser.call("Page.captureScreenshot", {"format": "png"})["data"])
-    with Image.open(io.BytesIO(shot)) as image:
-        return np.asarray(image.convert("RGB"))
-
-
-def pale(browser: Chromium) -> list[str]:
-    """Texts whose contrast with what is beneath them is below 4.5, 3 for large ones.
-
-    Colours are those of the elements; where a text stands on a picture or a canvas, those of the pixels there, without
-    the text.
-    """
-    found: list[str] = look(browser, "paleTexts()")
-    seen: set[str] = set()
-    while texts := look(browser, "overOther()"):
-        look(browser, "hideTexts(true)")
-        browser.run(REST)
-        pixels = screen(browser)
-        look(browser, "hideTexts(false)")
-        for text in texts:
-            left, top, right, bottom = (round(edge) for edge in text["box"])
-            ratios = _contrasts(np.array(text["colour"]), pixels[top:bottom, left:right].reshape(-1, 3))
-            # A line of a plot that crosses a text does not hide it.
-            if ratios.size and (ratio := np.quantile(ratios, 0.15)) < text["least"]:
-                seen.add(f"{text['text']}: contrast {ratio:.2f} with what is beneath, not {text['least']}")
-    return found + sorted(seen)
-
-
-def _contrasts(colour: Any, ground: UInt8Array) -> Any:
-    def luminance(rgb: Any) -> Any:
-        part = rgb / 255.0
-        return np.where(part <= 0.03928, part / 12.92, ((part + 0.055) / 1.055) ** 2.4) @ [0.2126, 0.7152, 0.0722]
-
-    text, beneath = luminance(colour), luminance(ground.astype(np.float64))
-    return (np.maximum(text, beneath) + 0.05) / (np.minimum(text, beneath) + 0.05)
-
-
 def pale_in_light(browser: Chromium) -> list[str]:
+    """Texts whose contrast with what is beneath them is below 4.5, 3 for large ones."""
     with seen_as(browser):
-        return pale(browser)
+        found: list[str] = look(browser, "paleTexts()")
+        return found
 
 
 def pale_in_dark(browser: Chromium) -> list[str]:
     with seen_as(browser, scheme="dark"):
-        return pale(browser)
+        found: list[str] = look(browser, "paleTexts()")
+        return found
 
 
 def light_in_dark(browser: Chromium) -> list[str]:
-    """What stays light where everything is dark: grounds that are as they were, the page itself, edges of canvases."""
+    """What stays light where everything is dark: grounds that are as they were, and the page itself."""
     with seen_as(browser):
         before = {(text, tuple(colour)) for text, colour, _ in look(browser, "grounds()")}
     with seen_as(browser, scheme="dark"):
@@ -139,17 +95,6 @@ def light_in_dark(browser: Chromium) -> list[str]:
         ]
         if look(browser, "isLight()"):
             found.append("the page is light in the dark")
-        for k in range(browser.run("document.querySelectorAll('canvas').length")):
-            box = browser.run(
-                f"(() => {{ const one = document.querySelectorAll('canvas')[{k}];"
-                " one.scrollIntoView({block: 'center', behavior: 'instant'});"
-                f" return {REST}.then(() => {{ const b = one.getBoundingClientRect();"
-                " return [b.left, b.top, b.right, b.bottom]; }); })()"
-            )
-            left, top, right, bottom = (max(0, round(edge)) for edge in box)
-            shown = screen(browser)[top:bottom, left:right]
-            if shown.size and np.median(np.concatenate([shown[4:8].ravel(), shown[:, 4:8].ravel()])) > 128:
-                found.append(f"canvas {k}: its edge stays light in the dark")
         return list(dict.fromkeys(found))
 
 
@@ -207,7 +152,7 @@ def structure(browser: Chromium) -> list[str]:
 
 
 def by_keyboard(browser: Chromium) -> list[str]:
-    """What Tab does not reach once and in the order of the page, what shows no focus, and what only a mouse can do."""
+    """What Tab does not reach once and in the order of the page, and what only a mouse can do."""
     with seen_as(browser):
         found: list[str] = look(browser, "order()") + _mouse_only(browser)
         browser.run("document.activeElement.blur(); getSelection().removeAllRanges(); scrollTo(0, 0)")
@@ -219,17 +164,12 @@ def by_keyboard(browser: Chromium) -> list[str]:
         )
         browser.run("document.body.tabIndex = -1; document.body.focus(); document.body.removeAttribute('tabindex')")
         reached: list[Any] = []
-        signs: set[str] = set()
         while len(reached) <= 2 * len(names) + 20:
             browser.press("Tab")
             here = browser.run(at)
             if here == -1 or (reached and here == reached[0]):
                 break
             reached.append(here)
-            sign = browser.run("document.activeElement.localName + document.activeElement.className")
-            if sign not in signs:
-                signs.add(sign)
-                found += _without_focus(browser)
         else:
             found.append(f"Tab never leaves the page: it goes on to {reached[-6:]}")
         ours = [one for one in reached if one != -2]
@@ -247,25 +187,6 @@ def by_keyboard(browser: Chromium) -> list[str]:
                 found.append(f"Shift+Tab does not go back from {names[places[-1]]}")
         browser.run("document.activeElement.blur()")
         return found
-
-
-def _without_focus(browser: Chromium) -> list[str]:
-    """The element that has the focus, where it looks as it does without."""
-    place = browser.run(
-        "(() => { const el = document.activeElement; el.scrollIntoView({block: 'center', behavior: 'instant'});"
-        f" return {REST}.then(() => {{ const b = el.getBoundingClientRect();"
-        " return [b.left - 6, b.top - 6, b.right + 6, b.bottom + 6]; }); })()"
-    )
-    left, top, right, bottom = (max(0, round(edge)) for edge in place)
-    browser.run("looks.before = document.activeElement; 0")
-    with_focus = screen(browser)[top:bottom, left:right].astype(int)
-    browser.run(f"(looks.before.blur(), {REST})")
-    without = screen(browser)[top:bottom, left:right].astype(int)
-    told: str = browser.run("looks.told(looks.before)")
-    browser.run("looks.before.focus({ preventScroll: true, focusVisible: true })")
-    if with_focus.shape == without.shape and (np.abs(with_focus - without).max(axis=-1, initial=0) > 40).sum() >= 40:
-        return []
-    return [f"{told}: does not show that it has the focus"]
 
 
 def _mouse_only(browser: Chromium) -> list[str]:
@@ -293,82 +214,7 @@ def _mouse_only(browser: Chromium) -> list[str]:
     return sorted({one for one in found if one})
 
 
-def operated(browser: Chromium) -> list[str]:
-    """Controls with which a keyboard changes nothing, and texts that are too pale once one changed something."""
-    found: list[str] = []
-    done: set[str] = set()
-    with seen_as(browser):
-        known = {*look(browser, "paleTexts()")}
-        for _ in range(MOST_ROUNDS):  # what a control brings about has controls of its own
-            keys = look(browser, "controls().map((one) => [one.key, one.n, looks.told(one.el)])")
-            left = [(key, told) for key, n, told in keys if key not in done and n < MOST_ALIKE]
-            for key, told in left:
-                if not look(browser, f"find({json.dumps(key)}) !== undefined"):
-                    continue
-                done.add(key)
-                if not _is_answered(browser, key):
-                    found.append(f"{told}: no key changes anything")
-                pale_now = {*look(browser, f"paleTexts(looks.partOf({json.dumps(key)}))")} - known
-                found += [f"{line} (after {told})" for line in sorted(pale_now)]
-                known |= pale_now
-        return found + sorted({*look(browser, "paleTexts()")} - known)
-
-
 # What a keyboard does with a control; what none of them is, is clicked.
-KEYS: Mapping[str, tuple[str, ...]] = {
-    "select": ("ArrowDown", "ArrowUp"),
-    "range": ("ArrowLeft", "ArrowRight"),
-    "checkbox": ("Space",),
-    "radio": ("ArrowDown", "ArrowUp"),
-    "input": ("x",),
-    "textarea": ("x",),
-    "a": ("Enter",),
-    "canvas": ("ArrowLeft", "ArrowRight"),
-    "scroll": ("ArrowDown", "ArrowRight"),
-}
-CLICK = ("Enter", "Space")
-KIND = """(() => { const el = FIND;
-  el.scrollIntoView({ block: 'center', behavior: 'instant' });
-  if (el.localName === 'a' && !el.getAttribute('href').startsWith('#')) return '';
-  if (el.localName === 'select') return el.options.length > 1 ? 'select' : '';
-  if (['range', 'checkbox', 'radio'].includes(el.type)) return el.type;
-  const isMade = el.matches('[aria-pressed=true]'); // a choice of several that is made is made again
-  if (isMade && el.parentElement.querySelectorAll('[aria-pressed]').length > 1) return '';
-  if (el.matches('button, summary, input, textarea, a, canvas, tr, [role=button]')) return el.localName;
-  return looks.scrolls(el) ? 'scroll' : ''; })()"""
-
-
-def _views(browser: Chromium, find: str) -> list[bytes]:
-    """What the canvases beside a control show, of which the document tells nothing."""
-    boxes = browser.run(
-        f"[...({find}?.closest('section, dialog, main')?.querySelectorAll('canvas') || [])].map((one) =>"
-        " one.getBoundingClientRect()).map((box) => [box.left, box.top, box.right, box.bottom])"
-    )
-    if not boxes:
-        return []
-    shown = screen(browser)
-    edges = [[max(0, round(edge)) for edge in box] for box in boxes]
-    return [shown[top:bottom, left:right].tobytes() for left, top, right, bottom in edges]
-
-
-def _is_answered(browser: Chromium, key: str) -> bool:
-    """Whether a key changes something in the page or in its picture; a choice of one cannot be changed."""
-    find = f"looks.find({json.dumps(key)})"
-    kind = browser.run(KIND.replace("FIND", find))
-    focus = f"({find}?.focus({{ preventScroll: true, focusVisible: true }}), {REST})"
-    for pressed in KEYS.get(kind, CLICK) if kind else ():
-        browser.run(focus)
-        browser.run("looks.before = looks.state(); 0")
-        n_messages, before = len(browser.messages), _views(browser, find)
-        browser.press(pressed)
-        browser.run(REST)
-        is_told = "Page.downloadWillBegin" in [one.get("method") for one in browser.messages[n_messages:]]
-        if is_told or browser.run("looks.before !== looks.state()") or before != _views(browser, find):
-            if kind in ("input", "textarea"):  # so that tables have their rows again
-                browser.press("Backspace")
-            browser.until(WHOLE)
-            return True
-    return not kind
 
 
 CHECKS: Mapping[str, Callable[[Chromium], list[str]]] = {
@@ -381,5 +227,4 @@ CHECKS: Mapping[str, Callable[[Chromium], list[str]]] = {
     "can be printed": on_paper,
     "rests where nothing shall move": moving,
     "can be reached by keyboard": by_keyboard,
-    "answers the keyboard with each control": operated,
 }

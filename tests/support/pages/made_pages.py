@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import chromium
@@ -18,10 +19,10 @@ from registry_bundles import painted_bundle
 
 from su3d_bench.cli.main import main
 from su3d_bench.reports.pictures.items import png_bytes
-from su3d_bench.reports.sheet.second_looks import second_looks_page
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.sheets.making.sets import PAGE, write_sheets
+from su3d_bench.sheets.scores import SecondLook, second_looks_page
+from su3d_bench.sheets.sets import PAGE, write_sheets
 
 PAINTED = f"{SCENES}/painted.py"
 # WebGL without a graphics card.
@@ -80,28 +81,21 @@ def page_of_annotation(folder: Path) -> Path:
     return folder / "out" / "annotator-1" / PAGE
 
 
-def page_of_retrieval(folder: Path) -> Path:
-    """A sheet of one question an item."""
-    write_sheets(made("retrieval", ("chair", LONG, "lamp")), folder / "out", folder / "key")
-    return folder / "out" / "annotator-1" / PAGE
-
-
 def page_of_second_looks(folder: Path) -> Path:
     """What ``sheets score`` leaves to look at again."""
     (folder / "item-1.png").write_bytes(png_bytes(np.full((400, 1200, 3), 90, np.uint8)))
-    look = {
-        "item_id": "item-1", "ask": "label 1", "reason": "annotators disagree", "automatic": "right",
-        "answers": {"annotator-1": "right", "annotator-2": "wrong"}, "scene": "rooms/living0",
-        "methods": ["opensu3d"], "text": LONG, "pictures": ["item-1.png"],
-    }  # fmt: skip
+    look = SecondLook(
+        "item-1", "label 1", LONG, "rooms/living0", ("opensu3d",), ("item-1.png",),
+        {"annotator-1": "right", "annotator-2": "wrong"}, "right", "annotators disagree",
+    )  # fmt: skip
     page = folder / "second_looks.html"
-    page.write_text(second_looks_page([look, {**look, "text": "x" * 200}], ".", "sheet-1"), encoding="utf-8")
+    page.write_text(second_looks_page([look, replace(look, text="x" * 200)], ".", "sheet-1"), encoding="utf-8")
     return page
 
 
 def page_of_audit(folder: Path) -> Path:
     """``questions audit``."""
-    words = ["questions", "audit", "--scenes", f"{PAINTED}:Painted/a", "--n", "6", "--out", str(folder), "--quiet"]
+    words = ["query", "audit", "--scenes", f"{PAINTED}:Painted/a", "--n", "6", "--out", str(folder), "--quiet"]
     assert main(words) == 0
     return folder / "index.html"
 
@@ -114,7 +108,7 @@ def site_of_registry(folder: Path) -> Path:
         painted_bundle(registry, "ann", ["@drop=1", "@noise_m=0.3"], said=f"{LONG} {STRUCK}")
         painted_bundle(registry, "bob", [""], scenes="ab")
         words = ["--out", str(site), "--bundles-at", "https://example.org/bundles", "--quiet"]
-        assert main(["registry", "build", str(registry), *words]) == 0
+        assert main(["dev", "registry", "build", str(registry), *words]) == 0
     return site
 
 
@@ -128,28 +122,20 @@ def page_of_method(folder: Path) -> Path:
     return min((site_of_registry(folder) / "methods").iterdir())
 
 
-def page_of_scene(folder: Path) -> Path:
-    """The page of a scene of the site."""
-    return min((site_of_registry(folder) / "scenes").iterdir())
-
-
 PAGES: Mapping[str, Callable[[Path], Path]] = {
     "page of runs": page_of_runs,
     "tables": page_of_tables,
     "sheet of annotation": page_of_annotation,
-    "sheet of retrieval": page_of_retrieval,
     "second looks": page_of_second_looks,
     "audit": page_of_audit,
     "registry": page_of_registry,
     "method of a registry": page_of_method,
-    "scene of a registry": page_of_scene,
 }
 # The files of the program that begin a page, and the pages above that come out of each.
 WRITERS = {
     "reports/page/page.html.j2": ("page of runs",),
     "reports/tables/formats.py": ("tables",),
     "reports/sheet/page.html.j2": ("sheet of annotation", "sheet of retrieval"),
-    "reports/sheet/second_looks.py": ("second looks",),
-    "reports/sheet/audit_page.py": ("audit",),
+    "reports/sheet/page.py": ("second looks", "audit"),
     "reports/registry/page.html.j2": ("registry", "method of a registry", "scene of a registry"),
 }

@@ -16,7 +16,7 @@ from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.interfaces import SceneTools
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Frame, SceneInfo, Surface
-from su3d_bench.runs.feeding import no_detections
+from su3d_bench.runs.frame_loop import no_detections
 
 SCENE = SceneInfo("rooms", "a b", 6, 1, "rendered-rooms", seed=7)
 SURFACE = Surface(

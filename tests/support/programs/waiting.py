@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Callable
 from typing import TypeVar
@@ -16,3 +17,9 @@ def wait_until(is_so: Callable[[], Value], what: str = "it never became so", sec
         assert time.monotonic() < end, f"{what} in {seconds:g} s"
         time.sleep(0.01)
     return value
+
+
+def hear_signals() -> None:
+    """For ``preexec_fn``: the child hears signals that ``nohup`` or a shell's background has this process ignore."""
+    for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)

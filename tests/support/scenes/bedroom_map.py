@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from su3d_bench.core.types import Float64Array
-from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
+from su3d_bench.questions.scene_map import MapObject, SceneMap
 
 
 def box(x: float, y: float, z: float, dx: float, dy: float, dz: float) -> Float64Array:

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.baselines.conceptgraphs.clouds import bounding_box
-from su3d_bench.baselines.conceptgraphs.config import MappingConfig
-from su3d_bench.baselines.conceptgraphs.objects import MapObject, Sighting
+from su3d_bench.baselines.conceptgraphs.objects import MapObject, MappingConfig, Sighting, bounding_box
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, Frame, SceneInfo

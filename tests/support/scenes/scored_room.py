@@ -10,8 +10,9 @@ import numpy as np
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Prediction
 from su3d_bench.core.types import Float32Array, GroundTruth, LabelSet, UInt8Array
+from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.metrics.scoring import SceneScore, combine, score_scene
+from su3d_bench.metrics.scoring import combine, score_scene
 
 SEMANTIC = ("rooms-semantic", "replica-mesh-ex6")
 INSTANCE = ("rooms-instance", "replica-openmask3d")

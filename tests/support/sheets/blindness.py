@@ -1,26 +1,22 @@
 """Whether pictures of annotation sheets tell methods apart: items of several methods for the same asked things.
 
 What may tell is cut out: the zone of the answer itself, which is its region in each view, the closer look, the ring and
-the arrow, its words. What is left is held against a picture in which no map has a part, and put before a classifier.
+the arrow, its words. What is left is compared with a picture in which no map has a part.
 """
 
 from __future__ import annotations
 
-import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import combinations
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 from PIL import Image, ImageDraw
-from threadpoolctl import threadpool_limits
 
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import BoolArray, Float64Array, UInt8Array
-from su3d_bench.numerics.statistics import holm
-from su3d_bench.questions.reasoning.asking import built_in
+from su3d_bench.core.types import BoolArray, UInt8Array
+from su3d_bench.questions.language_solver import built_in
 from su3d_bench.reports.pictures.items import (
     CAPTION,
     LOW_HEIGHT,
@@ -36,36 +32,19 @@ from su3d_bench.reports.pictures.items import (
     compose,
     draw_tags,
 )
-from su3d_bench.reports.pictures.map_views import MapView, pale
+from su3d_bench.reports.pictures.maps import MapView, pale
 from su3d_bench.reports.pictures.render import OVERSAMPLING, colour
+from su3d_bench.sheets.drafts import Draft, annotation_drafts, questions_of, reasoning_drafts, retrieval_drafts
+from su3d_bench.sheets.drawing import PLACE_SHARE, ROOM_SHARE, Artist
 from su3d_bench.sheets.items import SheetKind
-from su3d_bench.sheets.making.drafts import (
-    Draft,
-    annotation_drafts,
-    questions_of,
-    reasoning_drafts,
-    retrieval_drafts,
-)
-from su3d_bench.sheets.making.drawing import Artist
-from su3d_bench.sheets.making.run_source import RunSource
-from su3d_bench.sheets.making.shown_room import PLACE_SHARE, ROOM_SHARE
+from su3d_bench.sheets.sources import RunSource
 
-SMALLER = 4  # times, of the pictures that are compared
 LINE = 9  # pixels on either side of a region that its outline takes
-ALPHA = 0.05
 TOP = MARGIN + TITLE_LINE + 6  # below a title of one line
 LOW = TOP + CAPTION + TOP_HEIGHT + MARGIN
 RIGHT = MARGIN + PHOTO_WIDTH + MARGIN
 Thing = tuple[str, str]  # scene, and what is asked in it
 Drafts = dict[Thing, dict[str, Draft]]  # of each thing the draft of each method
-
-
-@dataclass(frozen=True)
-class Look:
-    """A picture (h, w, 3) without its title, and the zone (h, w) of the answer, both made ``SMALLER``."""
-
-    picture: UInt8Array
-    zone: BoolArray
 
 
 def asked_alike(source: RunSource, encoder: Encoder, kind: SheetKind, per_kind: int, most: int) -> Drafts:
@@ -215,100 +194,12 @@ def _put(zone: BoolArray, panel: Panel, mask: BoolArray, at: tuple[int, int], si
         zone |= differs(np.asarray(names), 0)
 
 
-def look_at(picture: UInt8Array, zone: BoolArray) -> Look:
-    """Both at a fraction of their size; a pixel that holds any of the zone is of it."""
-    size = picture.shape[1] // SMALLER, picture.shape[0] // SMALLER
-    cut = tuple(slice(SMALLER * side) for side in size[::-1])
-    small: Any = cv2.resize(picture[cut], size, interpolation=cv2.INTER_AREA)
-    share: Any = cv2.resize(np.ascontiguousarray(zone[cut]).view(np.uint8) * 255, size, interpolation=cv2.INTER_AREA)
-    return Look(small, share > 0)  # of 16 pixels one is still 16 of 255
-
-
-def features_of(look: Look, zone: BoolArray) -> Float64Array:
-    """What a classifier is shown of a picture outside ``zone``: the picture made small, colours, edges, file size."""
-    left = ~zone
-    picture = look.picture * left[:, :, None]
-    grey = picture.astype(np.float32) @ np.full(3, 1 / 3, np.float32)
-    small: Any = cv2.resize(grey, (30, 26), interpolation=cv2.INTER_AREA)
-    seen = picture[left]
-    red, green, blue = (seen >> 6).T
-    colours = np.bincount(16 * red + 4 * green + blue, minlength=64) / max(1, len(seen))
-    both = left[1:, 1:] & left[:-1, 1:] & left[1:, :-1]
-    down, across = (np.abs(np.diff(grey, axis=axis))[: len(grey) - 1, : grey.shape[1] - 1] for axis in (0, 1))
-    edges = [float(one[both].mean()) for one in (down, across)] + [
-        float((one[both] > 20).mean()) for one in (down, across)
-    ]
-    means = seen.mean(axis=0)
-    return np.concatenate([small.ravel(), colours, edges, means, [len(zlib.compress(picture.tobytes(), 1))]])
-
-
-def p_of_telling(pairs: Sequence[tuple[str, Look, Look]]) -> float | None:
-    """How probable it is by chance to tell two methods apart as well as a logistic regression does; None untested.
-
-    ``pairs``: scene, and the looks of both methods at one asked thing. Trained on every other scene, the model says
-    which of the two is which: were they exchangeable, each pair of a scene would be a toss. The least p of the scenes,
-    corrected for their number. What both methods share tells nothing and is left out.
-    """
-    from sklearn.linear_model import LogisticRegression
-    from sklearn.pipeline import make_pipeline
-    from sklearn.preprocessing import StandardScaler
-
-    unlike = [(scene, a, b, a.zone | b.zone) for scene, a, b in pairs if a is not b]
-    shown = [(scene, features_of(a, zone), features_of(b, zone)) for scene, a, b, zone in unlike]
-    scenes, found = sorted({scene for scene, *_ in shown}), []
-    for held_out in scenes:
-        train = [(a, b) for scene, a, b in shown if scene != held_out]
-        test = [(a, b) for scene, a, b in shown if scene == held_out and not np.array_equal(a, b)]
-        if not train or not test:
-            continue
-        model = make_pipeline(StandardScaler(), LogisticRegression(C=0.1, max_iter=500))
-        with threadpool_limits(1):  # so few rows: threads would only wait for each other
-            model.fit(np.array([one for pair in train for one in pair]), [0, 1] * len(train))
-        lead = model.decision_function([b for _, b in test]) - model.decision_function([a for a, _ in test])
-        found.append(_p_of_tosses(int((lead > 0).sum()), len(test)))
-    return min(1.0, len(found) * min(found)) if found else None
-
-
-def _p_of_tosses(n_right: int, n: int) -> float:
-    """Of so many tosses so many heads or more."""
-    from scipy.stats import binom
-
-    return float(binom.sf(n_right - 1, n, 0.5))
-
-
-Looks = Mapping[Thing, Mapping[str, Look]]
-
-
-def pairs_of(looks: Looks, one: str, other: str) -> list[tuple[str, Look, Look]]:
-    """What both methods show for the same asked things."""
-    return [(thing[0], shown[one], shown[other]) for thing, shown in looks.items() if {one, other} <= shown.keys()]
-
-
-def methods_in(looks: Looks) -> list[str]:
-    """The methods of which something is shown."""
-    return sorted({method for shown in looks.values() for method in shown})
-
-
-def told_apart(looks_of: Mapping[str, Looks]) -> dict[tuple[str, str, str], float | None]:
-    """For each kind and pair of its methods Holm's p that the pictures are no better told apart than by chance."""
-    names = [(kind, *pair) for kind, looks in looks_of.items() for pair in combinations(methods_in(looks), 2)]
-    raw = [p_of_telling(pairs_of(looks_of[kind], one, other)) for kind, one, other in names]
-    return dict(zip(names, holm(raw), strict=True))
-
-
-def all_looks(
+def all_checked(
     artist: Artist, drafts: Drafts, check: Callable[[Draft, UInt8Array, UInt8Array, BoolArray], None]
-) -> Looks:
-    """The looks of all drafts; ``check`` sees of each the picture, the one without a map, and the answer's zone."""
-    looks: dict[Thing, dict[str, Look]] = {}
-    drawn: dict[int, Look] = {}  # an item of several methods is drawn once
+) -> None:
+    """``check`` sees of each draft the picture, the one without a map, and the answer's zone."""
     onlooker = Onlooker(artist)
-    for thing, of_method in drafts.items():
-        for method, draft in of_method.items():
-            if id(draft) not in drawn:
-                parts = artist.parts(draft)
-                picture, zone = untitled(parts), onlooker.zone_of(draft, parts)
-                check(draft, picture, onlooker.without_answer(draft, parts), zone)
-                drawn[id(draft)] = look_at(picture, zone)
-            looks.setdefault(thing, {})[method] = drawn[id(draft)]
-    return looks
+    # an item of several methods is drawn once
+    for draft in {id(one): one for of_method in drafts.values() for one in of_method.values()}.values():
+        parts = artist.parts(draft)
+        check(draft, untitled(parts), onlooker.without_answer(draft, parts), onlooker.zone_of(draft, parts))

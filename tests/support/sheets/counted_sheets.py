@@ -10,9 +10,9 @@ from collections.abc import Sequence
 import openpyxl
 from simulated_annotators import answered
 
+from su3d_bench.sheets.answers import AnswerRow, check_answers, check_key
 from su3d_bench.sheets.items import ANSWER_COLUMNS, Key, Sheet
-from su3d_bench.sheets.judging.answers import AnswerRow, check_answers, check_key
-from su3d_bench.sheets.judging.scores import Scores, score
+from su3d_bench.sheets.scores import Scores, score
 
 Rows = list[AnswerRow]
 SHEET, STRINGS, RELATIONS = "xl/worksheets/sheet1.xml", "xl/sharedStrings.xml", "xl/_rels/workbook.xml.rels"

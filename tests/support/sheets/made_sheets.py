@@ -10,9 +10,9 @@ import numpy as np
 from places import SCENES
 
 from su3d_bench.reports.pictures.items import png_bytes
+from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.items import ASKS, SheetKind
-from su3d_bench.sheets.making.drafts import Draft
-from su3d_bench.sheets.making.sets import MadeSheets, Origin, make_sheets
+from su3d_bench.sheets.sets import MadeSheets, Origin, make_sheets
 
 PAINTED = f"{SCENES}/painted.py:Painted"
 COLLECTOR = f"{SCENES}/painted.py:Collector"

@@ -11,7 +11,7 @@ import pytest
 from painted import colour_perception
 
 if TYPE_CHECKING:
-    from su3d_bench.sheets.making.run_source import RunSource
+    from su3d_bench.sheets.sources import RunSource
 
 
 @pytest.fixture(scope="session")
@@ -41,7 +41,7 @@ def painted_source(painted_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Run
     """The run, judged by rules of the built-in rooms, whose label space the painted scenes have."""
     from su3d_bench.metrics.protocols.loading import load_protocol
     from su3d_bench.runs.finished import read_run
-    from su3d_bench.sheets.making.run_source import RunSource
+    from su3d_bench.sheets.sources import RunSource
 
     monkeypatch.setenv("SU3D_DATA", str(painted_folder / "data"))
     monkeypatch.setattr(RunSource, "rules", lambda self, scene, kind: load_protocol(f"rooms-{kind}"))

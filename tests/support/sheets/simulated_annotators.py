@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from su3d_bench.questions.model import KINDS
+from su3d_bench.sheets.answers import AnswerRow
 from su3d_bench.sheets.items import (
     ANSWER_COLUMNS,
     ASKS,
@@ -21,7 +22,6 @@ from su3d_bench.sheets.items import (
     SheetKind,
     new_item,
 )
-from su3d_bench.sheets.judging.answers import AnswerRow
 
 SCHEMES = tuple(f"opensu3d@scheme{k}" for k in range(1, 5))
 RATES = {SCHEMES[0]: 0.5, SCHEMES[1]: 0.6, SCHEMES[2]: 0.7, SCHEMES[3]: 0.9}  # how often each is right, in truth

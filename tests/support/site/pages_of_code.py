@@ -16,12 +16,20 @@ import su3d_bench
 from su3d_bench.cli.main import main
 from su3d_bench.core import registry
 from su3d_bench.core.config import flatten, toml_value
-from su3d_bench.metrics.protocols.files import HEADING, protocol_names, remarks_of, rules_files
 from su3d_bench.metrics.protocols.kinds import RULES_OF_KIND
-from su3d_bench.metrics.protocols.loading import load_protocol, not_comparable_with
+from su3d_bench.metrics.protocols.loading import (
+    HEADING,
+    Original,
+    Stated,
+    load_protocol,
+    not_comparable_with,
+    original_of,
+    protocol_names,
+    remarks_of,
+    rules_files,
+)
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.protocols.originals import Original, Stated, original_of
-from su3d_bench.reports.tables.papers.published import Figure, figures_of
+from su3d_bench.reports.tables.paper import Figure, figures_of
 
 PROTOCOLS = "reference/protocols"
 METHODS = "reference/methods"
@@ -192,9 +200,9 @@ def _reported(figures: Sequence[Figure], who: str) -> list[str]:
 
 
 def told_of(name: str) -> dict[str, Any]:
-    """What ``su3d-bench methods NAME --json`` answers."""
+    """What ``su3d-bench methods show NAME --json`` answers."""
     with redirect_stdout(io.StringIO()) as answer:
-        main(["methods", name, "--json"])
+        main(["methods", "show", name, "--json"])
     told: dict[str, Any] = json.loads(answer.getvalue())
     return told
 
@@ -210,7 +218,7 @@ def methods_page(methods: Sequence[Mapping[str, Any]]) -> str:
 
 
 def method_page(told: Mapping[str, Any]) -> str:
-    """What ``su3d-bench methods NAME`` prints, as a page."""
+    """What ``su3d-bench methods show NAME`` prints, as a page."""
     name = told["name"]
     origin = [(field, prose(told[field])) for field in ("paper", "source", "licence") if told[field]]
     origin += [("needs", plain("; ".join(told["needs"])))] if told["needs"] else []
@@ -236,7 +244,7 @@ def method_page(told: Mapping[str, Any]) -> str:
         table(("method", "settings"), presets, is_stacked=True) if presets else "",
         *_reported(figures_of(method=name), "protocol"),
         "## On the command line",
-        f"<pre><code>su3d-bench methods {plain(name)}</code></pre>",
+        f"<pre><code>su3d-bench methods show {plain(name)}</code></pre>",
     )
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from pages_of_code import PROTOCOLS, made_pages
 from site_text import DOCS, ROOT, ROOT_PAGES, for_site
 
-from su3d_bench.metrics.protocols.files import protocol_names
+from su3d_bench.metrics.protocols.loading import protocol_names
 
 _made: dict[str, str] = {}  # the pages of this build that are no files of docs/
 

@@ -7,19 +7,18 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import ConfigDict
+from pydantic import ConfigDict, Field
 
-from su3d_bench.core.errors import DataError, printable
-from su3d_bench.core.system.devices import CPU, Batches, first_batch, make_deterministic, require
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.system.devices import CPU, Batches
 from su3d_bench.core.types import Float32Array, Int64Array, UInt8Array
 from su3d_bench.perception.cache import FrameCache, content_key
-from su3d_bench.perception.models.encoders.image_transform import LARGEST_SIZE, ImageTransform
-from su3d_bench.perception.models.encoders.text_tokens import TOKENS_VERSION, TokensKind
-from su3d_bench.perception.models.onnx.session import PROVIDERS
+from su3d_bench.perception.models.encoders.images import ImageTransform
+from su3d_bench.perception.models.encoders.texts import TOKENS_VERSION, TokensKind
+from su3d_bench.perception.models.onnx import PROVIDERS
 
 ENCODER_VERSION = "1"
 # 65,536 features of 1024 numbers take 256 MB.
@@ -32,33 +31,12 @@ class EncoderSpec:
 
     __pydantic_config__ = ConfigDict(extra="forbid")
 
-    dim: int
-    n_tokens: int
-    n_words: int
+    dim: Annotated[int, Field(ge=1, le=2**16)]
+    n_tokens: Annotated[int, Field(ge=1, le=8192)]
+    n_words: Annotated[int, Field(ge=1, le=2_000_000)]
     tokens: TokensKind
-    pad_id: int | None
+    pad_id: Annotated[int, Field(ge=0, le=2_000_000)] | None
     transform: ImageTransform
-
-
-def check_spec(spec: EncoderSpec, where: object) -> EncoderSpec:
-    """``spec`` as a file said it; a ``DataError`` where a value is none that an encoder has."""
-    transform = spec.transform
-    for key, value, limit in (
-        ("dim", spec.dim, 2**16),
-        ("n_tokens", spec.n_tokens, 8192),
-        ("n_words", spec.n_words, 2_000_000),
-        ("size", transform.size, LARGEST_SIZE),
-    ):
-        if type(value) is not int or not 1 <= value <= limit:
-            raise DataError(f"{where}: {key} is {printable(str(value), 40)}, out of range; expected 1 to {limit}")
-    is_known = transform.fit in ("shortest", "squash") and transform.resample in range(6)
-    is_rgb = len(transform.mean) == len(transform.std) == 3 and 0 not in transform.std
-    if not is_known or not is_rgb or not np.isfinite((*transform.mean, *transform.std)).all():
-        raise DataError(f"{where}: the preparation of images is none that is known; fetch or export the folder anew")
-    pad = spec.pad_id
-    if spec.tokens not in ("clip", "siglip") or not (pad is None or (type(pad) is int and 0 <= pad < spec.n_words)):
-        raise DataError(f"{where}: the tokens are none that are known; fetch or export the folder anew")
-    return spec
 
 
 class Towers(Protocol):
@@ -72,37 +50,6 @@ class Towers(Protocol):
     def image_features(self, pixels: Float32Array) -> Float32Array: ...
 
     def text_features(self, tokens: Int64Array) -> Float32Array: ...
-
-
-class TorchTowers:
-    """``Towers`` of a torch model on one device in one precision; a subclass says what encodes images and texts.
-
-    ``n_values``: about how many numbers an image takes on its way, which rules the first batch on a GPU.
-    """
-
-    encode_image: Callable[[Any], Any]
-    encode_text: Callable[[Any], Any]
-
-    def __init__(self, model: Any, device: str, precision: str, batch: int, n_values: int) -> None:
-        dtype = getattr(require("torch", f"device '{device}'"), precision)
-        make_deterministic(device)
-        self._device, self._dtype = device, dtype
-        model.to(device=device, dtype=dtype)
-        n_bytes = sum(p.numel() * p.element_size() for p in model.parameters())
-        self.batch = batch or first_batch(device, n_values * dtype.itemsize, n_bytes)
-
-    def image_features(self, pixels: Float32Array) -> Float32Array:
-        return self._features(self.encode_image, pixels, self._dtype)
-
-    def text_features(self, tokens: Int64Array) -> Float32Array:
-        return self._features(self.encode_text, tokens, None)
-
-    def _features(self, encode: Callable[[Any], Any], values: NDArray[Any], dtype: Any) -> Float32Array:
-        import torch
-
-        with torch.inference_mode():
-            features = encode(torch.from_numpy(values).to(device=self._device, dtype=dtype))
-            return np.asarray(features.float().cpu().numpy(), np.float32)
 
 
 class FoundationEncoder:

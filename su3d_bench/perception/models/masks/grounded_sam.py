@@ -14,7 +14,7 @@ from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import BoolArray, Frame, Int64Array, Regions
 from su3d_bench.perception.cache import content_key
 from su3d_bench.perception.crops import mask_boxes
-from su3d_bench.perception.models.encoders.model_images import Resample
+from su3d_bench.perception.models.encoders.images import Resample
 from su3d_bench.perception.models.masks.automatic_masks import AutomaticMaskConfig, AutomaticMasks
 from su3d_bench.perception.models.masks.grounding_dino import CONCEPTGRAPHS_BOXES, BoxConfig, GroundingDino
 from su3d_bench.perception.models.masks.sam import Sam
@@ -69,16 +69,12 @@ GROUNDED_MASKS: Mapping[str, GroundedConfig] = MappingProxyType(
 
 @dataclass(frozen=True)
 class Networks:
-    """What the segmenters run, read from disk when first asked for; ``digest`` moves with weights and precision.
-
-    ``stand_ins``: names of the models whose weights cannot be the published ones.
-    """
+    """What the segmenters run, read from disk when first asked for; ``digest`` moves with weights and precision."""
 
     tagger: Tagger
     load_detector: Callable[[], GroundingDino]
     load_sam: Callable[[], Sam]
     digest: str
-    stand_ins: tuple[str, ...] = ()
 
 
 class GroundedSam:

@@ -6,15 +6,20 @@ A network that says what it sees is separate from the geometry around it: ``Torc
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import numpy as np
+from pydantic import Field
 
-from su3d_bench.core.system.devices import Batches
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.system.devices import Batches, require_transformers
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
-from su3d_bench.perception.models.encoders.model_images import normalised_bytes, resized, size_with_longest_side
+from su3d_bench.perception.models.encoders.images import normalised_bytes, resized, size_with_longest_side
+from su3d_bench.perception.models.files import ModelFiles, bounded, kept, load_class, on_device, read_weights
+from su3d_bench.perception.models.onnx import OnnxManifest, Provider, open_session, wrong_files
 
 MASK_THRESHOLD = 0.0  # on the network's logits
 BACKGROUND_POINT, OBJECT_POINT = 0, 1
@@ -189,3 +194,151 @@ class TorchSam:
         import torch
 
         return torch.from_numpy(np.ascontiguousarray(array)).to(self.model.device)
+
+
+# ---- through transformers, from a model folder or an original checkpoint
+
+# Width, layers, heads and layers with global attention of the image towers, from segment_anything/build_sam.py.
+_SAM_TOWERS = {
+    "sam-vit-h": (1280, 32, 16, (7, 15, 23, 31)),
+    "sam-vit-l": (1024, 24, 16, (5, 11, 17, 23)),
+    "sam-vit-b": (768, 12, 12, (2, 5, 8, 11)),
+}
+# The original's names and transformers' for the same tensors, as whole parts of a dotted name.
+_SAM_NAMES = (
+    (r"^image_encoder\.", "vision_encoder."),
+    (r"\.patch_embed\.proj\.", ".patch_embed.projection."),
+    (r"\.blocks\.", ".layers."),
+    (r"\.neck\.0\.", ".neck.conv1."),
+    (r"\.neck\.1\.", ".neck.layer_norm1."),
+    (r"\.neck\.2\.", ".neck.conv2."),
+    (r"\.neck\.3\.", ".neck.layer_norm2."),
+    (r"\.norm(\d|_final_attn)\.", r".layer_norm\1."),
+    (r"\.pe_layer\.positional_encoding_gaussian_matrix$", ".shared_embedding.positional_embedding"),
+    (r"\.point_embeddings\.", ".point_embed."),
+    (r"\.mask_downscaling\.0\.", ".mask_embed.conv1."),
+    (r"\.mask_downscaling\.1\.", ".mask_embed.layer_norm1."),
+    (r"\.mask_downscaling\.3\.", ".mask_embed.conv2."),
+    (r"\.mask_downscaling\.4\.", ".mask_embed.layer_norm2."),
+    (r"\.mask_downscaling\.6\.", ".mask_embed.conv3."),
+    (r"\.output_upscaling\.0\.", ".upscale_conv1."),
+    (r"\.output_upscaling\.1\.", ".upscale_layer_norm."),
+    (r"\.output_upscaling\.3\.", ".upscale_conv2."),
+    (r"(\.output_hypernetworks_mlps\.\d+|\.iou_prediction_head)\.layers\.0\.", r"\1.proj_in."),
+    (r"(\.output_hypernetworks_mlps\.\d+|\.iou_prediction_head)\.layers\.2\.", r"\1.proj_out."),
+    (r"(\.output_hypernetworks_mlps\.\d+|\.iou_prediction_head)\.layers\.1\.", r"\1.layers.0."),
+)
+_SAM_POSITIONS = "shared_image_embedding.positional_embedding"
+_SAM_NO_WEIGHTS = ("pixel_mean", "pixel_std")  # of the image, which some copies of the checkpoint hold
+
+
+def load_sam(files: ModelFiles, device: str, precision: str) -> TorchSam:
+    """SAM ready to run."""
+
+    def load() -> TorchSam:
+        model = _original_sam(files) if files.form.form == "original" else load_class(files, "SamModel")
+        return TorchSam(on_device(model, device, precision))
+
+    return kept(files, (device, precision), load)
+
+
+def sam_names(tensors: dict[str, Any]) -> dict[str, Any]:
+    """The tensors of an original SAM checkpoint under the names of ``transformers``' SamModel."""
+    renamed = {}
+    for name, tensor in tensors.items():
+        if name in _SAM_NO_WEIGHTS:
+            continue
+        for old, new in _SAM_NAMES:
+            name = re.sub(old, new, name)
+        renamed[name] = tensor
+    positions = renamed.get("prompt_encoder.shared_embedding.positional_embedding")
+    if positions is not None:
+        renamed[_SAM_POSITIONS] = positions  # one tensor in the original, two names in transformers
+    return renamed
+
+
+def sam_config(name: str) -> Any:
+    """``transformers``' configuration of the published SAM called ``name``."""
+    transformers = require_transformers(f"segmenter '{name}'")
+    width, n_layers, n_heads, global_layers = _SAM_TOWERS[name]
+    tower = {
+        "hidden_size": width,
+        "num_hidden_layers": n_layers,
+        "num_attention_heads": n_heads,
+        "global_attn_indexes": list(global_layers),
+    }
+    return transformers.SamConfig(vision_config=tower)
+
+
+def fill_sam(model: Any, tensors: dict[str, Any], where: str) -> Any:
+    """``model`` with the weights of an original checkpoint, every one of them; raises ``DataError``."""
+    try:
+        model.load_state_dict(sam_names(tensors), strict=True)
+    except RuntimeError as error:
+        raise DataError(f"{where}: is no checkpoint of this SAM: {bounded(error)}; fetch it anew") from error
+    return model
+
+
+def _original_sam(files: ModelFiles) -> Any:
+    transformers = require_transformers(f"segmenter '{files.entry.name}'")
+    model = transformers.SamModel(sam_config(files.entry.name))
+    return fill_sam(model, read_weights(files.weights), str(files.weights))
+
+
+# ---- exported to ONNX: a folder with encoder.onnx, decoder.onnx (and .data files beside large ones) and manifest.json
+
+ENCODER_FILE, DECODER_FILE = "encoder.onnx", "decoder.onnx"
+# Labels of points in the exported decoder, those of the original's own export: 0 background, 1 object, and these.
+NO_POINT, TOP_LEFT, BOTTOM_RIGHT = -1, 2, 3
+
+
+class SamManifest(OnnxManifest):
+    """The manifest of an exported SAM; ``image_px`` is the side of its network's image."""
+
+    FORMAT = "su3d-bench onnx segmenter 1"
+    REQUIRES = (ENCODER_FILE, DECODER_FILE)
+
+    image_px: Annotated[int, Field(ge=16, le=4096)]
+
+
+class OnnxSam:
+    """``SamNetwork`` of the exported encoder and decoder; what follows them is computed in torch on the CPU."""
+
+    def __init__(self, encoder: Any, decoder: Any, image_px: int) -> None:
+        self._encoder = encoder
+        self._decoder = decoder
+        self.image_px = image_px
+
+    def embed(self, pixels: Float32Array) -> Any:
+        return self._encoder.run(["embedding"], {"pixels": pixels[None]})[0]
+
+    def decode(self, embedding: Any, prompts: Prompts, is_single: bool) -> tuple[Any, Any]:
+        import torch
+
+        points, labels = exported_points(prompts)
+        fed = {"embedding": embedding, "points": points, "labels": labels}
+        logits, predicted = (torch.from_numpy(part) for part in self._decoder.run(["logits", "iou"], fed))
+        chosen = slice(0, 1) if is_single else slice(1, None)
+        return logits[:, chosen], predicted[:, chosen]
+
+
+def exported_points(prompts: Prompts) -> tuple[Float32Array, Int64Array]:
+    """Points (B, P, 2) and labels (B, P) as the exported decoder takes them: a box is its corners.
+
+    Points without a box are followed by one that is no point, as the network was trained.
+    """
+    if prompts.boxes is not None:
+        labels = np.tile(np.array([TOP_LEFT, BOTTOM_RIGHT], np.int64), (len(prompts), 1))
+        return prompts.boxes.reshape(-1, 2, 2).astype(np.float32), labels
+    assert prompts.points is not None and prompts.labels is not None
+    points = np.pad(prompts.points.astype(np.float32), ((0, 0), (0, 1), (0, 0)))
+    return points, np.pad(prompts.labels, ((0, 0), (0, 1)), constant_values=NO_POINT)
+
+
+def load_onnx_sam(files: ModelFiles, provider: Provider = "cpu", device_index: int = 0) -> OnnxSam:
+    """An exported SAM ready to run; raises ``DataError`` where a file is not the one that was written."""
+    manifest = SamManifest.read(files.weights)
+    if wrong := wrong_files(manifest, files.folder):
+        raise DataError(wrong[0])
+    sessions = [open_session(files.folder / name, provider, device_index) for name in (ENCODER_FILE, DECODER_FILE)]
+    return OnnxSam(sessions[0], sessions[1], manifest.image_px)

@@ -18,13 +18,14 @@ from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.perception.cache import content_key
 from su3d_bench.perception.embedded.naming import PromptedWords, listed_words, vocabulary
 from su3d_bench.perception.models.catalogue import ONNX_MANIFEST
-from su3d_bench.perception.models.encoders.model_images import Resample, normalised, resized
+from su3d_bench.perception.models.encoders.images import Resample, normalised, resized
 from su3d_bench.perception.models.files import ModelFiles, bounded, read_weights, what_to_fetch
-from su3d_bench.perception.models.onnx import ram_plus_program
-from su3d_bench.perception.models.onnx.manifest import OnnxManifest, wrong_files
+from su3d_bench.perception.models.onnx import OnnxManifest, wrong_files
 
-RAM_PX = ram_plus_program.IMAGE_PX
+RAM_PX = 384
 RAM_MODEL, RAM_TAG_LIST = "ram_plus.onnx", "ram_tag_list.txt"
+# Of its tensors: made by the network itself from its window size; the authors' loader drops them too.
+MADE_BY_ITSELF = ("relative_position_index", "attn_mask")
 WORDS_CAVEAT = "tags: RAM++ is not here; the words of a list that the encoder finds likeliest stand in for its tags"
 MAX_WORDS, MAX_WORD_LENGTH = 20_000, 100
 MAX_LIST_BYTES = 1 << 21
@@ -78,7 +79,7 @@ class RamTagger:
 class OnnxRamTagger:
     """RAM++ exported: ``image`` (1, 3, 384, 384) to ``tag`` (1, T), 1 where it holds, its first answer.
 
-    ``su3d-bench models export`` writes it so, and the script of recognize-anything's pull request 204.
+    ``tools/export_onnx.py`` writes it so, and the script of recognize-anything's pull request 204.
     """
 
     name = "ram-onnx"
@@ -102,20 +103,10 @@ class OnnxRamTagger:
 
 
 class RamManifest(OnnxManifest):
-    """The manifest of an exported RAM++.
-
-    ``code``: SHA-256 of the authors' files by name; ``made_with``: versions of the packages that ran them;
-    ``n_undecided``: tags of the compared images that lie within the tolerance of their threshold.
-    """
+    """The manifest of an exported RAM++."""
 
     FORMAT = "su3d-bench onnx tagger 1"
-    IS_OF = "a tagger"
     REQUIRES = (RAM_MODEL, RAM_TAG_LIST)
-
-    n_tags: int
-    code: dict[str, str]
-    made_with: dict[str, str]
-    n_undecided: int
 
 
 def wrong_tagger(files: ModelFiles) -> list[str]:
@@ -199,7 +190,7 @@ def load_ram(files: ModelFiles, device: str) -> Any:
         models = require("ram.models", "tagger 'ram-plus'")
     except ModelMissing as error:
         raise ModelMissing(
-            "tagger 'ram-plus': its package is not installed; run su3d-bench models export ram-plus, or "
+            "tagger 'ram-plus': its package is not installed; export it with tools/export_onnx.py, or "
             "set perception.paper.tagger to words"
         ) from error
     make_deterministic(device)
@@ -216,8 +207,16 @@ def load_ram(files: ModelFiles, device: str) -> Any:
 
 
 def fill_ram(model: Any, tensors: dict[str, Any], files: ModelFiles) -> None:
-    """Give ``model`` its weights; raises ``DataError`` where some lack or have another shape."""
+    """Give ``model`` its weights under the names of the authors' own loader; ``DataError`` where some do not fit."""
+    advice = what_to_fetch(files.entry, (files.form,))
+    named = {
+        name.replace("vision_multi", "tagging_head"): tensor
+        for name, tensor in tensors.items()
+        if not any(part in name for part in MADE_BY_ITSELF)
+    }
     try:
-        ram_plus_program.fill(model, tensors)
-    except ValueError as error:
-        raise DataError(f"{files.weights}: {bounded(error)}; {what_to_fetch(files.entry, (files.form,))}") from error
+        missing = model.load_state_dict(named, strict=False).missing_keys
+    except RuntimeError as error:
+        raise DataError(f"{files.weights}: does not fit RAM++ ({bounded(error)}); {advice}") from error
+    if missing := [name for name in missing if not any(part in name for part in MADE_BY_ITSELF)]:
+        raise DataError(f"{files.weights}: lacks {len(missing)} tensors, such as {missing[0][:80]}; {advice}")

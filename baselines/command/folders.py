@@ -1,0 +1,242 @@
+"""The folders that a user's program works in: the frames that it gets, and the prediction that it leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from su3d_bench.core.config import write_toml
+from su3d_bench.core.errors import DataError, PredictionError, printable
+from su3d_bench.core.files.atomic import make_folder, write_bytes, write_text
+from su3d_bench.core.maps import Instances, Prediction
+from su3d_bench.core.types import Float64Array, Frame, SceneInfo, Surface
+from su3d_bench.metrics.matching.nearest import masks_of_partition, select
+from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for
+from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
+
+LAYOUT_VERSION = 1
+MILLIMETRES = 1000.0
+MOST_MILLIMETRES = 65535  # of 16 bits; what lies farther is written as no depth
+ColourFormat = Literal["png", "jpg"]
+JPEG_QUALITY = 95
+
+# The same folder as the dataset `rgbd` reads it; {index} stands for the frame's number.
+DESCRIPTION = """colour = "colour/{{index}}.{colour}"
+depth = "depth/{{index}}.png"
+pose = "pose/{{index}}.txt"
+depth_unit_m = 0.001
+intrinsics_file = "intrinsics.txt"
+"""
+
+
+@dataclass
+class FrameFolder:
+    """Writes frames as they come; ``close`` may be called after each and completes the folder as it then is."""
+
+    path: Path
+    scene: SceneInfo
+    colour: ColourFormat = "png"
+    surface: Surface | None = None
+    _numbers: list[int] = field(default_factory=list)
+    _times_s: list[float] = field(default_factory=list)
+    _intrinsics: list[Float64Array] = field(default_factory=list)
+    _size: tuple[int, int] = (0, 0)
+
+    def open(self) -> None:
+        for name in ("colour", "depth", "pose"):
+            make_folder(self.path / name)
+        if self.surface is not None:
+            write_mesh(self.path / "mesh.ply", self.surface)
+
+    def add(self, frame: Frame) -> None:
+        """Write the files of one frame, named by its number in the sequence."""
+        size = (frame.rgb.shape[1], frame.rgb.shape[0])
+        if self._numbers and size != self._size:
+            raise DataError(
+                f"{self.scene.dataset}/{self.scene.scene} frame {frame.index}: is {size[0]}x{size[1]}, the frames "
+                f"before are {self._size[0]}x{self._size[1]}; a program gets frames of one size"
+            )
+        self._size = size
+        name = f"{frame.index:06d}"
+        write_bytes(self.path / "colour" / f"{name}.{self.colour}", _colour_bytes(frame, self.colour))
+        write_bytes(self.path / "depth" / f"{name}.png", _depth_bytes(frame))
+        write_text(self.path / "pose" / f"{name}.txt", matrix_text(frame.camera_to_world))
+        self._numbers.append(frame.index)
+        self._times_s.append(float(frame.timestamp_s))
+        self._intrinsics.append(frame.intrinsics)
+
+    def close(self) -> None:
+        """Write what holds for all frames so far; ``DataError`` without a frame."""
+        if not self._numbers:
+            raise DataError(f"{self.scene.dataset}/{self.scene.scene}: no frame to hand to the program")
+        write_text(self.path / "intrinsics.txt", matrix_text(self._intrinsics[0]))
+        differ = any(not np.array_equal(matrix, self._intrinsics[0]) for matrix in self._intrinsics)
+        if differ:
+            make_folder(self.path / "intrinsics")
+            for number, matrix in zip(self._numbers, self._intrinsics, strict=True):
+                write_text(self.path / "intrinsics" / f"{number:06d}.txt", matrix_text(matrix))
+        mesh = "" if self.surface is None else 'mesh = "mesh.ply"\n'
+        write_text(self.path / "rgbd.toml", DESCRIPTION.format(colour=self.colour) + mesh)
+        write_text(self.path / "scene.toml", self._scene_text(intrinsics_differ=differ))
+
+    def _scene_text(self, *, intrinsics_differ: bool) -> str:
+        first = self._intrinsics[0]
+        values: list[tuple[str, object, str]] = [
+            ("layout", LAYOUT_VERSION, "version of this folder's layout"),
+            ("dataset", printable(self.scene.dataset), "where the scene is from"),
+            ("scene", printable(self.scene.scene), "its name there"),
+            ("image_domain", self.scene.image_domain, "rendered-rooms or camera"),
+            ("stride", self.scene.stride, "every so many frames of the sequence are here"),
+            ("seed", self.scene.seed, "for whatever the program draws at random"),
+            ("n_frames", len(self._numbers), "frames in this folder"),
+            ("width", self._size[0], "pixels"),
+            ("height", self._size[1], "pixels"),
+            ("colour", f"colour/NNNNNN.{self.colour}", "8-bit RGB"),
+            ("depth", "depth/NNNNNN.png", "16-bit, along the optical axis, 0 where there is none"),
+            ("depth_unit_m", 0.001, "metres of one unit"),
+            ("pose", "pose/NNNNNN.txt", "4x4, camera to world, metres; x right, y down, z forward"),
+            ("intrinsics", "intrinsics.txt", "3x3, pixels"),
+            ("intrinsics_differ", intrinsics_differ, "then intrinsics/NNNNNN.txt has those of each frame"),
+            ("fx", float(first[0, 0]), "pixels"),
+            ("fy", float(first[1, 1]), "pixels"),
+            ("cx", float(first[0, 2]), "pixels"),
+            ("cy", float(first[1, 2]), "pixels"),
+            ("mesh", "mesh.ply" if self.surface is not None else None, "the scan's mesh, without labels"),
+            ("n_vertices", 0 if self.surface is None else len(self.surface.vertices), "of the mesh"),
+            ("frames", self._numbers, "the numbers NNNNNN, in the order of the updates"),
+            ("times_s", self._times_s, "seconds, one a frame"),
+        ]
+        return write_toml([((key,), value, remark) for key, value, remark in values])
+
+
+def matrix_text(matrix: Float64Array) -> str:
+    """A matrix, a row a line, such that reading it gives the same float64."""
+    return "".join(" ".join(repr(float(value)) for value in row) + "\n" for row in matrix)
+
+
+def _colour_bytes(frame: Frame, colour: ColourFormat) -> bytes:
+    import cv2
+
+    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if colour == "jpg" else []
+    done, content = cv2.imencode(f".{colour}", cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR), options)
+    assert done
+    return content.tobytes()
+
+
+def _depth_bytes(frame: Frame) -> bytes:
+    import cv2
+
+    depth_m = np.nan_to_num(frame.depth_m.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+    millimetres = np.rint(depth_m * MILLIMETRES)
+    millimetres[(millimetres < 0) | (millimetres > MOST_MILLIMETRES)] = 0
+    done, content = cv2.imencode(".png", millimetres.astype(np.uint16))
+    assert done
+    return content.tobytes()
+
+
+def write_mesh(path: Path, surface: Surface) -> None:
+    """The mesh as binary PLY, vertices in their order, which is the order that masks over them refer to."""
+    n_vertices, n_triangles = len(surface.vertices), len(surface.triangles)
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {n_vertices}\nproperty float x\nproperty float y\n"
+        f"property float z\nelement face {n_triangles}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    faces = np.zeros(n_triangles, np.dtype([("n", "u1"), ("corners", "<i4", (3,))]))
+    faces["n"] = 3
+    faces["corners"] = surface.triangles
+    write_bytes(path, header.encode() + surface.vertices.astype("<f4").tobytes() + faces.tobytes())
+
+
+def read_output(folder: Path, scene: str, format: str | None) -> ScenePrediction:
+    """The only prediction in ``folder``, or the one of ``scene`` where there are several."""
+    from su3d_bench.predictions.formats import recognise  # every format there is: not for a list of methods
+
+    files = [path for path in folder.iterdir() if not path.name.startswith(".")]
+    if not files:
+        raise PredictionError("it ended without an error and left nothing in {output}")
+    reader = recognise(folder, format)
+    names = list(reader.scenes(folder))
+    if not names:
+        raise PredictionError(f"what it left in {{output}} has no prediction in the format {reader.name}")
+    if len(names) > 1 and scene not in names:
+        shown = printable(", ".join(names[:4]), 200)
+        raise PredictionError(f"it left predictions of {len(names)} scenes ({shown}), none of them '{scene}'")
+    return reader.read(folder, scene if scene in names else names[0])
+
+
+def as_prediction(content: Content, surface: Surface | None, names: Mapping[int, str]) -> Prediction:
+    """``content`` as a map; masks and labels without points stand on the vertices of ``surface``.
+
+    ``names`` are those of the class numbers of such masks.
+    """
+    if not isinstance(content, VertexMasks | VertexLabels):
+        return content
+    if surface is None:
+        raise PredictionError(
+            "its masks have no points of their own and the dataset has no mesh; write points too, in another format"
+        )
+    n = len(surface.vertices)
+    n_points = len(content.class_ids) if isinstance(content, VertexLabels) else content.n_points
+    if n_points not in {None, n}:
+        raise PredictionError(f"its masks are over {n_points} points, the mesh has {n} vertices; they must be the same")
+    masks = _masks_of_labels(content) if isinstance(content, VertexLabels) else content
+    return Instances.of(
+        surface.vertices,
+        masks,
+        masks.scores,
+        masks.features,
+        labels=_labels(masks, names),
+        names=tuple(printable(key, 200) for key in masks.keys),
+        ids=range(1, len(masks) + 1),
+    )
+
+
+def _masks_of_labels(content: VertexLabels) -> VertexMasks:
+    """One mask a class; ids of 0 and below are no class, nor are places in a list below 0."""
+    distinct, row = np.unique(content.class_ids, return_inverse=True)
+    is_class = distinct >= (content.numbering == "id")
+    masks = select(masks_of_partition(row, len(distinct)), np.flatnonzero(is_class))
+    kept = distinct[is_class].astype(np.int32)
+    return VertexMasks(
+        masks.indptr,
+        masks.indices,
+        n_points=len(content.class_ids),
+        scores=np.ones(len(kept)),
+        class_numbers=kept,
+        numbering=content.numbering,
+        keys=tuple(f"class {number}" for number in kept),
+    )
+
+
+def _labels(masks: VertexMasks, names: Mapping[int, str]) -> tuple[str, ...] | None:
+    if masks.class_numbers is None:
+        return None
+    return tuple(names.get(number, f"class {number}") for number in masks.class_numbers.tolist())
+
+
+def class_names(content: Content, dataset: str, protocol: str | None) -> dict[int, str]:
+    """The names of the class numbers of ``content``: in ``protocol``, else in all that score the dataset by default.
+
+    Empty where it has none. Raises ``PredictionError`` where the protocols give one number different names.
+    """
+    has_numbers = isinstance(content, VertexMasks) and content.class_numbers is not None and len(content) > 0
+    if not (has_numbers or isinstance(content, VertexLabels)):
+        return {}
+    own = [load_protocol(protocol)] if protocol is not None else list(map(load_protocol, protocols_for(dataset)))
+    own = [rules for rules in own if rules.classes]
+    lists = [[(entry.id, entry.name) for entry in rules.classes] for rules in own]
+    if isinstance(content, VertexMasks) and content.numbering == "index":
+        scored = dict.fromkeys(tuple(entry.name for entry in rules.scored) for rules in own if rules.kind == "instance")
+        lists = [list(enumerate(names)) for names in scored]
+    elif isinstance(content, VertexMasks | VertexLabels) and content.numbering == "line":
+        whole = dict.fromkeys(tuple(entry.name for entry in rules.classes) for rules in own)
+        lists = [list(enumerate(names)) for names in whole]
+    pairs = {pair for listed in lists for pair in listed}
+    if not pairs or len(pairs) > len({number for number, _ in pairs}):
+        known = ", ".join(rules.name for rules in own) or "any that has classes"
+        raise PredictionError(f"whose are its class numbers? name a protocol in classes_of (known: {known})")
+    return dict(pairs)

@@ -1,0 +1,117 @@
+"""Models exported to ONNX: their ``manifest.json``, and sessions that give the same answer every time."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from su3d_bench.core.errors import DataError, ModelMissing
+from su3d_bench.perception.models.files import bounded, file_sha256, read_settings
+
+Provider = Literal["cpu", "cuda", "tensorrt"]
+PROVIDERS: dict[Provider, str] = {
+    "cpu": "CPUExecutionProvider",
+    "cuda": "CUDAExecutionProvider",
+    "tensorrt": "TensorrtExecutionProvider",
+}
+
+
+class OnnxManifest(BaseModel):
+    """What is read of every manifest: ``files`` name -> SHA-256; ``tools/export_onnx.py`` writes more beside it.
+
+    Of each kind: ``FORMAT`` of its file, and the files that it ``REQUIRES``.
+    """
+
+    model_config = ConfigDict(strict=True, frozen=True)
+    FORMAT: ClassVar[str]
+    REQUIRES: ClassVar[tuple[str, ...]]
+
+    name: str
+    files: dict[str, str]
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """The manifest at ``path``; raises ``DataError`` for anything else, and where a required file is not named."""
+        content = read_settings(path)
+        layout = content.get("format")
+        if layout != cls.FORMAT:
+            raise DataError(f"{path}: format is {str(layout)[:60]!r}; expected {cls.FORMAT!r}; export it again")
+        try:
+            manifest = cls.model_validate_json(json.dumps(content))
+        except ValidationError as error:
+            raise DataError(f"{path}: is no manifest of an exported model ({bounded(error, 120)})") from error
+        if any(Path(name).name != name for name in manifest.files) or not {*cls.REQUIRES} <= set(manifest.files):
+            needed = " and ".join(cls.REQUIRES)
+            raise DataError(f"{path}: files must be names inside the folder, {needed} among them; export it again")
+        return manifest
+
+
+def wrong_files(manifest: OnnxManifest, folder: Path) -> list[str]:
+    """A line for each file of the exported model in ``folder`` that is missing or not the one that was written."""
+    wrong = []
+    for name, digest in manifest.files.items():
+        path = folder / name
+        if not path.is_file():
+            wrong.append(f"{path}: is missing; export it again")
+        elif file_sha256(path) != digest:
+            wrong.append(f"{path}: is not the file that the manifest describes; export it again")
+    return wrong
+
+
+def open_session(path: Path, provider: Provider = "cpu", device_index: int = 0, n_threads: int = 1) -> Any:
+    """An ``InferenceSession`` of the model at ``path``; raises where the provider is absent or the file damaged.
+
+    ``n_threads`` on the CPU: one, so that no sum depends on the machine's number of cores. Operators that a GPU
+    provider lacks run on the CPU.
+    """
+    import onnxruntime
+
+    available = onnxruntime.get_available_providers()
+    if PROVIDERS[provider] not in available:
+        known = ", ".join(name for name, long in PROVIDERS.items() if long in available)
+        raise ModelMissing(
+            f"provider '{provider}': this onnxruntime has {known} alone; pip install onnxruntime-gpu in its place"
+        )
+    if not path.is_file():
+        raise ModelMissing(f"{path}: there is no such file; export the model with tools/export_onnx.py")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = n_threads
+    options.inter_op_num_threads = 1
+    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
+    options.use_deterministic_compute = True
+    options.log_severity_level = 3
+    try:
+        session = onnxruntime.InferenceSession(str(path), options, providers=_chain(provider, device_index))
+    except _refusals() as error:
+        raise DataError(f"{path}: ONNX Runtime cannot load it: {bounded(error)}; export it again") from error
+    used = session.get_providers()
+    if PROVIDERS[provider] not in used:
+        # ONNX Runtime falls back to the CPU where a provider's own libraries do not load
+        raise ModelMissing(
+            f"provider '{provider}': onnxruntime could not start it; install the CUDA libraries it needs"
+        )
+    return session
+
+
+def _refusals() -> tuple[type[Exception], ...]:
+    """What ONNX Runtime raises for a file: classes of its own, with none in common but ``Exception``."""
+    from onnxruntime.capi import onnxruntime_pybind11_state as state
+
+    found = (value for value in vars(state).values() if isinstance(value, type))
+    return tuple(value for value in found if issubclass(value, Exception))
+
+
+def _chain(provider: Provider, device_index: int) -> list[Any]:
+    on_device = {"device_id": device_index}
+    if provider == "cuda":
+        # the default searches an algorithm by timing, which may differ from run to run
+        return [
+            (PROVIDERS["cuda"], {**on_device, "cudnn_conv_algo_search": "HEURISTIC", "use_tf32": "0"}),
+            PROVIDERS["cpu"],
+        ]
+    if provider == "tensorrt":
+        return [(PROVIDERS["tensorrt"], on_device), (PROVIDERS["cuda"], on_device), PROVIDERS["cpu"]]
+    return [PROVIDERS["cpu"]]

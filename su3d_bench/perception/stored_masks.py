@@ -1,0 +1,234 @@
+"""Stored detections in the formats of others: label images, and ConceptGraphs' detections.
+
+A label image is a PNG with one channel of 8 or 16 bits and the frame's size; each value above 0 is one region.
+``pattern`` names the image of a frame below ``folder``: ``{index}`` stands for the frame's number with any zeros before
+it, ``{dataset}`` and ``{scene}`` for the scene. ``names``, a TOML or JSON file, maps values to names (``48 = "book"``);
+a region without one is named by the encoder.
+
+ConceptGraphs' ``gsa_detections_*`` are one gzipped pickle a frame, read as data: a dict of ``xyxy`` (N, 4),
+``confidence`` (N,), ``class_id`` (N,), ``mask`` (N, H, W) bool, ``classes``, a list of names, ``image_crops``, which
+are passed over, ``image_feats`` and ``text_feats`` (N, D), as ``generate_gsa_results.py`` writes it.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.core.errors import DataError, printable
+from su3d_bench.core.system.files import file_bytes, file_text
+from su3d_bench.core.toml import parse_toml
+from su3d_bench.core.types import BoolArray, Float32Array, Frame, Regions, SceneInfo
+from su3d_bench.formats.images import decoded, whole_png_header
+from su3d_bench.formats.pickles.pickles import read_pickle_file
+from su3d_bench.perception.crops import mask_boxes
+from su3d_bench.perception.stored import StoredFrame, check_masks, numbered_files
+
+MAX_NAMES_BYTES = 1 << 20
+MAX_NAME_LENGTH = 100
+
+
+@dataclass(frozen=True)
+class LabelledRegions:
+    """Regions of one image by ascending value: masks (K, H, W), boxes (K, 4) as in ``Regions``, names where given."""
+
+    values: tuple[int, ...]
+    masks: BoolArray
+    boxes: Float32Array
+    names: tuple[str | None, ...]
+
+
+class LabelImages:
+    """The label images of a scene; ``files`` are those that a run reads, the names' file first."""
+
+    name = "label images"
+
+    def __init__(self, folder: Path, pattern: str, names: Path | None, scene: SceneInfo) -> None:
+        self._where = f"{scene.dataset}/{scene.scene}"
+        self._pattern = pattern
+        self._images = numbered_files(folder, pattern, scene, self._where)
+        self._name_of = {} if names is None else read_names(names, self._where)
+        self.files = (*(() if names is None else (names,)), *self._images.values())
+
+    def regions(self, frame: Frame) -> LabelledRegions:
+        """What the image of ``frame`` shows; raises ``DataError``."""
+        path = self._images.get(frame.index)
+        if path is None:
+            raise DataError(
+                f"{self._where}: no label image for frame {frame.index} matches {self._pattern!r}; a frame without "
+                "regions has an image of zeros"
+            )
+        labels = decode_labels(path, frame.depth_m.shape, f"{self._where}: {path.name}")
+        values = [int(value) for value in np.unique(labels) if value > 0]
+        check_masks(len(values), labels.shape, f"{self._where}: {path.name}")
+        masks = np.empty((len(values), *labels.shape), np.bool_)
+        for mask, value in zip(masks, values, strict=True):
+            np.equal(labels, value, out=mask)
+        return LabelledRegions(
+            tuple(values), masks, mask_boxes(masks), tuple(self._name_of.get(value) for value in values)
+        )
+
+    def frame(self, frame: Frame) -> StoredFrame:
+        """The same with "" for a name that is not given, and no score below another."""
+        labelled = self.regions(frame)
+        names = tuple(name or "" for name in labelled.names)
+        return StoredFrame(Regions(labelled.masks, labelled.boxes, np.ones(len(names), np.float32), names))
+
+
+def decode_labels(path: Path, shape: tuple[int, ...], where: str) -> NDArray[Any]:
+    """Values (H, W) of a label image of this ``shape``; its header is believed before anything is decoded."""
+    import cv2
+
+    try:
+        content = file_bytes(path)
+    except OSError as error:
+        raise DataError(f"{where} cannot be read: {error.strerror}") from error
+    header = whole_png_header(content)
+    if header is None:
+        raise DataError(f"{where}: not a readable PNG image; write it again")
+    width, height, bits, colour_type = header
+    if bits not in (8, 16) or colour_type != 0:
+        raise DataError(
+            f"{where}: not a label image: {bits} bits, PNG colour type {colour_type}; expected one grey channel of 8 "
+            "or 16 bits"
+        )
+    if (height, width) != tuple(shape):
+        raise DataError(f"{where} is {width}x{height}, the frame has width {shape[1]} and height {shape[0]}")
+    labels = decoded(content, cv2.IMREAD_UNCHANGED)
+    if labels is None or labels.shape != (height, width):
+        raise DataError(f"{where}: not a readable PNG image; write it again")
+    return np.asarray(labels)
+
+
+def read_names(path: Path, where: str) -> dict[int, str]:
+    """Value -> name out of a TOML or JSON table whose keys are the values."""
+    where = f"{where}: {path.name}"
+    try:
+        if path.stat().st_size > MAX_NAMES_BYTES:
+            raise DataError(f"{where} has {path.stat().st_size} bytes; expected a table of names")
+        text = file_text(path)
+        table = json.loads(text) if path.suffix == ".json" else parse_toml(text)
+    except OSError as error:
+        raise DataError(f"{where} cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise DataError(f'{where}: not a TOML or JSON table of names by value, such as 48 = "book"') from error
+    if not isinstance(table, dict):
+        raise DataError(f'{where}: not a table; expected names by value, such as {{"48": "book"}}')
+    names: dict[int, str] = {}
+    for key, name in table.items():
+        if not re.fullmatch(r"[0-9]{1,5}", key) or not 0 < int(key) < 1 << 16:
+            raise DataError(f"{where}: {key[:20]!r} is no value of a label image; expected 1 to 65535")
+        if not (isinstance(name, str) and name.strip() and name.isprintable() and len(name) <= MAX_NAME_LENGTH):
+            raise DataError(f"{where}: the name of {key} is {str(name)[:40]!r}; expected a short text")
+        names[int(key)] = name.strip()
+    return names
+
+
+MAX_NAME_LENGTH = 100
+_SKIPPED = ("image_crops",)
+# Who made the features in the files, and of which crops: boxes and 20 px on every side.
+FEATURES_ENCODER, FEATURES_PADDING_PX = "clip-vit-h-14", 20
+
+
+class GsaFiles:
+    """The detections of a scene; ``files`` are those that a run may read."""
+
+    name = "gsa"
+
+    def __init__(self, folder: Path, pattern: str, scene: SceneInfo) -> None:
+        self._where = f"{scene.dataset}/{scene.scene}"
+        self._paths = numbered_files(folder, pattern, scene, self._where, "file of detections", "detections")
+        self.files = tuple(self._paths.values())
+
+    def frame(self, frame: Frame) -> StoredFrame:
+        """The detections of ``frame``; raises ``DataError`` or, for what is no plain pickle, ``PredictionError``."""
+        path = self._paths.get(frame.index)
+        if path is None:
+            raise DataError(
+                f"{self._where}: there are no detections of frame {frame.index}; run ConceptGraphs' "
+                "generate_gsa_results.py with the stride of this run, or with 1"
+            )
+        where = f"{self._where}: {path.name}"
+        content = read_pickle_file(path, forget=_SKIPPED)
+        if not isinstance(content, dict):
+            raise DataError(f"{where}: holds a {type(content).__name__}, expected a table of detections")
+        return _frame(content, frame, where)
+
+
+def _frame(content: Mapping[object, object], frame: Frame, where: str) -> StoredFrame:
+    height, width = frame.depth_m.shape
+    scores = _numbers(content, "confidence", where).reshape(-1)
+    n = len(scores)
+    check_masks(n, (height, width), where)
+    if not np.isfinite(scores).all():
+        raise DataError(f"{where}: a confidence is not finite")
+    masks = _masks(content, n, (height, width), where)
+    corners = _numbers(content, "xyxy", where).astype(np.float64).reshape(-1, 4) if n else np.zeros((0, 4))
+    if corners.shape != (n, 4) or not np.isfinite(corners).all():
+        raise DataError(f"{where}: xyxy is {corners.shape}; expected {n} boxes of finite numbers")
+    # As the detector has them: a box may reach beyond the image, by half its size at most. That bounds hostile ones.
+    size = np.array([width, height, width, height])
+    boxes: Float32Array = np.clip(corners, -size, 2 * size).astype(np.float32)
+    names = _names(content, n, where)
+    features = _features(content, n, where)
+    # SAM's predicted IoU may be a little above 1. A mask without pixels is no region; one that is a pixel wide is one,
+    # though SAM's box of it, from the first to the last pixel, has no width.
+    kept = np.flatnonzero(masks.any(axis=(1, 2)) & (boxes[:, 2:] >= boxes[:, :2]).all(axis=1))
+    scores = np.clip(scores[kept], 0, 1).astype(np.float32)
+    regions = Regions(masks[kept], boxes[kept], scores, tuple(names[k] for k in kept), rows=kept.astype(np.int64))
+    of_ratio = {} if features is None else {1.0: features[kept]}
+    return StoredFrame(regions, of_ratio, made_by=FEATURES_ENCODER, made_at_px=FEATURES_PADDING_PX)
+
+
+def _numbers(content: Mapping[object, object], key: str, where: str) -> NDArray[Any]:
+    value = content.get(key)
+    if isinstance(value, np.ndarray) and value.dtype.kind in "buif":
+        return value
+    if isinstance(value, list) and not value:
+        return np.zeros(0)
+    raise DataError(f"{where}: '{key}' is no array of numbers; it is written by generate_gsa_results.py")
+
+
+def _masks(content: Mapping[object, object], n: int, shape: tuple[int, int], where: str) -> BoolArray:
+    masks = _numbers(content, "mask", where)
+    if n == 0:
+        return np.zeros((0, *shape), bool)
+    if masks.shape != (n, *shape):
+        raise DataError(
+            f"{where}: masks are {masks.shape}, the frame has height {shape[0]} and width {shape[1]} and {n} "
+            "detections; they must be made from the images of the dataset at their own size"
+        )
+    return masks.astype(bool, copy=False)
+
+
+def _names(content: Mapping[object, object], n: int, where: str) -> tuple[str, ...]:
+    classes, chosen = content.get("classes"), _numbers(content, "class_id", where).reshape(-1)
+    if not isinstance(classes, list) or not all(isinstance(name, str) for name in classes):
+        raise DataError(f"{where}: 'classes' is no list of names")
+    if len(chosen) != n or (chosen.dtype.kind not in "iu" and n):
+        raise DataError(f"{where}: {len(chosen)} class numbers of type {chosen.dtype} for {n} detections")
+    outside = chosen[(chosen < 0) | (chosen >= len(classes))]
+    if len(outside):
+        raise DataError(f"{where}: class number {int(outside[0])}; 'classes' has {len(classes)} names")
+    names = tuple(printable(classes[int(k)].strip(), MAX_NAME_LENGTH) for k in chosen)
+    if not all(names):
+        raise DataError(f"{where}: a class has an empty name")
+    return names
+
+
+def _features(content: Mapping[object, object], n: int, where: str) -> Float32Array | None:
+    if n == 0 or "image_feats" not in content:
+        return None
+    features = _numbers(content, "image_feats", where)
+    lengths = np.linalg.norm(features.astype(np.float64), axis=-1) if features.ndim == 2 else np.zeros(0)
+    # Made in half precision in the original, whose lengths are 1 to the third decimal.
+    if len(features) != n or features.ndim != 2 or not (np.abs(lengths - 1) < 1e-2).all():
+        raise DataError(f"{where}: image_feats are {features.shape}; expected {n} rows of length 1")
+    return (features / lengths[:, None]).astype(np.float32)

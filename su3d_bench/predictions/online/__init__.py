@@ -1,1 +1,0 @@
-"""Maps of systems that build them while they walk, each with its own points: OVO, RayFronts, ESAM, OnlineAnySeg."""

@@ -1,1 +1,0 @@
-"""Things that a scene has not and that are asked for all the same."""

@@ -1,0 +1,287 @@
+"""Chains of texts that lead to an object, and questions of single objects, as Beacon3D has them, made from a truth.
+
+The finest text of a chain means one object alone: by a property, by where it is, or by its name. Before it comes the
+name, which means every thing so called. An object has three chains; one with fewer such texts is not asked for.
+
+An object that has three chains of texts is asked about three times, each time under a text that means it alone: what
+it stands on (class), its colour (appearance), whether it is taller or larger than another (geometry), what it is next
+to or closer to (spatial), what is next to it (existence). What a slightly other threshold would answer otherwise, or no
+frame shows plainly, is not asked. Templates are ours.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.core.english import is_plural, with_article, words
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import GroundTruth
+from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
+from su3d_bench.metrics.questions.chains import CHAINS_EACH, ChainedText, Place
+from su3d_bench.numerics.relations import gap_m
+from su3d_bench.questions.generator import TWICE, generate, is_flat
+from su3d_bench.questions.model import KINDS, Question
+from su3d_bench.questions.scene_map import MapObject, SceneMap
+from su3d_bench.questions.sight import COLOURS, SHAPES, SIZES
+
+INSTANCE, _, PROPERTY, RELATIVE = KINDS
+FORMS = SHAPES | {word for more, less, _ in SIZES for word in (more, less) if word}
+
+
+def chain_truth(scene: str, truth: GroundTruth, objects: SceneMap, most_objects: int | None = None) -> QueryTruth:
+    """The texts of a scene in chains of objects, ``most_objects`` at most, over the instances of its truth."""
+    owner = truth.instance.astype(np.int64)
+    owner[owner <= 0] = -1
+    cases = chains_of(generate(scene, objects), objects, most_objects)
+    source = f"chains made from {truth.source}"
+    return QueryTruth(truth.points, owner, cases, truth.variant, source, truth.labels.space)
+
+
+def chains_of(
+    questions: Sequence[Question], objects: SceneMap, most_objects: int | None = None
+) -> tuple[ChainedText, ...]:
+    """Every text of the chains, once, in the order of the objects.
+
+    Of several texts that mean an object those count that come first by a digest, one of each sort in turn.
+    """
+    name_of = {question.text: question for question in questions if question.kind == INSTANCE}
+    cases: dict[str, ChainedText] = {}
+    n_objects = 0
+    for thing in objects.objects:
+        coarse = name_of.get(thing.name)
+        fine = [] if coarse is None else _meaning(thing.id, questions)
+        if coarse is None or len(fine) < CHAINS_EACH or n_objects == most_objects:
+            continue
+        for number, question in enumerate(fine[:CHAINS_EACH]):
+            for step, one in enumerate((question, coarse)):
+                known = cases.get(one.text) or ChainedText(one.text, one.answers or (), tags=_tags(one))
+                places = (*known.places, Place(n_objects, number, step))
+                cases[one.text] = replace(known, places=places)
+        n_objects += 1
+    return tuple(cases.values())
+
+
+def _meaning(object_id: int, questions: Sequence[Question]) -> list[Question]:
+    """Properties and relations that one object alone has, one sort after the other, each sort by a digest."""
+    alone = {
+        one.text: one for one in questions if one.answers == (object_id,) and one.kind.startswith((PROPERTY, RELATIVE))
+    }
+    turn = dict[frozenset[str], int]()
+    ranked = []
+    for one in sorted(alone.values(), key=lambda one: hashlib.sha256(one.text.encode()).digest()):
+        tags = _tags(one)
+        turn[tags] = turn.get(tags, 0) + 1
+        ranked.append((turn[tags], one))
+    return [one for _, one in sorted(ranked, key=lambda pair: pair[0])]
+
+
+def _tags(question: Question) -> frozenset[str]:
+    """By what a text tells its objects, in Beacon3D's words.
+
+    >>> from su3d_bench.questions.model import new_question
+    >>> sorted(_tags(new_question("a/b", "property", "red chair", (1,), "")))
+    ['appearance', 'class']
+    """
+    if question.kind == INSTANCE:
+        return frozenset(("class",))
+    if question.kind.startswith(RELATIVE):
+        return frozenset(("class", "spatial"))
+    is_form = question.text.partition(" ")[0] in FORMS
+    return frozenset(("class", "geometry" if is_form else "appearance"))
+
+
+TALLER = 1.5  # ours: times as high, from which anybody says so
+LEAD_M, FAR_M = 0.5, 1.5  # ours: by how much the closer one leads; how far away is surely not next to it
+MOST_PLAIN = 3  # words of a text that needs no quotation marks in a question
+MOST_WAYS = 4  # of one template about one object
+
+
+@dataclass(frozen=True)
+class MadeQuestion:
+    """A question of an object; ``told`` are the words on which the answer rests: a text with them gives it away."""
+
+    text: str
+    answer: str
+    tag: str
+    told: str
+
+
+def metadata_of(scene: str, objects: SceneMap, most_objects: int | None = None) -> tuple[dict[str, Any], ...]:
+    """The classes of a scene in the form of ``metadata_*_grounding.json`` and of ``metadata_*_qa.json``.
+
+    Ids are one less than here, as in ScanNet. Objects of which fewer than three questions can be asked are in neither.
+    """
+    cases = chains_of(generate(scene, objects), objects)
+    grounding: dict[str, Any] = {}
+    asked: dict[str, Any] = {}
+    for chains in _chains_of_objects(cases):
+        fine = [chain[0] for chain in chains]
+        (object_id,) = fine[0].object_ids
+        thing, key = objects.by_id(object_id), str(object_id - 1)
+        made = _drawn(thing, fine, objects)
+        if len(made) < CHAINS_EACH or (most_objects is not None and sum(map(len, asked.values())) == most_objects):
+            continue
+        texts = [case.text for case in fine]
+        known = {word for text in texts for word in words(text)}
+        grounding.setdefault(thing.name, {})[key] = {
+            f"chain_{number}": [_entry(case) for case in chain] for number, chain in enumerate(chains, 1)
+        }
+        rows = [_question(one, is_told=set(words(one.told)) <= known) for one in made]
+        asked.setdefault(thing.name, {})[key] = {"grounding_text": texts, "qa": rows}
+    return grounding, asked
+
+
+def made_files(scenes: Mapping[str, SceneMap], per_scene: int | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The contents of both metadata files for scenes by their names, ``per_scene`` objects of each at most."""
+    grounding: dict[str, Any] = {}
+    asked: dict[str, Any] = {}
+    for scene, objects in scenes.items():
+        chains, questions = metadata_of(scene, objects, per_scene)
+        if questions:
+            grounding[scene], asked[scene] = chains, questions
+    if not asked:
+        raise DataError("no object of these scenes has three texts that mean it alone and three questions; name others")
+    return grounding, asked
+
+
+def _chains_of_objects(cases: Sequence[ChainedText]) -> Iterator[list[list[ChainedText]]]:
+    """The three chains of each object, each with its finest text first."""
+    chains: dict[int, dict[int, dict[int, ChainedText]]] = {}
+    for case in cases:
+        for place in case.places:
+            chains.setdefault(place.object, {}).setdefault(place.chain, {})[place.step] = case
+    for _, of_object in sorted(chains.items()):
+        yield [[chain[step] for step in sorted(chain)] for _, chain in sorted(of_object.items())]
+
+
+def _entry(case: ChainedText) -> dict[str, Any]:
+    tags = sorted(case.tags, key=lambda tag: (tag != "class", tag))
+    return {"text": case.text, "obj_id": [str(one - 1) for one in case.object_ids], "tag": "-".join(tags)}
+
+
+def _question(one: MadeQuestion, *, is_told: bool) -> dict[str, Any]:
+    return {"question": one.text, "answer": one.answer, "tag": one.tag, "extra_knowledge": int(not is_told)}
+
+
+def _drawn(thing: MapObject, fine: Sequence[ChainedText], objects: SceneMap) -> list[MadeQuestion]:
+    """Three questions of different kinds as far as there are, by a digest of their texts; yes as often as no."""
+    every = [
+        one for case in fine for one in questions_about(thing, case.text, objects) if not _gives_away(one, case.text)
+    ]
+    turn = Counter[str]()
+    ranked = []
+    unwanted = {tag: ("Yes", "No")[_digest(f"{thing.id} {tag}")[-1] % 2] for tag in {one.tag for one in every}}
+    for one in sorted(every, key=lambda one: (one.answer == unwanted[one.tag], _digest(one.text))):
+        turn[one.tag] += 1
+        ranked.append((turn[one.tag], _digest(f"{thing.id} {one.tag}"), one))
+    ranked.sort(key=lambda entry: entry[:2])
+    drawn: dict[tuple[str, str], MadeQuestion] = {}
+    for _, _, one in ranked:
+        drawn.setdefault((one.tag, one.told), one)
+    return list(drawn.values())[:CHAINS_EACH]
+
+
+def _digest(text: str) -> bytes:
+    return hashlib.sha256(text.encode()).digest()
+
+
+def _gives_away(one: MadeQuestion, text: str) -> bool:
+    """Whether the text under which an object is asked about tells the answer."""
+    return bool(set(words(one.told)) & set(words(text)))
+
+
+def questions_about(thing: MapObject, text: str, objects: SceneMap) -> Iterator[MadeQuestion]:
+    """Every question that can be asked of an object under a text that means it alone."""
+    it = f"the {text}" if len(text.split()) <= MOST_PLAIN else f"'the {text}'"
+    colours = sorted(set(thing.caption.split()) & COLOURS)
+    if len(colours) == 1:
+        yield MadeQuestion(f"What color is {it}?", colours[0].capitalize(), "appearance", colours[0])
+        named = sorted(COLOURS - set(colours))
+        other = named[_digest(it)[0] % len(named)]
+        for word, answer in ((colours[0], "Yes"), (other, "No")):
+            yield MadeQuestion(f"Is {it} {word}?", answer, "appearance", colours[0])
+    alone = [other for other in objects.objects if _is_alone(other, objects) and other.id != thing.id]
+    yield from _borne(thing, it, objects)
+    yield from _measured(thing, it, alone)
+    yield from _beside(thing, it, alone, objects)
+    yield from _existing(thing, it, objects)
+
+
+def _is_alone(thing: MapObject, objects: SceneMap) -> bool:
+    """Whether a thing is the only one that its name means, and is plain to see."""
+    return thing.is_asked and not is_plural(thing.name) and len(_called(thing.name, objects)) == 1
+
+
+def _called(name: str, objects: SceneMap) -> list[MapObject]:
+    """What is called so, or something that ends or begins so."""
+    wanted = set(words(name))
+    return [other for other in objects.objects if wanted <= set(words(other.name)) or set(words(other.name)) <= wanted]
+
+
+def _borne(thing: MapObject, it: str, objects: SceneMap) -> Iterator[MadeQuestion]:
+    """What an object stands on, where it is one thing."""
+    under = [other for other in objects.objects if other.id != thing.id and objects.holds("on", thing, other)]
+    doubts = [other for other in objects.objects if other.id != thing.id and objects.is_doubtful("on", thing, other)]
+    if len(under) == 1 and not doubts and under[0].is_asked:
+        yield MadeQuestion(f"What is {it} on?", under[0].name.capitalize(), "class", under[0].name)
+
+
+def _measured(thing: MapObject, it: str, alone: Sequence[MapObject]) -> Iterator[MadeQuestion]:
+    """Whether an object is taller, or larger, than another, where it is by far; of whole things alone."""
+    ways = 0
+    for other in sorted(alone, key=lambda other: _digest(f"{it} {other.name}")):
+        if ways == MOST_WAYS or not (thing.is_whole and other.is_whole):
+            return
+        high, low = float(thing.size[2]), float(other.size[2])
+        volumes = float(np.prod(thing.size)), float(np.prod(other.size))
+        if max(high, low) >= TALLER * min(high, low):
+            answer = "Taller" if high > low else "Shorter"
+            text = f"Is {it} taller or shorter than the {other.name}?"
+        elif max(volumes) >= TWICE * min(volumes) and not (is_flat(thing) or is_flat(other)):
+            answer = "Larger" if volumes[0] > volumes[1] else "Smaller"
+            text = f"Is {it} larger or smaller than the {other.name}?"
+        else:
+            continue
+        ways += 1
+        yield MadeQuestion(text, answer, "geometry", f"{answer} {other.name}")
+
+
+def _beside(thing: MapObject, it: str, alone: Sequence[MapObject], objects: SceneMap) -> Iterator[MadeQuestion]:
+    """Whether an object is next to another, and which of two is closer to it by far."""
+    for other in alone:
+        if objects.is_doubtful("next to", thing, other):
+            continue
+        is_next = objects.holds("next to", thing, other)
+        if is_next or gap_m(thing.box, other.box) > FAR_M:
+            answer = "Yes" if is_next else "No"
+            yield MadeQuestion(f"Is {it} next to the {other.name}?", answer, "spatial", other.name)
+    ranked = sorted(alone, key=lambda other: gap_m(thing.box, other.box))
+    for near, far in zip(ranked[:MOST_WAYS], reversed(ranked), strict=False):
+        if gap_m(thing.box, far.box) - gap_m(thing.box, near.box) < LEAD_M or near is far:
+            continue
+        first, second = sorted((near.name, far.name), key=lambda name: _digest(f"{it} {name}"))
+        text = f"Which is closer to {it}, the {first} or the {second}?"
+        yield MadeQuestion(text, near.name.capitalize(), "spatial", near.name)
+
+
+def _existing(thing: MapObject, it: str, objects: SceneMap) -> Iterator[MadeQuestion]:
+    """Whether something of a name is next to an object; the answer is no where none is within reach."""
+    names = sorted({other.name for other in objects.objects if other.id != thing.id and not is_plural(other.name)})
+    ways = Counter[str]()
+    for name in sorted(names, key=lambda name: _digest(f"{it} {name}")):
+        others = [other for other in _called(name, objects) if other.id != thing.id]
+        is_next = [objects.holds("next to", other, thing) for other in others]
+        if any(objects.is_doubtful("next to", other, thing) for other in others):
+            continue
+        plain = [other.is_asked for other, holds in zip(others, is_next, strict=True) if holds]
+        is_far = all(gap_m(thing.box, other.box) > FAR_M for other in others)
+        answer = "Yes" if any(plain) else "No" if is_far and not any(is_next) else ""
+        if answer and ways[answer] < MOST_WAYS:
+            ways[answer] += 1
+            yield MadeQuestion(f"Is there {with_article(name)} next to {it}?", answer, "existence", name)

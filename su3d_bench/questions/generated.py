@@ -1,0 +1,260 @@
+"""Questions about a scene made from templates, with the answers that geometry gives them.
+
+Each question is about names that stand in the scene, asked so that the answer is one and that nobody would dispute it:
+what is closest leads by a margin, references are single objects, pairs near a threshold are left out, yes and no are
+equally frequent, and what no frame shows plainly is neither asked for nor an answer. Left and right depend on who
+looks, and are asked only where an eye is given.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import zip_longest
+
+import numpy as np
+
+from su3d_bench.core.english import is_countable, is_plural, plural, with_article, words
+from su3d_bench.core.types import Float64Array
+from su3d_bench.numerics.relations import Relation, gap_m
+from su3d_bench.perception.embedded.naming import vocabulary
+from su3d_bench.questions.generator import extreme_of, is_flat
+from su3d_bench.questions.model import Answer
+from su3d_bench.questions.scene_map import MapObject, SceneMap, is_room_surface, meant_by, plain_name
+from su3d_bench.questions.solver import Solver
+
+MARGIN_M, MARGIN_SHARE = 0.25, 0.25  # by which the closest leads: metres, and of the longest side of what is compared
+LEVEL_M = 0.75  # things whose middles differ more in height are not compared by distance
+FAR_M = 1.5  # of what is asked about with the answer no
+FEW_BETWEEN = 2  # more things between two are no answer that one would give
+BETWEEN_M = 2.5  # nobody looks farther for what is between
+MOST_SINGLE = 30  # of the objects whose name no other has, so many are asked about: there are cubically many triples
+DISTANCE_M, DISTANCE_SHARE = 0.25, 0.1  # a guess is right within this
+HEAPED = frozenset({("book",), ("magazine",), ("newspaper",), ("shoe",), ("dish",)})  # annotated by the row or the pile
+ASKED_RELATIONS: tuple[Relation, ...] = ("on", "under", "above", "next to", "in")
+CENTRES = ", measured between centres"
+Random = np.random.Generator
+
+
+@dataclass(frozen=True)
+class GeneratedQuestion:
+    """A question with its true answer; ``kind`` names the template.
+
+    ``by_chance``: how often a guess among what could be answered is right; ``by_name``: how often one is who knows what
+    each object is called and nothing else.
+    """
+
+    text: str
+    kind: str
+    answer: Answer
+    by_chance: float = math.nan
+    by_name: float = math.nan
+
+
+@dataclass(frozen=True)
+class _Draft:
+    """A text with the shares that are right ``by_chance`` and ``by_name``; of one ``part`` as many as of another."""
+
+    text: str
+    by_chance: float
+    by_name: float
+    part: str = ""
+
+
+def generate_questions(
+    scene: SceneMap, *, n_each: int = 5, seed: int = 0, eye: Float64Array | None = None
+) -> tuple[GeneratedQuestion, ...]:
+    """Up to ``n_each`` questions of each kind, drawn with ``seed``; the built-in solver supplies the truth."""
+    random = np.random.default_rng(seed)
+    solver = Solver(scene, eye)
+    questions: list[GeneratedQuestion] = []
+    for kind, drafts in _Drafts(scene, random, with_sides=eye is not None).of_kinds().items():
+        for draft in _drawn(drafts, n_each, random):
+            answer = solver.answer(draft.text)
+            is_seen = all(scene.by_id(object_id).is_asked for object_id in answer.object_ids)
+            if answer.is_settled and is_seen:
+                questions.append(GeneratedQuestion(draft.text, kind, answer, draft.by_chance, draft.by_name))
+    return tuple(questions)
+
+
+def _drawn(drafts: Sequence[_Draft], n: int, random: Random) -> list[_Draft]:
+    """``n`` at most, in the order of their texts: as many of one part as of the other, of several in turn.
+
+    A single one is of any part.
+    """
+    parts: dict[str, list[_Draft]] = {}
+    for draft in sorted({draft.text: draft for draft in drafts}.values(), key=lambda draft: draft.text):
+        parts.setdefault(draft.part, []).append(draft)
+    waiting = [[part[k] for k in random.permutation(len(part))] for _, part in sorted(parts.items())]
+    waiting = [waiting[k] for k in random.permutation(len(waiting))]
+    turns = zip(*waiting, strict=False) if len(waiting) == 2 else zip_longest(*waiting)
+    drawn = [draft for turn in turns for draft in turn if draft is not None]
+    return sorted(drawn[: n - n % 2 if len(waiting) == 2 and n > 1 else n], key=lambda draft: draft.text)
+
+
+class _Drafts:
+    """The texts of each kind on one scene."""
+
+    def __init__(self, scene: SceneMap, random: Random, *, with_sides: bool) -> None:
+        self._scene = scene
+        self._random = random
+        self._with_sides = with_sides
+        self._all = [thing for thing in scene.objects if thing.name and not is_room_surface(thing.name)]
+        hidden = {thing.name for thing in self._all if not thing.is_asked}
+        self._things = [thing for thing in self._all if thing.name not in hidden]
+        self._n_of = Counter(thing.name for thing in self._things)
+        single = [
+            thing
+            for thing in self._things
+            if self._n_of[thing.name] == 1 and not is_plural(thing.name) and not thing.is_cut
+        ]
+        self._single = [single[k] for k in sorted(random.permutation(len(single))[:MOST_SINGLE])]
+
+    def of_kinds(self) -> Mapping[str, list[_Draft]]:
+        kinds: dict[str, Callable[[], Iterator[_Draft]]] = {
+            "closer": partial(self._extreme, 1),
+            "nearest": self._nearest,
+            "farthest": partial(self._extreme, -1),
+            "distance": self._distances,
+            "count": self._counts,
+            "largest": self._largest,
+            "compare": self._compared,
+            "between": self._between,
+        }
+        for relation in ASKED_RELATIONS:
+            kinds[f"what {relation}"] = partial(self._what, relation)
+            kinds[f"is {relation}"] = partial(self._is, relation)
+        if self._with_sides:
+            kinds["left of"] = self._sides
+        return {kind: list(drafts()) for kind, drafts in kinds.items()}
+
+    def _extreme(self, sign: int) -> Iterator[_Draft]:
+        """Which of several is nearest to (``sign`` 1) or farthest from (-1) a reference."""
+        of_two, of_more = ("closer to", "closest to") if sign > 0 else ("farther from", "farthest from")
+        for reference in self._single:
+            for name, n in self._n_of.items():
+                several = [thing for thing in self._things if thing.name == name]
+                if n > 1 and _leads(several, reference, sign):
+                    verb = "are" if is_plural(name) else "is"
+                    words = of_two if n == 2 else of_more
+                    yield _Draft(f"Which {name} {verb} {words} the {reference.name}{CENTRES}?", 1 / n, 1 / n)
+
+    def _nearest(self) -> Iterator[_Draft]:
+        for reference in self._single:
+            others = [thing for thing in self._all if thing is not reference]
+            ranked = sorted(others, key=partial(_away_m, reference))
+            if len(ranked) > 1 and _leads(ranked[:2], reference, 1):
+                share = 1 / len(others)
+                yield _Draft(f"Which object is closest to the {reference.name}{CENTRES}?", share, share)
+
+    def _distances(self) -> Iterator[_Draft]:
+        pairs = [(a, b, _away_m(a, b)) for a, b in _pairs(self._single)]
+        every = np.array([away_m for *_, away_m in pairs])
+        for a, b, away_m in pairs:
+            share = float((np.abs(every - away_m) <= max(DISTANCE_M, DISTANCE_SHARE * away_m)).mean())
+            yield _Draft(f"What is the distance between the centres of the {a.name} and the {b.name}?", share, share)
+
+    def _counts(self) -> Iterator[_Draft]:
+        """How many there are of every name, and of as many names of which there is none."""
+        counted = {name: len(meant_by(name, self._scene).objects) for name in self._n_of if _is_counted(name)}
+        absent = [plain_name(name) for name in vocabulary() if not is_room_surface(name)]
+        absent = [name for name in absent if _is_counted(name) and not meant_by(name, self._scene).objects]
+        counted |= {absent[k]: 0 for k in self._random.permutation(len(absent))[: max(1, len(counted) // 4)]}
+        of_value = Counter(counted.values())
+        for name, n in counted.items():
+            yield _Draft(f"How many {plural(name)} are there?", of_value[n] / len(counted), 1.0, str(n))
+
+    def _largest(self) -> Iterator[_Draft]:
+        for name, n in self._n_of.items():
+            named = [thing for thing in self._things if thing.name == name]
+            if n < 2 or any(map(is_flat, named)) or not all(thing.is_whole for thing in named):
+                continue
+            if extreme_of(named, 1) is not None:
+                yield _Draft(f"Which {name} is the largest?", 1 / n, 1 / n)
+
+    def _compared(self) -> Iterator[_Draft]:
+        for reference in self._single:
+            for a, b in _pairs([thing for thing in self._single if thing is not reference]):
+                if _leads([a, b], reference, 1):
+                    text = f"Which is closer to the {reference.name}{CENTRES}, the {a.name} or the {b.name}?"
+                    yield _Draft(text, 0.5, 0.5, "first" if _away_m(a, reference) < _away_m(b, reference) else "second")
+
+    def _between(self) -> Iterator[_Draft]:
+        for a, b in _pairs(self._single):
+            if _away_m(a, b) > BETWEEN_M or gap_m(a.box, b.box) == 0 or not self._scene.are_in_one_place(a, b):
+                continue
+            between = [thing for thing in self._all if self._scene.is_between(thing, a, b)]
+            is_plain = all(self._scene.are_in_one_place(thing, a, b) and not thing.is_cut for thing in between)
+            is_plain &= not any(self._scene.may_be_between(thing, a, b) for thing in self._all if thing not in between)
+            if 0 < len(between) <= FEW_BETWEEN and is_plain:
+                share = 1 / math.comb(len(self._all), len(between))
+                yield _Draft(f"What is between the {a.name} and the {b.name}?", share, share)
+
+    def _what(self, relation: Relation) -> Iterator[_Draft]:
+        for reference in self._single:
+            pairs = [(thing, reference) for thing in self._all if thing is not reference]
+            if not all(self._scene.is_said(relation, *pair) for pair in pairs if self._scene.holds(relation, *pair)):
+                continue
+            held = [pair for pair in pairs if self._holds(relation, *pair)]
+            if held and not any(self._scene.is_doubtful(relation, *pair) for pair in pairs):
+                share = 1 / math.comb(len(pairs), len(held))
+                yield _Draft(f"What is {relation} the {reference.name}?", share, share)
+
+    def _is(self, relation: Relation) -> Iterator[_Draft]:
+        """Whether something called so stands in a relation; the answer is no for things that are far."""
+        subjects = {
+            a.name for a in self._things if any(self._holds(relation, a, b) for b in self._single if a is not b)
+        }
+        for reference in self._single:
+            pairs_of = {
+                name: [(a, reference) for a in self._things if a.name == name]
+                for name in self._n_of
+                if name != reference.name
+            }
+            is_held = {name: any(self._holds(relation, *pair) for pair in pairs) for name, pairs in pairs_of.items()}
+            for name, pairs in pairs_of.items():
+                is_far = all(gap_m(a.box, b.box) > FAR_M for a, b in pairs)
+                is_sure = not any(self._scene.is_doubtful(relation, *pair) for pair in pairs)
+                is_sure &= all(self._scene.is_said(relation, *pair) for pair in pairs)
+                if is_sure and (is_held[name] or (is_far and name in subjects and any(is_held.values()))):
+                    verb, noun = ("Are", name) if is_plural(name) else ("Is", with_article(name))
+                    text = f"{verb} there {noun} {relation} the {reference.name}?"
+                    yield _Draft(text, 0.5, 0.5, "yes" if is_held[name] else "no")
+
+    def _holds(self, relation: Relation, a: MapObject, b: MapObject) -> bool:
+        """Whether people would say so: a cushion is within the box of a sofa, and on it."""
+        is_also_on = relation == "in" and self._scene.holds("on", a, b)
+        return self._scene.holds(relation, a, b) and not is_also_on
+
+    def _sides(self) -> Iterator[_Draft]:
+        for a, b in _pairs(self._single):
+            if _away_m(a, b) < 2.0:
+                yield _Draft(f"Is the {a.name} left of the {b.name}?", 0.5, 0.5)
+
+
+def _is_counted(name: str) -> bool:
+    return is_countable(name) and words(name) not in HEAPED
+
+
+def _pairs(objects: Sequence[MapObject]) -> Iterator[tuple[MapObject, MapObject]]:
+    return ((a, b) for k, a in enumerate(objects) for b in objects[k + 1 :])
+
+
+def _away_m(a: MapObject, b: MapObject) -> float:
+    return float(np.linalg.norm(a.centroid - b.centroid))
+
+
+def _leads(things: Sequence[MapObject], reference: MapObject, sign: int) -> bool:
+    """Whether the first by distance (the last, ``sign`` -1) leads by what anybody sees, all on one level."""
+    heights = [thing.centroid[2] for thing in (*things, reference)]
+    if any(thing.is_cut for thing in things):
+        return False
+    if len(things) < 2 or max(heights) - min(heights) > LEVEL_M:
+        return False
+    ranked = sorted(things, key=lambda thing: sign * _away_m(thing, reference))[:2]
+    sides = [float(thing.size.max()) for thing in (*ranked, reference)]
+    lead_m = abs(_away_m(ranked[1], reference) - _away_m(ranked[0], reference))
+    return lead_m >= max(MARGIN_M, MARGIN_SHARE * max(sides))

@@ -1,0 +1,318 @@
+"""Question sets in files: TOML and CSV of our own, and the forms of ScanRefer, Nr3D (Sr3D), SQA3D and Beacon3D.
+
+In a CSV a text that a spreadsheet would compute begins with ``'``, which is left out again where it is read.
+
+ScanRefer: a JSON list of ``scene_id``, ``object_id``, ``description``, and ``object_name`` by which a sentence is
+unique or multiple. Nr3D: a CSV with ``scan_id``, ``target_id``, ``utterance``, and ``stimulus_id``, ``tokens`` and
+``mentions_target_class`` by which one is easy or hard, by the view or not, or left out. SQA3D: a JSON with
+``questions`` of ``scene_id``, ``situation``, ``question``, ``question_id``, whose answers stand in a file of
+annotations beside it. Beacon3D: ``metadata_*.json``, see ``beacon3d``. Object ids are ScanNet's own, one less than the
+ground truth's here. Sources: Beacon3D's data and daveredrum/ScanRefer.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import AfterValidator, BaseModel, Field, StringConstraints
+
+from su3d_bench.core.config import toml_value
+from su3d_bench.core.errors import DataError, printable
+from su3d_bench.core.files.atomic import make_folder, write_text
+from su3d_bench.core.system.files import file_text, opened
+from su3d_bench.core.toml import parse_toml
+from su3d_bench.formats.images import read_bytes
+from su3d_bench.formats.tables.csv_text import no_formula
+from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
+from su3d_bench.questions.beacon3d import chains_of, kind_of_metadata, questions_of_objects, read_metadata
+from su3d_bench.questions.model import ALL_KINDS, KINDS, REASONING, Question, new_question
+from su3d_bench.questions.query_files import (
+    COLUMNS,
+    MORE_COLUMNS,
+    ObjectId,
+    nr3d_groups,
+    only_words,
+    read_query_rows,
+    validated,
+)
+
+PAPER = Path(__file__).parent / "paper_queries.toml"
+PAGE = "opensu3d.github.io"
+PAPER_FIGURES = ("comparison", "schemes", "teaser")
+
+
+def read_questions(path: Path, dataset: str | None = None) -> tuple[Question, ...]:
+    """The questions of a file, each scene as ``<dataset>/<scene>``.
+
+    ``dataset`` completes scenes that name none; an empty one leaves them as they are.
+
+    A query without a kind is one of kind instance. The same question of the same scene may stand there once.
+    """
+    if is_foreign(path):
+        return _each_once(read_foreign(path))
+    questions: dict[str, Question] = {}
+    for row in read_query_rows(path):
+        kind = row.kind or KINDS[0]
+        if kind not in ALL_KINDS:
+            raise DataError(f"{row.at}: unknown kind '{printable(kind, 40)}'; known: {', '.join(ALL_KINDS)}")
+        if "/" not in row.scene and dataset is None:
+            raise DataError(f"{row.at}: of which dataset is scene '{printable(row.scene, 60)}'? write dataset/scene")
+        scene = f"{dataset}/{row.scene}" if dataset and "/" not in row.scene else row.scene
+        source = row.source or printable(path.name, 100)
+        question = new_question(scene, kind, row.text, row.objects or None, source)
+        if question.id in questions:
+            raise DataError(f"{row.at}: '{printable(row.text, 60)}' stands there twice for {printable(scene, 60)}")
+        questions[question.id] = question
+    return tuple(questions.values())
+
+
+def _each_once(questions: Sequence[Question]) -> tuple[Question, ...]:
+    """The first of each id: people wrote some sentences twice; where objects or replies differ, all are right."""
+    answers: dict[str, set[int]] = {}
+    replies: dict[str, dict[str, None]] = {}
+    for question in questions:
+        answers.setdefault(question.id, set()).update(question.answers or ())
+        replies.setdefault(question.id, {}).update({question.reply: None} if question.reply else {})
+    first = {question.id: question for question in reversed(questions)}
+    return tuple(
+        replace(first[key], answers=tuple(sorted(ids)) or None, reply=" or ".join(replies[key]))
+        for key, ids in answers.items()
+    )
+
+
+def paper_queries() -> tuple[Question, ...]:
+    """The queries that the paper's page shows, for each of its 13 scenes, and its questions to reasoning of one scene.
+
+    Of these alone an answer is published, in words.
+    """
+    content = _paper()
+    asked = [(kind, text) for kind in KINDS for text in content["queries"][kind]]
+    asked += [(kind, text) for name in PAPER_FIGURES for kind, text in content["figures"][name]]
+    queries = (
+        new_question(scene, kind, text, None, PAGE)
+        for scene in content["scenes"]
+        for kind, text in dict.fromkeys(asked)
+    )
+    reasoning = (
+        new_question(one["scene"], REASONING, one["text"], None, PAGE, one["reply"]) for one in content["reasoning"]
+    )
+    return (*queries, *reasoning)
+
+
+def figure_texts(figure: str) -> tuple[str, ...]:
+    """The texts of a figure of the paper or its page, one of ``PAPER_FIGURES``, each once.
+
+    >>> figure_texts("teaser")
+    ('a musical instrument', 'which sink is closer to bed?')
+    """
+    return tuple(dict.fromkeys(text for _, text in _paper()["figures"][figure]))
+
+
+def _paper() -> dict[str, Any]:
+    return parse_toml(file_text(PAPER))
+
+
+def check_form(path: Path) -> None:
+    """``DataError`` where the name of a file to be written says no form."""
+    if path.suffix.lower() not in (".toml", ".csv"):
+        raise DataError(f"{printable(str(path), 200)}: is neither .toml nor .csv; name the file so")
+
+
+def write_questions(path: Path, questions: Sequence[Question]) -> None:
+    """Write a set as ``read_questions`` reads it, TOML or CSV by the file's name; answers in words are not kept."""
+    check_form(path)
+    make_folder(path.parent)
+    write_text(path, csv_text(questions) if path.suffix.lower() == ".csv" else toml_text(questions))
+
+
+def toml_text(questions: Sequence[Question]) -> str:
+    """The set as ``[[query]]`` tables."""
+    blocks = []
+    for question in questions:
+        values = {"scene": question.scene, "kind": question.kind, "text": question.text}
+        values_more = {"objects": list(question.answers or ()), "source": question.source}
+        lines = [f"{key} = {toml_value(value)}" for key, value in (values | values_more).items()]
+        blocks.append("\n".join(["[[query]]", *lines]))
+    return "\n\n".join(blocks) + "\n"
+
+
+def csv_text(questions: Sequence[Question]) -> str:
+    """The set as rows."""
+    text = io.StringIO(newline="")
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow((*COLUMNS, *MORE_COLUMNS))
+    for question in questions:
+        objects = " ".join(map(str, question.answers or ()))
+        rows.writerow(map(no_formula, (question.scene, question.text, objects, question.kind, question.source)))
+    return text.getvalue()
+
+
+DATASET = "scannet"
+MOST_BYTES = 256 << 20  # ScanRefer's training set has some 40 MB
+NR3D_COLUMNS = ("scan_id", "target_id", "utterance")
+ADVICE = (
+    "give ScanRefer_filtered_*.json, nr3d.csv or sr3d.csv, SQA3D's v1_balanced_questions_*.json or Beacon3D's "
+    "metadata_*.json as released, or write scene, text and objects as CSV or TOML"
+)
+_FIRST_BYTES = 65536
+Row = TypeVar("Row", bound=BaseModel)
+Scene = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_]{1,100}$")]
+# On one line: what people typed holds line ends and tabs.
+Sentence = Annotated[str, AfterValidator(lambda text: only_words(" ".join(text.split())))]
+OptionalText = Annotated[str, AfterValidator(lambda text: only_words(text) if text else text)]
+
+
+class _ScanRefer(BaseModel):
+    scene_id: Scene
+    description: Sentence
+    object_id: ObjectId
+    object_name: OptionalText | None = None
+
+
+class _Nr3D(BaseModel):
+    scan_id: Scene
+    utterance: Sentence
+    target_id: ObjectId
+    stimulus_id: OptionalText | None = None
+    tokens: OptionalText | None = None
+    mentions_target_class: OptionalText | None = None
+
+
+class _Situated(BaseModel):
+    scene_id: Scene
+    situation: Sentence | Literal[""] | None = None
+    question: Sentence
+    question_id: Any = None
+
+
+class _Answer(BaseModel):
+    answer: Sentence
+
+
+class _Reply(BaseModel):
+    question_id: Any = None
+    answers: list[_Answer] = Field(min_length=1)
+
+
+def is_foreign(path: Path) -> bool:
+    """Whether a file is of one of these forms, by its ending or, for a CSV, its first line."""
+    if path.suffix.lower() != ".csv" or not path.is_file():
+        return path.suffix.lower() in (".json", ".jsonl")
+    with opened(path) as file:
+        line = file.read(_FIRST_BYTES).partition(b"\n")[0].decode("utf-8", "replace")
+    return len(set(NR3D_COLUMNS) & {word.strip().strip('"').lstrip("\ufeff") for word in line.split(",")}) > 1
+
+
+def read_foreign(path: Path) -> tuple[Question, ...]:
+    """The sentences of a file: descriptions and utterances as relative queries, SQA3D's as reasoning questions."""
+    where = printable(str(path), 200)
+    text = _text_of(path, where)
+    if path.suffix.lower() == ".csv":
+        return tuple(_nr3d(text, where))
+    content = _json_of(text, where)
+    if kind_of_metadata(content) is not None:
+        return tuple(_of_objects(content, where))
+    if isinstance(content, list):
+        return tuple(_scanrefer(content, where))
+    if isinstance(content, dict) and isinstance(content.get("questions"), list):
+        return tuple(_situated(content["questions"], _replies(path), where))
+    raise DataError(f"{where}: holds no questions that can be read; {ADVICE}")
+
+
+def read_foreign_queries(path: Path) -> dict[str, tuple[TextQuery, ...]]:
+    """The sentences of each scene that name an object, each as often as the file has it; Beacon3D's in their chains."""
+    if path.suffix.lower() == ".json" and kind_of_metadata(content := read_metadata(path)) == "grounding":
+        return dict(chains_of(content, printable(str(path), 200)).cases)
+    queries_of_scene: dict[str, list[TextQuery]] = {}
+    for question in read_foreign(path):
+        if not question.is_known:
+            raise DataError(
+                f"{printable(str(path), 200)}: {question.source} names no objects; nothing can be scored by it"
+            )
+        scene = question.scene.rpartition("/")[2]
+        query = TextQuery(question.text, question.answers or (), question.groups, question.name)
+        queries_of_scene.setdefault(scene, []).append(query)
+    return {scene: tuple(queries) for scene, queries in queries_of_scene.items()}
+
+
+def _of_objects(content: Any, where: str) -> Iterator[Question]:
+    """Beacon3D's texts as relative queries, its questions as reasoning questions with the object they are about."""
+    if kind_of_metadata(content) == "grounding":
+        for scene, cases in chains_of(content, where).cases.items():
+            for case in cases:
+                text = " ".join(case.text.split())
+                yield new_question(f"{DATASET}/{scene}", "relative", text, case.object_ids, "Beacon3D")
+        return
+    for asked in questions_of_objects(content, where).entries:
+        text, reply = " ".join(asked.question.split()), " ".join(asked.answer.split())
+        yield new_question(f"{DATASET}/{asked.scene}", REASONING, text, None, "Beacon3D", reply)
+
+
+def _text_of(path: Path, where: str) -> str:
+    try:
+        return read_bytes(path, where, ADVICE, MOST_BYTES).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise DataError(f"{where}: not a text file in UTF-8; {ADVICE}") from error
+
+
+def _json_of(text: str, where: str) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{where}: not JSON ({printable(str(error), 120)}); {ADVICE}") from error
+
+
+def _scanrefer(rows: list[Any], where: str) -> Iterator[Question]:
+    for row in _rows(_ScanRefer, rows, where, "entry"):
+        question = new_question(
+            f"{DATASET}/{row.scene_id}", "relative", row.description, (row.object_id + 1,), "ScanRefer"
+        )
+        yield replace(question, name=row.object_name or "")
+
+
+def _nr3d(text: str, where: str) -> Iterator[Question]:
+    """The utterances, in the groups of the file where it has such columns."""
+    try:
+        lines = list(csv.DictReader(io.StringIO(text, newline=""), strict=True))
+    except csv.Error as error:
+        raise DataError(f"{where}: not CSV ({printable(str(error), 120)}); {ADVICE}") from error
+    for number, row in enumerate(_rows(_Nr3D, lines, where, "row", 2), 2):
+        question = new_question(f"{DATASET}/{row.scan_id}", "relative", row.utterance, (row.target_id + 1,), "Nr3D")
+        groups: tuple[str, ...] = ()
+        if row.stimulus_id is not None:
+            groups = nr3d_groups(row.stimulus_id, row.tokens, row.mentions_target_class, f"{where}: row {number}")
+        yield replace(question, groups=groups)
+
+
+def _situated(rows: list[Any], replies: Mapping[str, str], where: str) -> Iterator[Question]:
+    for row in _rows(_Situated, rows, where, "question"):
+        text = f"{row.situation or ''} {row.question}".strip()
+        reply = replies.get(str(row.question_id), "")
+        yield new_question(f"{DATASET}/{row.scene_id}", REASONING, text, None, "SQA3D", reply)
+
+
+def _replies(path: Path) -> dict[str, str]:
+    """The first answer to each question, from ``..._sqa_annotations_...`` beside ``..._questions_...``."""
+    beside = path.with_name(path.name.replace("_questions_", "_sqa_annotations_"))
+    if beside == path or not beside.is_file():
+        return {}
+    where = printable(str(beside), 200)
+    content = _json_of(_text_of(beside, where), where)
+    rows = content.get("annotations") if isinstance(content, dict) else None
+    if not isinstance(rows, list):
+        raise DataError(f"{where}: has no 'annotations'")
+    known = _rows(_Reply, rows, where, "annotation")
+    return {str(row.question_id): row.answers[0].answer for row in known}
+
+
+def _rows(kind: type[Row], rows: list[Any], where: str, noun: str, first: int = 1) -> Iterator[Row]:
+    if not rows:
+        raise DataError(f"{where}: is empty; {ADVICE}")
+    for number, row in enumerate(rows, first):
+        yield validated(kind, row, f"{where}: {noun} {number}")

@@ -1,0 +1,314 @@
+"""Label n': one name for an instance out of the names that its best views gave it, by vote or by a language model.
+
+The file of labels n' lies beside a map, which itself stays as the run sealed it. The paper's filter of large background
+objects is applied again under labels n': "Large background objects (walls, ground, roof, ceiling) and objects with
+bounding boxes > 95 % of image area are excluded" (section IV, Filtering and Post-Processing); labels n' "help to filter
+out undesired large instances" (the text beside Table V).
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from su3d_bench.core.digests import digest_file
+from su3d_bench.core.english import words
+from su3d_bench.core.errors import PredictionError, StoreError, printable
+from su3d_bench.core.files.atomic import read_json, write_json
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import Float64Array
+from su3d_bench.metrics.questions.score import RefinedNames
+from su3d_bench.opensu3d.config import OpenSU3DConfig
+from su3d_bench.perception.detections import is_background
+from su3d_bench.perception.language.captioner import REFINE, REFINE_FORM, list_of_names, reason_of
+from su3d_bench.perception.language.chat import ChatRequest
+from su3d_bench.perception.language.client import LanguageModel
+from su3d_bench.perception.language.config import LanguageConfig
+from su3d_bench.perception.language.parsing import chosen_name
+from su3d_bench.store.run_folder import JobFolder
+
+_OF_IMAGES = OpenSU3DConfig()
+
+
+class FilterConfig(BaseModel):
+    """Which instances labels n' leave out; no ``background_names`` and a ``max_map_fraction`` of 1 leave out none."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    # The paper's list, by the head noun of a name, as for what is found in images.
+    background_names: Annotated[tuple[str, ...], Field(strict=False)] = _OF_IMAGES.background_names
+    # The paper's share is of an image's area; the map has no image, so that of its floor plan stands here (ours).
+    max_map_fraction: float = Field(default=_OF_IMAGES.max_box_fraction, gt=0, le=1)
+
+
+def undesired(instances: Instances, names: Sequence[str], config: FilterConfig) -> tuple[str, ...]:
+    """Why each instance is left out under its label n' in ``names``; '' where it stays."""
+    fractions = _map_fractions(instances)
+    return tuple(_reason(name, float(share), config) for name, share in zip(names, fractions, strict=True))
+
+
+def _reason(name: str, fraction: float, config: FilterConfig) -> str:
+    if is_background(name, config.background_names):
+        return f"'{printable(name, 60)}' is background"
+    if fraction > config.max_map_fraction:
+        return f"its box has {100 * fraction:.0f} % of the map's area from above"
+    return ""
+
+
+def _map_fractions(instances: Instances) -> Float64Array:
+    """The share (K,) of the map's box from above that the box of each instance has; 0 where the map has no area."""
+    k, points, boxes = len(instances), instances.points, instances.boxes.astype(np.float64)
+    if boxes.shape != (k, 2, 3) or points.ndim != 2 or points.shape[1] != 3:
+        raise PredictionError(f"this map has boxes {boxes.shape} for {k} instances, and points {points.shape}")
+    if not len(points):
+        return np.zeros(k)
+    area = float(np.prod(np.ptp(points[:, :2], axis=0).astype(np.float64)))
+    sides = np.maximum(boxes[:, 1, :2] - boxes[:, 0, :2], 0.0)
+    answer: Float64Array = np.prod(sides, axis=1) / area if area > 0 else np.zeros(k)
+    return answer
+
+
+MOST_NAMES = 5  # the paper's m: n' comes from the names of so many best views
+MOST_ANSWER_TOKENS = 200  # a name needs few; models that think aloud need more
+Source = Literal["model", "vote", "label"]
+
+
+@dataclass(frozen=True)
+class TopNames:
+    """The names of an instance's ``m`` best views, best first, with their prediction scores; ``label`` is n."""
+
+    label: str
+    names: tuple[str, ...]
+    scores: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class RefinedName:
+    """Label n' of an instance and who chose it; ``label``: n stayed, for the ``reason`` given."""
+
+    name: str
+    source: Source
+    reason: str
+    key: str = ""
+
+
+def top_names(instances: Instances, m: int) -> list[TopNames]:
+    """Names of the ``m`` views of highest prediction score of each instance; ties: the earlier view."""
+    if instances.view_names is None or instances.view_scores is None:
+        raise PredictionError("this map keeps no names of its views; make it anew with a method that does (opensu3d)")
+    tops = []
+    for k, label in enumerate(instances.names):
+        first, last = int(instances.view_indptr[k]), int(instances.view_indptr[k + 1])
+        scores = np.asarray(instances.view_scores[first:last], np.float64)
+        order = [first + int(row) for row in np.argsort(-scores, kind="stable")[:m]]
+        names = [(instances.view_names[row].strip(), float(instances.view_scores[row])) for row in order]
+        named = [(name, score) for name, score in names if name]
+        tops.append(TopNames(label, tuple(name for name, _ in named), tuple(score for _, score in named)))
+    return tops
+
+
+def vote(top: TopNames) -> RefinedName:
+    """The name with the greatest sum of prediction scores; ties: the one with the best view.
+
+    Names that differ in case, hyphens or plural alone count together, under the spelling of the best view. No language
+    model takes part: names of different words stay different.
+
+    >>> vote(TopNames("sofa", ("sofa", "couch", "couch"), (0.9, 0.5, 0.5))).name
+    'couch'
+    """
+    if not top.names:
+        return RefinedName(top.label, "label", "no view has a name")
+    totals: dict[tuple[str, ...], float] = {}
+    spelling: dict[tuple[str, ...], str] = {}
+    for name, score in zip(top.names, top.scores, strict=True):
+        key = words(name) or (name,)
+        totals[key] = totals.get(key, 0.0) + score
+        spelling.setdefault(key, name)
+    best = max(totals.values())
+    return RefinedName(next(spelling[key] for key, total in totals.items() if total == best), "vote", "")
+
+
+class ModelRefiner:
+    """Asks the text model for a single name, with the paper's prompt."""
+
+    def __init__(self, model: LanguageModel, config: LanguageConfig) -> None:
+        self._model = model
+        self._config = config
+
+    def requests(self, tops: Sequence[TopNames]) -> list[ChatRequest]:
+        """One request for each instance that has a name."""
+        config = self._config
+        return [
+            ChatRequest(
+                "refine",
+                config.text_model,
+                f"{REFINE}. {REFINE_FORM}",
+                list_of_names(top.names),
+                max_answer_tokens=min(config.max_answer_tokens, MOST_ANSWER_TOKENS),
+                temperature=config.temperature,
+                seed=config.seed,
+            )
+            for top in tops
+            if top.names
+        ]
+
+    def refine(self, tops: Sequence[TopNames]) -> list[RefinedName]:
+        """n' of each instance: the model's name where it can be used, else n with the reason."""
+        requests = self.requests(tops)
+        answers = iter(zip(requests, self._model.ask_all(requests), strict=True))
+        refined = []
+        for top in tops:
+            if not top.names:
+                refined.append(RefinedName(top.label, "label", "no view has a name"))
+                continue
+            request, reply = next(answers)
+            name = None if reply.failure else chosen_name(reply.text, top.names)
+            if name is None:
+                refined.append(RefinedName(top.label, "label", reason_of(reply), request.key))
+            else:
+                refined.append(RefinedName(name, "model", "", request.key))
+        return refined
+
+
+log = logging.getLogger(__name__)
+FILE_NAME = "refined_names.json"
+SCHEMA = 2
+Refiner = Literal["vote", "model"]
+
+
+def voted_names(instances: Instances) -> RefinedNames | None:
+    """Label n' by vote: of the names that the best views gave, the one with the greatest sum of prediction scores."""
+    if instances.view_names is None or instances.view_scores is None:
+        return None
+    names = tuple(vote(top).name for top in top_names(instances, MOST_NAMES))
+    left_out = undesired(instances, names, FilterConfig())
+    return RefinedNames(names, f"the vote of the names of {MOST_NAMES} views, no language model", left_out)
+
+
+class NameRecord(BaseModel):
+    """Labels n and n' of one instance, the names that n' was chosen from, and why n' leaves it out, '' where not."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    id: int
+    label: str
+    refined: str
+    source: Literal["model", "vote", "label"]
+    reason: str
+    candidates: tuple[str, ...]
+    request: str
+    left_out: str
+
+
+class NameRecords(BaseModel):
+    """Labels n' of a map and the filter that goes with them; ``prediction_sha256`` ties them to the map.
+
+    ``model`` is empty for the vote.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    schema_version: int
+    prediction_sha256: str
+    refiner: Refiner
+    model: str
+    top_m: int
+    filter: FilterConfig
+    names: tuple[NameRecord, ...]
+
+    @property
+    def refined(self) -> RefinedNames:
+        who = f"the model {self.model}" if self.refiner == "model" else "the vote"
+        return RefinedNames(
+            tuple(record.refined for record in self.names),
+            f"{who} of su3d-bench runs refine, names of {self.top_m} views",
+            tuple(record.left_out for record in self.names),
+        )
+
+
+def records_of(
+    job: JobFolder,
+    instances: Instances,
+    tops: Sequence[TopNames],
+    refined: Sequence[RefinedName],
+    refiner: Refiner,
+    model: str,
+    top_m: int,
+    config: FilterConfig,
+) -> NameRecords:
+    """The records of one map, an instance each; what is large background under its label n' is left out."""
+    ids = instances.ids.tolist() if len(instances.ids) else range(len(instances))
+    left_out = undesired(instances, [name.name for name in refined], config)
+    names = tuple(
+        NameRecord(
+            id=one_id,
+            label=top.label,
+            refined=name.name,
+            source=name.source,
+            reason=name.reason,
+            candidates=top.names,
+            request=name.key,
+            left_out=reason,
+        )
+        for one_id, top, name, reason in zip(ids, tops, refined, left_out, strict=True)
+    )
+    return NameRecords(
+        schema_version=SCHEMA,
+        prediction_sha256=digest_file(job.prediction),
+        refiner=refiner,
+        model=model,
+        top_m=top_m,
+        filter=config,
+        names=names,
+    )
+
+
+def write_records(job: JobFolder, records: NameRecords) -> Path:
+    """Write the file beside the map; its path."""
+    job.prepare()
+    path = job.path / FILE_NAME
+    write_json(path, records.model_dump(mode="json"))
+    return path
+
+
+def read_records(job: JobFolder) -> NameRecords | None:
+    """Labels n' of the map; None where there are none, a ``StoreError`` where they belong to another map."""
+    path = job.path / FILE_NAME
+    if not path.is_file():
+        return None
+    try:
+        content = read_json(path)
+        if isinstance(content, dict) and content.get("schema_version") == 1:
+            raise StoreError(f"{path}: knows no filter of large background yet; give su3d-bench runs refine again")
+        records = NameRecords.model_validate(content)
+    except (ValidationError, RecursionError) as error:
+        raise StoreError(f"{path}: is not as su3d-bench runs refine writes it; give that command again") from error
+    if records.schema_version != SCHEMA or records.prediction_sha256 != digest_file(job.prediction):
+        raise StoreError(
+            f"{path}: belongs to another map than {job.prediction.name}; give su3d-bench runs refine again"
+        )
+    return records
+
+
+def refined_digest(job: JobFolder) -> dict[str, str]:
+    """What of the file moves numbers, for the key of the scores; nothing where there is none."""
+    path = job.path / FILE_NAME
+    return {"refined": digest_file(path)} if path.is_file() else {}
+
+
+def refined_names(job: JobFolder, instances: Instances) -> RefinedNames | None:
+    """Labels n' of the map in ``job``; a file that belongs to another map is passed over with a warning."""
+    try:
+        records = read_records(job)
+    except StoreError as error:
+        log.warning("%s; n' is the vote until then", error)
+        records = None
+    if records is None or len(records.names) != len(instances):
+        return voted_names(instances)
+    return records.refined

@@ -1,1 +1,0 @@
-"""Names of objects made better by a language model that is shown them."""

@@ -1,0 +1,416 @@
+"""A map without points and features, as reasoning is given it, which of its objects a noun means, and that of a truth.
+
+A noun means objects by name, by other English names, by adjectives of the caption; the nearest name by a text encoder
+is the last resort, and is said.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+
+import numpy as np
+
+from su3d_bench.core.english import last_word, words
+from su3d_bench.core.errors import PredictionError, nearest, printable
+from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array, WholeObject
+from su3d_bench.metrics.questions.score import RefinedNames, labels_n
+from su3d_bench.numerics.relations import (
+    BUILT_IN,
+    FIXTURES,
+    RELATIONS,
+    SURFACES,
+    Relation,
+    Relations,
+    is_between,
+    may_be_between,
+)
+from su3d_bench.perception.embedded.lexicon import GROUPS, SYNONYMS
+from su3d_bench.perception.embedded.naming import vocabulary
+from su3d_bench.questions.sight import WITHOUT_COLOUR, Looks, Sight, instance_rows, looks_of
+
+MOST_NAME, MOST_CAPTION = 80, 400  # characters; a hostile map may hold texts of any length
+
+
+@dataclass(frozen=True, eq=False)
+class MapObject:
+    """One instance; ``centroid`` (3,) and ``box`` (2, 3), lowest and highest corner, in metres, z up.
+
+    Of a truth: ``is_asked``, whether people can see it well enough to be asked about it; ``is_whole``, whether its box
+    is that of the thing itself and not of what a recording saw; ``is_cut``, whether it ends where the images ended;
+    ``looks``, of a recording alone.
+    """
+
+    id: int
+    name: str
+    caption: str
+    centroid: Float64Array
+    box: Float64Array
+    row: int = -1
+    is_asked: bool = True
+    is_whole: bool = True
+    is_cut: bool = False
+    looks: Looks | None = None
+
+    @property
+    def shown(self) -> str:
+        """Name and id as answers write them."""
+        return f"{self.name or 'object'} #{self.id}"
+
+    @property
+    def size(self) -> Float64Array:
+        sides: Float64Array = self.box[1] - self.box[0]
+        return sides
+
+
+def is_room_surface(name: str) -> bool:
+    """Whether what is called so is a part of the room itself."""
+    return last_word(name) in SURFACES
+
+
+@dataclass(frozen=True)
+class SceneMap:
+    """M' of the paper: the map minus points and feature vectors; ``row`` of an object leads back to the map."""
+
+    objects: tuple[MapObject, ...]
+
+    def __len__(self) -> int:
+        return len(self.objects)
+
+    @cached_property
+    def _by_id(self) -> dict[int, MapObject]:
+        return {thing.id: thing for thing in self.objects}
+
+    def by_id(self, object_id: int) -> MapObject:
+        return self._by_id[object_id]
+
+    @cached_property
+    def relations(self) -> Relations:
+        """How the objects lie to one another, by their rows here."""
+        boxes = np.array([thing.box for thing in self.objects], np.float64).reshape(-1, 2, 3)
+        return Relations(boxes, [last_word(thing.name) for thing in self.objects])
+
+    @cached_property
+    def _row_of(self) -> dict[int, int]:
+        return {thing.id: row for row, thing in enumerate(self.objects)}
+
+    def holds(self, relation: Relation, subject: MapObject, other: MapObject) -> bool:
+        """Whether one object of the map stands in ``relation`` to another."""
+        return bool(self.relations.of(relation)[self._row_of[subject.id], self._row_of[other.id]])
+
+    def is_doubtful(self, relation: Relation, subject: MapObject, other: MapObject) -> bool:
+        """Whether a slightly other threshold, another reading or an object that is seen whole may decide otherwise."""
+        return bool(self.doubtful(relation)[self._row_of[subject.id], self._row_of[other.id]])
+
+    def doubtful(self, relation: Relation) -> BoolArray:
+        """The doubtful pairs (K, K) by their rows here."""
+        return self._doubtful[relation]
+
+    @cached_property
+    def _doubtful(self) -> dict[Relation, BoolArray]:
+        is_cut = np.array([thing.is_cut for thing in self.objects], bool)
+        beside_cut = (is_cut[:, None] | is_cut[None]) & self.relations.near
+        return {relation: self.relations.doubtful(relation) | beside_cut for relation in RELATIONS}
+
+    def is_between(self, thing: MapObject, first: MapObject, second: MapObject) -> bool:
+        """Whether an object stands between two others; what one of them holds, or stands on, does not."""
+        return is_between(thing.box, first.box, second.box) and not self._is_of(thing, first, second)
+
+    def may_be_between(self, thing: MapObject, first: MapObject, second: MapObject) -> bool:
+        """Whether some people would say that an object stands between two others."""
+        return may_be_between(thing.box, first.box, second.box) and not self._is_of(thing, first, second)
+
+    def _is_of(self, thing: MapObject, *ends: MapObject) -> bool:
+        """Whether an object is one of ``ends``, or holds or is held by one."""
+        pairs = [pair for end in ends for pair in ((thing, end), (end, thing))]
+        return thing in ends or any(self.holds("on", *pair) or self.holds("in", *pair) for pair in pairs)
+
+    @staticmethod
+    def is_said(relation: Relation, subject: MapObject, other: MapObject) -> bool:
+        """Whether people speak so of such things: windows, blinds and vents are above whatever is in the room."""
+        if relation not in ("above", "under"):
+            return True
+        if relation == "under" and last_word(other.name) in BUILT_IN:
+            return False
+        return {last_word(subject.name), last_word(other.name)}.isdisjoint(FIXTURES)
+
+    def are_in_one_place(self, *things: MapObject) -> bool:
+        """Whether objects are on one support, all on the floor, or all hang."""
+        rows = [self._row_of[thing.id] for thing in things]
+        return all(self.relations.one_place[a, b] for a in rows for b in rows if a != b)
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        return tuple(thing.id for thing in self.objects)
+
+    @property
+    def middle(self) -> Float64Array:
+        """The middle of the box around all objects."""
+        if not self.objects:
+            return np.zeros(3)
+        low = np.min([thing.box[0] for thing in self.objects], axis=0)
+        high = np.max([thing.box[1] for thing in self.objects], axis=0)
+        centre: Float64Array = (low + high) / 2
+        return centre
+
+
+def map_of(instances: Instances, refined: RefinedNames | None = None) -> SceneMap:
+    """The map of ``instances``; names are n' where ``refined`` gives them, else the method's own label, else n.
+
+    What the filter of labels n' leaves out is left out, and so is what has no finite box; without ids of their own
+    instances are numbered from 0.
+    """
+    k = len(instances)
+    names = labels_n(instances) if refined is None else refined.names
+    ids = instances.ids if len(instances.ids) else np.arange(k)
+    boxes, centroids = instances.boxes.astype(np.float64), instances.centroids.astype(np.float64)
+    if boxes.shape != (k, 2, 3) or centroids.shape != (k, 3) or len(ids) != k:
+        raise PredictionError(f"this map has boxes {boxes.shape} and centroids {centroids.shape} for {k} instances")
+    if len(set(ids.tolist())) != k:
+        raise PredictionError("this map has two instances of one id, so an answer could name neither")
+    is_sound = np.isfinite(boxes).all(axis=(1, 2)) & np.isfinite(centroids).all(axis=1)
+    is_sound &= True if refined is None else refined.is_kept
+    return SceneMap(
+        tuple(
+            MapObject(
+                int(ids[row]),
+                printable(names[row], MOST_NAME),
+                printable(instances.captions[row], MOST_CAPTION),
+                centroids[row],
+                boxes[row],
+                int(row),
+            )
+            for row in np.flatnonzero(is_sound)
+        )
+    )
+
+
+Words = tuple[str, ...]
+# A name, and how near it is by the encoder (cosine).
+NearestName = Callable[[str, Sequence[str]], tuple[str, float]]
+
+ANYTHING = frozenset({"object", "thing", "item", "anything", "something", "everything", "one"})
+GATHERED = frozenset({"row", "pile", "stack", "heap"})  # of things of one name
+MOST_ADJECTIVES = 3
+# Ours: by the embedded encoder other words of a thing reach 0.84 ("carpeting") to 0.93 ("armchair"), words of another
+# thing up to 0.72 ("wastebasket" for a basket).
+LEAST_LIKENESS = 0.8
+COLOUR_SPELLINGS = {"gray": "grey", "wood": "wooden"}
+
+
+@dataclass(frozen=True)
+class Meant:
+    """The objects that a noun means, in the map's order, and what must be said of it."""
+
+    objects: tuple[MapObject, ...]
+    notes: tuple[str, ...] = ()
+
+
+@cache
+def _class_of_words() -> dict[Words, str]:
+    """Every known name -> the class that it names."""
+    class_of = {words(name): name for name in vocabulary()}
+    for name, others in SYNONYMS.items():
+        for other in (name, *others):
+            class_of.setdefault(words(other), name)
+    return class_of
+
+
+def meant_by(noun: str, scene: SceneMap, nearest: NearestName | None = None) -> Meant:
+    """The objects that ``noun`` means; without relation words in it."""
+    noun_words = words(noun)
+    if not noun_words:
+        return Meant(())
+    if len(noun_words) == 1 and noun_words[0] in ANYTHING:
+        return Meant(tuple(thing for thing in scene.objects if not is_room_surface(thing.name)))
+    for n_adjectives in range(min(MOST_ADJECTIVES, len(noun_words) - 1) + 1):
+        adjectives, rest = noun_words[:n_adjectives], noun_words[n_adjectives:]
+        named = _named(rest, scene.objects)
+        held = tuple(thing for thing in named if _has(thing, adjectives))
+        if held:
+            return Meant(held)
+    if noun_words[0] in GATHERED and noun_words[1:2] == ("of",):
+        return meant_by(
+            " ".join(noun_words[2:]), scene, nearest
+        )  # of which a map may know the single ones, or one of all
+    if noun_words in _class_of_words():
+        return Meant(())  # a word that is known, for a thing that is not there
+    return _by_encoder(noun, scene, nearest)
+
+
+def meant_instead(noun: str, scene: SceneMap) -> str:
+    """A clause ``; did you mean 'x'?`` for a noun that nobody knows and that is spelt nearly as a thing of the map."""
+    noun_words = words(noun)
+    if not noun_words or {noun_words, noun_words[-1:]} & (_class_of_words().keys() | groups().keys()):
+        return ""
+    names = {thing.name for thing in scene.objects if thing.name}
+    own = {_class_of_words().get(words(name)) for name in names}
+    names |= {other for name in own if name is not None for other in SYNONYMS.get(name, ())}
+    return nearest(noun, sorted(names)) or nearest(noun_words[-1], sorted(names))
+
+
+@cache
+def groups() -> dict[Words, tuple[str, ...]]:
+    """Words for several classes -> the classes."""
+    return {words(name): classes for name, classes in GROUPS.items()}
+
+
+def _named(noun_words: Words, objects: Iterable[MapObject]) -> list[MapObject]:
+    group = groups().get(noun_words)
+    class_of = _class_of_words()
+    if group is not None:
+        return [
+            thing for thing in objects if class_of.get(words(thing.name)) in group or words(thing.name) == noun_words
+        ]
+    kind = class_of.get(noun_words)
+    return [thing for thing in objects if _means(words(thing.name), noun_words, kind)]
+
+
+def _means(name: Words, noun_words: Words, kind: str | None) -> bool:
+    """Whether an object called ``name`` is what ``asked`` (of class ``kind``) asks for: a coffee table is a table."""
+    if name == noun_words:
+        return True
+    own = _class_of_words().get(name)
+    if own is not None:
+        # A name of its own class: a paper towel is no towel.
+        return own == kind
+    is_kind_of = len(name) > len(noun_words) and name[len(name) - len(noun_words) :] == noun_words
+    return is_kind_of or (kind is not None and _class_of_words().get(name[-1:]) == kind)
+
+
+def _has(thing: MapObject, adjectives: Words) -> bool:
+    known = {*words(thing.name), *words(thing.caption)}
+    return all(COLOUR_SPELLINGS.get(word, word) in known or word in known for word in adjectives)
+
+
+def _by_encoder(noun: str, scene: SceneMap, nearest: NearestName | None) -> Meant:
+    names = sorted({thing.name for thing in scene.objects if thing.name and not is_room_surface(thing.name)})
+    if nearest is None or not names:
+        return Meant(())
+    name, likeness = nearest(noun, names)
+    if likeness < LEAST_LIKENESS:
+        return Meant(())
+    things = tuple(thing for thing in scene.objects if thing.name == name)
+    note = f"the map has no '{noun}'; taken for '{name}', the nearest name by the text encoder (cosine {likeness:.2f})"
+    return Meant(things, (note,))
+
+
+def nearest_by(encoder: Encoder) -> NearestName:
+    """The nearest name by the text features of ``encoder``."""
+
+    def nearest(noun: str, names: Sequence[str]) -> tuple[str, float]:
+        features = encoder.encode_texts([noun, *names]).astype(np.float64)
+        likeness = np.einsum("nd,d->n", features[1:], features[0])
+        best = int(np.argmax(likeness))
+        return names[best], float(likeness[best])
+
+    return nearest
+
+
+STRAY_PERCENT = 1.0  # ours: of an object's vertices at either end of an axis, which in a scan are often a neighbour's
+
+
+def known_objects(
+    truth: GroundTruth,
+    min_vertices: int,
+    whole: Sequence[WholeObject] | None = None,
+    seen: Mapping[int, Sight] | None = None,
+) -> SceneMap:
+    """The objects of a scene without the room's own surfaces, by ascending id.
+
+    Those of the truth with at least ``min_vertices`` vertices; an object's class is that of most of them. ``whole``
+    gives all objects of the scene as they are. Where ``seen`` says what frames show, colours are in the captions and
+    what is not plain to see is not to be asked about; nor is a cabinet where there are base cabinets too.
+    """
+    rows_of = dict(instance_rows(truth, min_vertices))
+    objects = [_of_vertices(truth, instance, rows) for instance, rows in rows_of.items()] if whole is None else whole
+    names = {known.name for known in objects if known is not None}
+    things = []
+    for known in objects:
+        if known is None or is_room_surface(known.name):
+            continue
+        sight = None if seen is None else seen.get(known.id)
+        is_asked = known.id in rows_of and (seen is None or (sight is not None and sight.is_plain))
+        is_asked &= not any(name.endswith(f" {known.name}") for name in names)
+        is_cut = whole is None and sight is not None and sight.is_cut
+        looks = None
+        if whole is None and seen is not None:
+            looks = looks_of(known.name, _without_strays(truth, rows_of[known.id]), sight, is_cut=is_cut)
+        things.append(
+            MapObject(
+                known.id,
+                known.name,
+                " ".join((*_colour(known, sight), *known.adjectives)),
+                known.box.mean(axis=0),
+                known.box,
+                is_asked=is_asked,
+                is_whole=whole is not None,
+                is_cut=is_cut,
+                looks=looks,
+            )
+        )
+    return SceneMap(tuple(things))
+
+
+def _colour(known: WholeObject, sight: Sight | None) -> tuple[str, ...]:
+    """The word for what frames show, where it is what the thing was made in, or nobody knows and it is plain."""
+    if sight is None or not sight.colour or last_word(known.name) in WITHOUT_COLOUR:
+        return ()
+    return (sight.colour,) if known.colour == sight.colour or (not known.colour and sight.is_sure_colour) else ()
+
+
+def _of_vertices(truth: GroundTruth, instance: int, rows: Int64Array) -> WholeObject | None:
+    class_id = int(np.bincount(truth.semantic[rows].clip(min=0)).argmax())
+    if class_id == 0:
+        return None
+    return WholeObject(instance, plain_name(truth.labels.name_of(class_id)), _box_of(truth, rows))
+
+
+def _box_of(truth: GroundTruth, rows: Int64Array) -> Float64Array:
+    box: Float64Array = np.percentile(
+        truth.points[rows].astype(np.float64), [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0
+    )
+    return box
+
+
+def _without_strays(truth: GroundTruth, rows: Int64Array) -> Float64Array:
+    """The points of an object within the box that is taken for it."""
+    points, (low, high) = truth.points[rows].astype(np.float64), _box_of(truth, rows)
+    kept: Float64Array = points[((points >= low) & (points <= high)).all(axis=1)]
+    return kept
+
+
+def plain_name(name: str) -> str:
+    """A class name as people say it.
+
+    >>> plain_name("indoor-plant")
+    'indoor plant'
+    """
+    return " ".join(name.replace("-", " ").replace("_", " ").split())
+
+
+def is_called(label: str, class_name: str) -> bool:
+    """Whether a label is right for an object of a class, by the lexicon's other names and by what it is a kind of.
+
+    A more special name is right ("office chair" for a chair), a more general one too ("chair" for an office chair), a
+    word for many classes ("furniture") is not.
+
+    >>> is_called("couch", "sofa"), is_called("paper towel", "towel"), is_called("furniture", "sofa")
+    (True, False, False)
+    """
+    label_words, class_words = words(label), words(class_name)
+    if not label_words or not class_words:
+        return False
+    if label_words == class_words:
+        return True
+    if " ".join(label_words) in GROUPS:
+        return False
+    return bool(meant_by(class_name, _only(label)).objects) or bool(meant_by(label, _only(class_name)).objects)
+
+
+def _only(name: str) -> SceneMap:
+    nowhere = np.zeros(3)
+    return SceneMap((MapObject(1, name, "", nowhere, np.zeros((2, 3))),))

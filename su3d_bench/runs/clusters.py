@@ -1,0 +1,267 @@
+"""Where units of work run: on the machines of an existing Ray cluster, or as Slurm jobs submitted through submitit.
+
+Under Ray each unit has a fresh worker process, as with processes here. Ray's own retries are switched off: only a unit
+whose worker or machine was lost runs again, a bounded number of times, and what its work answers is final.
+
+submitit hands units and outcomes over as pickles in a folder of the run, which all machines must see; nobody else may
+write there.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from su3d_bench.core.config import RunConfig
+from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, package_versions
+from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError
+from su3d_bench.core.system.endings import Ended, ending_in_order, kept_handlers
+from su3d_bench.runs.executors import Outcome, Report, Unit, Work, answer_of, limit_threads, unwrap
+
+CONNECT_S = 5.0  # a machine of a cluster in one network answers within milliseconds
+ENDED = "ended"  # the kind of answer of a worker that was asked to end
+MOST_AT_ONCE = 1000  # a pending task of Ray costs the driver memory; Slurm's MaxArraySize is 1001 where nobody set it
+
+
+def run_ray(
+    work: Work[Unit, Outcome],
+    units: Sequence[Unit],
+    report: Report,
+    *,
+    jobs: int,
+    config: RunConfig,
+    ray: Any,
+    lost: Callable[[Unit, str], Outcome],
+) -> Iterator[Outcome]:
+    """Outcomes of ``units`` as they come in, at most ``jobs`` of them handed to the cluster at once.
+
+    ``ray`` is what ``connected`` gave. A unit whose worker or machine was lost ``config.retries`` + 1 times has the
+    outcome that ``lost`` makes. A ``Su3dError`` that leaves ``work``, or an interrupt, stops all. ``report`` hears
+    nothing from inside a unit.
+    """
+    remote = ray.remote(num_cpus=1, num_gpus=config.gpus_per_job, max_retries=0, max_calls=1)(_on_node)
+    versions = _versions()
+    waiting = deque((unit, 1) for unit in units)
+    running: dict[Any, tuple[Unit, int]] = {}
+    while waiting or running:
+        while waiting and len(running) < min(jobs, MOST_AT_ONCE):
+            unit, attempt = waiting.popleft()
+            running[remote.remote(work, unit, versions)] = unit, attempt
+        for reference in ray.wait(list(running), num_returns=1)[0]:
+            unit, attempt = running.pop(reference)
+            answer, reason = _answer(ray, reference)
+            if reason is None:
+                yield unwrap(answer)
+            elif attempt <= config.retries:
+                waiting.appendleft((unit, attempt + 1))
+            else:
+                yield lost(unit, f"{reason}, {attempt} times; see the cluster's logs, or raise --retries")
+
+
+def _answer(ray: Any, reference: Any) -> tuple[Any, str | None]:
+    """What a task answered, or a clause that says how the task was lost."""
+    errors = ray.exceptions
+    try:
+        answer = ray.get(reference)
+        return answer, f"the worker was ended by {answer[1]}" if answer[0] == ENDED else None
+    except errors.RayTaskError as error:  # the task itself raises nothing, so it could not even begin
+        last = str(error).strip().splitlines()[-1]
+        raise ConfigError(
+            f"a machine of the Ray cluster cannot run su3d-bench ({last[:200]}); install the same version on each"
+        ) from error
+    except errors.OutOfMemoryError:
+        return None, "the worker was killed for want of memory"
+    except (errors.WorkerCrashedError, errors.LocalRayletDiedError, errors.NodeDiedError):
+        return None, "the worker or its machine was lost"
+    except (errors.ObjectLostError, errors.OutOfDiskError, errors.RaySystemError) as error:
+        return None, f"the outcome was lost ({type(error).__name__})"
+
+
+def _on_node(work: Work[Unit, Outcome], unit: Unit, versions: dict[str, str]) -> tuple[str, Any]:
+    """What becomes of ``unit`` in a worker of the cluster; a worker of another version must not mix its numbers in."""
+    limit_threads()  # before numerical libraries are loaded
+    own = _versions()
+    for name in versions:
+        if own.get(name) != versions[name]:
+            message = f"{socket.gethostname()}: has {name} {own.get(name)}, the run {versions[name]}; install the same"
+            return "user-error", StoreError(message)
+    try:
+        with ending_in_order():  # where Ray's own handler would leave the work as if it had failed
+            return answer_of(work, unit, lambda event: None)
+    except Ended as end:
+        return ENDED, str(end)
+
+
+def _versions() -> dict[str, str]:
+    return {"su3d-bench's code": code_digest(), **package_versions(NUMERIC_PACKAGES)}
+
+
+@contextmanager
+def connected(config: RunConfig) -> Iterator[Any]:
+    """The module ``ray``, connected to the cluster that ``config`` names, which has a machine for each job.
+
+    The address ``local`` starts a cluster of this machine alone, for the time of the block.
+    """
+    try:
+        import ray
+    except ImportError as error:
+        raise ModelMissing("the executor 'ray' needs the ray extra: pip install 'su3d-bench[ray]'") from error
+    was_connected = ray.is_initialized()
+    if not was_connected:
+        _refuse_silent(config.ray_address)
+        _connect(ray, config.ray_address)
+    try:
+        _refuse_too_many_gpus(ray, config.gpus_per_job)
+        yield ray
+    finally:
+        if not was_connected:
+            ray.shutdown()
+
+
+def _connect(ray: Any, address: str) -> None:
+    try:
+        with kept_handlers():  # Ray's own would end the process as if a check had failed
+            ray.init(address=address or "auto", log_to_driver=False, logging_level="error")
+    except (ConnectionError, RuntimeError, ValueError, OSError, TimeoutError) as error:
+        if not address and isinstance(error, ConnectionError):
+            named = os.environ.get("RAY_ADDRESS")
+            where = f"at RAY_ADDRESS={named}" if named else "on this machine"
+            raise ConfigError(
+                f"no Ray cluster runs {where}; add --ray-address local to start one here for this run, or name another "
+                "with --ray-address HOST:PORT"
+            ) from error
+        line = " ".join(str(error).split())[:300]
+        raise ConfigError(
+            f"no Ray cluster at '{address}' takes this run: {line}; start one with ray start --head, or name another "
+            "with --ray-address"
+        ) from error
+
+
+def _refuse_silent(address: str) -> None:
+    """Ray waits a minute for a machine that is not there."""
+    host, colon, port = address.removeprefix("ray://").rpartition(":")
+    if not colon or not port.isdigit():
+        return
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_S).close()
+    except (OSError, OverflowError) as error:
+        reason = (getattr(error, "strerror", None) or str(error) or "no answer").lower()
+        raise ConfigError(
+            f"no Ray cluster answers at '{address}' ({reason}); start one with ray start --head, or name another with "
+            "--ray-address"
+        ) from error
+
+
+def _refuse_too_many_gpus(ray: Any, gpus_per_job: float) -> None:
+    """Ray waits for ever for a machine that has what a task asks for."""
+    most = max((node["Resources"].get("GPU", 0.0) for node in ray.nodes() if node["Alive"]), default=0.0)
+    if gpus_per_job > most:
+        raise ConfigError(
+            f"--gpus-per-job {gpus_per_job:g}: no machine of the Ray cluster has more than {most:g}; lower it"
+        )
+
+
+CLUSTERS = ("slurm", "local")  # submitit takes this machine for a cluster in silence where there is no Slurm
+DEFAULTS = {"timeout_min": 240}  # submitit's own limit is 5 minutes, less than a long scene takes
+POLL_S = 0.5
+
+
+def run_slurm(
+    work: Work[Unit, Outcome],
+    units: Sequence[Unit],
+    report: Report,
+    *,
+    jobs: int,
+    config: RunConfig,
+    folder: Path,
+    parameters: Mapping[str, Any],
+    lost: Callable[[Unit, str], Outcome],
+) -> Iterator[Outcome]:
+    """Outcomes of ``units`` as they come in, at most ``jobs`` of them submitted at once, as job arrays.
+
+    ``parameters`` are those of submitit's ``AutoExecutor``, and ``cluster``; ``folder`` is on a shared disk. A unit
+    whose job died ``config.retries`` + 1 times has the outcome that ``lost`` makes. A ``Su3dError`` that leaves
+    ``work``, or an interrupt, stops all. ``report`` hears nothing from inside a unit.
+    """
+    n_at_once = min(jobs, MOST_AT_ONCE)
+    executor, failures = slurm_executor(folder, parameters, int(config.gpus_per_job), n_at_once)
+    waiting = deque((unit, 1) for unit in units)
+    running: list[tuple[Any, Unit, int]] = []
+    is_clean = True
+    try:
+        while waiting or running:
+            fresh = [waiting.popleft() for _ in range(min(len(waiting), n_at_once - len(running)))]
+            running += _submit(executor, work, fresh) if fresh else []
+            ended = [job for job in running if job[0].done()]
+            running = [job for job in running if job not in ended]
+            for job, unit, attempt in ended:
+                try:
+                    answer = job.result()
+                except failures as error:
+                    if attempt <= config.retries:
+                        waiting.appendleft((unit, attempt + 1))
+                        continue
+                    is_clean = False
+                    yield lost(unit, f"its job failed {attempt} times: {_last_line(error)}; see {folder}")
+                    continue
+                yield unwrap(answer)
+            if not ended:
+                time.sleep(POLL_S)
+    finally:
+        for job, _, _ in running:
+            job.cancel(check=False)
+    if is_clean:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _submit(executor: Any, work: Work[Unit, Outcome], fresh: Sequence[tuple[Unit, int]]) -> list[tuple[Any, Unit, int]]:
+    with executor.batch():
+        jobs = [executor.submit(_in_job, work, unit) for unit, _ in fresh]
+    return [(job, unit, attempt) for job, (unit, attempt) in zip(jobs, fresh, strict=True)]
+
+
+def _in_job(work: Work[Unit, Outcome], unit: Unit) -> tuple[str, Any]:
+    limit_threads()
+    return answer_of(work, unit, lambda event: None)
+
+
+def slurm_executor(
+    folder: Path, given: Mapping[str, Any], n_gpus: int, n_at_once: int
+) -> tuple[Any, tuple[type[Exception], ...]]:
+    """submitit's executor, which may make ``folder``, and the errors by which it says that a job died."""
+    try:
+        import submitit
+    except ImportError as error:
+        raise ModelMissing("the executor 'slurm' needs the slurm extra: pip install 'su3d-bench[slurm]'") from error
+    parameters = {**DEFAULTS, "slurm_array_parallelism": n_at_once, **given}
+    cluster = parameters.pop("cluster", CLUSTERS[0])
+    if cluster not in CLUSTERS:
+        raise ConfigError(f"--slurm cluster={cluster}: expected {' or '.join(CLUSTERS)}")
+    if cluster == CLUSTERS[0] and shutil.which("srun") is None:
+        raise ConfigError(
+            "no Slurm cluster is here: there is no srun; give the command where there is, or add --slurm cluster=local "
+            "to try it on this machine"
+        )
+    if n_gpus:
+        parameters["gpus_per_node"] = n_gpus
+    try:
+        executor = submitit.AutoExecutor(folder=folder, cluster=cluster)
+        executor.update_parameters(**parameters)
+    except (NameError, AssertionError, TypeError, ValueError, RuntimeError) as error:
+        line = " ".join(str(error).split())[:300]
+        raise ConfigError(f"--slurm: submitit refuses it: {line}") from error
+    return executor, (submitit.core.utils.UncompletedJobError,)
+
+
+def _last_line(error: Exception) -> str:
+    """The last line of the job's own traceback where it left one, else the first of what submitit says."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    rules = [k for k, line in enumerate(lines) if set(line) == {"-"}]
+    return (lines[rules[-1] - 1] if len(rules) > 1 else lines[0])[:200] if lines else type(error).__name__

@@ -1,0 +1,331 @@
+"""Where units of work run: in this process or each in a spawned process of its own; ``clusters`` has other machines.
+
+A unit that takes its process down (killed for memory, a crash in native code) fails alone. Numerical libraries are
+held to one thread everywhere, so that no result depends on how many units run side by side.
+"""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing
+import os
+import signal
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Any, TypeVar
+
+from su3d_bench.core.config import RunConfig, parse_value
+from su3d_bench.core.errors import ConfigError, Su3dError
+from su3d_bench.core.files.scratch import TemporaryFolder
+from su3d_bench.core.printing import doors
+from su3d_bench.core.system.endings import Ended, ending_in_order
+from su3d_bench.store.run_folder import refuse_links
+
+ENDING_S = 20.0  # for a worker without a parent to let go of what it holds; Slurm ends what it asked to end after 30 s
+# For a worker whose parent was asked to end. One that loads a library or searches a tree hears of nothing meanwhile; it
+# is ended then, as by a loss of power, after which all that is on disk is whole and the scene is taken up again.
+PATIENCE_S = 1.0
+FOR_THE_PARENT = frozenset({signal.SIGINT, signal.SIGHUP})  # a terminal sends them to both; the parent decides
+SCENE_DONE = "scene"  # label of the event that says that a unit is finished
+Unit = TypeVar("Unit")
+Outcome = TypeVar("Outcome")
+ONE_THREAD = dict.fromkeys(
+    (
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "NUMEXPR_NUM_THREADS",
+        "VECLIB_MAXIMUM_THREADS",
+        "NUMBA_NUM_THREADS",
+    ),
+    "1",
+)
+
+
+@dataclass(frozen=True)
+class Event:
+    """Progress of one unit: ``done`` of ``total`` steps under ``label``, 0 where nobody knows their number yet;
+    ``n_instances`` of the map so far.
+
+    ``doing``: what is done from now on that is none of these steps.
+    """
+
+    unit: str
+    label: str
+    done: int = 0
+    total: int = 0
+    n_instances: int | None = None
+    doing: str = ""
+
+
+Report = Callable[[Event], None]
+Work = Callable[[Unit, Report], Outcome]
+
+
+def limit_threads() -> None:
+    """Hold libraries that are loaded from now on, in this process and its children, to one thread."""
+    os.environ.update(ONE_THREAD)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Hold the libraries that are loaded already to one thread for the time of the block."""
+    import cv2
+    from threadpoolctl import threadpool_limits
+
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        with threadpool_limits(limits=1):
+            yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+def run_inline(work: Work[Unit, Outcome], units: Sequence[Unit], report: Report) -> Iterator[Outcome]:
+    """Outcomes of ``units`` one after the other, in this process."""
+    for unit in units:
+        with one_thread():
+            outcome = work(unit, report)
+        yield outcome
+
+
+def run_processes(
+    work: Work[Unit, Outcome],
+    units: Sequence[Unit],
+    report: Report,
+    *,
+    jobs: int,
+    lost: Callable[[Unit, str], Outcome],
+) -> Iterator[Outcome]:
+    """Outcomes of ``units`` as they come in, at most ``jobs`` side by side, each unit in a fresh spawned process.
+
+    ``lost`` makes the outcome of a unit whose process died, from a clause that says how. A ``Su3dError`` that leaves
+    ``work``, or an interrupt, stops all.
+    """
+    waiting = list(reversed(units))
+    running: dict[Connection, tuple[Unit, BaseProcess]] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < jobs:
+                unit = waiting.pop()
+                connection, process = _start(work, unit)
+                running[connection] = unit, process
+            for ready in wait(list(running)):
+                assert isinstance(ready, Connection)
+                message = _receive(ready)
+                if message is not None and message[0] == "event":
+                    report(message[1])
+                    continue
+                unit, process = running.pop(ready)
+                process.join()
+                ready.close()
+                yield lost(unit, _cause(process.exitcode)) if message is None else unwrap(message)
+    finally:
+        _end([process for _, process in running.values()])
+        for connection in running:
+            connection.close()
+
+
+def _end(processes: Sequence[BaseProcess]) -> None:
+    """Have workers let go of what they hold, and end those that do not come to it at once."""
+    for process in processes:
+        process.terminate()
+    until = time.monotonic() + PATIENCE_S
+    for process in processes:
+        process.join(max(until - time.monotonic(), 0.0))
+        if process.is_alive():
+            process.kill()
+            process.join()
+
+
+def _start(work: Work[Unit, Outcome], unit: Unit) -> tuple[Connection, BaseProcess]:
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe(duplex=False)
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    limit_threads()
+    # A worker that still imports would answer an interrupt with a traceback; it inherits that none reaches it yet. The
+    # tracker, whose start would let them through again, has started by then.
+    resource_tracker.ensure_running()
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, FOR_THE_PARENT)
+    try:
+        process = context.Process(target=_worker, args=(work, unit, theirs), daemon=True)
+        process.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+    theirs.close()
+    return ours, process
+
+
+def _receive(connection: Connection) -> tuple[str, Any] | None:
+    """The next message of a worker; None when it died, be it in the middle of a message."""
+    try:
+        message: tuple[str, Any] = connection.recv()
+    except (EOFError, OSError):
+        return None
+    return message
+
+
+def answer_of(work: Work[Unit, Outcome], unit: Unit, report: Report) -> tuple[str, Any]:
+    """What became of ``unit`` in this process, as a message that ``unwrap`` takes elsewhere; raises ``Ended`` alone."""
+    try:
+        with doors(), one_thread():
+            return "outcome", work(unit, report)
+    except Su3dError as error:
+        return "user-error", error
+    except Ended:
+        raise
+    except BaseException:  # noqa: BLE001 - ``unwrap`` raises it again, with its traceback
+        return "internal-error", traceback.format_exc()
+
+
+def unwrap(message: tuple[str, Any]) -> Any:
+    """The outcome in a message of ``answer_of``; an error in it is raised here."""
+    kind, content = message
+    if kind == "user-error":
+        raise content
+    if kind == "internal-error":
+        raise RuntimeError(f"a worker failed:\n{content}")
+    return content
+
+
+def _cause(exit_code: int | None) -> str:
+    if exit_code == -signal.SIGKILL:
+        return "the worker was killed (signal 9), most often for want of memory; try fewer --jobs"
+    if exit_code is not None and exit_code < 0:
+        return f"the worker crashed (signal {-exit_code}, {signal.Signals(-exit_code).name})"
+    return f"the worker ended early (exit code {exit_code})"
+
+
+def _worker(work: Work[Unit, Outcome], unit: Unit, connection: Connection) -> None:
+    for number in FOR_THE_PARENT:
+        signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, FOR_THE_PARENT)
+    try:
+        with ending_in_order():
+            threading.Thread(target=_end_with_parent, daemon=True).start()
+            connection.send(answer_of(work, unit, lambda event: connection.send(("event", event))))
+            connection.close()
+        gc.freeze()  # all that is left goes with the process: nobody need search it for cycles
+    except Ended as end:  # all is let go of; the parent is told how it came
+        signal.signal(end.number, signal.SIG_DFL)
+        os.kill(os.getpid(), end.number)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    main = threading.main_thread().ident
+    assert parent is not None and main is not None
+    parent.join()
+    signal.pthread_kill(main, signal.SIGTERM)
+    time.sleep(ENDING_S)
+    os._exit(1)
+
+
+# The options of executors on other machines; a value other than the default is refused elsewhere.
+USED_BY = {
+    "ray_address": ("ray",),
+    "gpus_per_job": ("ray", "slurm"),
+    "retries": ("ray", "slurm"),
+    "slurm": ("slurm",),
+}
+ELSEWHERE = ("ray", "slurm")  # executors whose units run on machines that share no more than a disk or a store
+
+
+def executor_of(config: RunConfig, n_workers: int) -> str:
+    """The executor that ``auto`` stands for: this process for one job, else processes."""
+    if config.executor != "auto":
+        return config.executor
+    return "inline" if n_workers == 1 else "processes"
+
+
+def check_execution(config: RunConfig) -> None:
+    """A ``ConfigError`` where an option means nothing to the executor that was asked for."""
+    for name, executors in USED_BY.items():
+        value = getattr(config, name)
+        if value != RunConfig.model_fields[name].default and config.executor not in executors:
+            shown = " ".join(value) if isinstance(value, tuple) else value
+            wanted = " or ".join(f"--executor {executor}" for executor in executors)
+            raise ConfigError(
+                f"--{name.replace('_', '-')} {shown}: means nothing to the executor '{config.executor}'; add {wanted}"
+            )
+    if config.executor == "inline" and config.jobs > 1:
+        raise ConfigError(f"--jobs {config.jobs}: the executor 'inline' runs one; choose --executor processes")
+    is_whole = config.gpus_per_job == int(config.gpus_per_job)
+    if not is_whole and (config.executor == "slurm" or config.gpus_per_job > 1):
+        what = "Slurm gives whole GPUs" if config.executor == "slurm" else "a share is below 1, more come whole"
+        raise ConfigError(f"--gpus-per-job {config.gpus_per_job:g}: {what}")
+    slurm_parameters(config)
+
+
+def slurm_parameters(config: RunConfig) -> dict[str, Any]:
+    """What ``--slurm KEY=VALUE`` says, by key."""
+    parameters = {}
+    for text in config.slurm:
+        key, equals, value = text.partition("=")
+        if not equals or not key.strip().isidentifier():
+            raise ConfigError(f"--slurm {text}: expected KEY=VALUE, such as slurm_partition=gpu timeout_min=60")
+        parameters[key.strip()] = parse_value(value)
+    return parameters
+
+
+@contextmanager
+def reached(config: RunConfig, n_workers: int) -> Iterator[Any]:
+    """What the executor of ``config`` works through, for ``run_units`` in the block; a ``Su3dError`` where no cluster
+    answers, before a run has left anything."""
+    executor = executor_of(config, n_workers)
+    if executor == "ray":
+        from su3d_bench.runs.clusters import connected
+
+        with connected(config) as ray:
+            yield ray
+    elif executor == "slurm":
+        from su3d_bench.runs.clusters import slurm_executor
+
+        with TemporaryFolder("su3d-slurm-") as scratch:  # submitit makes the folder when it only looks
+            slurm_executor(scratch, slurm_parameters(config), int(config.gpus_per_job), n_workers)
+        yield None
+    else:
+        yield None
+
+
+def run_units(
+    work: Work[Unit, Outcome],
+    units: Sequence[Unit],
+    report: Report,
+    *,
+    config: RunConfig,
+    n_workers: int,
+    folder: Path,
+    through: Any,
+    lost: Callable[[Unit, str], Outcome],
+) -> Iterator[Outcome]:
+    """Outcomes of ``units`` as they come in, from the executor of ``config``; ``folder`` is the run's, and ``through``
+    what ``reached`` gave."""
+    executor = executor_of(config, n_workers)
+    if executor == "inline":
+        return run_inline(work, units, report)
+    if executor == "processes":
+        return run_processes(work, units, report, jobs=n_workers, lost=lost)
+    if executor == "ray":
+        from su3d_bench.runs.clusters import run_ray
+
+        return run_ray(work, units, report, jobs=n_workers, config=config, ray=through, lost=lost)
+    from su3d_bench.runs.clusters import run_slurm
+
+    at, parameters = folder.absolute() / "slurm", slurm_parameters(config)
+    refuse_links(at.parent, at)
+    return run_slurm(work, units, report, jobs=n_workers, config=config, folder=at, parameters=parameters, lost=lost)

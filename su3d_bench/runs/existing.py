@@ -1,0 +1,278 @@
+"""What a folder holds already: the request of its run, whether that is the one asked for, and how two become one.
+
+A run folder belongs to one request. The same one resumes; another one is refused with its first differences, unless it
+*extends* the run (the union of scenes, methods and protocols, all other values as they were) or *replaces* it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from su3d_bench.core.config import MOVES_NO_NUMBER, KeyPath, Settings, read_file
+from su3d_bench.core.digests import digest_bytes
+from su3d_bench.core.errors import ConfigError, StoreError, counted, printable, shown
+from su3d_bench.core.files.atomic import is_file
+from su3d_bench.core.system.files import file_bytes
+from su3d_bench.questions.language_solver import MOVES_ANSWERS
+from su3d_bench.runs.job import FIELDS_KNOWN_LATER, INSTEAD, NOT_IN_KEY, Part, SceneJob, build_method, config_key
+from su3d_bench.store.records import RequestRecord, read_record
+from su3d_bench.store.run_folder import JobFolder, RunFolder
+
+Into = Literal["own", "extend", "replace"]  # what a request wants of a folder that holds a run
+Start = Literal["begun", "kept", "replaced"]  # what a plan does with it, see ``Plan``
+JOINED = ("scenes", "methods", "protocols")
+OF_THIS_CALL = MOVES_NO_NUMBER - {"pictures", "accept_poses"}  # where scenes run, which an extension does not inherit
+FINISHED = ("complete", "incomplete")
+MOST_NAMED = 3
+SEAL = "# whole: "
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a run is asked for, resolved: names, and every value by its path in ``run.toml``."""
+
+    scenes: tuple[str, ...]
+    methods: tuple[str, ...]
+    protocols: tuple[str, ...]
+    values: Mapping[KeyPath, Any]
+
+
+@dataclass(frozen=True)
+class ExistingRun:
+    """The run in a folder: what ``run.json`` says, None where it is not there, and the settings of its ``run.toml``.
+
+    ``content`` is ``run.toml`` as it lies there; ``is_known`` says whether it is whole. ``remarks`` say where each
+    value came from when the run was first asked for.
+    """
+
+    folder: Path
+    content: bytes | None
+    record: RequestRecord | None
+    is_known: bool = False
+    settings: Settings = field(default_factory=Settings)
+    remarks: Mapping[KeyPath, str] = field(default_factory=dict)
+
+    @property
+    def is_finished(self) -> bool:
+        has_metrics = is_file(self.folder / "metrics.json")
+        return self.is_known and has_metrics and self.record is not None and self.record.status in FINISHED
+
+    @property
+    def values(self) -> dict[KeyPath, Any]:
+        return {entry.path: entry.value for entry in self.settings.entries}
+
+    def asked(self, name: str) -> tuple[str, ...]:
+        """The list of texts that was asked for as ``name``, such as patterns of scenes."""
+        value = self.values.get((name,))
+        return tuple(map(str, value)) if isinstance(value, list | tuple) else ()
+
+    @property
+    def protocols(self) -> tuple[str, ...]:
+        """Those that scored it, or will."""
+        own = () if self.record is None else tuple(rules.name for rules in self.record.protocols)
+        return own or self.asked("protocols")
+
+
+def sealed(text: str) -> str:
+    """``run.toml`` with a last line that tells whether all of it is there, as after a power cut it may not be."""
+    return f"{text}{SEAL}{digest_bytes(text.encode())}\n"
+
+
+def existing_run(folder: Path) -> ExistingRun | None:
+    """The run in ``folder``; None where there is none. Of a ``run.toml`` that is not whole nothing is believed."""
+    record = None
+    if is_file(folder / "run.json"):
+        with suppress(StoreError):  # what stands in run.toml counts then
+            record = read_record(RequestRecord, folder / "run.json", shown(folder))
+    if not is_file(folder / "run.toml"):
+        return None if record is None else ExistingRun(folder, None, record)
+    content = file_bytes(folder / "run.toml")
+    text, seal, digest = content.rpartition(SEAL.encode())
+    if not seal or digest != f"{digest_bytes(text)}\n".encode():
+        return ExistingRun(folder, content, record)
+    settings = read_file(folder / "run.toml")
+    lines = text.decode().splitlines()
+    numbers = {entry.path: int(entry.source.rpartition(":")[2]) for entry in settings.entries}
+    remarks = {
+        path: lines[n - 1].rpartition("  # ")[2].strip() for path, n in numbers.items() if "  # " in lines[n - 1]
+    }
+    return ExistingRun(folder, content, record, True, settings, remarks)
+
+
+def extended(asked: Settings, held: ExistingRun | None, where: str) -> Settings:
+    """What ``held`` was asked for and what is asked for now; ``where`` is the run's folder, or its URL."""
+    if held is None or not held.is_known:
+        raise ConfigError(
+            f"--extend: {printable(where, 300)} holds no run.toml of a run; leave --extend out to begin one"
+        )
+    joined = []
+    for name in JOINED:
+        given = [entry for entry in asked.entries if entry.path == (name,)]
+        if given and isinstance(given[-1].value, list | tuple):
+            before = held.protocols if name == "protocols" else held.asked(name)
+            both = list(dict.fromkeys([*before, *map(str, given[-1].value)]))
+            joined.append(replace(given[-1], value=both))
+    names = {entry.path[0] for entry in joined}
+    old = [entry for entry in held.settings.entries if entry.path[0] not in {*names, *OF_THIS_CALL}]
+    new = [entry for entry in asked.entries if entry.path[0] not in names]
+    return Settings((*old, *new, *joined))
+
+
+def remembered(settings: Settings, held: ExistingRun) -> Settings:
+    """``settings`` of an extension, those of the run before with the remarks that they had."""
+    own = {id(entry) for entry in held.settings.entries}
+    return Settings(
+        tuple(
+            replace(entry, source=held.remarks.get(entry.path, entry.source)) if id(entry) in own else entry
+            for entry in settings.entries
+        )
+    )
+
+
+@dataclass(frozen=True)
+class Difference:
+    """A clause on what differs; ``can_join``: both may stand in one run."""
+
+    clause: str
+    can_join: bool = False
+
+
+def differences(held: ExistingRun, now: Request) -> list[Difference]:
+    """In what the request of the run in a folder differs from ``now``; none where the same command was given again."""
+    found: list[Difference] = []
+    if held.record is None and not held.is_known:
+        return found
+    for noun, name in (("scene", "scenes"), ("method", "methods"), ("protocol", "protocols")):
+        before = held.asked(name) if held.record is None else _names(held.record, name)
+        after = getattr(now, name) if held.record is not None else tuple(map(str, now.values[(name,)]))
+        gone, new = [one for one in before if one not in after], [one for one in after if one not in before]
+        if gone:
+            found.append(Difference(f"{_some(noun, gone)} not asked for now", can_join=True))
+        if new:
+            found.append(Difference(f"{_some(noun, new)} new", can_join=True))
+    if held.is_known:
+        found += [Difference(clause) for clause in _changed_values(held, now)]
+    return found
+
+
+def _names(record: RequestRecord, name: str) -> tuple[str, ...]:
+    return tuple(rules.name for rules in record.protocols) if name == "protocols" else getattr(record, name)
+
+
+def _some(noun: str, names: Sequence[str]) -> str:
+    """``scenes a, b, c and 2 more are``"""
+    shown_names = ", ".join(printable(name, 80) for name in names[:MOST_NAMED])
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return f"{noun if len(names) == 1 else noun + 's'} {shown_names}{more} {'is' if len(names) == 1 else 'are'}"
+
+
+def _changed_values(held: ExistingRun, now: Request) -> list[str]:
+    """``seed was 0, now 1`` of every value that both requests have and that moves numbers."""
+    old, new = held.values, now.values
+    parts = {path[:2] for path in old if len(path) > 2} & {path[:2] for path in new if len(path) > 2}
+    clauses = []
+    for path in dict.fromkeys([*new, *old]):
+        if len(path) == 1 and (path[0] in (*JOINED, "stride") or path[0] in MOVES_NO_NUMBER):
+            continue
+        if path[0] in ("method", "dataset") and (path[:2] not in parts or path[2:] == ("stride",)):
+            continue
+        if not _counts(path, new) or _is_same(path, old.get(path), new.get(path), held):
+            continue
+        clauses.append(
+            f"{printable('.'.join(path), 120)} was {_shown(path, old.get(path))}, now {_shown(path, new.get(path))}"
+        )
+    strides = [(_stride(old, name), _stride(new, name)) for kind, name in sorted(parts) if kind == "method"]
+    clauses += dict.fromkeys(f"stride was {before}, now {after}" for before, after in strides if before != after)
+    return clauses
+
+
+def _counts(path: KeyPath, values: Mapping[KeyPath, Any]) -> bool:
+    """Whether what stands at ``path`` can move a number of the request that has these ``values``."""
+    if path[:2] == ("perception", "language"):
+        return values.get(("solver",)) == "llm" and path[2:3] in [(name,) for name in MOVES_ANSWERS]
+    return not ".".join(path).startswith(NOT_IN_KEY)
+
+
+def _is_same(path: KeyPath, before: Any, after: Any, held: ExistingRun) -> bool:
+    if path == ("anytime",):
+        return sorted(set(before or ())) == sorted(set(after or ()))
+    if path == ("profile",) and "auto" in (before, after):  # which came out as the one that is named
+        came_out = None if held.record is None else held.record.profile
+        return before == after or came_out in (before, after)
+    return bool(_plain(before) == _plain(after))
+
+
+def _plain(value: Any) -> Any:
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _shown(path: KeyPath, value: Any) -> str:
+    if value is None or (path == ("limit",) and not value):
+        return "none"
+    return printable(json.dumps(_plain(value), ensure_ascii=False, default=str), 80)
+
+
+def _stride(values: Mapping[KeyPath, Any], method: str) -> Any:
+    return values.get(("stride",)) or values.get(("method", method, "stride"), 1)
+
+
+def refuse_other_request(held: ExistingRun, now: Request, into: Into, where: str) -> None:
+    """A ``StoreError`` that says how the run at ``where`` differs from ``now``, with the choices that there are."""
+    found = differences(held, now)
+    if into == "extend":  # what is new is what it is for
+        found = [one for one in found if not one.clause.endswith(" new")]
+    if into == "replace" or not found:
+        return
+    rest = f" and {counted(len(found) - MOST_NAMED, 'difference')} more" if len(found) > MOST_NAMED else ""
+    what = ", ".join(one.clause for one in found[:MOST_NAMED]) + rest
+    name = printable(where, 300)
+    if into == "extend":
+        raise StoreError(f"{name}: cannot be extended by this ({what}); {choices(can_join=False)}")
+    raise StoreError(f"{name}: holds another run ({what}); {choices(can_join=all(one.can_join for one in found))}")
+
+
+def choices(*, can_join: bool) -> str:
+    """What whoever meets another run in a folder may do."""
+    join = "--extend adds this one to it, " if can_join else ""
+    return join + INSTEAD
+
+
+class ConfigKeys:
+    """What of the keys of predictions is known before any data is read; the same for all scenes of a dataset."""
+
+    def __init__(self) -> None:
+        self._keys: dict[tuple[Part, Part], dict[str, str]] = {}
+
+    def of(self, job: SceneJob, part: Part) -> dict[str, str]:
+        if (job.dataset, part) not in self._keys:
+            self._keys[job.dataset, part] = config_key(job, part, build_method(part))
+        return self._keys[job.dataset, part]
+
+
+def _kept_jobs(folder: RunFolder, jobs: Sequence[SceneJob]) -> set[Path]:
+    """Folders of jobs in a run that is replaced whose maps are those of ``jobs``, as far as the request tells."""
+    keys = ConfigKeys()
+    places = [(folder.job(job.scene, part.name), keys.of(job, part)) for job in jobs for part in job.parts]
+    return {
+        place.path
+        for place, key in places
+        if place.changed_field("predict", key, known_later=FIELDS_KNOWN_LATER) is None
+    }
+
+
+def replaced_jobs(folder: RunFolder, jobs: Sequence[SceneJob]) -> list[JobFolder]:
+    """The jobs in ``folder`` that go where ``jobs`` replace its run; ``StoreError`` where files of others would go."""
+    kept = _kept_jobs(folder, jobs)
+    going = [job for job in folder.jobs() if job.path not in kept]
+    names = {job.path.relative_to(folder.path).as_posix() for job in going}
+    for stranger in folder.strangers():
+        if any(f"{stranger}/".startswith(f"{name}/") or name.startswith(f"{stranger}/") for name in names):
+            raise StoreError(
+                f"{shown(folder.path / stranger)}: is of no run and would go with what --replace removes; move it"
+            )
+    return going

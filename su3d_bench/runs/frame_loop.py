@@ -1,0 +1,300 @@
+"""Feed a method frame by frame, write down its map, and note what each update and each map cost."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Generic, Self, TypeVar, overload
+
+import numpy as np
+
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.interfaces import (
+    Closes,
+    CountsLosses,
+    Dataset,
+    HasFinishCosts,
+    HasSurface,
+    Method,
+    RegionPerception,
+)
+from su3d_bench.core.maps import Proposals, starts_of
+from su3d_bench.core.printing import one_line, plain_text
+from su3d_bench.core.system.timing import MethodClock, Timer, calibration_ms, memory_bytes
+from su3d_bench.core.types import (
+    BoolArray,
+    Detections,
+    Float32Array,
+    Frame,
+    GroundTruth,
+    Int64Array,
+    PerceptionNeeds,
+    SceneInfo,
+    Surface,
+)
+from su3d_bench.perception.profiles import Perception
+from su3d_bench.runs.executors import Event, Report
+from su3d_bench.runs.plugins import told
+from su3d_bench.store.predictions import write_prediction
+from su3d_bench.store.records import updates_text
+
+
+@dataclass(frozen=True)
+class FirstFrames(Sequence[Frame]):
+    """The first ``n`` of ``frames``, read anew at every access."""
+
+    frames: Sequence[Frame]
+    n: int
+
+    def __len__(self) -> int:
+        return self.n
+
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Frame]: ...
+
+    def __getitem__(self, index: int | slice) -> Frame | list[Frame]:
+        if isinstance(index, slice):
+            return [self.frames[i] for i in range(self.n)[index]]
+        return self.frames[range(self.n)[index]]
+
+
+class TimedRegions:
+    """Perception on demand, its time told apart from that of the method that asks for it."""
+
+    def __init__(self, regions: RegionPerception, clock: MethodClock) -> None:
+        self._regions = regions
+        self._clock = clock
+
+    @property
+    def dim(self) -> int:
+        return self._regions.dim
+
+    def mask_at(self, frame: Frame, points: Int64Array) -> tuple[BoolArray, float]:
+        with self._clock.perception():
+            return self._regions.mask_at(frame, points)
+
+    def encode_regions(self, frame: Frame, mask: BoolArray, boxes: Int64Array) -> Float32Array:
+        with self._clock.perception():
+            return self._regions.encode_regions(frame, mask, boxes)
+
+
+def no_detections(frame: Frame, needs: PerceptionNeeds) -> Detections:
+    """What a method that needs no masks gets."""
+    return Detections(
+        frame_index=frame.index,
+        masks=np.zeros((0, *frame.depth_m.shape), np.bool_),
+        boxes=np.zeros((0, 4), np.float32),
+        scores=np.zeros(0, np.float32),
+        names=(),
+        captions=(),
+        crop_ratios=needs.crop_ratios,
+        crop_features=np.zeros((0, len(needs.crop_ratios), 0), np.float32),
+        global_feature=np.zeros(0, np.float32),
+    )
+
+
+def warm_up(method: Method) -> None:
+    """Feeds ``method``, which is thrown away, a made-up frame: no timed step then waits for a compiler or an import."""
+    size, needs = 32, method.needs
+    depth_m = 1 + np.linspace(0, 0.5, size * size, dtype=np.float32).reshape(size, size) ** 2
+    intrinsics = np.array([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1]])
+    frame = Frame(0, 0.0, np.zeros((size, size, 3), np.uint8), depth_m, np.eye(4), intrinsics)
+    detections = Detections(
+        frame_index=0,
+        masks=np.ones((1, size, size), np.bool_),
+        boxes=np.zeros((1, 4), np.float32),
+        scores=np.ones(1, np.float32),
+        names=("",),
+        captions=("",),
+        crop_ratios=needs.crop_ratios,
+        crop_features=np.ones((1, len(needs.crop_ratios), 1), np.float32),
+        global_feature=np.ones(1, np.float32),
+        name_features=np.ones((1, 1), np.float32) if needs.name_features else None,
+    )
+    method.start(SceneInfo("made-up", "made-up", N_WARM_UP, 1, "camera"))
+    for _ in range(N_WARM_UP):
+        method.update(frame, detections, Timer())
+    method.finish()
+    if isinstance(method, Closes):
+        method.close()
+
+
+def surface_of(dataset: Dataset, scene: str) -> Surface:
+    """The mesh of a scene without labels; ``DataError`` where its dataset has none."""
+    if not isinstance(dataset, HasSurface):
+        raise DataError(f"{dataset.name}/{scene}: the dataset has no mesh; this method works on one")
+    return dataset.surface(scene)
+
+
+def true_proposals(truth: GroundTruth) -> Proposals:
+    """Every annotated instance of ``truth`` as a class-agnostic mask, in the order of the instance ids."""
+    order = np.argsort(truth.instance, kind="stable").astype(np.int32)
+    order = order[truth.instance[order] > 0]
+    sizes = np.unique(truth.instance[order], return_counts=True)[1]
+    ones = np.ones(len(sizes))
+    return Proposals(starts_of(sizes), order, points=truth.points, scores=ones, source="ground truth")
+
+
+Read = TypeVar("Read")
+N_THREADS = 2
+N_AHEAD = 2  # frames in memory besides the one in use
+
+
+class ReadAhead(Generic[Read]):
+    """The first ``n`` of ``frames`` one after another, at most ``n_ahead`` of them read before they are asked for.
+
+    What reading a frame raises is raised when that frame is asked for, not before. The first frame is read alone: what
+    a dataset makes at its first use is made once. Leaving the block, at whatever frame, ends the threads; reads that
+    have begun are waited for. ``n_ahead`` 0: each frame is read when it is asked for.
+    """
+
+    def __init__(self, frames: Sequence[Read], n: int, *, n_threads: int = N_THREADS, n_ahead: int = N_AHEAD) -> None:
+        self._frames, self._n = frames, n
+        self._n_ahead = n_ahead
+        self._n_begun = 0
+        self._reading: deque[Future[Read]] = deque()
+        self._threads = ThreadPoolExecutor(n_threads, thread_name_prefix="read-ahead")
+
+    def __enter__(self) -> Self:
+        self._begin_up_to(min(1, self._n_ahead))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._threads.shutdown(cancel_futures=True)
+        self._reading.clear()
+
+    def next_frame(self) -> Read:
+        """The frame after the one that was taken last."""
+        self._begin_up_to(1)
+        frame = self._reading.popleft().result()
+        self._begin_up_to(self._n_ahead)
+        return frame
+
+    def _begin_up_to(self, n_waiting: int) -> None:
+        while self._n_begun < self._n and len(self._reading) < n_waiting:
+            self._reading.append(self._threads.submit(self._frames.__getitem__, self._n_begun))
+            self._n_begun += 1
+
+
+Row = dict[str, float | int]
+N_WARM_UP = 3  # sightings that an object must have by default to be in a map
+CALIBRATE_EVERY = 4  # about 5 ms each: a hundredth of the time of the updates
+# What a method may say of its size after an update.
+SIZES = ("n_points", "n_instances", "map_bytes")
+
+
+class Feeding:
+    """One method on one scene: ``maps`` holds, for each map written, the updates before it and what it took."""
+
+    def __init__(
+        self, scene: str, method: Method, perception: Perception, report: Report, clock: MethodClock | None = None
+    ) -> None:
+        self.maps: list[dict[str, float | int]] = []
+        self._clock = clock or MethodClock()
+        self._scene = scene
+        self._method = method
+        self._perception = perception
+        self._report = report
+        self._timer = Timer()
+        self._rows: list[Row] = []
+        self._calibrations: list[float] = []
+
+    @property
+    def calibration_ms(self) -> float | None:
+        """The median time of the calibrating piece of work between the updates; None where there was none."""
+        return round(float(np.median(self._calibrations)), 4) if self._calibrations else None
+
+    def up_to(self, n_fed: int, frames: ReadAhead[Frame], n_frames: int) -> None:
+        """Feed the frames that are missing to ``n_fed``; ``n_frames`` are all that will come.
+
+        Stage ``decode`` is what an update waited for its frame.
+        """
+        if not self._rows and n_frames:
+            self._report(Event(self._scene, self._method.name, 0, n_frames))
+        for update in range(len(self._rows), n_fed):
+            if update % CALIBRATE_EVERY == 0:
+                self._calibrations.append(calibration_ms())
+            row = self._feed(update, frames)
+            self._rows.append(row)
+            size = row.get("n_instances")
+            self._report(
+                Event(self._scene, self._method.name, update + 1, n_frames, None if size is None else int(size))
+            )
+
+    def _feed(self, update: int, frames: ReadAhead[Frame]) -> Row:
+        timer, method = self._timer, self._method
+        start = time.perf_counter()
+        with timer.stage("decode"):
+            frame = frames.next_frame()
+        if not (frame.depth_m > 0).any():
+            raise DataError(f"{self._scene} frame {frame.index}: depth is empty, no pixel is above 0 m")
+        detections = self._detect(frame)
+        with self._clock.running("update"):
+            method.update(frame, detections, timer)
+        total_ms = (time.perf_counter() - start) * 1e3
+        own: Row = {"update": update, "frame": frame.index, "n_detections": len(detections)}
+        of_method: Row = {name: int(told(method, name)) for name in SIZES if hasattr(method, name)}
+        of_method |= dict(told(method, "losses")) if isinstance(method, CountsLosses) else {}
+        of_method |= {"rss_bytes": memory_bytes()}
+        of_method |= {f"{name}_ms": round(ms, 3) for name, ms in timer.take().items()}
+        # What is measured here goes before what a method calls by the same name.
+        own |= {key: value for key, value in of_method.items() if key not in own}
+        return own | {"method_ms": round(self._clock.take("update").method_ms, 3), "total_ms": round(total_ms, 3)}
+
+    def _detect(self, frame: Frame) -> Detections:
+        needs = self._method.needs
+        return (
+            no_detections(frame, needs) if needs.masks == "none" else self._perception.detect(frame, needs, self._timer)
+        )
+
+    def write_map(self, path: Path) -> None:
+        """Write the method's map so far."""
+        with self._clock.running("finish"):
+            prediction = self._method.finish()
+        spent = self._clock.take("finish")
+        write_prediction(path, prediction)
+        costs = dict(told(self._method, "finish_costs")) if isinstance(self._method, HasFinishCosts) else {}
+        own = {"n_updates": len(self._rows), "finish_ms": spent.total_ms, "perception_ms": spent.perception_ms}
+        self.maps.append({**own, **costs, **{name: round(value, 3) for name, value in own.items()}})
+
+    def updates_text(self) -> str:
+        """The table of the updates."""
+        return updates_text(self._rows)
+
+
+class SceneLog(logging.Handler):
+    """Keeps what the library says while a scene runs: all ``lines`` for its log, ``warnings`` for the record too."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[str] = []
+        self.warnings: list[str] = []
+
+    def text(self, *last: str) -> str:
+        return plain_text("\n".join([*self.lines, *last])) + "\n"
+
+    def remarks(self) -> dict[str, list[str]]:
+        """What a seal keeps of it, for a run that goes on from there."""
+        return {"log": self.lines, "warnings": list(dict.fromkeys(self.warnings))}
+
+    def recall(self, remarks: Mapping[str, Any]) -> None:
+        """Begin with what an earlier process said."""
+        self.lines[:0] = remarks.get("log", [])
+        self.warnings[:0] = remarks.get("warnings", [])
+
+    def emit(self, record: logging.LogRecord) -> None:
+        message = one_line(record.getMessage())
+        self.lines.append(f"{record.levelname.lower()}: {message}")
+        if record.levelno >= logging.WARNING:
+            self.warnings.append(message)

@@ -1,1 +1,0 @@
-"""Datasets and methods that are somebody's own: watched where they answer, and tried."""

@@ -1,0 +1,457 @@
+"""From what was asked for to what will be done: one job a scene, everything resolved and checked before any work."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from su3d_bench.core import registry
+from su3d_bench.core.config import (
+    MOVES_NO_NUMBER,
+    KeyPath,
+    RunConfig,
+    Setting,
+    Settings,
+    check_keys,
+    check_names,
+    flatten,
+    parse_value,
+    read_assignments,
+    read_file,
+    resolve,
+)
+from su3d_bench.core.digests import code_digest, digest_json
+from su3d_bench.core.errors import ConfigError, StoreError, counted, printable, some, suggest
+from su3d_bench.core.interfaces import HasPresets, IsSystem
+from su3d_bench.core.registry import CEILING_METHOD
+from su3d_bench.core.system.devices import device_for
+from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
+from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names, protocols_for
+from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
+from su3d_bench.runs.executors import ELSEWHERE, check_execution
+from su3d_bench.runs.existing import (
+    ConfigKeys,
+    ExistingRun,
+    Into,
+    Request,
+    Start,
+    differences,
+    existing_run,
+    extended,
+    refuse_other_request,
+    remembered,
+    replaced_jobs,
+)
+from su3d_bench.runs.job import (
+    FIELDS_KNOWN_LATER,
+    Part,
+    SceneJob,
+    options_model,
+    own_code,
+    part_of,
+    refuse_other_run,
+)
+from su3d_bench.runs.remote_store import DataPlace, RemoteData, data_place, is_url
+from su3d_bench.runs.run_place import LocalRun, RunPlace, StoredRun
+from su3d_bench.runs.scenes import (
+    cache_root,
+    data_root,
+    dataset_targets,
+    expand_scenes,
+    looks_like_scene,
+)
+from su3d_bench.store.run_folder import JobFolder, RunFolder, scene_of_folder
+
+
+def asked_settings(
+    values: Mapping[str, Any], *, device: str | None, config: Path | None, source_of: Callable[[str], str]
+) -> Settings:
+    """The settings of the file ``config``, then those of ``values``, which win; None stands for what was not asked.
+
+    ``values`` are by key of a run, ``source_of`` says of a key where it was asked, which begins an error's line.
+    """
+    settings = Settings() if config is None else read_file(config)
+    given: list[tuple[KeyPath, Any]] = [((name,), value) for name, value in values.items()]
+    given.append((("perception", "models", "device"), device))
+    return settings + Settings(
+        tuple(Setting(path, value, source_of(path[-1])) for path, value in given if value is not None)
+    )
+
+
+MOST_NAMED = 4  # scenes and methods whose maps go
+MOST_CHARACTERS = 120  # the name is a folder's name too
+_COMMA_OUTSIDE_BRACKETS = re.compile(r",(?![^\[]*\])")
+
+
+@dataclass(frozen=True)
+class NamedMethod:
+    """``target`` finds the class, ``base`` is the name that it bears, ``name`` the one with the variant.
+
+    A variant is ``METHOD@PRESET`` where the method's class has ``presets`` (``opensu3d@scheme4``), or
+    ``METHOD@KEY=VALUE,KEY=VALUE`` with values in TOML (``opensu3d@top_m=1``). It counts as a method of its own.
+    """
+
+    target: str
+    base: str
+    name: str
+    settings: tuple[Setting, ...]
+
+    @property
+    def essence(self) -> tuple[Any, ...]:
+        """What it is, however it was written."""
+        return self.target, [(entry.path, entry.value) for entry in self.settings]
+
+
+def named_method(text: str) -> NamedMethod:
+    """What ``text`` asks for; ``ConfigError`` for an unknown method, preset or an unreadable variant."""
+    start = text.rfind(".py:") + 1
+    at = text.find("@", start)
+    target, variant = (text, "") if at < 0 else (text[:at], text[at + 1 :])
+    method = registry.load("method", target)
+    base = str(method.name)
+    if at < 0:
+        return NamedMethod(target, base, base, ())
+    name = f"{base}@{variant.replace(' ', '')}"
+    if not variant or "/" in variant or not variant.isprintable() or len(name) > MOST_CHARACTERS:
+        raise ConfigError(f"--methods {text}: expected METHOD@PRESET or METHOD@KEY=VALUE, such as opensu3d@top_m=1")
+    values = _assigned(text, variant) if "=" in variant else _preset(text, base, method, variant)
+    entries = tuple(Setting(("method", name, *path), value, f"--methods {text}") for path, value in flatten(values))
+    return NamedMethod(target, base, name, entries)
+
+
+def _preset(text: str, base: str, method: Any, variant: str) -> Mapping[str, Any]:
+    presets = method.presets if isinstance(method, HasPresets) else {}
+    if variant not in presets:
+        hint = suggest(variant, presets, "it has") or "; it has none"
+        raise ConfigError(f"--methods {text}: {base} has no preset '{variant}'{hint}; or write {base}@KEY=VALUE")
+    return presets[variant]
+
+
+def _assigned(text: str, variant: str) -> Mapping[str, Any]:
+    values: dict[str, Any] = {}
+    for part in _COMMA_OUTSIDE_BRACKETS.split(variant):
+        key, equals, value = part.partition("=")
+        if not equals or not key.strip():
+            raise ConfigError(f"--methods {text}: '{part}' is no KEY=VALUE")
+        values[key.strip()] = parse_value(value)
+    return values
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run will do: one job a scene; ``notes`` are remarks for whoever asked.
+
+    ``existing``: the run that the folder held when the plan was made. ``start`` says what becomes of it: it is none, or
+    unfinished, and the records *begin*; it is *kept* until new records take its place; or it is *replaced*, for which
+    the jobs in ``removes`` go.
+    """
+
+    config: RunConfig
+    settings: Settings
+    place: RunPlace
+    jobs: tuple[SceneJob, ...]
+    n_workers: int
+    notes: tuple[str, ...]
+    data: RemoteData | None = None
+    existing: ExistingRun | None = None
+    start: Start = "begun"
+    removes: tuple[JobFolder, ...] = ()
+
+    @property
+    def folder(self) -> RunFolder:
+        return self.place.folder
+
+    @property
+    def is_distant(self) -> bool:
+        """Whether workers share no more than a disk or a store with this process."""
+        return self.config.executor in ELSEWHERE or self.place.url is not None or self.data is not None
+
+    @property
+    def values(self) -> list[tuple[KeyPath, Any]]:
+        """Every resolved value with its path, parts in the order of the run."""
+        leaves = flatten(self.config.model_dump(mode="json"))
+        job_of_dataset = {job.dataset.name: job for job in self.jobs}
+        sections: list[tuple[KeyPath, str]] = [(("method", part.name), part.options) for part in self.jobs[0].methods]
+        sections += [(("dataset", name), job.dataset.options) for name, job in job_of_dataset.items()]
+        sections.append((("perception",), self.jobs[0].perception))
+        for prefix, options in sections:
+            leaves += [((*prefix, *path), value) for path, value in flatten(json.loads(options))]
+        return leaves
+
+    @property
+    def protocols(self) -> tuple[str, ...]:
+        """Names of the protocols that score some scene."""
+        names = dict.fromkeys(name for job in self.jobs for name in job.protocols)
+        return tuple(dict.fromkeys(load_protocol(name).name for name in names))
+
+    @property
+    def request(self) -> Request:
+        return Request(tuple(job.scene for job in self.jobs), self.methods, self.protocols, dict(self.values))
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Names of the methods that tables show."""
+        return tuple(part.name for part in self.jobs[0].methods)
+
+    @property
+    def is_partial(self) -> bool:
+        return self.config.limit > 0
+
+
+def make_plan(
+    settings: Settings, assignments: Sequence[str] = (), out: Path | str | None = None, *, into: Into = "own"
+) -> Plan:
+    """The plan of what was asked for; everything wrong with the request itself is found here, before any work.
+
+    ``assignments`` are ``KEY=VALUE`` texts as ``read_assignments`` takes them. ``out`` None: a folder below ``runs/``
+    named after datasets, profile and a key of the request, so that the same command resumes its own run; a text: the
+    URL of a store. A folder that holds a run of another request is refused, or extended or replaced where ``into`` says
+    so.
+    """
+    if into != "own" and out is None:
+        raise ConfigError(f"--{into}: say which run with --out, such as --out runs/demo")
+    place = None if out is None else _place(out)
+    existing = None if place is None else existing_run(place.folder.path)
+    check_keys(settings)
+    if into == "extend":
+        settings = extended(settings, existing, str(out))
+    config = resolve(settings, (), RunConfig)
+    check_execution(config)
+    if config.profile not in PROFILES:
+        raise ConfigError(f"unknown profile '{config.profile}'{suggest(config.profile, PROFILES)}")
+    named_methods = [named_method(text) for text in _method_targets(config.methods)]
+    _check_one_a_name("--methods", [(method.name, method.essence) for method in named_methods])
+    methods = {method.name: method for method in named_methods}
+    named_datasets = [(str(registry.load("dataset", target).name), target) for target in dataset_targets(config.scenes)]
+    _check_one_a_name("--scenes", named_datasets)
+    datasets = dict(named_datasets)
+    settings += read_assignments(assignments, [*{method.base for method in methods.values()}, *methods], list(datasets))
+    _check_sections("method", settings, {method.base: method.target for method in methods.values()}, list(methods))
+    _check_sections("dataset", settings, datasets)
+    perception = resolve(settings, ("perception",), PerceptionConfig)
+    check_models(config.profile, perception)
+    if config.executor not in ELSEWHERE:
+        device_for(perception.models.device, 0)  # raises where there is no such GPU
+    parts = _Parts(
+        tuple(method_part(method, settings) for method in methods.values()),
+        {target: part_of("dataset", target, settings) for target in datasets.values()},
+        None if CEILING_METHOD in methods else part_of("method", CEILING_METHOD, settings),
+        perception.model_dump_json(),
+        protocols_of_run(config.protocols, list(datasets.values())),
+    )
+    if config.solver == "llm" and not any(map(asks_questions, parts.protocols.values())):
+        raise ConfigError(
+            "--solver llm: answers the questions of reasoning protocols; add such as --protocols rooms-reasoning"
+        )
+    if place is None:
+        place = LocalRun(RunFolder(Path("runs") / _run_name(config, parts)))
+        existing = existing_run(place.folder.path)
+    if place.url is None:
+        place.folder.refuse_other_content()
+    named = os.environ.get("SU3D_DATA") or ""
+    with data_place(named) if is_url(named) else nullcontext(DataPlace(data_root())) as data_root_here:
+        chosen, notes = expand_scenes(config.scenes, parts.datasets, data_root_here.root)
+        data = data_root_here.needed({parts.datasets[target] for target, _ in chosen})
+    jobs = tuple(
+        replace(
+            _scene_job(config, parts, place.folder.path, data_root_here.root, target, scene),
+            index=index,
+            replaces=into == "replace",
+        )
+        for index, (target, scene) in enumerate(chosen)
+    )
+    n_here = len(jobs) if config.executor in ELSEWHERE else os.cpu_count() or 1
+    n_workers = min(config.jobs or n_here, len(jobs))
+    notes += tuple(_notes_on_protocols(parts.protocols, config.protocols))
+    plan = Plan(config, settings, place, jobs, n_workers, notes, data, existing)
+    try:
+        return _started(plan, into)
+    except StoreError as error:
+        raise StoreError(str(error).replace(str(place.folder.path), place.name)) from error
+
+
+def _place(out: Path | str) -> RunPlace:
+    return LocalRun(RunFolder(out)) if isinstance(out, Path) else StoredRun.opened(out, cache_root())
+
+
+def _started(plan: Plan, into: Into) -> Plan:
+    """``plan`` with what becomes of the run in its folder; a ``StoreError`` where that is another one."""
+    existing = plan.existing
+    if existing is not None:
+        refuse_other_request(existing, plan.request, into, plan.place.name)
+    keys = ConfigKeys()
+    for job in plan.jobs:
+        for part in job.methods:
+            folder = plan.folder.job(job.scene, part.name)
+            folder.refuse_links()
+            if into != "replace":
+                refuse_other_run(folder, keys.of(job, part), FIELDS_KNOWN_LATER)
+    if into == "replace":
+        removes = tuple(replaced_jobs(plan.folder, plan.jobs))
+        if removes or (existing is not None and differences(existing, plan.request)):
+            return replace(plan, start="replaced", removes=removes, notes=(*plan.notes, *_what_goes(plan, removes)))
+        # else the run that replaced another is resumed
+    if existing is not None and into == "extend":
+        plan = replace(plan, settings=remembered(plan.settings, existing))
+    return replace(plan, start="begun" if existing is None or not existing.is_finished else "kept")
+
+
+def _what_goes(plan: Plan, removes: Sequence[JobFolder]) -> list[str]:
+    if not removes:
+        return []
+    going = [job.path.parts[-2:] for job in removes]
+    scenes, methods = (list(dict.fromkeys(names)) for names in zip(*going, strict=True))
+    which = f"{some([scene_of_folder(name) for name in scenes], MOST_NAMED)} by {some(methods, MOST_NAMED)}"
+    n_all = len(plan.folder.jobs())
+    return [f"--replace: {len(removes)} of the {counted(n_all, 'map')} in {plan.place.name} go: {which}"]
+
+
+def _check_one_a_name(flag: str, named: Iterable[tuple[str, Any]]) -> None:
+    """A ``ConfigError`` where a name cannot be that of a folder, or two things that differ share one."""
+    found: dict[str, Any] = {}
+    for name, value in named:
+        check_folder_name(flag, name)
+        if found.setdefault(name, value) != value:
+            raise ConfigError(f"{flag}: two different ones are called '{name}'; give one of them another name")
+
+
+def check_folder_name(flag: str, name: str) -> None:
+    """A ``ConfigError`` where ``name``, which ``flag`` gave, cannot be that of a folder."""
+    is_plain = name.isprintable() and "/" not in name and len(name) <= MOST_CHARACTERS
+    if not name or name.startswith(".") or not is_plain:
+        raise ConfigError(
+            f"{flag}: '{printable(name, 80)}' cannot be the name of a folder; call it by letters and digits"
+        )
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """The resolved parts of a run; ``datasets`` and ``protocols`` by the dataset's target."""
+
+    methods: tuple[Part, ...]
+    datasets: dict[str, Part]
+    ceiling: Part | None
+    perception: str
+    protocols: dict[str, tuple[str, ...]]
+
+
+def method_part(method: NamedMethod, settings: Settings) -> Part:
+    """A method with the settings of its base, then those of its variant, then those under its own full name."""
+    path = "method", method.name
+    base, own = (
+        [replace(entry, path=(*path, *entry.path)) for entry in settings.under(("method", name))]
+        for name in (method.base, method.name)
+    )
+    layered = Settings((*base, *method.settings, *(own if method.name != method.base else ())))
+    options = resolve(layered, path, options_model("method", method.target))
+    return Part(method.target, method.name, options.model_dump_json())
+
+
+def _check_sections(kind: str, settings: Settings, used: Mapping[str, str], variants: Sequence[str] = ()) -> None:
+    """Sections of unknown names are refused; a shared file may configure parts unused here, but its keys must exist.
+
+    ``used``: name -> target; ``variants`` are full names that have sections of their own, checked with their part.
+    """
+    known = dict.fromkeys([*used, *registry.names(kind)])
+    check_names(kind, settings, [*known, *variants])
+    for name in known:
+        if settings.under((kind, name)):
+            resolve(settings, (kind, name), options_model(kind, used.get(name, name)))
+
+
+def _all_systems() -> list[str]:
+    loaded = {name: registry.load("method", name) for name in registry.METHODS}
+    return [name for name, method in loaded.items() if not isinstance(method, IsSystem) or method.is_system]
+
+
+def _method_targets(methods: Sequence[str]) -> list[str]:
+    named = [name for method in methods for name in (_all_systems() if method == "all" else [method])]
+    targets = list(dict.fromkeys(named))
+    for target in targets:
+        if target not in registry.names("method") and looks_like_scene(target):
+            raise ConfigError(f"--methods {target}: is a scene; write it before the flags, or behind --scenes")
+    if not targets:
+        raise ConfigError("no method was named; known: " + ", ".join(registry.names("method")))
+    return targets
+
+
+def protocols_of_run(wanted: Sequence[str], targets: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Dataset target -> protocols that score it: those asked for that fit it, or its own where none is asked for."""
+    if not wanted:
+        return {target: _usual_protocols(registry.load("dataset", target)) for target in targets}
+    wanted = list(dict.fromkeys(wanted))
+    rules = [load_protocol(name) for name in wanted]
+    _check_one_a_name("--protocols", [(rule.name, rule) for rule in rules])
+    truths = {target: TruthFacts.of_dataset(registry.load("dataset", target)) for target in targets}
+    for rule in rules:
+        reasons = [reason for truth in truths.values() if (reason := why_not_truth(rule, truth)) is not None]
+        if len(reasons) == len(truths):
+            raise ConfigError(f"protocol '{rule.name}' fits no scene of this run: {reasons[0]}")
+    return {
+        target: tuple(name for name, rule in zip(wanted, rules, strict=True) if why_not_truth(rule, truth) is None)
+        for target, truth in truths.items()
+    }
+
+
+def _usual_protocols(dataset: Any) -> tuple[str, ...]:
+    """The protocols of a dataset; of one that no protocol names those that its truth fits."""
+    if own := protocols_for(dataset.name):
+        return tuple(own)
+    truth = TruthFacts.of_dataset(dataset)
+    known = (rules for rules in map(load_protocol, protocol_names()) if rules.by_default)
+    return tuple(rules.name for rules in known if truth.variants and why_not_truth(rules, truth) is None)
+
+
+def _notes_on_protocols(protocols: Mapping[str, Sequence[str]], wanted: Sequence[str]) -> Iterator[str]:
+    """Which protocols score somebody's own datasets, that did not name any."""
+    for target, names in protocols.items():
+        dataset = registry.load("dataset", target)
+        if wanted or not dataset.variants or protocols_for(dataset.name):
+            continue
+        if names:
+            yield f"{dataset.name}: scored under the protocols that its truth fits; --protocols chooses among them"
+            continue
+        truth = f"ground truth {', '.join(dataset.variants)} with labels of '{dataset.label_space}'"
+        yield f"{dataset.name}: no protocol fits its {truth}; su3d-bench protocols new FILE writes one of your own"
+
+
+def asks_questions(protocols: Sequence[str]) -> bool:
+    """Whether one of ``protocols`` puts questions to the map."""
+    return any(load_protocol(name).answers is not None for name in protocols)
+
+
+def _run_name(config: RunConfig, parts: _Parts) -> str:
+    request = config.model_dump(mode="json", exclude=set(MOVES_NO_NUMBER))
+    options = [part.options for part in (*parts.methods, *parts.datasets.values())]
+    own = [digest for part in (*parts.methods, *parts.datasets.values()) if (digest := own_code(part.target))]
+    key = digest_json([request, options, parts.perception, code_digest(), *own])[:8]
+    return "-".join([*(part.name for part in parts.datasets.values()), config.profile, key])
+
+
+def _scene_job(config: RunConfig, parts: _Parts, folder: Path, root: Path, target: str, scene: str) -> SceneJob:
+    return SceneJob(
+        scene=f"{parts.datasets[target].name}/{scene}",
+        dataset=parts.datasets[target],
+        methods=parts.methods,
+        ceiling=parts.ceiling if parts.protocols[target] else None,
+        protocols=parts.protocols[target],
+        profile=config.profile,
+        perception=parts.perception,
+        stride=config.stride,
+        seed=config.seed,
+        limit=config.limit,
+        pictures=config.pictures,
+        anytime=tuple(sorted(set(config.anytime))),
+        folder=folder,
+        data_root=root,
+        cache_root=cache_root(),
+        is_offline=config.offline,
+        accepts_poses=config.accept_poses,
+        solver=config.solver,
+    )

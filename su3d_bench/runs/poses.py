@@ -1,0 +1,86 @@
+"""Whether a recording's poses are what its depth says, looked at on a few frames before a scene's work begins.
+
+What wrong poses and another axis that points up look like is known to ``datasets.recordings`` alone, which
+``datasets check`` asks too.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.interfaces import RendersFrames, SaysUp
+from su3d_bench.core.registry import DATASETS
+from su3d_bench.datasets.recordings.pose_convention import judge_scene
+from su3d_bench.runs.job import SceneJob, build_dataset, build_method
+from su3d_bench.store.run_folder import RunFolder
+
+ALL_THE_SAME = "--accept-poses runs it all the same"
+REMARK = "doubts"  # beside the seal of a prediction
+
+
+class PosesContradicted(DataError):
+    """Another reading of poses or depth agrees clearly better than the one that a run would take."""
+
+
+@dataclass(frozen=True)
+class _Remarks:
+    """What is to be said of a scene, and whether it must not be run."""
+
+    lines: tuple[str, ...] = ()
+    is_wrong: bool = False
+
+
+def judged(jobs: Sequence[SceneJob]) -> tuple[SceneJob, ...]:
+    """The jobs with what is to be said of their poses; ``PosesContradicted`` where one of them must not be run."""
+    with _unheard(), ThreadPoolExecutor(os.cpu_count()) as threads:
+        remarks = list(threads.map(_remarks, jobs))
+    pairs = list(zip(jobs, remarks, strict=True))
+    wrong = [said.lines[0] for job, said in pairs if said.is_wrong and not job.accepts_poses]
+    if wrong:
+        others = f" (and {len(wrong) - 1} more of {len(jobs)} scenes)" if len(wrong) > 1 else ""
+        raise PosesContradicted(f"{wrong[0]}{others}; {ALL_THE_SAME}")
+    return tuple(replace(job, doubts=said.lines) for job, said in pairs)
+
+
+def judged_where_read_here(jobs: Sequence[SceneJob]) -> tuple[SceneJob, ...]:
+    """The jobs, judged where the program itself reads the data: a user-defined reader may end the process that it runs
+    in, so that the scene's worker looks at these."""
+    known = {job.scene: job for job in judged([job for job in jobs if job.dataset.target in DATASETS])}
+    return tuple(known.get(job.scene, job) for job in jobs)
+
+
+def _remarks(job: SceneJob) -> _Remarks:
+    """Of a scene whose frames are files and will be read; of one that was begun, what was said then."""
+    try:
+        reading = [part for part in job.methods if build_method(part).needs.frames]
+        for part in reading:
+            said = RunFolder(job.folder).job(job.scene, part.name).remarks("predict").get(REMARK)
+            if said is not None:
+                return _Remarks(tuple(map(str, said)))
+        dataset = build_dataset(job.dataset, job.data_root)
+        if not reading or (isinstance(dataset, RendersFrames) and dataset.renders_frames):
+            return _Remarks()
+        verdict = judge_scene(dataset, job.scene_name)
+        lines = [] if verdict is None else [verdict.line]
+        if isinstance(dataset, SaysUp) and (doubt := dataset.up(job.scene_name).doubt) is not None:
+            lines.append(f"{job.scene}: {doubt}")
+        return _Remarks(tuple(lines), verdict is not None and verdict.is_wrong)
+    except Exception:  # noqa: BLE001 - a plug-in may raise anything; the scene's own work meets it and records it
+        return _Remarks()
+
+
+@contextmanager
+def _unheard() -> Iterator[None]:
+    """What readers say of a scene's data in the block is left to its work, which says it again."""
+    package = logging.getLogger("su3d_bench")
+    package.addHandler(handler := logging.NullHandler())
+    try:
+        yield
+    finally:
+        package.removeHandler(handler)

@@ -1,0 +1,210 @@
+"""Stores that fsspec reaches (``s3://bucket/runs/one``, ``gs://``, ``memory://``), and a data root in one.
+
+Names that a store lists are checked before they become paths here. What a driver of fsspec raises is its own; here it
+is a ``StoreError`` that names the store.
+
+Datasets look for scenes by the names of files. So a plan is made over an *outline* of a data root in a store: its tree
+as empty files. A job gets the real files of its scene alone.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError, printable
+from su3d_bench.core.files.atomic import make_folder, replacing
+from su3d_bench.core.files.scratch import TemporaryFolder
+from su3d_bench.runs.job import Part, build_dataset
+
+AT_ONCE = 256  # small files that one request to the driver asks for; it fetches them side by side
+BUCKETS = ("s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "oss")  # have no folders, and to make one makes a bucket
+MOST_NAME_CHARACTERS = 1024  # the longest key of an S3 object
+
+
+def is_url(text: str) -> bool:
+    """Whether ``text`` names a store rather than a folder of this machine."""
+    return "://" in text
+
+
+class RemoteFolder:
+    """The files below ``url``, by their names relative to it."""
+
+    def __init__(self, url: str) -> None:
+        self.url = url.rstrip("/")
+        try:
+            import fsspec
+        except ImportError as error:
+            raise ModelMissing(f"{url}: a store needs the stores extra: pip install 'su3d-bench[stores]'") from error
+        try:
+            self._driver, root = fsspec.url_to_fs(self.url)
+        except ImportError as error:
+            line = " ".join(str(error).split())[:200]
+            raise ModelMissing(f"{url}: the driver of this store is not installed ({line})") from error
+        except ValueError as error:
+            raise ConfigError(f"{url}: {' '.join(str(error).split())[:200]}; such as s3://bucket/folder") from error
+        self._root = str(root).rstrip("/")
+        self._has_buckets = self.url.partition(":")[0] in BUCKETS
+
+    def files(self, below: str = "") -> dict[str, int]:
+        """Size in bytes of every file in the folder ``below``, by name; empty where there is none."""
+        start = f"{self._root}/{below}".rstrip("/")
+        with self._telling("cannot be listed"):
+            self._driver.invalidate_cache()
+            try:
+                entries = self._driver.find(start, detail=True)
+            except FileNotFoundError:
+                return {}
+        sizes = {}
+        for path, about in entries.items():
+            name = str(path)[len(self._root) :].lstrip("/")
+            self._check(name)
+            sizes[name] = int(about.get("size") or 0)
+        return sizes
+
+    def _check(self, name: str) -> None:
+        """A name from a store may not lead out of the folder that it is copied to."""
+        parts = name.split("/")
+        is_plain = name.isprintable() and "\\" not in name and not {"", ".", ".."} & set(parts)
+        if not is_plain or len(name) > MOST_NAME_CHARACTERS:
+            raise StoreError(f"{self.url}: holds '{printable(name, 120)}', which is no name of a file; remove it")
+
+    def fetch(self, sizes: Mapping[str, int], into: Path) -> None:
+        """Copy the files named in ``sizes`` below ``into``; one that came with another size is an error."""
+        for name, size in sizes.items():
+            target = into / name
+            make_folder(target.parent)
+            with replacing(target) as stream, self._telling(f"{name} cannot be copied to {into}"):
+                self._driver.get_file(f"{self._root}/{name}", str(stream.name))
+            if target.stat().st_size != size:
+                raise StoreError(
+                    f"{self.url}: {name} has {target.stat().st_size} bytes here and {size} there; try again"
+                )
+
+    def read(self, names: Iterable[str]) -> Iterator[tuple[str, bytes]]:
+        """Name and content of small files; one that is gone meanwhile is left out."""
+        wanted = list(names)
+        for start in range(0, len(wanted), AT_ONCE):
+            paths = {f"{self._root}/{name}": name for name in wanted[start : start + AT_ONCE]}
+            with self._telling("cannot be read"):
+                contents = self._driver.cat(list(paths), on_error="omit")
+            yield from ((paths[path], content) for path, content in contents.items())
+
+    def send(self, folder: Path, names: Sequence[str]) -> None:
+        """Copy the files ``names`` of ``folder`` here, one after the other, in this order."""
+        for name in names:
+            with self._telling(f"{name} cannot be written"):
+                path = f"{self._root}/{name}"
+                if not self._has_buckets:
+                    self._driver.makedirs(path.rpartition("/")[0], exist_ok=True)
+                self._driver.put_file(str(folder / name), path)
+
+    def remove(self, names: Iterable[str]) -> None:
+        """Remove the files ``names`` where they exist."""
+        for name in names:
+            with self._telling(f"{name} cannot be removed"):
+                if self._driver.exists(f"{self._root}/{name}"):
+                    self._driver.rm_file(f"{self._root}/{name}")
+
+    @contextmanager
+    def _telling(self, what: str) -> Iterator[Any]:
+        try:
+            yield
+        except Exception as error:  # each driver has errors of its own (botocore's, gcsfs's), with no class in common
+            reason = printable(" ".join(str(error).split()) or type(error).__name__, 200)
+            raise StoreError(f"{self.url}: {what}: {reason}") from error
+
+
+MOST_SHARED_BYTES = 1 << 26  # label tables and camera files; the largest has 1 MB
+
+
+@dataclass(frozen=True)
+class RemoteData:
+    """The data root in a store, and by scene (``<dataset>/<scene>``) the files that a job needs, with their sizes."""
+
+    url: str
+    files: Mapping[str, Mapping[str, int]]
+
+
+@dataclass(frozen=True)
+class DataPlace:
+    """Where a plan looks for scenes: the data root, or the outline of the one at ``url``, with the sizes there."""
+
+    root: Path
+    url: str | None = None
+    sizes: Mapping[str, int] = field(default_factory=dict)
+
+    def needed(self, datasets: Iterable[Part]) -> RemoteData | None:
+        """What the scenes of ``datasets`` need; None where the data root is here."""
+        if self.url is None:
+            return None
+        files: dict[str, Mapping[str, int]] = {}
+        for part in datasets:
+            of_scenes = files_of_scenes(self.sizes, build_dataset(part, self.root).scenes())
+            files |= {f"{part.name}/{scene}": sizes for scene, sizes in of_scenes.items()}
+        return RemoteData(self.url, files)
+
+
+@contextmanager
+def data_place(url: str) -> Iterator[DataPlace]:
+    """The outline of the store at ``url``, for the time of the block."""
+    sizes = RemoteFolder(url).files()
+    if not sizes:
+        raise ConfigError(f"SU3D_DATA={url}: holds no file; name the folder that holds the datasets")
+    with TemporaryFolder("su3d-outline-") as folder:
+        for below in {str(Path(name).parent) for name in sizes}:
+            make_folder(folder / below)
+        for name in sizes:
+            (folder / name).touch()
+        yield DataPlace(folder, url, sizes)
+
+
+def files_of_scenes(sizes: Mapping[str, int], scenes: Sequence[str]) -> dict[str, dict[str, int]]:
+    """Files and sizes by scene of one dataset: those named after it or in a folder so named, and those of no scene.
+
+    A folder or file is named after a scene whatever stands around the name between separators and however the name
+    itself is separated: ``room0_mesh.ply`` and ``room_0/`` are of ``room0``. Files of no scene count where they are
+    beside scenes, in the same folder of the root, and are small.
+    """
+    of_key: dict[str, list[str]] = {}
+    for scene in scenes:
+        of_key.setdefault(_key(scene), []).append(scene)
+    owners = {name: _owner(name, of_key) for name in sizes}
+    tops = {_top(name) for name, owner in owners.items() if owner is not None}
+    shared = {
+        name: sizes[name]
+        for name, owner in owners.items()
+        if owner is None and _top(name) in tops and sizes[name] <= MOST_SHARED_BYTES
+    }
+    files: dict[str, dict[str, int]] = {scene: dict(shared) for scene in scenes}
+    for name, owner in owners.items():
+        for scene in of_key.get(owner or "", ()):  # those whose names differ in separators alone get each other's too
+            files[scene][name] = sizes[name]
+    return files
+
+
+def _top(name: str) -> str:
+    return name.partition("/")[0] if "/" in name else ""
+
+
+def _owner(name: str, of_key: Mapping[str, Sequence[str]]) -> str | None:
+    for part in name.split("/"):
+        for key in _keys(part):
+            if key in of_key:
+                return key
+    return None
+
+
+def _keys(part: str) -> Iterable[str]:
+    """What ``part`` may be named after, the longest first."""
+    words = [word for word in re.split(r"[._-]+", part) if word]
+    for n in range(len(words), 0, -1):
+        yield from ("".join(words[k : k + n]) for k in range(len(words) - n + 1))
+
+
+def _key(scene: str) -> str:
+    return "".join(re.split(r"[._-]+", scene))

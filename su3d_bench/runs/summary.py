@@ -1,0 +1,306 @@
+"""What a run came to: its numbers, its record, what must be said of it, and what maps hold that nothing scores.
+
+A summary holds no time, date or path: two runs of one request give the same bytes, whatever the number of workers and
+however often a run was killed and resumed.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cache, partial
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.core.digests import code_digest, git_state, package_versions
+from su3d_bench.core.errors import printable
+from su3d_bench.core.files.atomic import is_file
+from su3d_bench.core.maps import Instances, Partition, Prediction
+from su3d_bench.core.registry import CEILING_METHOD
+from su3d_bench.core.system.files import file_bytes
+from su3d_bench.core.system.timing import hardware_line, processor_digest
+from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
+from su3d_bench.metrics.labels import labels_counted
+from su3d_bench.metrics.metric import SceneScore
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.scoring import EVERY_SCENE, combine, combined_metrics, plain_json, unpack_scores
+from su3d_bench.perception.profiles import PerceptionConfig
+from su3d_bench.reports.tables.run import Found, Unscored, not_scored_lines
+from su3d_bench.runs.finished import FinishedRun, record_of_rules
+from su3d_bench.runs.job import MethodOutcome, SceneJob
+from su3d_bench.runs.plan import Plan
+from su3d_bench.store.predictions import read_prediction
+from su3d_bench.store.records import (
+    FailureRecord,
+    GitRecord,
+    MetricsRecord,
+    MidwayRecord,
+    NumbersRecord,
+    ResultRecord,
+    RunRecord,
+    UnscoredRecord,
+    read_updates,
+)
+from su3d_bench.store.run_folder import JobFolder, RunFolder
+
+Scores = Mapping[tuple[str, str], SceneScore]
+BY_THE_METHOD = "computed by the method"
+
+
+def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> MetricsRecord:
+    """One result a method and protocol, with ceiling and the scenes that are missing.
+
+    The counts of one method and of the ceiling are in memory at a time.
+    """
+    by_method: dict[str, list[MethodOutcome]] = {}
+    for outcome in outcomes:
+        by_method.setdefault(outcome.method, []).append(outcome)
+    perfect = _read_scores(plan, by_method.get(CEILING_METHOD, ()), attrgetter("counts"))
+    rules = {rule.name: rule for rule in _rules(plan)}
+
+    @cache
+    def ceiling(protocol: str, scenes: tuple[str, ...]) -> Any:
+        return _metrics_over(scenes, rules[protocol], perfect)
+
+    results = {}
+    for method in plan.methods:
+        mine = by_method.get(method, ())
+        scores = perfect if method == CEILING_METHOD else _read_scores(plan, mine, attrgetter("counts"))
+        early = {
+            share: _read_scores(plan, mine, partial(JobFolder.anytime_counts, share=share))
+            for share in sorted(set(plan.config.anytime))
+        }
+        for rule in rules.values():
+            result = _result(plan, method, rule, mine, scores, early)
+            scored = tuple(result.result.scenes) if result.result else ()
+            results[rule.name, method] = replace(result, ceiling=ceiling(rule.name, scored))
+    return MetricsRecord(
+        is_partial=plan.is_partial,
+        limit=plan.config.limit,
+        seed=plan.config.seed,
+        scenes=tuple(job.scene for job in plan.jobs),
+        results=tuple(results[name, method] for name in rules for method in plan.methods),
+    )
+
+
+def _rules(plan: Plan) -> list[ProtocolRules]:
+    return [load_protocol(name) for name in dict.fromkeys(name for job in plan.jobs for name in job.protocols)]
+
+
+def _read_scores(plan: Plan, outcomes: Sequence[MethodOutcome], file_of: Callable[[JobFolder], Path]) -> Scores:
+    """(protocol, scene) -> counts, from the files of the outcomes that did not fail and have one."""
+    scores: dict[tuple[str, str], SceneScore] = {}
+    for outcome in outcomes:
+        file = file_of(plan.folder.job(outcome.scene, outcome.method))
+        if outcome.error is None and file.is_file():
+            scores |= {(name, outcome.scene): score for name, score in unpack_scores(file_bytes(file)).items()}
+    return scores
+
+
+def _metrics_over(scenes: Sequence[str], rules: ProtocolRules, scores: Scores) -> Any:
+    """The metrics over ``scenes``; None where there is none, or one has no score."""
+    of_scenes = {scene: scores[rules.name, scene] for scene in scenes if (rules.name, scene) in scores}
+    return plain_json(combined_metrics(rules, of_scenes)) if of_scenes and len(of_scenes) == len(scenes) else None
+
+
+def _result(
+    plan: Plan,
+    method: str,
+    rules: ProtocolRules,
+    outcomes: Sequence[MethodOutcome],
+    scores: Scores,
+    early: Mapping[float, Scores],
+) -> ResultRecord:
+    """The result without its ceiling; the maps midway count where all scenes of the final one are scored."""
+    planned = {job.scene: job for job in plan.jobs if rules.name in _protocol_names(job)}
+    mine = {outcome.scene: outcome for outcome in outcomes if outcome.scene in planned}
+    scored = {scene: scores[rules.name, scene] for scene in planned if (rules.name, scene) in scores}
+    failed = {scene: mine[scene].error for scene in planned if mine[scene].error is not None}
+    scenes = [scene for protocol, scene in scores if protocol == rules.name]
+    doubts = tuple(line for scene in sorted(scored) for line in mine[scene].doubts)
+    numbers = NumbersRecord(**combine(rules, scored).to_json()) if scored else None
+    if numbers is not None:
+        numbers = replace(numbers, warnings=(*numbers.warnings, *doubts))
+    encoder = _join(outcome.encoder for outcome in mine.values() if outcome.profile is not None)
+    midway = [(share, _metrics_over(scenes, rules, counts)) for share, counts in early.items()]
+    return ResultRecord(
+        method=method,
+        protocol=rules.name,
+        version=rules.version,
+        kind=rules.kind,
+        headline=rules.headline,
+        profile=_join(outcome.profile for outcome in mine.values()),
+        caveat=_join((outcome.caveat for outcome in mine.values()), "; "),
+        encoder=encoder,
+        encoder_digest=_join(outcome.encoder_digest for outcome in mine.values()),
+        n_planned=len(planned),
+        failed=tuple(failed),
+        unscored=tuple(scene for scene in planned if scene not in scored and scene not in failed),
+        ceiling=None,
+        result=numbers,
+        anytime=tuple(MidwayRecord(share, metrics) for share, metrics in midway if metrics) if early else None,
+        confidences=None if numbers is None else confidences_of(rules, numbers),
+        labels=None if numbers is None else labels_counted(rules, by_features=encoder is not None),
+    )
+
+
+def confidences_of(rules: ProtocolRules, numbers: NumbersRecord) -> str | None:
+    """What ranks the predictions of an average precision; None where the protocol forms none."""
+    if rules.confidence is None:
+        return None
+    if rules.confidence != "prediction":
+        what = "1 for every instance" if rules.confidence == "ones" else "similarity to the query"
+        return f"{what}, by the protocol"
+    said = {warning.partition(": ")[0] for warning in numbers.warnings if CONSTANT_CONFIDENCE in warning}
+    are_equal = EVERY_SCENE in said or said >= {scene for scene, n in numbers.n_predictions.items() if n > 1}
+    return "the same for all instances of a scene" if are_equal else BY_THE_METHOD
+
+
+def _protocol_names(job: SceneJob) -> list[str]:
+    return [load_protocol(name).name for name in job.protocols]
+
+
+def _join(texts: Iterable[str | None], separator: str = ", ") -> str | None:
+    """Each text once; None where there is none."""
+    return separator.join(dict.fromkeys(text for text in texts if text)) or None
+
+
+def _model_files(plan: Plan, outcomes: Sequence[MethodOutcome]) -> dict[str, dict[str, str]]:
+    """SHA-256 of every weight file of the profiles that the run used, by model and file name."""
+    from su3d_bench.perception.models.catalogue import PROFILE_MODELS
+    from su3d_bench.perception.models.inspection import models_record
+
+    used = [profile for outcome in outcomes for profile in (outcome.profile or "").split(", ")]
+    names = [name for profile in dict.fromkeys(used) for name in PROFILE_MODELS.get(profile, ())]
+    return models_record(names, PerceptionConfig.model_validate_json(plan.jobs[0].perception).models) if names else {}
+
+
+def record(plan: Plan, outcomes: Sequence[MethodOutcome], status: str) -> RunRecord:
+    """Where the numbers come from."""
+    git = git_state()
+    return RunRecord(
+        status=status,
+        is_partial=plan.is_partial,
+        code=code_digest(),
+        git=None if git is None else GitRecord(**git),
+        packages=package_versions(),
+        hardware=hardware_line(),
+        processor=processor_digest(),
+        n_workers=plan.n_workers,
+        seed=plan.config.seed,
+        profile=_join(outcome.profile for outcome in outcomes) or plan.config.profile,
+        models=_model_files(plan, outcomes),
+        encoder=_join(outcome.encoder for outcome in outcomes),
+        encoder_digest=_join(outcome.encoder_digest for outcome in outcomes),
+        data_digests={outcome.scene: outcome.data_digest for outcome in outcomes if outcome.data_digest is not None},
+        protocols=tuple(map(record_of_rules, _rules(plan))),
+        methods=plan.methods,
+        scenes=tuple(job.scene for job in plan.jobs),
+        failed=tuple(
+            FailureRecord(outcome.scene, outcome.method, outcome.error)
+            for outcome in outcomes
+            if outcome.error is not None
+        ),
+        unscored=tuple(
+            UnscoredRecord(outcome.scene, outcome.method, *pair) for outcome in outcomes for pair in outcome.unscored
+        ),
+        warnings=tuple(dict.fromkeys(line for outcome in outcomes for line in outcome.warnings)),
+    )
+
+
+# ---- what must be said
+
+
+def remarks_of(
+    plan: Plan, outcomes: Sequence[MethodOutcome], without_score: Sequence[tuple[str, str]]
+) -> tuple[str, ...]:
+    """What is worth saying of scenes that did not fail: warnings, protocols left out, ceilings that are missing."""
+    failed = {outcome.scene for outcome in outcomes if outcome.error is not None and outcome.method in plan.methods}
+    lines = [line for outcome in outcomes for line in outcome.warnings]
+    reasons = [Unscored(one.scene, one.method, *pair) for one in outcomes for pair in one.unscored]
+    lines += not_scored_lines(reasons)
+    # A table says the caveat beneath it; what no protocol scores has no table.
+    has_table = {(one.method, one.caveat) for one in outcomes if (one.scene, one.method) not in without_score}
+    caveats: dict[str, dict[str, None]] = {}
+    for outcome in outcomes:
+        if outcome.caveat and outcome.error is None and (outcome.method, outcome.caveat) not in has_table:
+            caveats.setdefault(outcome.caveat, {})[outcome.method] = None
+    lines += [f"{', '.join(methods)}: {caveat}" for caveat, methods in caveats.items()]
+    reported = {(reason.scene, reason.why) for reason in reasons}
+    for outcome in outcomes:
+        if outcome.error is not None and outcome.scene not in failed and (outcome.scene, outcome.error) not in reported:
+            lines.append(f"{outcome.scene}: no score of the truth: {outcome.error}")
+    return tuple(dict.fromkeys(lines))
+
+
+def outcomes_without_score(plan: Plan, outcomes: Sequence[MethodOutcome]) -> list[tuple[str, str]]:
+    """(scene, method) of what did not fail and that no protocol scored."""
+    n_protocols = {job.scene: len(job.protocols) for job in plan.jobs}
+    return [
+        (outcome.scene, outcome.method)
+        for outcome in outcomes
+        if outcome.method in plan.methods
+        and outcome.error is None
+        and len(outcome.unscored) == n_protocols[outcome.scene]
+    ]
+
+
+# ---- maps that nothing scores
+
+
+MOST_OF_A_NAME = 60  # characters
+
+
+def found_in(folder: RunFolder, jobs: Iterable[tuple[str, str]]) -> Iterator[Found]:
+    """What each of ``jobs`` (scene, method) found, of those whose map is here."""
+    for scene, method in jobs:
+        job = folder.job(scene, method)
+        if is_file(job.prediction):
+            where = f"{printable(scene, 120)}: {job.updates.name}"
+            columns = read_updates(job.updates, where) if is_file(job.updates) else {}
+            times = columns.get("total_ms", np.zeros(0))
+            prediction = read_prediction(job.prediction)
+            yield Found(
+                scene=printable(scene, 200),
+                method=printable(method, 200),
+                n_points=len(prediction.points),
+                n_instances=_n_instances(prediction),
+                names=_names(prediction),
+                extents_m=_extents_m(prediction),
+                n_updates=len(times),
+                update_ms=float(np.median(times)) if len(times) else None,
+            )
+
+
+def without_score(run: FinishedRun) -> list[tuple[str, str]]:
+    """(scene, method) of what no protocol scored and did not fail."""
+    told = {(failure.scene, failure.method) for failure in run.record.failed}
+    for (method, _), result in run.results.items():
+        told |= {(scene, method) for scene in (result.result.scenes if result.result is not None else ())}
+    return [(scene, method) for scene in run.scenes for method in run.methods if (scene, method) not in told]
+
+
+def _n_instances(prediction: Prediction) -> int | None:
+    if isinstance(prediction, Instances):
+        return len(prediction)
+    return len(prediction.features) if isinstance(prediction, Partition) else None
+
+
+def _names(prediction: Prediction) -> tuple[tuple[str, int], ...]:
+    if not isinstance(prediction, Instances):
+        return ()
+    labels = prediction.labels or ("",) * len(prediction)
+    names = (printable(label or name, MOST_OF_A_NAME) for label, name in zip(labels, prediction.names, strict=True))
+    return tuple(Counter(names).most_common())
+
+
+def _extents_m(prediction: Prediction) -> tuple[float, float, float] | None:
+    if not isinstance(prediction, Instances) or not len(prediction):
+        return None
+    longest = np.sort(np.ptp(prediction.boxes, axis=1).max(axis=1).astype(np.float64))
+    return float(longest[0]), float(np.median(longest)), float(longest[-1])

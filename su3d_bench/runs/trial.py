@@ -1,0 +1,114 @@
+"""A user-defined method tried on two frames of a built-in room, a user-defined dataset asked for everything once."""
+
+from __future__ import annotations
+
+import tempfile
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from su3d_bench.core.config import KeyPath, Setting, Settings
+from su3d_bench.core.errors import ConfigError, DataError, PlugInError
+from su3d_bench.core.maps import DenseFeatures
+from su3d_bench.datasets.checks_of_frames import check_frames, facts_of
+from su3d_bench.metrics.metric import n_predictions
+from su3d_bench.runs.plan import make_plan
+from su3d_bench.runs.plugins import is_ours, place_of
+from su3d_bench.runs.runner import run_plan
+from su3d_bench.store.predictions import read_prediction
+
+SCENE = "rooms/living0"
+ASKED: dict[KeyPath, Any] = {
+    ("scenes",): [SCENE],
+    ("profile",): "oracle",
+    ("protocols",): ["rooms-instance"],
+    ("stride",): 4,
+    ("dataset", "rooms", "n_frames"): 8,
+    ("jobs",): 1,
+    ("executor",): "inline",
+    ("pictures",): False,
+}
+N_FRAMES = 2
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a method made of the two frames; ``n_instances`` None where its map has none."""
+
+    method: str
+    scene: str
+    n_frames: int
+    kind: str
+    n_points: int
+    n_instances: int | None
+    has_features: bool
+
+
+def try_method(target: str) -> Trial:
+    """What the method at ``target`` makes of two frames; a ``ConfigError`` with what went wrong where it fails."""
+    asked = {**ASKED, ("methods",): [target]}
+    settings = Settings(tuple(Setting(path, value, "the trial") for path, value in asked.items()))
+    with tempfile.TemporaryDirectory(prefix="su3d-trial-") as folder:
+        plan = make_plan(settings, (), Path(folder) / "run")
+        result = run_plan(plan, lambda event: None)
+        if result.failures:
+            raise ConfigError(result.failures[0][2])
+        (method,) = plan.methods
+        prediction = read_prediction(plan.folder.job(SCENE, method).prediction)
+        n_instances = None if isinstance(prediction, DenseFeatures) else n_predictions(prediction)
+        has_features = prediction.features is not None
+        return Trial(
+            method, SCENE, N_FRAMES, type(prediction).__name__, len(prediction.points), n_instances, has_features
+        )
+
+
+def try_dataset(dataset: Any, scene: str) -> None:
+    """Ask somebody's own ``dataset`` for everything of ``scene`` once, and for two frames.
+
+    A ``PlugInError`` at the first answer that is not as it must be, and whatever its own code raises; what merely is
+    not there, such as a file or a truth, is left to whoever checks the whole scene.
+    """
+    if is_ours(type(dataset)):
+        return
+    with suppress(DataError, OSError):
+        _try_frames(dataset, scene)
+    with suppress(DataError, OSError):
+        dataset.files(scene)
+    with suppress(DataError, OSError):
+        dataset.digest(scene)
+    for variant in dataset.variants:
+        with suppress(DataError, OSError):
+            truth = dataset.ground_truth(scene, variant)
+            if truth.labels.space != dataset.label_space:
+                raise PlugInError(
+                    f"{_place(dataset, 'ground_truth')}: its labels are of '{truth.labels.space}', and the class says "
+                    f"label_space = '{dataset.label_space}'"
+                )
+    with suppress(DataError, OSError):
+        dataset.instance_mesh(scene)
+
+
+def _try_frames(dataset: Any, scene: str) -> None:
+    for stride in (1, 2):
+        info, frames = dataset.info(scene, stride), dataset.frames(scene, stride)
+        if len(frames) != info.n_frames:
+            raise PlugInError(
+                f"{_place(dataset, 'frames')} gave {len(frames)} frames at stride {stride}, its info counts "
+                f"{info.n_frames}"
+            )
+        if stride == 1:
+            n_frames = len(frames)
+            facts = [facts_of(frames[k]) for k in range(min(N_FRAMES, n_frames))]
+        elif len(frames) != -(-n_frames // stride):
+            raise PlugInError(
+                f"{_place(dataset, 'frames')} gave {len(frames)} frames at stride {stride} and {n_frames} at stride 1; "
+                "every stride-th from the first on is expected"
+            )
+    for finding in check_frames(facts):
+        if finding.severity == "error" and finding.check in ("pose", "intrinsics", "size"):
+            raise PlugInError(f"{_place(dataset, 'frames')}: {finding.where}: {finding.text}")
+
+
+def _place(dataset: Any, name: str) -> str:
+    return place_of(type(dataset), name, getattr(dataset, name))

@@ -1,0 +1,128 @@
+"""Whether the numbers of a run follow from its own counts, and its files are those that it vouches for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from su3d_bench.core.digests import digest_file
+from su3d_bench.core.errors import ConfigError, Su3dError, printable
+from su3d_bench.core.files.atomic import is_file
+from su3d_bench.metrics.metric import SceneScore
+from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.scoring import ProtocolResult, combine
+from su3d_bench.predictions.own_runs import read_stored
+from su3d_bench.runs.finished import FinishedRun
+from su3d_bench.store.predictions import features_beside
+from su3d_bench.store.records import ROUNDING, NumbersRecord, plain
+from su3d_bench.store.run_folder import JobFolder
+
+# What metrics.json says that must follow from the counts; how intervals are formed may change without a new version.
+SAID = ("metrics", "pooled", "scene_mean", "per_scene", "per_class", "groups", "coverage", "n_predictions")
+
+
+def rules_of_run(run: FinishedRun, protocol: str) -> ProtocolRules:
+    """The rules that scored ``run``, to the digest; a ``ConfigError`` where there are none."""
+    if protocol not in run.protocols:
+        raise ConfigError("its protocol is none of those that run.json names")
+    return run.rules(protocol, to_the_letter=True)
+
+
+def contradiction(said: NumbersRecord, counted: ProtocolResult) -> str | None:
+    """The first thing that ``said`` has otherwise than the counts give, or lacks of it; None where it follows."""
+    if set(said.scenes) != set(counted.scenes):
+        return f"it has {len(said.scenes)} scenes, the counts {len(counted.scenes)}"
+    record, numbers = plain(said), counted.to_json()
+    for table in SAID:
+        for where, value in _leaves(record[table]):
+            known = _at(numbers[table], where)
+            if known is _NOTHING or not _agree(value, known):
+                shown = "nothing" if known is _NOTHING else _shown(known)
+                return f"{table}.{'.'.join(where)} is {_shown(value)}, the counts give {shown}"
+    for name in counted.headline:
+        rows = {"metrics": said.metrics, **{f"per_scene.{scene}": said.per_scene.get(scene) for scene in said.scenes}}
+        lacking = next((where for where, row in rows.items() if row is None or name not in row), None)
+        if lacking is not None:
+            return f"{lacking} has no {name}"
+    return None
+
+
+_NOTHING = object()
+
+
+def _leaves(value: Any, where: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], float | None]]:
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            yield from _leaves(item, (*where, key))
+    else:
+        yield where, value
+
+
+def _at(value: Any, where: tuple[str, ...]) -> Any:
+    for key in where:
+        if not isinstance(value, Mapping) or key not in value:
+            return _NOTHING
+        value = value[key]
+    return value
+
+
+def _agree(said: float | None, known: Any) -> bool:
+    if said is None or known is None:
+        return said is known
+    return not isinstance(known, Mapping) and abs(said - known) <= ROUNDING
+
+
+def _shown(value: Any) -> str:
+    return "undefined" if value is None else f"{value:.12g}" if isinstance(value, float | int) else "a table"
+
+
+def why_not_counted(run: FinishedRun, method: str, protocol: str, scores: Mapping[str, SceneScore]) -> str | None:
+    """Why the numbers of a method under a protocol do not follow from ``scores``, its counts; None where they do."""
+    record = run.results.get((method, protocol))
+    if record is None or record.result is None:
+        return "was not scored"
+    try:
+        counted = combine(rules_of_run(run, protocol), scores, with_intervals=False)
+    except Su3dError as error:
+        return str(error)
+    fault = contradiction(record.result, counted)
+    if fault is None and record.version != counted.version:
+        fault = f"version is {record.version}, the counts are of {counted.version}"
+    return None if fault is None else f"metrics.json does not follow from the counts: {fault}; run its command again"
+
+
+def damaged_files(run: FinishedRun) -> Iterator[tuple[str, str]]:
+    """Where and what, of every scene and method whose map, counts or times are not those that the run sealed."""
+    for scene in run.scenes:
+        for method in run.methods:
+            fault = _damage(run.folder.job(scene, method))
+            if fault is not None:
+                yield f"{printable(method, 80)} / scene {printable(scene, 80)}", fault
+
+
+def _damage(job: JobFolder) -> str | None:
+    seals = job.seals()
+    sealed = {
+        name: digest for step in ("predict", "score") if step in seals for name, digest in seals[step].files.items()
+    }
+    for file in (job.prediction, job.updates, job.counts):
+        if file.name not in sealed:
+            return f"done.json does not vouch for {file.name}"
+    beside = features_beside(job.prediction)
+    for file in dict.fromkeys((job.prediction, beside, job.updates, job.counts)):
+        if file.name not in sealed:
+            continue
+        if not is_file(file):
+            return f"{file.name} is missing"
+        if digest_file(file) != sealed[file.name]:
+            return f"{file.name} is not the file that the run wrote"
+    return _unreadable(job.prediction)
+
+
+def _unreadable(file: Path) -> str | None:
+    try:
+        read_stored(file)
+    except Su3dError as error:
+        return f"holds no map: {error}"
+    return None

@@ -1,0 +1,217 @@
+"""Answers that came back from annotators: CSV files as the page exports or a spreadsheet saves them, and workbooks.
+
+Formulas are never evaluated: one that stands in the place of an answer is read as its text, which is no answer.
+"""
+
+from __future__ import annotations
+
+import csv
+import unicodedata
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from su3d_bench.core.errors import DataError, nearest, printable, some, suggest
+from su3d_bench.formats.images import read_bytes
+from su3d_bench.formats.tables.csv_text import meant, separated_rows
+from su3d_bench.formats.tables.workbooks import read_workbook
+from su3d_bench.sheets.items import ANSWER_COLUMNS, Key, Sheet, SheetItem
+
+MOST_BYTES = 256 << 20  # of one file: a workbook holds its pictures
+MOST_TEXT_BYTES = 32 << 20  # of a CSV file: some hundred thousand answers
+ADVICE = "give the files that annotators sent back"
+MOST_CHARACTERS = 1000  # of one cell that is read
+HEADER_WITHIN = 30  # rows of a worksheet above its header, which may hold instructions
+
+
+Row = tuple[int, Sequence[str | None]]  # its number from 1 on, and its cells
+
+
+@dataclass(frozen=True)
+class AnswerRow:
+    """One answer as it stands in a file, nothing checked but that all is text; ``at`` names file and row."""
+
+    at: str
+    sheet_id: str
+    item_id: str
+    annotator: str
+    question: str
+    answer: str
+    check: str
+
+
+def read_answers(path: Path) -> list[AnswerRow]:
+    """Every row of a CSV file or XLSX workbook in its order; ``DataError`` where it is no file of answers."""
+    where, suffix = printable(str(path), 200), path.suffix.lower()
+    if suffix not in (".csv", ".xlsx"):
+        raise DataError(f"{where}: is neither .csv nor .xlsx; export a CSV from the page or save an .xlsx workbook")
+    if suffix == ".csv":
+        return parse_csv(read_bytes(path, where, ADVICE, MOST_TEXT_BYTES), where)
+    return parse_workbook(read_bytes(path, where, ADVICE, MOST_BYTES), where)
+
+
+def csv_rows(content: bytes, where: str) -> list[list[str]]:
+    """The rows of a CSV file: UTF-8, with or without the mark that Excel writes, separated by ``,`` ``;`` or tab."""
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise DataError(f"{where}: is not UTF-8; save it as 'CSV UTF-8'") from error
+    first = text.partition("\n")[0]
+    separator = max(",;\t", key=first.count)
+    try:
+        return separated_rows(text, separator)
+    except csv.Error as error:
+        raise DataError(f"{where}: is no CSV ({printable(str(error), 120)}); export it again") from error
+
+
+def parse_csv(content: bytes, where: str) -> list[AnswerRow]:
+    """The answers of a CSV file."""
+    return _of_pages([(where, list(enumerate(csv_rows(content, where), 1)))], where)
+
+
+def parse_workbook(content: bytes, where: str) -> list[AnswerRow]:
+    """The answers of every worksheet of an XLSX workbook that has their columns."""
+    pages = read_workbook(content, where)
+    return _of_pages([(f"{where}: {printable(page.name, 60)}", page.rows) for page in pages], where)
+
+
+def _of_pages(pages: Iterable[tuple[str, Iterable[Row]]], where: str) -> list[AnswerRow]:
+    """The answers of tables, each with its place; a table's header may stand below instructions."""
+    answers: list[AnswerRow] = []
+    has_columns = False
+    for at, page in pages:
+        rows = iter(page)
+        columns = next((found for number, row in rows if number <= HEADER_WITHIN and (found := _columns(row))), None)
+        if columns is not None:
+            has_columns = True
+            answers += _rows(rows, columns, at)
+    if not has_columns:
+        raise DataError(f"{where}: lacks the columns {', '.join(ANSWER_COLUMNS)}, once each; put their names back")
+    return answers
+
+
+def _columns(row: Sequence[str | None]) -> dict[str, int] | None:
+    """Where each column stands; None where the row is not their header."""
+    names = [(cell or "").strip().lower() for cell in row]
+    if any(names.count(name) != 1 for name in ANSWER_COLUMNS):
+        return None
+    return {name: names.index(name) for name in ANSWER_COLUMNS}
+
+
+def _rows(rows: Iterable[tuple[int, Sequence[str | None]]], columns: dict[str, int], where: str) -> Iterator[AnswerRow]:
+    for number, row in rows:
+        if all(cell is None or cell == "" for cell in row):
+            continue
+        at = f"{where}: row {number}"
+        cells = {name: cell_text(row[k] if k < len(row) else None, name, at) for name, k in columns.items()}
+        if any(cells[name] for name in ANSWER_COLUMNS if name != "annotator"):
+            yield AnswerRow(at, **cells)
+
+
+def cell_text(value: str | None, name: str, at: str) -> str:
+    """The text of a cell, without the mark that keeps a text from being a formula."""
+    text = (value or "").strip()
+    # as files that a spreadsheet is to open have it before text that would be taken for a formula
+    text = meant(text)
+    if len(text) > MOST_CHARACTERS or any(unicodedata.category(character) in ("Cc", "Cs") for character in text):
+        raise DataError(f"{at}: '{name}' is too long or holds control characters: '{printable(text, 40)}'")
+    return text
+
+
+LABELS = ("n", "n'")  # as the paper calls them: the name of the best view, and that out of the names of several
+SHOWN_ITEMS = 5  # of many that are missing
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """What one annotator said of one item to one of its questions."""
+
+    item_id: str
+    annotator: str
+    ask: str
+    answer: str
+
+
+@dataclass(frozen=True)
+class Checked:
+    """``judgements`` in the order of the sheet, and in ``faults`` one line each for what must be mended first.
+
+    ``silent``: annotators of the set of whom no answer is there.
+    """
+
+    judgements: tuple[Judgement, ...]
+    faults: tuple[str, ...]
+    silent: tuple[str, ...]
+
+
+def check_key(sheet: Sheet, key: Key) -> None:
+    """Raise ``DataError`` where the key is not that of the sheet."""
+    if (sheet.id, sheet.kind) != (key.sheet_id, key.kind) or {one.id for one in sheet.items} != {
+        one.id for one in key.items
+    }:
+        raise DataError(
+            f"key: is of the set '{printable(key.sheet_id, 60)}', the sheet is '{printable(sheet.id, 60)}'; give the "
+            f"key that was made with it"
+        )
+
+
+def check_answers(sheet: Sheet, rows: Sequence[AnswerRow]) -> Checked:
+    """Every row compared with the sheet, then what each annotator who answered has left out."""
+    items = {item.id: item for item in sheet.items}
+    shares = {share.name: share.item_ids for share in sheet.annotators}
+    first: dict[tuple[str, str, str], str] = {}
+    judgements, faults = [], []
+    for row in rows:
+        place = (row.annotator, row.item_id, row.question)
+        fault = _fault(sheet, row, items, shares)
+        if fault is None and place in first:
+            fault = f"is answered a second time, first at {first[place]}; keep one of the two"
+        first.setdefault(place, row.at)
+        if fault is None:
+            judgements.append(Judgement(row.item_id, row.annotator, row.question, _plain(row.answer)))
+        else:
+            faults.append(f"{row.at}: {fault}")
+    answered = {row.annotator for row in rows if row.sheet_id == sheet.id}
+    for name, share in shares.items():
+        missing = [item_id for item_id in share for ask in items[item_id].asks if (name, item_id, ask) not in first]
+        if name in answered and missing:
+            faults.append(
+                f"annotator '{printable(name, 40)}': {len(missing)} answers are not there "
+                f"({some(list(dict.fromkeys(missing)), SHOWN_ITEMS)}); answer them, or give the rest of the files"
+            )
+    order = {item.id: k for k, item in enumerate(sheet.items)}
+    names = [ask.name for ask in sheet.asks]
+    judgements.sort(key=lambda one: (order[one.item_id], names.index(one.ask), one.annotator))
+    return Checked(tuple(judgements), tuple(faults), tuple(name for name in shares if name not in answered))
+
+
+def _plain(answer: str) -> str:
+    """An answer as choices are spelt, whatever its capitals and blanks."""
+    return " ".join(answer.split()).casefold()
+
+
+def _fault(
+    sheet: Sheet, row: AnswerRow, items: Mapping[str, SheetItem], shares: Mapping[str, Sequence[str]]
+) -> str | None:
+    """What is wrong with a row, and what to do about it."""
+    item = items.get(row.item_id)
+    if row.sheet_id != sheet.id:
+        return f"belongs to the set '{printable(row.sheet_id, 60)}', not to '{sheet.id}'; give the key of its own set"
+    if item is None:
+        near = nearest(row.item_id, items)
+        return f"item '{printable(row.item_id, 40)}' is not in this set{near or '; put its id back'}"
+    if row.check != item.check:
+        return f"cells of item '{item.id}' were changed ('check' does not fit); put back what stood there"
+    if row.question not in item.asks:
+        known = ", ".join(item.asks)
+        return f"question '{printable(row.question, 40)}' is not asked of item '{item.id}', but {known}; put it back"
+    if row.item_id not in shares.get(row.annotator, ()):
+        hint = suggest(row.annotator, sorted(shares), "it has")
+        return f"item '{item.id}' is not in the share of annotator '{printable(row.annotator, 40)}'{hint}"
+    if not row.answer:
+        return f"no answer (item '{item.id}', question '{row.question}'); answer, and export again"
+    choices = sheet.ask(row.question).choices
+    if _plain(row.answer) not in choices:
+        hint = suggest(row.answer, choices, "choose one of")
+        return f"unknown answer '{printable(row.answer, 40)}' to '{row.question}'{hint}"
+    return None

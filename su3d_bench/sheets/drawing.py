@@ -1,0 +1,350 @@
+"""Drafts as pictures: the best frame of the object, and its place in the room as the frames saw it.
+
+Of a map nothing is drawn but what is judged: the rest of it would give its method away. An instance becomes points of
+the room, by one reach for all maps, and from then on its map has no part in the picture: how dense, how rough and how
+complete the map around it is cannot be seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NoReturn, Protocol
+
+import numpy as np
+
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, UInt8Array
+from su3d_bench.reports.pictures.items import (
+    CAP_M,
+    LOW_HEIGHT,
+    PHOTO_WIDTH,
+    ZOOM_WIDTH,
+    ItemParts,
+    Panel,
+    Tag,
+    best_view,
+    compose,
+    mask_in_frame,
+    palette_of,
+    png_bytes,
+)
+from su3d_bench.reports.pictures.maps import MapView, cameras_of, pale, thinned_rows, view_of
+from su3d_bench.reports.pictures.render import colour
+from su3d_bench.reports.pictures.scene import evenly, seen_points
+from su3d_bench.runs.executors import Event, Report, run_inline, run_processes
+from su3d_bench.sheets.drafts import Draft
+from su3d_bench.sheets.items import KINDS_OF_SHEETS
+from su3d_bench.sheets.sources import mask_digest
+
+ANSWER_COLOUR, OTHER_COLOUR = (222, 74, 22), (32, 98, 196)  # those of reasoning_picture
+SEEN_POINTS = 1_500_000  # of all frames together, before they are thinned: floors are seen at a low angle
+ROOM_SHARE, PLACE_SHARE = 0.75, 0.5  # of the room's colours, so that what is judged stands out
+# A map's points may lie 5 cm from what the frames saw, and 5 cm apart. What that reach takes of the neighbours is given
+# back, but for the width of a drawn point, which noise needs.
+REACH_M, BACK_M = CAP_M, 0.035
+PALETTE_FRAMES = 8  # from which the colours of all pictures of a scene are chosen
+
+
+@dataclass(frozen=True)
+class Region:
+    """Where an instance lies: ``is_member`` (N,) of the room's points; ``points`` (M, 3) are these, in the world.
+
+    Where the frames saw nothing of it ``is_member`` is false throughout, and ``points`` are those of its map.
+    """
+
+    is_member: BoolArray
+    points: Float32Array
+
+    @property
+    def centre(self) -> Float64Array:
+        """The middle (3,) of what is shown; NaN without a point."""
+        if not len(self.points):
+            return np.full(3, np.nan)
+        middle: Float64Array = self.points.mean(axis=0, dtype=np.float64)
+        return middle
+
+
+class ShownRoom:
+    """A scene in the colours that its frames saw, from above and from two corners: the same for every method."""
+
+    def __init__(self, scene: str, frames: Sequence[Frame]) -> None:
+        from scipy.spatial import KDTree
+
+        self.scene, self.frames = scene, frames
+        seen, rgb = seen_points(frames, SEEN_POINTS)
+        rows = thinned_rows(seen)
+        self.points, self.colours = seen[rows], rgb[rows]
+        self.tree: Any = KDTree(self.points, balanced_tree=False, compact_nodes=False)
+        self.above: MapView = view_of(self.points, cameras_of(self.points, ZOOM_WIDTH, LOW_HEIGHT)[0])
+        corners = cameras_of(self.points, PHOTO_WIDTH, LOW_HEIGHT)[1:]
+        self.corners: tuple[MapView, ...] = tuple(view_of(self.points, camera) for camera in corners)
+
+    @cached_property
+    def palette(self) -> UInt8Array:
+        """The colours (n, 3) of all pictures of the scene, whatever is outlined in them."""
+        photos = [self.frames[k].rgb for k in evenly(len(self.frames), PALETTE_FRAMES)]
+        views = [
+            colour(view.shown, pale(self.colours, share))
+            for view, share in ((self.above, PLACE_SHARE), *((corner, ROOM_SHARE) for corner in self.corners))
+        ]
+        return palette_of([*photos, *views], (ANSWER_COLOUR, OTHER_COLOUR))
+
+    def region(self, points: Float32Array) -> Region:
+        """Where an instance of these ``points`` (M, 3) lies, however many and in whatever order they are."""
+        is_member = np.zeros(len(self.points), np.bool_)
+        if len(points) and len(self.points):
+            margin = REACH_M + BACK_M
+            is_near = ((self.points >= points.min(axis=0) - margin) & (self.points <= points.max(axis=0) + margin)).all(
+                1
+            )
+            near = np.flatnonzero(is_near)
+            reached = _within(points, self.points[near], REACH_M)
+            kept = ~_within(self.points[near[~reached]], self.points[near[reached]], BACK_M)
+            is_member[near[reached][kept]] = True
+        return Region(is_member, self.points[is_member] if is_member.any() else points)
+
+    def union(self, regions: Sequence[Region]) -> Region:
+        """All of ``regions`` as one."""
+        is_member = np.zeros(len(self.points), np.bool_)
+        for region in regions:
+            is_member |= region.is_member
+        if is_member.any():
+            return Region(is_member, self.points[is_member])
+        return Region(is_member, np.concatenate([np.zeros((0, 3), np.float32), *(one.points for one in regions)]))
+
+    def photo(self, region: Region) -> tuple[Frame, BoolArray] | None:
+        """The frame that shows the region best, and where (h, w); None where none shows it."""
+        if not region.is_member.any():
+            return None
+        view = best_view(self.frames, region.points)
+        if view is None:
+            return None
+        frame = self.frames[view.frame]
+        bounds = np.stack([region.points.min(axis=0), region.points.max(axis=0)]).astype(np.float64)
+        return frame, at_full_size(mask_in_frame(frame, self.tree, region.is_member, bounds), frame.rgb)
+
+
+def _within(these: Float32Array, of: Float32Array, distance_m: float) -> BoolArray:
+    """Which points of ``of`` (N, 3) have one of ``these`` within ``distance_m``."""
+    from scipy.spatial import KDTree
+
+    if not len(these) or not len(of):
+        return np.zeros(len(of), np.bool_)
+    tree: Any = KDTree(these, balanced_tree=False, compact_nodes=False)
+    distances, _ = tree.query(of, distance_upper_bound=distance_m)
+    is_within: BoolArray = np.isfinite(distances)
+    return is_within
+
+
+def at_full_size(mask: BoolArray, rgb: UInt8Array, gap: int = 3) -> BoolArray:
+    """The mask at the size of the colour image ``rgb``, gaps of less than ``gap`` of its pixels closed."""
+    import cv2
+
+    closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((gap, gap), np.uint8))
+    height, width = rgb.shape[:2]
+    full: BoolArray = cv2.resize(closed, (width, height), interpolation=cv2.INTER_NEAREST) > 0
+    return full
+
+
+ROOM_PHOTOS = 6  # of the room, for answers that name nothing
+
+
+class PictureSource(Protocol):
+    """Maps and frames of scenes; ``opener`` opens the same in another process."""
+
+    @property
+    def opener(self) -> Callable[[], PictureSource]: ...
+
+    @property
+    def instances(self) -> Callable[[str, str], Instances]: ...
+
+    def frames(self, scene: str) -> Sequence[Frame]: ...
+
+
+class Artist:
+    """Draws the items of a run, one scene after another; what a scene's items share is made once."""
+
+    def __init__(self, source: PictureSource) -> None:
+        self._source = source
+        self._room: ShownRoom | None = None
+        self._regions: dict[bytes, Region] = {}
+        self._photos: dict[bytes, tuple[Frame, BoolArray] | None] = {}
+
+    def draw(self, draft: Draft) -> bytes:
+        """The PNG of a draft."""
+        return png_bytes(self.picture(draft), palette=self.room(draft.scene).palette)
+
+    def picture(self, draft: Draft) -> UInt8Array:
+        """The picture (h, 960, 3) of a draft."""
+        return compose(self.parts(draft))
+
+    def parts(self, draft: Draft) -> ItemParts:
+        """What stands in the picture of a draft: of its map the regions of ``rows`` and ``others`` alone."""
+        room = self.room(draft.scene)
+        answer, other = (room.union([self._region(draft, row) for row in rows]) for rows in (draft.rows, draft.others))
+        photo, eye = self._photo(draft, room)
+        best = max(room.corners, key=lambda view: int(view.shows(answer.is_member).sum()))
+        room_view = Panel(
+            KINDS_OF_SHEETS[draft.kind].room if draft.rows or draft.others else "the room",
+            colour(best.shown, _coloured(room, answer, other, ROOM_SHARE)),
+            best.shows(answer.is_member),
+            self._tags(draft, best),
+            line=2,
+        )
+        ring = _ring(draft, room, answer)
+        stands_at = None if eye is None else _inside(room.above.project(eye[None])[0])
+        has_arrow = ring is not None and stands_at is not None
+        place = Panel(
+            ("its place, from above" if draft.rows else "from above")
+            + (" (arrow: from the camera)" if has_arrow else ""),
+            colour(room.above.shown, _coloured(room, answer, other, PLACE_SHARE)),
+            tags=self._tags(draft, room.above),
+            ring=ring,
+            eye=stands_at,
+        )
+        photos = self._room_photos(draft) if photo is None else ()
+        return ItemParts(draft.title, photo, room_view, place, photos)
+
+    def room(self, scene: str) -> ShownRoom:
+        """The scene as its frames show it."""
+        if self._room is None or self._room.scene != scene:
+            self._room = ShownRoom(scene, self._source.frames(scene))
+            self._regions.clear()
+            self._photos.clear()
+        return self._room
+
+    def _region(self, draft: Draft, row: int) -> Region:
+        """Where an instance of the draft's map lies; that of another map where it has the same mask."""
+        instances = self._map(draft)
+        key = mask_digest(instances, (row,))
+        if key not in self._regions:
+            self._regions[key] = self.room(draft.scene).region(instances.points[instances.mask(row)])
+        return self._regions[key]
+
+    def _map(self, draft: Draft) -> Instances:
+        """The map whose rows a draft names."""
+        if draft.points is not None:
+            return Instances.of(draft.points, [np.arange(len(draft.points))])
+        return self._source.instances(draft.scene, draft.methods[0])
+
+    def _room_photos(self, draft: Draft) -> tuple[UInt8Array, ...]:
+        """Some of the frames, spread over the walk, where an answer names nothing that could be outlined."""
+        if draft.rows:
+            return ()
+        frames = self._source.frames(draft.scene)
+        return tuple(frames[k].rgb for k in evenly(len(frames), ROOM_PHOTOS))
+
+    def _photo(self, draft: Draft, room: ShownRoom) -> tuple[Panel | None, Float64Array | None]:
+        """The frame that shows the object best, and where its camera was."""
+        wanted = draft.rows or draft.others
+        if not wanted:
+            return None, None
+        key = mask_digest(self._map(draft), wanted)
+        if key not in self._photos:
+            self._photos[key] = room.photo(room.union([self._region(draft, row) for row in wanted]))
+        shown = self._photos[key]
+        if shown is None:
+            return None, None
+        frame, mask = shown
+        title = KINDS_OF_SHEETS[draft.kind].outlined if draft.rows else "what the answer was held against"
+        return Panel(f"outlined: {title}", frame.rgb, mask), frame.camera_to_world[:3, 3]
+
+    def _tags(self, draft: Draft, view: MapView) -> tuple[Tag, ...]:
+        """The names of what an answer speaks of, where it is."""
+        if not draft.names:
+            return ()
+        rows = tuple(dict.fromkeys((*draft.rows, *draft.others)))
+        places = np.array([self._region(draft, row).centre for row in rows]).reshape(-1, 3)
+        shades = [ANSWER_COLOUR if row in draft.rows else OTHER_COLOUR for row in rows]
+        return tags_at(places, view, [draft.names[row] for row in rows], shades)
+
+
+def _coloured(room: ShownRoom, answer: Region, other: Region, share: float) -> UInt8Array:
+    """The colours of the room's points, what is judged and what it was held against in strong ones."""
+    colours = pale(room.colours, share)
+    colours[other.is_member] = OTHER_COLOUR
+    colours[answer.is_member] = ANSWER_COLOUR
+    return colours
+
+
+def tags_at(
+    places: Float64Array, view: MapView, names: Sequence[str], shades: Sequence[tuple[int, int, int]]
+) -> tuple[Tag, ...]:
+    """A name at each of ``places`` (N, 3), as far as it lies before the camera."""
+    return tuple(
+        Tag(name, float(x), float(y), shade)
+        for name, shade, (x, y) in zip(names, shades, view.project(places), strict=True)
+        if np.isfinite([x, y]).all()
+    )
+
+
+def _ring(draft: Draft, room: ShownRoom, answer: Region) -> tuple[float, float, float] | None:
+    """Around what is outlined, from above; none around several things, which have names."""
+    if len(draft.rows) != 1 or draft.names or not len(answer.points):
+        return None
+    low, high = room.above.project(np.percentile(answer.points, [2, 98], axis=0).astype(np.float64))
+    x, y = (low + high) / 2
+    return float(x), float(y), float(0.6 * np.abs(high - low).max())
+
+
+def _inside(place: Float64Array) -> tuple[float, float] | None:
+    """``place`` where it is in the picture."""
+    x, y = float(place[0]), float(place[1])
+    return (x, y) if 0 <= x <= 1 and 0 <= y <= 1 else None
+
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class SceneDrafts:
+    """What one process draws: the drafts of one scene by their places among all."""
+
+    opener: Callable[[], PictureSource]
+    drafts: Mapping[int, Draft]
+
+
+def draw_all(
+    source: PictureSource,
+    drafts: Sequence[Draft],
+    jobs: int,
+    progress: Progress = lambda n_done, n: None,
+) -> list[bytes]:
+    """The pictures of ``drafts`` in their order, ``jobs`` scenes at once; the same bytes whatever their number."""
+    units = []
+    for scene in dict.fromkeys(draft.scene for draft in drafts):
+        mine = {k: draft for k, draft in enumerate(drafts) if draft.scene == scene}
+        units.append(SceneDrafts(source.opener, mine))
+    n_done = 0
+
+    def report(event: Event) -> None:
+        nonlocal n_done
+        n_done += 1
+        progress(n_done, len(drafts))
+
+    if jobs == 1 or len(units) == 1:
+        scenes = run_inline(draw_scene, units, report)
+    else:
+        scenes = run_processes(draw_scene, units, report, jobs=jobs, lost=_lost)
+    pictures: dict[int, bytes] = {}
+    for drawn in scenes:
+        pictures |= drawn
+    return [pictures[k] for k in range(len(drafts))]
+
+
+def draw_scene(unit: SceneDrafts, report: Report) -> dict[int, bytes]:
+    """The PNG of each draft of one scene by its place."""
+    artist = Artist(unit.opener())
+    pictures = {}
+    for place, draft in unit.drafts.items():
+        pictures[place] = artist.draw(draft)
+        report(Event(draft.scene, "pictures", len(pictures), len(unit.drafts)))
+    return pictures
+
+
+def _lost(unit: SceneDrafts, how: str) -> NoReturn:
+    scene = next(iter(unit.drafts.values())).scene
+    raise DataError(f"{scene}: the process that drew its pictures {how}; try --jobs 1")

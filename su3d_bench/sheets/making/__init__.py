@@ -1,1 +1,0 @@
-"""From a finished run or the truth of scenes to what lies before people: drafts, pictures, workbooks, sets."""

@@ -1,0 +1,386 @@
+"""A set of sheets from drafts: shuffled, numbered, drawn, dealt to annotators, written as page, workbook and table."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.core.digests import digest_bytes
+from su3d_bench.core.errors import ConfigError, ModelMissing, printable
+from su3d_bench.core.files.atomic import is_file, make_folder, write_bytes, write_text
+from su3d_bench.core.system.files import file_bytes
+from su3d_bench.formats.tables.csv_text import csv_lines
+from su3d_bench.reports.sheet.page import page_html
+from su3d_bench.sheets.drafts import Draft
+from su3d_bench.sheets.items import (
+    ANSWER_COLUMNS,
+    ASKS,
+    GUIDE,
+    KEY_FILE,
+    KINDS_OF_SHEETS,
+    PICTURES,
+    SHEET_FILE,
+    AnnotatorShare,
+    JudgedRun,
+    Key,
+    KeyItem,
+    Sheet,
+    SheetKind,
+    guide_of,
+    new_item,
+    read_key,
+    read_sheet,
+    sheet_id_of,
+    write_key,
+    write_sheet,
+)
+
+# The columns of an answers file stand among these; what nobody needs to see is hidden.
+COLUMNS = ("item_id", "picture", "text", "asked", "answer", "question", "sheet_id", "annotator", "check")
+HIDDEN = ("question", "sheet_id", "annotator", "check")
+WIDTHS = {"item_id": 11, "picture": 88, "text": 34, "asked": 30, "answer": 17}  # in characters
+HEADER_ROW = 3
+ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)  # the date of every file in a workbook
+PICTURE_WIDTH = 600  # pixels as shown; the file has more
+POINTS_A_PIXEL = 0.75
+MOST_ROW_POINTS = 400.0  # a spreadsheet's rows end at 409
+FONT = "Calibri"  # that of a plain cell; without a name a bold one gets another
+HEAD_FILL, OPEN_FILL = "FF1857B8", "FFFFF4CC"
+
+
+def workbook_bytes(sheet: Sheet, share: AnnotatorShare, pictures: Mapping[str, bytes], title: str) -> bytes:
+    """An XLSX file, the same bytes for the same sheet. Needs the ``sheets`` extra."""
+    try:
+        from openpyxl import Workbook
+    except ImportError as error:
+        raise ModelMissing("a workbook needs the sheets extra: pip install 'su3d-bench[sheets]'") from error
+    book = Workbook()
+    page = book.active
+    page.title = "answers"
+    last = _write_rows(page, sheet, share, pictures)
+    _write_head(page, title, last)
+    _dress(page, last)
+    _write_guide(book.create_sheet(GUIDE), sheet, title)
+    buffer = io.BytesIO()
+    book.save(buffer)
+    return _without_time(buffer.getvalue())
+
+
+def _write_rows(page: Any, sheet: Sheet, share: AnnotatorShare, pictures: Mapping[str, bytes]) -> int:
+    """The rows of all items; the number of the last one."""
+    from openpyxl.styles import Alignment, Protection
+    from openpyxl.worksheet.datavalidation import DataValidation
+
+    lists: dict[tuple[str, ...], DataValidation] = {}
+    row = HEADER_ROW
+    for item in sheet.items_of(share):
+        first = row + 1
+        for name in item.asks:
+            row += 1
+            ask = sheet.ask(name)
+            values = (item.id, "", item.text, ask.text, "", name, sheet.id, share.name, item.check)
+            for column, value in enumerate(values, 1):
+                cell = text_cell(page, row, column, value)
+                cell.alignment = Alignment(wrap_text=True, vertical="top")
+            answer = page.cell(row, COLUMNS.index("answer") + 1)
+            answer.protection = Protection(locked=False)
+            if ask.choices not in lists:
+                lists[ask.choices] = _choice_list(ask.choices)
+            lists[ask.choices].add(answer)
+        _put_picture(page, first, row, pictures[item.pictures[0]])
+    for menu in lists.values():
+        page.add_data_validation(menu)
+    return row
+
+
+def text_cell(page: Any, row: int, column: int, text: str) -> Any:
+    """Write ``text`` into a cell as text, never as a formula, also when somebody edits it."""
+    cell = page.cell(row, column)
+    # Line breaks stay; whatever else cannot be printed is shown as its escape.
+    cell.value = "\n".join(printable(line, 2000) for line in text.split("\n")) or None
+    if cell.value is not None:
+        cell.data_type = "s"
+        cell.quotePrefix = True
+    return cell
+
+
+def _choice_list(choices: tuple[str, ...]) -> Any:
+    from openpyxl.worksheet.datavalidation import DataValidation
+
+    menu = DataValidation(type="list", formula1='"' + ",".join(choices) + '"', allow_blank=True, showErrorMessage=True)
+    menu.errorTitle, menu.error = "one of the list", f"choose {', '.join(choices)}"
+    return menu
+
+
+def _put_picture(page: Any, first: int, last: int, content: bytes) -> None:
+    """Anchor a picture at its first row, and make its rows high enough for it."""
+    from openpyxl.drawing.image import Image
+
+    picture = Image(io.BytesIO(content))
+    n_rows = last - first + 1
+    height = PICTURE_WIDTH * picture.height / picture.width
+    shrink = min(1.0, n_rows * MOST_ROW_POINTS / (height * POINTS_A_PIXEL))
+    picture.width, picture.height = round(PICTURE_WIDTH * shrink), round(height * shrink)
+    picture.anchor = f"{'ABCDEFGHI'[COLUMNS.index('picture')]}{first}"
+    page.add_image(picture)
+    for row in range(first, last + 1):
+        page.row_dimensions[row].height = (picture.height * POINTS_A_PIXEL + 6) / n_rows
+
+
+def _write_head(page: Any, title: str, last: int) -> None:
+    """Title, progress and the names of the columns, which stay in sight."""
+    from openpyxl.styles import Alignment, Font, PatternFill
+
+    text_cell(page, 1, 2, title).font = Font(name=FONT, bold=True, size=15)
+    letter = "ABCDEFGHI"[COLUMNS.index("answer")]
+    cells = f"{letter}{HEADER_ROW + 1}:{letter}{last}"
+    page.cell(2, 2).value = f'=COUNTA({cells})&" of "&ROWS({cells})&" answered"'
+    page.cell(2, 2).font = Font(name=FONT, bold=True, color=HEAD_FILL)
+    text_cell(page, 2, 3, "Choose from the list in the column 'answer', save, and send the file back.")
+    for column, name in enumerate(COLUMNS, 1):
+        cell = text_cell(page, HEADER_ROW, column, name)
+        cell.font = Font(name=FONT, bold=True, color="FFFFFFFF")
+        cell.fill = PatternFill("solid", fgColor=HEAD_FILL)
+        cell.alignment = Alignment(vertical="center")
+    page.freeze_panes = page.cell(HEADER_ROW + 1, 2)
+
+
+def _dress(page: Any, last: int) -> None:
+    """Widths, hidden columns, a colour for what is open, and a lock on all but the answers."""
+    from openpyxl.formatting.rule import FormulaRule
+    from openpyxl.styles import PatternFill
+
+    for column, name in enumerate(COLUMNS):
+        dimension = page.column_dimensions["ABCDEFGHI"[column]]
+        dimension.width = WIDTHS.get(name, 12)
+        dimension.hidden = name in HIDDEN
+    letter = "ABCDEFGHI"[COLUMNS.index("answer")]
+    is_open = FormulaRule(
+        formula=[f"ISBLANK({letter}{HEADER_ROW + 1})"],
+        fill=PatternFill("solid", start_color=OPEN_FILL, bgColor=OPEN_FILL),
+    )
+    page.conditional_formatting.add(f"{letter}{HEADER_ROW + 1}:{letter}{last}", is_open)
+    page.protection.sheet = True  # without a password: it keeps from slips, not from intent
+    page.protection.formatColumns = page.protection.formatRows = False
+
+
+def _write_guide(page: Any, sheet: Sheet, title: str) -> None:
+    """What the pictures show, and what each choice means."""
+    from openpyxl.styles import Alignment, Font
+
+    text_cell(page, 1, 1, title).font = Font(name=FONT, bold=True, size=15)
+    row = 2
+    for sentence in guide_of(sheet):
+        row += 1
+        text_cell(page, row, 1, sentence)
+    row += 1
+    for ask in sheet.asks:
+        row += 1
+        text_cell(page, row, 1, ask.text).font = Font(name=FONT, bold=True)
+        for choice, meaning in zip(ask.choices, ask.meanings, strict=True):
+            row += 1
+            text_cell(page, row, 1, choice).alignment = Alignment(indent=1)
+            text_cell(page, row, 2, meaning)
+        row += 1
+    page.column_dimensions["A"].width, page.column_dimensions["B"].width = 48, 60
+
+
+def _without_time(content: bytes) -> bytes:
+    """The archive with every date in it set to one day, so that the same sheet gives the same bytes."""
+    stamp = datetime(*ZIP_EPOCH, tzinfo=UTC).strftime("%Y-%m-%dT%H:%M:%SZ").encode()
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(buffer, "w") as new:
+        for name in old.namelist():
+            member = old.read(name)
+            if name == "docProps/core.xml":
+                member = re.sub(rb"(<dcterms:(?:created|modified)[^>]*>)[^<]*", rb"\g<1>" + stamp, member)
+            entry = zipfile.ZipInfo(name, date_time=ZIP_EPOCH)
+            entry.compress_type = zipfile.ZIP_STORED if name.endswith(".png") else zipfile.ZIP_DEFLATED
+            new.writestr(entry, member)
+    return buffer.getvalue()
+
+
+MOST_ANNOTATORS = 100
+PAGE, WORKBOOK, TABLE = "sheet.html", "sheet.xlsx", "sheet.csv"
+
+
+@dataclass(frozen=True)
+class Origin(JudgedRun):
+    """Where the drafts come from, for the key."""
+
+    run: str
+    run_digest: str
+    methods: tuple[str, ...]
+    automatic_rule: str
+
+
+@dataclass(frozen=True)
+class MadeSheets:
+    """A set as it was made; ``pictures`` by file name."""
+
+    sheet: Sheet
+    key: Key
+    pictures: dict[str, bytes]
+
+
+def make_sheets(
+    kind: SheetKind,
+    drafts: Sequence[Draft],
+    drawn: Sequence[bytes],
+    origin: Origin,
+    *,
+    seed: int = 0,
+    annotators: int = 1,
+    overlap: float = 1.0,
+) -> MadeSheets:
+    """The set of all ``drafts``, dealt evenly to ``annotators``; a share ``overlap`` of it goes to each of them.
+
+    ``drawn``: the picture of each draft, a PNG.
+    """
+    check_split(len(drafts), annotators, overlap)
+    random = np.random.default_rng(seed)
+    order = np.argsort(random.permutation(len(drafts))).tolist()
+    chosen = [drafts[k] for k in order]
+    ids = [f"item-{number:04d}" for number in range(1, len(order) + 1)]
+    pictures = {f"{item_id}.png": drawn[k] for item_id, k in zip(ids, order, strict=True)}
+    digests = [digest_bytes(content) for content in pictures.values()]
+    shown = list(zip(ids, chosen, pictures, digests, strict=True))
+    contents = [[item_id, draft.text, list(draft.asks), digest] for item_id, draft, _, digest in shown]
+    set_id = sheet_id_of(kind, seed, contents)
+    items = tuple(
+        new_item(set_id, item_id, draft.text, draft.asks, (name,), (digest,)) for item_id, draft, name, digest in shown
+    )
+    sheet = Sheet(set_id, kind, seed, ASKS[kind], items, dealt(ids, annotators, overlap, random))
+    key_items = tuple(_key_item(item_id, draft) for item_id, draft, *_ in shown)
+    return MadeSheets(sheet, Key(sheet_id=set_id, kind=kind, items=key_items, **asdict(origin)), pictures)
+
+
+def check_split(n_items: int, annotators: int, overlap: float) -> None:
+    """A ``ConfigError`` where so many items cannot be dealt so."""
+    if not n_items:
+        raise ConfigError("there is nothing to judge: no question, or no instance, in these scenes")
+    if not 1 <= annotators <= MOST_ANNOTATORS:
+        raise ConfigError(f"--annotators {annotators}: expected 1 to {MOST_ANNOTATORS}")
+    if not 0.0 <= overlap <= 1.0:
+        raise ConfigError(f"--overlap {overlap:g}: expected a share of the items from 0 to 1")
+
+
+def dealt(
+    item_ids: Sequence[str], annotators: int, overlap: float, random: np.random.Generator
+) -> tuple[AnnotatorShare, ...]:
+    """Who gets what: a share of the items goes to all, the others are dealt in turn; each in an order of their own.
+
+    >>> shares = dealt(["a", "b", "c", "d"], 2, 0.5, np.random.default_rng(0))
+    >>> [len(one.item_ids) for one in shares], len(set(shares[0].item_ids) & set(shares[1].item_ids))
+    ([3, 3], 2)
+    """
+    drawn = [item_ids[k] for k in random.permutation(len(item_ids))]
+    n_shared = round(overlap * len(drawn)) if annotators > 1 else 0
+    shared, others = drawn[:n_shared], drawn[n_shared:]
+    shares = []
+    for k in range(annotators):
+        own = [*shared, *others[k::annotators]]
+        own = own if annotators == 1 else [own[place] for place in random.permutation(len(own))]
+        shares.append(AnnotatorShare(f"annotator-{k + 1}", tuple(sorted(own) if annotators == 1 else own)))
+    return tuple(shares)
+
+
+def _key_item(item_id: str, draft: Draft) -> KeyItem:
+    return KeyItem(
+        id=item_id,
+        scene=draft.scene,
+        methods=draft.methods,
+        instance_ids=draft.instance_ids,
+        question_id=draft.question_id,
+        question_kind=draft.question_kind,
+        stands_for=dict(draft.stands_for),
+        automatic=dict(draft.automatic),
+    )
+
+
+def write_sheets(made: MadeSheets, folder: Path, key_folder: Path) -> list[Path]:
+    """Write everything into ``folder`` and the key into ``key_folder``; the files for annotators, a folder each.
+
+    Raises ``ConfigError``, before anything is written, where the folders hold another set, or answers.
+    """
+    if key_folder.resolve() == folder.resolve() or folder.resolve() in key_folder.resolve().parents:
+        raise ConfigError(f"--key {printable(str(key_folder), 200)}: lies where the sheets are; keep the key apart")
+    tables: dict[Path, bytes] = {}
+    for share in made.sheet.annotators:
+        tables[folder / share.name / WORKBOOK] = workbook_bytes(
+            made.sheet, share, made.pictures, KINDS_OF_SHEETS[made.sheet.kind].title
+        )
+        tables[folder / share.name / TABLE] = table_csv(made.sheet, share).encode()
+    _refuse_other_sheets(made.sheet.id, folder, key_folder, tables)
+    for path in (folder, key_folder, folder / PICTURES):
+        make_folder(path)
+    for name, content in made.pictures.items():  # in the order of their numbers, which is drawn
+        write_bytes(folder / PICTURES / name, content)
+    written = []
+    for share in made.sheet.annotators:
+        own = folder / share.name
+        make_folder(own)
+        write_text(own / PAGE, page_html(KINDS_OF_SHEETS[made.sheet.kind].title, page_data(made, share)))
+        for path in (own / WORKBOOK, own / TABLE):
+            write_bytes(path, tables[path])
+        written += [own / PAGE, own / WORKBOOK, own / TABLE]
+    write_sheet(folder, made.sheet)
+    write_key(key_folder, made.key)
+    return written
+
+
+def _refuse_other_sheets(sheet_id: str, folder: Path, key_folder: Path, tables: Mapping[Path, bytes]) -> None:
+    """Answers belong to one set and its key: neither gives way to another, and no answer to an empty table."""
+    held = {}
+    if is_file(folder / SHEET_FILE):
+        held["--out"] = read_sheet(folder / SHEET_FILE).id
+    if is_file(key_folder / KEY_FILE):
+        held["--key"] = read_key(key_folder / KEY_FILE).sheet_id
+    for flag, other in held.items():
+        if other != sheet_id:
+            raise ConfigError(f"{flag}: holds the sheets {printable(other)}; name another folder")
+    for path, content in tables.items():
+        if is_file(path) and file_bytes(path) != content:
+            where = printable(str(path), 200)
+            raise ConfigError(f"--out: {where} holds answers, or another set; name another folder")
+
+
+def page_data(made: MadeSheets, share: AnnotatorShare) -> dict[str, Any]:
+    """What the page of an annotator shows; nothing of the key."""
+    return {
+        "id": made.sheet.id,
+        "annotator": share.name,
+        "columns": list(ANSWER_COLUMNS),
+        "guide": list(guide_of(made.sheet)),
+        "asks": [asdict(ask) for ask in made.sheet.asks],
+        "items": [
+            {
+                "id": item.id,
+                "text": item.text,
+                "asks": list(item.asks),
+                "check": item.check,
+                "picture": base64.b64encode(made.pictures[item.pictures[0]]).decode("ascii"),
+            }
+            for item in made.sheet.items_of(share)
+        ],
+    }
+
+
+def table_csv(sheet: Sheet, share: AnnotatorShare) -> str:
+    """The table of one annotator, answers to be filled in; text that a spreadsheet would compute begins with ``'``."""
+    rows: list[tuple[str, ...]] = [(*ANSWER_COLUMNS, "picture", "text", "asked", "choices")]
+    for item in sheet.items_of(share):
+        for name in item.asks:
+            ask = sheet.ask(name)
+            shown = (f"../{PICTURES}/{item.pictures[0]}", " / ".join(item.text.split("\n")), ask.text)
+            rows.append((sheet.id, item.id, share.name, name, "", item.check, *shown, " | ".join(ask.choices)))
+    return csv_lines(rows)
