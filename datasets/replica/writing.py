@@ -13,7 +13,7 @@ from su3d_bench.core.files.atomic import json_text, make_folder, write_json, wri
 from su3d_bench.core.types import Float64Array, Frame
 from su3d_bench.datasets.replica.folders import original_name, replica_label_set
 from su3d_bench.datasets.replica.frames import colour_name, depth_name
-from su3d_bench.datasets.replica.mesh_truth import INFO_NAME, MESH_NAME
+from su3d_bench.datasets.replica.truth import INFO_NAME, MESH_NAME
 from su3d_bench.datasets.writing import Layout, Scan, ScannedDataset, ScannedObject, SceneTarget, write_shared_text
 from su3d_bench.formats.images import (
     JPEG_QUALITY,

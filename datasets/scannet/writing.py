@@ -19,8 +19,6 @@ from su3d_bench.core.files.atomic import make_folder, write_text
 from su3d_bench.core.system.files import file_bytes, file_text
 from su3d_bench.core.toml import parse_toml
 from su3d_bench.core.types import Float64Array, Frame, Int64Array, UInt8Array
-from su3d_bench.datasets.scannet.annotations import aggregation_name, segments_name
-from su3d_bench.datasets.scannet.labels import TABLE_NAME
 from su3d_bench.datasets.scannet.sens import (
     FRAME_RECORD,
     MICROSECONDS,
@@ -29,7 +27,15 @@ from su3d_bench.datasets.scannet.sens import (
     SensHeader,
     write_sens,
 )
-from su3d_bench.datasets.scannet.truth import labels_name, mesh_name, meta_name, truth_names
+from su3d_bench.datasets.scannet.truth import (
+    TABLE_NAME,
+    aggregation_name,
+    labels_name,
+    mesh_name,
+    meta_name,
+    segments_name,
+    truth_names,
+)
 from su3d_bench.datasets.writing import Layout, Scan, ScannedDataset, ScannedObject, SceneTarget, write_shared_text
 from su3d_bench.formats.images import JPEG_QUALITY, depth_in_units, image_size, jpeg_bytes, list_column, triangles_of
 from su3d_bench.formats.ply import Column, PlyElement, write_ply

@@ -20,9 +20,9 @@ from su3d_bench.core.toml import parse_toml
 from su3d_bench.datasets import openscan
 from su3d_bench.datasets.openscan import KEYS, RAW_NAME, attribute_id, attribute_ids, label_set, read_attributes
 from su3d_bench.datasets.rooms import attributes as of_rooms
-from su3d_bench.datasets.rooms.attributes import attribute_of_object
 from su3d_bench.datasets.rooms.classes import CLASS_BY_NAME, MATERIALS
 from su3d_bench.datasets.rooms.dataset import Rooms
+from su3d_bench.datasets.rooms.truth import attribute_of_object
 from su3d_bench.datasets.scannet.dataset import ScanNet
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.protocols.loading import load_protocol

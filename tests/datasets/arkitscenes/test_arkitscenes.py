@@ -25,7 +25,7 @@ from arkitscenes_scene import (
 from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing, ScenesMissing
 from su3d_bench.datasets.arkitscenes.challenge import DEVELOPMENT_SCENES
 from su3d_bench.datasets.arkitscenes.dataset import ArkitScenes
-from su3d_bench.datasets.arkitscenes.trajectory import Trajectory, read_trajectory
+from su3d_bench.datasets.arkitscenes.frames import Trajectory, read_trajectory
 
 POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 3429978\n"
 

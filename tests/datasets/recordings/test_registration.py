@@ -8,8 +8,7 @@ import pytest
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.geometry import are_rigid
 from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
-from su3d_bench.datasets.recordings.registration import Grid, Registration, filled, make_registration
-from su3d_bench.datasets.recordings.source import SensorPair
+from su3d_bench.datasets.recordings.source import Grid, Registration, SensorPair, filled, make_registration
 
 
 def intrinsics(focal: float, size: tuple[int, int]) -> Float64Array:

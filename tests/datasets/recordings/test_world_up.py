@@ -16,8 +16,7 @@ from su3d_bench.core.config import write_toml
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.geometry import turn_to_z
 from su3d_bench.core.types import Float64Array, Frame, UpAxis
-from su3d_bench.datasets.recordings.pose_convention import judge_scene
-from su3d_bench.datasets.recordings.world_up import guess_up
+from su3d_bench.datasets.recordings.pose_convention import guess_up, judge_scene
 from su3d_bench.datasets.rgbd.dataset import Rgbd
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 from su3d_bench.reports.pictures.scene import look_at

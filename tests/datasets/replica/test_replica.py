@@ -34,7 +34,7 @@ from su3d_bench.core.types import Frame
 from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.datasets.replica.folders import original_name
 from su3d_bench.datasets.replica.frames import read_camera, read_trajectory
-from su3d_bench.datasets.replica.mesh_truth import object_of_vertex
+from su3d_bench.datasets.replica.truth import object_of_vertex
 from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
 
 Change = Callable[[Path], object]

@@ -16,8 +16,8 @@ from scored_room import instances
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float32Array
-from su3d_bench.datasets.replica.cloud_truth import N_EMBEDDING
 from su3d_bench.datasets.replica.dataset import Replica
+from su3d_bench.datasets.replica.truth import N_EMBEDDING
 from su3d_bench.formats.poses import read_first_pose
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene

@@ -13,7 +13,7 @@ from scored_room import instances
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.datasets.replica.dataset import Replica
-from su3d_bench.datasets.replica.label_file_truth import OVO_CLASSES, read_whole_numbers
+from su3d_bench.datasets.replica.truth import OVO_CLASSES, read_whole_numbers
 from su3d_bench.formats.ply import PlyElement, write_ply
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene

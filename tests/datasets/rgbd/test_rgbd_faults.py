@@ -17,8 +17,13 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.recordings.pose_convention import FLIP, judge_scene
 from su3d_bench.datasets.recordings.recorded_frames import square
 from su3d_bench.datasets.rgbd.dataset import Rgbd
-from su3d_bench.datasets.rgbd.description import RgbdDescription
-from su3d_bench.datasets.rgbd.files import camera_to_world, direction_in, read_intrinsics, read_trajectory_file
+from su3d_bench.datasets.rgbd.files import (
+    RgbdDescription,
+    camera_to_world,
+    direction_in,
+    read_intrinsics,
+    read_trajectory_file,
+)
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 from su3d_bench.formats.text_files import read_text
 

@@ -16,11 +16,10 @@ from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.geometry import back_project
 from su3d_bench.core.maps import Instances
 from su3d_bench.datasets.openscan import label_set
-from su3d_bench.datasets.rooms.attributes import attribute_of_object
 from su3d_bench.datasets.rooms.dataset import DEFAULT_SCENES, N_STRUCTURE, Rooms
-from su3d_bench.datasets.rooms.kept import MESH_ARRAYS, kept_mesh, kept_walk
 from su3d_bench.datasets.rooms.rendering.mesh import RoomMesh
-from su3d_bench.datasets.rooms.scan import RoomScan
+from su3d_bench.datasets.rooms.scan import MESH_ARRAYS, RoomScan, kept_mesh, kept_walk
+from su3d_bench.datasets.rooms.truth import attribute_of_object
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 

@@ -36,8 +36,8 @@ from su3d_bench.core.types import Float64Array, UInt8Array
 from su3d_bench.datasets.recordings.source import SensorPair
 from su3d_bench.datasets.scannet.dataset import ScanNet, ScannetOptions
 from su3d_bench.datasets.scannet.folders import PAPER_SCENES, find_scans, split_scenes
-from su3d_bench.datasets.scannet.frames import read_walk
-from su3d_bench.datasets.scannet.labels import TABLE_NAME
+from su3d_bench.datasets.scannet.recordings import read_walk
+from su3d_bench.datasets.scannet.truth import TABLE_NAME
 from su3d_bench.formats.images import UInt16Array
 from su3d_bench.runs.job import Part
 from su3d_bench.runs.scenes import expand_scenes

@@ -19,7 +19,7 @@ from scannet_scan import (
 from scannet_scans import WHERE, dataset, export, write_scan
 
 from su3d_bench.datasets.scannet.dataset import ScanNet
-from su3d_bench.datasets.scannet.labels import TABLE_NAME
+from su3d_bench.datasets.scannet.truth import TABLE_NAME
 
 
 def test_files_are_all_that_is_read(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from scannet_toy import (
 )
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.datasets.recordings.exported_frames import ExportedFrames
+from su3d_bench.datasets.recordings.source import ExportedFrames
 from su3d_bench.datasets.scannet.recordings import find_source, open_cpp_export, open_python_export, read_info
 from su3d_bench.datasets.scannet.sens import SensFile, SensSource
 

@@ -13,31 +13,27 @@ from damage import damages, outcomes, truncations
 from scannet_scan import SCAN, TABLE_ROWS, grid, table_text, write_json, write_mesh, write_truth
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
-from su3d_bench.datasets.scannet.annotations import (
-    aggregation_name,
-    object_of_vertex,
-    read_objects,
-    read_segments,
-    segments_name,
-)
-from su3d_bench.datasets.scannet.labels import (
+from su3d_bench.datasets.scannet.truth import (
     FIRST_TABLE_NAME,
     TABLE_NAME,
-    LabelTable,
-    nyu40_label_set,
-    raw_label_set,
-    read_label_table,
-)
-from su3d_bench.datasets.scannet.truth import (
     AnnotatedScan,
+    LabelTable,
+    aggregation_name,
     aligned,
     instance_mesh,
     labels_name,
     mesh_name,
+    nyu40_label_set,
     nyu40_truth,
+    object_of_vertex,
+    raw_label_set,
     read_annotated_scan,
     read_axis_alignment,
+    read_label_table,
+    read_objects,
+    read_segments,
     scannet200_truth,
+    segments_name,
     truth_names,
 )
 from su3d_bench.metrics.instance.average_precision import encode_ground_truth

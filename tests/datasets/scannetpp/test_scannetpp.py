@@ -225,7 +225,7 @@ def test_points_of_images_are_passed_over_and_a_line_without_end_is_refused(
     head, pose, _, *rest = path.read_text().splitlines()[1:]
     path.write_text("\n".join([head, pose, "1 2 3 " * 40, *rest]) + "\n")
     assert len(dataset(tmp_path).frames(SCENE, 1)) == 3
-    monkeypatch.setattr("su3d_bench.datasets.scannetpp.iphone.poses.MOST_LINE_BYTES", 200)
+    monkeypatch.setattr("su3d_bench.datasets.scannetpp.poses.MOST_LINE_BYTES", 200)
     with pytest.raises(DataError, match=rf"^{WHERE}: colmap/images.txt: a line has more than"):
         dataset(tmp_path).frames(SCENE, 1)
 
@@ -257,7 +257,7 @@ def test_tracking_that_cannot_be_right_is_named(tmp_path: Path, changes: dict[st
 
 def test_a_depth_file_that_ends_too_soon_says_how_many_images_it_has(tmp_path: Path) -> None:
     folder = write_scene(tmp_path, packed=True)
-    from su3d_bench.datasets.scannetpp.iphone.depth_file import packed_metres
+    from su3d_bench.datasets.scannetpp.images import packed_metres
 
     (folder / "iphone/depth.bin").write_bytes(b"".join(packed_metres(depth_values(k)) for k in range(4)))
     with pytest.raises(DataError, match=f"^{WHERE}: depth.bin: has 4 images, frame 10 is not among them"):

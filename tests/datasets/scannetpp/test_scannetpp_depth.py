@@ -14,9 +14,15 @@ import pytest
 from places import CASES
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.datasets.scannetpp.iphone.depth_file import DepthFile, millimetres, packed_metres
-from su3d_bench.datasets.scannetpp.iphone.forward import N_KEPT, ForwardReader
-from su3d_bench.datasets.scannetpp.iphone.lz4 import NotLz4, unpacked_block
+from su3d_bench.datasets.scannetpp.images import (
+    N_KEPT,
+    DepthFile,
+    ForwardReader,
+    NotLz4,
+    millimetres,
+    packed_metres,
+    unpacked_block,
+)
 
 CASE = json.loads((CASES / "scannetpp_lz4.json").read_text())
 SHAPE = (192, 256)

@@ -22,8 +22,8 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.predictions.base import VertexMasks
-from su3d_bench.predictions.formats import recognise
 from su3d_bench.predictions.export import answer_as_it_is, answer_to, write_opensun3d
+from su3d_bench.predictions.formats import recognise
 from su3d_bench.questions.truths import question_truth
 
 PROBLEMS = json.loads((CASES / "opensun3d02_queries.json").read_text())["problems"]
