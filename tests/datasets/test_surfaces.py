@@ -17,9 +17,7 @@ from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.datasets.rgbd.dataset import Rgbd
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 from su3d_bench.datasets.scannet.dataset import ScanNet, ScannetOptions
-from su3d_bench.datasets.tum.dataset import Tum
 from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
-from su3d_bench.runs.frame_loop import surface_of
 
 
 @pytest.fixture(scope="module")
@@ -111,12 +109,6 @@ def test_another_mesh_or_other_segments_make_another_digest(tmp_path: Path) -> N
     assert len(digests) == 3
 
 
-def test_segments_of_another_mesh_are_refused(tmp_path: Path) -> None:
-    write_scan(tmp_path, [7] * 23)
-    with pytest.raises(DataError, match=r"has 23 vertices, .* has 24; they belong to two meshes"):
-        scannet(tmp_path).surface(SCAN)
-
-
 def test_axis_alignment_moves_the_surface_with_the_frames(tmp_path: Path) -> None:
     folder = write_scan(tmp_path, [7] * 24)
     turn = "0 -1 0 2 1 0 0 3 0 0 1 0 0 0 0 1"
@@ -144,8 +136,3 @@ def test_a_mesh_outside_the_described_folder_is_refused(tmp_path: Path) -> None:
     folder = write_scene(tmp_path, mesh="../mesh.ply")
     with pytest.raises(DataError, match="leads out of the folder"):
         Rgbd(tmp_path).surface(folder.name)
-
-
-def test_a_dataset_without_meshes_says_so(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="tum/desk: the dataset has no mesh; this method works on one"):
-        surface_of(Tum(tmp_path), "desk")

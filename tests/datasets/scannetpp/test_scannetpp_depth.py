@@ -83,11 +83,6 @@ def test_what_is_packed_is_unpacked_to_the_same_millimetres() -> None:
         np.testing.assert_array_equal((depth_m * 1000).astype(np.uint16), values.reshape(-1))  # as the toolkit does
 
 
-def test_metres_are_cut_off_and_what_is_no_depth_is_none() -> None:
-    depth_m = np.array([0.0, 1.9999, 65.535, 65.5361, -1.0, np.nan, np.inf], np.float32)
-    assert millimetres(depth_m).tolist() == [0, 1999, 65535, 0, 0, 0, 0]
-
-
 @pytest.mark.parametrize("content", [b"nothing of the kind", raw(b"\0" * 1000), raw(b"\0" * 4 * 49152)[:-3]])
 def test_a_file_of_no_form_is_one_line(tmp_path: Path, content: bytes) -> None:
     with pytest.raises(DataError, match=r"^here: depth.bin: (is none of the forms|ends within an image)"):
