@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import box_room
-import cv2
 import numpy as np
 import painted
 import pytest
@@ -79,25 +78,9 @@ def test_every_damaged_file_is_named(root: Path) -> None:
     assert look(root).n_read == N_FRAMES - 3
 
 
-def test_of_many_missing_files_each_one_is_named(tmp_path: Path) -> None:
-    write_box_room(tmp_path, 60, with_truth=False)
-    gone = sorted((tmp_path / "Replica/room0/results").glob("depth*.png"))[::2]
-    for path in gone:
-        path.unlink()
-    said = " ".join(texts(look(tmp_path)))
-    assert all(path.name in said for path in gone)
-
-
 def test_counts_that_disagree_are_an_error(root: Path) -> None:
     write_poses(root / "Replica/room0", [box_room.pose(index) for index in range(N_FRAMES - 2)])
     assert any("6" in one and "8" in one for one in texts(look(root)))
-
-
-def test_an_image_of_another_size_is_an_error(root: Path) -> None:
-    path = root / "Replica/room0/results/frame000003.jpg"
-    cv2.imwrite(str(path), np.full((20, 30, 3), 90, np.uint8))
-    (said,) = texts(look(root))
-    assert "frame000003.jpg" in said and "30x20" in said
 
 
 def test_a_wrong_depth_scale_is_an_error_and_what_would_be_right_is_said(root: Path) -> None:
@@ -201,11 +184,6 @@ def found_in(*frames: Frame) -> list[tuple[str, str, str]]:
     return [(one.severity, one.check, one.where) for one in found]
 
 
-def test_frames_without_a_fault_have_no_finding() -> None:
-    assert found_in(frame(), frame(index=1), frame(index=2)) == []
-    assert found_in() == []
-
-
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
@@ -255,22 +233,6 @@ def test_the_command_caps_what_it_lists_and_ends_with_1(at_root: Path, capsys: p
     assert json.loads(capsys.readouterr().out)["scenes"][0]["n_errors"] == 14
 
 
-def test_the_json_has_everything(at_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (at_root / "Replica/room0/results/depth000001.png").write_bytes(b"x")
-    assert main(["datasets", "check", "replica/room0", "--quick", "--json", "--quiet"]) == 1
-    table = json.loads(capsys.readouterr().out)
-    assert (table["n_scenes"], table["n_with_errors"], table["data_root"]) == (1, 1, str(at_root))
-    (one,) = table["scenes"]
-    assert set(one) == {
-        "scene", "n_errors", "n_warnings", "n_frames", "n_read", "n_files", "size", "depth", "up", "truth", "meeting",
-        "digest", "findings", "elapsed_s",
-    }  # fmt: skip
-    assert set(one["findings"][0]) == {"severity", "check", "where", "text"}
-    assert set(one["truth"][0]) == {"variant", "reason", "n_points", "n_objects", "n_classes"}
-    assert set(one["depth"]) == {"near_m", "median_m", "far_m", "valid_share"}
-    assert set(one["meeting"]) == {"share", "distance_m", "hint"}
-
-
 def test_the_digest_is_the_one_that_a_run_records(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -287,24 +249,6 @@ def test_the_digest_is_the_one_that_a_run_records(
     assert digest in (tmp_path / "run" / "run.json").read_text()
     assert json.loads((tmp_path / "run/scenes/painted.a/collector/done.json").read_text())
     assert digest in (tmp_path / "run/scenes/painted.a/collector/done.json").read_text()
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["replica/room9"], "no scene matches 'replica/room9'; did you mean 'replica/room0'?"),
-        (["replcia/*"], "no scene matches 'replcia/*'; did you mean 'replica/*'?"),
-        (["replica/room0", "--jobs", "0"], "--jobs 0: expected 1 or more"),
-        (["rooms/living0", "--set", "rooms.n_frame=3"], "--set rooms.n_frame: unknown key 'n_frame'; did you mean"),
-        (["replica/room0", "--set", "rooms.n_frames=3"], "--set rooms.n_frames=3: 'rooms' is no method or dataset"),
-    ],
-)
-def test_wrong_names_are_one_line(
-    at_root: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["datasets", "check", *words]) == 2
-    said = capsys.readouterr()
-    assert said.out == "" and said.err.startswith(f"su3d-bench: {message}") and said.err.count("\n") == 1
 
 
 def test_text_of_files_reaches_the_terminal_without_control_characters() -> None:

@@ -110,13 +110,6 @@ def test_frames_without_a_pose_in_time_are_counted_and_left_out(
     assert len(Tum(tmp_path, TumOptions(max_difference_s=0.04)).frames(SCENE, 1)) == 4
 
 
-def test_associate_txt_wins_over_the_lists(tmp_path: Path) -> None:
-    folder = write_sequence(tmp_path)
-    (folder / "associate.txt").write_text("100.2 rgb/100.200000.png 100.1 depth/100.104000.png\n")
-    (frame,) = Tum(tmp_path).frames(SCENE, 1)
-    assert frame.depth_m[0, 0] == np.float32(1 / 5000) and frame.camera_to_world[0, 3] == 2
-
-
 def reference_pairs(first: list[float], second: list[float], limit: float) -> list[tuple[float, float]]:
     """The benchmark's associate.py, its two loops over everything."""
     near = sorted((abs(a - b), a, b) for a in first for b in second if abs(a - b) < limit)
@@ -242,16 +235,3 @@ def test_times_denser_than_any_camera_are_refused_before_pairs_are_made(tmp_path
         (folder / name).write_text(lines)
     with pytest.raises(DataError, match=r"4000000 pairs within 0\.02 s; lower the limit"):
         Tum(tmp_path).info(SCENE, 1)
-
-
-def test_the_digest_moves_with_every_file_that_is_read(tmp_path: Path) -> None:
-    folder = write_sequence(tmp_path)
-    seen = {Tum(tmp_path).digest(SCENE)}
-    files = Tum(tmp_path).files(SCENE)
-    assert set(files) == {path for path in folder.rglob("*") if path.is_file()}
-    for name in ("camera.txt", "rgb.txt", "groundtruth.txt"):
-        rewrite(name, lambda text: text + "\n")(folder)
-        seen.add(Tum(tmp_path).digest(SCENE))
-    cv2.imwrite(str(folder / "depth/100.304000.png"), np.full((HEIGHT, WIDTH), 7, np.uint16))
-    seen.add(Tum(tmp_path).digest(SCENE))
-    assert len(seen) == 5

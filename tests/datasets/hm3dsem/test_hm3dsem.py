@@ -50,11 +50,6 @@ def test_the_truth_holds_objects_in_the_order_of_the_file_with_floors_rooms_and_
     np.testing.assert_allclose(truth.places.object_boxes[1][1], np.ptp(CHAIR, axis=0) + 0.02)
 
 
-def test_a_category_that_the_list_does_not_have_is_no_class(walk: Path, tmp_path: Path) -> None:
-    change(walk, lambda content: content["objects"][0].update(category="chaise of doom"))
-    assert Hm3dSem(tmp_path).ground_truth(SCENE, "hovsg-objects").semantic[:6].tolist() == [0] * 6
-
-
 def test_scenes_groups_and_a_word_on_each(walk: Path, tmp_path: Path) -> None:
     dataset = Hm3dSem(tmp_path)
     assert (dataset.scenes(), dataset.status(SCENE)) == ((SCENE,), "2 frames, ground truth")

@@ -62,38 +62,11 @@ def test_frames_hold_what_the_files_hold(tmp_path: Path) -> None:
         frames[2]
 
 
-def test_the_largest_depth_is_none_where_it_stands_apart(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    write_render(tmp_path)
-    values = depth_values(1)
-    values[0] = 65535
-    cv2.imwrite(str(tmp_path / "Replica/room0/results/depth000001.png"), values)
-    first, second, _ = Replica(tmp_path).frames("room0", 1)
-    assert (second.depth_m[0] == 0).all() and (second.depth_m[1:] > 0).all() and first.depth_m[0, 1] > 0
-    assert [record.getMessage().partition(" counts")[0] for record in caplog.records] == [
-        f"replica/room0: depth 65535 ({65535 / SCALE:.4g} m)"
-    ]
-
-
-def test_info_counts_the_frames_of_the_stride(tmp_path: Path) -> None:
-    write_render(tmp_path, n_frames=5)
-    info = Replica(tmp_path).info("room0", 2)
-    assert (info.dataset, info.scene, info.n_frames, info.stride, info.image_domain) == (
-        "replica", "room0", 3, 2, "camera",
-    )  # fmt: skip
-
-
 def test_official_scenes_come_first_and_others_in_natural_order(tmp_path: Path) -> None:
     for scene in ("living10", "office1", "living2", "room2", "room0"):
         write_render(tmp_path, scene, 1)
     (tmp_path / "Replica" / ".living3.partial" / "results").mkdir(parents=True)
     assert Replica(tmp_path).scenes() == ("room0", "room2", "office1", "living2", "living10")
-
-
-@pytest.mark.parametrize("folder", ["Replica", "replica", "."])
-def test_the_render_is_found_in_the_usual_places(tmp_path: Path, folder: str) -> None:
-    write_render(tmp_path, folder=folder)
-    (tmp_path / "rooms").mkdir()
-    assert Replica(tmp_path).scenes() == ("room0",)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from rgbd_scene import HEIGHT, WIDTH, depth_values, log_of, open_scene, pose, te
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.datasets.recordings.pose_convention import FLIP
-from su3d_bench.datasets.rgbd.dataset import Rgbd, RgbdOptions
+from su3d_bench.datasets.rgbd.dataset import Rgbd
 
 
 def test_frames_hold_what_the_files_hold(tmp_path: Path) -> None:
@@ -156,19 +156,6 @@ def test_a_trajectory_counts_missing_images_or_leaves_them_out(tmp_path: Path) -
         open_scene(tmp_path)
 
 
-def test_descriptions_anywhere_can_be_named(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path / "elsewhere")
-    (folder / "rgbd.toml").rename(folder / "shelf.toml")
-    rgbd = Rgbd(tmp_path, RgbdOptions(files=(folder / "shelf.toml",)))
-    assert rgbd.scenes() == ("shelf",) and len(rgbd.frames("shelf", 1)) == 3
-    assert RgbdOptions.model_validate_json('{"files": "a.toml"}').files == (Path("a.toml"),)
-    (folder / "shelf.toml").rename(folder / "rgbd.toml")
-    assert Rgbd(tmp_path, RgbdOptions(files=(folder,))).scenes() == ("desk",)
-    write_scene(tmp_path)
-    with pytest.raises(DataError, match="rgbd: scene 'desk' is described twice"):
-        Rgbd(tmp_path, RgbdOptions(files=(folder,))).scenes()
-
-
 def test_there_is_no_ground_truth_and_no_scene_without_description(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"rgbd: no scene in .*--set rgbd\.files=path/to/rgbd\.toml"):
         Rgbd(tmp_path).scenes()
@@ -179,16 +166,3 @@ def test_there_is_no_ground_truth_and_no_scene_without_description(tmp_path: Pat
         Rgbd(tmp_path).ground_truth("desk", "mesh-vertices")
     with pytest.raises(GroundTruthMissing):
         Rgbd(tmp_path).instance_mesh("desk")
-
-
-def test_the_digest_moves_with_every_file_that_is_read(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path, intrinsics=None, intrinsics_file="camera.json")
-    seen = {Rgbd(tmp_path).digest("desk")}
-    unused = {"trajectory.log", "intrinsics.txt"}
-    expected = {path for path in folder.rglob("*") if path.is_file() and path.name not in unused}
-    assert {path.resolve() for path in Rgbd(tmp_path).files("desk")} == expected
-    for path in (folder / "rgbd.toml", folder / "data/camera.json", folder / "data/frame-1.pose.txt"):
-        path.write_text(path.read_text() + "\n")
-        seen.add(Rgbd(tmp_path).digest("desk"))
-    cv2.imwrite(str(folder / "data/depth/frame-2.png"), depth_values(3))
-    assert len(seen | {Rgbd(tmp_path).digest("desk")}) == 5

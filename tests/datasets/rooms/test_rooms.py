@@ -46,24 +46,6 @@ def test_the_same_name_gives_the_same_bytes(rooms: Rooms, tmp_path: Path) -> Non
     assert _same(rooms.scan(SCENE), again.scan(SCENE))
 
 
-def test_names_and_seed_offsets_give_different_rooms(rooms: Rooms, tmp_path: Path) -> None:
-    other = Rooms(tmp_path, SMALL.model_copy(update={"seed_offset": 1}))
-    assert rooms.truth("bathroom8").objects != rooms.truth(SCENE).objects
-    assert other.truth(SCENE).objects != rooms.truth(SCENE).objects
-    assert len({rooms.digest(SCENE), rooms.digest("bathroom8"), other.digest(SCENE)}) == 3
-
-
-def test_frames_can_be_read_in_any_order(rooms: Rooms) -> None:
-    frames = rooms.frames(SCENE, 40)
-    last, first = frames[1], frames[0]
-    assert (len(frames), first.index, last.index) == (2, 0, 40)
-    assert rooms.info(SCENE, 40).n_frames == 2
-    assert np.array_equal(frames[0].rgb, first.rgb)
-    assert np.array_equal(last.camera_to_world, rooms.trajectory(SCENE)[40])
-    with pytest.raises(IndexError):
-        frames[2]
-
-
 @pytest.mark.parametrize("name", ["kitchn0", "living", "living-1", "living00", "cellar3", "office 1", "living1000000"])
 def test_a_name_that_is_no_scene_is_refused(rooms: Rooms, name: str) -> None:
     with pytest.raises(DataError, match="no scene"):
@@ -165,13 +147,6 @@ def test_a_mesh_and_a_walk_that_were_kept_are_those_made_anew(tmp_path: Path) ->
             assert one.dtype == two.dtype and one.tobytes() == two.tobytes(), field.name
         assert made.trajectory.tobytes() == other.trajectory.tobytes()
     assert not (tmp_path / "no-folder").exists(), "a dataset that is only looked at makes no data root"
-
-
-def test_a_cache_that_cannot_be_written_is_said_so(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    blocked = Rooms(tmp_path / "file", Rooms.Options(n_frames=2, mesh_spacing_m=0.1))
-    with pytest.raises(DataError, match="cannot write the scan"):
-        blocked.scan(SCENE)
 
 
 def test_image_size_and_noise_do_not_move_the_scan(rooms: Rooms) -> None:

@@ -7,7 +7,6 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from scannet_scan import (
@@ -28,15 +27,13 @@ from scannet_scan import (
 from scannet_scans import WHERE, dataset, export, write_scan
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing
+from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.types import Float64Array, UInt8Array
 from su3d_bench.datasets.recordings.source import SensorPair
 from su3d_bench.datasets.scannet.dataset import ScanNet
 from su3d_bench.datasets.scannet.folders import PAPER_SCENES, split_scenes
 from su3d_bench.datasets.scannet.recordings import read_walk
 from su3d_bench.formats.images import UInt16Array
-from su3d_bench.runs.job import Part
-from su3d_bench.runs.scenes import expand_scenes
 
 
 @pytest.mark.parametrize(
@@ -78,24 +75,6 @@ def test_frames_hold_what_the_recording_holds_on_the_depth_grid(tmp_path: Path) 
     assert frames[1].rgb[0, [15, 16]].tolist() == [list(LEFT), list(RIGHT)]
     with pytest.raises(IndexError):
         frames[3]
-
-
-@pytest.mark.parametrize("source", ["sens", "export"])
-def test_the_largest_depth_is_none_where_it_stands_apart(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, source: str
-) -> None:
-    if source == "sens":
-        values = np.full(DEPTH_SIZE[::-1], 2000, np.uint16)
-        values[0] = 65535
-        write_recording(tmp_path / SCAN / f"{SCAN}.sens", depth=values)
-    else:
-        export(tmp_path / SCAN)
-        values = np.full(DEPTH_SIZE[::-1], 1500, np.uint16)
-        values[0] = 65535
-        cv2.imwrite(str(tmp_path / SCAN / "depth/0.png"), values)
-    depth_m = ScanNet(tmp_path).frames(SCAN, 1)[0].depth_m
-    assert (depth_m[0] == 0).all() and (depth_m[1:] == values[1:] / 1000).all()
-    assert "depth 65535 (65.54 m) counts as no depth" in caplog.text
 
 
 def test_the_colour_grid_keeps_colour_and_thins_depth(tmp_path: Path) -> None:
@@ -205,32 +184,6 @@ def test_the_official_splits_are_whole_and_apart() -> None:
     assert [len(scans) for scans in lists.values()] == [1201, 312, 100]
     assert len({scan for scans in lists.values() for scan in scans}) == 1613
     assert set(PAPER_SCENES) <= {*lists["train"], *lists["val"]}
-
-
-def expand(monkeypatch: pytest.MonkeyPatch, root: Path, *addresses: str) -> list[str]:
-    monkeypatch.setenv("SU3D_DATA", str(root))
-    chosen, _ = expand_scenes(addresses, {"scannet": Part("scannet", "scannet", "{}")})
-    return ["/".join(one) for one in chosen]
-
-
-def test_a_split_is_asked_for_by_name_and_must_be_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "su3d_bench.datasets.scannet.dataset.split_scenes", lambda split: (f"scene000{len(split)}_00", SCAN)
-    )
-    write_scan(tmp_path)
-    write_scan(tmp_path, "scene0003_00", n_frames=1)
-    assert expand(monkeypatch, tmp_path, "scannet/val", f"scannet/{SCAN}") == ["scannet/scene0003_00", WHERE]
-    with pytest.raises(ConfigError) as caught:
-        expand(monkeypatch, tmp_path, "scannet/train")
-    assert str(caught.value) == (
-        "scannet/train: 1 of its 2 scenes are not here (the first: scene0005_00); get them or name the scenes that are"
-    )
-    with pytest.raises(
-        ConfigError, match=r"^scannet/paper: 4 of its 5 scenes are not here \(the first: scene0034_00\)"
-    ):
-        expand(monkeypatch, tmp_path, "scannet/paper")
-    with pytest.raises(ConfigError, match=r"no scene matches 'scannet/trian'; did you mean 'scannet/train'\?"):
-        expand(monkeypatch, tmp_path, "scannet/trian")
 
 
 def test_no_data_is_said_with_the_way_to_get_it(tmp_path: Path) -> None:

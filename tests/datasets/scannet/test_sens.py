@@ -174,14 +174,6 @@ def test_frames_in_any_order_are_those_in_order(tmp_path: Path, order: list[int]
         np.testing.assert_array_equal(one.camera_to_world, in_order[i].camera_to_world)
 
 
-def test_times_are_30_a_second_where_the_stamps_do_not_increase(tmp_path: Path) -> None:
-    same = [replace(frame, colour_timestamp=2**64 - 1) for frame in frames(header(), 3)]
-    write_sens(tmp_path / "a.sens", header(), stored(same))
-    source = SensSource(tmp_path / "a.sens", WHERE)
-    assert [source.timestamp_s(i) for i in range(3)] == pytest.approx([0, 1 / 30, 2 / 30])
-    assert source.record(0).colour_timestamp == 2**64 - 1
-
-
 def test_the_cameras_of_a_source_are_those_of_the_header(expected: dict[str, np.ndarray]) -> None:
     camera = SensSource(TOY, WHERE).camera
     assert (camera.colour_size, camera.depth_size, camera.depth_shift) == ((64, 48), (32, 24), 1000.0)
@@ -327,18 +319,6 @@ def test_a_missing_file_a_folder_and_a_pipe_are_data_errors(tmp_path: Path) -> N
             DataError, match=rf"{name}: cannot be read: (Is a directory|a pipe stands where a file should be)"
         ):
             SensFile(tmp_path / name, WHERE)
-
-
-def test_a_file_that_shrinks_or_goes_while_it_is_read_is_a_data_error(tmp_path: Path) -> None:
-    file = opened(tmp_path / "a.sens", TOY.read_bytes())
-    (tmp_path / "a.sens").write_bytes(TOY.read_bytes()[: N_HEADER + 200])
-    with pytest.raises(DataError, match=r"a\.sens: frame 0 at byte \d+: the file became shorter"):
-        file.colour(0)
-    with pytest.raises(DataError, match=r"a\.sens: motion data: has 0 bytes"):
-        file.motion()
-    (tmp_path / "a.sens").unlink()
-    with pytest.raises(DataError, match=r"a\.sens is missing"):
-        file.depth(0)
 
 
 @pytest.mark.parametrize("path", [TOY, RAW_TOY], ids=["jpeg", "raw"])

@@ -13,7 +13,6 @@ from scannetpp_scene import (
     NUMBERS,
     SCENE,
     WHERE,
-    depth_values,
     grey,
     poses,
     tracking,
@@ -197,19 +196,6 @@ def test_poses_that_cannot_be_right_are_named(tmp_path: Path, name: str, text: s
         list(dataset(tmp_path).frames(SCENE, 1))
 
 
-def test_points_of_images_are_passed_over_and_a_line_without_end_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = write_scene(tmp_path)
-    path = folder / "iphone/colmap/images.txt"
-    head, pose, _, *rest = path.read_text().splitlines()[1:]
-    path.write_text("\n".join([head, pose, "1 2 3 " * 40, *rest]) + "\n")
-    assert len(dataset(tmp_path).frames(SCENE, 1)) == 3
-    monkeypatch.setattr("su3d_bench.datasets.scannetpp.poses.MOST_LINE_BYTES", 200)
-    with pytest.raises(DataError, match=rf"^{WHERE}: colmap/images.txt: a line has more than"):
-        dataset(tmp_path).frames(SCENE, 1)
-
-
 @pytest.mark.parametrize(
     ("changes", "line"),
     [
@@ -224,15 +210,6 @@ def test_tracking_that_cannot_be_right_is_named(tmp_path: Path, changes: dict[st
     write_json(folder / "iphone/pose_intrinsic_imu.json", tracking(**changes))
     with pytest.raises(DataError, match=f"^{WHERE}: pose_intrinsic_imu.json: .*{line}"):
         dataset(tmp_path, poses="tracking").frames(SCENE, 1)
-
-
-def test_a_depth_file_that_ends_too_soon_says_how_many_images_it_has(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path, packed=True)
-    from su3d_bench.datasets.scannetpp.images import packed_metres
-
-    (folder / "iphone/depth.bin").write_bytes(b"".join(packed_metres(depth_values(k)) for k in range(4)))
-    with pytest.raises(DataError, match=f"^{WHERE}: depth.bin: has 4 images, frame 10 is not among them"):
-        list(dataset(tmp_path).frames(SCENE, 1))
 
 
 def test_both_releases_and_a_link_to_one_are_found_once(tmp_path: Path) -> None:
