@@ -21,7 +21,7 @@ from su3d_bench.reports.tables.ablation import ablation_table
 from su3d_bench.reports.tables.judged import JUDGED, WHO_DID, judged_table
 from su3d_bench.reports.tables.latex import PrintedCell, printed_cells
 from su3d_bench.reports.tables.model import BY_PEOPLE, Measured
-from su3d_bench.reports.tables.paper import PaperTable, paper_table
+from su3d_bench.reports.tables.paper import PaperTable, Shown, paper_table
 from su3d_bench.reports.tables.run import found_table
 from su3d_bench.reports.tables.timing import AnytimePoint
 from su3d_bench.runs.ablation import read_rows

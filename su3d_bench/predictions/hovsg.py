@@ -19,9 +19,8 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import DataError, PredictionError, converted, printable, reading, shown
-from su3d_bench.core.places import UP, Floor, Places, Room
 from su3d_bench.core.system.files import file_bytes
-from su3d_bench.core.types import Float32Array, Float64Array
+from su3d_bench.core.types import UP, Float32Array, Float64Array, Floor, Places, Room
 from su3d_bench.formats.arrays import MOST_MASKS, MOST_POINTS, checked_points, feature_table, without_nonfinite
 from su3d_bench.formats.pcd import read_pcd_points
 from su3d_bench.formats.ply import read_ply

@@ -27,7 +27,7 @@ from su3d_bench.formats.arrays import MOST_MASKS, checked_points, kind_of, witho
 from su3d_bench.formats.pickles import read_pickle_file
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.relations.graphs import last_best
+from su3d_bench.metrics.relations import last_best
 from su3d_bench.predictions.base import ONES, Reader, ScenePrediction, first_found, instances_of, named_once
 
 SUFFIX = ".pkl.gz"

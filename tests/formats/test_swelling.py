@@ -23,7 +23,7 @@ from memory import bounded_addresses, peak_bytes, reset_peak
 
 from su3d_bench.core.errors import DataError, PredictionError, StoreError, Su3dError
 from su3d_bench.core.files.atomic import read_arrays
-from su3d_bench.core.system.damage import DAMAGE
+from su3d_bench.core.files.unpacking import DAMAGE
 from su3d_bench.evaluation.texts import read_text_features
 from su3d_bench.formats.arrays import MOST_MEMBERS, run_members
 from su3d_bench.formats.images import decode_colour, decode_depth
@@ -34,7 +34,7 @@ from su3d_bench.formats.tables.csv_text import separated_rows
 from su3d_bench.formats.torch_files import read_torch
 from su3d_bench.metrics.scoring import unpack_scores
 from su3d_bench.predictions.formats import READERS
-from su3d_bench.questions.files.queries import read_query_file
+from su3d_bench.questions.query_files import read_query_file
 from su3d_bench.store.predictions import read_prediction
 
 MOST_GROWN = 320 * MIB

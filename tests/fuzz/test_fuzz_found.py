@@ -22,11 +22,11 @@ from su3d_bench.core.errors import (
     Su3dError,
 )
 from su3d_bench.core.files.atomic import read_arrays, read_json
-from su3d_bench.core.system.damage import DAMAGE
+from su3d_bench.core.files.unpacking import DAMAGE
 from su3d_bench.formats.numpy_files import read_npy
 from su3d_bench.metrics.protocols.loading import read_protocol
 from su3d_bench.metrics.scoring import unpack_scores
-from su3d_bench.questions.files.queries import read_query_file
+from su3d_bench.questions.query_files import read_query_file
 from su3d_bench.store.predictions import read_prediction
 
 DEEP, LONG = "[" * 100_000, "1" * 5000

@@ -25,7 +25,7 @@ from su3d_bench.core.files.atomic import make_folder, read_json, write_json
 from su3d_bench.core.system.devices import make_deterministic, require, require_transformers
 from su3d_bench.core.system.files import file_text, regular
 from su3d_bench.formats.torch_files import check_stored
-from su3d_bench.perception.models.catalogue import STAND_IN, FormName, ModelEntry, ModelForm, model_entry
+from su3d_bench.perception.models.catalogue import FormName, ModelEntry, ModelForm, model_entry
 
 DEFAULT_FOLDER = "~/.cache/su3d-bench/models"
 DIGEST_FOLDER = "model-digests"

@@ -94,13 +94,13 @@ def _image(path: Path) -> object:
 
 
 def _query_file(path: Path) -> object:
-    from su3d_bench.questions.files.queries import read_query_file
+    from su3d_bench.questions.query_files import read_query_file
 
     return read_query_file(path)
 
 
 def _questions(path: Path) -> object:
-    from su3d_bench.questions.files.files import read_questions
+    from su3d_bench.questions.question_files import read_questions
 
     return read_questions(path)
 
@@ -173,7 +173,7 @@ FILES = (
 
 
 def _rules_text() -> bytes:
-    from su3d_bench.metrics.protocols.files import rules_file
+    from su3d_bench.metrics.protocols.loading import rules_file
 
     return rules_file("rooms-semantic").read_bytes()
 
@@ -314,7 +314,7 @@ def _answers(name: str) -> Make:
         from counted_sheets import workbook
         from simulated_annotators import answered, as_csv, retrieval_set
 
-        from su3d_bench.sheets.judging.answers import check_answers, read_answers
+        from su3d_bench.sheets.answers import check_answers, read_answers
 
         sheet, key = retrieval_set(4)
         rows = answered(sheet, key, {"ann": 0.0})
@@ -327,7 +327,7 @@ def _answers(name: str) -> Make:
 def _gsa(folder: Path) -> Read:
     from test_perception_gsa import FRAME, PATTERN, SCENE, detections, write
 
-    from su3d_bench.perception.stored.gsa_files import GsaFiles
+    from su3d_bench.perception.stored_masks import GsaFiles
 
     write(folder, detections())
     return lambda: GsaFiles(folder, PATTERN, SCENE).frame(FRAME)
@@ -371,8 +371,8 @@ def _archive(name: str) -> Make:
 def _truth(folder: Path) -> Read:
     from evaluated_text import write_texts, write_truth
 
+    from su3d_bench.evaluation.text_truth import read_values
     from su3d_bench.evaluation.texts import read_text_features
-    from su3d_bench.evaluation.truth import read_values
 
     write_truth(folder, values=[0, 5001, 1163002, 39001, 7])
     write_texts(folder / "texts.npz", ["chair", "table"], {"chair": 1}, encoder="one")
