@@ -202,7 +202,7 @@ class FileDataset(ABC, Generic[OptionsT]):
             labelled: GroundTruth = openlex3d.truth_below(self.root, self.labels_of, scene, variant)
             return labelled
         if variant not in self.variants:
-            hint = suggest(variant, self.variants)
+            hint = suggest(variant, self.variants) or f"; {self.no_mesh}"
             raise GroundTruthMissing(f"{self.where(scene)}: no ground truth '{variant}'{hint}")
         return self.own_truth(scene, variant)
 

@@ -172,13 +172,13 @@ def test_there_is_no_ground_truth_and_no_sequence_without_data(tmp_path: Path) -
     with pytest.raises(DataError, match=r"tum: no scene in .*folder with rgb\.txt and depth\.txt"):
         Tum(tmp_path).scenes()
     write_sequence(tmp_path)
-    with pytest.raises(GroundTruthMissing, match="has none of objects"):
+    with pytest.raises(GroundTruthMissing, match="the benchmark has none"):
         Tum(tmp_path).ground_truth(SCENE, "mesh-vertices")
     with pytest.raises(GroundTruthMissing, match="no annotated mesh"):
         Tum(tmp_path).instance_mesh(SCENE)
-    with pytest.raises(DataError, match=f"no sequence 'freiburg2_xyz'; did you mean '{SCENE}'"):
+    with pytest.raises(DataError, match=f"no scene 'freiburg2_xyz'; did you mean '{SCENE}'"):
         Tum(tmp_path).info("freiburg2_xyz", 1)
-    with pytest.raises(DataError, match=r"no sequence '\.\./tum'"):
+    with pytest.raises(DataError, match=r"no scene '\.\./tum'"):
         Tum(tmp_path).info("../tum", 1)
 
 
