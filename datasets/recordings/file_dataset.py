@@ -21,7 +21,9 @@ from su3d_bench.datasets.openlex3d import release as openlex3d
 from su3d_bench.datasets.recordings.recorded_frames import reading
 
 MARKER = "rooms.json"  # in a folder of scenes: those that `datasets make` rendered
-DatasetT, OptionsT, Answer = TypeVar("DatasetT"), TypeVar("OptionsT", bound=BaseModel), TypeVar("Answer")
+DatasetT = TypeVar("DatasetT")
+OptionsT = TypeVar("OptionsT", bound=BaseModel)
+Answer = TypeVar("Answer")
 
 
 class NoOptions(BaseModel):

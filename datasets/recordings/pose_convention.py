@@ -1,5 +1,7 @@
 """Whether poses and depth images are meant as they are read: depth of one frame, seen from another, must agree.
 
+And which axis of the world points up, from the cameras and level surfaces.
+
 Wrong poses that are rigid motions look right to every other check, and a map made with them is only bad. The points of
 one frame are projected into another under the reading at hand and under the usual mistakes: the inverse motion, the
 other camera axes, both, and another unit of depth. Where a mistake agrees clearly better, the reading is wrong; where

@@ -1,4 +1,4 @@
-"""The files that ``rgbd.toml`` names: which belong together, and the poses and intrinsics in them."""
+"""``rgbd.toml`` and the files that it names: which belong together, and the poses and intrinsics in them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The ground-truth surface of a room: what a scanner on the walk would have seen, in small even quads."""
+"""The ground-truth surface of a room as a scanner on the walk would have seen it; and what of a room is kept."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is true of a room: its objects and how they relate."""
+"""What is true of a room: its objects, how they relate, and their attributes as OpenScan has them."""
 
 from __future__ import annotations
 

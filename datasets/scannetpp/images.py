@@ -1,4 +1,6 @@
-"""Depth images in the iPhone's ``depth.bin``: 256x192, millimetres as the official toolkit unpacks them.
+"""Images of the iPhone: depth out of ``depth.bin``, colour out of ``rgb.mkv``, read forward.
+
+Depth is 256x192, millimetres as the official toolkit unpacks them.
 
 Three forms circulate: all images in one raw deflate stream of float32 metres; or one behind the other, each with its
 length in four bytes, as an LZ4 block of uint16 millimetres or as a raw deflate stream of float32 metres. Metres become

@@ -1,4 +1,4 @@
-"""Builders of what is fitted to a room: doors, windows, kitchen and bathroom fixtures."""
+"""Builders of what is fitted to a room: doors, windows, kitchen and bathroom fixtures, devices."""
 
 from __future__ import annotations
 
