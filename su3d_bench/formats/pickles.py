@@ -118,6 +118,13 @@ Names = Mapping[str, object]  # what stands for each name that a pickle may use
 class PlainUnpickler(pickle._Unpickler):
     """``forget``: the keys of dicts below which payloads are passed over."""
 
+    # of the unpickler in the standard library
+    stack: list[Any]
+    metastack: list[list[Any]]
+    memo: dict[int, Any]
+    append: Callable[[object], None]
+    read: Callable[[int], bytes]
+
     dispatch: ClassVar[Any] = {code: run for code, run in pickle._Unpickler.dispatch.items() if code in CODES}
 
     def __init__(

@@ -65,7 +65,7 @@ class Storage:
 
     def fill(self, stream: Any, where: str) -> None:
         """Read the bytes out of ``stream``."""
-        place = memoryview(self.content)[: self.n_bytes]
+        place = self.content.data[: self.n_bytes]
         n_read = 0
         while n_read < self.n_bytes and (n := stream.readinto(place[n_read : n_read + PIECE])):
             n_read += n

@@ -349,7 +349,8 @@ def onlineanyseg(place: Path, scene: str) -> Parsed:
             f"{where}: the masks are of {masks.n_points} points, {ONLINE_CLOUD} has {len(points)}; both must be of one "
             "run"
         )
-    features, remarks = None, ("the file has no features: the masks are class-agnostic",)
+    features: Float32Array | None = None
+    remarks: tuple[str, ...] = ("the file has no features: the masks are class-agnostic",)
     value: Any = arrays.get("pred_sem_features")
     if value is not None:
         if value.ndim != 2 or value.dtype.kind != "f" or value.shape[1] != len(masks):

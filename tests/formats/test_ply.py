@@ -70,7 +70,9 @@ def test_every_scalar_type_keeps_its_values_to_the_ends_of_its_range(tmp_path: P
 
 
 @pytest.mark.parametrize("format", FORMATS)
-@pytest.mark.parametrize(("count", "item"), zip(["i1", "u1", "i2", "u2", "i4", "u4", "u1", "i4"], TYPES, strict=True))
+@pytest.mark.parametrize(
+    ("count", "item"), [*zip(["i1", "u1", "i2", "u2", "i4", "u4", "u1", "i4"], TYPES, strict=True)]
+)
 def test_lists_of_every_count_and_item_type_round_trip(tmp_path: Path, format: str, count: str, item: str) -> None:
     values = np.concatenate([extremes(item), extremes(item)])
     for indptr in (np.array([0, 5, 10]), np.array([0, 3, 3, 10])):  # equal lengths and different ones

@@ -124,8 +124,6 @@ def test_a_torch_archive_whose_pickle_swells_is_refused(tmp_path: Path) -> None:
     ("first", "n", "byte", "told"),
     [
         (b"\x80\x04\x8e" + struct.pack("<Q", 1500 * MIB), 1500, 0, "unpacks to more than"),  # one payload
-        (b"\x80\x04", 64, ord("]"), "takes too many operations"),
-        (b"\x80\x04", 64, ord("("), "takes too many operations"),
         (b"\x80\x04N", 64, 0x94, "takes too many operations"),  # remembered again and again
     ],
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import random
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from memory import bounded_addresses
 from su3d_bench.core.errors import DataError
 
 N_INPUTS = 1_000
+N_VECTORS = int(os.environ.get("SU3D_FUZZ_EXAMPLES", "4"))  # of words behind each verb
 WEIGHT = sum(one.weight for one in TARGETS.values())
 # A verb whose work could begin with nothing more than its name ends with words that keep it from that.
 HELD_BACK = {"run": ["--scenes", "replica/none", "--dry-run"], "ablate": ["--scenes", "replica/none", "--dry-run"]}
@@ -51,7 +53,7 @@ def test_any_words_behind_a_verb_are_done_or_declined_in_one_line(words: tuple[s
     Path("a.csv").write_text("a,b\n1,2\n")
     Path("folder").mkdir()
     parser, rng = dict(verbs())[words], random.Random(" ".join(words))
-    for _ in range(4):
+    for _ in range(N_VECTORS):
         try:
             with alarm(60):
                 called([*words, *drawn_words(parser, rng), *HELD_BACK.get(words[-1], [])])

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fuzz_targets_runs import copied_run
+from fuzz_targets import copied_run
 from numpy.typing import NDArray
 
 from su3d_bench.core.config import read_file

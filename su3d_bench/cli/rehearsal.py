@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from su3d_bench.cli.datasets.make import dataset_part, make_files
-from su3d_bench.cli.shared.answers import remark
+from su3d_bench.cli.make_scenes import dataset_part, make_files
+from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import ConfigError, some
 from su3d_bench.core.files.atomic import make_folder
 from su3d_bench.datasets.layouts import LAYOUTS

@@ -1,33 +1,48 @@
-"""``su3d-bench sheets score``: what annotators' answers add up to."""
+"""``su3d-bench sheets``: sheets for people to judge a run, what their answers add up to, and figures for print."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from su3d_bench.cli.shared.answers import answer_json, answer_tables, remark, written
-from su3d_bench.cli.shared.flags import add_table_format, add_verb
+from su3d_bench.cli import sheets_make
+from su3d_bench.cli.options import Verbs, add_group, add_options, add_verb
+from su3d_bench.cli.output import answer_either, answer_json, answer_tables, remark, remark_unseen, written
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, counted
 
 if TYPE_CHECKING:
     from su3d_bench.sheets.scores import Scores
 
-NAME = "score"
 SHOWN_FAULTS = 200  # lines; the number of all is told
 
 
-def add_parser(actions: Any) -> None:
+def add_parser(verbs: Verbs) -> None:
+    actions = add_group(
+        verbs,
+        "sheets",
+        "Make sheets for people to judge a run, score their answers, and draw figures.",
+        (
+            "su3d-bench sheets make runs/my-run --kind retrieval --out sheets",
+            "su3d-bench sheets score ann.csv bob.xlsx --key key/key.json",
+        ),
+    )
+    sheets_make.add_parser(actions)
+    _add_score(actions)
+    _add_pictures(actions)
+
+
+def _add_score(verbs: Verbs) -> None:
     parser = add_verb(
-        actions,
-        NAME,
+        verbs,
+        "score",
         "Check the answers of all annotators and add them up: accuracies, tests, agreement, people beside the truth.",
         (
             "su3d-bench sheets score ann.csv bob.xlsx --key key/key.json --out scores",
             "su3d-bench sheets score ann.csv bob.csv --key key --disputed disputed.csv",
         ),
-        call,
+        call_score,
     )
     parser.add_argument(
         "files",
@@ -52,10 +67,10 @@ def add_parser(actions: Any) -> None:
         metavar="FILE",
         help="sheets of questions: write those that not everybody calls right there, for --leave-out",
     )
-    add_table_format(parser)
+    add_options(parser, "--format")
 
 
-def call(arguments: argparse.Namespace) -> int:
+def call_score(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
     from su3d_bench.formats.tables.table import Prose
@@ -156,3 +171,71 @@ def _looks_line(scores: Scores) -> str:
     n_others = len(scores.second_looks) - n_disagree
     others = "that nobody calls right" if scores.kind == "questions" else "against the ground truth"
     return f"To look at again: {n_disagree} where annotators disagree, {n_others} {others}."
+
+
+SUBJECTS = ("similarity", "labels", "reasoning")
+MOST_ROWS = 40  # of one figure
+FIGURES = ("comparison", "schemes", "teaser")  # as questions/files/files.py has them
+
+
+def _add_pictures(verbs: Verbs) -> None:
+    parser = add_verb(
+        verbs,
+        "pictures",
+        "Draw a figure of a run for print: similarity to texts, labels n and n', or answers with their objects.",
+        (
+            "su3d-bench sheets pictures runs/my-run --queries 'plant on shelf' 'place to sit' --out heat.pdf",
+            "su3d-bench sheets pictures runs/my-run --figure schemes --scenes replica/room0 --out schemes.pdf",
+        ),
+        call_pictures,
+    )
+    parser.add_argument("run", type=Path, metavar="RUN", help="the folder of a run")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="a .pdf, .png or .svg file")
+    parser.add_argument("--what", choices=SUBJECTS, default="similarity", help="what is drawn (default: similarity)")
+    parser.add_argument("--queries", nargs="+", default=[], metavar="TEXT", help="texts, or questions to be answered")
+    parser.add_argument(
+        "--figure", choices=FIGURES, help="the texts of the paper's figure, or of its page's teaser, before --queries"
+    )
+    add_options(parser, "--scenes", "--methods")
+    parser.add_argument("--photo", action="store_true", help="a first column with the colours that the frames saw")
+    parser.add_argument("--view", choices=("corner", "above"), default="corner", help="from where (default: a corner)")
+    parser.add_argument("--colours", choices=("paper", "cividis"), default="paper", help="of similarity")
+    add_options(parser, "--device")
+
+
+def call_pictures(arguments: argparse.Namespace) -> int:
+    from su3d_bench.questions.question_files import figure_texts
+    from su3d_bench.reports.pictures.canvas import scale_stops
+    from su3d_bench.reports.pictures.figures import draw_grid
+    from su3d_bench.runs.finished import read_run
+    from su3d_bench.sheets.figures import Figures
+    from su3d_bench.sheets.sources import RunSource
+
+    of_figure = () if arguments.figure is None else figure_texts(arguments.figure)
+    texts = [*of_figure, *(query.strip() for query in arguments.queries)]
+    if (arguments.what == "labels") == bool(texts) or not all(texts):
+        what = "labels take none" if arguments.what == "labels" else f"{arguments.what} needs at least one, not empty"
+        raise ConfigError(f"--queries: {what}")
+    run = read_run(arguments.run)
+    scenes = arguments.scenes or run.scenes[:1]
+    if len(scenes) * max(1, len(texts)) > MOST_ROWS:
+        raise ConfigError(
+            f"--queries, --scenes: give {len(scenes) * len(texts)} rows; at most {MOST_ROWS} fit a figure"
+        )
+    source = RunSource(run, arguments.methods, scenes)
+    figures = Figures(source, with_photo=arguments.photo, view=arguments.view)
+    scale, columns = None, figures.columns
+    if arguments.what == "labels":
+        columns, rows = figures.labels()
+    elif arguments.what == "reasoning":
+        rows = figures.reasoning(texts, run.encoder(arguments.device or "cpu"))
+    else:
+        encoder = run.encoder(arguments.device or "cpu")
+        for text in texts:
+            remark_unseen(encoder, text, quiet=arguments.quiet)
+        rows = figures.similarity(texts, encoder, arguments.colours)
+        scale = scale_stops(arguments.colours)
+    draw_grid(arguments.out, columns, rows, scale)
+    value = {"picture": str(arguments.out), "columns": columns, "rows": [row.title for row in rows]}
+    answer_either(arguments, value, str(arguments.out))
+    return EXIT_DONE

@@ -9,10 +9,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.fetch import replica, scannet
+from su3d_bench.cli import fetch
 from su3d_bench.cli.new import add_new
-from su3d_bench.cli.shared.answers import answer_either
-from su3d_bench.cli.shared.flags import add_group, add_modules, add_settings, add_verb
+from su3d_bench.cli.options import Verbs, add_group, add_options, add_verb, count
+from su3d_bench.cli.output import answer_either
 from su3d_bench.core.errors import EXIT_DONE
 
 LAYOUTS = (
@@ -29,7 +29,7 @@ LAYOUTS = (
 MAX_LISTED = 40
 
 
-def add_parser(verbs: Any) -> None:
+def add_parser(verbs: Verbs) -> None:
     actions = add_group(
         verbs,
         "datasets",
@@ -51,40 +51,30 @@ def add_parser(verbs: Any) -> None:
     _add_check(actions)
     _add_show(actions)
     _add_make(actions)
-    add_modules(
-        actions,
-        "fetch",
-        "Fetch published data: shown first, resumed, checked, unpacked where it is looked for.",
-        (replica, scannet),
-        (
-            "su3d-bench datasets fetch replica --dry-run",
-            "su3d-bench datasets fetch scannet --script download-scannet.py",
-        ),
-    )
+    fetch.add_data(actions)
     add_new(actions, "dataset")
 
 
-def _later(name: str) -> Callable[[argparse.Namespace], int]:
-    """The function ``name`` of the module of that name, which takes long to load."""
+def _later(module: str, name: str) -> Callable[[argparse.Namespace], int]:
+    """The function ``name`` of a module that takes long to load."""
 
     def call(arguments: argparse.Namespace) -> int:
-        module = import_module(f"su3d_bench.cli.datasets.{name}")
-        code: int = getattr(module, name)(arguments)
+        code: int = getattr(import_module(f"su3d_bench.cli.{module}"), name)(arguments)
         return code
 
     return call
 
 
-def _add_check(actions: Any) -> None:
+def _add_check(verbs: Verbs) -> None:
     parser = add_verb(
-        actions,
+        verbs,
         "check",
         "Look at every file and frame of scenes, name all that is wrong, and tell the digest that results carry.",
         (
             "su3d-bench datasets check 'replica/*'",
             "su3d-bench datasets check rooms/living0 --set rooms.n_frames=40 --json",
         ),
-        _later("check"),
+        _later("scenes", "check"),
     )
     parser.add_argument("scenes", nargs="+", metavar="SCENE", help="addresses or patterns, such as 'replica/*'")
     parser.add_argument(
@@ -92,41 +82,37 @@ def _add_check(actions: Any) -> None:
         action="store_true",
         help="read 20 evenly spaced frames of each scene, as is always done where scenes are made on demand",
     )
-    parser.add_argument("--jobs", type=int, metavar="N", help="frames read side by side (default: the CPU cores)")
-    _add_options(parser)
+    add_options(parser, "--jobs")
+    add_options(parser, "--set")
 
 
-def _add_show(actions: Any) -> None:
+def _add_show(verbs: Verbs) -> None:
     parser = add_verb(
-        actions,
+        verbs,
         "show",
         "Draw a scene: the walk seen from above, some frames, and the ground truth by class and by instance.",
         (
             "su3d-bench datasets show rooms/living0 --set rooms.n_frames=40",
             "su3d-bench datasets show replica/room0 --out room0.png --stride 50",
         ),
-        _later("show"),
+        _later("scenes", "show"),
     )
     parser.add_argument("scene", metavar="SCENE", help="the scene's address, such as rooms/living0")
     parser.add_argument("--out", type=Path, metavar="FILE", help="the PNG to write (default: DATASET-SCENE.png here)")
-    parser.add_argument("--stride", type=int, metavar="N", help="draw every Nth camera (default: 48 cameras in all)")
-    _add_options(parser)
+    parser.add_argument("--stride", type=count, metavar="N", help="draw every Nth camera (default: 48 cameras in all)")
+    add_options(parser, "--set")
 
 
-def _add_options(parser: argparse.ArgumentParser) -> None:
-    add_settings(parser, "an option of a dataset, such as rooms.n_frames=40")
-
-
-def _add_make(actions: Any) -> None:
+def _add_make(verbs: Verbs) -> None:
     parser = add_verb(
-        actions,
+        verbs,
         "make",
         "Make scenes on disk, whole or not at all; the same command again takes up what a killed one left.",
         (
             "su3d-bench datasets make rooms --layout replica --out data --scenes 'rooms/*'",
             "su3d-bench datasets make rooms --layout scannet --out small --scenes living0 --set n_frames=200",
         ),
-        _later("make"),
+        _later("make_scenes", "make"),
         takes_up=True,
     )
     parser.add_argument("dataset", help="what to make scenes of: rooms")
@@ -140,8 +126,7 @@ def _add_make(actions: Any) -> None:
         ".sens, mesh and annotation (default: native)",
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="the data root to make (native: default $SU3D_DATA)")
-    add_settings(parser, "an option of the dataset, such as n_frames=200")
-    parser.add_argument("--jobs", type=int, metavar="N", help="processes side by side (default: the CPU cores)")
+    add_options(parser, "--set", "--jobs")
 
 
 def call_list(arguments: argparse.Namespace) -> int:

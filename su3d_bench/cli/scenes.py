@@ -1,4 +1,4 @@
-"""``su3d-bench datasets check``: every file and frame of scenes looked at, what is wrong said scene by scene."""
+"""``su3d-bench datasets check`` and ``show``; imported late, since much of it takes long to load."""
 
 from __future__ import annotations
 
@@ -7,16 +7,17 @@ import os
 from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import groupby
+from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.shared.answers import answer, answer_either, remark
-from su3d_bench.cli.shared.bars import progress
+from su3d_bench.cli.output import answer, answer_either, answer_json, file_name_of_scene, progress, remark
 from su3d_bench.core import registry
 from su3d_bench.core.config import read_assignments
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable, printable_json
 from su3d_bench.core.types import WorldUp
 from su3d_bench.datasets.checks import Inspection, TruthVariant, inspect
 from su3d_bench.datasets.checks_of_frames import Finding
+from su3d_bench.reports.pictures.scene import draw_scene_picture, facts_line, look_at
 from su3d_bench.runs.executors import Event
 from su3d_bench.runs.job import build_dataset, part_of
 from su3d_bench.runs.scenes import data_root, dataset_targets, expand_scenes
@@ -27,8 +28,6 @@ MOST_OF_A_KIND = 10  # findings of one kind that are printed; --json has all
 
 def check(arguments: argparse.Namespace) -> int:
     """Look at every scene asked for; exit code 1 where one of them has errors."""
-    if arguments.jobs is not None and arguments.jobs < 1:
-        raise ConfigError(f"--jobs {arguments.jobs}: expected 1 or more")
     scenes = chosen_scenes(arguments.scenes, arguments.set, is_quiet=arguments.quiet)
     n_threads = arguments.jobs or os.cpu_count() or 1
     inspections = []
@@ -138,3 +137,38 @@ def _truth_text(variant: TruthVariant) -> str:
         f"{variant.variant}: {variant.n_points:,} points, {counted(variant.n_objects, 'object')}, "
         f"{variant.n_classes} {'class' if variant.n_classes == 1 else 'classes'}"
     )
+
+
+def show(arguments: argparse.Namespace) -> int:
+    """Draw the scene and print its counts and where the picture is."""
+    scenes = chosen_scenes([arguments.scene], arguments.set, is_quiet=arguments.quiet)
+    if len(scenes) > 1:
+        names = ", ".join(f"{dataset.name}/{scene}" for dataset, scene in scenes[:3])
+        raise ConfigError(f"datasets show {arguments.scene}: {len(scenes)} scenes match ({names}, ...); name one")
+    dataset, scene = scenes[0]
+    name = f"{dataset.name}/{scene}"
+    path = arguments.out or Path(f"{file_name_of_scene(name)}.png")
+    if path.suffix.lower() != ".png" or path.is_dir():
+        raise ConfigError(f"--out {path}: the picture is a PNG; expected a file name that ends in .png")
+    with progress(1, is_quiet=arguments.quiet, last_step="drawing") as report:
+        look = look_at(dataset, scene, arguments.stride, lambda n_done, n: report(Event(name, "frames", n_done, n)))
+        draw_scene_picture(look, path)
+    table = {
+        "scene": name,
+        "picture": str(path),
+        "n_frames": look.n_frames,
+        "size": list(look.shown[0].rgb.shape[1::-1]) if look.shown else None,
+        "depth_m": list(look.depth_m),
+        "up": None if look.up is None else asdict(look.up),
+        "ground_truth": None if look.truth is None else {"variant": look.truth.variant, **look.counts},
+        "no_ground_truth": look.no_truth or None,
+    }
+    if answer_json(arguments, printable_json(table)):
+        return EXIT_DONE
+    answer(f"{printable(name)}: {facts_line(look)}")
+    if look.up is not None:
+        answer(f"up: {printable(up_text(look.up))}")
+    if look.no_truth:
+        answer(printable(look.no_truth))
+    answer(f"picture: {printable(str(path))}")
+    return EXIT_DONE

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import os
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from su3d_bench.cli.shared.answers import answer, answer_json, remark
-from su3d_bench.cli.shared.flags import add_verb
-from su3d_bench.cli.shared.language import add_language_flags, answer_estimate, chat_client
+from su3d_bench.cli.options import (
+    Verbs,
+    add_language_options,
+    add_options,
+    add_verb,
+    answer_estimate,
+    chat_client,
+    count,
+    given_language_option,
+)
+from su3d_bench.cli.output import answer, answer_json, remark
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, counted
 
 if TYPE_CHECKING:
@@ -25,19 +34,18 @@ if TYPE_CHECKING:
     from su3d_bench.sheets.sets import Origin
     from su3d_bench.sheets.sources import RunSource, TruthSource
 
-NAME = "make"
 QUESTIONS: Final = "questions"  # the kind that needs no method, and so no run
 KINDS = ("retrieval", "annotation", "reasoning", QUESTIONS)
 # A person judges some hundred items without a break: so many of each kind of question and scene, instances a scene,
 # or questions of each template and scene.
-LANGUAGE_FLAGS = ("model", "base_url", "config", "set", "offline", "ask_failed_again", "dry_run")
+
 PER_KIND = {"retrieval": 5, "annotation": 30, "reasoning": 1, QUESTIONS: 2}
 
 
-def add_parser(actions: Any) -> None:
+def add_parser(verbs: Verbs) -> None:
     parser = add_verb(
-        actions,
-        NAME,
+        verbs,
+        "make",
         "Make sheets on which people judge a run, or questions: an offline page, a workbook and a table with pictures.",
         (
             "su3d-bench sheets make runs/my-run --kind retrieval annotation reasoning --annotators 3 --out sheets",
@@ -63,7 +71,7 @@ def add_parser(actions: Any) -> None:
         metavar="FILE",
         help="a file of questions, 'paper' for those of its page, or 'generated' from the ground truth (default)",
     )
-    parser.add_argument("--methods", nargs="+", default=[], metavar="M", help="these alone (default: all of the run)")
+    add_options(parser, "--methods")
     parser.add_argument(
         "--scenes",
         nargs="+",
@@ -71,12 +79,10 @@ def add_parser(actions: Any) -> None:
         metavar="S",
         help="these alone (default: all of the run); without RUN addresses or patterns such as 'rooms/*'",
     )
-    parser.add_argument(
-        "--leave-out", type=Path, metavar="FILE", help="without the questions that a CSV file lists by their id"
-    )
+    add_options(parser, "--leave-out")
     parser.add_argument(
         "--per-kind",
-        type=int,
+        type=count,
         metavar="N",
         help="most items of a scene: questions of a kind (default: 5), instances (30), questions of a template (1); "
         "in sheets of questions 2 of each kind and template",
@@ -85,16 +91,14 @@ def add_parser(actions: Any) -> None:
     parser.add_argument(
         "--overlap", type=float, default=0.25, metavar="SHARE", help="of all items that everybody gets (default: 0.25)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the drawing and shuffling (default: 0)")
-    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="scenes drawn side by side (default: 2)")
-    parser.add_argument("--device", default="cpu", help="of the text's encoder (default: cpu)")
+    add_options(parser, "--seed", "--jobs", "--device")
     parser.add_argument(
         "--solver",
         choices=("built-in", "llm"),
         default="built-in",
         help="who answers in reasoning sheets: geometry alone (default), or a language model, as in query ask",
     )
-    add_language_flags(parser)
+    add_language_options(parser)
 
 
 def call(arguments: argparse.Namespace) -> int:
@@ -135,12 +139,6 @@ def call(arguments: argparse.Namespace) -> int:
 
 def _check(arguments: argparse.Namespace) -> None:
     """Refuse what could not be done, or would be done without being asked for."""
-    if arguments.per_kind is not None and arguments.per_kind < 1:
-        raise ConfigError(f"--per-kind {arguments.per_kind}: at least 1 item is needed")
-    if arguments.jobs < 1:
-        raise ConfigError(f"--jobs {arguments.jobs}: at least 1 is needed")
-    if arguments.seed < 0:
-        raise ConfigError(f"--seed {arguments.seed}: expected 0 or more")
     kinds = set(arguments.kind)
     if arguments.run is None and (kinds != {QUESTIONS} or not arguments.scenes):
         raise ConfigError(
@@ -156,9 +154,8 @@ def _check(arguments: argparse.Namespace) -> None:
         raise ConfigError("--methods: no method has a part in sheets of kind questions; leave it out")
     if arguments.solver == "llm" and "reasoning" not in arguments.kind:
         raise ConfigError("--solver llm: answers questions of reasoning sheets; add --kind reasoning")
-    given = [f"--{name.replace('_', '-')}" for name in LANGUAGE_FLAGS if getattr(arguments, name)]
-    if given and arguments.solver != "llm":
-        raise ConfigError(f"{given[0]}: is for --solver llm alone; the built-in solver asks nobody")
+    if arguments.solver != "llm" and (given := given_language_option(arguments)):
+        raise ConfigError(f"{given}: is for --solver llm alone; the built-in solver asks nobody")
 
 
 def _judgeable(source: RunSource, kind: SheetKind, is_quiet: bool) -> RunSource:
@@ -224,7 +221,7 @@ def _drafts(
     given = _given(source, arguments)
     drafts_of: dict[SheetKind, list[Draft]] = {kind: [] for kind in sources}
     needs_encoder = "retrieval" in sources or ("reasoning" in sources and arguments.solver != "llm")
-    encoder = source.run.encoder(arguments.device) if needs_encoder else None
+    encoder = source.run.encoder(arguments.device or "cpu") if needs_encoder else None
     ask, answered_by = _ask_map(source, encoder, arguments) if "reasoning" in sources else (None, "")
     labelled_by: dict[str, None] = {}
     for scene in source.scenes:  # all kinds of one scene together, for they share its truth
@@ -291,7 +288,7 @@ def _drawn(
     source: PictureSource, name: str, drafts: Mapping[SheetKind, Sequence[Draft]], arguments: argparse.Namespace
 ) -> dict[SheetKind, list[bytes]]:
     """The pictures of all drafts."""
-    from su3d_bench.cli.shared.bars import progress
+    from su3d_bench.cli.output import progress
     from su3d_bench.runs.executors import Event
     from su3d_bench.sheets.drawing import draw_all
 
@@ -300,7 +297,7 @@ def _drawn(
         pictures = draw_all(
             source,
             flat,
-            arguments.jobs,
+            arguments.jobs or os.cpu_count() or 1,
             lambda n_done, n: report(Event(name, "pictures", n_done, n)),
         )
     remaining = iter(pictures)

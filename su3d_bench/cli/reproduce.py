@@ -7,11 +7,10 @@ import os
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from su3d_bench.cli.run import add_executor_flags
-from su3d_bench.cli.shared.answers import answer, answer_document, answer_json, formatted, remark, show, written
-from su3d_bench.cli.shared.flags import add_settings, add_table_format, add_verb
+from su3d_bench.cli.options import EXECUTOR, Verbs, add_options, add_verb
+from su3d_bench.cli.output import answer, answer_document, answer_json, formatted, remark, show, written
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, RunIncomplete, counted, printable
 
 if TYPE_CHECKING:
@@ -23,7 +22,7 @@ VARIABLES = ("SU3D_DATA",)  # where a rehearsal's own data lie
 OF_A_RUN = ("jobs", "limit", "solver", "offline", "executor", "ray_address", "gpus_per_job", "retries", "slurm")
 
 
-def add_parser(verbs: Any) -> None:
+def add_parser(verbs: Verbs) -> None:
     parser = add_verb(
         verbs,
         "reproduce",
@@ -40,7 +39,7 @@ def add_parser(verbs: Any) -> None:
     )
     parser.add_argument("--table", nargs="+", default=[], metavar="NAME", help="these experiments alone (default: all)")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where all goes (default: reproduced/<recipe>)")
-    parser.add_argument("--dry-run", action="store_true", help="say what is missing and how large it is, and end")
+    add_options(parser, "--dry-run")
     parser.add_argument(
         "--rehearse", action="store_true", help="the same on rooms made in the same layouts, with embedded perception"
     )
@@ -62,21 +61,13 @@ def add_parser(verbs: Any) -> None:
         metavar="METHOD=FILE",
         help="what the encoder of its predictions makes of texts, as evaluate --text-features",
     )
-    parser.add_argument("--profile", help="whose perception (default: the recipe's)")
+    add_options(parser, "--profile")
     parser.add_argument("--encoder", help="of all runs, such as embedded (default: the recipe's)")
-    parser.add_argument("--device", help="cpu, cuda or cuda:1 (default: cpu)")
-    parser.add_argument("--jobs", type=int, metavar="N", help="scenes side by side (default: the CPU cores)")
-    parser.add_argument("--limit", type=int, metavar="N", help="only the first N updates of each scene")
-    parser.add_argument("--solver", choices=("built-in", "llm"), help="who answers, as run --solver")
-    parser.add_argument(
-        "--offline", action=argparse.BooleanOptionalAction, help="ask no language model, as run --offline"
-    )
-    add_executor_flags(parser)
-    add_settings(parser, "of all runs, such as perception.paper.captions=model")
+    add_options(parser, "--device", "--jobs", "--limit", "--solver", "--offline", *EXECUTOR, "--set")
     parser.add_argument(
         "--bundle", type=Path, metavar="FILE", help="the archive (default: bundle.zip in the folder of --out)"
     )
-    add_table_format(parser)
+    add_options(parser, "--format")
 
 
 def call(arguments: argparse.Namespace) -> int:
@@ -93,7 +84,7 @@ def call(arguments: argparse.Namespace) -> int:
     out = arguments.out or Path("reproduced") / (recipe.name + ("-rehearsal" if arguments.rehearse else ""))
     if not arguments.rehearse:
         return _reproduce(recipe, experiments, _asked(arguments), out, arguments)
-    from su3d_bench.cli.reproduce.rehearsal import places, rehearsed
+    from su3d_bench.cli.rehearsal import places, rehearsed
     from su3d_bench.reproducing.asked import environment
 
     asked = rehearsed(recipe, experiments, _asked(arguments), out, arguments)
@@ -179,7 +170,7 @@ def _say(known: Preflight, arguments: argparse.Namespace) -> None:
 
 def _carry_out(run: AskedRun, out: Path, arguments: argparse.Namespace) -> list[str]:
     """Lines of what failed."""
-    from su3d_bench.cli.shared.bars import progress
+    from su3d_bench.cli.output import progress
     from su3d_bench.reproducing.asked import carry_out, plan_of
 
     plan = plan_of(run, out)

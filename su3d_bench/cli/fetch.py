@@ -1,4 +1,4 @@
-"""What the verbs of ``fetch`` share: flags, what is shown first, whether the terms are accepted, bars, the answer."""
+"""``su3d-bench models fetch`` and ``datasets fetch``: published weights and data, once their terms are accepted."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.shared.answers import answer_either, remark
-from su3d_bench.cli.shared.bars import drawn_bars
+from su3d_bench.cli.options import Verbs, add_group, add_options, add_verb, perception_config
+from su3d_bench.cli.output import answer_either, drawn_bars, remark
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, suggest
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 MB = 1_000_000
 
 
-def add_fetch_flags(parser: argparse.ArgumentParser, *, has_servers: bool = True) -> None:
+def _add_fetch_options(parser: argparse.ArgumentParser, *, has_servers: bool = True) -> None:
     """``--accept``, ``--dry-run``, ``--retries``; where servers are in the table, ``--mirror`` and ``--sources``."""
     parser.add_argument(
         "--accept",
@@ -32,9 +32,7 @@ def add_fetch_flags(parser: argparse.ArgumentParser, *, has_servers: bool = True
         metavar="NAME",
         help="accept the licence of what has this name, or the licence itself, such as MIT (default: you are asked)",
     )
-    parser.add_argument(
-        "--dry-run", action="store_true", help="list every address, size and licence; contact nobody, write nothing"
-    )
+    add_options(parser, "--dry-run")
     parser.add_argument(
         "--retries", type=int, default=3, metavar="N", help="how often a broken download is taken up again (default: 3)"
     )
@@ -199,3 +197,117 @@ def watching(arguments: argparse.Namespace) -> Iterator[Watch]:
             bars.update(tasks[name], total=total, completed=n_done // unit)
 
         yield watch
+
+
+def add_models(verbs: Verbs) -> None:
+    parser = add_verb(
+        verbs,
+        "fetch",
+        "Fetch foundation models into $SU3D_MODELS: from the Hugging Face hub, or where their authors publish them.",
+        (
+            "su3d-bench models fetch --for paper --accept MIT Apache-2.0",
+            "su3d-bench models fetch sam-vit-h --dry-run",
+        ),
+        call_models,
+        takes_up=True,
+    )
+    parser.add_argument("names", nargs="*", metavar="MODEL", help="short names, as models list has them")
+    parser.add_argument("--for", dest="profile", metavar="PROFILE", help="every model that this profile loads: paper")
+    _add_fetch_options(parser)
+    add_options(parser, "--set")
+
+
+def call_models(arguments: argparse.Namespace) -> int:
+    from su3d_bench.fetching.bringing import plan_models
+    from su3d_bench.perception.models.files import models_folder
+
+    root = models_folder(perception_config(arguments).models.folder)
+    return fetch_planned(arguments, plan_models(sources_of(arguments), arguments.names, arguments.profile, root))
+
+
+def add_data(verbs: Verbs) -> None:
+    """``datasets fetch`` with a sub-verb for each dataset that can be fetched."""
+    actions = add_group(
+        verbs,
+        "fetch",
+        "Fetch published data: shown first, resumed, checked, unpacked where it is looked for.",
+        ("su3d-bench datasets fetch replica --dry-run", "su3d-bench datasets fetch scannet --dry-run"),
+    )
+    _add_replica(actions)
+    _add_scannet(actions)
+
+
+def _add_replica(verbs: Verbs) -> None:
+    parser = add_verb(
+        verbs,
+        "replica",
+        "Fetch Replica into $SU3D_DATA: NICE-SLAM's RGB-D frames, and the annotated meshes of the release.",
+        ("su3d-bench datasets fetch replica --dry-run", "su3d-bench datasets fetch replica frames --accept replica"),
+        call_replica,
+        takes_up=True,
+    )
+    parser.add_argument("parts", nargs="*", metavar="PART", help="frames, meshes (default: both)")
+    parser.add_argument("--keep-archives", action="store_true", help="keep what was unpacked, in .fetched")
+    _add_fetch_options(parser)
+
+
+def call_replica(arguments: argparse.Namespace) -> int:
+    from su3d_bench.fetching.bringing import plan_replica
+    from su3d_bench.runs.scenes import data_root
+
+    return fetch_planned(arguments, plan_replica(sources_of(arguments), arguments.parts, data_root()))
+
+
+def _add_scannet(verbs: Verbs) -> None:
+    parser = add_verb(
+        verbs,
+        "scannet",
+        "Fetch scans of ScanNet into $SU3D_DATA by your own official script or link, or say how to sign its terms.",
+        (
+            "su3d-bench datasets fetch scannet --script download-scannet.py",
+            "su3d-bench datasets fetch scannet val --from https://example.org/scannet --accept scannet",
+        ),
+        call_scannet,
+        takes_up=True,
+    )
+    parser.add_argument(
+        "scans", nargs="*", metavar="SCAN", help="scene0000_00, paper, train, val or test (default: paper)"
+    )
+    given = parser.add_mutually_exclusive_group()
+    given.add_argument("--script", type=Path, metavar="FILE", help="your official download script")
+    given.add_argument(
+        "--from", dest="address", metavar="URL", help="your own link, in which v1/scans and v2/scans lie"
+    )
+    _add_fetch_options(parser, has_servers=False)
+
+
+def call_scannet(arguments: argparse.Namespace) -> int:
+    from su3d_bench.fetching.scannet import fetch_by_script, fetch_from, how_to_sign, plan_scans
+    from su3d_bench.fetching.sources import built_in
+    from su3d_bench.runs.scenes import data_root
+
+    source, root = built_in().named("scannet"), data_root()
+    scans = plan_scans(arguments.scans, root)
+    here = root if scans.is_here else None
+    if arguments.dry_run:
+        missing = [name for names in scans.missing.values() for name in names]
+        row = plan_row(source, here) | {"missing": missing, "label_table": scans.label_table}
+        counts = f"  {scans.n_files} files of {scans.n_asked} scans are missing below {root}"
+        answer_either(arguments, [row], *plan_lines(source, here), counts, *(f"  {name}" for name in missing))
+        return EXIT_DONE
+    if scans.is_here:
+        answer_brought(arguments, [(source.name, root)], [])
+        return EXIT_DONE
+    if arguments.script is None and arguments.address is None:
+        raise how_to_sign(source)
+    for name in arguments.accept:
+        if name.lower() not in (source.name, source.licence.name.lower()):
+            raise ConfigError(f"--accept '{name}': is nothing that is asked for; known: {source.name}")
+    accept(arguments, [source])
+    with watching(arguments) as watch:
+        if arguments.script is not None:
+            brought = fetch_by_script(source, scans, arguments.script, watch)
+        else:
+            brought = fetch_from(source, scans, arguments.address, watch, patience_of(arguments))
+    answer_brought(arguments, [], [brought])
+    return EXIT_DONE

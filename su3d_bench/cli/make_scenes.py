@@ -12,8 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NoReturn
 
-from su3d_bench.cli.shared.answers import answer_either, remark
-from su3d_bench.cli.shared.bars import drawn_bars
+from su3d_bench.cli.output import answer_either, drawn_bars, remark
 from su3d_bench.core import registry
 from su3d_bench.core.config import read_assignments
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, nearest
@@ -50,8 +49,6 @@ class Unit:
 
 def make(arguments: argparse.Namespace) -> int:
     """Make what was asked for and print, scene by scene, whether it was made or was there already."""
-    if arguments.jobs is not None and arguments.jobs < 1:
-        raise ConfigError(f"--jobs {arguments.jobs}: expected 1 or more")
     part = dataset_part(arguments.dataset, arguments.set)
     scenes = _scenes(part, arguments.scenes)
     is_native = arguments.layout == "native"

@@ -5,14 +5,15 @@ from __future__ import annotations
 import argparse
 import re
 from pathlib import Path
-from typing import Any
 
-from su3d_bench.cli.shared.answers import answer_either
-from su3d_bench.cli.shared.flags import add_verb
+from su3d_bench.cli.options import Verbs, add_verb
+from su3d_bench.cli.output import answer_either
 from su3d_bench.core.errors import EXIT_DONE, ConfigError
 
 SUFFIX = {"method": ".py", "dataset": ".py", "protocol": ".toml"}
 REGISTRY = "registry"
+TEMPLATES = Path(__file__).parent / "templates"
+TEMPLATE_OF = {"method": "my_method.py.txt", "dataset": "my_dataset.py.txt", "protocol": "my_protocol.toml"}
 # Where each file of a registry's template goes; an empty folder is none for git, so that bundles has a file of its own.
 REGISTRY_FILES = {
     "README.md": "README.md",
@@ -30,12 +31,12 @@ NEXT = {
 }
 
 
-def add_new(actions: Any, what: str) -> None:
+def add_new(verbs: Verbs, what: str) -> None:
     """The sub-verb ``new`` of methods, datasets, protocols and registries."""
     group = {REGISTRY: "dev registry"}.get(what, f"{what}s")
     place = "my-registry" if what == REGISTRY else f"my_{what}{SUFFIX[what]}"
     parser = add_verb(
-        actions,
+        verbs,
         "new",
         f"Write a {what} of your own that works as it is, to begin from.",
         (f"su3d-bench {group} new {place}", f"su3d-bench {group} new {place} --json"),
@@ -49,7 +50,7 @@ def add_new(actions: Any, what: str) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.cli.shared.answers import written
+    from su3d_bench.cli.output import written
     from su3d_bench.core.system.files import file_text
 
     what, file = arguments.what, arguments.file
@@ -63,7 +64,7 @@ def call(arguments: argparse.Namespace) -> int:
     if file.exists():
         raise ConfigError(f"{what}s new: {file} is there already; name another file, nothing is overwritten")
     name, class_name = "-".join(words).lower(), "".join(word[0].upper() + word[1:] for word in words)
-    template = file_text(Path(__file__).parent / f"my_{what}{SUFFIX[what]}")
+    template = file_text(TEMPLATES / TEMPLATE_OF[what])
     text = template.replace(f"My{what.capitalize()}", class_name).replace(f"my-{what}", name)
     written(file, text)
     at = str(file) if what == "protocol" else f"{file}:{class_name}"
@@ -78,7 +79,7 @@ def _new_registry(folder: Path, arguments: argparse.Namespace) -> int:
     import os
     import shlex
 
-    from su3d_bench.cli.shared.answers import written
+    from su3d_bench.cli.output import written
     from su3d_bench.core.system.files import file_text
     from su3d_bench.core.version import __version__
 
@@ -93,7 +94,7 @@ def _new_registry(folder: Path, arguments: argparse.Namespace) -> int:
             f"dev registry new: {taken or folder} is there already; name another folder, nothing is overwritten"
         )
     for source, place in REGISTRY_FILES.items():
-        text = file_text(Path(__file__).parent / "my_registry" / source)
+        text = file_text(TEMPLATES / "registry" / source)
         written(folder / place, text.replace("my-registry", name).replace("VERSION", __version__))
     written(folder / KEPT, "")
     commands = [f"su3d-bench {command.format(at=shlex.quote(str(folder)))}" for command in NEXT[REGISTRY]]
