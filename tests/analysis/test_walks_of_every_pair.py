@@ -26,7 +26,7 @@ from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float32Array, GroundTruth, UInt8Array
 from su3d_bench.datasets.layouts import LAYOUTS
 from su3d_bench.datasets.recordings.meshes import vertex_positions
-from su3d_bench.datasets.replica.label_file_truth import OVO_CLASSES
+from su3d_bench.datasets.replica.truth import OVO_CLASSES
 from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.formats.ply import read_ply
 from su3d_bench.metrics.matching.nearest import nearest
