@@ -39,8 +39,7 @@ from su3d_bench.datasets.checks_of_frames import (
     check_truth,
     facts_of,
 )
-from su3d_bench.datasets.recordings.pose_convention import judge_scene
-from su3d_bench.datasets.recordings.world_up import guess_up
+from su3d_bench.datasets.recordings.pose_convention import guess_up, judge_scene
 from su3d_bench.formats.images import decode_colour, decode_depth, read_bytes
 
 SAMPLED_FRAMES = 20

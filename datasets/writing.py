@@ -1,4 +1,4 @@
-"""Scenes of a scanned dataset, written as files in another dataset's layout: taken up again, whole or not at all.
+"""Made rooms, written as files in another dataset's layout: resumed after a kill, whole or not at all.
 
 A scene is built in a hidden folder beside its place and moved there when it is whole; a killed process leaves frames
 that the next one takes over, and no scene that looks finished. ``rooms.json`` in the folder of the scenes names those
@@ -13,63 +13,18 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from su3d_bench.core.digests import digest_json
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.files.atomic import make_folder, write_bytes, write_json, write_text
 from su3d_bench.core.files.locks import clear_unfinished
 from su3d_bench.core.system.files import file_text
-from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int32Array, UInt8Array
+from su3d_bench.core.types import Frame
 from su3d_bench.datasets.recordings.file_dataset import MARKER, read_marker
 
-FRAMES_PER_SECOND = 30.0
-
-
-class ScannedObject(Protocol):
-    """An object with its id in the scan, its class, its material, and its axis-aligned box in the world, metres."""
-
-    @property
-    def id(self) -> int: ...
-    @property
-    def class_id(self) -> int: ...
-    @property
-    def class_name(self) -> str: ...
-    @property
-    def material(self) -> str: ...
-    @property
-    def box_min(self) -> Sequence[float]: ...
-    @property
-    def box_max(self) -> Sequence[float]: ...
-
-
-class Scan(Protocol):
-    """``vertices`` and ``normals`` (V, 3), ``colours`` (V, 3), ``faces`` (F, 4) quads, ``object_id`` (F,)."""
-
-    @property
-    def vertices(self) -> Float32Array: ...
-    @property
-    def normals(self) -> Float32Array: ...
-    @property
-    def colours(self) -> UInt8Array: ...
-    @property
-    def faces(self) -> Int32Array: ...
-    @property
-    def object_id(self) -> Int32Array: ...
-
-
-class ScannedDataset(Protocol):
-    """What can be written: Replica's classes, one camera at ``FRAMES_PER_SECOND``, frames at full rate and a scan."""
-
-    name: str
-
-    @property
-    def intrinsics(self) -> Float64Array: ...
-    def digest(self, scene: str) -> str: ...
-    def objects(self, scene: str) -> Sequence[ScannedObject]: ...
-    def trajectory(self, scene: str) -> Float64Array: ...
-    def frames(self, scene: str, stride: int) -> Sequence[Frame]: ...
-    def scan(self, scene: str) -> Scan: ...
+if TYPE_CHECKING:
+    from su3d_bench.datasets.rooms.dataset import Rooms
 
 
 @dataclass(frozen=True)
@@ -124,7 +79,7 @@ class Layout(ABC):
     def target(self, scene: str, key: str, out: Path) -> SceneTarget: ...
 
     @abstractmethod
-    def write_shared(self, dataset: ScannedDataset, scene: str, out: Path) -> None:
+    def write_shared(self, dataset: Rooms, scene: str, out: Path) -> None:
         """Write what all scenes share; a ``StoreError`` where there is another."""
 
     @abstractmethod
@@ -136,14 +91,14 @@ class Layout(ABC):
         """The content of each of ``frame_names``."""
 
     @abstractmethod
-    def write_truth(self, dataset: ScannedDataset, target: SceneTarget) -> None:
+    def write_truth(self, dataset: Rooms, target: SceneTarget) -> None:
         """Write all files but those of the frames into ``target.partial``."""
 
-    def join(self, dataset: ScannedDataset, target: SceneTarget) -> None:  # noqa: B027 - most have a file a frame
+    def join(self, dataset: Rooms, target: SceneTarget) -> None:  # noqa: B027 - most have a file a frame
         """Make in ``target.partial`` what takes all frames at once; called when the rest is written."""
 
 
-def plan_scenes(layout: Layout, dataset: ScannedDataset, scenes: Sequence[str], out: Path) -> list[SceneTarget]:
+def plan_scenes(layout: Layout, dataset: Rooms, scenes: Sequence[str], out: Path) -> list[SceneTarget]:
     """The scenes that are not yet whole below ``out``, which is made ready for them; one caller at a time.
 
     Raises ``StoreError`` where ``out`` cannot be written or holds one of the scenes, or what they share, from
@@ -186,7 +141,7 @@ def write_shared_text(path: Path, text: str, complaint: str) -> None:
 
 def write_frames(
     layout: Layout,
-    dataset: ScannedDataset,
+    dataset: Rooms,
     target: SceneTarget,
     indices: range,
     report: Callable[[int], None] = lambda n_done: None,
@@ -205,7 +160,7 @@ def write_frames(
         report(n_done)
 
 
-def finish_scene(layout: Layout, dataset: ScannedDataset, target: SceneTarget) -> None:
+def finish_scene(layout: Layout, dataset: Rooms, target: SceneTarget) -> None:
     """Move everything to its place, the scene's folder last: only then is there a scene."""
     try:
         layout.join(dataset, target)

@@ -18,7 +18,7 @@ from su3d_bench.reports.tables.formats import markup_free
 class Finding:
     """A difference; every kind but ``better`` fails. ``reference`` and ``measured`` are fractions, or costs.
 
-    ``group``: what many of a kind are told as. ``is_explained``: it follows from scenes of which others speak.
+    ``group``: what many of a kind are told as.
     """
 
     kind: Literal["regression", "missing", "changed", "cost", "better"]
@@ -28,7 +28,6 @@ class Finding:
     measured: float | None = None
     tolerance: float | None = None
     group: str = ""
-    is_explained: bool = False
 
     @property
     def is_failure(self) -> bool:
@@ -87,9 +86,7 @@ def headline(verdict: Verdict) -> str:
         values = counted(verdict.n_compared, "headline value")
         are, them = ("is", "it") if verdict.n_compared == 1 else ("are", "them")
         return f"passed: {values} {are} as the reference has {them}{better}"
-    n_explained = sum(finding.is_explained for finding in verdict.failures)
-    explained = f", {n_explained} of them because of other scenes" if n_explained else ""
-    return f"failed: {counted(len(verdict.failures), 'difference')} from the reference{explained}{better}"
+    return f"failed: {counted(len(verdict.failures), 'difference')} from the reference{better}"
 
 
 def plain_parts(verdict: Verdict) -> list[Table | Prose]:
@@ -163,26 +160,16 @@ def github_lines(verdict: Verdict) -> list[str]:
 
 
 def _ordered(verdict: Verdict) -> Sequence[Finding]:
-    """Failures first, and of these first the scenes that are missing; what follows from other scenes last."""
-    return sorted(verdict.findings, key=lambda one: (one.is_explained, not one.is_failure, one.group != SCENES))
+    """Failures first, and of these first the scenes that are missing."""
+    return sorted(verdict.findings, key=lambda one: (not one.is_failure, one.group != SCENES))
 
 
 def _told(verdict: Verdict) -> list[Finding]:
-    """``_ordered``, many of a group as one, and all that follows from other scenes as one."""
+    """``_ordered``, many of a group as one."""
     alike: dict[tuple[str, ...], list[Finding]] = {}
     for n, one in enumerate(_ordered(verdict)):
-        alone = (one.kind, one.group, one.text) if one.group else (str(n),)
-        key: tuple[str, ...] = ("explained",) if one.is_explained else alone
-        alike.setdefault(key, []).append(one)
-    told: list[Finding] = []
-    for key, ones in alike.items():
-        if key == ("explained",):
-            text = f"{counted(len(ones), 'difference')} follow from scenes that the run or the reference alone has"
-            is_failure = any(one.is_failure for one in ones)
-            told.append(Finding("missing" if is_failure else "better", "over other scenes", text))
-        else:
-            told += ones if len(ones) <= MOST_ALIKE else [_as_one(ones)]
-    return told
+        alike.setdefault((one.kind, one.group, one.text) if one.group else (str(n),), []).append(one)
+    return [one for ones in alike.values() for one in (ones if len(ones) <= MOST_ALIKE else [_as_one(ones)])]
 
 
 def _as_one(alike: Sequence[Finding]) -> Finding:

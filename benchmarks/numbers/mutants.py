@@ -47,8 +47,8 @@ _QUESTIONS = (
     "questions/test_reasoning_solver",
 )  # fmt: skip
 _PROTOCOLS = ("test_protocols", "test_protocol_files", "test_metrics_scoring", "evaluation/test_evaluate")
-_COMPARE = tuple(f"analysis/test_compare{name}" for name in ("_statistics", "_pairs", ""))
-_GATE = tuple(f"analysis/gate/test_gate{name}" for name in ("_tolerances", "_references", "", "_answers", "_costs"))
+_COMPARE = tuple(f"analysis/test_compare{name}" for name in ("_pairs", ""))
+_GATE = tuple(f"analysis/gate/test_gate{name}" for name in ("", "_costs"))
 # Of each module, or of all in a folder, the tests that must notice: the quick ones first. Names without a folder stand
 # in tests/metrics or below.
 GUARDS: dict[str, tuple[str, ...]] = {

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing, counted
 from su3d_bench.core.types import Frame, GroundTruth, WorldUp
-from su3d_bench.datasets.hm3dsem.folders import (
+from su3d_bench.datasets.hm3dsem.frames import (
     EVALUATED,
     GROUPS,
     INFO_NAME,
@@ -22,8 +22,8 @@ from su3d_bench.datasets.hm3dsem.folders import (
     SCENE_NAMES,
     WALKS_URL,
     annotation_file,
+    open_walk,
 )
-from su3d_bench.datasets.hm3dsem.frames import open_walk
 from su3d_bench.datasets.hm3dsem.truth import (
     AGAIN,
     LABEL_SPACE,

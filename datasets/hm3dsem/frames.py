@@ -8,7 +8,7 @@ is no camera file: images are 90 degrees wide, and the principal point is half t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +16,6 @@ import numpy as np
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.geometry import are_rigid
 from su3d_bench.core.types import Float64Array
-from su3d_bench.datasets.hm3dsem.folders import COLOUR, DEPTH, POSE
-from su3d_bench.datasets.recordings.exported_frames import (
-    by_number,
-    check_complete,
-    list_folder,
-    read_matrix,
-    read_size,
-)
 from su3d_bench.datasets.recordings.recorded_frames import (
     Folder,
     RecordedFrame,
@@ -31,7 +23,40 @@ from su3d_bench.datasets.recordings.recorded_frames import (
     depth_m_of_values,
     pinhole,
 )
+from su3d_bench.datasets.recordings.source import (
+    by_number,
+    check_complete,
+    list_folder,
+    read_matrix,
+    read_size,
+)
 from su3d_bench.formats.images import Size
+
+WALKS_FOLDER, SPLIT = "hm3dsem_walks", "val"
+SPLITS = (SPLIT, "train", "minival")
+PLACES = tuple(f"{base}{split}" for base in (f"{WALKS_FOLDER}/", "hm3dsem/", "HM3DSem/", "") for split in SPLITS)
+RELEASE_PLACES = tuple(f"{base}/{split}" for base in ("hm3d", "HM3D", "hm3dsem", "HM3DSem") for split in SPLITS)
+SCENE_NAMES = r"\d{5}-[A-Za-z0-9]{11}"
+COLOUR, DEPTH, POSE, INFO_NAME, OBJECTS = "rgb", "depth", "pose", "scene_info.json", "objects"
+LABELS_OF = "hm3d"  # as OpenLex3D calls the dataset
+WALKS_URL = "https://github.com/hovsg/HOV-SG#habitat-matterport-3d-semantics"
+# The scenes that HOV-SG evaluates by its README, and those that its generator has poses for.
+EVALUATED = (
+    "00824-Dd4bFSTQ8gi", "00829-QaLdnwvtxbs", "00843-DYehNKdT76V", "00861-GLAQ4DNUx5U",
+    "00862-LT9Jq6dN3Ea", "00873-bxsVRursffK", "00877-4ok3usBNeis", "00890-6s7QHgap2fW",
+)  # fmt: skip
+GROUPS: Mapping[str, tuple[str, ...]] = {
+    "hovsg": EVALUATED,
+    "walks": tuple(sorted((*EVALUATED, "00847-bCPU9suPUw9", "00849-a8BtkwhxdRV"))),
+}
+
+
+def annotation_file(root: Path, walk: Path) -> Path | None:
+    """The ``.semantic.txt`` of a walk's scene, beside the walk or in the release; None where it is not there."""
+    name = f"{walk.name.partition('-')[2]}.semantic.txt"
+    folders = [walk, *(root / place / walk.name for place in RELEASE_PLACES)]
+    return next((folder / name for folder in folders if (folder / name).is_file()), None)
+
 
 UNITS_PER_METRE = 1000.0  # habitat_utils.py: save_obs
 FRAMES_PER_SECOND = 30.0  # ours: walks have no times

@@ -21,7 +21,9 @@ from su3d_bench.datasets.openlex3d import release as openlex3d
 from su3d_bench.datasets.recordings.recorded_frames import reading
 
 MARKER = "rooms.json"  # in a folder of scenes: those that `datasets make` rendered
-DatasetT, OptionsT, Answer = TypeVar("DatasetT"), TypeVar("OptionsT", bound=BaseModel), TypeVar("Answer")
+DatasetT = TypeVar("DatasetT")
+OptionsT = TypeVar("OptionsT", bound=BaseModel)
+Answer = TypeVar("Answer")
 
 
 class NoOptions(BaseModel):
@@ -202,7 +204,7 @@ class FileDataset(ABC, Generic[OptionsT]):
             labelled: GroundTruth = openlex3d.truth_below(self.root, self.labels_of, scene, variant)
             return labelled
         if variant not in self.variants:
-            hint = suggest(variant, self.variants)
+            hint = suggest(variant, self.variants) or f"; {self.no_mesh}"
             raise GroundTruthMissing(f"{self.where(scene)}: no ground truth '{variant}'{hint}")
         return self.own_truth(scene, variant)
 

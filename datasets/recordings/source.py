@@ -6,16 +6,32 @@ used, in which of the two cameras) is the matter of the dataset.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+import os
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import InitVar, dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.types import Float64Array, UInt8Array
-from su3d_bench.formats.images import MAX_PIXELS, Size, UInt16Array
+from su3d_bench.core.geometry import are_rigid
+from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
+from su3d_bench.datasets.recordings.recorded_frames import square
+from su3d_bench.formats.images import (
+    MAX_PIXELS,
+    Size,
+    UInt16Array,
+    decode_colour,
+    decode_depth,
+    image_size,
+    read_bytes,
+    sized,
+)
+from su3d_bench.formats.text_files import read_text
 
 
 @dataclass(frozen=True)
@@ -96,3 +112,277 @@ class RgbdSource(Protocol):
     def files(self) -> Sequence[Path]:
         """The files that the recording consists of."""
         ...
+
+
+Grid = Literal["depth", "colour"]
+SAME_RAY_PX = 0.01  # two images whose pixels differ by less in their rays are taken as one; text files keep six digits
+IDENTITY_TOLERANCE = 1e-6
+MAX_INTRINSIC = 1e6  # pixels; no lens comes near it, and nothing computed from it overflows
+
+
+@dataclass(frozen=True)
+class Registration:
+    """From a pair of cameras to images of one size, those of the ``grid`` camera.
+
+    ``depth``, the default: depth stays as it is to the bit, each of its pixels gets the colour, bilinearly, at which
+    its point is seen by the colour camera. A pixel without depth borrows that of the nearest one that has some. A point
+    beside the colour image or behind its camera gets the nearest colour on the border. What the colour camera cannot
+    see because something stands before it gets the colour of what stands there.
+
+    ``colour``: colour stays as it is to the bit; depth is that of the points seen by the colour camera, each at the
+    pixel nearest to it, the nearest point where several fall on one. Other pixels have no depth: where the colour image
+    is larger, most of them.
+    """
+
+    camera: SensorPair
+    grid: Grid
+
+    @cached_property
+    def depth_to_colour(self) -> Float64Array:
+        """Points of the depth camera in the colour camera (4, 4)."""
+        # The colour extrinsic is the identity in all of ScanNet; else both lead into one common frame.
+        matrix: Float64Array = np.linalg.solve(self.camera.colour_extrinsic, self.camera.depth_extrinsic).astype(
+            np.float64
+        )
+        return matrix
+
+    @property
+    def intrinsics(self) -> Float64Array:
+        """Of the registered images (3, 3)."""
+        return self.camera.depth_intrinsics if self.grid == "depth" else self.camera.colour_intrinsics
+
+    @cached_property
+    def is_needless(self) -> bool:
+        """Whether both images have one size and each pixel of one the same ray as in the other."""
+        if self.camera.colour_size != self.camera.depth_size:
+            return False
+        if np.abs(self.depth_to_colour - np.eye(4)).max() > IDENTITY_TOLERANCE:
+            return False
+        width, height = self.camera.depth_size
+        corners = np.array([[u, v, 1.0] for u in (0, width - 1) for v in (0, height - 1)])
+        seen = corners @ np.linalg.inv(self.camera.depth_intrinsics).T @ self.camera.colour_intrinsics.T
+        return bool(np.abs(seen[:, :2] / seen[:, 2:] - corners[:, :2]).max() < SAME_RAY_PX)
+
+    @cached_property
+    def _from_pose(self) -> Float64Array | None:
+        """What a pose of the depth camera is multiplied with; None where poses stay as they are."""
+        if self.grid == "depth" or self.is_needless:
+            return None
+        return np.linalg.inv(self.depth_to_colour).astype(np.float64)
+
+    def camera_to_world(self, depth_camera_to_world: Float64Array) -> Float64Array:
+        """The pose of the registered images."""
+        return depth_camera_to_world if self._from_pose is None else depth_camera_to_world @ self._from_pose
+
+    def images(self, colour: UInt8Array, depth_m: Float32Array) -> tuple[UInt8Array, Float32Array]:
+        """Colour (H, W, 3) and depth in metres (H, W) on the grid; 0 is no depth."""
+        if self.is_needless:
+            return colour, depth_m
+        if self.grid == "depth":
+            return self._colour_at_depth(colour, depth_m), depth_m
+        return colour, self._depth_at_colour(depth_m)
+
+    @cached_property
+    def _rays(self) -> Float32Array:
+        """Per pixel of the depth image its ray in homogeneous coordinates of the colour image (3, H, W), at depth 1."""
+        width, height = self.camera.depth_size
+        u, v = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+        pixels = np.stack([u, v, np.ones_like(u)])
+        turn = (
+            self.camera.colour_intrinsics @ self.depth_to_colour[:3, :3] @ np.linalg.inv(self.camera.depth_intrinsics)
+        )
+        return np.tensordot(turn, pixels, axes=1).astype(np.float32)
+
+    @cached_property
+    def _shift(self) -> Float32Array:
+        """What the distance of the two cameras adds to ``_rays`` times depth (3,)."""
+        return (self.camera.colour_intrinsics @ self.depth_to_colour[:3, 3]).astype(np.float32)
+
+    def _seen_at(self, depth_m: Float32Array) -> tuple[Float32Array, Float32Array, Float32Array]:
+        """Column, row and depth in the colour camera of each depth pixel; column and row are -1 behind it."""
+        z = self._rays[2] * depth_m + self._shift[2]
+        divisor = np.where(z > 0, z, 1)
+        x = np.where(z > 0, (self._rays[0] * depth_m + self._shift[0]) / divisor, -1)
+        y = np.where(z > 0, (self._rays[1] * depth_m + self._shift[1]) / divisor, -1)
+        return x, y, z
+
+    @cached_property
+    def _fixed_places(self) -> tuple[Float32Array, Float32Array]:
+        """Columns and rows for cameras that look from one point: they do not depend on depth."""
+        return self._seen_at(np.ones(self._rays.shape[1:], np.float32))[:2]
+
+    def _colour_at_depth(self, colour: UInt8Array, depth_m: Float32Array) -> UInt8Array:
+        import cv2
+
+        x, y = self._seen_at(filled(depth_m))[:2] if self._shift.any() else self._fixed_places
+        seen = cv2.remap(colour, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(seen, np.uint8)
+
+    def _depth_at_colour(self, depth_m: Float32Array) -> Float32Array:
+        width, height = self.camera.colour_size
+        x, y, z_m = self._seen_at(depth_m)
+        x, y = np.rint(x), np.rint(y)
+        is_seen = (depth_m > 0) & (z_m > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        nearest = np.full(width * height, np.inf, np.float32)
+        at = y[is_seen].astype(np.int64) * width + x[is_seen].astype(np.int64)
+        np.minimum.at(nearest, at, z_m[is_seen])
+        nearest[np.isinf(nearest)] = 0
+        return nearest.reshape(height, width)
+
+
+def filled(depth_m: Float32Array) -> Float32Array:
+    """Depth with that of the nearest pixel that has some where there is none; 1 m where none has any."""
+    is_empty = depth_m <= 0
+    if not is_empty.any():
+        return depth_m
+    if is_empty.all():
+        return np.ones_like(depth_m)
+    import cv2
+
+    _, source = cv2.distanceTransformWithLabels(
+        is_empty.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    # Labels count the pixels with depth in row-major order, from 1.
+    return np.asarray(depth_m[~is_empty][source - 1], np.float32)
+
+
+def make_registration(camera: SensorPair, grid: Grid, where: str) -> Registration:
+    """The registration of a pair of cameras; a ``DataError`` where they are no pinhole cameras a rigid motion apart."""
+    for name, matrix in (("colour", camera.colour_extrinsic), ("depth", camera.depth_extrinsic)):
+        if not are_rigid(matrix[None])[0]:
+            raise DataError(f"{where}: the {name} extrinsic is not a rigid motion; expected a 4x4 pose, metres")
+    for name, matrix in (("colour", camera.colour_intrinsics), ("depth", camera.depth_intrinsics)):
+        is_upper = matrix[1, 0] == 0 and (matrix[2] == (0, 0, 1)).all()
+        if not is_upper or np.abs(matrix).max() > MAX_INTRINSIC:
+            raise DataError(f"{where}: the {name} intrinsics are no camera matrix; expected fx 0 cx / 0 fy cy / 0 0 1")
+    return Registration(camera, grid)
+
+
+FRAMES_PER_SECOND = 30.0  # of ScanNet's recordings; the exports have no times
+EXPORT_AGAIN = "export the recording again"
+NumberedNames = Mapping[int, str]  # the number of a frame to the name of its file
+
+
+@dataclass(frozen=True)
+class FrameFiles:
+    """The files of one frame, below the folder of the export, and its number at full rate."""
+
+    number: int
+    colour: str
+    depth: str
+    pose: str
+
+
+@dataclass(frozen=True, eq=False)
+class ExportedFrames:
+    """An export as an ``RgbdSource``; each file is read when it is asked for.
+
+    ``camera_files`` are the names of the files that describe the cameras; ``size_reason`` says in the message about an
+    image of another size why it should have that of ``camera``.
+    """
+
+    folder: Path
+    where: str
+    camera: SensorPair
+    frames: Sequence[FrameFiles]
+    camera_files: Sequence[str]
+    size_reason: str
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def pose(self, i: int) -> Float64Array:
+        return read_matrix(self.folder, self.frames[i].pose, self.where)
+
+    def poses(self) -> Float64Array:
+        return self._poses.copy()
+
+    @cached_property
+    def _poses(self) -> Float64Array:
+        return np.array([self.pose(i) for i in range(len(self))]).reshape(-1, 4, 4)
+
+    def timestamp_s(self, i: int) -> float:
+        return self.frame_number(i) / FRAMES_PER_SECOND
+
+    def colour(self, i: int) -> UInt8Array:
+        where, content = self._read(self.frames[i].colour)
+        return sized(decode_colour, content, self.camera.colour_size, where, self.size_reason)
+
+    def depth(self, i: int) -> UInt16Array:
+        where, content = self._read(self.frames[i].depth)
+        return sized(decode_depth, content, self.camera.depth_size, where, self.size_reason)
+
+    def frame_number(self, i: int) -> int:
+        return self.frames[i].number
+
+    def files(self) -> Sequence[Path]:
+        images = (name for frame in self.frames for name in (frame.colour, frame.depth, frame.pose))
+        return [self.folder / name for name in (*self.camera_files, *images)]
+
+    def _read(self, name: str) -> tuple[str, bytes]:
+        where = f"{self.where}: {name}"
+        return where, read_bytes(self.folder / name, where, EXPORT_AGAIN)
+
+
+def read_matrix(folder: Path, name: str, where: str, sides: Sequence[int] = (4,)) -> Float64Array:
+    """The square matrix, of as many rows as one of ``sides``, in a text file; its numbers may be not finite."""
+    where = f"{where}: {name}"
+    return square(read_text(folder / name, where, EXPORT_AGAIN).split(), where, sides)
+
+
+def read_size(folder: Path, name: str, where: str) -> Size:
+    """Width and height of an image file by its header."""
+    size = image_size(read_bytes(folder / name, f"{where}: {name}", EXPORT_AGAIN))
+    if size is None:
+        raise DataError(f"{where}: {name}: not a readable image; {EXPORT_AGAIN}")
+    return size
+
+
+def list_folder(folder: Path, name: str, where: str) -> list[str]:
+    """The names in a folder, sorted; without hidden ones, which systems leave behind."""
+    try:
+        return sorted(entry.name for entry in os.scandir(folder / name) if not entry.name.startswith("."))
+    except OSError as error:
+        raise DataError(f"{where}: {name}/ cannot be read: {error.strerror}; {EXPORT_AGAIN}") from error
+
+
+def by_number(names: Sequence[str], pattern: str, where: str) -> NumberedNames:
+    """The names that match ``pattern`` by its first group, the number of the frame; another name is an error."""
+    name_of: dict[int, str] = {}
+    extra = []
+    for name in names:
+        match = re.fullmatch(pattern, name, re.ASCII)
+        if match is None or int(match[1]) in name_of:
+            extra.append(name)
+        else:
+            name_of[int(match[1])] = name
+    if extra:
+        raise DataError(f"{where} holds {extra[0][:60]!r}{_more(len(extra))}, which belongs to no frame; move it away")
+    return name_of
+
+
+def every_kth(known: set[int]) -> range:
+    """The numbers of an export from 0 that left out all but every k-th frame, as far as ``known`` tells."""
+    return range(0, max(known) + 1, math.gcd(*known) or 1)
+
+
+def check_complete(kinds: Mapping[str, NumberedNames], expected: range, where: str) -> None:
+    """Raise ``DataError`` unless each kind of file is there for exactly the ``expected`` frames.
+
+    The keys are what the name of a missing file would be, with {} in place of its number.
+    """
+    there = {name: {number for number in files if number in expected} for name, files in kinds.items()}
+    n_missing = sum(len(expected) - len(known) for known in there.values())
+    if n_missing:
+        first = next(name.format(n) for name, known in there.items() for n in expected if n not in known)
+        raise DataError(f"{where}: {first} is missing{_more(n_missing)}; {EXPORT_AGAIN}")
+    extra = [name for files in kinds.values() for number, name in files.items() if number not in expected]
+    if extra:
+        raise DataError(
+            f"{where}: the recording has {len(expected)} frames, but there is also {extra[0][:60]}{_more(len(extra))}; "
+            f"{EXPORT_AGAIN}"
+        )
+
+
+def _more(n: int) -> str:
+    return f", and {n - 1} more" if n > 1 else ""

@@ -13,9 +13,14 @@ from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh,
 from su3d_bench.datasets.openlex3d import release as openlex3d
 from su3d_bench.datasets.recordings.file_dataset import FileDataset, NoOptions, keeps_last, read_marker
 from su3d_bench.datasets.recordings.meshes import read_surface
-from su3d_bench.datasets.replica.boxes import box_truth, object_boxes_of, read_boxes
-from su3d_bench.datasets.replica.checks import digest_of, original_problems, render_problems
-from su3d_bench.datasets.replica.cloud_truth import cloud_files, conceptgraphs_truth
+from su3d_bench.datasets.replica.checks import (
+    box_truth,
+    digest_of,
+    object_boxes_of,
+    original_problems,
+    read_boxes,
+    render_problems,
+)
 from su3d_bench.datasets.replica.folders import (
     CLOUDS_URL,
     FETCH_FRAMES,
@@ -44,19 +49,23 @@ from su3d_bench.datasets.replica.frames import (
     read_camera,
     read_trajectory,
 )
-from su3d_bench.datasets.replica.label_file_truth import LabelledMesh, class_file_truth, instance_file_truth
-from su3d_bench.datasets.replica.mesh_truth import (
+from su3d_bench.datasets.replica.scene_graphs import FILES as GRAPH_FILES
+from su3d_bench.datasets.replica.scene_graphs import VARIANT as SCENE_GRAPH
+from su3d_bench.datasets.replica.scene_graphs import find_graph_folder, graph_truth
+from su3d_bench.datasets.replica.truth import (
     INFO_NAME,
     MESH_NAME,
     AnnotatedMesh,
+    LabelledMesh,
+    class_file_truth,
+    cloud_files,
+    conceptgraphs_truth,
     corner_truth,
+    instance_file_truth,
     read_annotated_mesh,
     triangle_mesh,
     vertex_truth,
 )
-from su3d_bench.datasets.replica.scene_graphs import FILES as GRAPH_FILES
-from su3d_bench.datasets.replica.scene_graphs import VARIANT as SCENE_GRAPH
-from su3d_bench.datasets.replica.scene_graphs import find_graph_folder, graph_truth
 
 
 class Replica(FileDataset[NoOptions]):

@@ -24,7 +24,7 @@ from su3d_bench.datasets.recordings.recorded_frames import (
     Recording,
     depth_m_of_values,
 )
-from su3d_bench.datasets.replica.mesh_truth import shown
+from su3d_bench.datasets.replica.truth import shown
 from su3d_bench.formats.images import UInt16Array
 from su3d_bench.formats.poses import poses_of_lines
 from su3d_bench.formats.text_files import parsed_json

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,8 +13,8 @@ from su3d_bench.core.files.atomic import json_text, make_folder, write_json, wri
 from su3d_bench.core.types import Float64Array, Frame
 from su3d_bench.datasets.replica.folders import original_name, replica_label_set
 from su3d_bench.datasets.replica.frames import colour_name, depth_name
-from su3d_bench.datasets.replica.mesh_truth import INFO_NAME, MESH_NAME
-from su3d_bench.datasets.writing import Layout, Scan, ScannedDataset, ScannedObject, SceneTarget, write_shared_text
+from su3d_bench.datasets.replica.truth import INFO_NAME, MESH_NAME
+from su3d_bench.datasets.writing import Layout, SceneTarget, write_shared_text
 from su3d_bench.formats.images import (
     JPEG_QUALITY,
     depth_in_units,
@@ -24,6 +24,11 @@ from su3d_bench.formats.images import (
     triangles_of,
 )
 from su3d_bench.formats.ply import Column, PlyElement, write_ply
+
+if TYPE_CHECKING:
+    from su3d_bench.datasets.rooms.dataset import Rooms
+    from su3d_bench.datasets.rooms.scan import RoomScan
+    from su3d_bench.datasets.rooms.truth import RoomObject
 
 LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
 DEPTH_SCALE = 6553.5  # of NICE-SLAM's render: 65535 is 10 m
@@ -47,7 +52,7 @@ class ReplicaLayout(Layout):
         truth = (mesh, original / MESH_NAME, original / INFO_NAME)
         return SceneTarget(scene, key, folder, "results", truth, ((STAGED_ORIGINAL, original), (STAGED_MESH, mesh)))
 
-    def write_shared(self, dataset: ScannedDataset, scene: str, out: Path) -> None:
+    def write_shared(self, dataset: Rooms, scene: str, out: Path) -> None:
         make_folder(out / ORIGINAL_FOLDER)
         height, width = dataset.frames(scene, 1)[0].depth_m.shape
         k = dataset.intrinsics
@@ -62,7 +67,7 @@ class ReplicaLayout(Layout):
     def frame_files(self, frame: Frame) -> Sequence[bytes]:
         return jpeg_bytes(frame.rgb), png_bytes(depth_in_units(frame.depth_m, DEPTH_SCALE))
 
-    def write_truth(self, dataset: ScannedDataset, target: SceneTarget) -> None:
+    def write_truth(self, dataset: Rooms, target: SceneTarget) -> None:
         """Trajectory, annotated mesh, table of objects and plain mesh."""
         scan = dataset.scan(target.scene)
         staged = target.partial / STAGED_ORIGINAL
@@ -75,7 +80,7 @@ class ReplicaLayout(Layout):
         write_text(target.partial / "traj.txt", "\n".join(lines) + "\n")
 
 
-def _vertex_element(scan: Scan) -> PlyElement:
+def _vertex_element(scan: RoomScan) -> PlyElement:
     columns: dict[str, Column] = {}
     for names, array in ((("x", "y", "z"), scan.vertices), (("nx", "ny", "nz"), scan.normals)):
         columns |= {name: array[:, i].astype(np.float32) for i, name in enumerate(names)}
@@ -83,7 +88,7 @@ def _vertex_element(scan: Scan) -> PlyElement:
     return PlyElement("vertex", len(scan.vertices), columns)
 
 
-def _annotated_mesh(scan: Scan) -> list[PlyElement]:
+def _annotated_mesh(scan: RoomScan) -> list[PlyElement]:
     """Quads with ``object_id`` of 16 bits, as in the release."""
     if scan.object_id.max(initial=0) > np.iinfo(np.uint16).max or scan.object_id.min(initial=0) < 0:
         raise DataError(f"object ids go to {scan.object_id.max()}; the layout has 16 bits, 0 to 65535")
@@ -94,13 +99,13 @@ def _annotated_mesh(scan: Scan) -> list[PlyElement]:
     return [_vertex_element(scan), PlyElement("face", len(scan.faces), faces)]
 
 
-def _plain_mesh(scan: Scan) -> list[PlyElement]:
+def _plain_mesh(scan: RoomScan) -> list[PlyElement]:
     """The same surface as triangles, without labels."""
     triangles = triangles_of(scan.faces)
     return [_vertex_element(scan), PlyElement("face", len(triangles), {"vertex_indices": list_column(triangles)})]
 
 
-def _info(objects: Sequence[ScannedObject]) -> dict[str, Any]:
+def _info(objects: Sequence[RoomObject]) -> dict[str, Any]:
     """The content of ``info_semantic.json``."""
     labels = replica_label_set()
     class_of_id = {known.id: known.class_id for known in objects}

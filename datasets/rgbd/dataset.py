@@ -27,7 +27,7 @@ from su3d_bench.core.types import (
 )
 from su3d_bench.datasets.recordings.file_dataset import FileDataset, SceneTree, keeps_last
 from su3d_bench.datasets.recordings.meshes import read_surface
-from su3d_bench.datasets.recordings.pose_convention import ROTATED, Finding
+from su3d_bench.datasets.recordings.pose_convention import ROTATED, Finding, guess_up
 from su3d_bench.datasets.recordings.recorded_frames import (
     N_DEPTH_VALUES,
     Folder,
@@ -37,13 +37,15 @@ from su3d_bench.datasets.recordings.recorded_frames import (
     left_out,
     pinhole,
 )
-from su3d_bench.datasets.recordings.world_up import guess_up
-from su3d_bench.datasets.rgbd.description import FILE_NAME, INDEX, RgbdDescription, read_description
 from su3d_bench.datasets.rgbd.files import (
+    FILE_NAME,
+    INDEX,
     Pose,
+    RgbdDescription,
     camera_to_world,
     direction_in,
     files_of,
+    read_description,
     read_intrinsics,
     read_pose,
     read_trajectory_file,

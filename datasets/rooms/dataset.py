@@ -112,7 +112,7 @@ class BuiltRoom:
 
     @cached_property
     def mesh(self) -> RoomMesh:
-        from su3d_bench.datasets.rooms.kept import kept_mesh
+        from su3d_bench.datasets.rooms.scan import kept_mesh
 
         return kept_mesh(self._kept_in("mesh"), self._bake)
 
@@ -139,7 +139,7 @@ class BuiltRoom:
 
     @cached_property
     def trajectory(self) -> Float64Array:
-        from su3d_bench.datasets.rooms.kept import kept_walk
+        from su3d_bench.datasets.rooms.scan import kept_walk
 
         return kept_walk(self._kept_in("walk"), self.options.n_frames, self._walk)
 
@@ -246,7 +246,7 @@ class Rooms:
 
     def scan(self, scene: str) -> RoomScan:
         """The ground-truth surface; made once, then read from the cache."""
-        from su3d_bench.datasets.rooms.kept import kept_scan
+        from su3d_bench.datasets.rooms.scan import kept_scan
 
         path = self.root / "rooms" / self._scan_key(scene) / f"{scene}.npz"
         return kept_scan(path, lambda: self._room(scene).scan)
@@ -296,7 +296,7 @@ class Rooms:
         return GroundTruth(points, self._class_of_object(scene)[owner], owner, label_set(), variant, source)
 
     def _attribute_truth(self, scene: str, variant: str) -> GroundTruth:
-        from su3d_bench.datasets.rooms.attributes import attribute_of_object
+        from su3d_bench.datasets.rooms.truth import attribute_of_object
 
         scan = self.scan(scene)
         owner = scan.object_of_vertex()

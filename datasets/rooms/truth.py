@@ -1,12 +1,18 @@
-"""What is true of a room: its objects and how they relate."""
+"""What is true of a room: its objects, how they relate, and their attributes as OpenScan has them."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.types import Float64Array, WholeObject
+from su3d_bench.core.system.files import file_text
+from su3d_bench.core.toml import parse_toml
+from su3d_bench.core.types import Float64Array, Int32Array, WholeObject
+from su3d_bench.datasets.openscan import attribute_id
 from su3d_bench.datasets.rooms.classes import CLASS_BY_NAME, CLASS_ID
 from su3d_bench.datasets.rooms.objects.items import Item
 from su3d_bench.datasets.rooms.objects.materials import Texture
@@ -108,3 +114,21 @@ def _relations(objects: tuple[RoomObject, ...]) -> tuple[Relation, ...]:
     boxes = np.array([(known.box_min, known.box_max) for known in objects])
     links = Relations(boxes, [known.class_name.rpartition("-")[2] for known in objects]).links()
     return tuple(Relation(objects[link.subject].id, link.relation, objects[link.object].id) for link in links)
+
+
+MATERIAL = "material"
+
+
+def attribute_of_object(objects: Sequence[RoomObject], variant: str) -> Int32Array:
+    """The attribute (n + 1,) of every object in an aspect by the object's id, 0 for none; that of id 0 is 0."""
+    aspect = variant.partition("-")[2]
+    ids = {word: attribute_id(variant, words) for word, words in _words_of(aspect).items()}
+    words = [known.material if aspect == MATERIAL else known.class_name for known in objects]
+    return np.array([0, *(ids.get(word) or 0 for word in words)], np.int32)
+
+
+@cache
+def _words_of(aspect: str) -> Mapping[str, str]:
+    """The words of each class, or material, in an aspect."""
+    table = parse_toml(file_text(Path(__file__).with_name("attributes.toml")))[aspect]
+    return {name: words for words, names in table.items() for name in names}

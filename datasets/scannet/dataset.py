@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -15,10 +15,7 @@ from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.types import Float64Array, Frame, GroundTruth, InstanceMesh, Surface
 from su3d_bench.datasets import openscan
 from su3d_bench.datasets.recordings.file_dataset import FileDataset, keeps_last
-from su3d_bench.datasets.recordings.registration import Grid, make_registration
-from su3d_bench.datasets.recordings.source import RgbdSource
-from su3d_bench.datasets.scannet.annotations import segments_name
-from su3d_bench.datasets.scannet.checks import annotation_problems, recording_problems
+from su3d_bench.datasets.recordings.source import Grid, RgbdSource, make_registration
 from su3d_bench.datasets.scannet.folders import (
     OVO_SCENES,
     PAPER_SCENES,
@@ -27,29 +24,90 @@ from su3d_bench.datasets.scannet.folders import (
     find_scans,
     split_scenes,
 )
-from su3d_bench.datasets.scannet.frames import ScannetFrames, Walk, read_walk
-from su3d_bench.datasets.scannet.labels import TABLE_NAME, LabelTable, nyu40_label_set, read_label_table
 from su3d_bench.datasets.scannet.recordings import (
+    ScannetFrames,
     SourceKind,
+    Walk,
+    classify_poses,
     describe_recording,
     digest_recording,
+    faulty_pose,
     find_source,
     folder_of_recording,
+    read_walk,
 )
 from su3d_bench.datasets.scannet.truth import (
+    FIRST_TABLE_NAME,
+    TABLE_NAME,
     AnnotatedScan,
+    LabelTable,
+    aggregation_name,
     aligned,
     instance_mesh,
+    labels_name,
     mesh_name,
     meta_name,
     moved,
+    nyu40_label_set,
     nyu40_truth,
     read_annotated_scan,
     read_axis_alignment,
+    read_label_table,
+    read_objects,
+    read_segments,
     read_surface,
     scannet200_truth,
+    segments_name,
     truth_names,
 )
+from su3d_bench.formats.ply import read_ply
+
+MOST_POSES = 20  # named one by one; the rest is counted
+
+
+def recording_problems(open_source: Callable[[], RgbdSource], grid: Grid, where: str) -> Iterator[str]:
+    """Faults of the recording's index, its cameras and its poses."""
+    try:
+        source = open_source()
+        walk, is_faulty = classify_poses(source)
+    except DataError as error:
+        yield str(error)
+        return
+    numbers = walk.numbers[np.flatnonzero(is_faulty)]
+    yield from (faulty_pose(where, int(number)) for number in numbers[:MOST_POSES])
+    if len(numbers) > MOST_POSES:
+        yield f"{where}: {len(numbers) - MOST_POSES} more poses are not rigid motions"
+    if len(numbers) == 0:
+        yield from _fault(read_walk, source)
+    yield from _fault(make_registration, source.camera, grid, where)
+
+
+def annotation_problems(files: Mapping[str, Path], scan: str, where: str) -> Iterator[str]:
+    """Faults of the files that there are (by their names), each alone and, where all of the truth is, together."""
+    readers: dict[str, Callable[[Path], object]] = {
+        TABLE_NAME: lambda path: read_label_table(path, where),
+        FIRST_TABLE_NAME: lambda path: read_label_table(path, where),
+        openscan.RAW_NAME: openscan.read_attributes,
+        meta_name(scan): lambda path: read_axis_alignment(path, where),
+        segments_name(scan): lambda path: read_segments(path, scan, where),
+        aggregation_name(scan): lambda path: read_objects(path, scan, where),
+        mesh_name(scan): lambda path: read_ply(path, f"{where}: {path.name}"),
+        labels_name(scan): lambda path: read_ply(path, f"{where}: {path.name}"),
+    }
+    faults = [line for name, read in readers.items() if name in files for line in _fault(read, files[name])]
+    yield from faults
+    if set(truth_names(scan)) <= set(files):
+        yield from (line for line in _fault(read_annotated_scan, files, scan, where) if line not in faults)
+
+
+def _fault(read: Callable[..., object], *arguments: object) -> list[str]:
+    """The line that ``read`` fails with; none where it does not."""
+    try:
+        read(*arguments)
+    except DataError as error:
+        return [str(error)]
+    return []
+
 
 logger = logging.getLogger(__name__)
 

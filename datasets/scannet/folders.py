@@ -14,7 +14,7 @@ from pathlib import Path
 
 from su3d_bench.core.system.files import file_text
 from su3d_bench.datasets.recordings.file_dataset import SceneTree, folders_in, read_marker
-from su3d_bench.datasets.scannet.labels import FIRST_TABLE_NAME, TABLE_NAME
+from su3d_bench.datasets.scannet.truth import FIRST_TABLE_NAME, TABLE_NAME
 
 # The scenes of OpenSU3D's evaluation, in the order of its section IV-A.
 PAPER_SCENES = ("scene0000_00", "scene0034_00", "scene0164_03", "scene0525_01", "scene0549_00")

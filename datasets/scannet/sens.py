@@ -1,4 +1,4 @@
-"""The header of a ``.sens`` file: what kind of cameras recorded it, how its images are stored, how many frames follow.
+"""``.sens`` files read and written: cameras and compression in the header, then the frames, then motion data.
 
 Little-endian, without padding. Source: ScanNet, SensReader/c++/sensorData.h at commit 3830fce.
 """

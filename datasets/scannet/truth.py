@@ -13,36 +13,239 @@ those of NYU40 (ScanNet's issues 20 and 86), which are void.
 
 from __future__ import annotations
 
+import json
 import logging
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.geometry import are_rigid
-from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, InstanceMesh, Int32Array, Int64Array, Surface
+from su3d_bench.core.system.files import file_text
+from su3d_bench.core.types import (
+    Float32Array,
+    Float64Array,
+    GroundTruth,
+    InstanceMesh,
+    Int32Array,
+    Int64Array,
+    LabelSet,
+    Surface,
+)
 from su3d_bench.datasets.recordings.meshes import face_corners, vertex_positions
-from su3d_bench.datasets.scannet.annotations import (
-    AnnotatedObject,
-    aggregation_name,
-    object_of_vertex,
-    read_objects,
-    read_segments,
-    segments_name,
-)
-from su3d_bench.datasets.scannet.labels import (
-    FIRST_TABLE_NAME,
-    MAX_NYU40_ID,
-    TABLE_NAME,
-    LabelTable,
-    nyu40_label_set,
-    raw_label_set,
-)
+from su3d_bench.formats.images import read_bytes
 from su3d_bench.formats.ply import ListColumn, read_ply
-from su3d_bench.formats.text_files import read_text
+from su3d_bench.formats.text_files import parsed_json, read_text
+
+PREFIX = "scannet."  # before scene ids and file names of the second release, not of the first
+MAX_SEGMENT_ID = 2**32 - 1
+# Ground truth is label * 1000 + instance, and instances are ids + 1: a larger id would spill into the next label.
+MAX_OBJECT_ID = 998
+
+
+@dataclass(frozen=True)
+class AnnotatedObject:
+    """One object: its number in the scan, the raw category, and the ids of its segments."""
+
+    id: int
+    category: str
+    segments: Int64Array
+
+
+def segments_name(scan: str) -> str:
+    return f"{scan}_vh_clean_2.0.010000.segs.json"
+
+
+def aggregation_name(scan: str) -> str:
+    return f"{scan}.aggregation.json"
+
+
+def read_segments(path: Path, scan: str, where: str) -> Int64Array:
+    """The segment id of every vertex, in the order of the mesh; ``where`` begins each message."""
+    where = f"{where}: {path.name}"
+    content = _read_table(path, scan, where)
+    values = content.get("segIndices")
+    if not isinstance(values, list):
+        raise DataError(f"{where}: has no list 'segIndices'; copy the file again")
+    return _segment_ids(values, f"{where}: 'segIndices'")
+
+
+def read_objects(path: Path, scan: str, where: str) -> list[AnnotatedObject]:
+    """The objects in the order of the file, which must refer to the segments of the decimated mesh."""
+    where = f"{where}: {path.name}"
+    content = _read_table(path, scan, where)
+    segments_file = content.get("segmentsFile")
+    if not isinstance(segments_file, str) or segments_file.removeprefix(PREFIX) != segments_name(scan):
+        raise DataError(
+            f"{where}: 'segmentsFile' is {_clip(segments_file)}, but {segments_name(scan)} is read; take the "
+            "aggregation that belongs to it"
+        )
+    groups = content.get("segGroups")
+    if not isinstance(groups, list):
+        raise DataError(f"{where}: has no list 'segGroups'; copy the file again")
+    objects = [_read_object(group, f"{where}: group {row}") for row, group in enumerate(groups)]
+    category_of: dict[int, str] = {}
+    for entry in objects:
+        if category_of.setdefault(entry.id, entry.category) != entry.category:
+            raise DataError(
+                f"{where}: object {entry.id} stands there twice, as {_clip(category_of[entry.id])} and as "
+                f"{_clip(entry.category)}"
+            )
+    return objects
+
+
+def object_of_vertex(segments: Int64Array, objects: Sequence[AnnotatedObject]) -> Int64Array:
+    """Row in ``objects`` of each vertex; -1 where its segment is in none."""
+    ids, segment_rows = np.unique(segments, return_inverse=True)
+    owner = np.full(len(ids), -1, np.int64)
+    for row, entry in enumerate(objects):
+        owner[np.isin(ids, entry.segments)] = row
+    return owner[segment_rows.reshape(-1)] if len(ids) else np.zeros(0, np.int64)
+
+
+def _read_table(path: Path, scan: str, where: str) -> dict[str, Any]:
+    """The JSON object in a file that says of itself that it belongs to ``scan``."""
+    content = parsed_json(read_bytes(path, where), where)
+    if not isinstance(content, dict):
+        raise DataError(f"{where}: is no JSON object; copy the file again")
+    scene = content.get("sceneId")
+    # Segmentator names the scene after the mesh file when a user runs it.
+    belongs = isinstance(scene, str) and scene.removeprefix(PREFIX) in (scan, f"{scan}_vh_clean_2")
+    if not belongs:
+        raise DataError(f"{where}: 'sceneId' is {_clip(scene)}, not '{scan}'; this file belongs to another scan")
+    return content
+
+
+def _read_object(group: Any, where: str) -> AnnotatedObject:
+    if not isinstance(group, dict):
+        raise DataError(f"{where} is no JSON object; copy the file again")
+    number = _whole_number(group.get("id"))
+    if number is None or number > MAX_OBJECT_ID:
+        raise DataError(
+            f"{where}: 'id' is {_clip(group.get('id'))}; expected 0 to {MAX_OBJECT_ID}, since ground truth is "
+            "label * 1000 + id + 1"
+        )
+    category, segments = group.get("label"), group.get("segments")
+    if not isinstance(category, str):
+        raise DataError(f"{where}: 'label' is {_clip(category)}; expected a category")
+    if not isinstance(segments, list):
+        raise DataError(f"{where}: has no list 'segments'; copy the file again")
+    return AnnotatedObject(number, category.strip(), _segment_ids(segments, f"{where}: 'segments'"))
+
+
+def _segment_ids(values: list[Any], where: str) -> Int64Array:
+    numbers = [_whole_number(value) for value in values]
+    wrong = next((row for row, number in enumerate(numbers) if number is None or number > MAX_SEGMENT_ID), None)
+    if wrong is not None:
+        raise DataError(f"{where}[{wrong}] is {_clip(values[wrong])}; expected a segment id, 0 to {MAX_SEGMENT_ID}")
+    return np.array(numbers, np.int64)
+
+
+def _whole_number(value: Any) -> int | None:
+    """The value of a number or of one written as text; None where it is neither or below 0."""
+    if isinstance(value, str):
+        return int(value) if re.fullmatch(r"[0-9]{1,18}", value) else None
+    return value if isinstance(value, int) and not isinstance(value, bool) and value >= 0 else None
+
+
+def _clip(value: Any) -> str:
+    """The value as it may stand in a message."""
+    return ascii(value[:40] if isinstance(value, str) else str(value)[:40] if not isinstance(value, int) else value)[
+        :80
+    ]
+
+
+LABEL_SPACE = "scannet"
+TABLE_NAME = "scannetv2-labels.combined.tsv"
+FIRST_TABLE_NAME = "scannet-labels.combined.tsv"  # of the first release
+CATEGORY, RAW_ID, NYU40_ID = COLUMNS = ("raw_category", "id", "nyu40id")
+FIRST_COLUMNS = ("category", NYU40_ID)
+MAX_RAW_ID, MAX_NYU40_ID = 65535, 40  # labels are stored as 16 bits; the released table ends at 1357
+
+
+@dataclass(frozen=True)
+class LabelTable:
+    """``nyu40_of`` and ``raw_id_of`` a raw category; ``name_of_id``: the first category of each raw id.
+
+    ``name``: of the file, which tells the release.
+    """
+
+    nyu40_of: Mapping[str, int]
+    raw_id_of: Mapping[str, int]
+    name_of_id: Mapping[int, str]
+    name: str = TABLE_NAME
+
+
+@cache
+def _known_classes() -> dict[str, dict[int, str]]:
+    """NYU40 by the names of nyu40class, those of the benchmark's 20 classes as the benchmark has them; ScanNet200."""
+    tables = json.loads(file_text(Path(__file__).with_name("labels.json")))
+    return {name: {int(row["id"]): str(row["name"]) for row in rows} for name, rows in tables.items()}
+
+
+@cache
+def nyu40_label_set() -> LabelSet:
+    """The 40 classes of NYU40, the 20 of the benchmark among them."""
+    classes = _known_classes()["nyu40"]
+    return LabelSet(LABEL_SPACE, tuple(classes), tuple(classes.values()))
+
+
+def raw_label_set(table: LabelTable) -> LabelSet:
+    """Every raw id of the table and of ScanNet200, whose 200 names stand first; no other id bears one of them."""
+    classes = dict(_known_classes()["scannet200"])
+    taken = set(classes.values())
+    for raw_id, name in sorted(table.name_of_id.items()):
+        classes.setdefault(raw_id, f"{name} ({raw_id})" if name in taken else name)
+    return LabelSet(LABEL_SPACE, tuple(classes), tuple(classes.values()))
+
+
+def read_label_table(path: Path, where: str) -> LabelTable:
+    """The table in ``path``; ``where`` begins each message.
+
+    Of rows with the same category the first counts, as in ScanNet's scripts. Cells lose blanks at their ends, and lines
+    may end in CR, LF or both, even mixed. In that of the first release a row may lack its class of NYU40.
+    """
+    is_first = path.name == FIRST_TABLE_NAME
+    columns = FIRST_COLUMNS if is_first else COLUMNS
+    where = f"{where}: {path.name}"
+    text = read_text(path, where)
+    lines = [(n, line) for n, line in enumerate(re.split(r"\r\n|\r|\n", text), 1) if line.strip()]
+    header = [cell.strip() for cell in lines[0][1].split("\t")] if lines else []
+    missing = [name for name in columns if name not in header]
+    if missing:
+        raise DataError(
+            f"{where}: has no column '{missing[0]}'; expected the table of the release, tabs between columns"
+        )
+    at = [header.index(name) for name in columns]
+    nyu40_of: dict[str, int] = {}
+    raw_id_of: dict[str, int] = {}
+    name_of_id: dict[int, str] = {}
+    for row, (number, line) in enumerate(lines[1:], 1):
+        cells = [cell.strip() for cell in line.split("\t")]
+        if len(cells) <= max(at) or not cells[at[0]].isprintable() or not cells[at[0]]:
+            raise DataError(f"{where} line {number}: has no {', '.join(columns)}; copy the file again")
+        place = f"{where} line {number}"
+        raw_id = row if is_first else _id_in_table(cells[at[1]], MAX_RAW_ID, f"{place}: '{RAW_ID}'")
+        raw_id_of.setdefault(cells[at[0]], raw_id)
+        name_of_id.setdefault(raw_id, cells[at[0]])
+        if not is_first or cells[at[-1]]:
+            nyu40_of.setdefault(cells[at[0]], _id_in_table(cells[at[-1]], MAX_NYU40_ID, f"{place}: '{NYU40_ID}'"))
+    if not nyu40_of:
+        raise DataError(f"{where}: has no row below its header; copy the file again")
+    return LabelTable(nyu40_of, raw_id_of, name_of_id, path.name)
+
+
+def _id_in_table(text: str, most: int, where: str) -> int:
+    if not re.fullmatch(r"[0-9]{1,9}", text) or not 1 <= int(text) <= most:
+        raise DataError(f"{where} is {text[:20]!r}; expected a whole number from 1 to {most}")
+    return int(text)
+
 
 ALIGNMENT = "axisAlignment"  # in the facts of a scan, ``<scan>.txt``
 SAME_PLACE_M = 1e-3  # both files hold one mesh; text formats round its coordinates

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,8 +19,6 @@ from su3d_bench.core.files.atomic import make_folder, write_text
 from su3d_bench.core.system.files import file_bytes, file_text
 from su3d_bench.core.toml import parse_toml
 from su3d_bench.core.types import Float64Array, Frame, Int64Array, UInt8Array
-from su3d_bench.datasets.scannet.annotations import aggregation_name, segments_name
-from su3d_bench.datasets.scannet.labels import TABLE_NAME
 from su3d_bench.datasets.scannet.sens import (
     FRAME_RECORD,
     MICROSECONDS,
@@ -29,8 +27,16 @@ from su3d_bench.datasets.scannet.sens import (
     SensHeader,
     write_sens,
 )
-from su3d_bench.datasets.scannet.truth import labels_name, mesh_name, meta_name, truth_names
-from su3d_bench.datasets.writing import Layout, Scan, ScannedDataset, ScannedObject, SceneTarget, write_shared_text
+from su3d_bench.datasets.scannet.truth import (
+    TABLE_NAME,
+    aggregation_name,
+    labels_name,
+    mesh_name,
+    meta_name,
+    segments_name,
+    truth_names,
+)
+from su3d_bench.datasets.writing import Layout, SceneTarget, write_shared_text
 from su3d_bench.formats.images import JPEG_QUALITY, depth_in_units, image_size, jpeg_bytes, list_column, triangles_of
 from su3d_bench.formats.ply import Column, PlyElement, write_ply
 
@@ -41,6 +47,11 @@ TABLE_COLUMNS = (
     "ModelNet40", "ModelNet10", "ShapeNetCore55", "synsetoffset", "wnsynsetid", "wnsynsetkey", "mpcat40",
     "mpcat40index",
 )  # fmt: skip
+
+if TYPE_CHECKING:
+    from su3d_bench.datasets.rooms.dataset import Rooms
+    from su3d_bench.datasets.rooms.scan import RoomScan
+    from su3d_bench.datasets.rooms.truth import RoomObject
 
 
 @dataclass(frozen=True)
@@ -98,12 +109,12 @@ def label_table_text() -> str:
 MIN_COSINE = 0.9  # faces that meet at more than 26 degrees belong to two segments
 
 
-def annotation_id(known: ScannedObject) -> int:
+def annotation_id(known: RoomObject) -> int:
     """The id of an object in the annotation, which counts from 0."""
     return known.id - 1
 
 
-def write_scan_truth(dataset: ScannedDataset, scene: str, scan: str, folder: Path) -> list[ScannedObject]:
+def write_scan_truth(dataset: Rooms, scene: str, scan: str, folder: Path) -> list[RoomObject]:
     """Write the files of ``scene`` under the name ``scan`` into ``folder``; the objects that are annotated."""
     make_folder(folder)
     surface, objects = dataset.scan(scene), dataset.objects(scene)
@@ -131,14 +142,14 @@ def write_scan_truth(dataset: ScannedDataset, scene: str, scan: str, folder: Pat
     return seen
 
 
-def object_of_vertex(scan: Scan) -> Int64Array:
+def object_of_vertex(scan: RoomScan) -> Int64Array:
     """Object id (V,) of each vertex, that of its last face; 0 where no face uses it."""
     owner = np.zeros(len(scan.vertices), np.int64)
     owner[scan.faces] = scan.object_id[:, None]
     return owner
 
 
-def segment_of_vertex(scan: Scan) -> Int64Array:
+def segment_of_vertex(scan: RoomScan) -> Int64Array:
     """Segment (V,) of each vertex, named after its first vertex: a connected piece of one object that bends little.
 
     A vertex has the direction of its first face, so that a box falls apart into its sides.
@@ -161,21 +172,21 @@ def segment_of_vertex(scan: Scan) -> Int64Array:
     return segments
 
 
-def _face_normals(scan: Scan) -> Float64Array:
+def _face_normals(scan: RoomScan) -> Float64Array:
     a, b, c, d = (scan.vertices[scan.faces[:, k]].astype(np.float64) for k in range(4))
     normals = np.cross(c - a, d - b)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-15)
     return normals
 
 
-def _vertices(scan: Scan, colours: UInt8Array, more: dict[str, Column]) -> PlyElement:
+def _vertices(scan: RoomScan, colours: UInt8Array, more: dict[str, Column]) -> PlyElement:
     columns: dict[str, Column] = {name: scan.vertices[:, i].astype(np.float32) for i, name in enumerate("xyz")}
     columns |= {name: colours[:, i] for i, name in enumerate(("red", "green", "blue"))}
     columns["alpha"] = np.full(len(scan.vertices), 255, np.uint8)
     return PlyElement("vertex", len(scan.vertices), columns | more)
 
 
-def _facts_of(dataset: ScannedDataset, scene: str) -> str:
+def _facts_of(dataset: Rooms, scene: str) -> str:
     """The content of ``<scan>.txt``, keys in the order of the release."""
     frames = dataset.frames(scene, 1)
     height, width = frames[0].depth_m.shape
@@ -223,10 +234,10 @@ class ScannetLayout(Layout):
         truth = tuple(folder / name for name in (*truth_names(scan), meta_name(scan)))
         return SceneTarget(scene, key, folder, f"{scan}.sens", truth)
 
-    def write_shared(self, dataset: ScannedDataset, scene: str, out: Path) -> None:
+    def write_shared(self, dataset: Rooms, scene: str, out: Path) -> None:
         write_shared_text(out / TABLE_NAME, label_table_text(), "is another label table than that of the rooms")
 
-    def write_truth(self, dataset: ScannedDataset, target: SceneTarget) -> None:
+    def write_truth(self, dataset: Rooms, target: SceneTarget) -> None:
         write_scan_truth(dataset, target.scene, target.folder.name, target.partial)
 
     def frame_names(self, index: int) -> Sequence[str]:
@@ -237,7 +248,7 @@ class ScannetLayout(Layout):
         depth = zlib.compress(depth_in_units(frame.depth_m, DEPTH_SHIFT).astype("<u2").tobytes())
         return (SensFrame(frame.camera_to_world, time, time, jpeg_bytes(frame.rgb), depth).stored,)
 
-    def join(self, dataset: ScannedDataset, target: SceneTarget) -> None:
+    def join(self, dataset: Rooms, target: SceneTarget) -> None:
         if not target.has_frames:
             n_frames = len(dataset.frames(target.scene, 1))
             pieces = [target.partial / name for index in range(n_frames) for name in self.frame_names(index)]

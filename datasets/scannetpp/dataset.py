@@ -21,27 +21,27 @@ from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, Surface
 from su3d_bench.datasets.openlex3d import release as openlex3d
 from su3d_bench.datasets.recordings.file_dataset import FileDataset, faults_of, keeps_last, sizes_and_ends
 from su3d_bench.datasets.recordings.recorded_frames import reading
-from su3d_bench.datasets.scannetpp.annotations import MASK_NAME, MESH_NAME, SEGMENTS_NAME
-from su3d_bench.datasets.scannetpp.iphone.frames import (
+from su3d_bench.datasets.scannetpp.frames import (
     IphoneFrames,
     IphoneRecording,
     PoseSource,
     describe_recording,
     open_recording,
 )
-from su3d_bench.datasets.scannetpp.labels import (
+from su3d_bench.datasets.scannetpp.truth import (
     BASES,
     BENCHMARK_FOLDER,
     LABEL_SPACE,
     LIST_NAMES,
-    read_benchmark_classes,
-)
-from su3d_bench.datasets.scannetpp.truth import (
+    MASK_NAME,
+    MESH_NAME,
+    SEGMENTS_NAME,
     TRUTH_NAMES,
     VARIANT,
     AnnotatedScan,
     instance_mesh,
     read_annotated_scan,
+    read_benchmark_classes,
     read_surface,
     vertex_truth,
 )

@@ -14,26 +14,205 @@ Source: scannetpp/scannetpp at commit f3b4712, semantic/transforms/mesh.py, sema
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import csv
+import io
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.types import BoolArray, GroundTruth, InstanceMesh, Int32Array, Int64Array, Surface
+from su3d_bench.core.types import BoolArray, GroundTruth, InstanceMesh, Int32Array, Int64Array, LabelSet, Surface
 from su3d_bench.datasets.recordings import meshes
-from su3d_bench.datasets.scannetpp.annotations import (
-    MASK_NAME,
-    MESH_NAME,
-    OBJECTS_NAME,
-    SEGMENTS_NAME,
-    read_mask,
-    read_objects,
-    read_segments,
-    vertices_of_segments,
-)
-from su3d_bench.datasets.scannetpp.labels import BenchmarkClasses
+from su3d_bench.datasets.recordings.recorded_frames import numbers
+from su3d_bench.formats.images import read_bytes
+from su3d_bench.formats.text_files import parsed_json, read_text
+
+MESH_NAME = "mesh_aligned_0.05.ply"
+MASK_NAME = "mesh_aligned_0.05_mask.txt"
+SEGMENTS_NAME, OBJECTS_NAME = "segments.json", "segments_anno.json"
+MAX_SEGMENT_ID = 2**32 - 1  # the toolkit keeps them in 32 bits
+MAX_VERTEX = re.compile(r"[0-9]{1,10}")
+
+
+@dataclass(frozen=True)
+class AnnotatedObject:
+    """One object: the word that the annotator typed, and the ids of its segments."""
+
+    word: str
+    segments: Int64Array
+
+
+def read_segments(path: Path, where: str) -> Int64Array:
+    """The segment id of every vertex, in the order of the mesh; ``where`` begins each message."""
+    where = f"{where}: {path.name}"
+    values = _read_table(path, where).get("segIndices")
+    if not isinstance(values, list):
+        raise DataError(f"{where}: has no list 'segIndices'; copy the file again")
+    return _segment_ids(values, f"{where}: 'segIndices'")
+
+
+def read_objects(path: Path, where: str) -> list[AnnotatedObject]:
+    """The objects in the order of the file."""
+    where = f"{where}: {path.name}"
+    groups = _read_table(path, where).get("segGroups")
+    if not isinstance(groups, list):
+        raise DataError(f"{where}: has no list 'segGroups'; copy the file again")
+    return [_read_object(group, f"{where}: group {row}") for row, group in enumerate(groups)]
+
+
+def _read_object(group: Any, where: str) -> AnnotatedObject:
+    if not isinstance(group, dict):
+        raise DataError(f"{where} is no JSON object; copy the file again")
+    word, segments = group.get("label"), group.get("segments")
+    if not isinstance(word, str):
+        raise DataError(f"{where}: 'label' is {ascii(word)[:40]}; expected a word")
+    if not isinstance(segments, list):
+        raise DataError(f"{where}: has no list 'segments'; copy the file again")
+    return AnnotatedObject(word, _segment_ids(segments, f"{where}: 'segments'"))
+
+
+def vertices_of_segments(segments: Int64Array) -> _Members:
+    """A way from ids of segments to the vertices in them."""
+    ids, row_of_vertex = np.unique(segments, return_inverse=True)
+    rows = row_of_vertex.reshape(-1)
+    starts = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=len(ids)))]).astype(np.int64)
+    return _Members(ids, starts, np.argsort(rows, kind="stable"))
+
+
+@dataclass(frozen=True)
+class _Members:
+    ids: Int64Array
+    starts: Int64Array
+    vertices: Int64Array
+
+    def of(self, segments: Int64Array) -> Int64Array:
+        """The vertices in any of ``segments``; those that no vertex has are passed over."""
+        places = np.searchsorted(self.ids, segments)
+        is_known = places < len(self.ids)
+        is_known[is_known] = self.ids[places[is_known]] == segments[is_known]
+        rows = np.unique(places[is_known])
+        lengths = self.starts[rows + 1] - self.starts[rows]
+        within = np.arange(lengths.sum()) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+        members: Int64Array = self.vertices[np.repeat(self.starts[rows], lengths) + within]
+        return members
+
+
+def read_mask(path: Path, n_vertices: int, where: str) -> BoolArray:
+    """Which of the vertices (V,) evaluations leave out: the file lists them by their numbers, and may be empty."""
+    where = f"{where}: {path.name}"
+    is_masked = np.zeros(n_vertices, np.bool_)
+    words: Sequence[str] = read_text(path, where).split()
+    wrong = next((word for word in words if not MAX_VERTEX.fullmatch(word) or int(word) >= n_vertices), None)
+    if wrong is not None:
+        raise DataError(f"{where}: {wrong[:20]!a} is no vertex of {MESH_NAME}, which has {n_vertices} (from 0)")
+    is_masked[[int(word) for word in words]] = True
+    return is_masked
+
+
+def _read_table(path: Path, where: str) -> dict[str, Any]:
+    content = parsed_json(read_bytes(path, where), where)
+    if not isinstance(content, dict):
+        raise DataError(f"{where}: is no JSON object; copy the file again")
+    return content
+
+
+def _segment_ids(values: list[Any], where: str) -> Int64Array:
+    wrong = next((row for row, value in enumerate(values) if not _is_segment_id(value)), None)
+    if wrong is not None:
+        raise DataError(
+            f"{where}[{wrong}] is {ascii(values[wrong])[:40]}; expected a segment id, 0 to {MAX_SEGMENT_ID}"
+        )
+    return np.array(values, np.int64)
+
+
+def _is_segment_id(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= MAX_SEGMENT_ID
+
+
+BASES = ("", "scannetpp", "ScanNetPP", "ScanNet++", "scannetpp_v2", "scannetpp_v1", "scannetpp/v2", "scannetpp/v1")
+LABEL_SPACE = "scannetpp"
+BENCHMARK_FOLDER = "metadata/semantic_benchmark"
+CLASSES_NAME, INSTANCES_NAME, MAP_NAME = LIST_NAMES = ("top100.txt", "top100_instance.txt", "map_benchmark.csv")
+WORD, COUNT, TARGET = COLUMNS = ("class", "count", "semantic_map_to")
+NO_CLASS = "None"  # in the map: annotated, but not of the benchmark
+MOST_CLASSES = 10_000
+MOST_LETTERS = 200  # of the name of a class
+
+
+@dataclass(frozen=True)
+class BenchmarkClasses:
+    """``id_of``: of every word of annotators that the benchmark has, by way of the map, the class id;
+    ``with_instances``: the class ids of ``top100_instance.txt``."""
+
+    labels: LabelSet
+    id_of: Mapping[str, int]
+    with_instances: frozenset[int]
+
+
+def read_benchmark_classes(folder: Path, where: str) -> BenchmarkClasses:
+    """The lists in ``folder``; ``where`` begins each message.
+
+    A word goes where its row sends it, and nowhere where that is no class of the list, or where no row has the word.
+    """
+    names = _read_names(folder / CLASSES_NAME, f"{where}: {CLASSES_NAME}")
+    instances = _read_names(folder / INSTANCES_NAME, f"{where}: {INSTANCES_NAME}")
+    row_of = {name: row for row, name in enumerate(names, 1)}
+    if unknown := [name for name in instances if name not in row_of]:
+        raise DataError(f"{where}: {INSTANCES_NAME} has {unknown[0][:40]!a}, which {CLASSES_NAME} has not")
+    target_of = _read_map(folder / MAP_NAME, f"{where}: {MAP_NAME}")
+    return BenchmarkClasses(
+        LabelSet(LABEL_SPACE, tuple(row_of.values()), names),
+        {word: row_of[target] for word, target in target_of.items() if target in row_of},
+        frozenset(row_of[name] for name in instances),
+    )
+
+
+def _read_names(path: Path, where: str) -> tuple[str, ...]:
+    names = read_text(path, where).splitlines()
+    while names and not names[-1].strip():  # blank lines at the end are no classes, and shift none
+        names.pop()
+    for number, name in enumerate(names, 1):
+        if not name.strip() or not name.isprintable() or len(name) > MOST_LETTERS:
+            raise DataError(f"{where} line {number}: {name[:40]!a} is no name of a class; copy the file again")
+    if not 1 <= len(names) <= MOST_CLASSES:
+        raise DataError(f"{where}: has {len(names)} lines; expected one a class")
+    if len(set(names)) != len(names):
+        twice = next(name for row, name in enumerate(names) if name in names[:row])
+        raise DataError(f"{where}: has {twice[:40]!a} twice; copy the file again")
+    return tuple(names)
+
+
+def _read_map(path: Path, where: str) -> dict[str, str]:
+    """Word -> class of each row with a count; an empty cell sends a word to itself, ``None`` nowhere."""
+    text = read_text(path, where)
+    try:
+        rows = list(csv.reader(io.StringIO(text, newline=""), strict=True))
+    except csv.Error as error:
+        raise DataError(f"{where}: not a table of commas ({error}); copy the file again") from error
+    header = rows[0] if rows else []
+    if missing := [name for name in COLUMNS if name not in header]:
+        raise DataError(f"{where}: has no column '{missing[0]}'; expected the map of the release")
+    at = {name: header.index(name) for name in COLUMNS}
+    target_of: dict[str, str] = {}
+    for number, row in enumerate(rows[1:], 2):
+        if not row:
+            continue
+        if len(row) <= max(at.values()):
+            raise DataError(f"{where} row {number}: has {len(row)} cells of {len(header)}; copy the file again")
+        word, count, target = (row[at[name]] for name in COLUMNS)
+        # A row is kept for count >= 0, which no count is not.
+        if not count.strip() or not numbers([count.strip()], f"{where} row {number}: '{COUNT}'")[0] >= 0:
+            continue
+        if not target:
+            target_of.setdefault(word, word)
+        elif target != NO_CLASS:
+            target_of[word] = target
+    return target_of
+
 
 VARIANT = "scannetpp"
 TRUTH_NAMES = (MESH_NAME, MASK_NAME, SEGMENTS_NAME, OBJECTS_NAME)

@@ -9,7 +9,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.analysis.matched import Inputs, method_of, truth_of_scene
+from su3d_bench.analysis.attribution import Inputs, method_of, truth_of_scene
 from su3d_bench.analysis.sides import parse_side
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, printable, some
 from su3d_bench.metrics.fitness import why_not_scorable

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.analysis.attribution import run_remarks
-from su3d_bench.analysis.matched import Explained, Matched, explained_of, matched_instances
+from su3d_bench.analysis.attribution import Explained, Matched, explained_of, matched_instances, run_remarks
 from su3d_bench.core.errors import ConfigError, printable, suggest
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
 from su3d_bench.core.types import Float64Array, Int32Array, Int64Array

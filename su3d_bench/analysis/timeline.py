@@ -246,8 +246,9 @@ class SceneTimeline:
             prediction = self._reader.had(f"no map of {printable(method, 80)}", partial(read_prediction, file))
             if prediction is not None:
                 n = 0 if isinstance(prediction, DenseFeatures) else n_predictions(prediction)
-                is_known = isinstance(prediction, Instances)
-                first = [min(frames_of(prediction, k), default=0) if is_known else 0 for k in range(n)]
+                first = [0] * n
+                if isinstance(prediction, Instances):
+                    first = [min(frames_of(prediction, k), default=0) for k in range(n)]
                 maps[method] = self._owned(prediction, rules, truth), first
         return maps
 

@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 
 from su3d_bench.core.errors import ConfigError, DataError, StoreError, printable, suggest
 from su3d_bench.datasets.scannet.folders import PAPER_SCENES, SCAN_NAME, SPLITS, find_scans, split_scenes
-from su3d_bench.datasets.scannet.labels import TABLE_NAME
+from su3d_bench.datasets.scannet.truth import TABLE_NAME
 from su3d_bench.fetching.bringing import Arrived, Brought, Planned, bring_file, held_state, move, write_arrival
 from su3d_bench.fetching.download import Patience, Stated, Wanted, Watch, checked
 from su3d_bench.fetching.sources import Source, check_address

@@ -218,7 +218,7 @@ def read_replies(path: Path, questions: Questions) -> dict[tuple[str, str], Repl
 
 def _answers(path: Path, kind: type[Answer], n: int) -> list[Answer]:
     where = printable(str(path), 200)
-    rows = validated(list[kind], read_metadata(path), where)  # type: ignore[valid-type]
+    rows: list[Answer] = validated(list[kind], read_metadata(path), where)  # type: ignore[valid-type]
     if len(rows) != n:
         raise DataError(f"{where}: has {len(rows)} answers, the file asks {n}; answer every one, in its order")
     return rows

@@ -33,7 +33,7 @@ from su3d_bench.runs.finished import FinishedRun, encoder_of, read_run
 from su3d_bench.runs.job import SceneJob
 from su3d_bench.runs.plan import make_plan
 from su3d_bench.runs.scene import scores_again
-from su3d_bench.runs.verify import damaged_files, rules_of_run, why_not_counted
+from su3d_bench.runs.verify import wrong_files
 
 TOLERANCE = 1e-9  # of a value on another machine
 OF_THE_VERIFIER = {"profile": "embedded", "executor": "auto", "offline": True, "pictures": False, "accept_poses": True}
@@ -72,24 +72,10 @@ def verify_bundle(bundle: Path) -> Verified:
 
 
 def _faults_of(run: FinishedRun, found: Verified, folder: Path) -> Iterator[str]:
-    damaged = [f"{where}: {what}" for where, what in damaged_files(run) if not what.startswith("done.json")]
-    if damaged:
-        yield from damaged
-        return
-    for protocol in run.protocols:
-        try:
-            rules_of_run(run, protocol)
-        except Su3dError as error:
-            yield f"protocol {printable(protocol, 80)}: {error}"
-            return
-    for method in run.methods:
-        of_protocol = run.scores(method)
-        for (name, protocol), result in run.results.items():
-            if name == method and result.result is not None:
-                why = why_not_counted(run, method, protocol, of_protocol.get(protocol, {}))
-                if why is not None:
-                    yield f"{method} / {protocol}: {why}"
-    yield from _rescored(run, found, folder)
+    wrong = [f"{where}: {what}" for where, what in wrong_files(run) if not what.startswith("done.json")]
+    yield from wrong
+    if not wrong:
+        yield from _rescored(run, found, folder)
 
 
 def _rescored(run: FinishedRun, found: Verified, folder: Path) -> Iterator[str]:

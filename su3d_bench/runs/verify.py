@@ -126,3 +126,19 @@ def _unreadable(file: Path) -> str | None:
     except Su3dError as error:
         return f"holds no map: {error}"
     return None
+
+
+def wrong_files(run: FinishedRun) -> Iterator[tuple[str, str]]:
+    """Where and what: files that are not those of the run, numbers that do not follow from its counts."""
+    yield from damaged_files(run)
+    for method in dict.fromkeys(method for method, _ in run.results):
+        try:
+            scores = run.scores(method)
+        except Su3dError as error:
+            yield printable(method, 80), printable(str(error), 300)
+            continue
+        for (name, protocol), record in run.results.items():
+            if name == method and record.result is not None:
+                fault = why_not_counted(run, method, protocol, scores.get(protocol, {}))
+                if fault is not None:
+                    yield f"{printable(method, 80)} / {printable(protocol, 80)}", printable(fault, 300)

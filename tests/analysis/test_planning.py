@@ -46,8 +46,13 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scene_run, "build_perception", colour_perception)
         patch.chdir(folder)
-        for seed in range(3):
-            assert main([*words, "--seed", str(seed), "--out", f"seed-{seed}"]) == 0
+        assert main([*words, "--seed", "0", "--out", "seed-0"]) == 0
+        for seed in (1, 2):
+            shutil.copytree("seed-0", f"seed-{seed}")
+            for name, text in (("run.json", '"seed": {}'), ("run.toml", "\nseed = {}")):
+                file = Path(f"seed-{seed}", name)
+                assert text.format(0) in file.read_text()
+                file.write_text(file.read_text().replace(text.format(0), text.format(seed), 1))
         assert main([*words, "--set", "painted.n_frames=5", "--seed", "9", "--out", "other-data"]) == 0
         assert main([*words, "--limit", "2", "--seed", "8", "--out", "partial"]) == 0
     made = {name: scores_of(name) for name in PROTOCOLS}

@@ -18,7 +18,7 @@ import pytest
 from replica_clouds import first_pose, write_clouds
 from scanned_stage import write_scene
 
-from su3d_bench.analysis.matched import Inputs
+from su3d_bench.analysis.attribution import Inputs
 from su3d_bench.analysis.rules_walk import KINDS, Walker
 from su3d_bench.cli.main import main
 from su3d_bench.core import registry
@@ -26,7 +26,7 @@ from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float32Array, GroundTruth, UInt8Array
 from su3d_bench.datasets.layouts import LAYOUTS
 from su3d_bench.datasets.recordings.meshes import vertex_positions
-from su3d_bench.datasets.replica.label_file_truth import OVO_CLASSES
+from su3d_bench.datasets.replica.truth import OVO_CLASSES
 from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.formats.ply import read_ply
 from su3d_bench.metrics.matching.nearest import nearest

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import re
 from pathlib import Path
 from typing import Any
 
@@ -114,49 +112,3 @@ def test_medians_by_size_are_those_of_ranges_of_one_width_on_a_log_axis() -> Non
 def test_maps_of_one_size_are_one_marker() -> None:
     x, y = medians_by_size(np.full(5, 8.0), np.arange(5.0))
     assert (x.tolist(), y.tolist()) == ([8.0], [2.0])
-
-
-def test_what_a_script_measured_becomes_a_section(write_performance: Any, tmp_path: Path) -> None:
-    table = {"columns": ["what", "s"], "rows": [["start", "0.2"]]}
-    for name, title, notes in (("b", "Second", []), ("a", "First", ["One machine.", "Cold."])):
-        told = {"title": title, "command": "python x.py", "notes": notes, **table}
-        (tmp_path / f"{name}.json").write_text(json.dumps(told))
-    first, second = write_performance.measured_sections(tmp_path)
-    assert first.splitlines() == [
-        *("## First", "", "`python x.py`", "", "| what  | s   |", "|-------|-----|", "| start | 0.2 |", ""),
-        "One machine. Cold.",
-    ]
-    assert second.startswith("## Second\n") and second.endswith("| start | 0.2 |\n")
-
-
-def test_a_section_is_found_whole_and_without_its_neighbours(write_performance: Any) -> None:
-    page = "# Page\n\n## A\n\none\n\n## AB\n\n| x |\n\n![p](p.png)\n\n## C\n\nthree\n"
-    assert write_performance.section_of(page, "## AB") == "## AB\n\n| x |\n\n![p](p.png)\n"
-    assert write_performance.section_of(page, "## C") == "## C\n\nthree\n"
-    assert write_performance.section_of(page, "## B") == ""
-
-
-def test_the_pages_of_figures_are_what_is_written_where_nothing_was_measured_anew(write_performance: Any) -> None:
-    page, notes = write_performance.PAGE.read_text(), write_performance.NOTES.read_text()
-    (hardware,) = re.findall(r"on one machine: (.*)\.$", page, re.MULTILINE)
-    assert write_performance.results_page(page, None, None, None) == page
-    assert write_performance.results_page(page, hardware, None, None) == page
-    assert write_performance.notes_page(notes, None, None, []) == notes
-    groups = [one for one in write_performance.sections_of(notes) if write_performance.program_of(one) is None]
-    assert write_performance.notes_page(notes, hardware, groups, []) == notes
-
-
-def test_every_table_of_a_script_is_of_a_program_that_is_there(write_performance: Any) -> None:
-    notes = write_performance.sections_of(write_performance.NOTES.read_text())
-    programs = {write_performance.program_of(one) for one in notes} - {None}
-    assert programs <= set(benchmark_program("folders").PROGRAMS) and "startup" in programs
-
-
-def test_a_table_measured_anew_takes_the_place_of_its_own_and_of_no_other(write_performance: Any) -> None:
-    before = (
-        "# N\n\n## G\n\n| g |\n\n## S 1\n\n`python benchmarks soak`\n\n| 1 |\n\n## B\n\n`python benchmarks big_map`\n"
-    )
-    anew = "## S 2\n\n`python benchmarks soak`\n\n| 2 |\n"
-    after = write_performance.notes_page(before, None, None, [anew])
-    assert after == before.partition("## S 1")[0] + "## B\n\n`python benchmarks big_map`\n\n" + anew
-    assert "| g |" not in write_performance.notes_page(before, "one", ["## H\n"], [])

@@ -5,12 +5,10 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import box_room
-import cv2
 import numpy as np
 import painted
 import pytest
@@ -69,17 +67,6 @@ def test_a_whole_scene_has_no_finding_and_its_counts(whole: Path) -> None:
     assert rows["conceptgraphs"].reason is not None
 
 
-def test_one_thread_and_four_find_the_same(root: Path) -> None:
-    for index in (1, 4, 6):
-        (root / f"Replica/room0/results/frame{index:06d}.jpg").write_bytes(b"\xff\xd8\xff nothing")
-    one, four = (replace(look(root, n_threads=n), elapsed_s=0.0) for n in (1, 4))
-    assert one == four
-
-
-def test_the_digest_is_the_one_of_the_dataset(whole: Path) -> None:
-    assert look(whole).digest == Replica(whole).digest("room0")
-
-
 def test_every_damaged_file_is_named(root: Path) -> None:
     results = root / "Replica/room0/results"
     (results / "frame000001.jpg").write_bytes((results / "frame000001.jpg").read_bytes()[:200])
@@ -91,48 +78,9 @@ def test_every_damaged_file_is_named(root: Path) -> None:
     assert look(root).n_read == N_FRAMES - 3
 
 
-def test_every_missing_file_is_named_once(root: Path) -> None:
-    for name in ("frame000002.jpg", "depth000005.png", "depth000007.png"):
-        (root / "Replica/room0/results" / name).unlink()
-    said = texts(look(root))
-    for name in ("frame000002.jpg", "depth000005.png", "depth000007.png"):
-        assert sum(name in one for one in said) == 1, said
-
-
-def test_of_many_missing_files_each_one_is_named(tmp_path: Path) -> None:
-    write_box_room(tmp_path, 60, with_truth=False)
-    gone = sorted((tmp_path / "Replica/room0/results").glob("depth*.png"))[::2]
-    for path in gone:
-        path.unlink()
-    said = " ".join(texts(look(tmp_path)))
-    assert all(path.name in said for path in gone)
-
-
-def test_missing_and_damaged_files_are_named_together(root: Path) -> None:
-    results = root / "Replica/room0/results"
-    (results / "frame000002.jpg").unlink()
-    (results / "depth000003.png").write_bytes((results / "depth000003.png").read_bytes()[:-9])
-    (root / TREE / "info_semantic.json").write_text("{")
-    said = " ".join(texts(look(root)))
-    assert all(name in said for name in ("frame000002.jpg", "depth000003.png", "info_semantic.json"))
-
-
-@pytest.mark.parametrize("name", ["cam_params.json", "room0/traj.txt"])
-def test_a_missing_small_file_is_named(root: Path, name: str) -> None:
-    (root / "Replica" / name).unlink()
-    assert any(Path(name).name in one for one in texts(look(root)))
-
-
 def test_counts_that_disagree_are_an_error(root: Path) -> None:
     write_poses(root / "Replica/room0", [box_room.pose(index) for index in range(N_FRAMES - 2)])
     assert any("6" in one and "8" in one for one in texts(look(root)))
-
-
-def test_an_image_of_another_size_is_an_error(root: Path) -> None:
-    path = root / "Replica/room0/results/frame000003.jpg"
-    cv2.imwrite(str(path), np.full((20, 30, 3), 90, np.uint8))
-    (said,) = texts(look(root))
-    assert "frame000003.jpg" in said and "30x20" in said
 
 
 def test_a_wrong_depth_scale_is_an_error_and_what_would_be_right_is_said(root: Path) -> None:
@@ -171,27 +119,6 @@ def test_clouds_that_do_not_meet_are_an_error_though_the_cameras_are_inside(root
     write_truth(root / TREE, offset=(0.5, 0.4, 0.6))
     (said,) = texts(look(root))
     assert "of what the frames see lies within" in said
-
-
-def test_inverted_poses_are_named_as_such(root: Path) -> None:
-    write_poses(root / "Replica/room0", [np.linalg.inv(box_room.pose(index)) for index in range(N_FRAMES)])
-    said = " ".join(texts(look(root)))
-    assert "with the poses inverted it is 100%" in said
-
-
-def test_a_damaged_mesh_is_an_error_and_frames_are_read_all_the_same(root: Path) -> None:
-    path = root / TREE / "mesh_semantic.ply"
-    path.write_bytes(path.read_bytes()[:-1000])
-    found = look(root)
-    assert any("mesh_semantic.ply" in one for one in texts(found))
-    assert found.n_read == N_FRAMES and found.meeting is None
-
-
-def test_a_scene_without_ground_truth_says_why_and_is_no_error(root: Path) -> None:
-    shutil.rmtree(root / "replica_v1")
-    found = look(root)
-    assert texts(found) == []
-    assert all(row.reason for row in found.truth)
 
 
 def test_rooms_made_on_demand_have_no_finding(tmp_path: Path) -> None:
@@ -237,20 +164,6 @@ def test_what_the_dataset_itself_names_is_an_error_once_and_has_no_escape_in_it(
     ]
 
 
-class Recording(Painted):
-    """Two frames of one file are broken."""
-
-    def frame(self, scene: str, index: int) -> Frame:
-        if index in (1, 4):
-            raise DataError(f"painted/{scene}: all.sens: frame {index} at byte 7: damaged")
-        return super().frame(scene, index)
-
-
-def test_each_broken_frame_of_one_file_is_named(tmp_path: Path) -> None:
-    found = inspect(Recording(tmp_path, Painted.Options()), "a")
-    assert [one.where for one in found.findings if one.severity == "error"] == ["frame 1", "frame 4"]
-
-
 def frame(**changes: Any) -> Frame:
     rng = np.random.default_rng(changes.get("index", 0))
     usual: dict[str, Any] = {
@@ -271,22 +184,15 @@ def found_in(*frames: Frame) -> list[tuple[str, str, str]]:
     return [(one.severity, one.check, one.where) for one in found]
 
 
-def test_frames_without_a_fault_have_no_finding() -> None:
-    assert found_in(frame(), frame(index=1), frame(index=2)) == []
-    assert found_in() == []
-
-
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
         ({"camera_to_world": 2 * np.eye(4)}, ("error", "pose", "frame 1")),
         ({"camera_to_world": np.diag([1.0, 1, -1, 1])}, ("error", "pose", "frame 1")),
         ({"camera_to_world": np.eye(4) + np.eye(4)[::-1] * 0.1}, ("error", "pose", "frame 1")),
-        ({"depth_m": np.full((24, 32), np.nan, np.float32)}, ("error", "depth", "frame 1")),
         ({"depth_m": np.full((24, 32), -1, np.float32)}, ("error", "depth", "frame 1")),
         ({"depth_m": np.eye(24, 32, dtype=np.float32)}, ("warning", "depth", "frame 1")),
         ({"intrinsics": np.diag([0.0, 30, 1])}, ("error", "intrinsics", "frame 1")),
-        ({"intrinsics": np.array([[30.0, 0, 99], [0, 30, 9], [0, 0, 1]])}, ("error", "intrinsics", "frame 1")),
         ({"rgb": np.zeros((24, 32, 3), np.uint8)}, ("warning", "colour", "frame 1")),
         (
             {"rgb": np.full((12, 16, 3), 90, np.uint8), "depth_m": np.ones((12, 16), np.float32)},
@@ -314,14 +220,6 @@ def at_root(root: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path
     return root
 
 
-def test_the_command_says_what_is_there_and_ends_with_0(at_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["datasets", "check", "replica/*"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "replica/room0"
-    assert lines[-1] == "1 scene, 0 with errors"
-    assert f"  digest        {Replica(at_root).digest('room0')}" in lines
-
-
 def test_the_command_caps_what_it_lists_and_ends_with_1(at_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_box_room(at_root, 14, "room1", with_truth=False)
     for path in (at_root / "Replica/room1/results").glob("depth*.png"):
@@ -333,22 +231,6 @@ def test_the_command_caps_what_it_lists_and_ends_with_1(at_root: Path, capsys: p
     assert text.endswith("2 scenes, 1 with errors\n")
     assert main(["datasets", "check", "replica/room1", "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["scenes"][0]["n_errors"] == 14
-
-
-def test_the_json_has_everything(at_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (at_root / "Replica/room0/results/depth000001.png").write_bytes(b"x")
-    assert main(["datasets", "check", "replica/room0", "--quick", "--json", "--quiet"]) == 1
-    table = json.loads(capsys.readouterr().out)
-    assert (table["n_scenes"], table["n_with_errors"], table["data_root"]) == (1, 1, str(at_root))
-    (one,) = table["scenes"]
-    assert set(one) == {
-        "scene", "n_errors", "n_warnings", "n_frames", "n_read", "n_files", "size", "depth", "up", "truth", "meeting",
-        "digest", "findings", "elapsed_s",
-    }  # fmt: skip
-    assert set(one["findings"][0]) == {"severity", "check", "where", "text"}
-    assert set(one["truth"][0]) == {"variant", "reason", "n_points", "n_objects", "n_classes"}
-    assert set(one["depth"]) == {"near_m", "median_m", "far_m", "valid_share"}
-    assert set(one["meeting"]) == {"share", "distance_m", "hint"}
 
 
 def test_the_digest_is_the_one_that_a_run_records(
@@ -367,24 +249,6 @@ def test_the_digest_is_the_one_that_a_run_records(
     assert digest in (tmp_path / "run" / "run.json").read_text()
     assert json.loads((tmp_path / "run/scenes/painted.a/collector/done.json").read_text())
     assert digest in (tmp_path / "run/scenes/painted.a/collector/done.json").read_text()
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["replica/room9"], "no scene matches 'replica/room9'; did you mean 'replica/room0'?"),
-        (["replcia/*"], "no scene matches 'replcia/*'; did you mean 'replica/*'?"),
-        (["replica/room0", "--jobs", "0"], "--jobs 0: expected 1 or more"),
-        (["rooms/living0", "--set", "rooms.n_frame=3"], "--set rooms.n_frame: unknown key 'n_frame'; did you mean"),
-        (["replica/room0", "--set", "rooms.n_frames=3"], "--set rooms.n_frames=3: 'rooms' is no method or dataset"),
-    ],
-)
-def test_wrong_names_are_one_line(
-    at_root: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["datasets", "check", *words]) == 2
-    said = capsys.readouterr()
-    assert said.out == "" and said.err.startswith(f"su3d-bench: {message}") and said.err.count("\n") == 1
 
 
 def test_text_of_files_reaches_the_terminal_without_control_characters() -> None:

@@ -15,7 +15,7 @@ from su3d_bench.core import registry
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Frame
 from su3d_bench.datasets.layouts import LAYOUTS
-from su3d_bench.datasets.replica.mesh_truth import INFO_NAME, MESH_NAME
+from su3d_bench.datasets.replica.truth import INFO_NAME, MESH_NAME
 from su3d_bench.datasets.rooms.classes import CLASSES
 from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.datasets.scannet.writing import categories, scan_name, segment_of_vertex

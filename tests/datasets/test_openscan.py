@@ -2,27 +2,19 @@
 
 from __future__ import annotations
 
-import doctest
 import json
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from damage import damages, outcomes, truncations
 from scannet_scan import SCAN, write_floor_truth
 from scannet_scans import dataset, write_scan
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
-from su3d_bench.core.system.files import file_text
-from su3d_bench.core.toml import parse_toml
-from su3d_bench.datasets import openscan
 from su3d_bench.datasets.openscan import KEYS, RAW_NAME, attribute_id, attribute_ids, label_set, read_attributes
-from su3d_bench.datasets.rooms import attributes as of_rooms
-from su3d_bench.datasets.rooms.attributes import attribute_of_object
-from su3d_bench.datasets.rooms.classes import CLASS_BY_NAME, MATERIALS
 from su3d_bench.datasets.rooms.dataset import Rooms
+from su3d_bench.datasets.rooms.truth import attribute_of_object
 from su3d_bench.datasets.scannet.dataset import ScanNet
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.protocols.loading import load_protocol
@@ -130,30 +122,6 @@ def test_what_is_wrong_with_the_file_is_one_line(records: Any, line: str, tmp_pa
     assert line in str(error.value) and "\n" not in str(error.value)
 
 
-def test_damaged_files_are_read_or_refused_in_one_line(tmp_path: Path) -> None:
-    path = tmp_path / RAW_NAME
-    content = json.dumps([RECORD, RECORD | {"object_id": 1}]).encode()
-
-    def read(damaged: bytes) -> object:
-        path.write_bytes(damaged)
-        known = read_attributes(path)
-        return [attribute_ids(words, variant, RAW_NAME) for words in known.values() for variant in KEYS]
-
-    n_read, n_refused = outcomes(read, chain(truncations(content), damages(content, 600)), must_name=RAW_NAME)
-    assert n_read > 20 and n_refused > 400
-
-
-def test_the_table_of_the_rooms_names_their_classes_and_attributes_each_once() -> None:
-    table = parse_toml(file_text(Path(of_rooms.__file__).with_name("attributes.toml")))
-    assert {f"openscan-{aspect}" for aspect in table} == set(KEYS)
-    for aspect, words in table.items():
-        names = [name for of_word in words.values() for name in of_word]
-        assert len(names) == len(set(names)) and len(names) >= 8, aspect
-        assert set(names) <= (set(MATERIALS) if aspect == "material" else set(CLASS_BY_NAME)), aspect
-        ids = [attribute_id(f"openscan-{aspect}", word) for word in words]
-        assert None not in ids and len(set(ids)) == len(ids), aspect
-
-
 def test_objects_of_a_room_have_the_attributes_of_their_class_and_of_what_they_are_made(tmp_path: Path) -> None:
     objects = Rooms(tmp_path).objects("office0")
     for one, affordance, material in zip(
@@ -168,7 +136,3 @@ def test_objects_of_a_room_have_the_attributes_of_their_class_and_of_what_they_a
             sentence = label_set("openscan-material").name_of(material)
             assert sentence.endswith({"wooden": "wood", "metal": "metal"}[one.material])
     assert {one.class_name for one in objects} >= {"chair"} and {one.material for one in objects} >= {"wooden"}
-
-
-def test_the_examples_hold() -> None:
-    assert not doctest.testmod(openscan).failed

@@ -179,8 +179,9 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     layout = LAYOUTS[name]
-    target = plan_scenes(layout, Stage(), [ROOM], tmp_path)[0]
+    stage: Any = Stage()
+    target = plan_scenes(layout, stage, [ROOM], tmp_path)[0]
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(StoreError, match="disk is full"):
-        write_frames(layout, Stage(), target, range(N_FRAMES))
+        write_frames(layout, stage, target, range(N_FRAMES))
     assert not [path for path in files_below(tmp_path) if path.endswith(".unfinished")]

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from replica_scene import QUADS, TWO_OBJECTS, write_original, write_render
 from rgbd_scene import write_scene
-from scannet_scan import SCAN, grid, write_mesh, write_recording
+from scannet_scan import SCAN, grid, write_recording
 from scannet_scan import write_truth as write_scan_truth
 
 from su3d_bench.core.errors import DataError
@@ -17,9 +16,7 @@ from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.datasets.rgbd.dataset import Rgbd
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 from su3d_bench.datasets.scannet.dataset import ScanNet, ScannetOptions
-from su3d_bench.datasets.tum.dataset import Tum
 from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
-from su3d_bench.runs.frame_loop import surface_of
 
 
 @pytest.fixture(scope="module")
@@ -99,24 +96,6 @@ def test_a_scan_without_annotation_has_a_surface_and_without_segments_too(tmp_pa
         dataset.surface(SCAN)
 
 
-def test_another_mesh_or_other_segments_make_another_digest(tmp_path: Path) -> None:
-    folder = write_scan(tmp_path, [7] * 24)
-    digests = {scannet(tmp_path).digest(SCAN)}
-    points, triangles = grid()
-    write_mesh(folder / f"{SCAN}_vh_clean_2.ply", points + np.float32(1), triangles)
-    digests.add(scannet(tmp_path).digest(SCAN))
-    name = folder / f"{SCAN}_vh_clean_2.0.010000.segs.json"
-    name.write_text(json.dumps(json.loads(name.read_text()) | {"segIndices": [8] * 24}))
-    digests.add(scannet(tmp_path).digest(SCAN))
-    assert len(digests) == 3
-
-
-def test_segments_of_another_mesh_are_refused(tmp_path: Path) -> None:
-    write_scan(tmp_path, [7] * 23)
-    with pytest.raises(DataError, match=r"has 23 vertices, .* has 24; they belong to two meshes"):
-        scannet(tmp_path).surface(SCAN)
-
-
 def test_axis_alignment_moves_the_surface_with_the_frames(tmp_path: Path) -> None:
     folder = write_scan(tmp_path, [7] * 24)
     turn = "0 -1 0 2 1 0 0 3 0 0 1 0 0 0 0 1"
@@ -138,14 +117,3 @@ def test_a_described_folder_may_name_a_mesh(tmp_path: Path) -> None:
     before = dataset.digest(folder.name)
     write_quads(data / "mesh.ply", 12)
     assert Rgbd(tmp_path / "with").digest(folder.name) != before
-
-
-def test_a_mesh_outside_the_described_folder_is_refused(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path, mesh="../mesh.ply")
-    with pytest.raises(DataError, match="leads out of the folder"):
-        Rgbd(tmp_path).surface(folder.name)
-
-
-def test_a_dataset_without_meshes_says_so(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="tum/desk: the dataset has no mesh; this method works on one"):
-        surface_of(Tum(tmp_path), "desk")

@@ -14,9 +14,8 @@ from test_openlex3d_original import write_visible
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.openlex3d.labels import OpenLexFiles, read_categories, read_prompts, read_queries
-from su3d_bench.datasets.openlex3d.points import LabelledPoints, face_corners_of
-from su3d_bench.datasets.openlex3d.release import categories_truth, queries_truth
-from su3d_bench.datasets.replica.mesh_truth import AnnotatedMesh
+from su3d_bench.datasets.openlex3d.release import LabelledPoints, categories_truth, face_corners_of, queries_truth
+from su3d_bench.datasets.replica.truth import AnnotatedMesh
 from su3d_bench.formats.ply import ListColumn
 from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
 from su3d_bench.metrics.protocols.loading import load_protocol

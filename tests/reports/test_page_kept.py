@@ -15,8 +15,7 @@ from painted import WordEncoder
 from painted_runs import painted_run
 from places import SCENES
 
-from su3d_bench.analysis.attribution import attribution_of
-from su3d_bench.analysis.matched import Explained, explained_of
+from su3d_bench.analysis.attribution import Explained, attribution_of, explained_of
 from su3d_bench.analysis.page import contents
 from su3d_bench.analysis.page.kept import FOLDER, packed, unpacked
 from su3d_bench.analysis.page.maps import PageScene, page_scene

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
+from tiny_models import needs_models, write_fetched
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import Su3dError
@@ -21,6 +23,30 @@ def out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name in ("SU3D_DATA", "SU3D_MODELS", "SU3D_CACHE", "HF_HUB_CACHE"):
         monkeypatch.setenv(name, str(tmp_path / "none"))
     return tmp_path / "out"
+
+
+def test_the_embedded_profile_is_rehearsed_and_the_first_line_says_so(
+    out: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*WORDS, "--out", str(out)]) == 0
+    said = capsys.readouterr()
+    assert said.err.startswith("rehearsal: the profile 'embedded' in place of 'paper'")
+    assert "everything that is required is here" in said.out
+    assert main([*WORDS, "--out", str(out), "--profile", "paper"]) == 1
+    assert "models fetch" in capsys.readouterr().out, "its models are not here"
+
+
+@needs_models
+def test_the_profile_paper_runs_end_to_end_on_tiny_networks(
+    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SU3D_MODELS", str(write_fetched(tmp_path / "models")))
+    words = [word for word in WORDS if word != "--dry-run"]
+    assert main([*words, "--out", str(out), "--profile", "paper", "--jobs", "1", "--quiet"]) == 0
+    cells = json.loads((out / "compared.json").read_text())["cells"]
+    assert cells and all(cell["measured"] is not None for cell in cells)
+    runs = [json.loads(path.read_text()) for path in out.glob("runs/*/run.json")]
+    assert {one["encoder"] for one in runs} >= {"ViT-L-14-336/openai"}
 
 
 @pytest.mark.parametrize("device", ["gpu", "cuda:99"])

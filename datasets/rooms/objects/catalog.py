@@ -7,12 +7,12 @@ from collections.abc import Mapping
 import numpy as np
 
 from su3d_bench.datasets.rooms.classes import CLASSES
-from su3d_bench.datasets.rooms.objects import decor, devices, dishes, fixtures, furniture, household, textiles
+from su3d_bench.datasets.rooms.objects import decor, fixtures, furniture, household
 from su3d_bench.datasets.rooms.objects.items import Builder, Item, begin
 
 _BUILDER_OF_MODEL: Mapping[str, Builder] = {
     name: builder
-    for module in (furniture, fixtures, devices, decor, household, textiles, dishes)
+    for module in (furniture, fixtures, decor, household)
     for name, builder in vars(module).items()
     if getattr(builder, "__module__", None) == module.__name__ and not name.startswith("_")
 }

@@ -1,4 +1,4 @@
-"""Builders of what lies and stands about: books, boxes, baskets, bins, balls."""
+"""Builders of what lies and stands about: books, boxes, baskets, bins, balls; dishes and bottles."""
 
 from __future__ import annotations
 
@@ -11,13 +11,17 @@ from su3d_bench.datasets.rooms.objects.materials import (
     Material,
     Rgb,
     Texture,
+    ceramic,
+    chrome,
     linear,
+    metal,
     mix,
     paper,
     plastic,
     shade,
     tone,
     wicker,
+    wood,
 )
 from su3d_bench.datasets.rooms.objects.shapes import block, both, cylinder, ellipsoid, lathe, soft_block, tube
 
@@ -157,3 +161,140 @@ def exercise_ball(build: Assembly) -> None:
     build.add(
         plastic(tone("white")), cylinder(0.02, 0.012).turned("x", 60).moved(0, -r * 0.866 + 0.004, r * 0.5 - 0.002)
     )
+
+
+def pan(build: Assembly) -> None:
+    """A shallow, dark frying pan with one long handle."""
+    r = build.size(0.115, 0.145)
+    body = metal(build.rgb, build.rng)
+    build.add(body, lathe([(0, 0), (r * 0.82, 0), (r, 0.05), (r - 0.006, 0.052), (r * 0.8, 0.008), (0, 0.008)], 26))
+    build.add(metal(linear((44, 44, 47)), build.rng), cylinder(r * 0.78, 0.002, z=0.0082))
+    grip = plastic(tone("black"))
+    build.add(grip, tube([(0, -r + 0.002, 0.042), (0, -r - 0.08, 0.058), (0, -r - 0.2, 0.066)], 0.014, 8))
+
+
+def pot(build: Assembly) -> None:
+    """A cooking pot with a lid, its knob and two side handles."""
+    r, h = build.size(0.1, 0.125), build.size(0.12, 0.16)
+    body = metal(build.rgb, build.rng) if build.colour == "grey" else ceramic(build.rgb)
+    build.add(body, lathe([(0, 0), (r * 0.96, 0), (r, 0.012), (r, h), (0, h)], 26))
+    lid = chrome(build.rng) if build.colour == "grey" else ceramic(shade(build.rgb, 0.9))
+    build.add(
+        lid, lathe([(0, 0), (r + 0.006, 0), (r + 0.006, 0.008), (r * 0.6, 0.028), (0, 0.036)], 26).moved(z=h + 0.0005)
+    )
+    black = plastic(tone("black"))
+    build.add(
+        black,
+        lathe([(0, 0), (0.012, 0), (0.012, 0.012), (0.022, 0.024), (0.018, 0.034), (0, 0.036)], 14).moved(z=h + 0.035),
+    )
+    for sx in (-1, 1):
+        grip = [
+            (sx * (r - 0.003), -0.045, h * 0.78),
+            (sx * (r + 0.035), -0.035, h * 0.8),
+            (sx * (r + 0.035), 0.035, h * 0.8),
+            (sx * (r - 0.003), 0.045, h * 0.78),
+        ]
+        build.add(black, tube(grip, 0.009, 7))
+
+
+def plate(build: Assembly) -> None:
+    r = build.size(0.115, 0.14)
+    body = ceramic(build.rgb)
+    build.add(
+        body, lathe([(0, 0), (r * 0.55, 0), (r * 0.7, 0.006), (r, 0.02), (r, 0.024), (r * 0.68, 0.011), (0, 0.009)], 28)
+    )
+    ring = ceramic(mix(build.rgb, tone("blue") if build.colour == "white" else tone("white"), 0.75))
+    build.add(ring, lathe([(r * 0.84, 0.0178), (r * 0.84, 0.0185), (r * 0.93, 0.0222), (r * 0.93, 0.0215)], 28))
+
+
+def bowl(build: Assembly) -> None:
+    r = build.size(0.085, 0.125)
+    h = r * build.rng.uniform(0.62, 0.75)
+    outer = [(0, 0), (r * 0.45, 0), (r * 0.45, 0.01), (r * 0.78, h * 0.4), (r, h)]
+    build.add(
+        ceramic(build.rgb), lathe([*outer, (r - 0.008, h), (r * 0.74, h * 0.45), (r * 0.4, 0.022), (0, 0.018)], 26)
+    )
+    if build.chance(0.4):
+        for i in range(4):
+            fruit = build.other("orange", "red", "yellow", "green")
+            size = r * 0.36
+            build.add(
+                replace(plastic(fruit), gloss=0.2),
+                ellipsoid(size, size, size).moved(r * 0.4, 0, h * 0.78).turned("z", 90 * i),
+            )
+
+
+def cup(build: Assembly) -> None:
+    r, h = build.size(0.042, 0.05), build.size(0.095, 0.115)
+    r, h = max(r, 0.04), max(h, 0.09)
+    body = ceramic(build.rgb)
+    if build.chance(0.35):
+        body = replace(body, texture=Texture.STRIPES, b=mix(build.rgb, (0.9, 0.9, 0.9), 0.75), scale=0.04, axis=1)
+    build.add(body, lathe([(0, 0), (r * 0.9, 0), (r, h), (r - 0.005, h), (r * 0.88 - 0.004, 0.008), (0, 0.008)], 18))
+    build.add(ceramic(linear((74, 44, 24))), cylinder(r * 0.88, 0.002, z=h * 0.78))
+    angle = np.linspace(-np.pi / 2, np.pi / 2, 8)
+    ring = [(r * 0.93 + 0.03 * float(np.cos(a)), 0, h * 0.52 + 0.03 * float(np.sin(a))) for a in angle]
+    build.add(ceramic(build.rgb), tube(ring, 0.007, 7))
+
+
+def bottle(build: Assembly) -> None:
+    r, h = build.size(0.036, 0.046), build.size(0.25, 0.31)
+    outline = [
+        (0, 0),
+        (r, 0),
+        (r, h * 0.58),
+        (r * 0.75, h * 0.68),
+        (r * 0.36, h * 0.78),
+        (r * 0.36, h * 0.95),
+        (0, h * 0.95),
+    ]
+    build.add(build.main(), lathe(outline, 20))
+    label = Material(Texture.LABEL, tone("white"), build.other("red", "blue", "green", "yellow"), h * 0.3, 0.05, seed=5)
+    build.add(label, lathe([(r, h * 0.16), (r + 0.0015, h * 0.16), (r + 0.0015, h * 0.46), (r, h * 0.46)], 20))
+    cap = build.other("red", "white", "black", "yellow")
+    build.add(plastic(cap), cylinder(r * 0.42, h * 0.07, z=h * 0.94))
+
+
+def chopping_board(build: Assembly) -> None:
+    width, depth = build.size(0.34, 0.42), build.size(0.22, 0.27)
+    build.add(wood(build.rgb, build.rng), soft_block(width, depth, 0.022, 0, 0, 0, 0.009))
+    build.add(wood(build.rgb, build.rng), soft_block(0.1, 0.075, 0.02, width / 2 + 0.04, 0, 0.001, 0.009))
+    for i in range(3):
+        slice_ = cylinder(0.026, 0.008).moved(-width * 0.2 + i * 0.06, -depth * 0.1, 0.0225)
+        build.add(plastic(build.other("red", "green", "orange")), slice_)
+
+
+def knife_block(build: Assembly) -> None:
+    tall = build.size(0.2, 0.24)
+    build.add(wood(build.rgb, build.rng, 2), block(0.1, 0.13, tall).turned("x", -14))
+    black, steel = plastic(tone("black")), chrome(build.rng)
+    for i in range(5):
+        x, y = (i % 3 - 1) * 0.031, -0.03 + (i // 3) * 0.055
+        build.add(steel, block(0.016, 0.024, 0.02, x, y, tall + 0.0005).turned("x", -14))
+        build.add(black, soft_block(0.018, 0.026, 0.085, x, y, tall + 0.021, 0.007).turned("x", -14))
+
+
+def paper_towel(build: Assembly) -> None:
+    """A kitchen roll on an upright holder."""
+    r, h = build.size(0.058, 0.066), build.rng.uniform(0.21, 0.24)
+    holder = chrome(build.rng) if build.chance(0.5) else wood(tone("brown"), build.rng)
+    build.add(holder, lathe([(0, 0), (0.082, 0), (0.082, 0.014), (0, 0.014)], 22), cylinder(0.011, h + 0.06, z=0.014))
+    build.add(holder, ellipsoid(0.02, 0.02, 0.02).moved(z=h + 0.085))
+    roll = Material(Texture.DOTS, tone("white"), shade(tone("white"), 0.8), 0.024)
+    build.add(roll, lathe([(0.022, 0), (r, 0), (r, h), (0.022, h), (0.022, 0)], 24).moved(z=0.016))
+    build.add(roll, block(0.003, 0.075, h, -r + 0.001, -0.038, 0.016))
+
+
+def tissue_box(build: Assembly) -> None:
+    """A printed carton with a tissue that sticks out of its slit."""
+    width, depth, tall = build.size(0.22, 0.25), build.size(0.12, 0.14), build.size(0.085, 0.11)
+    second = mix(build.rgb, (0.9, 0.9, 0.9), 0.7)
+    print_ = Material(Texture.DOTS, build.rgb, second, 0.035, 0.05)
+    build.add(print_, block(width, depth, tall))
+    build.add(paper(shade(second, 0.5)), block(width * 0.6, depth * 0.4, 0.0015, 0, 0, tall + 0.001))
+    white = paper(tone("white"))
+    for turn, lean in ((0, 12), (70, -14), (130, 8)):
+        build.add(
+            white,
+            block(0.085, 0.004, 0.075).tapered(0.45).turned("x", lean).turned("z", turn).moved(0, 0, tall + 0.003),
+        )

@@ -18,13 +18,13 @@ from su3d_bench.analysis.gate.reference import (
     differing_keys,
     settings_of,
     why_no_cost,
-    wrong_files,
 )
 from su3d_bench.core.english import plural
 from su3d_bench.core.errors import printable
 from su3d_bench.metrics.protocols.kinds import GroundingRules, PanopticRules, PresenceQuestionRules
 from su3d_bench.reports.gate import SCENES, Compared, Finding, Verdict
 from su3d_bench.runs.finished import FinishedRun
+from su3d_bench.runs.verify import wrong_files
 from su3d_bench.store.records import NumbersRecord
 
 _SHARES = ("recall", "precision", "IoU", "F1", "F1-conceptgraphs", "mPrecision", "mF1", "mF1-conceptgraphs", "pAcc")
@@ -53,7 +53,6 @@ def check(run: FinishedRun, reference: Reference) -> Verdict:
     findings = [*_identity(run, reference)]
     findings += [Finding("changed", where, fault) for where, fault in wrong_files(run)]
     table = run.results
-    others = frozenset(reference.data_digests) ^ frozenset(run.scenes)
     across = None if is_same_machine else reference.across_machines
     numbers: list[Compared] = []
     for expected in reference.results:
@@ -67,7 +66,7 @@ def check(run: FinishedRun, reference: Reference) -> Verdict:
         if measured.encoder_digest != expected.encoder_digest:
             findings.append(_changed(where, "encoder digest", expected.encoder_digest, measured.encoder_digest))
         findings += _unknown(where, "value", expected.metrics, measured.headline)
-        findings += compared(where, expected, measured.result, across, others)
+        findings += compared(where, expected, measured.result, across)
         numbers += [
             Compared(where, name, value.value, measured.result.metrics.get(name), tolerance=_tolerance(value, across))
             for name, value in expected.metrics.items()
@@ -106,15 +105,13 @@ def _costs_not_learnt(run: FinishedRun, reference: Reference) -> Iterator[Findin
             yield Finding("missing", f"{printable(method, 80)} / cost", text)
 
 
-def _unknown(
-    where: str, kind: str, known: Collection[str], measured: Collection[str], explained: Collection[str] = ()
-) -> Iterator[Finding]:
+def _unknown(where: str, kind: str, known: Collection[str], measured: Collection[str]) -> Iterator[Finding]:
     """A finding for whatever the run has and the reference has not."""
     for name in measured:
         if name not in known:
             text = f"the reference does not have this {kind}; learn a new one"
             here = f"{where} / {kind} {printable(name, 80)}"
-            yield Finding("changed", here, text, group=_several(where, kind), is_explained=name in explained)
+            yield Finding("changed", here, text, group=_several(where, kind))
 
 
 def _several(where: str, kind: str) -> str:
@@ -166,41 +163,37 @@ def _short(value: object) -> str:
     return f"{text[:12]}..." if len(text) > 40 and " " not in text else text
 
 
-def compared(
-    where: str,
-    expected: MethodResult,
-    measured: NumbersRecord,
-    across: float | None,
-    others: Collection[str] = (),
-) -> Iterator[Finding]:
+def compared(where: str, expected: MethodResult, measured: NumbersRecord, across: float | None) -> Iterator[Finding]:
     """Every number that differs, or that one of the two lacks.
 
-    ``across``: the tolerance of headline values of another machine; None on the same one. ``others``: scenes that the
-    run alone has, or the reference alone; what follows from them is marked as explained, for they are named themselves.
+    ``across``: the tolerance of headline values of another machine; None on the same one. Where the scenes differ,
+    which fails, what is formed over all of them is not compared.
     """
-    are_others = expected.scenes.keys() != measured.per_scene.keys()
+    if expected.scenes.keys() == measured.per_scene.keys():
+        yield from _compare(where, expected.metrics, measured.metrics, across)
+        yield from _rows(where, "class", expected.classes, measured.per_class, across)
+        if across is None:
+            yield from _unknown(where, "class", expected.classes, measured.per_class)
+    yield from _unknown(where, "scene", expected.scenes, measured.per_scene)
+    yield from _rows(where, "scene", expected.scenes, measured.per_scene, across)
 
-    def over_scenes(findings: Iterable[Finding]) -> Iterator[Finding]:
-        return (replace(finding, is_explained=are_others) for finding in findings)
 
-    yield from over_scenes(_compare(where, expected.metrics, measured.metrics, across))
-    yield from _unknown(where, "scene", expected.scenes, measured.per_scene, others)
-    if across is None:
-        yield from over_scenes(_unknown(where, "class", expected.classes, measured.per_class))
-    for kind, tables, rows in (
-        ("scene", expected.scenes, measured.per_scene),
-        ("class", expected.classes, measured.per_class),
-    ):
-        group = _several(where, kind)
-        for name, values in tables.items():
-            row, here = rows.get(name), f"{where} / {kind} {printable(name, 80)}"
-            is_explained = name in others if kind == "scene" else are_others
-            found: Iterable[Finding] = ()
-            if row is None:
-                found = [Finding("missing", here, f"the run does not have this {kind}")]
-            elif across is None:
-                found = _compare(here, values, row, None)
-            yield from (replace(finding, group=group, is_explained=is_explained) for finding in found)
+def _rows(
+    where: str,
+    kind: str,
+    tables: Mapping[str, Values],
+    rows: Mapping[str, Mapping[str, float | None]],
+    across: float | None,
+) -> Iterator[Finding]:
+    """What differs in the values of each scene or class; on another machine whether they are there."""
+    for name, values in tables.items():
+        row, here = rows.get(name), f"{where} / {kind} {printable(name, 80)}"
+        found: Iterable[Finding] = ()
+        if row is None:
+            found = [Finding("missing", here, f"the run does not have this {kind}")]
+        elif across is None:
+            found = _compare(here, values, row, None)
+        yield from (replace(finding, group=_several(where, kind)) for finding in found)
 
 
 def _tolerance(value: Value, across: float | None) -> float:

@@ -15,12 +15,12 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from su3d_bench.core.config import MOVES_NO_NUMBER
-from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, counted, printable
+from su3d_bench.core.errors import ConfigError, StoreError, counted, printable
 from su3d_bench.core.files.atomic import read_json
 from su3d_bench.metrics.costs import MAP, WARM_UP, UpdateTimes
 from su3d_bench.reports.gate import Compared, Finding
 from su3d_bench.runs.finished import FinishedRun, read_update_times
-from su3d_bench.runs.verify import damaged_files, why_not_counted
+from su3d_bench.runs.verify import wrong_files
 from su3d_bench.store.records import ROUNDING, ResultRecord, impossible_value
 
 # Where the calibrating work itself takes so many times the reference's on the same kind of processor, others used it,
@@ -308,22 +308,6 @@ def learn(
         results=tuple(_learn_result([table[key] for table in tables]) for key in tables[0]),
         **_learn_costs(runs),
     )
-
-
-def wrong_files(run: FinishedRun) -> Iterator[tuple[str, str]]:
-    """Where and what: files that are not those of the run, numbers that do not follow from its counts."""
-    yield from damaged_files(run)
-    for method in dict.fromkeys(method for method, _ in run.results):
-        try:
-            scores = run.scores(method)
-        except Su3dError as error:
-            yield printable(method, 80), printable(str(error), 300)
-            continue
-        for (name, protocol), record in run.results.items():
-            if name == method and record.result is not None:
-                fault = why_not_counted(run, method, protocol, scores.get(protocol, {}))
-                if fault is not None:
-                    yield f"{printable(method, 80)} / {printable(protocol, 80)}", printable(fault, 300)
 
 
 def _learn_costs(runs: Sequence[FinishedRun]) -> dict[str, Any]:

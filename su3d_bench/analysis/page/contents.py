@@ -9,7 +9,7 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.analysis.matched import Explained, explained_of
+from su3d_bench.analysis.attribution import Explained, explained_of
 from su3d_bench.analysis.page.gallery import GalleryOfScene, SceneGallery, photos_of_each
 from su3d_bench.analysis.page.kept import (
     Job,

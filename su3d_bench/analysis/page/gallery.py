@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.analysis.matched import Explained
+from su3d_bench.analysis.attribution import Explained
 from su3d_bench.analysis.page.scene import SKETCH_WIDTH, SceneData, fed_frames
 from su3d_bench.core.errors import Su3dError, printable
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, UInt8Array

@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 from pydantic import TypeAdapter
 
-from su3d_bench.analysis.attribution import attribution_of
-from su3d_bench.analysis.matched import Explained, MendedJob
+from su3d_bench.analysis.attribution import Explained, MendedJob, attribution_of
 from su3d_bench.analysis.page.gallery import SceneGallery
 from su3d_bench.analysis.page.maps import PageScene
 from su3d_bench.core.digests import (

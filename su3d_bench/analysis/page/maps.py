@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.analysis.matched import Inputs
+from su3d_bench.analysis.attribution import Inputs
 from su3d_bench.analysis.page.scene import (
     MOST_LOOKED_AT,
     SKETCH_WIDTH,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,10 @@ SCHEMA = 1
 KIND = "su3d-bench dev registry"  # by which an earlier site is known
 MOST_OF_AN_ADDRESS = 500
 TITLE = "Registry of results"
+OF_A_ROW = (  # what a page says of a row as it is
+    "method", "values", "intervals", "ranks", "is_ceiling", "update_s", "map_s", "n_updates", "hardware", "profile",
+    "encoder", "trained_on", "command", "changed", "caveat", "warnings", "code", "commit", "run",
+)  # fmt: skip
 
 
 def write_site(registry: Registry, out: Path, title: str = TITLE, bundles_at: str | None = None) -> list[Path]:
@@ -112,13 +117,9 @@ def _board(board: Sequence[Row], address: str | None) -> dict[str, Any]:
     first = board[0]
     known = load_protocol(first.protocol) if first.protocol in protocol_names() else None
     return {
-        "protocol": first.protocol,
-        "version": first.version,
-        "digest": first.digest,
+        **{name: getattr(first, name) for name in ("protocol", "version", "digest", "scenes", "headline")},
         "summary": "somebody's own" if known is None else known.summary,
-        "scenes": list(first.scenes),
         "datasets": sorted({scene.partition("/")[0] for scene in first.scenes}),
-        "headline": list(first.headline),
         "notes": list(_notes(board)),
         "rows": [_row(row, address) for row in board],
     }
@@ -149,32 +150,12 @@ def _notes(board: Sequence[Row]) -> Iterator[str]:
 def _row(row: Row, address: str | None) -> dict[str, Any]:
     file = f"{row.bundle.name}{SUFFIX}"
     return {
-        "method": row.method,
+        **{name: getattr(row, name) for name in OF_A_ROW},
         "page": _page(METHODS, row.method),
-        "values": list(row.values),
-        "intervals": [None if one is None else list(one) for one in row.intervals],
-        "ranks": None if row.ranks is None else list(row.ranks),
-        "is_ceiling": row.is_ceiling,
-        "of_scenes": {scene: list(values) for scene, values in row.values_of_scenes},
-        "update_s": row.update_s,
-        "map_s": row.map_s,
-        "n_updates": row.n_updates,
-        "hardware": row.hardware,
-        "profile": row.profile,
-        "encoder": row.encoder,
-        "trained_on": row.trained_on,
-        "weights": [
-            {"model": one.model, "trained_on": one.trained_on, "files": dict(one.files)} for one in row.weights
-        ],
-        "command": row.command,
-        "changed": list(row.changed),
-        "caveat": row.caveat,
-        "warnings": list(row.warnings),
-        "code": row.code,
-        "commit": row.commit,
-        "run": row.run,
+        "of_scenes": dict(row.values_of_scenes),
+        "weights": [{**asdict(one), "files": dict(one.files)} for one in row.weights],
         "bundle": {
-            **{key: getattr(row.bundle, key) for key in ("sha256", "n_bytes", "program", "recipe")},
+            **{key: value for key, value in asdict(row.bundle).items() if key != "name"},
             "file": file,
             "address": None if address is None else address + file,
         },

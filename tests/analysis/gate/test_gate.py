@@ -200,7 +200,7 @@ def test_a_request_that_is_neither_check_nor_learn_is_one_line(
     assert capsys.readouterr().err.startswith("su3d-bench: check: ")
 
 
-def test_scenes_that_are_missing_come_first_and_what_follows_from_them_is_counted(
+def test_scenes_that_are_missing_come_first_and_what_follows_from_them_is_not_compared(
     gated_copy: Path, gate_reference: Reference
 ) -> None:
     (gone,) = list(gate_reference.data_digests)[:1]
@@ -218,15 +218,9 @@ def test_scenes_that_are_missing_come_first_and_what_follows_from_them_is_counte
                 row.update({name: 0.25 for name, value in row.items() if isinstance(value, float)})
 
     edit(gated_copy / "metrics.json", without)
-    verdict = check(read_run(gated_copy), gate_reference)
-    lines = plain_lines(verdict)
-    n_explained = sum(one.is_explained for one in verdict.findings)
-    assert f"{n_explained} of them because of other scenes" in lines[0] and n_explained > 20
+    lines = plain_lines(check(read_run(gated_copy), gate_reference))
     assert lines[1] == f"FAIL {gone}: the run does not have this scene"
-    assert lines[-1] == (
-        f"FAIL over other scenes: {n_explained} differences follow from scenes that the run or the reference alone has"
-    )
-    assert len(lines) < 12
+    assert len(lines) < 12 and not any(" / mAcc:" in line for line in lines), "what is formed over other scenes"
 
 
 def test_a_run_without_numbers_teaches_nothing(gated_copy: Path, gated: Path) -> None:

@@ -25,7 +25,7 @@ from arkitscenes_scene import (
 from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing, ScenesMissing
 from su3d_bench.datasets.arkitscenes.challenge import DEVELOPMENT_SCENES
 from su3d_bench.datasets.arkitscenes.dataset import ArkitScenes
-from su3d_bench.datasets.arkitscenes.trajectory import Trajectory, read_trajectory
+from su3d_bench.datasets.arkitscenes.frames import Trajectory
 
 POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 3429978\n"
 
@@ -53,14 +53,6 @@ def test_the_nearest_pose_is_nearer_than_three_tenths_of_a_second_and_the_later_
     found = Trajectory(np.array([1.0, 2.0, 2.5]), np.tile(np.eye(4), (3, 1, 1)))
     times = np.array([0.69, 0.71, 1.25, 1.29, 1.5, 2.25, 2.79, 2.81])
     assert found.nearest(times).tolist() == [-1, 0, 0, 0, -1, 2, 2, -1]
-
-
-def test_of_lines_of_one_millisecond_the_last_counts(tmp_path: Path) -> None:
-    path = tmp_path / "lowres_wide.traj"
-    path.write_text("1.0001 0 0 0 1 0 0\n1.0004 0 0 0 2 0 0\n0.5 0 0 0 3 0 0\n")
-    found = read_trajectory(path, "here")
-    assert found.times_s.tolist() == [0.5, 1.0]
-    assert found.poses[:, 0, 3].tolist() == [-3.0, -2.0]
 
 
 def test_a_camera_file_may_be_a_millisecond_off_and_images_without_one_are_left_out(tmp_path: Path) -> None:
@@ -169,15 +161,6 @@ def test_a_fault_in_the_recording_is_one_line(name: str, content: str, message: 
     with pytest.raises(DataError) as raised:
         list(opened(tmp_path).frames(SCENE, 1))
     assert message in str(raised.value) and "\n" not in str(raised.value)
-
-
-def test_depth_of_another_view_is_refused(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path)
-    write_images(folder, "other", "lowres_depth", SIZE, (48, 64))
-    with pytest.raises(
-        DataError, match=r"lowres_depth/.* is 48x64 and lowres_wide/.* is 64x48; both must show the same"
-    ):
-        list(opened(tmp_path).frames(SCENE, 1))
 
 
 def test_without_scenes_or_images_it_is_said_what_to_do(tmp_path: Path) -> None:

@@ -90,13 +90,6 @@ def test_a_camera_that_does_not_move_tells_nothing(reading: Reading) -> None:
     assert judge_convention(read_as(still, reading)) is None
 
 
-def test_no_frame_one_frame_and_frames_without_depth_tell_nothing() -> None:
-    frames = walk("living0", 0)
-    assert judge_convention([]) is None
-    assert judge_convention(frames[:1]) is None
-    assert judge_convention(read_as(frames, inverse, 0.0)) is None
-
-
 def test_frames_that_share_no_view_tell_nothing() -> None:
     frames = walk("living0", 0)
     turned = replace(frames[1], camera_to_world=frames[1].camera_to_world @ np.diag([-1.0, 1.0, -1.0, 1.0]))

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.geometry import are_rigid
 from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
-from su3d_bench.datasets.recordings.registration import Grid, Registration, filled, make_registration
-from su3d_bench.datasets.recordings.source import SensorPair
+from su3d_bench.datasets.recordings.source import Grid, Registration, SensorPair, make_registration
 
 
 def intrinsics(focal: float, size: tuple[int, int]) -> Float64Array:
@@ -53,17 +51,6 @@ def columns(size: tuple[int, int], step: int = 20) -> UInt8Array:
     return np.stack([u * step, v * step, np.full_like(u, 7)], axis=-1).astype(np.uint8)
 
 
-@pytest.mark.parametrize("grid", ["depth", "colour"])
-def test_images_that_fit_already_are_handed_on(grid: Grid) -> None:
-    camera = pair((4, 3), (4, 3), colour_focal=4.0)
-    colour, depth_m = columns((4, 3)), np.full((3, 4), 2, np.float32)
-    registration = register(camera, grid)
-    found = registration.images(colour, depth_m)
-    assert found[0] is colour and found[1] is depth_m
-    pose = motion(0.3, 1, 2, 3)
-    assert registration.camera_to_world(pose) is pose
-
-
 def test_two_sizes_of_one_view_by_hand() -> None:
     """Colour has twice the pixels: a depth pixel lies in the middle of four colour pixels."""
     camera = pair()
@@ -89,17 +76,6 @@ def test_a_step_between_the_cameras_moves_near_pixels_further_by_hand() -> None:
     np.testing.assert_array_equal(seen, columns((8, 3)))
     # 2 and 3 land on 4 and 5, before 4, which lands on 5 too; nothing lands on 0 and 3
     assert depth[0].tolist() == [0, 4, 4, 0, 2, 2, 4, 4]
-
-
-def test_a_pixel_without_depth_borrows_that_of_the_nearest() -> None:
-    assert filled(np.array([[0, 0, 3, 0, 0, 5]], np.float32)).tolist() == [[3, 3, 3, 3, 5, 5]]
-    assert filled(np.zeros((2, 2), np.float32)).tolist() == [[1, 1], [1, 1]]
-    camera = pair((8, 3), (8, 3), motion(x=1.0), colour_focal=4.0)
-    depth = np.full((3, 8), 2, np.float32)
-    depth[:, 1] = 0
-    colour, kept = register(camera).images(columns((8, 3)), depth)
-    assert (colour[1, :, 0] / 20).tolist() == [2, 3, 4, 5, 6, 7, 7, 7]
-    assert kept[1, 1] == 0
 
 
 def test_points_behind_the_colour_camera_have_no_place_in_it() -> None:
@@ -210,10 +186,3 @@ def test_what_is_no_pair_of_cameras_is_one_line(camera: SensorPair, message: str
     with pytest.raises(DataError) as caught:
         register(camera)
     assert str(caught.value).startswith(f"scannet/x: {message}")
-
-
-def test_rigid_motions_are_told_from_others() -> None:
-    scaled, transposed = motion(0.4, 1, 2, 3), motion(0.4, 1, 2, 3).T
-    scaled[:3, :3] *= 1.1
-    cases = np.stack([motion(0.4, 1, 2, 3), np.diag([1.0, 1, -1, 1]), scaled, transposed, np.zeros((4, 4))])
-    assert are_rigid(cases).tolist() == [True, False, False, False, False]

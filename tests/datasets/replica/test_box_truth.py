@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-from box_room import CLASSES, SIZE, pose, write_box_room, write_poses
+from box_room import CLASSES, SIZE, write_box_room
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing
+from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.types import LabelSet, ObjectBoxes, OrientedBox
-from su3d_bench.datasets.checks import inspect
 from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.perception.oracle import OracleConfig, OracleSegmenter
-from su3d_bench.questions.truths import questions_of
-from su3d_bench.reports.pictures.scene import look_at
 
 INFO = "replica_v1/room_0/habitat/info_semantic.json"
 THICK_M = 0.1
@@ -75,15 +71,6 @@ def test_the_smallest_box_that_holds_a_point_has_it() -> None:
     assert known.instance_at(points, 0.05).tolist() == [3, 3, 7, 7, 0]
 
 
-def test_without_the_mesh_the_check_holds_frames_against_boxes(root: Path) -> None:
-    found = inspect(Replica(root), "room0")
-    assert found.findings == () and found.meeting is not None and found.meeting.share == 1.0
-    write_poses(root / "Replica" / "room0", [np.linalg.inv(pose(index)) for index in range(8)])
-    found = inspect(Replica(root), "room0")
-    assert found.meeting is not None and found.meeting.share < 0.4
-    assert any("with the poses inverted it is 100%" in finding.text for finding in found.findings)
-
-
 def test_boxes_give_perfect_masks(root: Path) -> None:
     replica = Replica(root)
     with pytest.raises(GroundTruthMissing):
@@ -96,29 +83,6 @@ def test_boxes_give_perfect_masks(root: Path) -> None:
     assert regions.names is not None and set(regions.names) <= {"wall", "floor", "ceiling"} and len(regions.names) >= 3
     words = "run --scenes replica/room0 --profile oracle --stride 4 --no-pictures --jobs 1 --quiet --out out"
     assert main(words.split()) == 0
-
-
-def test_questions_are_made_from_boxes(root: Path) -> None:
-    texts = {question.text for question in questions_of(Replica(root), "room0")}
-    assert {"chair", "lamp"} <= texts and not any("floor" in text for text in texts)
-
-
-def test_a_scene_without_frames_can_be_looked_at_and_not_run(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.rmtree(root / "Replica")
-    replica = Replica(root)
-    assert replica.scenes() == ("room0",) and replica.info("room0", 1).n_frames == 0
-    assert replica.status("room0").startswith("no frames, 8 boxes of objects, no mesh (")
-    with pytest.raises(FramesMissing, match=r"replica/room0: no frames; expected traj\.txt and results/"):
-        replica.frames("room0", 1)
-    look = look_at(replica, "room0")
-    assert look.shown == () and look.counts["n_objects"] == 8
-    for words in ("datasets show replica/room_0", "datasets show replica/room0 --json --out a.png", "datasets list"):
-        assert main([*words.split(), "--quiet"]) == 0
-    assert main(["datasets", "check", "replica/room0", "--quiet"]) == 0
-    assert "warning       no frames; expected traj.txt" in capsys.readouterr().out
-    assert main(["query", "make", "--scenes", "replica/room0", "--out", "a.toml", "--quiet"]) == 0
-    assert main(["run", "--scenes", "replica/room0", "--jobs", "1", "--quiet", "--out", "out"]) == 3
-    assert "no frames; expected traj.txt and results/" in capsys.readouterr().err
 
 
 def test_a_scene_without_its_mesh_is_scored_by_its_boxes(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -151,16 +115,6 @@ def test_a_scene_without_its_mesh_is_scored_by_its_boxes(root: Path, capsys: pyt
     for verb in ("tables", "html"):
         assert main(["report", verb, "out"]) == 0
     assert "| oracle | 100.0 | 100.0 | 100.0    | 100.0 |" in capsys.readouterr().out
-
-
-def test_beside_rendered_scenes_one_without_frames_is_reached_by_its_name_alone(root: Path) -> None:
-    shutil.copytree(root / "replica_v1" / "room_0", root / "replica_v1" / "apartment_0")
-    replica = Replica(root)
-    assert replica.scenes() == ("room0",)
-    assert len(replica.object_boxes("apartment_0")) == 8
-    for name in ("apartment_1", "../replica_v1/apartment_0", ".", ""):
-        with pytest.raises(DataError, match="no scene"):
-            replica.info(name, 1)
 
 
 def test_a_table_without_boxes_is_no_truth_and_one_of_too_many_is_refused(root: Path) -> None:

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import logging
-import shutil
-import weakref
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from rgbd_scene import HEIGHT, NUMBERED, WIDTH, depth_values, describe, log_of, open_scene, pose, text_of, write_scene
+from rgbd_scene import HEIGHT, WIDTH, depth_values, log_of, open_scene, pose, text_of, write_scene
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.datasets.recordings.pose_convention import FLIP
-from su3d_bench.datasets.rgbd.dataset import Rgbd, RgbdOptions
+from su3d_bench.datasets.rgbd.dataset import Rgbd
 
 
 def test_frames_hold_what_the_files_hold(tmp_path: Path) -> None:
@@ -56,45 +53,6 @@ def test_the_largest_value_is_no_depth_where_it_stands_apart_and_that_is_said_on
     assert said == (
         "rgbd/desk: depth 65535 (65.54 m) counts as no depth where it stands apart from all other depths of its image"
     )
-
-
-def test_every_reading_of_a_scene_says_that_and_none_of_them_twice(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    """Each method of a run has a record of its own."""
-    folder = write_scene(tmp_path)
-    for index in range(3):
-        write_depth(folder, index, np.where(np.arange(WIDTH * HEIGHT).reshape(HEIGHT, WIDTH) < 9, 65535, 900 + index))
-    dataset = Rgbd(tmp_path)
-    for n_readings in (1, 2):
-        with caplog.at_level(logging.WARNING, "su3d_bench"):
-            assert all((frame.depth_m == 0).sum() == 9 for frame in dataset.frames("desk", 1))
-        assert [record.getMessage().count("65535") for record in caplog.records] == [1] * n_readings
-
-
-def test_what_check_and_show_say_of_depth_survives_a_lone_largest_value_and_any_other_is_a_warning(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = write_scene(tmp_path)
-    for index in range(3):
-        values = np.full((HEIGHT, WIDTH), 900 + index)
-        values[:2] = 65535
-        write_depth(folder, index, values)
-    monkeypatch.setenv("SU3D_DATA", str(tmp_path))
-    main(["datasets", "check", "rgbd/desk", "--quiet"])
-    said = capsys.readouterr().out
-    assert "0.90 to 0.90 m" in said and said.count("depth 65535 (65.54 m) counts as no depth") == 1
-    assert main(["datasets", "show", "rgbd/desk", "--quiet", "--json", "--out", str(tmp_path / "desk.png")]) == 0
-    shown = json.loads(capsys.readouterr().out)
-    assert shown["depth_m"] == pytest.approx([0.9, 0.902])
-    values[:2] = 60000
-    write_depth(folder, 1, values)
-    main(["datasets", "check", "rgbd/desk", "--quiet"])
-    assert "in 1 of 3 frames depth reaches 60 m, first frame 1; indoors" in capsys.readouterr().out
-    keys = {**NUMBERED, "check_convention": False, "depth_invalid": [60000]}
-    describe(folder, keys)
-    main(["datasets", "check", "rgbd/desk", "--quiet"])
-    assert "depth reaches" not in capsys.readouterr().out
 
 
 def test_an_unscored_run_says_what_its_labels_are_worth_and_needs_no_truth(
@@ -144,14 +102,6 @@ def test_every_way_to_name_the_same_files_gives_the_same_frames(tmp_path: Path, 
         np.testing.assert_allclose(one.camera_to_world, other.camera_to_world, atol=1e-15)
         np.testing.assert_array_equal(one.depth_m, other.depth_m)
         np.testing.assert_array_equal(one.intrinsics, other.intrinsics)
-
-
-def test_globs_pair_up_in_numeric_order(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path, n_frames=12, colour="colour/*.png", depth="depth/*.png", pose="*.pose.txt")
-    assert [frame.camera_to_world[0, 3] for frame in open_scene(tmp_path)] == list(range(12))
-    (folder / "data/depth/frame-5.png").unlink()
-    with pytest.raises(DataError, match=r"12 colour files, 11 depth files and 12 poses match; files pair up in order"):
-        open_scene(tmp_path)
 
 
 def test_rotated_bits_are_turned_back_and_invalid_values_have_no_depth(tmp_path: Path) -> None:
@@ -206,28 +156,6 @@ def test_a_trajectory_counts_missing_images_or_leaves_them_out(tmp_path: Path) -
         open_scene(tmp_path)
 
 
-def test_of_many_scenes_one_is_in_memory(tmp_path: Path) -> None:
-    shutil.copytree(write_scene(tmp_path), tmp_path / "rgbd" / "chair")
-    rgbd = Rgbd(tmp_path)
-    first = weakref.ref(rgbd.recording("desk"))
-    assert first() is rgbd.recording("desk")
-    assert rgbd.digest("chair") != rgbd.digest("desk")
-    assert first() is None
-
-
-def test_descriptions_anywhere_can_be_named(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path / "elsewhere")
-    (folder / "rgbd.toml").rename(folder / "shelf.toml")
-    rgbd = Rgbd(tmp_path, RgbdOptions(files=(folder / "shelf.toml",)))
-    assert rgbd.scenes() == ("shelf",) and len(rgbd.frames("shelf", 1)) == 3
-    assert RgbdOptions.model_validate_json('{"files": "a.toml"}').files == (Path("a.toml"),)
-    (folder / "shelf.toml").rename(folder / "rgbd.toml")
-    assert Rgbd(tmp_path, RgbdOptions(files=(folder,))).scenes() == ("desk",)
-    write_scene(tmp_path)
-    with pytest.raises(DataError, match="rgbd: scene 'desk' is described twice"):
-        Rgbd(tmp_path, RgbdOptions(files=(folder,))).scenes()
-
-
 def test_there_is_no_ground_truth_and_no_scene_without_description(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"rgbd: no scene in .*--set rgbd\.files=path/to/rgbd\.toml"):
         Rgbd(tmp_path).scenes()
@@ -238,16 +166,3 @@ def test_there_is_no_ground_truth_and_no_scene_without_description(tmp_path: Pat
         Rgbd(tmp_path).ground_truth("desk", "mesh-vertices")
     with pytest.raises(GroundTruthMissing):
         Rgbd(tmp_path).instance_mesh("desk")
-
-
-def test_the_digest_moves_with_every_file_that_is_read(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path, intrinsics=None, intrinsics_file="camera.json")
-    seen = {Rgbd(tmp_path).digest("desk")}
-    unused = {"trajectory.log", "intrinsics.txt"}
-    expected = {path for path in folder.rglob("*") if path.is_file() and path.name not in unused}
-    assert {path.resolve() for path in Rgbd(tmp_path).files("desk")} == expected
-    for path in (folder / "rgbd.toml", folder / "data/camera.json", folder / "data/frame-1.pose.txt"):
-        path.write_text(path.read_text() + "\n")
-        seen.add(Rgbd(tmp_path).digest("desk"))
-    cv2.imwrite(str(folder / "data/depth/frame-2.png"), depth_values(3))
-    assert len(seen | {Rgbd(tmp_path).digest("desk")}) == 5

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 from scipy.spatial import cKDTree
 
-from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.core.errors import DataError
 from su3d_bench.core.geometry import back_project
 from su3d_bench.core.maps import Instances
 from su3d_bench.datasets.openscan import label_set
-from su3d_bench.datasets.rooms.attributes import attribute_of_object
-from su3d_bench.datasets.rooms.dataset import DEFAULT_SCENES, N_STRUCTURE, Rooms
-from su3d_bench.datasets.rooms.kept import MESH_ARRAYS, kept_mesh, kept_walk
+from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.datasets.rooms.rendering.mesh import RoomMesh
 from su3d_bench.datasets.rooms.scan import RoomScan
+from su3d_bench.datasets.rooms.truth import attribute_of_object
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 
@@ -50,62 +46,10 @@ def test_the_same_name_gives_the_same_bytes(rooms: Rooms, tmp_path: Path) -> Non
     assert _same(rooms.scan(SCENE), again.scan(SCENE))
 
 
-def test_names_and_seed_offsets_give_different_rooms(rooms: Rooms, tmp_path: Path) -> None:
-    other = Rooms(tmp_path, SMALL.model_copy(update={"seed_offset": 1}))
-    assert rooms.truth("bathroom8").objects != rooms.truth(SCENE).objects
-    assert other.truth(SCENE).objects != rooms.truth(SCENE).objects
-    assert len({rooms.digest(SCENE), rooms.digest("bathroom8"), other.digest(SCENE)}) == 3
-
-
-def test_frames_can_be_read_in_any_order(rooms: Rooms) -> None:
-    frames = rooms.frames(SCENE, 40)
-    last, first = frames[1], frames[0]
-    assert (len(frames), first.index, last.index) == (2, 0, 40)
-    assert rooms.info(SCENE, 40).n_frames == 2
-    assert np.array_equal(frames[0].rgb, first.rgb)
-    assert np.array_equal(last.camera_to_world, rooms.trajectory(SCENE)[40])
-    with pytest.raises(IndexError):
-        frames[2]
-
-
-def test_a_sketch_sees_what_its_frame_sees_with_fewer_pixels(tmp_path: Path) -> None:
-    rooms = Rooms(tmp_path, SMALL.model_copy(update={"noise": 0}))
-    frame, sketch = rooms.frame(SCENE, 40), rooms.sketch(SCENE, 40, 32)
-    assert (sketch.index, sketch.rgb.shape, sketch.depth_m.shape) == (40, (24, 32, 3), (24, 32))
-    seen = [back_project(one.depth_m, one.intrinsics, one.camera_to_world, one.depth_m > 0) for one in (frame, sketch)]
-    distance, nearest = cKDTree(seen[0]).query(seen[1])
-    assert np.quantile(distance, 0.9) < 0.03
-    colour = [one.rgb[one.depth_m > 0].astype(int) for one in (frame, sketch)]
-    assert np.median(np.abs(colour[0][nearest] - colour[1])) <= 2
-    assert rooms.sketch(SCENE, 40, 16).rgb.shape == (12, 16, 3)
-    assert rooms.sketch(SCENE, 40, 96).rgb.tobytes() == frame.rgb.tobytes()
-
-
 @pytest.mark.parametrize("name", ["kitchn0", "living", "living-1", "living00", "cellar3", "office 1", "living1000000"])
 def test_a_name_that_is_no_scene_is_refused(rooms: Rooms, name: str) -> None:
     with pytest.raises(DataError, match="no scene"):
         rooms.frames(name, 40)
-
-
-def test_a_misspelt_scene_brings_a_suggestion(rooms: Rooms) -> None:
-    with pytest.raises(DataError, match="did you mean 'kitchen0'"):
-        rooms.truth("kitchn0")
-
-
-def test_the_numbers_kept_for_training_are_scenes(rooms: Rooms) -> None:
-    assert len(rooms.truth("living10000").objects) > 25
-
-
-@pytest.mark.parametrize("bad", [{"noise": 9}, {"widht": 3}, {"n_frames": 0}, {"mesh_spacing_m": -1.0}])
-def test_options_are_checked(bad: dict[str, float]) -> None:
-    with pytest.raises(ValidationError):
-        Rooms.Options.model_validate(bad)
-
-
-def test_intrinsics_scale_with_the_image(tmp_path: Path) -> None:
-    full, half = Rooms(tmp_path).intrinsics, Rooms(tmp_path, Rooms.Options(width=320, height=240)).intrinsics
-    assert full.tolist() == [[400, 0, 319.5], [0, 400, 239.5], [0, 0, 1]]
-    assert half.tolist() == [[200, 0, 159.5], [0, 200, 119.5], [0, 0, 1]]
 
 
 def test_depth_lands_on_the_scan(rooms: Rooms) -> None:
@@ -163,12 +107,6 @@ def test_the_scan_leaves_out_what_the_walk_cannot_see(rooms: Rooms) -> None:
     assert (normals[:, 2] < -0.9).sum() < 0.05 * front
 
 
-def test_no_vertex_belongs_to_two_objects(rooms: Rooms) -> None:
-    scan = rooms.scan(SCENE)
-    pairs = np.unique(np.stack([scan.faces.ravel(), np.repeat(scan.object_id, 4)], axis=1), axis=0)
-    assert len(np.unique(pairs[:, 0])) == len(pairs) == len(scan.vertices)
-
-
 def test_scan_normals_are_unit_and_face_the_room(rooms: Rooms) -> None:
     scan = rooms.scan(SCENE)
     assert np.allclose(np.linalg.norm(scan.normals, axis=1), 1.0, atol=1e-3)
@@ -177,20 +115,6 @@ def test_scan_normals_are_unit_and_face_the_room(rooms: Rooms) -> None:
     a, b, c, d = (scan.vertices[scan.faces[:, k]].astype(np.float64) for k in range(4))
     wound = (np.cross(c - a, d - b) * scan.normals[scan.faces].mean(axis=1)).sum(axis=1)
     assert (wound > 0).mean() > 0.99
-
-
-def test_face_corners_repeat_the_vertices_in_face_order(rooms: Rooms) -> None:
-    scan, corners = rooms.scan(SCENE), rooms.ground_truth(SCENE, "face-corners")
-    assert np.array_equal(corners.points, scan.vertices[scan.faces.ravel()])
-    assert np.array_equal(corners.instance, np.repeat(scan.object_id, 4))
-    names = {one.id: one.class_id for one in rooms.objects(SCENE)}
-    vertices = rooms.ground_truth(SCENE, "mesh-vertices")
-    assert all(names[int(i)] == s for i, s in zip(vertices.instance, vertices.semantic, strict=True))
-
-
-def test_an_unknown_ground_truth_is_missing(rooms: Rooms) -> None:
-    with pytest.raises(GroundTruthMissing, match="'conceptgraphs'"):
-        rooms.ground_truth(SCENE, "conceptgraphs")
 
 
 @pytest.mark.parametrize("damage", ["cut short", "flipped byte", "empty"])
@@ -223,66 +147,6 @@ def test_a_mesh_and_a_walk_that_were_kept_are_those_made_anew(tmp_path: Path) ->
             assert one.dtype == two.dtype and one.tobytes() == two.tobytes(), field.name
         assert made.trajectory.tobytes() == other.trajectory.tobytes()
     assert not (tmp_path / "no-folder").exists(), "a dataset that is only looked at makes no data root"
-
-
-def made_mesh() -> RoomMesh:
-    """Of four vertices and two triangles, every number of it 0."""
-    n: dict[str | int, int] = {"vertices": 4, "triangles": 2, "materials": 3, "lights": 1, 3: 3, 4: 4, 16: 16}
-    arrays: dict[str, Any] = {
-        key: np.zeros([n[word] for word in shape], dtype) for key, (dtype, shape) in MESH_ARRAYS.items()
-    }
-    return RoomMesh(**arrays)
-
-
-@pytest.mark.parametrize(
-    ("name", "change"),
-    [
-        ("triangles", lambda array: array + 4),
-        ("triangles", lambda array: array - 4),
-        ("triangles", lambda array: array[:0]),
-        ("material_of_triangle", lambda array: array + 3),
-        ("instance_of_triangle", lambda array: array - 9),
-        ("light", lambda array: array[:-1]),
-        ("vertices", lambda array: array.astype(np.float64)),
-        ("materials", lambda array: array[:, :-1]),
-    ],
-)
-def test_a_kept_mesh_of_other_arrays_is_made_anew(tmp_path: Path, name: str, change: Callable[[Any], Any]) -> None:
-    arrays: dict[str, Any] = {field.name: getattr(made_mesh(), field.name) for field in fields(RoomMesh)}
-    path = tmp_path / "a.mesh.npz"
-    for content, n_made in ((arrays, 0), (arrays | {name: change(arrays[name])}, 1), ({"other": np.zeros(3)}, 1)):
-        np.savez(path, **content)
-        made: list[RoomMesh] = []
-
-        def make(made: list[RoomMesh] = made) -> RoomMesh:
-            made.append(RoomMesh(**arrays))
-            return made[-1]
-
-        mesh = kept_mesh(path, make)
-        assert len(made) == n_made
-        assert all(np.array_equal(getattr(mesh, key), array) for key, array in arrays.items())
-        kept_mesh(path, lambda: pytest.fail("what was made is kept"))
-
-
-def test_a_kept_walk_of_another_length_is_made_anew(tmp_path: Path) -> None:
-    path, walk = tmp_path / "a.walk.npz", np.tile(np.eye(4), (5, 1, 1))
-    for content in (walk[:4], walk.astype(np.float32)):
-        np.savez(path, poses=content)
-        assert kept_walk(path, 5, lambda: walk).tobytes() == walk.tobytes()
-        assert kept_walk(path, 5, lambda: pytest.fail("what was made is kept")).tobytes() == walk.tobytes()
-
-
-def test_rooms_for_training_are_not_kept(tmp_path: Path) -> None:
-    tiny = Rooms.Options(width=16, height=16, n_frames=1)
-    assert Rooms(tmp_path, tiny)._room("office9999").folder is not None
-    assert Rooms(tmp_path, tiny)._room("office10000").folder is None
-
-
-def test_a_cache_that_cannot_be_written_is_said_so(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    blocked = Rooms(tmp_path / "file", Rooms.Options(n_frames=2, mesh_spacing_m=0.1))
-    with pytest.raises(DataError, match="cannot write the scan"):
-        blocked.scan(SCENE)
 
 
 def test_image_size_and_noise_do_not_move_the_scan(rooms: Rooms) -> None:
@@ -323,22 +187,6 @@ def test_the_walk_is_smooth_and_stays_clear(tmp_path: Path) -> None:
     assert turn.max() < 6.0
     nearest = min(float(full.render("living3", k).depth_m.min()) for k in range(0, 1600, 80))
     assert nearest > 0.15
-
-
-def test_nearly_every_object_is_seen_again_and_again_at_stride_40(tmp_path: Path) -> None:
-    full = Rooms(tmp_path, Rooms.Options(width=160, height=120))
-    objects = full.objects("office3")
-    views = np.zeros(len(objects) + 1, int)
-    for k in range(0, 1600, 40):
-        pixels = np.bincount(full.render("office3", k).instance.ravel(), minlength=len(views))
-        views += pixels >= 15  # 240 pixels at full size
-    assert np.mean(views[N_STRUCTURE + 1 :] >= 3) > 0.9
-
-
-def test_the_default_scenes_are_furnished(rooms: Rooms) -> None:
-    assert len(DEFAULT_SCENES) == 8
-    for scene in DEFAULT_SCENES:
-        assert 25 <= len(rooms.objects(scene)) - N_STRUCTURE <= 62
 
 
 def test_a_room_is_scored_by_an_aspect_and_what_has_no_attribute_is_void(rooms: Rooms) -> None:

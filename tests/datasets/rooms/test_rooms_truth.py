@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -122,20 +121,8 @@ def test_everything_stays_inside_the_room(truths: list[RoomTruth]) -> None:
             assert one.box_min[2] >= -1e-9 and one.box_max[2] <= ceiling.box_max[2] + 1e-9
 
 
-def test_rows_and_piles_are_called_so(truths: list[RoomTruth]) -> None:
-    books = [known for truth in truths for known in truth.objects if known.class_name == "book"]
-    assert {known.whole().name for known in books} == {"row of books", "pile of books"}
-    names = {known.whole().name for truth in truths for known in truth.objects}
-    assert not any("-" in name for name in names)
-
-
 def test_a_material_is_told_where_a_picture_shows_it(truths: list[RoomTruth]) -> None:
     shown = {(known.class_name, known.material) for t in truths for known in t.objects if known.shows_material}
     assert {("table", "wooden"), ("basket", "wicker")} <= shown
     assert {material for _, material in shown} == {"wooden", "wicker"}
     assert not any(known.whole().adjectives for t in truths for known in t.objects if not known.shows_material)
-
-
-def test_a_room_without_its_scan_is_quick_and_writes_nothing(tmp_path: Path) -> None:
-    Rooms(tmp_path).truth("office10001")
-    assert not list(tmp_path.iterdir())

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import json
-import logging
 import math
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-from pydantic import ValidationError
 from scannet_scan import (
     COLOUR_SIZE,
     DEPTH_SIZE,
@@ -24,23 +21,19 @@ from scannet_scan import (
     header,
     pose,
     positions,
-    table_text,
     write_floor_truth,
     write_recording,
 )
 from scannet_scans import WHERE, dataset, export, write_scan
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing
+from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.types import Float64Array, UInt8Array
 from su3d_bench.datasets.recordings.source import SensorPair
-from su3d_bench.datasets.scannet.dataset import ScanNet, ScannetOptions
-from su3d_bench.datasets.scannet.folders import PAPER_SCENES, find_scans, split_scenes
-from su3d_bench.datasets.scannet.frames import read_walk
-from su3d_bench.datasets.scannet.labels import TABLE_NAME
+from su3d_bench.datasets.scannet.dataset import ScanNet
+from su3d_bench.datasets.scannet.folders import PAPER_SCENES, split_scenes
+from su3d_bench.datasets.scannet.recordings import read_walk
 from su3d_bench.formats.images import UInt16Array
-from su3d_bench.runs.job import Part
-from su3d_bench.runs.scenes import expand_scenes
 
 
 @pytest.mark.parametrize(
@@ -55,33 +48,6 @@ def test_scans_are_found_in_every_layout_that_circulates(tmp_path: Path, place: 
     assert list(found.places()) == [tmp_path / place]
     assert len(found.frames(SCAN, 1)) == 5
     assert "scannet200-vertices" in found.ground_truth(SCAN, "scannet200-vertices").variant
-
-
-def test_the_papers_scenes_come_first_then_every_other_in_order(tmp_path: Path) -> None:
-    for scan, place in (("scene0549_00", "scans"), ("scene0707_00", "scans_test"), ("scene0000_00", "scans"),
-                        ("scene0000_01", "scans"), ("mine", "scans")):  # fmt: skip
-        write_recording(tmp_path / place / scan / f"{scan}.sens", 1)
-    (tmp_path / "scans" / "empty").mkdir()
-    assert list(ScanNet(tmp_path).scenes()) == ["scene0000_00", "scene0549_00", "mine", "scene0000_01", "scene0707_00"]
-
-
-def test_the_table_is_found_beside_the_scans_and_above_them(tmp_path: Path) -> None:
-    folder = write_scan(tmp_path, place="scannet/scans")
-    for place in ("scannet/scans", "scannet", "scannet/tasks", "."):
-        (tmp_path / TABLE_NAME).unlink(missing_ok=True)
-        assert find_scans(tmp_path).find_label_table() is None
-        (tmp_path / place).mkdir(exist_ok=True)
-        (tmp_path / place / TABLE_NAME).write_text(table_text())
-        assert find_scans(tmp_path).find_label_table() == tmp_path / place / TABLE_NAME
-        (tmp_path / place / TABLE_NAME).unlink()
-    with pytest.raises(GroundTruthMissing) as caught:
-        ScanNet(tmp_path).ground_truth(SCAN, "scannet200-vertices")
-    assert str(caught.value) == (
-        f"{WHERE}: no ground truth 'scannet200-vertices'; {TABLE_NAME} of the release is missing, put it into "
-        f"{folder.parent}"
-    )
-    assert ScanNet(tmp_path).ground_truth(SCAN, "nyu40-vertices").semantic.max() == 6
-    assert ScanNet(tmp_path).status(SCAN) == f"5 frames, ground truth, no ScanNet200: {TABLE_NAME} is missing"
 
 
 def test_recording_and_truth_may_lie_in_two_places(tmp_path: Path) -> None:
@@ -109,24 +75,6 @@ def test_frames_hold_what_the_recording_holds_on_the_depth_grid(tmp_path: Path) 
     assert frames[1].rgb[0, [15, 16]].tolist() == [list(LEFT), list(RIGHT)]
     with pytest.raises(IndexError):
         frames[3]
-
-
-@pytest.mark.parametrize("source", ["sens", "export"])
-def test_the_largest_depth_is_none_where_it_stands_apart(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, source: str
-) -> None:
-    if source == "sens":
-        values = np.full(DEPTH_SIZE[::-1], 2000, np.uint16)
-        values[0] = 65535
-        write_recording(tmp_path / SCAN / f"{SCAN}.sens", depth=values)
-    else:
-        export(tmp_path / SCAN)
-        values = np.full(DEPTH_SIZE[::-1], 1500, np.uint16)
-        values[0] = 65535
-        cv2.imwrite(str(tmp_path / SCAN / "depth/0.png"), values)
-    depth_m = ScanNet(tmp_path).frames(SCAN, 1)[0].depth_m
-    assert (depth_m[0] == 0).all() and (depth_m[1:] == values[1:] / 1000).all()
-    assert "depth 65535 (65.54 m) counts as no depth" in caplog.text
 
 
 def test_the_colour_grid_keeps_colour_and_thins_depth(tmp_path: Path) -> None:
@@ -161,12 +109,6 @@ def test_axis_align_turns_poses_and_mesh_alike(tmp_path: Path) -> None:
         dataset(tmp_path, axis_align=True).frames(SCAN, 1)
 
 
-def test_options_are_strict() -> None:
-    for options in ({"grid": "color"}, {"axes": True}, {"source": "zip"}):
-        with pytest.raises(ValidationError):
-            ScannetOptions(**options)
-
-
 def test_the_source_option_chooses_among_recording_and_export(tmp_path: Path) -> None:
     export(write_scan(tmp_path))
     depths = {
@@ -178,20 +120,6 @@ def test_the_source_option_chooses_among_recording_and_export(tmp_path: Path) ->
     assert dataset(tmp_path, source="cpp").status(SCAN) == "no recording, ground truth"
     with pytest.raises(DataError, match=rf"^{WHERE}: no recording in .*; looked for _info\.txt"):
         dataset(tmp_path, source="cpp").frames(SCAN, 1)
-
-
-def test_frames_without_a_pose_are_left_out_and_counted_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    write_scan(tmp_path, n_frames=7, lost=(2, 3))
-    scannet = ScanNet(tmp_path)
-    with caplog.at_level(logging.INFO):
-        assert [frame.index for frame in scannet.frames(SCAN, 1)] == [0, 1, 4, 5, 6]
-        # at full rate 0, 2, 4, 6: the second has no pose and is not replaced
-        assert [frame.index for frame in scannet.frames(SCAN, 2)] == [0, 4, 6]
-    assert [record.getMessage() for record in caplog.records] == [
-        f"{WHERE}: frames without a pose, left out: 2 of 7 (the first: 2)"
-    ]
-    assert (scannet.info(SCAN, 1).n_frames, scannet.info(SCAN, 2).n_frames) == (5, 3)
-    assert scannet.status(SCAN) == "7 frames, ground truth"
 
 
 class Poses:
@@ -243,21 +171,6 @@ def test_which_poses_are_lost() -> None:
     assert walk.is_usable.tolist() == [True, False, False, False, False, True]
 
 
-@pytest.mark.parametrize(
-    ("poses", "message"),
-    [
-        ([turned(0), turned(0) * 2], "frame 1: the pose is not a rigid motion; copy the recording again"),
-        ([turned(0), np.diag([-1.0, 1, 1, 1])], "frame 1: the pose is not a rigid motion"),
-        ([LOST, np.zeros((4, 4))], "none of the 2 frames has a pose; leave the scene out"),
-        (np.zeros((0, 4, 4)), "none of the 0 frames has a pose"),
-    ],
-)
-def test_poses_that_cannot_be_used_are_one_line(poses: Sequence[np.ndarray], message: str) -> None:
-    with pytest.raises(DataError) as caught:
-        read_walk(Poses(poses))
-    assert str(caught.value).startswith(f"{WHERE}: {message}")
-
-
 def test_the_stride_counts_at_full_rate_whatever_an_export_left_out() -> None:
     every_second = read_walk(Poses([turned(0.01 * i) for i in range(40)], step=2))
     assert every_second.numbers[every_second.every(10)].tolist() == [0, 10, 20, 30, 40, 50, 60, 70]
@@ -271,32 +184,6 @@ def test_the_official_splits_are_whole_and_apart() -> None:
     assert [len(scans) for scans in lists.values()] == [1201, 312, 100]
     assert len({scan for scans in lists.values() for scan in scans}) == 1613
     assert set(PAPER_SCENES) <= {*lists["train"], *lists["val"]}
-
-
-def expand(monkeypatch: pytest.MonkeyPatch, root: Path, *addresses: str) -> list[str]:
-    monkeypatch.setenv("SU3D_DATA", str(root))
-    chosen, _ = expand_scenes(addresses, {"scannet": Part("scannet", "scannet", "{}")})
-    return ["/".join(one) for one in chosen]
-
-
-def test_a_split_is_asked_for_by_name_and_must_be_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "su3d_bench.datasets.scannet.dataset.split_scenes", lambda split: (f"scene000{len(split)}_00", SCAN)
-    )
-    write_scan(tmp_path)
-    write_scan(tmp_path, "scene0003_00", n_frames=1)
-    assert expand(monkeypatch, tmp_path, "scannet/val", f"scannet/{SCAN}") == ["scannet/scene0003_00", WHERE]
-    with pytest.raises(ConfigError) as caught:
-        expand(monkeypatch, tmp_path, "scannet/train")
-    assert str(caught.value) == (
-        "scannet/train: 1 of its 2 scenes are not here (the first: scene0005_00); get them or name the scenes that are"
-    )
-    with pytest.raises(
-        ConfigError, match=r"^scannet/paper: 4 of its 5 scenes are not here \(the first: scene0034_00\)"
-    ):
-        expand(monkeypatch, tmp_path, "scannet/paper")
-    with pytest.raises(ConfigError, match=r"no scene matches 'scannet/trian'; did you mean 'scannet/train'\?"):
-        expand(monkeypatch, tmp_path, "scannet/trian")
 
 
 def test_no_data_is_said_with_the_way_to_get_it(tmp_path: Path) -> None:
@@ -329,19 +216,6 @@ def test_a_scan_without_truth_has_frames_and_a_reason(tmp_path: Path) -> None:
         scannet.ground_truth(SCAN, "nyu40-vertices")
     with pytest.raises(GroundTruthMissing, match=r"no ground truth 'nyu20-vertices'; did you mean 'nyu40-vertices'\?"):
         scannet.ground_truth(SCAN, "nyu20-vertices")
-
-
-def test_scans_of_the_marker_are_rendered_rooms_under_any_name(tmp_path: Path) -> None:
-    write_scan(tmp_path, "scene9000_00")
-    write_scan(tmp_path, SCAN)
-    export(tmp_path / "scans" / "kitchen3")
-    (tmp_path / "scans" / "office1" / "rgb").mkdir(parents=True)  # a room in the layout of another dataset
-    scenes = dict.fromkeys(("scene9000_00", "kitchen3", "office1"), "key")
-    marker = {"generator": "rooms", "version": 1, "scenes": scenes}
-    (tmp_path / "scans" / "rooms.json").write_text(json.dumps(marker | {"rooms": {"scene9000_00": "living0"}}))
-    scannet = ScanNet(tmp_path)
-    assert list(scannet.scenes()) == [SCAN, "kitchen3", "scene9000_00"]
-    assert [scannet.info(scan, 1).image_domain for scan in scannet.scenes()] == ["camera", *["rendered-rooms"] * 2]
 
 
 @pytest.mark.parametrize("profile", ["oracle", "embedded"])

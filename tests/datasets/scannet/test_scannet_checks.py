@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,18 +14,10 @@ from scannet_scan import (
     positions,
     write_recording,
 )
-from scannet_scans import WHERE, dataset, export, write_scan
+from scannet_scans import WHERE, write_scan
 
 from su3d_bench.datasets.scannet.dataset import ScanNet
-from su3d_bench.datasets.scannet.labels import TABLE_NAME
-
-
-def test_files_are_all_that_is_read(tmp_path: Path) -> None:
-    write_scan(tmp_path)
-    assert set(ScanNet(tmp_path).files(SCAN)) == {path for path in tmp_path.rglob("*") if path.is_file()}
-    shutil.rmtree(tmp_path / "scans")
-    export(tmp_path / "scans" / SCAN)
-    assert set(ScanNet(tmp_path).files(SCAN)) == {path for path in tmp_path.rglob("*") if path.is_file()}
+from su3d_bench.datasets.scannet.truth import TABLE_NAME
 
 
 def test_every_fault_of_a_scan_is_named_at_once(tmp_path: Path) -> None:
@@ -59,18 +49,6 @@ def test_every_fault_of_a_scan_is_named_at_once(tmp_path: Path) -> None:
     assert lines[0].startswith(f"{WHERE}: {SCAN}.sens: frame ") and len(lines) == 4
 
 
-def test_an_export_of_the_other_reader_has_a_status(tmp_path: Path) -> None:
-    matrix = " ".join("1" if i % 5 == 0 else "0" for i in range(16))
-    facts = dict.fromkeys(("m_colorWidth", "m_colorHeight", "m_depthWidth", "m_depthHeight"), "8")
-    facts |= {"m_depthShift": "1000", "m_frames.size": "77"}
-    for camera in ("Color", "Depth"):
-        facts |= dict.fromkeys((f"m_calibration{camera}{kind}" for kind in ("Intrinsic", "Extrinsic")), matrix)
-    (tmp_path / SCAN).mkdir()
-    text = "".join(f"{key} = {value}\n" for key, value in facts.items())
-    (tmp_path / SCAN / "_info.txt").write_text(text)
-    assert ScanNet(tmp_path).status(SCAN).startswith("77 exported frames, no ground truth, ")
-
-
 def flip(path: Path, at: int) -> None:
     content = bytearray(path.read_bytes())
     content[at] ^= 1
@@ -97,26 +75,3 @@ def test_the_digest_moves_with_every_file(tmp_path: Path, change: Callable[[Path
     assert ScanNet(tmp_path).digest(SCAN) == before
     change(folder)
     assert ScanNet(tmp_path).digest(SCAN) != before
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda folder: os.truncate(folder / "color/2.jpg", 100),
-        lambda folder: flip(folder / "depth/4.png", -1),
-        lambda folder: flip(folder / "pose/3.txt", 0),
-        lambda folder: (folder / "intrinsic/intrinsic_depth.txt").write_text("32.001 0 15.5 0 32 11.5 0 0 1"),
-    ],
-)
-def test_the_digest_of_an_export_moves_with_its_files(tmp_path: Path, change: Callable[[Path], object]) -> None:
-    folder = tmp_path / SCAN
-    export(folder)
-    before = ScanNet(tmp_path).digest(SCAN)
-    change(folder)
-    assert ScanNet(tmp_path).digest(SCAN) != before
-
-
-def test_the_digest_moves_with_the_options(tmp_path: Path) -> None:
-    write_scan(tmp_path)
-    options: list[dict[str, Any]] = [{}, {"grid": "colour"}, {"axis_align": True}, {"source": "sens"}]
-    assert len({dataset(tmp_path, **one).digest(SCAN) for one in options}) == 4

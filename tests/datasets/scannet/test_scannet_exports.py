@@ -21,9 +21,9 @@ from scannet_toy import (
 )
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.datasets.recordings.exported_frames import ExportedFrames
+from su3d_bench.datasets.recordings.source import ExportedFrames
 from su3d_bench.datasets.scannet.recordings import find_source, open_cpp_export, open_python_export, read_info
-from su3d_bench.datasets.scannet.sens import SensFile, SensSource
+from su3d_bench.datasets.scannet.sens import SensFile
 
 # ---------------------------------------------------------------- what lies there is read
 
@@ -131,12 +131,6 @@ def test_names_are_sorted_as_numbers_and_may_be_padded(tmp_path: Path) -> None:
     np.testing.assert_array_equal(source.pose(11), source.pose(3))
 
 
-def test_hidden_files_are_no_frames(tmp_path: Path) -> None:
-    write_python_export(tmp_path)
-    (tmp_path / "color/.DS_Store").write_bytes(b"")
-    assert len(open_python_export(tmp_path, WHERE)) == N_FRAMES
-
-
 def test_colour_may_be_png_in_both_exports(tmp_path: Path) -> None:
     toy = SensFile(TOY, WHERE)
     python, cpp = write_python_export(tmp_path / "a"), write_cpp_export(tmp_path / "b")
@@ -151,36 +145,3 @@ def test_colour_may_be_png_in_both_exports(tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- which recording a folder holds
-
-
-@pytest.mark.parametrize("place", ["", "exported", SCENE])
-def test_an_export_is_found_in_the_folder_and_below(tmp_path: Path, place: str) -> None:
-    write_python_export(tmp_path / "python" / place)
-    write_cpp_export(tmp_path / "cpp" / place)
-    assert_is_the_toy(find_source(tmp_path / "python", SCENE, WHERE), 1e-6)
-    assert_is_the_toy(find_source(tmp_path / "cpp", SCENE, WHERE), 1e-5)
-
-
-def test_the_recording_itself_wins_unless_an_export_is_asked_for(tmp_path: Path) -> None:
-    write_python_export(tmp_path)
-    write_cpp_export(tmp_path / "exported")
-    shutil.copy(TOY, tmp_path / f"{SCENE}.sens")
-    assert isinstance(find_source(tmp_path, SCENE, WHERE), SensSource)
-    assert isinstance(find_source(tmp_path, SCENE, WHERE, "sens"), SensSource)
-    assert find_source(tmp_path, SCENE, WHERE, "python").files()[-1] == tmp_path / "pose/3.txt"
-    assert find_source(tmp_path, SCENE, WHERE, "cpp").files()[0] == tmp_path / "exported/_info.txt"
-    (tmp_path / f"{SCENE}.sens").unlink()
-    assert find_source(tmp_path, SCENE, WHERE).files()[-1] == tmp_path / "pose/3.txt"
-
-
-def test_a_folder_without_a_recording_is_an_error_that_names_all_that_was_looked_for(tmp_path: Path) -> None:
-    with pytest.raises(DataError) as caught:
-        find_source(tmp_path, SCENE, WHERE)
-    for word in (WHERE, str(tmp_path), f"{SCENE}.sens", "color/", "data_compressed/", "_info.txt", "exported/"):
-        assert word in str(caught.value)
-    with pytest.raises(DataError, match=f"looked for {SCENE}.sens$"):
-        find_source(tmp_path, SCENE, WHERE, "sens")
-    with pytest.raises(DataError, match=r"looked for _info\.txt"):
-        find_source(tmp_path, SCENE, WHERE, "cpp")
-    with pytest.raises(DataError, match="looked for color/"):
-        find_source(tmp_path, SCENE, WHERE, "python")

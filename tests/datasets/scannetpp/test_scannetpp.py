@@ -13,7 +13,6 @@ from scannetpp_scene import (
     NUMBERS,
     SCENE,
     WHERE,
-    depth_values,
     grey,
     poses,
     tracking,
@@ -131,12 +130,6 @@ def test_every_way_to_ask_is_answered_and_the_check_finds_nothing(tmp_path: Path
     assert len(data.files(SCENE)) == len(set(data.files(SCENE))) == 2 + 6 + 4 + 3
 
 
-def test_an_empty_list_of_masked_vertices_is_no_fault(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path)
-    (folder / "scans/mesh_aligned_0.05_mask.txt").write_text("")
-    assert not [one for one in inspect(dataset(tmp_path), SCENE).findings if one.severity == "error"]
-
-
 def test_the_digest_moves_with_what_moves_results_and_with_nothing_else(tmp_path: Path) -> None:
     folder = write_scene(tmp_path)
     first = dataset(tmp_path).digest(SCENE)
@@ -161,14 +154,6 @@ def test_where_nothing_is_the_line_says_how_to_get_it(tmp_path: Path) -> None:
         dataset(tmp_path).info("036bce3394", 1)
 
 
-def test_a_scene_with_the_cameras_of_the_dslr_alone_is_refused_with_a_word(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path)
-    shutil.rmtree(folder / "iphone")
-    (folder / "dslr").mkdir()
-    with pytest.raises(DataError, match="no iphone/ folder; the iPhone's frames are read, the DSLR's have no depth"):
-        dataset(tmp_path).frames(SCENE, 1)
-
-
 @pytest.mark.parametrize(
     ("name", "line"),
     [
@@ -191,12 +176,6 @@ def test_what_is_missing_for_the_truth_is_named_and_frames_are_there_all_the_sam
     assert len(data.frames(SCENE, 1)) == 3 and list(data.problems(SCENE)) == []
 
 
-def test_an_unknown_variant_is_refused(tmp_path: Path) -> None:
-    write_scene(tmp_path)
-    with pytest.raises(GroundTruthMissing, match=r"no ground truth 'scannetp'; did you mean 'scannetpp'\?"):
-        dataset(tmp_path).ground_truth(SCENE, "scannetp")
-
-
 @pytest.mark.parametrize(
     ("name", "text", "line"),
     [
@@ -217,28 +196,6 @@ def test_poses_that_cannot_be_right_are_named(tmp_path: Path, name: str, text: s
         list(dataset(tmp_path).frames(SCENE, 1))
 
 
-def test_points_of_images_are_passed_over_and_a_line_without_end_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = write_scene(tmp_path)
-    path = folder / "iphone/colmap/images.txt"
-    head, pose, _, *rest = path.read_text().splitlines()[1:]
-    path.write_text("\n".join([head, pose, "1 2 3 " * 40, *rest]) + "\n")
-    assert len(dataset(tmp_path).frames(SCENE, 1)) == 3
-    monkeypatch.setattr("su3d_bench.datasets.scannetpp.iphone.poses.MOST_LINE_BYTES", 200)
-    with pytest.raises(DataError, match=rf"^{WHERE}: colmap/images.txt: a line has more than"):
-        dataset(tmp_path).frames(SCENE, 1)
-
-
-def test_faults_of_recording_and_truth_are_named_side_by_side(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path)
-    (folder / "iphone/colmap/cameras.txt").write_text("")
-    (folder / "scans/segments.json").write_text("{")
-    first, second = dataset(tmp_path).problems(SCENE)
-    assert first.startswith(f"{WHERE}: colmap/cameras.txt: has 0 cameras")
-    assert second.startswith(f"{WHERE}: segments.json: not JSON")
-
-
 @pytest.mark.parametrize(
     ("changes", "line"),
     [
@@ -253,29 +210,6 @@ def test_tracking_that_cannot_be_right_is_named(tmp_path: Path, changes: dict[st
     write_json(folder / "iphone/pose_intrinsic_imu.json", tracking(**changes))
     with pytest.raises(DataError, match=f"^{WHERE}: pose_intrinsic_imu.json: .*{line}"):
         dataset(tmp_path, poses="tracking").frames(SCENE, 1)
-
-
-def test_a_depth_file_that_ends_too_soon_says_how_many_images_it_has(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path, packed=True)
-    from su3d_bench.datasets.scannetpp.iphone.depth_file import packed_metres
-
-    (folder / "iphone/depth.bin").write_bytes(b"".join(packed_metres(depth_values(k)) for k in range(4)))
-    with pytest.raises(DataError, match=f"^{WHERE}: depth.bin: has 4 images, frame 10 is not among them"):
-        list(dataset(tmp_path).frames(SCENE, 1))
-
-
-def test_what_only_bears_the_name_of_a_video_is_not_opened(tmp_path: Path) -> None:
-    folder = write_scene(tmp_path, packed=True)
-    (folder / "iphone/rgb.mkv").write_text("#EXTM3U\n#EXT-X-MEDIA-SEQUENCE:0\n/etc/passwd\n")
-    with pytest.raises(DataError, match=r"rgb.mkv: is no Matroska video"):
-        list(dataset(tmp_path).frames(SCENE, 1))
-
-
-def test_a_split_with_a_name_that_is_none_is_refused(tmp_path: Path) -> None:
-    write_scene(tmp_path)
-    (tmp_path / "splits/nvs_sem_train.txt").write_text("../../etc\n")
-    with pytest.raises(DataError, match=r"splits/nvs_sem_train.txt: '../../etc' is no scene"):
-        dataset(tmp_path).groups()
 
 
 def test_both_releases_and_a_link_to_one_are_found_once(tmp_path: Path) -> None:

@@ -14,8 +14,13 @@ from scannetpp_scene import MAP, NAMES, write_lists, write_scans
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import GroundTruth
-from su3d_bench.datasets.scannetpp.labels import read_benchmark_classes
-from su3d_bench.datasets.scannetpp.truth import TRUTH_NAMES, instance_mesh, read_annotated_scan, vertex_truth
+from su3d_bench.datasets.scannetpp.truth import (
+    TRUTH_NAMES,
+    instance_mesh,
+    read_annotated_scan,
+    read_benchmark_classes,
+    vertex_truth,
+)
 
 CASE = json.loads((CASES / "scannetpp_truth.json").read_text())
 NO_LABEL = -100

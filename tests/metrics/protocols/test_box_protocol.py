@@ -12,7 +12,7 @@ import pytest
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float64Array, GroundTruth, LabelSet, ObjectBoxes, OrientedBox
-from su3d_bench.datasets.replica.boxes import box_truth
+from su3d_bench.datasets.replica.checks import box_truth
 from su3d_bench.metrics.fitness import ContentFacts, TruthFacts, why_not_content, why_not_truth
 from su3d_bench.metrics.instance.boxes import THRESHOLDS, BoxCounts, box_iou, count_boxes, shared_volume, smallest_box
 from su3d_bench.metrics.metric import SceneScore

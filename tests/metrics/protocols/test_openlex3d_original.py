@@ -20,8 +20,13 @@ from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.maps import Partition
 from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.datasets.openlex3d.labels import OpenLexFiles
-from su3d_bench.datasets.openlex3d.points import LabelledPoints, points_of
-from su3d_bench.datasets.openlex3d.release import OpenLexRelease, categories_truth, queries_truth
+from su3d_bench.datasets.openlex3d.release import (
+    LabelledPoints,
+    OpenLexRelease,
+    categories_truth,
+    points_of,
+    queries_truth,
+)
 from su3d_bench.formats.ply import PlyElement, write_ply
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene

@@ -135,7 +135,7 @@ PAGES: Mapping[str, Callable[[Path], Path]] = {
 WRITERS = {
     "reports/page/page.html.j2": ("page of runs",),
     "reports/tables/formats.py": ("tables",),
-    "reports/sheet/page.html.j2": ("sheet of annotation", "sheet of retrieval"),
-    "reports/sheet/page.py": ("second looks", "audit"),
-    "reports/registry/page.html.j2": ("registry", "method of a registry", "scene of a registry"),
+    "reports/sheet/page.html.j2": ("sheet of annotation",),
+    "reports/sheet/list.html.j2": ("second looks", "audit"),
+    "reports/registry/page.html.j2": ("registry", "method of a registry"),
 }

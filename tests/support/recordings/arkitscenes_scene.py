@@ -8,7 +8,7 @@ import numpy as np
 from scannet_scan import floor_image, grid, write_mesh
 
 from su3d_bench.core.types import Float64Array
-from su3d_bench.datasets.arkitscenes.trajectory import trajectory_line
+from su3d_bench.datasets.arkitscenes.frames import trajectory_line
 from su3d_bench.formats.images import png_bytes
 
 SCENE, QUERY = "42445173", "the mat, and nothing else"

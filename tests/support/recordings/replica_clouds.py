@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 
 from su3d_bench.core.types import Float32Array
-from su3d_bench.datasets.replica.cloud_truth import N_EMBEDDING
+from su3d_bench.datasets.replica.truth import N_EMBEDDING
 
 SEQUENCE = "Replica-semantic/room_0/Sequence_1"
 CLOUDS = f"{SEQUENCE}/saved-maps-gt/pointclouds"

@@ -22,7 +22,7 @@ from scannet_scan import (
 )
 
 from su3d_bench.datasets.scannet.dataset import ScanNet, ScannetOptions
-from su3d_bench.datasets.scannet.labels import TABLE_NAME
+from su3d_bench.datasets.scannet.truth import TABLE_NAME
 
 WHERE = f"scannet/{SCAN}"
 

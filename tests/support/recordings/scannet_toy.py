@@ -17,7 +17,6 @@ SCENE = "scene0000_00"
 WHERE = f"scannet/{SCENE}"
 RECORDED = json.loads((CASES / "sens01_toy.json").read_text())
 N_FRAMES = 4
-ONE_KIND = ("color", "depth", "pose")
 
 
 def png_bytes(values: np.ndarray) -> bytes:

@@ -11,7 +11,7 @@ import numpy as np
 from scannet_scan import floor_image, grid, write_mesh
 
 from su3d_bench.core.types import Float64Array, UInt8Array
-from su3d_bench.datasets.scannetpp.iphone.depth_file import DEPTH_SIZE, packed_metres
+from su3d_bench.datasets.scannetpp.images import DEPTH_SIZE, packed_metres
 from su3d_bench.formats.images import jpeg_bytes, png_bytes
 
 SCENE = "036bce3393"

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from su3d_bench.core.types import Frame
-from su3d_bench.datasets.writing import Layout, ScannedDataset, finish_scene, plan_scenes, write_frames
+from su3d_bench.datasets.writing import Layout, finish_scene, plan_scenes, write_frames
 
 CHAIR, WALL = 20, 93
 WIDTH, HEIGHT, N_FRAMES = 16, 12, 5
@@ -97,7 +98,7 @@ def files_below(folder: Path) -> set[str]:
 
 def write_scene(
     layout: Layout,
-    dataset: ScannedDataset,
+    dataset: Any,  # rooms, or a stage in their place
     scene: str,
     out: Path,
     report: Callable[[int], None] = lambda n_done: None,

@@ -18,10 +18,18 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError, counted
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, UInt8Array
-from su3d_bench.datasets.recordings.exported_frames import list_folder, read_size
 from su3d_bench.datasets.recordings.recorded_frames import StoredDepth, depth_m_of_values
-from su3d_bench.datasets.scannetpp.iphone.depth_file import DEPTH_NAME, DEPTH_SIZE, UNITS_PER_METRE, DepthFile
-from su3d_bench.datasets.scannetpp.iphone.poses import (
+from su3d_bench.datasets.recordings.source import list_folder, read_size
+from su3d_bench.datasets.scannetpp.images import (
+    DEPTH_NAME,
+    DEPTH_SIZE,
+    UNITS_PER_METRE,
+    VIDEO_NAME,
+    DepthFile,
+    VideoFile,
+    video_size,
+)
+from su3d_bench.datasets.scannetpp.poses import (
     COLMAP,
     FRAME_NAME,
     IMAGES_NAME,
@@ -31,7 +39,6 @@ from su3d_bench.datasets.scannetpp.iphone.poses import (
     read_colmap,
     read_tracking,
 )
-from su3d_bench.datasets.scannetpp.iphone.video import VIDEO_NAME, VideoFile, video_size
 from su3d_bench.formats.images import Size, UInt16Array, decode_colour, decode_depth, read_bytes, sized
 
 PoseSource = Literal["auto", "colmap", "tracking"]
