@@ -346,7 +346,7 @@ def test_a_table_or_record_that_is_damaged_is_one_line(
     table, record = tmp_path / "wrong.toml", tmp_path / "data/.fetched/record.json"
     for text in ("sources = []", "sources = 1", "[", "[[sources]]\nname = 'a'\nsecret = 1"):
         table.write_text(text)
-        code, _, err = called(["fetch", "models", "sam-vit-h", "--dry-run", "--sources", table], capsys)
+        code, _, err = called(["models", "fetch", "sam-vit-h", "--dry-run", "--sources", table], capsys)
         assert code == 2 and str(table) in err and len(err.splitlines()) == 1
     record.parent.mkdir(parents=True)
     for text in ("{", "[]", '{"files": 1, "unpacked": {}}'):
