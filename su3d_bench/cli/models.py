@@ -22,7 +22,6 @@ def add_parser(verbs: Any) -> None:
         verbs,
         "models",
         "List the foundation models, check their files, or run them once.",
-        "list|check|warm",
         (
             "su3d-bench models list",
             "su3d-bench models check clip-vit-h-14",
