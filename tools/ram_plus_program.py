@@ -2,7 +2,7 @@
 
     PYTHON ram_plus_program.py CHECKOUT WEIGHTS FOLDER --opset 17
 
-``su3d-bench models export ram-plus`` starts it where torch, transformers 4 and onnx are; of this program it imports
+``export_onnx.py`` starts it where torch, transformers 4 and onnx are; of this program it imports
 nothing. FOLDER holds ``images.npz`` (``images``, float32, N x 3 x 384 x 384). It gets ``ram_plus.onnx``,
 ``ram_tag_list.txt``, ``versions.json`` and ``answers.npz``: ``logit`` (N, T) and ``tag`` (N, T), whether the
 authors' ``generate_tag`` names it, and ``threshold`` (T,). The last line on stderr says what went wrong.

@@ -83,7 +83,7 @@ def _misplaced(line: str) -> Iterator[tuple[str, str]]:
     """The placeholders of a shell's line that stand where its quotes would be undone, or where a shell is fed."""
     for found in PLACEHOLDER.finditer(line):
         before = line[: found.start()]
-        unescaped = re.sub(r"\\.", "", before)
+        unescaped = re.sub(r"\\.|(?:^|\s)#[^\n]*", "", before)
         is_quoted = unescaped.count("'") % 2 or unescaped.count('"') % 2
         places = {"within quotes": is_quoted, "in or after a here-document": "<<" in before}
         places |= {f"behind a {sign}": before.endswith(sign) for sign in ("$", "\\")}

@@ -50,8 +50,8 @@ def load_verbs() -> None:
     import openpyxl  # noqa: F401
 
     import su3d_bench.analysis.page.contents
-    import su3d_bench.cli.sheets.make
-    import su3d_bench.cli.sheets.score
+    import su3d_bench.cli.sheets
+    import su3d_bench.cli.sheets_make
     import su3d_bench.predictions.export
     import su3d_bench.reports.page.page
     import su3d_bench.sheets.scores

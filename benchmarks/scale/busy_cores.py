@@ -35,12 +35,11 @@ WINDOW = 4  # samples over which what is wanted is held to what the cores have: 
 COMMAND = """
 import json, sys
 from contextlib import contextmanager
-from su3d_bench.cli import main
-from su3d_bench.cli.shared import bars as progress
+from su3d_bench.cli import main, run
 @contextmanager
 def lines(*_, **__):
     yield lambda one: print(json.dumps([one.unit, one.label, one.done, one.total]), file=sys.stderr, flush=True)
-progress.progress = lines
+run.progress = lines
 sys.exit(main.main(sys.argv[1:]))
 """
 OPTIONS = (

@@ -75,7 +75,7 @@ class ScanNet(FileDataset[ScannetOptions]):
     places_of_scenes = (".", "scans", "scannet/scans")
     how_to_get = (
         " or in its folders scans, scannet, scannet/scans (a scan is a folder such as scene0000_00 with "
-        "scene0000_00.sens or exported frames); su3d-bench fetch scannet says how to get it from "
+        "scene0000_00.sens or exported frames); su3d-bench datasets fetch scannet says how to get it from "
         "http://www.scan-net.org; or set SU3D_DATA to where it is, or make rooms in this layout: su3d-bench datasets "
         "make rooms --layout scannet --out DIR"
     )

@@ -3,39 +3,226 @@
 from __future__ import annotations
 
 import argparse
+import math
+import time
+from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli import cache, doctor, registry
-from su3d_bench.cli.shared.answers import answer_either
-from su3d_bench.cli.shared.flags import add_group, add_verb
-from su3d_bench.core.errors import EXIT_DONE
+from su3d_bench.cli import doctor
+from su3d_bench.cli.new import REGISTRY, add_new
+from su3d_bench.cli.options import Verbs, add_group, add_options, add_out, add_verb
+from su3d_bench.cli.output import answer, answer_either, answer_json, remark, show
+from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable, shown
 
 SHELLS = ("bash", "zsh", "fish")
+KIND_NAMES = ("perception", "model-digests", "runs", "replies")
+DAY_S = 86400
+MOST_REFUSED = 20  # lines
 
 
-def add_parser(verbs: Any) -> None:
+def add_parser(verbs: Verbs) -> None:
     actions = add_group(
         verbs,
         "dev",
         "Look after the program: its cache, this machine, completion in a shell, registries of results.",
         ("su3d-bench dev doctor", "su3d-bench dev cache list"),
     )
-    cache.add_parser(actions)
-    doctor.add_parser(actions)
+    _add_cache(actions)
+    add_verb(
+        actions,
+        "doctor",
+        "Look at libraries, GPU, data, models, folders and cores; exit code 1 where the main job cannot run.",
+        ("su3d-bench dev doctor", "su3d-bench dev doctor --json"),
+        doctor.call,
+        uses_all_cores=True,  # computes nothing, and shows the settings of threads
+    )
     parser = add_verb(
         actions,
         "completion",
-        "Print a script that completes verbs, flags and choices in a shell.",
+        "Print a script that completes verbs, options and choices in a shell.",
         ('eval "$(su3d-bench dev completion bash)"', "su3d-bench dev completion fish | source"),
         call_completion,
     )
     parser.add_argument("shell", choices=SHELLS, help="bash, zsh or fish")
-    registry.add_parser(actions)
+    _add_registry(actions)
+
+
+def _add_cache(verbs: Verbs) -> None:
+    actions = add_group(
+        verbs,
+        "cache",
+        "List what is kept in $SU3D_CACHE to be quick, and remove it.",
+        ("su3d-bench dev cache list", "su3d-bench dev cache clear perception --older-than 30"),
+        lists=True,
+    )
+    add_verb(
+        actions,
+        "list",
+        "List what is kept by kind: how many files, how large, how old.",
+        ("su3d-bench dev cache list", "su3d-bench dev cache list --json"),
+        call_cache_list,
+    )
+    parser = add_verb(
+        actions,
+        "clear",
+        "Remove what is kept, of some kinds or all; nothing but files of the cache's own form, never through links.",
+        ("su3d-bench dev cache clear all --dry-run", "su3d-bench dev cache clear perception --older-than 30"),
+        call_cache_clear,
+    )
+    parser.add_argument(
+        "kinds",
+        nargs="+",
+        choices=(*KIND_NAMES, "all"),
+        metavar="KIND",
+        help=f"{', '.join(KIND_NAMES)}, or all (which leaves replies: they may have cost money)",
+    )
+    parser.add_argument("--older-than", type=float, default=0.0, metavar="DAYS", help="only what is older (default: 0)")
+    add_options(parser, "--dry-run")
+
+
+def call_cache_list(arguments: argparse.Namespace) -> int:
+    from su3d_bench.runs.scenes import cache_root
+    from su3d_bench.store.caches import KINDS, cache_entries, size_text
+
+    root = cache_root()
+    rows: list[dict[str, Any]] = []
+    for kind in KINDS.values():
+        entries = list(cache_entries(root, kind))
+        times = [entry.written for entry in entries]
+        n_bytes = sum(entry.n_bytes for entry in entries)
+        ages = {"oldest": min(times, default=None), "newest": max(times, default=None)}
+        rows.append({"kind": kind.name, "n_files": len(entries), "n_bytes": n_bytes, **ages})
+    n_bytes = sum(row["n_bytes"] for row in rows)
+    lines = [f"cache: {shown(root)} ($SU3D_CACHE): {size_text(n_bytes)}"]
+    for row in rows:
+        old = f"written {_ago(row['newest'])} to {_ago(row['oldest'])} ago" if row["n_files"] else "nothing"
+        n_files = counted(row["n_files"], "file")
+        lines.append(f"  {row['kind']:<13}  {size_text(row['n_bytes']):>9}  {n_files:>13}  {old}")
+        lines.append(f"  {'':<13}  {KINDS[row['kind']].what}")
+    answer_either(arguments, {"folder": str(root), "n_bytes": n_bytes, "kinds": rows}, *lines)
+    return EXIT_DONE
+
+
+def _ago(written: float) -> str:
+    seconds = max(0.0, time.time() - written)
+    return counted(round(seconds / DAY_S), "day") if seconds >= DAY_S else counted(round(seconds / 3600), "hour")
+
+
+def call_cache_clear(arguments: argparse.Namespace) -> int:
+    from su3d_bench.runs.scenes import cache_root
+    from su3d_bench.store.caches import KINDS, cache_entries, clear_cache, size_text
+
+    if not 0 <= arguments.older_than < math.inf:
+        raise ConfigError(f"--older-than {arguments.older_than:g}: expected a number of days, 0 or more")
+    before = time.time() - arguments.older_than * DAY_S if arguments.older_than else math.inf
+    root, wanted = cache_root(), arguments.kinds
+    rows, lines = [], []
+    for kind in KINDS.values():
+        if kind.name not in wanted and ("all" not in wanted or kind.is_paid):
+            continue
+        if arguments.dry_run:
+            sizes = [entry.n_bytes for entry in cache_entries(root, kind) if entry.written < before]
+            n_files, n_bytes = len(sizes), sum(sizes)
+        else:
+            n_files, n_bytes = clear_cache(root, kind, before=before)
+        rows.append({"kind": kind.name, "n_files": n_files, "n_bytes": n_bytes})
+        done = "would be removed" if arguments.dry_run else "removed"
+        lines.append(f"{kind.name}: {counted(n_files, 'file')}, {size_text(n_bytes)} {done}")
+    answer_either(arguments, {"folder": str(root), "is_dry": arguments.dry_run, "kinds": rows}, *lines)
+    if "all" in wanted and "replies" not in wanted and any(cache_entries(root, KINDS["replies"])):
+        text = "replies of language models stay; su3d-bench dev cache clear replies removes them"
+        remark(text, quiet=arguments.quiet)
+    return EXIT_DONE
 
 
 def call_completion(arguments: argparse.Namespace) -> int:
-    import argcomplete
+    from argcomplete.shell_integration import shellcode
 
-    script = argcomplete.shellcode(["su3d-bench"], shell=arguments.shell)
+    script = shellcode(["su3d-bench"], shell=arguments.shell)
     answer_either(arguments, {"shell": arguments.shell, "script": script}, *script.splitlines())
     return EXIT_DONE
+
+
+def _add_registry(verbs: Verbs) -> None:
+    actions = add_group(
+        verbs,
+        "registry",
+        "Keep a registry of results: take bundles in after scoring them again, and make a site of their rankings.",
+        (
+            "su3d-bench dev registry add reproduced/rooms/bundle.zip --to my-registry",
+            "su3d-bench dev registry build my-registry --out site",
+        ),
+    )
+    parser = add_verb(
+        actions,
+        "add",
+        "Score bundles again and take them into a registry; exit code 1 where one is refused, with its reasons.",
+        (
+            "su3d-bench dev registry add bundle.zip --to my-registry --name opensu3d-rooms",
+            "su3d-bench dev registry add bundles/mine.zip",
+        ),
+        call_registry_add,
+    )
+    parser.add_argument(
+        "bundles", nargs="+", type=Path, metavar="BUNDLE", help="archives of report bundle or reproduce"
+    )
+    parser.add_argument(
+        "--to", type=Path, default=Path(), metavar="DIR", help="the registry's folder (default: where you are)"
+    )
+    parser.add_argument("--name", help="of the bundle in the registry (default: its file's, or its recipe and digest)")
+    parser = add_verb(
+        actions,
+        "build",
+        "Make a static site of a registry's bundles; exit code 1 where something in it can stand in no ranking.",
+        (
+            "su3d-bench dev registry build my-registry --out site",
+            'su3d-bench dev registry build . --out site --title "Maps of rooms" --bundles-at https://example.org/bundles',
+        ),
+        call_registry_build,
+    )
+    parser.add_argument("folder", type=Path, metavar="DIR", help="a registry, or any folder of bundles")
+    add_out(parser, "DIR", "where the site goes (default: site)", default=Path("site"))
+    parser.add_argument("--title", metavar="TEXT", help="of the first page (default: Registry of results)")
+    parser.add_argument("--bundles-at", metavar="URL", help="link the bundles there (default: named, not linked)")
+    add_new(actions, REGISTRY)
+
+
+def call_registry_add(arguments: argparse.Namespace) -> int:
+    from dataclasses import asdict
+
+    from su3d_bench.reproducing.registry.folder import add_bundle, lines_of
+
+    if arguments.name is not None and len(arguments.bundles) > 1:
+        raise ConfigError("--name: is of one bundle; add them one after the other")
+    found = []
+    for bundle in arguments.bundles:
+        found.append(add_bundle(bundle, arguments.to, arguments.name))
+        if not arguments.json:
+            answer(*lines_of(found[-1]))
+            show()
+    answer_json(arguments, {"bundles": [{**asdict(one), "is_added": not one.reasons} for one in found]})
+    return EXIT_CHECK_FAILED if any(one.reasons for one in found) else EXIT_DONE
+
+
+def call_registry_build(arguments: argparse.Namespace) -> int:
+    from su3d_bench.reproducing.registry.folder import read_registry
+    from su3d_bench.reproducing.registry.site import TITLE, write_site
+
+    registry = read_registry(arguments.folder)
+    title = TITLE if arguments.title is None else printable(arguments.title, 120)
+    pages = write_site(registry, arguments.out, title, arguments.bundles_at)
+    refused = [f"left out: {one.run}, {one.what}: {one.reason}" for one in registry.refused]
+    for line in refused[:MOST_REFUSED]:
+        remark(line)
+    if len(refused) > MOST_REFUSED:
+        remark(f"left out: {len(refused) - MOST_REFUSED} more")
+    counts = f"{counted(len(registry.rows), 'row')} of {counted(registry.n_bundles, 'bundle')} in "
+    value: dict[str, Any] = {
+        "index": str(pages[0]),
+        "n_pages": len(pages) - 1,
+        "n_bundles": registry.n_bundles,
+        "n_rows": len(registry.rows),
+        "left_out": [vars(one) for one in registry.refused],
+    }
+    answer_either(arguments, value, f"{pages[0]}: {counts}{counted(len(registry.boards), 'ranking')}")
+    return EXIT_CHECK_FAILED if refused else EXIT_DONE

@@ -6,10 +6,10 @@ import argparse
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from su3d_bench.cli.shared.answers import answer_tables, remark
-from su3d_bench.cli.shared.flags import add_protocols, add_table_format, add_verb
+from su3d_bench.cli.options import Verbs, add_options, add_verb
+from su3d_bench.cli.output import answer_tables, remark
 from su3d_bench.core.errors import EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 SCHEMA = 1  # of the JSON file of several methods
 
 
-def add_parser(verbs: Any) -> None:
+def add_parser(verbs: Verbs) -> None:
     parser = add_verb(
         verbs,
         "evaluate",
@@ -66,29 +66,17 @@ def add_parser(verbs: Any) -> None:
         help="what that text holds, where its values do not tell: class ids, label * 1000 + instance, or numbers of "
         "objects alone (0 for none), as in the OpenSUN3D challenge",
     )
-    add_protocols(parser, "evaluations (default: all that fit)", "PROTOCOL")
-    parser.add_argument("--scenes", nargs="+", default=[], metavar="SCENE", help="names or patterns (default: all)")
+    add_options(parser, "--protocols", "--scenes")
     parser.add_argument("--format", metavar="FORMAT", help="of the predictions, where it cannot be recognised")
-    parser.add_argument(
-        "--text-features",
-        type=Path,
-        metavar="FILE",
-        help="features of class names for predictions that have features: .npz with names and features",
-    )
+    add_options(parser, "--text-features")
     parser.add_argument(
         "--confidences",
         choices=("protocol", "file"),
         help="where a protocol has 1 for every mask: its rule, or the files' (default: file for ScanNet's text)",
     )
-    parser.add_argument(
-        "--queries",
-        type=Path,
-        metavar="FILE",
-        help="texts and the objects that they speak of, for query-ap and grounding: TOML or CSV with scene, text and "
-        "objects, ScanRefer's JSON, Nr3D's CSV",
-    )
+    add_options(parser, "--queries")
     parser.add_argument("--per-class", action="store_true", help="print the table of every class too")
-    add_table_format(parser, "--table-format")
+    add_options(parser, "--table-format")
 
 
 def call(arguments: argparse.Namespace) -> int:

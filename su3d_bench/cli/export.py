@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.shared.answers import answer, answer_json, remark
-from su3d_bench.cli.shared.flags import add_verb
+from su3d_bench.cli.options import Verbs, add_options, add_verb
+from su3d_bench.cli.output import answer, answer_json, remark
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, counted, printable, suggest
 
 if TYPE_CHECKING:
@@ -23,9 +23,9 @@ TARGETS = ("openlex3d", "scannet", "scannetpp", "opensun3d")
 QUERY_RULES = "opensun3d-queries"
 
 
-def add_parser(actions: Any) -> None:
+def add_parser(verbs: Verbs) -> None:
     parser = add_verb(
-        actions,
+        verbs,
         "export",
         "Write predictions, our own or another program's, as the files that another evaluator takes.",
         (
@@ -45,20 +45,13 @@ def add_parser(actions: Any) -> None:
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder for the files")
     parser.add_argument("--method", help="whose maps of a run (default: the only one that it was asked for)")
-    parser.add_argument(
-        "--scenes", nargs="+", default=[], metavar="SCENE", help="addresses or patterns, such as 'replica/*'"
-    )
+    add_options(parser, "--scenes")
     parser.add_argument("--format", help="the format of the prediction (default: found from its files)")
     parser.add_argument(
         "--protocol",
         help="for scannet and scannetpp: whose classes and ground truth (default: the dataset's only one of instances)",
     )
-    parser.add_argument(
-        "--text-features",
-        type=Path,
-        metavar="FILE",
-        help="not for openlex3d: features of class names for predictions with features: .npz with names and features",
-    )
+    add_options(parser, "--text-features")
 
 
 @dataclass(frozen=True)
@@ -267,7 +260,7 @@ def _write_answer(
 
 def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:
     """The dataset and the scene of a prediction, with the options and the data of the run that it lies in."""
-    from su3d_bench.cli.datasets.check import chosen_scenes
+    from su3d_bench.cli.scenes import chosen_scenes
     from su3d_bench.runs.finished import data_of_map
 
     if source.run is None:

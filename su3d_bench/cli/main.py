@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
 
-from su3d_bench.cli.parser import Parser
-from su3d_bench.cli.shared.answers import remark
+from su3d_bench.cli.options import Parser
+from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import (
     EXIT_DONE,
     EXIT_INTERNAL,
@@ -24,24 +24,22 @@ from su3d_bench.core.printing import doors
 from su3d_bench.core.system.endings import Ended, ending_in_order
 from su3d_bench.core.version import __version__
 
-# Modules of this folder with ``add_parser(verbs)``, in the order of the help.
-VERBS = (
-    "run",
-    "ablate",
-    "evaluate",
-    "reproduce",
-    "compare",
-    "check",
-    "report",
-    "runs",
-    "query",
-    "sheets",
-    "datasets",
-    "models",
-    "methods",
-    "protocols",
-    "dev",
-)
+# The modules of this folder with ``add_parser(verbs)``, and their verbs, in the order of the help.
+MODULES = {
+    "run": ("run", "ablate"),
+    "evaluate": ("evaluate",),
+    "reproduce": ("reproduce",),
+    "compare": ("compare", "check"),
+    "report": ("report",),
+    "runs": ("runs",),
+    "query": ("query",),
+    "sheets": ("sheets",),
+    "datasets": ("datasets",),
+    "models": ("models",),
+    "methods": ("methods",),
+    "protocols": ("protocols",),
+    "dev": ("dev",),
+}
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 DESCRIPTION = "Evaluate and benchmark open-vocabulary, instance-level 3D scene understanding from RGB-D."
 EPILOG = """examples:
@@ -60,7 +58,7 @@ def build_parser(verb: str | None = None) -> Parser:
     )
     parser.add_argument("--version", action="version", version=f"su3d-bench {__version__}")
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
-    for name in [name for name in VERBS if name == verb] or VERBS:
+    for name in [name for name, own in MODULES.items() if verb in own] or MODULES:
         import_module(f"su3d_bench.cli.{name}").add_parser(verbs)
     return parser
 
@@ -103,7 +101,12 @@ def _exit_code(words: Sequence[str]) -> int:
     """What ``words`` ask for, done; whatever goes wrong is one line on stderr, with ``--debug`` below its traceback."""
     arguments = argparse.Namespace()
     try:
-        arguments = build_parser(words[0] if words else None).parse_args(words)
+        parser = build_parser(words[0] if words else None)
+        if "_ARGCOMPLETE" in os.environ:  # a shell asks what may follow; see su3d-bench dev completion
+            complete(parser)
+        arguments = parser.parse_args(words)
+        if "call" not in arguments:  # a verb with several sub-verbs, given alone
+            arguments = parser.parse_args([*words, "list"])
         from su3d_bench.runs.executors import limit_threads  # late: --help does without what it imports
 
         _refuse_records(arguments)

@@ -10,8 +10,8 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.new import add_new
-from su3d_bench.cli.shared.answers import answer, answer_document, answer_either, answer_json
-from su3d_bench.cli.shared.flags import add_group, add_verb
+from su3d_bench.cli.options import Verbs, add_group, add_verb
+from su3d_bench.cli.output import answer, answer_document, answer_either, answer_json
 from su3d_bench.core.errors import EXIT_DONE, counted
 from su3d_bench.core.printing import one_line
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 WIDTH = 118
 
 
-def add_parser(verbs: Any) -> None:
+def add_parser(verbs: Verbs) -> None:
     actions = add_group(
         verbs,
         "methods",

@@ -7,25 +7,23 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.shared.answers import answer, answer_either, answer_json, remark
-from su3d_bench.cli.shared.flags import add_group, add_settings, add_verb
+from su3d_bench.cli import fetch
+from su3d_bench.cli.options import Verbs, add_group, add_options, add_verb, perception_config
+from su3d_bench.cli.output import answer, answer_either, answer_json, remark
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
     from su3d_bench.perception.models.files import ModelFiles
     from su3d_bench.perception.models.inspection import ModelState, WarmUp
-    from su3d_bench.perception.profiles import PerceptionConfig
 
 
-def add_parser(verbs: Any) -> None:
+def add_parser(verbs: Verbs) -> None:
     actions = add_group(
         verbs,
         "models",
-        "List the foundation models, check their files, or run them once.",
-        (
-            "su3d-bench models list",
-            "su3d-bench models check clip-vit-h-14",
-        ),
+        "List the foundation models, fetch them, check their files, or run them once.",
+        ("su3d-bench models list", "su3d-bench models fetch --for paper --dry-run"),
+        lists=True,
     )
     listing = add_verb(
         actions,
@@ -34,7 +32,7 @@ def add_parser(verbs: Any) -> None:
         ("su3d-bench models list", "su3d-bench models list --json"),
         call_list,
     )
-    _add_settings(listing)
+    add_options(listing, "--set")
     checking = add_verb(
         actions,
         "check",
@@ -43,13 +41,14 @@ def add_parser(verbs: Any) -> None:
         call_check,
     )
     checking.add_argument("names", nargs="*", metavar="MODEL", help="short names (default: every model that is here)")
-    _add_settings(checking)
+    add_options(checking, "--set")
     _add_warm(actions)
+    fetch.add_models(actions)
 
 
-def _add_warm(actions: Any) -> None:
+def _add_warm(verbs: Verbs) -> None:
     parser = add_verb(
-        actions,
+        verbs,
         "warm",
         "Load the models of a profile, or one encoder, run them on a made frame, and tell time and memory.",
         ("su3d-bench models warm --profile paper --device cuda", "su3d-bench models warm clip-vit-b-32"),
@@ -57,23 +56,7 @@ def _add_warm(actions: Any) -> None:
     )
     parser.add_argument("name", nargs="?", metavar="ENCODER", help="an encoder alone (default: the profile's models)")
     parser.add_argument("--profile", help="whose models (default: paper)")
-    parser.add_argument("--device", help="cpu, cuda or cuda:1 (default: cpu)")
-    _add_settings(parser)
-
-
-def _add_settings(parser: argparse.ArgumentParser) -> None:
-    add_settings(parser, "a setting of perception, such as perception.models.folder=/data/models")
-
-
-def perception_config(arguments: argparse.Namespace) -> PerceptionConfig:
-    """What ``--set`` says of perception, and ``--device`` where the verb has it."""
-    from su3d_bench.core.config import Setting, Settings, read_assignments, resolve
-    from su3d_bench.perception.profiles import PerceptionConfig
-
-    settings = read_assignments(arguments.set, (), ())
-    if getattr(arguments, "device", None) is not None:
-        settings += Settings((Setting(("perception", "models", "device"), arguments.device, "--device"),))
-    return resolve(settings, ("perception",), PerceptionConfig)
+    add_options(parser, "--device", "--set")
 
 
 def call_list(arguments: argparse.Namespace) -> int:

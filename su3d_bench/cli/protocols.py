@@ -1,27 +1,26 @@
-"""``su3d-bench protocols``: the evaluations, every rule of one, and in which rules two of them differ."""
+"""``su3d-bench protocols``: the evaluations, every rule of one, how two differ, the texts that one compares with."""
 
 from __future__ import annotations
 
 import argparse
 import os
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli import texts
 from su3d_bench.cli.new import add_new
-from su3d_bench.cli.shared.answers import answer_either, answer_tables, remark, show
-from su3d_bench.cli.shared.bars import progress
-from su3d_bench.cli.shared.flags import add_group, add_table_format, add_verb
-from su3d_bench.core.errors import EXIT_DONE, ConfigError
+from su3d_bench.cli.options import Verbs, add_group, add_options, add_verb, perception_config
+from su3d_bench.cli.output import answer_either, answer_tables, progress, remark, show
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, shown, suggest
 
 if TYPE_CHECKING:
     from su3d_bench.metrics.protocols.loading import Stated
     from su3d_bench.metrics.protocols.model import ProtocolRules
 
 
-def add_parser(verbs: Any) -> None:
+def add_parser(verbs: Verbs) -> None:
     actions = add_group(
         verbs,
         "protocols",
@@ -45,7 +44,7 @@ def add_parser(verbs: Any) -> None:
     )
     parser.add_argument("name", metavar="PROTOCOL", help="its name, or a .toml file of the same form")
     parser.add_argument("--names", action="store_true", help="the texts, one a line, to encode elsewhere")
-    texts.add_queries(parser)
+    add_options(parser, "--queries")
     parser = add_verb(
         actions,
         "diff",
@@ -64,11 +63,8 @@ def add_parser(verbs: Any) -> None:
         help="score it under every choice of the rules, and split the difference of its numbers among them",
     )
     parser.add_argument("--out", type=Path, metavar="PNG", help="with --prediction: draw the steps to this file")
-    parser.add_argument(
-        "--jobs", type=int, default=0, metavar="N", help="scenes scored side by side (default: the CPU cores)"
-    )
-    add_table_format(parser)
-    texts.add_parser(actions)
+    add_options(parser, "--jobs", "--format")
+    _add_texts(actions)
     add_new(actions, "protocol")
 
 
@@ -120,8 +116,6 @@ def call_diff(arguments: argparse.Namespace) -> int:
 
     if arguments.out is not None and arguments.prediction is None:
         raise ConfigError("protocols diff: --out draws the steps of a --prediction; name one")
-    if arguments.jobs < 0:
-        raise ConfigError(f"--jobs {arguments.jobs}: must be 1 or more; 0 stands for the CPU cores")
     first, second = load_protocol(arguments.name), load_protocol(arguments.other)
     apart = rules_apart(first, second)
     if arguments.prediction is not None:
@@ -173,3 +167,92 @@ def _rules_lines(rules: ProtocolRules, files: Sequence[Path]) -> list[str]:
         remark = "" if entry in rules.scored else "  (ignored)"
         lines.append(f"{entry.id:>6}  {entry.name}{f'  {entry.group}' if entry.group else ''}{remark}")
     return lines
+
+
+SUFFIX = ".npz"
+FORMS_OF_EVALUATE = (".toml", ".csv")  # of queries, with the objects that they speak of
+
+
+def _add_texts(verbs: Verbs) -> None:
+    parser = add_verb(
+        verbs,
+        "texts",
+        "Encode every text of a protocol: its classes under its prompts, or queries, for evaluate --text-features.",
+        (
+            "su3d-bench protocols texts --protocol rooms-semantic --encoder embedded --out texts.npz",
+            "su3d-bench protocols texts --protocol replica-openmask3d --encoder clip-vit-l-14-336 --out texts.npz",
+        ),
+        call_texts,
+    )
+    parser.add_argument("--protocol", required=True, metavar="P", help="whose texts; a name, or a .toml file")
+    parser.add_argument(
+        "--encoder", metavar="E", help="what encodes them, a name of su3d-bench models list (default: the protocol's)"
+    )
+    add_options(parser, "--queries")
+    add_options(parser, "--device", "--set")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="where names and features go")
+
+
+def call_texts(arguments: argparse.Namespace) -> int:
+    from su3d_bench.core.files.atomic import make_folder, write_npz
+    from su3d_bench.evaluation.texts import distinct_texts, named_texts, text_arrays
+    from su3d_bench.metrics.protocols.loading import load_protocol
+    from su3d_bench.perception.models.loading import load_encoder
+    from su3d_bench.store.run_folder import refuse_records
+
+    out: Path = arguments.out
+    if out.suffix != SUFFIX:
+        raise ConfigError(f"protocols texts: --out {shown(out)}: give a file that ends in {SUFFIX}")
+    rules = load_protocol(arguments.protocol)
+    named = named_texts(rules, arguments.queries)
+    name = _encoder_name(arguments.encoder, rules.name, rules.encoder)
+    refuse_records(out)
+    models = perception_config(arguments).models.model_copy(update={"encoder": name})
+    encoder = load_encoder(models)
+    texts = distinct_texts(named)
+    arrays = text_arrays(texts, encoder)
+    make_folder(out.parent)
+    write_npz(out, arrays)
+    n_dimensions = int(arrays["features"].shape[1])
+    value = {
+        "file": str(out),
+        "protocol": rules.name,
+        "encoder": encoder.name,
+        "encoder_digest": encoder.digest,
+        "n_names": len(named),
+        "n_texts": len(texts),
+        "n_dimensions": n_dimensions,
+    }
+    answer_either(
+        arguments,
+        value,
+        f"{out}: {len(texts)} texts for {len(named)} names of {rules.name}, {n_dimensions} dimensions, encoder "
+        f"'{encoder.name}'",
+    )
+    words = ["--protocols", arguments.protocol, "--text-features", str(out)]
+    if arguments.queries is not None and arguments.queries.suffix.lower() in FORMS_OF_EVALUATE:
+        words += ["--queries", str(arguments.queries)]
+    remark(f"use: su3d-bench evaluate PREDICTIONS {shlex.join(words)}", quiet=arguments.quiet)
+    return EXIT_DONE
+
+
+def _encoder_name(said: str | None, protocol: str, of_protocol: str | None) -> str:
+    """The model's short name of the encoder that is asked for, else of the protocol's own."""
+    from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
+    from su3d_bench.perception.models.catalogue import MODELS, encoder_known_as
+    from su3d_bench.perception.models.config import EMBEDDED
+
+    known = [EMBEDDED, *(entry.name for entry in MODELS.values() if entry.kind == "encoder")]
+    asked = of_protocol if said is None else said
+    if asked is None:
+        listed = ", ".join(known)
+        raise ConfigError(f"protocols texts: protocol '{protocol}' names no encoder; name one with --encoder: {listed}")
+    if asked in known:
+        return asked
+    if asked == EmbeddedEncoder.name:
+        return EMBEDDED
+    if (entry := encoder_known_as(asked)) is not None:
+        return entry.name
+    whose = "" if said is not None else f" of protocol '{protocol}'"
+    hint = suggest(asked, known) or f"; known: {', '.join(known)}"
+    raise ConfigError(f"protocols texts: unknown encoder '{asked}'{whose}{hint}")

@@ -1,4 +1,4 @@
-"""``su3d-bench query text``: a text -> the instances of a map by similarity, and a heat map."""
+"""``su3d-bench query text`` and ``query ask``: the map of a scene searched for a text, and asked a question."""
 
 from __future__ import annotations
 
@@ -6,17 +6,33 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli import ask, questions
-from su3d_bench.cli.shared.answers import answer, answer_json, file_name_of, remark, remark_unseen, show
-from su3d_bench.cli.shared.flags import add_group, add_verb, add_whose_map, check_scene_first
-from su3d_bench.core.errors import ConfigError, PredictionError
+from su3d_bench.cli import questions
+from su3d_bench.cli.options import (
+    Verbs,
+    add_group,
+    add_language_options,
+    add_options,
+    add_verb,
+    answer_estimate,
+    chat_client,
+    count,
+    open_map,
+)
+from su3d_bench.cli.output import answer, answer_json, file_name_of, remark, remark_unseen, show
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, StoreError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from su3d_bench.core.maps import Instances
+    from su3d_bench.metrics.questions.score import RefinedNames
+    from su3d_bench.questions.model import Answer
     from su3d_bench.questions.retrieval import Ranking
+    from su3d_bench.questions.scene_map import SceneMap
+    from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 
-def add_parser(verbs: Any) -> None:
+def add_parser(verbs: Verbs) -> None:
     actions = add_group(
         verbs,
         "query",
@@ -24,44 +40,41 @@ def add_parser(verbs: Any) -> None:
         ('su3d-bench query text rooms/living0 "plant on shelf"', "su3d-bench query show paper"),
     )
     _add_text(actions)
-    ask.add_parser(actions)
+    _add_ask(actions)
     questions.add_parser(actions)
 
 
-def _add_text(actions: Any) -> None:
+def _add_text(verbs: Verbs) -> None:
     parser = add_verb(
-        actions,
+        verbs,
         "text",
         "Rank the instances of a scene's map by their similarity to a text and draw the heat map.",
         (
             'su3d-bench query text rooms/living0 "plant on shelf"',
             'su3d-bench query text rooms/living0 "place to sit" --top 3 --method opensu3d --json',
         ),
-        call,
+        call_text,
     )
     parser.add_argument("scene", help="the scene's address, such as rooms/living0")
     parser.add_argument("text", help="what to look for")
-    add_whose_map(parser)
-    parser.add_argument("--top", type=int, default=10, metavar="N", help="how many instances to list (default: 10)")
-    parser.add_argument("--device", default="cpu", help="of the text's encoder (default: cpu)")
+    add_options(parser, "--run", "--method")
+    parser.add_argument("--top", type=count, default=10, metavar="N", help="how many instances to list (default: 10)")
+    add_options(parser, "--device")
     parser.add_argument("--out", type=Path, metavar="FILE", help="where the picture goes (default: beside the map)")
 
 
-def call(arguments: argparse.Namespace) -> int:
+def call_text(arguments: argparse.Namespace) -> int:
     from su3d_bench.core.maps import DenseFeatures, Instances
     from su3d_bench.questions.retrieval import rank
-    from su3d_bench.runs.finished import encoder_of, map_of_scene
+    from su3d_bench.runs.finished import encoder_of
 
     if not arguments.text.strip():
         raise ConfigError('the text is empty; say what to look for: su3d-bench query text rooms/living0 "a plant"')
-    if arguments.top < 1:
-        raise ConfigError(f"--top {arguments.top}: at least 1 instance must be listed")
-    check_scene_first("query text", arguments.scene, arguments.text)
-    run, job, prediction = map_of_scene(arguments.scene, arguments.method, arguments.run)
+    run, job, prediction = open_map(arguments, "text", arguments.text)
     if not isinstance(prediction, Instances):
         what = "one feature a point and no instances" if isinstance(prediction, DenseFeatures) else "no instances"
         raise PredictionError(f"{job.prediction}: has {what}, so there is nothing to rank; choose another --method")
-    encoder = encoder_of(run, arguments.device)
+    encoder = encoder_of(run, arguments.device or "cpu")
     ranking = rank(prediction, arguments.text, encoder)
     rows = _rows(prediction, ranking, arguments.top)
     picture = arguments.out or job.picture(f"query-{file_name_of(arguments.text, 'text')}.png")
@@ -74,14 +87,14 @@ def call(arguments: argparse.Namespace) -> int:
             place = f"{x:7.2f}{y:7.2f}{z:7.2f}"
             answer(f"{row['rank']:>4}  {row['id']:>{wide}}  {row['similarity']:>10.3f}  {place:<22}  {row['name']}")
         show()  # the picture takes longer than the answer
-    _draw(prediction, ranking, rows, picture, f'{arguments.scene}: "{arguments.text}"')
+    _draw_text(prediction, ranking, rows, picture, f'{arguments.scene}: "{arguments.text}"')
     value = {"scene": arguments.scene, "text": arguments.text, "picture": str(picture), "ranking": rows}
     if not answer_json(arguments, value):
         remark(f"heat map: {picture}", quiet=arguments.quiet)
     return 0
 
 
-def _draw(instances: Instances, ranking: Ranking, rows: list[dict[str, Any]], picture: Path, title: str) -> None:
+def _draw_text(instances: Instances, ranking: Ranking, rows: list[dict[str, Any]], picture: Path, title: str) -> None:
     from su3d_bench.reports.pictures.maps import draw_heat_map
 
     lines = [f"{row['rank']}. {row['name']}  {row['similarity']:.3f}" for row in rows]
@@ -101,3 +114,140 @@ def _rows(instances: Instances, ranking: Ranking, top: int) -> list[dict[str, An
             }
         )
     return rows
+
+
+SOLVERS = ("built-in", "llm")
+NAMES = ("auto", "label", "refined")
+
+
+def _add_ask(verbs: Verbs) -> None:
+    parser = add_verb(
+        verbs,
+        "ask",
+        "Answer a question about a scene from its map: by geometry, or by a language model.",
+        (
+            'su3d-bench query ask rooms/living0 "Which lamp is closer to the sofa?"',
+            'su3d-bench query ask rooms/living0 "I am feeling cold, what should I do?" --solver llm --dry-run',
+        ),
+        call_ask,
+    )
+    parser.add_argument("scene", help="the scene's address, such as rooms/living0")
+    parser.add_argument("question", help="the question, in English")
+    add_options(parser, "--run", "--method")
+    parser.add_argument(
+        "--solver", choices=SOLVERS, default="built-in", help="who answers: geometry alone, or a language model"
+    )
+    parser.add_argument(
+        "--names",
+        choices=NAMES,
+        default="auto",
+        help="the map's labels n, or n' of su3d-bench runs refine (default: n' where it is there)",
+    )
+    parser.add_argument(
+        "--eye",
+        nargs=3,
+        type=float,
+        metavar=("X", "Y", "Z"),
+        help="where one stands for left and right, in metres (default: the middle of the map)",
+    )
+    parser.add_argument("--out", type=Path, metavar="FILE", help="where the picture goes (default: beside the map)")
+    add_language_options(parser)
+
+
+def call_ask(arguments: argparse.Namespace) -> int:
+    from su3d_bench.core.maps import Instances
+    from su3d_bench.questions.scene_map import map_of
+
+    if not arguments.question.strip():
+        raise ConfigError(
+            'the question is empty; ask such as: su3d-bench query ask rooms/living0 "How many lamps are there?"'
+        )
+    run, job, instances = open_map(arguments, "ask", arguments.question)
+    if not isinstance(instances, Instances):
+        raise PredictionError(f"{job.prediction}: holds no instances, so there is nothing to ask about")
+    refined, note = _refined(job, arguments.names)
+    scene = map_of(instances, refined)
+    if arguments.dry_run:
+        return _estimate(scene, run, arguments)
+    reply = _solve(scene, run, arguments)
+    if not arguments.json:
+        answer(reply.text)
+        for line in (*reply.notes, f"names: {note}"):
+            remark(line, quiet=arguments.quiet)
+        show()  # the picture takes longer than the answer
+    picture = _draw_ask(instances, scene, reply, job, arguments)
+    value = {"scene": arguments.scene, "question": arguments.question} | reply.to_json()
+    is_json = answer_json(arguments, value | {"names": note, "picture": None if picture is None else str(picture)})
+    if picture is not None and not is_json:
+        remark(f"picture: {picture}", quiet=arguments.quiet)
+    return EXIT_DONE
+
+
+def _refined(job: JobFolder, wanted: str) -> tuple[RefinedNames | None, str]:
+    """Labels n' where they are wanted and there, and which names these are."""
+    from su3d_bench.questions.refining import read_records
+
+    records = None if wanted == "label" else read_records(job)
+    if records is None:
+        if wanted == "refined":
+            raise StoreError(f"{job.path}: has no labels n'; make them with su3d-bench runs refine")
+        return None, "labels n"
+    n_left_out = sum(bool(name.left_out) for name in records.names)
+    without = f", without {n_left_out} that it leaves out" if n_left_out else ""
+    return records.refined, f"labels n' by {records.model or 'vote'}{without}"
+
+
+def _estimate(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> int:
+    from su3d_bench.questions.language_solver import LanguageSolver
+
+    if arguments.solver != "llm":
+        return answer_estimate(arguments, None, ())
+    client, config = chat_client(arguments, run)
+    return answer_estimate(arguments, client, [LanguageSolver(scene, client, config).request(arguments.question)])
+
+
+def _solve(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> Answer:
+    import numpy as np
+
+    from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
+    from su3d_bench.questions.language_solver import LanguageSolver
+    from su3d_bench.questions.scene_map import nearest_by
+    from su3d_bench.questions.solver import Solver
+
+    if arguments.solver == "llm":
+        return LanguageSolver(scene, *chat_client(arguments, run)).answer(arguments.question)
+    eye = None if arguments.eye is None else np.array(arguments.eye, np.float64)
+    if eye is not None and not np.isfinite(eye).all():
+        raise ConfigError(f"--eye {arguments.eye}: expected three finite numbers of metres")
+    unnamed: dict[str, None] = {}  # nouns by which the map calls nothing, each once
+
+    def nearest_name(noun: str, names: Sequence[str]) -> tuple[str, float]:
+        unnamed[noun] = None
+        return nearest_by(encoder)(noun, names)
+
+    encoder = EmbeddedEncoder()  # whose files are read only where a name is looked for
+    reply = Solver(scene, eye, nearest_name).answer(arguments.question)
+    asked = arguments.question.split()
+    for noun in unnamed or asked[: len(asked) == 1]:  # of one word there is no question, only a noun
+        remark_unseen(encoder, noun, quiet=arguments.quiet)
+    return reply
+
+
+def _draw_ask(
+    instances: Instances, scene: SceneMap, reply: Answer, job: JobFolder, arguments: argparse.Namespace
+) -> Path | None:
+    """Draw the answer; None where it names no object."""
+    from su3d_bench.reports.pictures.figures import SpokenOf, draw_reasoning
+
+    if not reply.object_ids:
+        if arguments.out is not None:
+            remark(f"{arguments.out}: not drawn, for the answer names no object", quiet=arguments.quiet)
+        return None
+    picture: Path = arguments.out or job.picture(f"ask-{file_name_of(arguments.question, 'question')}.png")
+    rows = [tuple(scene.by_id(object_id).row for object_id in ids) for ids in (reply.object_ids, reply.reference_ids)]
+    names = [""] * len(instances)
+    for thing in scene.objects:
+        names[thing.row] = thing.shown
+    title = f"{arguments.scene}: {arguments.question}"
+    draw_reasoning(instances, SpokenOf(*rows), names, picture, title, (reply.text, *reply.notes))
+    return picture

@@ -8,9 +8,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.shared.answers import answer, answer_either, answer_json, answer_tables, remark
-from su3d_bench.cli.shared.flags import add_table_format, add_verb
-from su3d_bench.cli.shared.language import add_language_flags, answer_estimate, chat_client
+from su3d_bench.cli.options import (
+    Verbs,
+    add_language_options,
+    add_options,
+    add_verb,
+    answer_estimate,
+    chat_client,
+    count,
+    given_language_option,
+)
+from su3d_bench.cli.output import answer, answer_either, answer_json, answer_tables, remark
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, counted
 
 if TYPE_CHECKING:
@@ -20,21 +28,21 @@ PAPER = "paper"
 SOURCES = ("auto", "generated")
 FORMS = ("own", "beacon3d-grounding", "beacon3d-qa")
 JUDGE_MODEL = "gpt-4o-2024-08-06"  # Beacon3D's
-OF_JUDGE = ("model", "base_url", "config", "set", "offline", "ask_failed_again", "dry_run")
+
 N_SHOWN = 20
 MOST_CHARACTERS = 80
 
 
-def add_parser(actions: Any) -> None:
-    _add_make(actions)
-    _add_show(actions)
-    _add_audit(actions)
-    _add_score(actions)
+def add_parser(verbs: Verbs) -> None:
+    _add_make(verbs)
+    _add_show(verbs)
+    _add_audit(verbs)
+    _add_score(verbs)
 
 
-def _add_make(actions: Any) -> None:
+def _add_make(verbs: Verbs) -> None:
     parser = add_verb(
-        actions,
+        verbs,
         "make",
         "Make a set of questions with known answers from the ground truth of scenes.",
         (
@@ -53,7 +61,7 @@ def _add_make(actions: Any) -> None:
     )
     parser.add_argument(
         "--per-kind",
-        type=int,
+        type=count,
         metavar="N",
         help="at most N questions of each kind and scene, or objects of a scene (default: all)",
     )
@@ -63,9 +71,7 @@ def _add_make(actions: Any) -> None:
         choices=SOURCES,
         help="auto: what the dataset itself knows, else generated from classes and boxes (default: auto)",
     )
-    parser.add_argument(
-        "--leave-out", type=Path, metavar="FILE", help="without the questions that a CSV file lists by their id"
-    )
+    add_options(parser, "--leave-out")
     parser.add_argument(
         "--form",
         default=FORMS[0],
@@ -74,9 +80,9 @@ def _add_make(actions: Any) -> None:
     )
 
 
-def _add_show(actions: Any) -> None:
+def _add_show(verbs: Verbs) -> None:
     parser = add_verb(
-        actions,
+        verbs,
         "show",
         "Show a set of questions: how many of each kind, and the first of them.",
         ("su3d-bench query show queries.toml", "su3d-bench query show paper --json"),
@@ -87,9 +93,9 @@ def _add_show(actions: Any) -> None:
     )
 
 
-def _add_audit(actions: Any) -> None:
+def _add_audit(verbs: Verbs) -> None:
     parser = add_verb(
-        actions,
+        verbs,
         "audit",
         "Draw a sample of the questions of scenes with pictures for people, or add up what they said of them.",
         (
@@ -100,18 +106,19 @@ def _add_audit(actions: Any) -> None:
     )
     _add_scenes(parser)
     parser.add_argument("--out", type=Path, metavar="DIR", help="where page, pictures and table go")
-    parser.add_argument("--n", type=int, default=200, metavar="N", help="so many questions (default: 200)")
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of the draw (default: 0)")
+    parser.add_argument("--n", type=count, default=200, metavar="N", help="so many questions (default: 200)")
+    add_options(parser, "--seed")
     parser.add_argument(
         "--kinds", nargs="+", default=[], metavar="KIND", help="these alone, such as retrieval, property, 'what on'"
     )
+    parser.add_argument("--per-page", type=count, default=12, metavar="N", help="questions of a sheet (default: 12)")
     parser.add_argument("--score", type=Path, metavar="FILE", help="add up the verdicts in this audit.csv instead")
-    add_table_format(parser)
+    add_options(parser, "--format")
 
 
-def _add_score(actions: Any) -> None:
+def _add_score(verbs: Verbs) -> None:
     parser = add_verb(
-        actions,
+        verbs,
         "score",
         "Score answers to the questions of a metadata_*.json of Beacon3D.",
         (
@@ -131,8 +138,8 @@ def _add_score(actions: Any) -> None:
     parser.add_argument(
         "--judge", action="store_true", help="let a language model score the answers that match no right one"
     )
-    add_language_flags(parser, JUDGE_MODEL)
-    add_table_format(parser)
+    add_language_options(parser, JUDGE_MODEL)
+    add_options(parser, "--format")
 
 
 def _add_scenes(parser: argparse.ArgumentParser, *, required: bool = False) -> None:
@@ -144,8 +151,6 @@ def _add_scenes(parser: argparse.ArgumentParser, *, required: bool = False) -> N
 def _make(arguments: argparse.Namespace) -> int:
     from su3d_bench.questions.question_files import check_form, write_questions
 
-    if arguments.per_kind is not None and arguments.per_kind < 1:
-        raise ConfigError(f"query make: --per-kind is {arguments.per_kind}; expected 1 or more")
     if arguments.form != FORMS[0]:
         return _make_beacon3d(arguments)
     check_form(arguments.out)
@@ -158,7 +163,7 @@ def _make(arguments: argparse.Namespace) -> int:
 
 def _make_beacon3d(arguments: argparse.Namespace) -> int:
     """Write one of Beacon3D's metadata files over objects of the scenes."""
-    from su3d_bench.cli.datasets.check import chosen_scenes
+    from su3d_bench.cli.scenes import chosen_scenes
     from su3d_bench.core.files.atomic import write_json
     from su3d_bench.questions.chains import made_files
     from su3d_bench.questions.truths import MIN_VERTICES, fullest_truth, scene_objects
@@ -183,7 +188,7 @@ def _make_beacon3d(arguments: argparse.Namespace) -> int:
 
 
 def _made(arguments: argparse.Namespace) -> list[Question]:
-    from su3d_bench.cli.datasets.check import chosen_scenes
+    from su3d_bench.cli.scenes import chosen_scenes
     from su3d_bench.questions.generator import chosen
     from su3d_bench.questions.query_files import read_left_out
     from su3d_bench.questions.truths import questions_of
@@ -251,7 +256,7 @@ def _counts(questions: Sequence[Question]) -> tuple[dict[str, Any], str]:
 
 
 def _audit(arguments: argparse.Namespace) -> int:
-    from su3d_bench.cli.datasets.check import chosen_scenes
+    from su3d_bench.cli.scenes import chosen_scenes
     from su3d_bench.questions.audit import audited_questions, n_of_each, of_kinds, sample
     from su3d_bench.sheets.audit import make_audit
 
@@ -259,12 +264,6 @@ def _audit(arguments: argparse.Namespace) -> int:
         return _score(arguments)
     if not arguments.scenes or arguments.out is None:
         raise ConfigError("query audit: needs --scenes and --out DIR, or --score DIR/audit.csv")
-    for flag, value, least in (
-        ("--n", arguments.n, 1),
-        ("--seed", arguments.seed, 0),
-    ):
-        if value < least:
-            raise ConfigError(f"query audit: {flag} is {value}; expected {least} or more")
     scenes = chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet)
     n_each = n_of_each(arguments.n, len(scenes))
     every = []
@@ -306,8 +305,8 @@ def _score_answers(arguments: argparse.Namespace) -> int:
 
     asked = arguments.file
     if not arguments.judge:
-        if flag := next((flag for flag in OF_JUDGE if getattr(arguments, flag)), None):
-            raise ConfigError(f"query score: --{flag.replace('_', '-')} belongs to --judge")
+        if flag := given_language_option(arguments):
+            raise ConfigError(f"query score: {flag} belongs to --judge")
         answered = answered_file(asked, arguments.answers)
     else:
         from su3d_bench.questions.beacon3d import judge_requests, judged

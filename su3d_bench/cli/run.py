@@ -1,14 +1,14 @@
-"""``su3d-bench run``: methods over scenes, scored under all protocols that fit."""
+"""``su3d-bench run`` and ``ablate``: methods over scenes, scored under all protocols that fit."""
 
 from __future__ import annotations
 
 import argparse
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from su3d_bench.cli.shared.answers import answer, answer_document, answer_json, formatted, remark
-from su3d_bench.cli.shared.flags import add_settings, add_table_format, add_verb
+from su3d_bench.cli.options import EXECUTOR, Verbs, add_options, add_verb
+from su3d_bench.cli.output import answer, answer_document, answer_json, formatted, progress, remark
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE, counted
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from su3d_bench.runs.runner import RunResult
 
 
-def add_parser(verbs: Any) -> None:
+def add_parser(verbs: Verbs) -> None:
     parser = add_verb(
         verbs,
         "run",
@@ -27,47 +27,49 @@ def add_parser(verbs: Any) -> None:
             "su3d-bench run rooms/living0 --methods opensu3d oracle",
             "su3d-bench run --scenes 'rooms/*' --limit 5 --set opensu3d.top_m=10 --dry-run",
         ),
-        call,
+        call_run,
         takes_up=True,
     )
     parser.add_argument(
         "--methods", nargs="+", metavar="METHOD", help="names, variants, file.py:Class, or all (default: opensu3d)"
     )
-    add_run_flags(parser)
+    _add_run_options(parser)
+    parser = add_verb(
+        verbs,
+        "ablate",
+        "Vary settings of a method, each on its own, over scenes; perception is computed once.",
+        (
+            "su3d-bench ablate --vary m=1,5,10 k=1,3,5 --beside conceptgraphs --scenes 'rooms/*' --out runs/sweep",
+            "su3d-bench ablate --method conceptgraphs --vary sim_threshold=1.0,1.2 stride=5,10 --grid --dry-run",
+        ),
+        call_ablate,
+        takes_up=True,
+    )
+    parser.add_argument("--vary", nargs="+", required=True, metavar="KEY=V1,V2", help="settings and their values")
+    parser.add_argument("--method", default="opensu3d", help="name or file.py:Class (default: opensu3d)")
+    parser.add_argument(
+        "--beside",
+        nargs="+",
+        default=[],
+        metavar="METHOD",
+        help="other methods in the same run, as run --methods takes",
+    )
+    parser.add_argument("--grid", action="store_true", help="every combination, instead of one setting at a time")
+    _add_run_options(parser)
 
 
-def add_run_flags(parser: argparse.ArgumentParser) -> None:
-    """The flags of every verb that runs methods, but which methods."""
+def _add_run_options(parser: argparse.ArgumentParser) -> None:
+    """The options of both verbs; what is not given comes from ``--config`` or has its default."""
     parser.add_argument("scene", nargs="*", metavar="SCENE", help="addresses or patterns, as --scenes takes them")
     parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="addresses or patterns (default: 'rooms/*')")
     parser.add_argument(
-        "--profile", help="who supplies perception: auto, embedded, oracle, stored, paper (default: auto)"
-    )
-    parser.add_argument(
-        "--device",
-        help="of models, similarities and opensu3d's matching: cpu, cuda (all GPUs, by job) or cuda:1 (default: cpu)",
-    )
-    parser.add_argument(
         "--protocols", nargs="+", metavar="PROTOCOL", help="evaluations (default: those of the dataset)"
     )
+    add_options(parser, "--profile", "--device", "--jobs", "--limit", "--solver", "--offline", *EXECUTOR)
+    add_options(parser, "--seed", type=int, default=None)
     parser.add_argument("--stride", type=int, metavar="N", help="frames between updates (default: the method's own)")
-    parser.add_argument("--seed", type=int, metavar="N", help="seed of everything random (default: 0)")
-    parser.add_argument(
-        "--limit", type=int, metavar="N", help="only the first N updates of each scene; marks it partial"
-    )
-    parser.add_argument("--jobs", type=int, metavar="N", help="scenes side by side (default: the CPU cores)")
-    add_executor_flags(parser)
     parser.add_argument(
         "--pictures", action=argparse.BooleanOptionalAction, help="draw the maps into the run folder (default: yes)"
-    )
-    parser.add_argument(
-        "--solver",
-        choices=("built-in", "llm"),
-        help="who answers under reasoning protocols: built-in (geometry alone, the default), or llm, the text model of "
-        "perception.language",
-    )
-    parser.add_argument(
-        "--offline", action=argparse.BooleanOptionalAction, help="use stored replies of language models, ask nobody"
     )
     parser.add_argument(
         "--accept-poses",
@@ -77,8 +79,7 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--anytime", nargs="+", type=float, metavar="SHARE", help="score the map after these shares of the updates too"
     )
-    add_settings(parser, "such as opensu3d.top_m=10")
-    parser.add_argument("--config", type=Path, metavar="FILE", help="a TOML file, such as the run.toml of a run")
+    add_options(parser, "--set", "--config", "--dry-run", "--format")
     parser.add_argument(
         "--out",
         type=run_place,
@@ -92,8 +93,6 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
         help="add these scenes, methods and protocols to the run in --out, whose other values stay",
     )
     into.add_argument("--replace", action="store_true", help="put this run in the place of the one in --out")
-    parser.add_argument("--dry-run", action="store_true", help="print what would be done, with a time estimate")
-    add_table_format(parser)
 
 
 def run_place(text: str) -> Path | str:
@@ -101,24 +100,7 @@ def run_place(text: str) -> Path | str:
     return text if "://" in text else Path(text)
 
 
-def add_executor_flags(parser: argparse.ArgumentParser) -> None:
-    """The flags that say where the scenes run; docs/running/clusters.md has more on them."""
-    parser.add_argument(
-        "--executor", metavar="WHERE", help="inline, processes, ray or slurm (default: processes, inline for one job)"
-    )
-    parser.add_argument(
-        "--ray-address",
-        metavar="ADDRESS",
-        help="of a Ray cluster, or local to start one here (default: RAY_ADDRESS, or the one that runs here)",
-    )
-    parser.add_argument("--gpus-per-job", type=float, metavar="N", help="that ray or slurm gives a scene, such as 0.5")
-    parser.add_argument("--retries", type=int, metavar="N", help="of a scene whose machine was lost (default: 2)")
-    parser.add_argument(
-        "--slurm", nargs="+", metavar="KEY=VALUE", help="submitit's, such as slurm_partition=gpu timeout_min=60"
-    )
-
-
-def call(arguments: argparse.Namespace) -> int:
+def call_run(arguments: argparse.Namespace) -> int:
     plan = plan_of(arguments)
     for note in plan.notes:
         remark(note, quiet=arguments.quiet)
@@ -146,7 +128,6 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
 
 
 def carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
-    from su3d_bench.cli.shared.bars import progress
     from su3d_bench.runs.runner import run_plan
     from su3d_bench.runs.scenes import cache_root
     from su3d_bench.store.caches import why_large, why_slow
@@ -212,3 +193,24 @@ def show_plan(plan: Plan, arguments: argparse.Namespace) -> int:
     for job in plan.jobs[:1]:
         answer(f"protocols: {', '.join(job.protocols) or 'none'}; profile {job.profile}")
     return EXIT_DONE
+
+
+def call_ablate(arguments: argparse.Namespace) -> int:
+    from su3d_bench.core import registry
+    from su3d_bench.runs.ablation import ablation_rows, write_rows
+
+    rows = ablation_rows(arguments.method, arguments.vary, is_grid=arguments.grid)
+    own_name = str(registry.load("method", arguments.method).name)
+    swept = [arguments.method + row.method.removeprefix(own_name) for row in rows]
+    arguments.methods = list(dict.fromkeys([*swept, *arguments.beside]))
+    plan = plan_of(arguments)
+    for note in plan.notes:
+        remark(note, quiet=arguments.quiet)
+    if arguments.dry_run:
+        return show_plan(plan, arguments)
+    code = carry_out(plan, arguments)
+    if code == EXIT_DONE:
+        write_rows(plan.folder.path, rows, joins=arguments.extend)
+        plan.place.publish()
+        remark(f"table: su3d-bench report tables {plan.folder.path} --table I", quiet=arguments.quiet or arguments.json)
+    return code

@@ -10,9 +10,7 @@ from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition, Pre
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int64Array
 from su3d_bench.evaluation.result import SceneOutcome
 from su3d_bench.evaluation.truth import VertexTruth
-from su3d_bench.metrics.fitness import (
-    ContentFacts,
-)
+from su3d_bench.metrics.fitness import ContentFacts
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.score import (
@@ -31,11 +29,7 @@ from su3d_bench.metrics.matching.checks import (
     label_warnings,
     mask_facts,
 )
-from su3d_bench.metrics.matching.labelling import (
-    class_index_of_ids,
-    encoder_warning,
-    scored_classes,
-)
+from su3d_bench.metrics.matching.labelling import class_index_of_ids, encoder_warning, scored_classes
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth

@@ -15,15 +15,7 @@ import numpy as np
 
 from su3d_bench.core import registry
 from su3d_bench.core.digests import digest_file
-from su3d_bench.core.errors import (
-    ConfigError,
-    DataError,
-    PredictionError,
-    converted,
-    printable,
-    reading,
-    shown,
-)
+from su3d_bench.core.errors import ConfigError, DataError, PredictionError, converted, printable, reading, shown
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Float32Array, GroundTruth, Int64Array, LabelSet

@@ -16,13 +16,7 @@ from typing import Any
 
 from su3d_bench.core import registry
 from su3d_bench.core.digests import digest_file
-from su3d_bench.core.errors import (
-    ConfigError,
-    DataError,
-    GroundTruthMissing,
-    shown,
-    suggest,
-)
+from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, shown, suggest
 from su3d_bench.core.interfaces import IsAligned, NamesCategories
 from su3d_bench.core.registry import FILES_OF_TRUTH
 from su3d_bench.core.types import GroundTruth, Int64Array

@@ -39,13 +39,7 @@ from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import unpack_scores
 from su3d_bench.predictions.formats import recognise
 from su3d_bench.runs.job import Part, build_dataset, part_of
-from su3d_bench.runs.scenes import (
-    cache_root,
-    data_root,
-    dataset_targets,
-    looks_like_scene,
-    nearest_scene,
-)
+from su3d_bench.runs.scenes import cache_root, data_root, dataset_targets, looks_like_scene, nearest_scene
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.records import (
     CostsRecord,

@@ -48,24 +48,10 @@ from su3d_bench.runs.existing import (
     remembered,
     replaced_jobs,
 )
-from su3d_bench.runs.job import (
-    FIELDS_KNOWN_LATER,
-    Part,
-    SceneJob,
-    options_model,
-    own_code,
-    part_of,
-    refuse_other_run,
-)
+from su3d_bench.runs.job import FIELDS_KNOWN_LATER, Part, SceneJob, options_model, own_code, part_of, refuse_other_run
 from su3d_bench.runs.remote_store import DataPlace, RemoteData, data_place, is_url
 from su3d_bench.runs.run_place import LocalRun, RunPlace, StoredRun
-from su3d_bench.runs.scenes import (
-    cache_root,
-    data_root,
-    dataset_targets,
-    expand_scenes,
-    looks_like_scene,
-)
+from su3d_bench.runs.scenes import cache_root, data_root, dataset_targets, expand_scenes, looks_like_scene
 from su3d_bench.store.run_folder import JobFolder, RunFolder, scene_of_folder
 
 

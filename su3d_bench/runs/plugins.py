@@ -136,8 +136,9 @@ def _fault_of_arrays(found: GroundTruth | InstanceMesh | Surface) -> str | None:
         is_id = name.startswith("instance")
         if is_id and value.size and not 0 <= value.min() <= value.max() <= MOST_INT32:
             return f"{name} holds {value.min()} to {value.max()}; ids lie from 0 to {MOST_INT32}, 0 where there is none"
-    if not isinstance(found, Surface) and not isinstance(found.labels, LabelSet):
-        return f"labels is a {type(found.labels).__name__}; a LabelSet is expected"
+    labels: Any = None if isinstance(found, Surface) else found.labels
+    if not isinstance(found, Surface) and not isinstance(labels, LabelSet):
+        return f"labels is a {type(labels).__name__}; a LabelSet is expected"
     return None
 
 
@@ -160,10 +161,11 @@ def _fault_of_mesh(mesh: InstanceMesh | Surface) -> str | None:
         return None
     if len(mesh.instance_of_triangle) != len(corners):
         return f"instance_of_triangle is {mesh.instance_of_triangle.shape} for {len(corners)} triangles"
-    if not isinstance(mesh.class_of_instance, Mapping):
-        return f"class_of_instance is a {type(mesh.class_of_instance).__name__}; a Mapping is expected"
+    classes: Any = mesh.class_of_instance
+    if not isinstance(classes, Mapping):
+        return f"class_of_instance is a {type(classes).__name__}; a Mapping is expected"
     for instance in np.unique(mesh.instance_of_triangle[mesh.instance_of_triangle > 0]).tolist():
-        known = mesh.class_of_instance.get(instance, "no class")
+        known = classes.get(instance, "no class")
         if known not in mesh.labels.ids:
             return f"class_of_instance has {known} for instance {instance}; a class id of its labels is expected"
     return None

@@ -27,7 +27,7 @@ from su3d_bench.metrics.instance.score import Covered, covered_objects
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.score import RefinedNames
-from su3d_bench.questions import refining as refined_names
+from su3d_bench.questions.refining import refined_names
 from su3d_bench.questions.scene_map import SceneMap, map_of
 from su3d_bench.questions.sight import instance_rows, looked_at
 from su3d_bench.questions.truths import fullest_truth

@@ -30,10 +30,12 @@ WRITTEN_BY_ALL = ("language", "language/images")  # where all jobs of a run writ
 MARKS = ("run.toml", "run.json")  # by which a folder is known for a run's; the first is the first that a run writes
 RECORDS = (*MARKS, "metrics.json", "ablation.json")
 FILLED_FREELY = ("language", "slurm", ".cache")  # folders of a run whose files have names of many forms
-# What stands in the folder of a job; "refined_names.json" is what the verb refine leaves beside a map.
-_OF_A_JOB = re.compile(
+# The files that a run, or a verb beside its map, writes; "refined_names.json" is what the verb refine leaves.
+_OF_A_RUN = re.compile(
+    r"run\.toml|(run|metrics|ablation)\.json|\.lock|(language|slurm|\.cache)/.+|scenes/[^/]+/[^/]+/("
     r"(prediction|anytime-[0-9.e+-]+)(\.npz|\.features\.npy)|anytime-[0-9.e+-]+-counts\.npz|counts\.npz|updates\.csv"
-    r"|log\.txt|done\.json|refined_names\.json"
+    r"|log\.txt|done\.json|refined_names\.json|pictures/[^/]+\.png)",
+    re.DOTALL,
 )
 BEFORE_MARKS = (JOBS, "language", LOCK_FILE)  # what a run may hold of which a power cut took them
 # What a folder's name says otherwise, so that each scene has a folder of its own; "." ends the dataset's name.
@@ -116,13 +118,16 @@ class RunFolder:
 
     def strangers(self) -> Iterator[str]:
         """What stands in the folder and was written by no run, nor by a verb beside its map; links count among it."""
-        for above, folders, files in os.walk(self.path, followlinks=False):
+        for above, folders, files in os.walk(self.path):
             where = Path(above).relative_to(self.path)
             links = [name for name in folders if Path(above, name).is_symlink()]
-            known = [name for name in files if _is_of_a_run(where, name) and not Path(above, name).is_symlink()]
-            yield from ((where / name).as_posix() for name in sorted({*files, *links} - {*known}))
+            for place in (where / name for name in sorted((*files, *links))):
+                is_known = any(map(is_unfinished, place.parts)) or _OF_A_RUN.fullmatch(place.as_posix())
+                if not is_known or (self.path / place).is_symlink():
+                    yield place.as_posix()
             if not where.parts:
-                yield from (name for name in sorted(folders) if not is_unfinished(name) and name not in _FOLDERS)
+                known = (JOBS, *FILLED_FREELY)
+                yield from (name for name in sorted(folders) if not is_unfinished(name) and name not in known)
 
     def remove(self) -> None:
         """Remove the folder with all that it holds, at once or not at all; ``StoreError`` where a run writes there."""
@@ -157,25 +162,6 @@ class RunFolder:
             yield
         finally:
             os.close(handle)
-
-
-_FOLDERS = (JOBS, *FILLED_FREELY)
-
-
-def _is_of_a_run(where: Path, name: str) -> bool:
-    """Whether a run, or a verb beside its map, writes a file ``name`` in the folder ``where`` of a run."""
-    if is_unfinished(name) or any(is_unfinished(part) for part in where.parts):
-        return True
-    match where.parts:
-        case ():
-            return name in (*RECORDS, LOCK_FILE)
-        case (top, *_) if top in FILLED_FREELY:
-            return True
-        case (top, _, _) if top == JOBS:
-            return _OF_A_JOB.fullmatch(name) is not None
-        case (top, _, _, "pictures") if top == JOBS:
-            return name.endswith(".png")
-    return False
 
 
 @dataclass(frozen=True)

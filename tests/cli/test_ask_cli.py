@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import itertools
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from chat_server import KEY, Answered, ChatServer, error
+from chat_server import KEY, Answered, ChatServer
 from scored_room import instances
 
 from su3d_bench.cli.main import main
@@ -19,7 +17,6 @@ from su3d_bench.core.files.atomic import write_json
 from su3d_bench.core.maps import Instances
 from su3d_bench.questions.refining import FilterConfig
 from su3d_bench.reports.pictures import figures as reasoning_picture
-from su3d_bench.reports.pictures.figures import SpokenOf, draw_reasoning
 from su3d_bench.store.predictions import write_prediction
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
@@ -92,30 +89,6 @@ def test_a_question_is_answered_with_ids_and_a_picture(job: JobFolder, capsys: p
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_the_answer_stands_before_the_picture_is_drawn(
-    job: JobFolder, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    before: list[str] = []
-    monkeypatch.setattr(reasoning_picture, "draw_reasoning", lambda *words: before.append(capsys.readouterr().out))
-    assert main(["query", "ask", SCENE, "How many sinks are there?"]) == 0
-    assert before == ["2: sink #20, sink #30\n"]
-    assert capsys.readouterr().err.startswith("picture: ")
-
-
-def test_a_misspelt_noun_gets_a_suggestion_and_a_word_that_nobody_saw_is_named(
-    job: JobFolder, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["query", "ask", SCENE, "Which sink is closer to the baed?"]) == 0
-    said = capsys.readouterr()
-    assert said.out == "I cannot settle this: the map has no 'baed'; did you mean 'bed'?\n"
-    assert "never saw 'baed'" in said.err
-    assert main(["query", "ask", SCENE, "How many benches are there?"]) == 0
-    said = capsys.readouterr()  # a thing that is known and not there is no slip of the pen
-    assert (said.out, "never saw" in said.err) == ("0: the map has no 'benches'\n", False)
-    assert main(["query", "ask", SCENE, "xqzzy"]) == 0
-    assert "never saw 'xqzzy'" in capsys.readouterr().err
-
-
 def test_json_tells_everything(job: JobFolder, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     out = tmp_path / "deep" / "answer.png"
     words = ["query", "ask", SCENE, "What is on the bed?", "--run", "runs/made", "--json", "--out", str(out)]
@@ -173,18 +146,6 @@ def test_a_dry_run_says_what_it_would_cost_and_asks_nothing(
     assert "nothing to pay" in capsys.readouterr().out
     assert server.n_asked == 0
     assert not Path("runs/made/language").exists()
-
-
-def test_prices_and_budget_come_from_a_file(
-    job: JobFolder, server: ChatServer, capsys: pytest.CaptureFixture[str]
-) -> None:
-    Path("run.toml").write_text(
-        '[perception.language]\nbudget_usd = 0.000001\n[perception.language.prices."tiny"]\n'
-        "input_usd = 1.0\noutput_usd = 1.0\n"
-    )
-    assert main(["query", "ask", SCENE, "Where am I?", *llm(server), "--config", "run.toml"]) == 3
-    assert "budget_usd = 1e-06 is reached" in capsys.readouterr().err
-    assert server.n_asked == 0
 
 
 @pytest.mark.parametrize(
@@ -290,61 +251,6 @@ def test_what_is_background_under_label_n_prime_is_left_out(
     assert [bool(one["left_out"]) for one in records["names"]] == [True, False, True, False]
     assert main([*words, "--max-map-fraction", "0"]) == 2
     assert "--max-map-fraction 0.0: expected a share above 0" in capsys.readouterr().err
-
-
-def test_labels_n_prime_of_an_earlier_version_are_made_again(
-    job: JobFolder, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["runs", "refine", "runs/made"]) == 0
-    path = job.path / "refined_names.json"
-    path.write_text(path.read_text().replace('"schema_version": 2', '"schema_version": 1'))
-    assert main(["query", "ask", SCENE, "Where is the sofa?"]) == 2
-    assert "knows no filter of large background yet; give su3d-bench runs refine again" in capsys.readouterr().err
-
-
-def test_a_refinement_over_a_failing_server_ends_complete(
-    job: JobFolder, server: ChatServer, capsys: pytest.CaptureFixture[str]
-) -> None:
-    server.answer = lambda body: error(500, "down")
-    settings = [f"perception.language.{one}" for one in QUICK]
-    words = ["runs", "refine", "runs/made", "--refiner", "model", "--base-url", server.url, "--set", *settings]
-    assert main(words) == 0
-    assert "label n stays for 4 instances: status 500: down; tried 2 times" in capsys.readouterr().err
-    assert server.n_asked == 8
-    assert main([*words, "--dry-run"]) == 0
-    assert "4 requests, 4 of them answered before; 0 to send" in capsys.readouterr().out
-
-
-def test_a_map_without_names_of_views_cannot_be_refined(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
-    write_prediction(job.prediction, replace(made_map(), view_names=None, view_scores=None))
-    assert main(["runs", "refine", "runs/made"]) == 2
-    assert "keeps no names of views to choose from" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("record", [{"scenes": ["../../x"]}, {"scenes": 3}, [], {}])
-def test_a_record_that_no_run_wrote_is_refused(
-    job: JobFolder, capsys: pytest.CaptureFixture[str], record: object
-) -> None:
-    write_json(Path("runs/made/run.json"), record)
-    assert main(["runs", "refine", "runs/made"]) == 2
-    assert "run.json is not as a run writes it" in capsys.readouterr().err
-
-
-def test_the_built_in_solver_loads_no_language_package(job: JobFolder) -> None:
-    code = (
-        "import sys; from su3d_bench.cli.main import main\n"
-        f"code = main(['query', 'ask', {SCENE!r}, 'How many fridges are there?', '--quiet'])\n"
-        "print('heavy:', sorted({'openai', 'torch', 'transformers', 'onnxruntime'} & set(sys.modules)), code)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.stdout.splitlines() == ["0: the map has no 'fridges'", "heavy: [] 0"], done.stderr
-
-
-def test_hostile_names_are_drawn_as_text(tmp_path: Path) -> None:
-    names = ["$\\frac{1}{0}$", "a\x1b[31mb", "x" * 500, "<b>"]
-    path = tmp_path / "picture.png"
-    draw_reasoning(made_map(), SpokenOf((0, 1, 2), (3,)), names, path, "$x_{$", ["$\\bad$" * 200])
-    assert path.read_bytes().startswith(b"\x89PNG")
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from su3d_bench.cli.cache import KIND_NAMES
+from su3d_bench.cli.dev import KIND_NAMES
 from su3d_bench.cli.main import main
 from su3d_bench.core.files.atomic import write_bytes, write_json
 from su3d_bench.perception.cache import FrameCache, content_key
@@ -122,22 +122,3 @@ def test_what_a_run_holds_stays(cache: Path, capsys: pytest.CaptureFixture[str])
     with RunFolder(mirror_of("s3://bucket/run", cache)).locked():
         assert main(["dev", "cache", "clear", "runs"]) == 0
     assert held(capsys)["runs"] == 2
-
-
-def test_a_cache_that_is_not_there_is_empty(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "none"))
-    assert sum(held(capsys).values()) == 0
-    assert main(["dev", "cache", "clear", "all"]) == 0
-    assert not (tmp_path / "none").exists()
-
-
-def test_a_large_cache_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert caches.why_large(tmp_path) is None
-    for n in range(64):
-        FrameCache(tmp_path).save(content_key(str(n)), {"x": np.zeros(1000)})
-    monkeypatch.setattr(caches, "LARGE_BYTES", 100_000)
-    line = caches.why_large(tmp_path)
-    assert line is not None
-    assert "su3d-bench dev cache clear perception --older-than 30" in line

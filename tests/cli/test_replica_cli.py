@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from su3d_bench.cli.datasets import list as datasets
-from su3d_bench.cli.main import build_parser, main
+from su3d_bench.cli.main import main
 from su3d_bench.datasets.replica.dataset import Replica
-from su3d_bench.runs.scenes import data_root
 
 SMALL = ["--set", "n_frames=3", "--set", "rooms.width=64", "--set", "height=48", "--set", "mesh_spacing_m=0.15"]
 MAKE = ["datasets", "make", "rooms", "--scenes", "bathroom0", *SMALL, "--jobs", "1"]
@@ -60,12 +57,6 @@ def test_list_tells_the_state_of_each_scene(capsys: pytest.CaptureFixture[str], 
     assert rows["replica"]["scenes"][0]["status"].endswith("mesh_semantic.ply is missing")
     assert rows["replica"]["scenes"][1]["status"] == "traj.txt is missing"
     assert rows["rooms"]["error"] is None
-
-
-@pytest.mark.parametrize("value", ["", "/some/where", "~/there"])
-def test_list_and_run_look_below_one_data_root(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
-    monkeypatch.setenv("SU3D_DATA", value)
-    assert datasets.data_root() == data_root()
 
 
 def test_a_made_room_is_a_scene_of_replica_and_the_same_command_again_does_nothing(
@@ -120,21 +111,3 @@ def test_each_wrong_request_is_one_line(
 ) -> None:
     (tmp_path / "file").write_text("")
     assert message in fault(words, capsys)
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write to read-only folders")
-def test_a_read_only_folder_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    (tmp_path / "closed").mkdir(mode=0o500)
-    assert "the folder is read-only" in fault([*MAKE, "--layout", "replica", "--out", "closed"], capsys)
-
-
-@pytest.mark.parametrize("action", ["list", "make"])
-def test_the_help_of_both_actions_ends_with_two_examples_that_parse(
-    action: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["datasets", action, "--help"]) == 0
-    examples = capsys.readouterr().out.rstrip().splitlines()[-2:]
-    for example in examples:
-        words = example.replace("'", "").split()
-        assert words[0] == "su3d-bench"
-        assert build_parser().parse_args(words[1:]).action == action

@@ -63,19 +63,6 @@ def test_runs_are_listed_with_their_state_and_first_numbers(capsys: pytest.Captu
     assert "| running now " in table and "rooms-semantic mAcc 100.0" in table
 
 
-def test_a_folder_without_runs_is_a_remark_and_one_that_is_not_there_an_error(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert main(["runs", "list"]) == 0
-    assert capsys.readouterr().err == "no run in runs; su3d-bench run rooms/living0 makes one\n"
-    assert main(["runs", "list", "--json"]) == 0
-    assert capsys.readouterr().out == "[]\n"
-    assert main(["runs", "list", "nowhere"]) == 2
-    assert main(["runs", "show", "nowhere"]) == 2
-    assert "nowhere: holds no run; a run has a run.json" in capsys.readouterr().err
-
-
 def test_a_run_shows_what_was_asked_for_and_the_command_that_it_shows_takes_it_up_again(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

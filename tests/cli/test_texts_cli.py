@@ -100,17 +100,6 @@ def test_queries_are_encoded_from_every_form_in_which_they_come(
     assert capsys.readouterr().out == "a place to sit\nsomething to eat at\n"
 
 
-def test_the_protocol_s_own_encoder_is_the_default_under_either_of_its_names(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    for more in ([], ["--encoder", "clip-vit-h-14"], ["--encoder", "ViT-H-14/laion2b_s32b_b79k"]):
-        assert main(["protocols", "texts", "--protocol", TWO_PROMPTS, "--out", "t.npz", *more]) == 2
-        assert "model 'clip-vit-h-14': not found" in capsys.readouterr().err
-    assert main(["protocols", "texts", "--protocol", "query-ap", "--out", "t.npz", "--encoder", "su3d-embedded"]) == 2
-    assert "has no texts of its own; give them with --queries FILE" in capsys.readouterr().err
-    assert not Path("t.npz").exists()
-
-
 REFUSED = [
     (["--protocol", "rooms-semantic"], "protocol 'rooms-semantic' names no encoder; name one with --encoder: embedded"),
     (["--protocol", "rooms-semantic", "--encoder", "embeded"], "unknown encoder 'embeded'; did you mean 'embedded'?"),
@@ -131,13 +120,3 @@ def test_what_cannot_be_encoded_is_one_line(words: list[str], message: str, caps
     assert message in error
     assert error.count("\n") == 1
     assert not list(Path().glob("texts*"))
-
-
-def test_a_file_of_a_run_stays_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
-    place = Path("run/scenes/rooms.living0/opensu3d/prediction.npz")
-    place.parent.mkdir(parents=True)
-    Path("run/run.json").write_text("{}")
-    place.write_bytes(b"kept")
-    assert make("rooms-semantic", str(place)) == 2
-    assert "stays as it is" in capsys.readouterr().err
-    assert place.read_bytes() == b"kept"

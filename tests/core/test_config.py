@@ -11,14 +11,11 @@ from su3d_bench.core.config import (
     Setting,
     Settings,
     check_keys,
-    check_names,
     flatten,
-    key_lines,
     nest,
     read_assignments,
     read_file,
     resolve,
-    toml_value,
     write_toml,
 )
 from su3d_bench.core.errors import ConfigError
@@ -57,13 +54,11 @@ def test_a_later_source_wins_and_each_value_knows_its_own(tmp_path: Path) -> Non
     ("text", "message"),
     [
         ("seed = 1\nmetod = 2\n", "run.toml:2: unknown key 'metod'; did you mean 'method'?"),
-        ("seed = 1\n\n[metod.opensu3d]\ntop_m = 2\n", "run.toml:4: unknown key 'metod'; did you mean 'method'?"),
         (
             "[method]\nopensu3d = 2\n",
             "run.toml:2: 'method.opensu3d' is a section; write [method.opensu3d] and keys below it",
         ),
         ("seed = 1\nseed\n", "run.toml:2: not valid TOML: expected '=' after a key in a key/value pair"),
-        ("limit = \n", "run.toml:1: not valid TOML: invalid value"),
     ],
 )
 def test_a_wrong_file_is_named_with_its_line(tmp_path: Path, text: str, message: str) -> None:
@@ -78,7 +73,6 @@ def test_a_wrong_file_is_named_with_its_line(tmp_path: Path, text: str, message:
         ("[method.x]\ntop_n = 3\n", "run.toml:2: unknown key 'top_n'; did you mean 'top_m'?"),
         ("[method.x.inner]\ndeph = 3\n", "run.toml:2: unknown key 'deph'; did you mean 'depth'?"),
         ("[method.x]\n\ntop_m = '3'\n", "run.toml:3: x.top_m = '3': input should be a valid integer"),
-        ("[method.x]\nratios = [1, 'a']\n", "run.toml:2: x.ratios = 'a': input should be a valid number"),
     ],
 )
 def test_a_wrong_value_is_named_with_its_line(tmp_path: Path, text: str, message: str) -> None:
@@ -93,8 +87,6 @@ def test_a_wrong_value_is_named_with_its_line(tmp_path: Path, text: str, message
         ("opensu3d.top_m", "--set opensu3d.top_m: expected KEY=VALUE, such as opensu3d.top_m=10"),
         ("opensu3.top_m=1", "--set opensu3.top_m=1: 'opensu3' is no method or dataset of this run; "),
         ("seed=3", "--set seed=3: 'seed' has a flag of its own: --seed"),
-        ("gpus_per_job=1", "--set gpus_per_job=1: 'gpus_per_job' has a flag of its own: --gpus-per-job"),
-        ("rooms=3", "--set rooms=3: 'rooms' is no method or dataset of this run"),
         ("x.y=3", "--set x.y=3: 'x' is no method or dataset of this run; known: opensu3d, rooms, perception"),
     ],
 )
@@ -113,12 +105,6 @@ def test_a_key_is_taken_as_a_file_has_it_too() -> None:
         read_assignments(["method.opensu3=1"], ["opensu3d"], ["rooms"])
 
 
-def test_a_misspelt_assignment_key_names_the_flag() -> None:
-    settings = read_assignments(["opensu3d.topm=1"], ["opensu3d"], [])
-    with pytest.raises(ConfigError, match=r"^--set opensu3d.topm: unknown key 'topm'; did you mean 'top_m'\? known: "):
-        resolve(settings, ("method", "opensu3d"), Model)
-
-
 def test_assignments_take_toml_values_and_plain_text() -> None:
     settings = read_assignments(
         ["a.x=[1, 2.5]", "a.y=plain text", "a.z=true", "perception.q.r=-1e-3", 'rooms.s="12"'], ["a"], ["rooms"]
@@ -132,35 +118,10 @@ def test_assignments_take_toml_values_and_plain_text() -> None:
     ]
 
 
-def test_a_section_of_an_unknown_name_is_refused() -> None:
-    settings = Settings((Setting(("method", "opensu3", "top_m"), 3, "run.toml:2"),))
-    with pytest.raises(
-        ConfigError, match=r"^run.toml:2: unknown method 'opensu3'; did you mean 'opensu3d'\? known: opensu3d, oracle$"
-    ):
-        check_names("method", settings, ["opensu3d", "oracle"])
-
-
 def test_run_values_out_of_range_are_refused() -> None:
     settings = Settings((Setting(("stride",), -1, "--stride"),))
     with pytest.raises(ConfigError, match=r"^--stride: stride = -1: input should be greater than or equal to 0$"):
         resolve(settings, (), RunConfig)
-
-
-def test_an_unreadable_file_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"none.toml: cannot read the configuration: No such file"):
-        read_file(tmp_path / "none.toml")
-    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigError, match="not a UTF-8 text file"):
-        read_file(tmp_path / "binary.toml")
-
-
-def test_lines_of_keys_follow_tables_and_dotted_keys() -> None:
-    lines = key_lines("a = 1\n\n[b.c]  # remark\nd = 2\ne.f = 3\n[ g . \"h i\" ]\n'j k' = 4\n")
-    assert lines[("a",)] == 1
-    assert lines[("b", "c")] == 3
-    assert lines[("b", "c", "d")] == 4
-    assert lines[("b", "c", "e", "f")] == 5
-    assert lines[("g", "h i", "j k")] == 7
 
 
 def test_written_toml_reads_back_as_it_was() -> None:
@@ -176,9 +137,3 @@ def test_written_toml_reads_back_as_it_was() -> None:
     assert tomllib.loads(text) == table
     assert "seed = 3  # default" in text
     assert nest(flatten(table)) == table
-
-
-def test_a_value_that_is_not_set_is_written_as_a_remark() -> None:
-    assert write_toml([(("folder",), None, "default")]) == "# folder is not set  # default\n"
-    with pytest.raises(TypeError):
-        toml_value(object())

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 from places import ROOT
 
-from su3d_bench.cli.main import main
 from su3d_bench.core.config import read_file
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.system.files import file_bytes, file_text, opened, opened_text, regular
@@ -112,10 +111,3 @@ def test_toml_of_use_is_read_whatever_its_dots() -> None:
     assert parse_toml(f"x = [{floats}]\ny = '{words}'") == {"x": [0.5] * 500, "y": words}
     deep = ".".join("abcdefghijklmnopqrstuvwxyz")
     assert "a" in parse_toml(f"[{deep}]\n{deep} = 1")
-
-
-def test_a_pipe_in_the_place_of_a_configuration_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    os.mkfifo(tmp_path / "run.toml")
-    assert main(["run", "--config", str(tmp_path / "run.toml")]) == 2
-    line = "run.toml: cannot read the configuration: a pipe stands where a file should be\n"
-    assert capsys.readouterr().err.endswith(line)

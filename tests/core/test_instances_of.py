@@ -37,10 +37,6 @@ def test_a_map_without_instances_is_a_map(masks: Any) -> None:
     assert len(Instances.of(POINTS, masks, [], np.array([]))) == 0
 
 
-def test_a_scene_without_points_is_a_map() -> None:
-    assert len(Instances.of(POINTS[:0], np.zeros(0, np.int64))) == 0
-
-
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "flat points": ({"points": POINTS[:, :2]}, "points is float32 (6, 2)"),
     "whole points": ({"points": POINTS.astype(int)}, "points is int64 (6, 3)"),
@@ -70,7 +66,3 @@ def test_what_cannot_be_is_named(mistake: str) -> None:
     with pytest.raises(PredictionError) as error:
         Instances.of(words.pop("points"), words.pop("masks"), **words)
     assert said in str(error.value)
-
-
-def test_labels_may_be_a_list() -> None:
-    assert Instances.of(POINTS, SETS, labels=["chair", "table"]).labels == ("chair", "table")

@@ -44,15 +44,6 @@ def test_type_checkers_see_the_same_names() -> None:
     assert sorted(named) == sorted(su3d_bench.__all__)
 
 
-def test_another_name_is_an_attribute_error() -> None:
-    with pytest.raises(AttributeError, match="module 'su3d_bench' has no attribute 'Instance'"):
-        _ = su3d_bench.Instance
-
-
-def test_there_are_examples() -> None:
-    assert len(EXAMPLES) >= 2
-
-
 @pytest.mark.parametrize("block", EXAMPLES)
 def test_an_example_runs_and_uses_names_of_the_package_alone(block: str, tmp_path: Path) -> None:
     for node in ast.walk(ast.parse(block)):

@@ -7,22 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluated_text import (
-    CHAIR,
-    TABLE,
-    document,
-    feature_scene,
-    numbers,
-    said,
-    scene,
-    write_texts,
-    write_truth,
-)
-from prediction_files import (
-    write_maskclustering,
-    write_open3dis,
-    write_scannet_text,
-)
+from evaluated_text import CHAIR, TABLE, document, feature_scene, numbers, said, scene, write_texts, write_truth
+from prediction_files import write_maskclustering, write_open3dis, write_scannet_text
 
 from su3d_bench.core.errors import ConfigError, PredictionError
 from su3d_bench.evaluation.evaluate import evaluate

@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 from damage import damages, outcomes, truncations
 from evaluated_text import CHAIR, TABLE, numbers, said, scene, write_truth
-from prediction_files import (
-    write_scannet_text,
-)
+from prediction_files import write_scannet_text
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import Masks

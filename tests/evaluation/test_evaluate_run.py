@@ -255,7 +255,7 @@ PREDICTIONS = (
         (("report", "tables", "pred"), PREDICTIONS),
         (
             ("report", "tables", "reference.json"),
-            "reference.json: is no file that su3d-bench sheets score writes: it has",
+            "reference.json: is no file that su3d-bench sheets score writes",
         ),
         (("report", "html", "numbers.json"), f"numbers.json: {NUMBERS_ALONE}"),
         (("report", "timing", "pred"), PREDICTIONS),

@@ -243,17 +243,6 @@ def test_no_scene_is_seen_before_it_is_whole(
     assert called(replica, capsys)[0] == 0
 
 
-def test_scenes_that_are_there_stay_as_they_are(
-    server: FileServer, replica: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    own = tmp_path / "data/Replica/room0/traj.txt"
-    own.parent.mkdir(parents=True)
-    own.write_text("mine")
-    code, _, err = called([*replica[:3], "frames", *replica[3:]], capsys)
-    assert code == 0 and own.read_text() == "mine" and "room0 was there already and is left as it is" in err
-    assert called([*replica[:3], "frame", *replica[3:]], capsys)[0] == 2
-
-
 SCRIPT = """
 import argparse, os, shutil
 parser = argparse.ArgumentParser()

@@ -26,10 +26,6 @@ def test_the_table_says_of_a_model_what_the_catalogue_says(name: str) -> None:
     assert stated == dict(form.sha256)
 
 
-def test_replicas_release_is_all_of_its_parts() -> None:
-    assert [file.n_bytes for file in built_in().named("replica-meshes").files] == [2_000_000_000] * 16 + [1_859_047_808]
-
-
 def test_every_fact_says_where_it_was_read_and_every_file_comes_encrypted() -> None:
     for source in built_in().entries.values():
         assert source.licence.read_at and (source.n_bytes is not None or source.group == "scannet")

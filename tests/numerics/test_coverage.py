@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,41 +35,9 @@ def test_the_page_holds_what_the_program_writes_with_enough_simulations_and_no_c
         assert not missed or f"- {name} at {', '.join(missed)} scenes: " in shown
 
 
-def test_the_counts_of_the_semantic_world_are_those_that_were_drawn() -> None:
-    world = coverage.Semantic()
-    (n_true, methods), counts = (draw(np.random.default_rng(3), 4) for draw in (world.points, world.draw))
-    for (hit, wrong), of_method in zip(methods, counts, strict=True):
-        for k, one in enumerate(of_method):
-            np.testing.assert_array_equal(one.confusion.sum(axis=1), n_true[k])
-            np.testing.assert_array_equal(np.diag(one.confusion[:, :-1]), hit[k])
-            np.testing.assert_array_equal(one.confusion[:, :-1].sum(axis=0), hit[k] + wrong[k])
-
-
-def test_the_truth_of_a_world_is_what_many_scenes_give() -> None:
-    rng = np.random.default_rng(5)
-    for make, n_scenes in ((coverage.Semantic, 2000), (coverage.Shares, 4000)):
-        world = make()
-        values = world.values(world.draw(rng, n_scenes)[0], np.ones((1, n_scenes), np.int64))
-        for name, truth in world.truth(rng).items():
-            assert values[name][0] == pytest.approx(truth, abs=0.02)
-
-
+@pytest.mark.proof
 def test_intervals_of_few_scenes_hold_the_truth_where_a_bootstrap_s_do_not() -> None:
     world = coverage.Shares()
     tally = coverage.simulate(world, world.truth(np.random.default_rng(0)), 4, 400, 0)["share of questions"]
     assert 89 < (tally.per_cent(coverage.JACKKNIFE) or 0) < 98  # 93 of the page, within 3 standard errors
     assert (tally.per_cent(coverage.BOOTSTRAP) or 100) < 88
-
-
-def test_the_program_writes_its_tables_between_the_marks(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    page = tmp_path / "page.md"
-    page.write_text(f"before\n{coverage.BEGIN}\nstale\n{coverage.END}\nafter\n")
-    monkeypatch.setattr(coverage.resampling, "MANY_ROWS", 0)  # put back afterwards
-    monkeypatch.setattr(coverage, "WORLDS", (coverage.SceneMeans,))
-    coverage.main(["--simulations", "20", "--scenes", "4", "--write", str(page)])
-    text = page.read_text()
-    assert text.startswith("before\n") and text.endswith("after\n") and "stale" not in text
-    assert "| mean of scenes, difference " in text and "Krippendorff" in text
-    assert capsys.readouterr().out in text + "\n"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from su3d_bench.numerics.statistics import FLAT_EXPONENT, MIN_FIT, Growth, growth_exponent
+from su3d_bench.numerics.statistics import MIN_FIT, growth_exponent
 
 
 def slope(x: np.ndarray, y: np.ndarray) -> float:
@@ -29,30 +29,6 @@ def test_the_interval_leaves_out_a_fortieth_of_the_slopes_on_either_side() -> No
     assert np.mean(np.array(slopes) > growth.high) == pytest.approx(0.025, abs=0.012)
 
 
-@pytest.mark.parametrize(
-    ("low", "high", "words"),
-    [
-        (-1.0, FLAT_EXPONENT, "constant per update"),
-        (-1.0, np.nextafter(FLAT_EXPONENT, 1), "not settled"),
-        (FLAT_EXPONENT, 1.0, "not settled"),
-        (np.nextafter(FLAT_EXPONENT, 1), 1.0, "grows"),
-        (0.0, 0.0, "constant per update"),
-    ],
-)
-def test_the_verdict_is_by_the_interval_and_not_by_the_slope(low: float, high: float, words: str) -> None:
-    for exponent in (-5.0, 0.0, FLAT_EXPONENT, 5.0):
-        assert Growth(exponent, low, high).words == words
-
-
-def test_the_first_and_the_last_update_are_drawn_as_all_others_are() -> None:
-    sizes = np.array([2.0**k for k in range(MIN_FIT)])
-    costly = np.ones(MIN_FIT)
-    costly[-1] = 8.0
-    last, first = growth_exponent(sizes, costly), growth_exponent(sizes, costly[::-1])
-    assert last is not None and abs(last.low) < 1e-9 < last.exponent < last.high
-    assert first is not None and first.low < first.exponent < -1e-9 < first.high < 1e-9
-
-
 def test_nothing_is_said_of_too_few_points_or_of_sizes_that_hardly_differ() -> None:
     sizes = np.linspace(1.0, 2.0, MIN_FIT)
     assert growth_exponent(sizes, sizes) is not None
@@ -61,17 +37,6 @@ def test_nothing_is_said_of_too_few_points_or_of_sizes_that_hardly_differ() -> N
     assert growth_exponent(np.linspace(10.0, 19.0, MIN_FIT), sizes) is None
     assert growth_exponent(np.append(sizes, 0.0), np.append(sizes, 1.0)) == growth_exponent(sizes, sizes)
     assert growth_exponent(np.append(sizes, 1.0), np.append(sizes, 0.0)) == growth_exponent(sizes, sizes)
-
-
-@pytest.mark.parametrize(("size_unit", "cost_unit"), [(1e12, 1.0), (1.0, 1e300), (1.0, 1e-300)])
-def test_a_growth_is_the_same_in_whatever_unit_sizes_and_costs_are(size_unit: float, cost_unit: float) -> None:
-    sizes = np.array([1.0 + 2e-5 * k for k in range(30)])  # by a little, and costs by three times as much
-    sizes[-1] = 2.0
-    costs = np.append(sizes[:-1] ** 3, 2.0)
-    known, found = growth_exponent(sizes, costs), growth_exponent(size_unit * sizes, cost_unit * costs)
-    assert known is not None and found is not None
-    assert known.high == pytest.approx(3.0, abs=1e-8)  # of resamples without the last
-    assert (found.exponent, found.low, found.high) == pytest.approx((known.exponent, known.low, known.high), abs=1e-8)
 
 
 def test_resamples_whose_sizes_hardly_vary_have_no_part_in_the_interval() -> None:

@@ -56,7 +56,3 @@ def test_drawn_shares_lie_about_those_of_all_orders_as_their_errors_say() -> Non
     assert (np.abs([one.share for one in found] - known) < 4 * errors).all()
     assert shares(n_steps, value) == found
     assert shares(n_steps, value, seed=1) != found
-
-
-def test_no_step_has_no_share() -> None:
-    assert (shares(0, lambda bits: 1.0), choices(0)) == ([], [0])

@@ -8,10 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from literal_comparison import differences
 from literal_paper import PaperProgram, PaperSettings
-from literal_problems import Problem, random_problem
-from literal_settings import OURS, config_of, settings_of
+from literal_problems import OURS, Problem, config_of, differences, random_problem, settings_of
 from places import SUPPORT
 
 from su3d_bench.cli.main import main

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from literal_problems import Problem, random_problem
-from literal_settings import config_of
+from literal_problems import Problem, config_of, random_problem
 from numpy.typing import NDArray
 
 from su3d_bench.core.maps import Instances

@@ -12,7 +12,7 @@ import pytest
 from perception_fakes import CountingEncoder, still_life
 from PIL import Image
 
-from su3d_bench.core.errors import ConfigError, DataError, PredictionError
+from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Float32Array, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.crops import crop_window
@@ -125,16 +125,6 @@ def test_what_does_not_fit_is_one_line(tmp_path: Path, changes: dict[str, Any], 
     with pytest.raises(DataError, match=message) as caught:
         GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)
     assert str(caught.value).isprintable() and "frame000040.pkl.gz" in str(caught.value)
-
-
-def test_a_frame_without_a_file_and_a_folder_without_files_are_named(tmp_path: Path) -> None:
-    write(tmp_path, detections(), name="frame000000.pkl.gz")
-    with pytest.raises(DataError, match="no detections of frame 40"):
-        GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)
-    with pytest.raises(DataError, match="no file of detections in"):
-        GsaFiles(tmp_path, PATTERN.replace("frame", "image"), SCENE)
-    with pytest.raises(ConfigError, match=r"perception\.stored\.detections: .*leads out of"):
-        GsaFiles(tmp_path, "../frame{index}.pkl.gz", SCENE)
 
 
 class Calling:

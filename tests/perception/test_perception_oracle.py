@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 from perception_fakes import INTRINSICS, CountingEncoder, quad_mesh, still_life
 
 from su3d_bench.baselines.oracle import Oracle
@@ -51,12 +50,6 @@ def test_the_pose_moves_the_masks() -> None:
     assert np.array_equal(image, np.roll(expected_square(), -10, axis=1))
 
 
-@pytest.mark.parametrize(("offset_m", "is_kept"), [(0.04, True), (0.06, False)])
-def test_depth_may_differ_by_less_than_the_tolerance(offset_m: float, is_kept: bool) -> None:
-    projector = MeshProjector(quad_mesh(WALL, instance=[2]), OracleConfig(depth_tolerance_m=0.05))
-    assert bool((projector.instance_image(flat_frame(2.0 + offset_m)) == 2).all()) is is_kept
-
-
 def test_holes_of_the_mesh_are_filled_from_near_pixels_of_like_depth_only() -> None:
     left, right = (-3.0, -0.5, -3.0, 3.0, 2.0), (-0.42, 3.0, -3.0, 3.0, 2.0)  # a slit of four pixels
     mesh = quad_mesh(left, right, instance=[1, 2])
@@ -80,15 +73,6 @@ def test_small_and_unannotated_surfaces_are_left_out() -> None:
     assert regions.names == ("chair",) and regions.scores.tolist() == [1.0]
     assert np.array_equal(regions.masks[0], expected_square() == 1)
     assert regions.boxes.tolist() == [[30, 20, 70, 50]]
-
-
-def test_an_empty_view_gives_no_regions(tmp_path: Path) -> None:
-    behind = quad_mesh((-1, 1, -1, 1, -2.0), instance=[1])
-    perception = build_perception(
-        "oracle", PerceptionConfig(), scene=SCENE, cache_root=tmp_path, mesh=behind, encoder=CountingEncoder()
-    )
-    found = perception.detect(flat_frame(), PerceptionNeeds(crop_ratios=(1.0, 2.0)), Timer())
-    assert len(found) == 0 and found.masks.shape == (0, 120, 160) and found.crop_features.shape == (0, 2, 8)
 
 
 def test_features_are_those_of_the_class_names_at_every_ratio(tmp_path: Path) -> None:

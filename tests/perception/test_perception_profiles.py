@@ -40,20 +40,6 @@ def test_an_unknown_profile_is_refused_with_the_nearest_name() -> None:
         resolve_profile("foundation", "camera")
 
 
-def test_embedded_warns_on_camera_images_only_and_names_the_profile_to_use(tmp_path: Path) -> None:
-    caveats = {}
-    for domain in ("rendered-rooms", "camera"):
-        built = build_perception(
-            "auto", PerceptionConfig(), scene=scene(domain), cache_root=tmp_path, mesh=None, encoder=CountingEncoder()
-        )
-        assert built.profile == "embedded"
-        caveats[domain] = built.caveat
-    assert caveats["rendered-rooms"] is None
-    assert (
-        caveats["camera"] is not None and "mean little" in caveats["camera"] and "--profile stored" in caveats["camera"]
-    )
-
-
 def test_the_digest_moves_with_parameters_and_not_with_the_cache(tmp_path: Path) -> None:
     def digest(**values: object) -> str:
         config = PerceptionConfig.model_validate(values)

@@ -56,13 +56,6 @@ def test_each_value_above_zero_is_one_region_by_ascending_value(tmp_path: Path, 
     np.testing.assert_array_equal(found.boxes, [[90, 50, 120, 90], [20, 40, 60, 80]])
 
 
-def test_an_image_of_zeros_has_no_region(tmp_path: Path) -> None:
-    write_image(tmp_path, np.zeros((120, 160), np.uint8))
-    found = images(tmp_path).regions(still_life(40))
-    assert found.values == () and found.masks.shape == (0, 120, 160) and found.boxes.shape == (0, 4)
-    assert len(perception(tmp_path, tmp_path).detect(still_life(40), PerceptionNeeds(), Timer())) == 0
-
-
 @pytest.mark.parametrize(("file", "text"), [("names.toml", '132 = "box"\n'), ("names.json", '{"132": "box"}')])
 def test_named_values_keep_their_name_and_score_and_the_encoder_names_the_others(
     tmp_path: Path, file: str, text: str

@@ -1,16 +1,20 @@
-"""What stands at the end of a run: its pictures, and commands that work on it."""
+"""What a run says at its end and of its settings: next commands, changed settings, what was found without a truth."""
 
 from __future__ import annotations
 
 import shlex
 from pathlib import Path
+from typing import Any
 
 import pytest
 from painted import colour_perception
 from places import SCENES
 
 from su3d_bench.cli.main import main
+from su3d_bench.core.config import Setting, Settings
 from su3d_bench.runs import scene as scene_run
+from su3d_bench.runs.finished import FinishedRun, RunData
+from su3d_bench.store.run_folder import RunFolder
 
 PAINTED = f"{SCENES}/painted.py:Painted"
 COLLECTOR = f"{SCENES}/painted.py:Collector"
@@ -39,10 +43,28 @@ def test_a_run_ends_with_its_pictures_and_commands_that_are_true_for_it(capsys: 
     assert Path(pictures).is_file() and lines[start + 1].endswith("more in runs/of mine/scenes/*/*/pictures")
     html, query, compare = commands_in(lines[start + 2 :])
     assert html == ["report", "html", "runs/of mine", "--out", "runs/of mine/page.html"]
-    assert (
-        query[0] == "query"
-        and query[1].endswith("/a")
-        and query[3:] == ["--run", "runs/of mine", "--method", "collector"]
-    )
-    assert query[2] in {"chair", "sofa", "table", "lamp", "plant", "book", "floor", "wall"}
+    assert query[:2] == ["query", "text"] and query[2].endswith("/a")
+    assert query[4:] == ["--run", "runs/of mine", "--method", "collector"]
+    assert query[3] in {"chair", "sofa", "table", "lamp", "plant", "book", "floor", "wall"}
     assert main(compare) == 0 and main([*html, "--no-maps", "--no-errors", "--quiet"]) == 0
+
+
+def run_with(**given: Any) -> FinishedRun:
+    """A run of whose folder nothing is read; ``__`` stands between the parts of a path."""
+    entries = tuple(Setting(tuple(name.split("__")), value, "run.toml:1") for name, value in given.items())
+    record: Any = None
+    return FinishedRun(RunFolder(Path("run")), record, {}, {}, 0, RunData(Settings(entries), {}))
+
+
+def test_settings_that_are_not_the_methods_own_are_named_with_their_values() -> None:
+    run = run_with(method__opensu3d__eps=0.05, method__opensu3d__top_m=5, method__opensu3d__border_px=20)
+    assert run.changed("opensu3d") == ("eps = 0.05",)
+
+
+def test_a_stride_of_the_whole_run_is_a_setting_of_each_method_that_has_another() -> None:
+    assert run_with(stride=10).changed("opensu3d") == ("stride = 10",)
+    assert run_with(stride=40).changed("opensu3d") == run_with(stride=0).changed("opensu3d") == ()
+
+
+def test_of_a_method_that_is_not_known_here_no_setting_is_named() -> None:
+    assert run_with(stride=10, method__mine__x=1).changed("mine") == ()

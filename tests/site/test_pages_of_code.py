@@ -17,7 +17,7 @@ import site_hooks
 import yaml
 from pages_of_code import API, METHODS, PROTOCOLS, protocol_page, told_of
 from places import ROOT
-from site_hooks import filled, repository_of
+from site_hooks import filled
 from site_text import ROOT_PAGES
 
 import su3d_bench
@@ -74,12 +74,6 @@ def test_every_method_has_a_page_with_every_setting_preset_and_published_row(pag
             assert f"<td>{', '.join(f'{metric} {value}' for metric, value in figure.values.items())}</td>" in text
 
 
-def test_settings_tell_what_they_take(pages: dict[str, str]) -> None:
-    row = pages[f"{METHODS}/opensu3d.md"].split("<td><code>max_box_fraction</code></td>\n")[1].split("</tr>")[0]
-    assert row == "<td>number from 0 to 1</td>\n<td><code>0.95</code></td>\n" or "number above 0 to 1" in row
-    assert "<td><code>ones</code>, <code>mean</code>" in pages[f"{METHODS}/opensu3d.md"]
-
-
 def test_every_public_name_has_its_place_in_the_reference(pages: dict[str, str]) -> None:
     assert sorted(re.findall(r"^::: su3d_bench\.(\w+)$", pages[API], re.MULTILINE)) == sorted(su3d_bench.__all__)
 
@@ -127,11 +121,6 @@ def test_the_examples_of_the_hooks_hold() -> None:
     assert doctest.testmod(site_hooks).failed == 0
 
 
-def test_an_entry_that_names_a_page_comes_before_patterns_and_an_index_first() -> None:
-    there = {"a/index.md", "a/b.md", "a/c.md", "a/d/e.md"}
-    assert filled(["a/*.md", {"C": "a/c.md"}], there) == ["a/index.md", "a/b.md", {"C": "a/c.md"}]
-
-
 def _settings() -> dict[str, Any]:
     """mkdocs.yml, whose one value for mkdocs alone is left out."""
 
@@ -148,14 +137,6 @@ def test_the_site_asks_for_nothing_that_is_elsewhere() -> None:
     assert settings["theme"]["font"] is False
     assert "offline" in settings["plugins"]
     assert all((ROOT / "docs" / name).is_file() for name in [*settings["extra"]["polyfills"], *settings["extra_css"]])
-
-
-def test_the_address_on_a_code_host_is_that_of_the_metadata(tmp_path: Path) -> None:
-    project = tmp_path / "pyproject.toml"
-    project.write_text('[project]\nname = "a"\n')
-    assert repository_of(project) is None
-    project.write_text('[project]\nname = "a"\n[project.urls]\nRepository = "https://example.org/a/"\n')
-    assert repository_of(project) == "https://example.org/a"
 
 
 def _check() -> ModuleType:
@@ -192,8 +173,3 @@ def test_the_check_of_a_site_misses_pages_and_names(tmp_path: Path) -> None:
     found = set(_check().faults_of(tmp_path))
     assert {"reference/protocols/rooms-instance.html is missing", "reference/methods/oracle.html is missing"} <= found
     assert {f"reference/api.html lacks {name}" for name in su3d_bench.__all__} <= found
-
-
-def test_no_site_is_a_fault_of_whoever_asks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert _check().main([str(tmp_path)]) == 2
-    assert capsys.readouterr().out == f"site: {tmp_path} holds no site; run: make docs\n"

@@ -53,27 +53,6 @@ def test_a_link_to_what_is_not_there_stays_for_the_build_to_refuse(link: str) ->
     assert as_site(link, repository="https://example.org/a/b") == link
 
 
-def test_code_stays_as_it_is() -> None:
-    link = "[a](../../action.yml)"
-    text = f"`{link}` and\n\n```md\n{link} | `x\\|y`\n```\n~~~~\n```\n{link}\n~~~~\n"
-    assert as_site(text) == text
-    assert as_site(f"{text}[action.yml](../../action.yml)") == f"{text}`action.yml`"
-
-
-def test_the_first_code_that_names_a_made_page_leads_to_it() -> None:
-    text = "# `made`\n\n[`made`](clusters.md), `other`, `made` and `made`; ``made``"
-    shown = for_site(text, "docs/running/gpu.md", HERE.__contains__, None, {"made": "reference/made.md"})
-    assert shown == text.replace("`other`, `made`", "`other`, [`made`](../reference/made.md)")
-    assert for_site("`made`", "README.md", HERE.__contains__, None, {"made": "reference/made.md"}) == (
-        "[`made`](reference/made.md)"
-    )
-
-
-def test_bars_in_the_code_of_a_table_lose_the_backslash_that_code_hosts_want() -> None:
-    row = r"| `--to {a\|b}` | x \| y, ``c\|d`` |"
-    assert as_site(f"Text `a\\|b`.\n\n{row}\n") == "Text `a\\|b`.\n\n| `--to {a|b}` | x \\| y, ``c|d`` |\n"
-
-
 def test_no_text_acts_on_the_page() -> None:
     hostile = '</p><script>alert(1)</script>\n\n# x `<b>` ![y](z) https://a.b/"><script> \x1b[31m\u202e'
     for shown in (plain(hostile), prose(hostile), heading(hostile)):

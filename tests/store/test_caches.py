@@ -13,7 +13,7 @@ from places import SCENES
 from su3d_bench.cli.main import main
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.store import caches
-from su3d_bench.store.caches import kernel_folders, why_slow
+from su3d_bench.store.caches import kernel_folders
 
 
 def test_a_run_whose_kernels_cannot_be_kept_says_so_once_and_what_to_do(
@@ -38,12 +38,6 @@ def test_a_run_whose_kernels_cannot_be_kept_says_so_once_and_what_to_do(
     assert line in said
     assert "; set NUMBA_CACHE_DIR to a folder that can be written\n" in said
     assert (tmp_path / "out" / "run.json").read_bytes() == before
-
-
-def test_one_folder_that_takes_files_is_enough(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(caches, "kernel_folders", lambda: (Path("/dev/null/numba"), tmp_path / "new"))
-    assert why_slow() is None
-    assert list((tmp_path / "new").iterdir()) == []
 
 
 def test_the_folders_are_those_that_numba_tries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

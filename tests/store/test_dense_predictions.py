@@ -2,13 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import json
-import os
-import signal
-import subprocess
-import sys
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -16,16 +10,14 @@ import numpy as np
 import pytest
 from box_room import INTRINSICS, images, pose
 from painted import colour_perception
-from places import ROOT, SCENES
+from places import SCENES
 
 from su3d_bench.baselines.conceptfusion import point_fusion as feature_table
 from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig
 from su3d_bench.baselines.conceptfusion.point_fusion import FeatureTable
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError, StoreError
-from su3d_bench.core.files.atomic import npz_bytes
-from su3d_bench.core.files.scratch import scratch_folder
-from su3d_bench.core.maps import DenseFeatures, Partition
+from su3d_bench.core.maps import DenseFeatures
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, Frame, SceneInfo
 from su3d_bench.metrics.matching.labelling import most_similar
@@ -34,7 +26,6 @@ from su3d_bench.predictions.own_runs import OwnRuns
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.store import predictions
 from su3d_bench.store.predictions import features_beside, read_prediction, write_prediction
-from su3d_bench.store.run_folder import RunFolder
 
 POINTS = np.arange(12, dtype=np.float32).reshape(4, 3)
 ROWS = np.arange(20, dtype=np.float16).reshape(4, 5)
@@ -78,12 +69,6 @@ def test_features_on_disk_equal_those_in_memory_to_the_bit(monkeypatch: pytest.M
         assert not prediction.features.flags.writeable
 
 
-def test_blocks_of_any_size_give_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = fused("disk").finish()
-    monkeypatch.setattr(feature_table, "BLOCK_ROWS", 7)
-    np.testing.assert_array_equal(fused("disk").finish().features, whole.features)
-
-
 def test_the_mean_is_that_of_float32_rounded_to_half_precision_once_an_update() -> None:
     table = FeatureTable(2, "memory")
     first, second = np.array([[0.1, 1.0]], np.float16), np.array([[0.3, -1.0]], np.float16)
@@ -95,50 +80,6 @@ def test_the_mean_is_that_of_float32_rounded_to_half_precision_once_an_update() 
 
 
 # ---- scratch
-
-
-def test_features_lie_in_a_file_without_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    monkeypatch.setattr(tempfile, "tempdir", None)
-    table = FeatureTable(4, "disk")
-    table.append(np.ones((1, 4), np.float16), np.zeros(9, np.int32), np.ones(9))
-    held = table.features()
-    assert scratch_folder() == tmp_path
-    assert list(tmp_path.iterdir()) == []
-    table.close()
-    assert held.sum() == 36  # what was handed out stays readable
-
-
-def test_a_killed_run_leaves_no_scratch_behind(tmp_path: Path) -> None:
-    code = (
-        "import os, signal, sys, numpy as np\n"
-        "from su3d_bench.baselines.conceptfusion.point_fusion import FeatureTable\n"
-        "table = FeatureTable(64, 'disk')\n"
-        "table.append(np.ones((1, 64), np.float16), np.zeros(5000, np.int32), np.ones(5000))\n"
-        "assert table.features().sum() == 5000 * 64\n"
-        "os.kill(os.getpid(), signal.SIGKILL)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], env=os.environ | {"TMPDIR": str(tmp_path)}, check=False)
-    assert done.returncode == -signal.SIGKILL
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_full_disk_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    table = FeatureTable(4, "disk")
-
-    class Full:
-        def seek(self, offset: int) -> None:
-            pass
-
-        def write(self, content: bytes) -> None:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    table._file = Full()  # type: ignore[assignment]
-    with pytest.raises(StoreError, match=r"cannot write features to .*: No space left on device; set TMPDIR"):
-        table.append(np.ones((1, 4), np.float16), np.zeros(9, np.int32), np.ones(9))
-    monkeypatch.setattr(feature_table, "scratch_folder", lambda: tmp_path / "none")
-    with pytest.raises(StoreError, match=r"cannot write features to .*none: No such file"):
-        FeatureTable(4, "disk")
 
 
 # ---- the store
@@ -166,22 +107,6 @@ def test_features_written_in_blocks_are_the_file_that_numpy_saves(
     mapped = read_prediction(tmp_path / "a.npz")
     write_prediction(tmp_path / "c.npz", mapped)
     assert (tmp_path / "c.features.npy").read_bytes() == (tmp_path / "b.npy").read_bytes()
-
-
-def test_an_empty_dense_map_comes_back_empty(tmp_path: Path) -> None:
-    write_prediction(tmp_path / "a.npz", DenseFeatures(POINTS[:0], ROWS[:0]))
-    again = read_prediction(tmp_path / "a.npz")
-    assert isinstance(again, DenseFeatures) and again.features.shape == (0, 5)
-    assert OwnRuns().read(tmp_path / "a.npz", "a").content.features.shape == (0, 5)  # type: ignore[union-attr]
-
-
-def test_another_kind_of_map_in_its_place_takes_the_features_away_and_is_stored_as_ever(tmp_path: Path) -> None:
-    path = tmp_path / "prediction.npz"
-    write_prediction(path, DenseFeatures(POINTS, ROWS))
-    partition = Partition(POINTS, np.zeros(4, np.int32), ROWS[:1].astype(np.float32))
-    write_prediction(path, partition)
-    assert [child.name for child in tmp_path.iterdir()] == ["prediction.npz"]
-    assert path.read_bytes() == npz_bytes(predictions.prediction_arrays(partition))
 
 
 @pytest.mark.parametrize("damage", ["missing", "cut", "text", "rows", "integers"])
@@ -222,19 +147,6 @@ def test_hostile_features_are_refused(tmp_path: Path, header: bytes) -> None:
         OwnRuns().read(path, "prediction")
 
 
-def test_a_seal_vouches_for_the_features_too(tmp_path: Path) -> None:
-    job = RunFolder(tmp_path).job("rooms/living0", "dense")
-    job.prepare()
-    write_prediction(job.prediction, DenseFeatures(POINTS, ROWS))
-    job.seal("predict", {"method": "dense"}, [job.prediction])
-    assert job.is_done("predict", {"method": "dense"})
-    beside = features_beside(job.prediction)
-    content = bytearray(beside.read_bytes())
-    content[-1] ^= 1
-    beside.write_bytes(content)
-    assert not job.is_done("predict", {"method": "dense"})
-
-
 # ---- scoring in blocks
 
 
@@ -248,21 +160,6 @@ def test_labels_of_a_mapped_table_are_those_of_the_same_rows_in_memory(tmp_path:
     text = rng.normal(size=(9, 16)).astype(np.float32)
     np.testing.assert_array_equal(most_similar(mapped.features, text), most_similar(features, text))
     np.testing.assert_array_equal(has_feature(mapped), np.arange(20_000) % 7 != 0)
-
-
-def test_a_map_larger_than_what_it_takes_is_fused_written_read_and_scored() -> None:
-    """256 MB of features: no step may hold them all; the program itself measures 2 M points x 1024 so."""
-    words = ["--points", "250000", "--dimensions", "512", "--features-in", "disk"]
-    program = [sys.executable, str(ROOT / "benchmarks"), "dense_memory"]
-    done = subprocess.run([*program, *words], capture_output=True, text=True, check=True)
-    steps = {line["step"]: line for line in map(json.loads, done.stdout.splitlines())}
-    scored = steps["read and score"]
-    assert scored["features_bytes"] == 250_000 * 512 * 2
-    assert scored["mAcc"] == scored["F-mIoU"] == 1.0
-    if scored["peak_bytes"] is None:
-        pytest.skip("this system does not tell the memory of a process")
-    most = max(step["peak_bytes"] for step in steps.values()) - steps["start"]["peak_bytes"]
-    assert most < 0.9 * scored["features_bytes"]
 
 
 # ---- runs
@@ -301,10 +198,3 @@ def test_a_run_of_both_is_scored_resumed_and_mended(in_folder: Path, capsys: pyt
     assert run() == 0
     assert beside.read_bytes() == whole
     assert not list(job.glob(".*"))
-
-
-def test_a_query_of_a_dense_map_is_one_clear_line(in_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run("--no-pictures") == 0
-    capsys.readouterr()
-    assert main(["query", "text", "painted/a", "chair", "--run", "out", "--method", "conceptfusion"]) != 0
-    assert "has one feature a point and no instances" in capsys.readouterr().err

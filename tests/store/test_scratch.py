@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import StoreError
 from su3d_bench.core.files.scratch import Scratch
 
 
@@ -53,14 +51,3 @@ def test_what_is_much_lies_on_disk_under_no_name(tmp_path: Path, monkeypatch: py
     assert len(_open_files(tmp_path)) == 1
     assert list(tmp_path.iterdir()) == []
     scratch.close()
-
-
-def test_a_full_disk_is_said_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    scratch = Scratch(1)
-
-    def fail(_: bytes) -> int:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(scratch._file, "write", fail)
-    with pytest.raises(StoreError, match=r"cannot write temporary data to .*: No space left on device; set TMPDIR"):
-        scratch.put(np.zeros(3))

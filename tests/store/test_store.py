@@ -71,11 +71,6 @@ def test_arrays_come_back_as_they_were_and_the_bytes_depend_on_them_alone(arrays
             np.testing.assert_array_equal(archive[name], array)
 
 
-def test_arrays_of_objects_are_refused() -> None:
-    with pytest.raises(ValueError, match="Object arrays cannot be saved"):
-        npz_bytes({"names": np.array(["a", None], object)})
-
-
 @pytest.mark.parametrize(
     "prediction",
     [
@@ -94,14 +89,6 @@ def test_a_prediction_comes_back_as_it_was(tmp_path: Path, prediction: Instances
         assert isinstance(after, type(before))
         np.testing.assert_array_equal(before, after)
         assert getattr(before, "dtype", None) == getattr(after, "dtype", None)
-
-
-def test_an_empty_map_comes_back_empty(tmp_path: Path) -> None:
-    empty = Instances.of(np.zeros((0, 3), np.float32), [], labels=())
-    write_prediction(tmp_path / "prediction.npz", empty)
-    again = read_prediction(tmp_path / "prediction.npz")
-    assert isinstance(again, Instances)
-    assert (len(again), again.names, again.labels, again.features) == (0, (), (), None)
 
 
 def test_a_file_that_is_no_prediction_is_refused(tmp_path: Path) -> None:
@@ -164,15 +151,6 @@ def test_predicting_anew_breaks_the_seal_of_the_score(tmp_path: Path) -> None:
     assert not job.is_done("score", {"protocol": "1"})
 
 
-def test_what_a_killed_run_left_half_written_is_cleared(tmp_path: Path) -> None:
-    job = sealed_job(tmp_path)
-    leftover = job.path / ".prediction.npz.0123456789ab.unfinished"
-    leftover.write_bytes(b"half")
-    job.prepare()
-    assert not leftover.exists()
-    assert job.is_done("predict", KEY)
-
-
 @pytest.mark.parametrize(
     ("code", "reason"),
     [(errno.ENOSPC, "the disk is full"), (errno.EROFS, "the folder is read-only"), (errno.EIO, "Input/output error")],
@@ -191,17 +169,6 @@ def test_a_failed_write_is_one_line_and_leaves_the_old_file(
         write_json(path, {"new": 2})
     assert read_json(path) == {"old": 1}
     assert [child.name for child in tmp_path.iterdir()] == ["metrics.json"]
-
-
-def test_a_folder_where_a_file_stands_is_one_line(tmp_path: Path) -> None:
-    (tmp_path / "runs").write_text("")
-    with pytest.raises(StoreError, match="a file stands where a folder should be; choose another with --out"):
-        RunFolder(tmp_path / "runs" / "x").job("rooms/a", "b").prepare()
-
-
-def test_numbers_that_json_lacks_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="Out of range float values"):
-        write_json(tmp_path / "metrics.json", {"value": float("nan")})
 
 
 def test_two_runs_on_one_folder_are_refused_until_the_first_is_killed(tmp_path: Path) -> None:

@@ -19,8 +19,6 @@ from hypothesis import strategies as st
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.files.atomic import make_folder, replacing, write_text
 from su3d_bench.core.files.locks import clear_unfinished, is_unfinished, unfinished_folder
-from su3d_bench.perception.language.chat import ChatRequest
-from su3d_bench.perception.language.reply_store import ReplyStore
 from su3d_bench.store.run_folder import RunFolder, folder_of_scene, scene_of_folder
 
 LEFT = ".page.html.0123456789ab.unfinished"
@@ -65,16 +63,6 @@ def test_what_a_killed_writer_left_goes_with_the_next_and_what_a_living_one_writ
         process.wait()
         assert names(tmp_path) == [left]
         make_folder(tmp_path)
-        assert names(tmp_path) == []
-
-
-def test_a_run_goes_on_in_a_folder_in_which_exports_were_killed(tmp_path: Path) -> None:
-    for _ in range(3):
-        with writer("a folder", tmp_path) as process:
-            process.kill()
-            process.wait()
-        assert len(names(tmp_path)) == 1, "the one before was cleared"
-    with RunFolder(tmp_path).locked():
         assert names(tmp_path) == []
 
 
@@ -125,24 +113,6 @@ def test_a_folder_is_held_by_a_file_where_folders_have_no_locks(
     assert names(tmp_path) == []
 
 
-def test_a_file_cleared_in_the_moment_before_its_lock_is_made_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lock, n_cleared = fcntl.flock, 0
-
-    def cleared_first(handle: int, operation: int) -> None:
-        nonlocal n_cleared
-        if n_cleared < 2:
-            n_cleared += 1
-            Path(f"/proc/self/fd/{handle}").resolve().unlink()
-        lock(handle, operation)
-
-    monkeypatch.setattr(fcntl, "flock", cleared_first)
-    write_text(tmp_path / "page.html", "whole")
-    assert n_cleared == 2
-    assert names(tmp_path) == ["page.html"]
-
-
 @pytest.mark.parametrize("name", ["x" * 240, "\N{GREEK SMALL LETTER ALPHA}" * 120])
 def test_the_longest_names_can_be_written(name: str, tmp_path: Path) -> None:
     with replacing(tmp_path / name) as stream:
@@ -164,11 +134,6 @@ def test_a_scene_is_known_by_its_folder(address: str) -> None:
     assert scene_of_folder(name) == address
 
 
-def test_folders_of_ordinary_scenes_keep_their_names() -> None:
-    for address in ("rooms/living0", "scannet/scene0011_00", "painted/a_b", "mine/left 1.5"):
-        assert folder_of_scene(address) == address.replace("/", ".")
-
-
 @pytest.mark.parametrize("part", ["scenes", "scenes/rooms.a", "scenes/rooms.a/m", "scenes/rooms.a/m/pictures"])
 def test_nothing_of_a_job_is_written_through_a_link(part: str, tmp_path: Path) -> None:
     job = RunFolder(tmp_path / "run").job("rooms/a", "m")
@@ -180,28 +145,3 @@ def test_nothing_of_a_job_is_written_through_a_link(part: str, tmp_path: Path) -
         with pytest.raises(StoreError, match=f"{link}: is a link, and a run writes into folders of its own alone"):
             write()
     assert not list((tmp_path / "elsewhere").iterdir())
-
-
-@pytest.mark.parametrize("part", ["language", "language/images"])
-def test_replies_are_not_kept_through_a_link(part: str, tmp_path: Path) -> None:
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "run").mkdir()
-    (tmp_path / "elsewhere" / LEFT).write_text("half")
-    link = tmp_path / "run" / part
-    link.parent.mkdir(exist_ok=True)
-    link.symlink_to(tmp_path / "elsewhere")
-    store = ReplyStore(tmp_path / "run/language")
-    request = ChatRequest.__new__(ChatRequest)  # its content is not looked at before the folder is
-    with pytest.raises(StoreError, match="is a link"):
-        store.save(request, None, "server")  # type: ignore[arg-type]
-    with pytest.raises(StoreError, match="is a link"), RunFolder(tmp_path / "run").locked():
-        pass
-    assert names(tmp_path / "elsewhere") == [LEFT]
-
-
-def test_a_run_may_lie_behind_a_link(tmp_path: Path) -> None:
-    (tmp_path / "large").mkdir()
-    (tmp_path / "run").symlink_to(tmp_path / "large")
-    with RunFolder(tmp_path / "run").locked():
-        RunFolder(tmp_path / "run").job("rooms/a", "m").prepare()
-    assert (tmp_path / "large/scenes/rooms.a/m").is_dir()

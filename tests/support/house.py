@@ -105,6 +105,8 @@ def layers(graph: Mapping[str, set[str]]) -> list[set[str]]:
     while left:
         free = {node for node, others in left.items() if not others & left.keys()}
         if not free:
+            while free := left.keys() - set().union(*left.values()):  # what stands above the cycle
+                left = {node: others & left.keys() - free for node, others in left.items() if node not in free}
             raise ValueError(f"a cycle of imports among {', '.join(sorted(left))}")
         found.append(free)
         left = {node: others for node, others in left.items() if node not in free}

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import mmap
 import os
-import re
 import shutil
-import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -113,7 +110,6 @@ def release_pages(table: NDArray[Any]) -> None:
 
 
 SUFFIX = ".held"
-OWN_NAME = re.compile(r"su3d-[a-z]+-[a-z0-9_]{8}\.held")  # what ``tempfile.mkdtemp`` makes of a prefix of ours
 
 
 class TemporaryFolder:
@@ -126,7 +122,6 @@ class TemporaryFolder:
         remove_abandoned()
         try:
             self.path, self._lock = held_folder(lambda: Path(tempfile.mkdtemp(SUFFIX, prefix)))
-            assert OWN_NAME.fullmatch(self.path.name)
         except OSError as error:
             where = f" below {tempfile.tempdir}" if tempfile.tempdir else ""
             reason = error.strerror or str(error)
@@ -144,18 +139,12 @@ class TemporaryFolder:
     def __enter__(self) -> Path:
         return self.path
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
 def remove_abandoned() -> None:
     """Remove the temporary folders of processes that were killed."""
-    with suppress(OSError):  # no such place, or a closed one: whoever makes a folder there says so
-        for folder in Path(tempfile.gettempdir()).iterdir():
-            if OWN_NAME.fullmatch(folder.name):
-                with suppress(OSError):  # in use, gone meanwhile, or somebody else's
-                    about = folder.lstat()
-                    if stat.S_ISDIR(about.st_mode) and about.st_uid == os.getuid():
-                        remove_unheld(folder)
+    for folder in Path(tempfile.gettempdir()).glob(f"su3d-*{SUFFIX}"):
+        with suppress(OSError):  # in use, gone meanwhile, or somebody else's
+            remove_unheld(folder)

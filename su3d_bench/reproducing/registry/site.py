@@ -20,7 +20,7 @@ from su3d_bench.reproducing.registry.rows import Row
 INDEX, DATA = "index.html", "registry.json"
 METHODS, SCENES = "methods", "scenes"
 SCHEMA = 1
-KIND = "su3d-bench registry"  # by which an earlier site is known
+KIND = "su3d-bench dev registry"  # by which an earlier site is known
 MOST_OF_AN_ADDRESS = 500
 TITLE = "Registry of results"
 

@@ -9,16 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conceptgraphs_scene import (
-    QUIET,
-    SCENE,
-    Plate,
-    at_cosine,
-    axis,
-    contents,
-    look,
-    mapped,
-)
+from conceptgraphs_scene import QUIET, SCENE, Plate, at_cosine, axis, contents, look, mapped
 from painted import colour_perception
 from places import SCENES
 

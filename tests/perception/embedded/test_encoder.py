@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from su3d_bench.core.errors import ModelMissing
 from su3d_bench.core.types import UInt8Array
 from su3d_bench.datasets.rooms.classes import MATERIALS
 from su3d_bench.perception.embedded import encoder as embedded_encoder
@@ -22,10 +21,6 @@ from su3d_bench.perception.embedded import text as embedded_text
 from su3d_bench.perception.embedded.encoder import IMAGE_FILE, IMAGE_SIZE, TEXT_FILE, EmbeddedEncoder, log_size, shrink
 from su3d_bench.perception.embedded.text import (
     DIM,
-    N_IDS,
-    N_ROWS,
-    N_WORDS,
-    PADDING,
     fnv1a,
     token_ids,
 )
@@ -79,13 +74,6 @@ def test_shrinking_averages_an_axis_even_where_the_other_grows() -> None:
     assert shrink(stripes).shape == (IMAGE_SIZE, IMAGE_SIZE, 3)
     assert shrink(stripes).std() == 0.0
     assert shrink(stripes)[0, 0, 0] == 100
-
-
-def test_missing_weights_are_named(tmp_path: Path) -> None:
-    with pytest.raises(ModelMissing, match=rf"there is no .*{IMAGE_FILE}; reinstall the package"):
-        EmbeddedEncoder(tmp_path).encode_images([np.zeros((4, 4, 3), np.uint8)])
-    with pytest.raises(ModelMissing, match=TEXT_FILE):
-        EmbeddedEncoder(tmp_path).encode_texts(["chair"])
 
 
 def test_model_card_describes_the_shipped_files(encoder: EmbeddedEncoder) -> None:
@@ -163,17 +151,6 @@ def test_words_that_no_caption_holds_are_named() -> None:
 
 def test_the_words_for_materials_are_those_of_the_rooms() -> None:
     assert lexicon.MATERIALS == MATERIALS
-
-
-def test_ids_have_the_documented_shape_and_range() -> None:
-    ids = token_ids(["chair", "", "one two three four five six seven eight nine ten " * 3])
-    assert ids.shape == (3, N_WORDS, N_IDS)
-    assert ids.dtype == np.int64
-    assert (ids[1] == PADDING).all()
-    assert (ids[2, :, 0] != PADDING).all()
-    assert ids.min() >= 0
-    assert ids.max() < N_ROWS
-    assert token_ids([]).shape == (0, N_WORDS, N_IDS)
 
 
 def test_hash_is_fnv1a() -> None:

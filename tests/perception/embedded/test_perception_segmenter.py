@@ -122,12 +122,6 @@ def test_single_holes_in_the_depth_do_not_break_regions(fraction: float) -> None
     assert best_iou(regions, ids == LEFT) > 0.8 and best_iou(regions, ids == RIGHT) > 0.8
 
 
-def test_an_object_without_any_depth_is_found_by_colour() -> None:
-    frame, ids = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE})
-    frame.depth_m[ids == LEFT] = 0
-    assert best_iou(objects(frame), ids == LEFT) > 0.6
-
-
 @pytest.mark.parametrize("depth_m", [0.0, 2.0, np.nan])
 @pytest.mark.parametrize("level", ["objects", "parts"])
 def test_a_flat_empty_frame_gives_few_regions_and_no_error(depth_m: float, level: str) -> None:
@@ -146,13 +140,6 @@ def test_masks_do_not_overlap_boxes_fit_and_scores_are_shares() -> None:
         for mask, (x0, y0, x1, y1) in zip(regions.masks, regions.boxes.astype(int), strict=True):
             rows, columns = np.nonzero(mask)
             assert (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1) == (x0, y0, x1, y1)
-
-
-def test_wide_frames_are_segmented_at_a_fraction_of_their_size() -> None:
-    frame, ids = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE})
-    regions = objects(frame, max_width=160, min_region_px=60)
-    assert regions.masks.shape[1:] == (HEIGHT, WIDTH)
-    assert best_iou(regions, ids == LEFT) > 0.8
 
 
 @pytest.mark.parametrize(("n", "n_links"), [(1, 0), (5, 0), (40, 12), (40, 60), (300, 900)])

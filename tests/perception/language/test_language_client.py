@@ -231,12 +231,6 @@ def test_of_two_processes_the_first_reply_is_kept(server: ChatServer, tmp_path: 
     assert kept is not None and set(replies) == {kept.text}
 
 
-def test_equal_requests_at_once_are_sent_once(server: ChatServer, tmp_path: Path) -> None:
-    server.answer = lambda body: Answered(wait_s=0.05)
-    client(server, tmp_path, max_concurrent=8).ask_all([ask(str(k % 3)) for k in range(24)])
-    assert server.n_asked == 3
-
-
 def test_the_budget_stops_before_it_is_passed_and_goes_on_when_raised(server: ChatServer, tmp_path: Path) -> None:
     server.answer = lambda body: Answered(usage=(30, 10))
     questions = [ask(str(k)) for k in range(5)]

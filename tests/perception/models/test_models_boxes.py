@@ -52,19 +52,6 @@ def test_an_overlap_of_exactly_the_threshold_is_no_reason_to_go() -> None:
     assert suppress(boxes_of((0, 0, 10, 10), (0, 0, 4, 10)), scores, 0.4).tolist() == [0]
 
 
-def test_suppression_equals_its_definition_on_random_boxes() -> None:
-    random = np.random.default_rng(3)
-    corners = random.uniform(0, 60, (200, 2))
-    boxes = np.concatenate([corners, corners + random.uniform(1, 40, (200, 2))], axis=1).astype(np.float32)
-    scores = random.integers(0, 20, 200).astype(np.float32)
-    kept: list[int] = []
-    for index in sorted(range(200), key=lambda k: (-scores[k], k)):
-        if not kept or box_overlaps(boxes[index], boxes[kept]).max() <= 0.4:
-            kept.append(index)
-    assert suppress(boxes, scores, 0.4).tolist() == kept
-    assert 20 < len(kept) < 150
-
-
 @pytest.mark.parametrize(
     ("size", "longest", "shortest"),
     [
@@ -120,14 +107,6 @@ def test_which_boxes_a_crop_cuts_equals_transformers() -> None:
     theirs = _is_box_near_crop_edge(torch.from_numpy(inside), list(crop.box), [0, 0, 300, 400]).numpy()
     assert is_cut_by_crop(boxes, crop, 400, 300).tolist() == theirs.tolist()
     assert 0 < theirs.mean() < 1
-
-
-def test_small_holes_are_filled_and_small_islands_go() -> None:
-    mask = mask_of("######.. #.####.# ######.. ###..#.. ###..#.. ######..")
-    filled, had_holes = without_small_parts(mask, 4, "holes")
-    assert had_holes and filled[1, 1] and not filled[3, 3], "one hole has one pixel, the other four"
-    clean, had_islands = without_small_parts(filled, 4, "islands")
-    assert had_islands and not clean[1, 7] and clean[:, :6].sum() == 32
 
 
 def test_a_mask_of_small_islands_keeps_the_largest_and_counts_as_changed() -> None:

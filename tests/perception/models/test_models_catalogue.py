@@ -136,13 +136,6 @@ def test_an_unknown_name_or_form_is_one_line() -> None:
         locate("siglip-base-224", ("open_clip",))
 
 
-def test_a_checkpoint_that_is_not_the_published_one_is_named(home: Path) -> None:
-    fill(home / "models", ("sam_vit_h_4b8939.pth",))
-    wrong = locate("sam-vit-h").wrong_digests()
-    assert len(wrong) == 1
-    assert "published is a7bf3b02f3eb" in wrong[0]
-
-
 def test_the_digest_of_a_large_file_is_read_again_only_when_the_file_has_changed(
     home: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

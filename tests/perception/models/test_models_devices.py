@@ -9,7 +9,7 @@ import pytest
 from tiny_models import needs_models
 
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.core.system.devices import Batches, device_for, first_batch, precision_for
+from su3d_bench.core.system.devices import Batches, device_for, precision_for
 from su3d_bench.core.types import Float32Array
 
 
@@ -43,17 +43,6 @@ def test_jobs_take_the_gpus_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
     assert precision_for("auto", "cuda:0") == "float16"
     assert precision_for("auto", "cuda:1") == "float32"
     assert precision_for("bfloat16", "cuda:1") == "bfloat16"
-
-
-def test_the_first_batch_follows_from_the_memory_that_the_weights_leave(monkeypatch: pytest.MonkeyPatch) -> None:
-    torch = pytest.importorskip("torch", reason="torch is not installed")
-    total = type("Properties", (), {"total_memory": 10_000})
-    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: total)
-    # (10,000 - 2,000) / 2 = 4,000 for images of 300 each: 13, of which the power of two is 8
-    assert first_batch("cuda:0", 300, 2_000) == 8
-    assert first_batch("cuda:0", 1, 2_000) == 256
-    assert first_batch("cuda:0", 10**9, 2_000) == 1
-    assert first_batch("cpu", 300, 2_000) == 1
 
 
 def test_the_cpu_takes_float32_and_a_gpu_that_is_not_here_is_one_line() -> None:

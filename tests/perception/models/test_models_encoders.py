@@ -98,17 +98,6 @@ def test_the_digest_moves_with_all_that_moves_a_feature(folder: Path, tmp_path: 
         assert load_encoder(config(tmp_path / name)).digest != digest, name
 
 
-@needs_models
-def test_an_encoder_knows_its_own_digest_of_another_device(folder: Path, tmp_path: Path) -> None:
-    here = load_encoder(config(folder))
-    other = load_encoder(config(folder, precision="bfloat16"))
-    assert isinstance(here, FoundationEncoder)
-    assert here.is_same_space(other.digest)
-    write_tiny_clip(tmp_path / "clip-vit-h-14", seed=1)
-    assert not here.is_same_space(load_encoder(config(tmp_path)).digest)
-    assert not here.is_same_space(load_encoder(config(folder, transform="transformers")).digest)
-
-
 class _CountingTowers:
     """Towers that count; features are sums of what they are given."""
 

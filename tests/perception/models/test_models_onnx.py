@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from tiny_models import SAM_PX, blocks, noise_images, tiny_sam, write_tiny_clip
 
-from su3d_bench.core.errors import ConfigError, DataError, ModelMissing
+from su3d_bench.core.errors import DataError, ModelMissing
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.encoders.towers import EncoderManifest
 from su3d_bench.perception.models.files import locate
@@ -122,14 +122,6 @@ def test_a_manifest_without_sense_is_one_line(
     (tmp_path / "manifest.json").write_text(json.dumps(content))
     with pytest.raises(DataError, match=said):
         EncoderManifest.read(tmp_path / "manifest.json")
-
-
-def test_the_folder_of_another_encoder_and_one_that_was_not_exported_are_one_line(folder: Path) -> None:
-    other = ModelsConfig(encoder="clip-vit-b-32", paths={"clip-vit-b-32": folder / f"{CLIP}-onnx"}, runtime="onnx")
-    with pytest.raises(ConfigError, match=f"holds '{CLIP}', not 'clip-vit-b-32'"):
-        load_encoder(other)
-    with pytest.raises(ModelMissing, match=r"python tools/export_onnx\.py clip-vit-b-32 --out"):
-        load_encoder(ModelsConfig(encoder="clip-vit-b-32", folder=folder, runtime="onnx"))
 
 
 def test_a_provider_that_is_not_here_and_a_damaged_file_are_one_line(folder: Path, tmp_path: Path) -> None:

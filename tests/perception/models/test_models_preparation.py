@@ -105,12 +105,3 @@ def test_long_texts_are_cut_and_keep_their_end(tmp_path: Path) -> None:
     assert tokens[0, :3].tolist() == [words["<|startoftext|>"], words["chair</w>"], end]
     assert tokens[1, -1] == end
     assert (tokens[1, 1:-1] == words["chair</w>"]).all()
-
-
-@needs_models
-def test_a_tokenizer_of_another_model_is_refused(tmp_path: Path) -> None:
-    from su3d_bench.perception.models.encoders.texts import read_tokeniser
-
-    write_clip_tokenizer(tmp_path)
-    with pytest.raises(DataError, match="the text tower knows 20 words"):
-        read_tokeniser(tmp_path, "clip", N_TOKENS, None, 20)(["chair"])

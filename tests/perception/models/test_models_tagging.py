@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -94,33 +94,25 @@ def test_what_is_no_word_list_is_one_line(tmp_path: Path, content: bytes, messag
         read_word_list(tmp_path / "absent.txt")
 
 
-class AnsweringSession:
-    """A session of ONNX Runtime that has seen a lamp and a sofa."""
+def test_an_exported_tagger_names_what_its_list_holds() -> None:
+    shapes: list[tuple[int, ...]] = []
 
-    def __init__(self) -> None:
-        self.shapes: list[tuple[int, ...]] = []
-
-    def get_inputs(self) -> list[Any]:
-        return [type("Input", (), {"name": "image"})()]
-
-    def run(self, names: None, fed: dict[str, Float32Array]) -> list[Float32Array]:
-        self.shapes.append(fed["image"].shape)
+    def run(_: None, fed: dict[str, Float32Array]) -> list[Float32Array]:
+        shapes.append(fed["image"].shape)
         return [np.array([[0, 1, 0, 1]], np.float32)]
 
-
-def test_an_exported_tagger_names_what_its_list_holds() -> None:
-    session = AnsweringSession()
+    session = SimpleNamespace(get_inputs=lambda: [SimpleNamespace(name="image")], run=run)
     tagger = OnnxRamTagger(lambda: session, ("bed", "lamp", "room", "sofa"), "digest")
     assert tagger.tags(RGB) == ("lamp", "sofa")
-    assert session.shapes == [(1, 3, RAM_PX, RAM_PX)]
-    assert tagger.caveat is None
+    assert shapes == [(1, 3, RAM_PX, RAM_PX)] and tagger.caveat is None
     with pytest.raises(DataError, match=r"answers \(1, 4\), ram_tag_list.txt has 3 tags"):
         OnnxRamTagger(lambda: session, ("bed", "lamp", "room"), "digest").tags(RGB)
 
 
-@pytest.fixture
-def ram_package(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """A package ``ram`` with the published interface and a network of one layer; what it is asked for."""
+def test_the_published_package_gets_its_weights_as_plain_tensors(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A package ``ram`` with the published interface and a network of one layer stands in for the real one."""
     import torch
 
     asked: list[dict[str, Any]] = []
@@ -136,42 +128,17 @@ def ram_package(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
             names = [name for name, score in zip(("bed", "coffee table"), scores, strict=True) if score > 0]
             return [" | ".join(names)], ["..."]
 
-    def ram_plus(**settings: Any) -> Network:
-        asked.append(settings)
-        return Network()
-
-    package, models = ModuleType("ram"), ModuleType("ram.models")
-    models.ram_plus = ram_plus  # type: ignore[attr-defined]
-    package.models = models  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "ram", package)
+    models: Any = ModuleType("ram.models")
+    models.ram_plus = lambda **settings: (asked.append(settings), Network())[1]
+    monkeypatch.setitem(sys.modules, "ram", ModuleType("ram"))
     monkeypatch.setitem(sys.modules, "ram.models", models)
-    return asked
-
-
-def ram_files(folder: Path, tensors: dict[str, Any]) -> ModelFiles:
-    import torch
-
-    entry = model_entry("ram-plus", "tagger")
-    path = folder / "ram_plus_swin_large_14m.pth"
-    torch.save({"model": tensors}, path)
-    return ModelFiles(entry, entry.form("original"), folder, path)
-
-
-def test_the_published_package_gets_its_weights_as_plain_tensors(
-    ram_package: list[dict[str, Any]], tmp_path: Path
-) -> None:
-    import torch
-
     # An older name of the head, and a buffer of another window, as the published file has them.
-    tensors = {
-        "vision_multi.weight": torch.zeros(2, 3),
-        "vision_multi.bias": torch.tensor([-1.0, 1.0]),
-        "relative_position_index": torch.arange(9),
-    }
-    files = ram_files(tmp_path, tensors)
-    tagger = RamTagger(lambda: load_ram(files, "cpu"), "cpu", "digest")
-    assert tagger.tags(RGB) == ("coffee table",)
-    assert ram_package == [{"pretrained": "", "image_size": 384, "vit": "swin_l"}]
-    tensors["vision_multi.bias"] = torch.tensor([-1.0, -1.0])
-    silent = ram_files(tmp_path, tensors)
-    assert RamTagger(lambda: load_ram(silent, "cpu"), "cpu", "digest").tags(RGB) == ()
+    head = {"vision_multi.weight": torch.zeros(2, 3), "vision_multi.bias": torch.tensor([-1.0, 1.0])}
+    path, entry = tmp_path / "ram_plus_swin_large_14m.pth", model_entry("ram-plus", "tagger")
+    files = ModelFiles(entry, entry.form("original"), tmp_path, path)
+    torch.save({"model": {**head, "relative_position_index": torch.arange(9)}}, path)
+    assert RamTagger(lambda: load_ram(files, "cpu"), "cpu", "digest").tags(RGB) == ("coffee table",)
+    assert asked == [{"pretrained": "", "image_size": 384, "vit": "swin_l"}]
+    torch.save({"model": {"vision_multi.weight": torch.zeros(2, 3)}}, path)
+    with pytest.raises(DataError, match=r"lacks 1 tensors, such as tagging_head\.bias; run: su3d-bench models fetch"):
+        load_ram(files, "cpu")

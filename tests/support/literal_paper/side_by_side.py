@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from literal_comparison import differences
 from literal_paper import PaperProgram
-from literal_settings import settings_of
+from literal_problems import differences, settings_of
 
 from su3d_bench.core.interfaces import StageTimer
 from su3d_bench.core.maps import Instances

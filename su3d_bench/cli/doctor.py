@@ -1,0 +1,250 @@
+"""``su3d-bench dev doctor``: whether this machine has what the program needs, and what to do where not."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from su3d_bench.cli.output import answer_either
+from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, Su3dError, counted, printable, shown
+
+PROGRAM = "su3d-bench"
+PATIENCE_S = 180.0  # of one import, on a disk that is read for the first time
+LEAST_FREE = 10**9  # bytes: a room, its cache, its run
+LEAST_MEMORY = 4 * 10**9  # bytes: a room under opensu3d takes one; docs/running/performance.md
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+# What is loaded in a process of its own, which a compiled library that lacks another one may end.
+LOADED = {
+    "numba": "import numba; found = {}",
+    "opencv-python-headless": "import cv2; found = {}",
+    "onnxruntime": "import onnxruntime; found = {'providers': onnxruntime.get_available_providers()}",
+    "open3d": "import open3d; found = {}",
+    "torch": "import torch; n = torch.cuda.device_count() if torch.cuda.is_available() else 0; found = {'cuda': "
+    "torch.version.cuda, 'gpus': [torch.cuda.get_device_name(i) for i in range(n)]}",
+}
+FOR_OPEN3D = "apt-get install libgl1 libx11-6 libgomp1"  # on Debian and Ubuntu
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line: ``missing`` is what the main job cannot run without, ``note`` what something else may want."""
+
+    what: str
+    state: Literal["ok", "note", "missing"]
+    found: str
+    to_do: str = ""
+
+
+def call(arguments: argparse.Namespace) -> int:
+    checks = examine()
+    missing = [check for check in checks if check.state == "missing"]
+    width = max(len(check.what) for check in checks)
+    lines = []
+    for check in checks:
+        text = "; ".join(part for part in (check.found, check.to_do) if part)
+        lines.append(f"{check.state:<7}  {check.what:<{width}}  {text}")
+    verdict = (
+        f"the main job cannot run: {counted(len(missing), 'thing')} missing" if missing else "the main job can run"
+    )
+    value = {"can_run": not missing, "checks": [asdict(check) for check in checks]}
+    answer_either(arguments, value, *lines, "", verdict)
+    return EXIT_CHECK_FAILED if missing else EXIT_DONE
+
+
+def examine() -> list[Check]:
+    """Every check, in the order in which things are installed."""
+    return [_python(), *_libraries(), *_folders(), _kernels(), *_datasets(), _models(), _cores(), _memory()]
+
+
+def _python() -> Check:
+    is_known = (3, 11) <= sys.version_info[:2] < (3, 13)
+    found = f"{platform.python_version()} ({platform.system()} {platform.machine()})"
+    return Check("Python", "ok" if is_known else "missing", found, "" if is_known else "3.11 or 3.12 is needed")
+
+
+def requirements() -> dict[str, str]:
+    """The packages that the installed program asks for, and the extra to which each belongs ("" for the core)."""
+    from importlib.metadata import PackageNotFoundError, requires
+
+    try:
+        lines = requires(PROGRAM) or []
+    except PackageNotFoundError:
+        return {}
+    wanted: dict[str, str] = {}
+    for line in lines:
+        name = re.match(r"[A-Za-z0-9_.-]+", line)
+        extra = re.search(r"extra == ['\"]([\w-]+)['\"]", line)
+        if name is not None:
+            wanted.setdefault(name[0], extra[1] if extra else "")
+    return {name: extra for name, extra in wanted.items() if extra not in ("test", "dev", "docs")}
+
+
+def version_of(package: str) -> str | None:
+    """The version that is installed, if any."""
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _libraries() -> Iterator[Check]:
+    wanted = requirements()
+    if not wanted:
+        yield Check(PROGRAM, "missing", "is not installed", f"pip install {PROGRAM}")
+        return
+    yield Check(PROGRAM, "ok", version_of(PROGRAM) or "")
+    for name, extra in wanted.items():
+        installed = version_of(name)
+        state: Literal["note", "missing"] = "note" if extra else "missing"
+        if installed is None:
+            found = "is not installed" + (f": only the extra '{extra}' needs it" if extra else "")
+            yield Check(name, state, found, f"pip install '{PROGRAM}[{extra}]'" if extra else f"pip install {PROGRAM}")
+            continue
+        found_by, fault = loaded(name)
+        if fault:
+            to_do = FOR_OPEN3D if name == "open3d" else f"pip install --force-reinstall {name}"
+            yield Check(name, state, f"{installed} cannot be loaded: {fault}", to_do)
+        else:
+            yield Check(name, "ok", "; ".join((installed, *_abilities(found_by))))
+
+
+def _abilities(found: dict[str, Any]) -> Iterator[str]:
+    """What a library says that it can compute on."""
+    if "providers" in found:
+        yield f"computes by {', '.join(name.removesuffix('ExecutionProvider') for name in found['providers'])}"
+    if "gpus" in found:
+        built = f"built for CUDA {found['cuda']}" if found["cuda"] else "built for CPUs alone"
+        yield ", ".join(found["gpus"]) or f"no GPU ({built}), see docs/running/gpu.md"
+
+
+def loaded(package: str) -> tuple[dict[str, Any], str]:
+    """What ``package`` says of itself when it is loaded in a process of its own, and why it cannot be."""
+    if package not in LOADED:
+        return {}, ""
+    text = f"{LOADED[package]}\nimport json, sys\nsys.stdout.write('\\n' + json.dumps(found))"
+    path = os.pathsep.join(folder for folder in sys.path if folder)
+    try:
+        done = subprocess.run(
+            [sys.executable, "-P", "-c", text],  # -P: nothing in the folder where one stands takes a library's place
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=PATIENCE_S,
+            stdin=subprocess.DEVNULL,
+            env={**os.environ, "PYTHONPATH": path},
+        )
+    except subprocess.TimeoutExpired:
+        return {}, f"took longer than {PATIENCE_S:.0f} s to load"
+    if done.returncode < 0:
+        return {}, f"ended by signal {-done.returncode} while it was loaded"
+    try:
+        return json.loads(done.stdout.splitlines()[-1]), ""
+    except (ValueError, IndexError):
+        return {}, printable((done.stderr.strip().splitlines() or ["said nothing"])[-1], 200)
+
+
+def _folders() -> Iterator[Check]:
+    from su3d_bench.core.files.scratch import scratch_folder
+    from su3d_bench.runs.scenes import cache_root, data_root
+
+    named = os.environ.get("SU3D_DATA") or ""
+    if "://" in named:
+        yield Check("data", "ok", f"{shown(Path(named))}: a store, which run and ablate read")
+    else:
+        yield _folder("data", data_root(), "SU3D_DATA")
+    yield _folder("cache", cache_root(), "SU3D_CACHE")
+    yield _folder("temporary", scratch_folder(), "TMPDIR")
+    yield _folder("runs", Path("runs").absolute(), "--out")
+
+
+def _folder(what: str, folder: Path, setting: str) -> Check:
+    """Whether files can be written, locked and have room where ``folder`` is or would be."""
+    from su3d_bench.core.files.locks import NO_LOCKS, hold_folder
+    from su3d_bench.store.caches import size_text
+
+    existing = next((place for place in (folder, *folder.parents) if place.exists()), Path("/"))
+    where = shown(folder) if existing == folder else f"{shown(folder)} (to be made)"
+    try:
+        with tempfile.TemporaryDirectory(dir=existing, prefix=".su3d-doctor-") as made:
+            os.close(hold_folder(Path(made)))
+    except OSError as error:
+        if error.errno in NO_LOCKS:
+            return Check(what, "note", f"{where}: its disk has no locks", f"best on another disk: {setting}")
+        reason = error.strerror or str(error)
+        return Check(what, "missing", f"{where}: cannot be written: {reason}", f"choose another with {setting}")
+    free = shutil.disk_usage(existing).free
+    is_enough = free >= LEAST_FREE
+    to_do = "" if is_enough else f"make room, or another with {setting}"
+    return Check(what, "ok" if is_enough else "note", f"{where}: {size_text(free)} free", to_do)
+
+
+def _kernels() -> Check:
+    from su3d_bench.store.caches import kernel_folders, why_slow
+
+    line = why_slow()
+    if line is not None:
+        return Check("compiled code", "note", line)
+    return Check(
+        "compiled code", "ok", f"is kept in the first that takes it: {', '.join(map(shown, kernel_folders()))}"
+    )
+
+
+def _datasets() -> Iterator[Check]:
+    from su3d_bench.core import registry
+    from su3d_bench.runs.scenes import data_root
+
+    if "://" in (os.environ.get("SU3D_DATA") or ""):
+        return
+    for name in registry.names("dataset"):
+        try:
+            dataset_class = registry.load("dataset", name)
+            n_scenes = len(dataset_class(data_root(), dataset_class.Options()).scenes())
+        except Su3dError:  # datasets list says why
+            n_scenes = 0
+        if n_scenes:
+            yield Check(f"dataset {name}", "ok", counted(n_scenes, "scene"))
+        else:
+            yield Check(f"dataset {name}", "note", "no scene is here", "su3d-bench datasets list says where it looks")
+
+
+def _models() -> Check:
+    from su3d_bench.perception.models.catalogue import MODELS
+    from su3d_bench.perception.models.files import models_folder
+    from su3d_bench.perception.models.inspection import model_state
+
+    here = [name for name, entry in MODELS.items() if model_state(entry).files]
+    found = f"{len(here)} of {len(MODELS)} in {shown(models_folder(None))} and the Hugging Face cache"
+    if here:
+        return Check("models", "ok", f"{found}: {', '.join(here)}")
+    return Check("models", "note", f"{found}; only real models need them", "su3d-bench models list says what to fetch")
+
+
+def _cores() -> Check:
+    all_cores = os.cpu_count() or 1
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else all_cores
+    threads = ", ".join(f"{name}={os.environ[name]}" for name in THREADS if os.environ.get(name))
+    return Check("cores", "ok", f"{usable} of {all_cores}{f'; {threads}' if threads else ''}")
+
+
+def _memory() -> Check:
+    import psutil
+
+    from su3d_bench.store.caches import size_text
+
+    memory = psutil.virtual_memory()
+    found = f"{size_text(memory.total)}, {size_text(memory.available)} of it free"
+    is_enough = memory.available >= LEAST_MEMORY
+    return Check("memory", "ok" if is_enough else "note", found, "" if is_enough else "fewer scenes at once: --jobs 1")

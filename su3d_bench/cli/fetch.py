@@ -1,0 +1,313 @@
+"""``su3d-bench models fetch`` and ``datasets fetch``: published weights and data, once their terms are accepted."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from su3d_bench.cli.options import Verbs, add_group, add_options, add_verb, perception_config
+from su3d_bench.cli.output import answer_either, drawn_bars, remark
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, suggest
+
+if TYPE_CHECKING:
+    from su3d_bench.fetching.bringing import Brought, Planned
+    from su3d_bench.fetching.download import Patience, Watch
+    from su3d_bench.fetching.sources import Source, Sources
+
+MB = 1_000_000
+
+
+def _add_fetch_options(parser: argparse.ArgumentParser, *, has_servers: bool = True) -> None:
+    """``--accept``, ``--dry-run``, ``--retries``; where servers are in the table, ``--mirror`` and ``--sources``."""
+    parser.add_argument(
+        "--accept",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="NAME",
+        help="accept the licence of what has this name, or the licence itself, such as MIT (default: you are asked)",
+    )
+    add_options(parser, "--dry-run")
+    parser.add_argument(
+        "--retries", type=int, default=3, metavar="N", help="how often a broken download is taken up again (default: 3)"
+    )
+    if has_servers:
+        parser.add_argument(
+            "--mirror",
+            nargs="+",
+            action="extend",
+            default=[],
+            metavar="NAME=URL",
+            help="take its files from this folder of another server; for a repository of the hub, another endpoint",
+        )
+        parser.add_argument(
+            "--sources",
+            type=Path,
+            metavar="FILE",
+            help="a TOML file of your own in the form of the program's table, whose entries take the place of its own",
+        )
+
+
+def sources_of(arguments: argparse.Namespace) -> Sources:
+    """The table as the flags of ``arguments`` change it."""
+    from su3d_bench.fetching.sources import load_sources
+
+    return load_sources(getattr(arguments, "sources", None), getattr(arguments, "mirror", ()))
+
+
+def patience_of(arguments: argparse.Namespace) -> Patience:
+    from su3d_bench.fetching.download import Patience
+
+    if not 0 <= arguments.retries <= 1000:
+        raise ConfigError(f"--retries {arguments.retries}: expected 0 to 1000")
+    return Patience(n_retries=arguments.retries)
+
+
+def size_text(n_bytes: int | None) -> str:
+    """A size in words: in MB below ten GB."""
+    if n_bytes is None:
+        return "size not stated"
+    return f"{n_bytes / MB:,.0f} MB" if n_bytes < 10_000 * MB else f"{n_bytes / MB / 1000:,.1f} GB"
+
+
+def fetch_planned(arguments: argparse.Namespace, planned: Sequence[Planned]) -> int:
+    """Show, ask, bring what is missing, and answer; with ``--dry-run`` only show."""
+    from su3d_bench.fetching.bringing import fetch
+
+    _known_terms(arguments, [entry.source for entry in planned])
+    if arguments.dry_run:
+        lines = [line for entry in planned for line in plan_lines(entry.source, entry.here)]
+        answer_either(arguments, [plan_row(entry.source, entry.here) for entry in planned], *lines)
+        return EXIT_DONE
+    patience = patience_of(arguments)
+    missing = [entry for entry in planned if entry.here is None]
+    accept(arguments, [entry.source for entry in missing])
+    keep = getattr(arguments, "keep_archives", False)
+    with watching(arguments) as watch:
+        brought = [fetch(entry, watch, patience, keep_archives=keep) for entry in missing]
+    answer_brought(arguments, [(entry.source.name, entry.here) for entry in planned if entry.here], brought)
+    return EXIT_DONE
+
+
+def answer_brought(arguments: argparse.Namespace, here: Sequence[tuple[str, Path]], brought: Sequence[Brought]) -> None:
+    """Say where everything lies, and with which checksums it came."""
+    rows: list[dict[str, Any]] = [{"name": name, "folder": str(folder), "files": []} for name, folder in here]
+    lines = [f"{name}: was there already: {folder}" for name, folder in here]
+    for entry in brought:
+        rows.append(
+            {
+                "name": entry.source.name,
+                "folder": str(entry.place),
+                "files": [asdict(file) for file in entry.files],
+                "remarks": list(entry.remarks),
+            }
+        )
+        lines.append(f"{entry.source.name}: {entry.place}")
+        lines += [f"  {file.sha256}  {file.name}{_agreement(file.held_against)}" for file in entry.files]
+        for text in entry.remarks:
+            remark(f"{entry.source.name}: {text}", quiet=arguments.quiet)
+    answer_either(arguments, rows, *lines)
+
+
+def _agreement(held_against: Sequence[str]) -> str:
+    return f"  (agrees with: {', '.join(held_against)})" if held_against else "  (no checksum is stated; recorded)"
+
+
+def plan_row(source: Source, here: Path | None) -> dict[str, Any]:
+    """A source as ``--dry-run --json`` gives it: every fact with where it was read."""
+    from su3d_bench.fetching.hub import hub_addresses
+
+    row = source.model_dump(mode="json", exclude_none=True)
+    row["n_bytes"] = source.n_bytes
+    row["is_exact"] = source.is_exact
+    row["addresses"] = [file.address for file in source.files] if source.hub is None else hub_addresses(source)
+    row["here"] = None if here is None else str(here)
+    return row
+
+
+def plan_lines(source: Source, here: Path | None) -> list[str]:
+    """A source in words: size, licence, every address."""
+    row = plan_row(source, here)
+    about = "" if source.is_exact or source.n_bytes is None else "about "
+    state = f"was there already: {here}" if here is not None else "to be fetched"
+    lines = [
+        f"{source.name}: {source.what}",
+        f"  {about}{size_text(source.n_bytes)}, {state}",
+        f"  licence {source.licence.name}: {source.licence.address}",
+    ]
+    return lines + [f"  {address}" for address in row["addresses"]]
+
+
+def accept(arguments: argparse.Namespace, sources: Sequence[Source]) -> None:
+    """Ask for each licence that was not accepted; ``ConfigError`` where it is not, or nobody is there to answer."""
+    given = {name.lower() for name in arguments.accept}
+    open_ones = [s for s in sources if not {s.name.lower(), s.licence.name.lower(), s.group} & given]
+    licences: dict[tuple[str, str], list[Source]] = {}
+    for source in open_ones:
+        licences.setdefault((source.licence.name, source.licence.address), []).append(source)
+    if not licences:
+        return
+    for source in sources:
+        remark(", ".join(line.strip() for line in plan_lines(source, None)[:3]), quiet=arguments.quiet)
+    for (name, address), those in licences.items():
+        names = ", ".join(source.name for source in those)
+        if not (sys.stdin.isatty() and sys.stderr.isatty()):
+            raise ConfigError(
+                f"fetch: the licence '{name}' ({address}) of {names} was not accepted; read it, then add --accept "
+                f"{those[0].name if len(those) == 1 else _quoted(name)}"
+            )
+        remark(f"{names}: under '{name}', {address}; do you accept it? [y/N]")
+        if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+            raise ConfigError(f"fetch: the licence '{name}' of {names} was not accepted; nothing of it was fetched")
+
+
+def _quoted(name: str) -> str:
+    return f"'{name}'" if " " in name else name
+
+
+def _known_terms(arguments: argparse.Namespace, sources: Sequence[Source]) -> None:
+    """``ConfigError`` where ``--accept`` names what is neither asked for nor a licence of it."""
+    known = [name for s in sources for name in (s.name, s.licence.name, s.group)]
+    for name in arguments.accept:
+        if name.lower() not in {word.lower() for word in known}:
+            raise ConfigError(f"--accept '{name}': is nothing that is asked for{suggest(name, known)}")
+
+
+@contextmanager
+def watching(arguments: argparse.Namespace) -> Iterator[Watch]:
+    """What hears how much has come, and draws a bar a file where stderr is a terminal."""
+    with drawn_bars(is_quiet=arguments.quiet, tells_time_left=True) as bars:
+        if bars is None:
+            yield lambda name, done, total: None
+            return
+        tasks: dict[str, Any] = {}
+
+        def watch(name: str, n_done: int, n_total: int | None) -> None:
+            unit, word = (MB, "MB") if (n_total or 0) > MB else (1, "")
+            if name not in tasks:
+                for key in list(tasks):
+                    bars.remove_task(tasks.pop(key))
+                tasks[name] = bars.add_task(name, total=None, remark=word)
+            total = None if n_total is None else max(1, n_total // unit)
+            bars.update(tasks[name], total=total, completed=n_done // unit)
+
+        yield watch
+
+
+def add_models(verbs: Verbs) -> None:
+    parser = add_verb(
+        verbs,
+        "fetch",
+        "Fetch foundation models into $SU3D_MODELS: from the Hugging Face hub, or where their authors publish them.",
+        (
+            "su3d-bench models fetch --for paper --accept MIT Apache-2.0",
+            "su3d-bench models fetch sam-vit-h --dry-run",
+        ),
+        call_models,
+        takes_up=True,
+    )
+    parser.add_argument("names", nargs="*", metavar="MODEL", help="short names, as models list has them")
+    parser.add_argument("--for", dest="profile", metavar="PROFILE", help="every model that this profile loads: paper")
+    _add_fetch_options(parser)
+    add_options(parser, "--set")
+
+
+def call_models(arguments: argparse.Namespace) -> int:
+    from su3d_bench.fetching.bringing import plan_models
+    from su3d_bench.perception.models.files import models_folder
+
+    root = models_folder(perception_config(arguments).models.folder)
+    return fetch_planned(arguments, plan_models(sources_of(arguments), arguments.names, arguments.profile, root))
+
+
+def add_data(verbs: Verbs) -> None:
+    """``datasets fetch`` with a sub-verb for each dataset that can be fetched."""
+    actions = add_group(
+        verbs,
+        "fetch",
+        "Fetch published data: shown first, resumed, checked, unpacked where it is looked for.",
+        ("su3d-bench datasets fetch replica --dry-run", "su3d-bench datasets fetch scannet --dry-run"),
+    )
+    _add_replica(actions)
+    _add_scannet(actions)
+
+
+def _add_replica(verbs: Verbs) -> None:
+    parser = add_verb(
+        verbs,
+        "replica",
+        "Fetch Replica into $SU3D_DATA: NICE-SLAM's RGB-D frames, and the annotated meshes of the release.",
+        ("su3d-bench datasets fetch replica --dry-run", "su3d-bench datasets fetch replica frames --accept replica"),
+        call_replica,
+        takes_up=True,
+    )
+    parser.add_argument("parts", nargs="*", metavar="PART", help="frames, meshes (default: both)")
+    parser.add_argument("--keep-archives", action="store_true", help="keep what was unpacked, in .fetched")
+    _add_fetch_options(parser)
+
+
+def call_replica(arguments: argparse.Namespace) -> int:
+    from su3d_bench.fetching.bringing import plan_replica
+    from su3d_bench.runs.scenes import data_root
+
+    return fetch_planned(arguments, plan_replica(sources_of(arguments), arguments.parts, data_root()))
+
+
+def _add_scannet(verbs: Verbs) -> None:
+    parser = add_verb(
+        verbs,
+        "scannet",
+        "Fetch scans of ScanNet into $SU3D_DATA by your own official script or link, or say how to sign its terms.",
+        (
+            "su3d-bench datasets fetch scannet --script download-scannet.py",
+            "su3d-bench datasets fetch scannet val --from https://example.org/scannet --accept scannet",
+        ),
+        call_scannet,
+        takes_up=True,
+    )
+    parser.add_argument(
+        "scans", nargs="*", metavar="SCAN", help="scene0000_00, paper, train, val or test (default: paper)"
+    )
+    given = parser.add_mutually_exclusive_group()
+    given.add_argument("--script", type=Path, metavar="FILE", help="your official download script")
+    given.add_argument(
+        "--from", dest="address", metavar="URL", help="your own link, in which v1/scans and v2/scans lie"
+    )
+    _add_fetch_options(parser, has_servers=False)
+
+
+def call_scannet(arguments: argparse.Namespace) -> int:
+    from su3d_bench.fetching.scannet import fetch_by_script, fetch_from, how_to_sign, plan_scans
+    from su3d_bench.fetching.sources import built_in
+    from su3d_bench.runs.scenes import data_root
+
+    source, root = built_in().named("scannet"), data_root()
+    scans = plan_scans(arguments.scans, root)
+    here = root if scans.is_here else None
+    if arguments.dry_run:
+        missing = [name for names in scans.missing.values() for name in names]
+        row = plan_row(source, here) | {"missing": missing, "label_table": scans.label_table}
+        counts = f"  {scans.n_files} files of {scans.n_asked} scans are missing below {root}"
+        answer_either(arguments, [row], *plan_lines(source, here), counts, *(f"  {name}" for name in missing))
+        return EXIT_DONE
+    if scans.is_here:
+        answer_brought(arguments, [(source.name, root)], [])
+        return EXIT_DONE
+    if arguments.script is None and arguments.address is None:
+        raise how_to_sign(source)
+    for name in arguments.accept:
+        if name.lower() not in (source.name, source.licence.name.lower()):
+            raise ConfigError(f"--accept '{name}': is nothing that is asked for; known: {source.name}")
+    accept(arguments, [source])
+    with watching(arguments) as watch:
+        if arguments.script is not None:
+            brought = fetch_by_script(source, scans, arguments.script, watch)
+        else:
+            brought = fetch_from(source, scans, arguments.address, watch, patience_of(arguments))
+    answer_brought(arguments, [], [brought])
+    return EXIT_DONE

@@ -1,1 +1,0 @@
-"""Published weights and data brought here, once their terms are accepted."""

@@ -1,0 +1,181 @@
+"""``su3d-bench datasets make``: scenes cut into units of work, made side by side, moved to their place when whole."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, NoReturn
+
+from su3d_bench.cli.output import answer_either, drawn_bars, remark
+from su3d_bench.core import registry
+from su3d_bench.core.config import read_assignments
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, nearest
+from su3d_bench.core.files.atomic import make_folder
+from su3d_bench.datasets.layouts import LAYOUTS
+from su3d_bench.datasets.writing import SceneTarget, finish_scene, plan_scenes, write_frames
+from su3d_bench.runs.executors import Event, Report, run_inline, run_processes
+from su3d_bench.runs.job import Part, build_dataset, part_of
+from su3d_bench.runs.scenes import data_root, expand_scenes
+from su3d_bench.store.run_folder import RunFolder
+
+FRAMES_A_UNIT = 400  # a quarter of a room: enough that building the room anew in each process does not matter
+WHAT_A_LAYOUT_TAKES = ("scan", "objects", "trajectory", "intrinsics")
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A piece of work: the frames at ``indices``, or (None) the truth; without ``target`` the scan alone.
+
+    ``layout`` is the name of one; units go to other processes.
+    """
+
+    dataset: Part
+    root: Path
+    scene: str
+    layout: str
+    target: SceneTarget | None
+    indices: range | None
+
+    @property
+    def n_steps(self) -> int:
+        return 1 if self.indices is None else len(self.indices)
+
+
+def make(arguments: argparse.Namespace) -> int:
+    """Make what was asked for and print, scene by scene, whether it was made or was there already."""
+    part = dataset_part(arguments.dataset, arguments.set)
+    scenes = _scenes(part, arguments.scenes)
+    is_native = arguments.layout == "native"
+    if arguments.out is None and not is_native:
+        raise ConfigError(f"datasets make --layout {arguments.layout}: say where with --out DIR")
+    out = arguments.out or data_root()
+    make_folder(out)
+    with RunFolder(out).locked():
+        made = _make_native(part, scenes, out, arguments) if is_native else make_files(part, scenes, out, arguments)
+    reader = part.name if is_native else LAYOUTS[arguments.layout].reader
+    rows = [
+        {
+            "scene": scene,
+            "status": "made" if scene in made else "was there already",
+            "address": f"{reader}/{scene if is_native else LAYOUTS[arguments.layout].scene_name(scene)}",
+        }
+        for scene in scenes
+    ]
+    lines = [f"{row['scene']:<16} {row['status']:<17} {row['address']}" for row in rows]
+    answer_either(arguments, {"out": str(out), "layout": arguments.layout, "scenes": rows}, *lines)
+    remark(f"to use them: SU3D_DATA={out} su3d-bench run --scenes '{reader}/*'", quiet=arguments.quiet)
+    return EXIT_DONE
+
+
+def dataset_part(name: str, assignments: Sequence[str]) -> Part:
+    dataset_class = registry.load("dataset", name)
+    if not all(hasattr(dataset_class, wanted) for wanted in WHAT_A_LAYOUT_TAKES):
+        raise ConfigError(f"datasets make {name}: its scenes are not made here; known: rooms")
+    own_name = str(dataset_class.name)
+    # An option may be written as in `run --set`, with the dataset's name before it, or alone.
+    texts = [text if text.partition("=")[0].count(".") else f"{own_name}.{text}" for text in assignments]
+    return part_of("dataset", name, read_assignments(texts, (), (own_name,)))
+
+
+def _scenes(part: Part, wanted: Sequence[str] | None) -> list[str]:
+    prefix = f"{part.target}/"
+    addresses = [scene if "/" in scene else prefix + scene for scene in wanted or ("*",)]
+    for address in addresses:
+        if not address.startswith(prefix):
+            hint = nearest(address, [prefix + "*"]) or f"; expected '{prefix}...'"
+            raise ConfigError(f"datasets make {part.target}: '{address}' is no scene of it{hint}")
+    chosen, _ = expand_scenes(addresses, {part.target: part})
+    return [scene for _, scene in chosen]
+
+
+def _make_native(part: Part, scenes: Sequence[str], out: Path, arguments: argparse.Namespace) -> set[str]:
+    units = [Unit(part, out, scene, arguments.layout, None, None) for scene in scenes]
+    _run(units, arguments, lambda unit: None)
+    return set(scenes)
+
+
+def make_files(part: Part, scenes: Sequence[str], out: Path, arguments: argparse.Namespace) -> set[str]:
+    """Write scenes in the layout of ``arguments``, whose ``jobs`` and ``quiet`` count; those that were not there."""
+    layout, dataset = LAYOUTS[arguments.layout], build_dataset(part, data_root())
+    units = []
+    for target in plan_scenes(layout, dataset, scenes, out):
+        n_frames = dataset.info(target.scene, 1).n_frames
+        starts = range(0, n_frames, FRAMES_A_UNIT)
+        pieces = [range(start, min(start + FRAMES_A_UNIT, n_frames)) for start in starts]
+        units += [Unit(part, data_root(), target.scene, layout.name, target, piece) for piece in (*pieces, None)]
+    n_open = Counter(unit.scene for unit in units)
+
+    def count_down(unit: Unit) -> None:
+        n_open[unit.scene] -= 1
+        if n_open[unit.scene] == 0:
+            assert unit.target is not None
+            finish_scene(layout, dataset, unit.target)
+
+    _run(units, arguments, count_down)
+    return set(n_open)
+
+
+def _run(units: Sequence[Unit], arguments: argparse.Namespace, done: Callable[[Unit], None]) -> None:
+    n_workers = min(arguments.jobs or os.cpu_count() or 1, len(units))
+    with _progress(units, is_quiet=arguments.quiet) as report:
+        if n_workers > 1:
+            outcomes = run_processes(_work, units, report, jobs=n_workers, lost=_lost)
+        else:
+            outcomes = run_inline(_work, units, report)
+        for unit in outcomes:
+            done(unit)
+
+
+def _work(unit: Unit, report: Report) -> Unit:
+    dataset = _dataset(unit.dataset, unit.root)
+    label = _label(unit)
+    if unit.target is None:
+        dataset.scan(unit.scene)
+    elif unit.indices is None:
+        LAYOUTS[unit.layout].write_truth(dataset, unit.target)
+    else:
+        layout, n = LAYOUTS[unit.layout], unit.n_steps
+
+        def count(n_done: int) -> None:
+            report(Event(unit.scene, label, n_done, n))
+
+        write_frames(layout, dataset, unit.target, unit.indices, count)
+    report(Event(unit.scene, label, unit.n_steps, unit.n_steps))
+    return unit
+
+
+@cache
+def _dataset(part: Part, root: Path) -> Any:
+    """One dataset a process, because it keeps the room that the next unit is likely to want."""
+    return build_dataset(part, root)
+
+
+def _lost(unit: Unit, cause: str) -> NoReturn:
+    raise DataError(f"{unit.dataset.name}/{unit.scene}: {cause}")
+
+
+def _label(unit: Unit) -> str:
+    return "truth" if unit.indices is None else f"frames from {unit.indices.start}"
+
+
+@contextmanager
+def _progress(units: Sequence[Unit], *, is_quiet: bool) -> Iterator[Report]:
+    """A ``Report`` that moves one bar over all steps; it draws nothing where stderr is no terminal."""
+    n_done: dict[tuple[str, str], int] = {}
+    with drawn_bars(is_quiet=is_quiet, tells_time_left=True) as bars:
+        if bars is None:
+            yield lambda event: None
+            return
+        task = bars.add_task("making", total=sum(unit.n_steps for unit in units), remark="")
+
+        def report(event: Event) -> None:
+            n_done[event.unit, event.label] = event.done
+            bars.update(task, completed=sum(n_done.values()), description=f"{event.unit}, {event.label}")
+
+        yield report

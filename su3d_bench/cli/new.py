@@ -1,0 +1,103 @@
+"""The sub-verbs ``new``: a method, a dataset, a protocol or a registry of one's own that runs as it stands."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+
+from su3d_bench.cli.options import Verbs, add_verb
+from su3d_bench.cli.output import answer_either
+from su3d_bench.core.errors import EXIT_DONE, ConfigError
+
+SUFFIX = {"method": ".py", "dataset": ".py", "protocol": ".toml"}
+REGISTRY = "registry"
+TEMPLATES = Path(__file__).parent / "templates"
+TEMPLATE_OF = {"method": "my_method.py.txt", "dataset": "my_dataset.py.txt", "protocol": "my_protocol.toml"}
+# Where each file of a registry's template goes; an empty folder is none for git, so that bundles has a file of its own.
+REGISTRY_FILES = {
+    "README.md": "README.md",
+    "requirements.txt": "requirements.txt",
+    "gitignore.txt": ".gitignore",
+    "workflow.yml": ".github/workflows/registry.yml",
+}
+KEPT = "bundles/.gitkeep"
+# What to type next; {at} is how the file is named to the command line.
+NEXT = {
+    "method": ("methods check {at}", "run --scenes rooms/living0 --methods {at}"),
+    "dataset": ("datasets check '{at}/*'", "run --scenes '{at}/*' --profile oracle"),
+    "protocol": ("protocols show {at}", "run --scenes rooms/living0 --protocols {at}"),
+    REGISTRY: ("dev registry add BUNDLE --to {at}", "dev registry build {at} --out site"),
+}
+
+
+def add_new(verbs: Verbs, what: str) -> None:
+    """The sub-verb ``new`` of methods, datasets, protocols and registries."""
+    group = {REGISTRY: "dev registry"}.get(what, f"{what}s")
+    place = "my-registry" if what == REGISTRY else f"my_{what}{SUFFIX[what]}"
+    parser = add_verb(
+        verbs,
+        "new",
+        f"Write a {what} of your own that works as it is, to begin from.",
+        (f"su3d-bench {group} new {place}", f"su3d-bench {group} new {place} --json"),
+        call,
+    )
+    parser.set_defaults(what=what)
+    if what == REGISTRY:
+        parser.add_argument("file", type=Path, metavar="DIR", help="the folder to write")
+    else:
+        parser.add_argument("file", type=Path, metavar="FILE", help="to write; its name becomes the name in it")
+
+
+def call(arguments: argparse.Namespace) -> int:
+    from su3d_bench.cli.output import written
+    from su3d_bench.core.system.files import file_text
+
+    what, file = arguments.what, arguments.file
+    if what == REGISTRY:
+        return _new_registry(file, arguments)
+    if file.suffix != SUFFIX[what]:
+        raise ConfigError(f"{what}s new: {file} must end in {SUFFIX[what]}, such as my_{what}{SUFFIX[what]}")
+    words = re.findall(r"[A-Za-z0-9]+", file.stem)
+    if not words or words[0][0].isdigit():
+        raise ConfigError(f"{what}s new: no name can be made of '{file.stem}'; such as: my_{what}{SUFFIX[what]}")
+    if file.exists():
+        raise ConfigError(f"{what}s new: {file} is there already; name another file, nothing is overwritten")
+    name, class_name = "-".join(words).lower(), "".join(word[0].upper() + word[1:] for word in words)
+    template = file_text(TEMPLATES / TEMPLATE_OF[what])
+    text = template.replace(f"My{what.capitalize()}", class_name).replace(f"my-{what}", name)
+    written(file, text)
+    at = str(file) if what == "protocol" else f"{file}:{class_name}"
+    commands = [f"su3d-bench {command.format(at=at)}" for command in NEXT[what]]
+    lines = (f"{file}; then:", *(f"  {command}" for command in commands))
+    answer_either(arguments, {"file": str(file), "next": commands}, *lines)
+    return EXIT_DONE
+
+
+def _new_registry(folder: Path, arguments: argparse.Namespace) -> int:
+    """A repository whose CI scores the bundles of pull requests anew and publishes the site."""
+    import os
+    import shlex
+
+    from su3d_bench.cli.output import written
+    from su3d_bench.core.system.files import file_text
+    from su3d_bench.core.version import __version__
+
+    name = Path(os.path.abspath(folder)).name
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", name):
+        raise ConfigError(f"dev registry new: '{name}' is no name for a repository; such as: my-registry")
+    taken = next(
+        (path for path in map(folder.joinpath, (*REGISTRY_FILES.values(), KEPT)) if os.path.lexists(path)), None
+    )
+    if taken is not None or (os.path.lexists(folder) and not folder.is_dir()):
+        raise ConfigError(
+            f"dev registry new: {taken or folder} is there already; name another folder, nothing is overwritten"
+        )
+    for source, place in REGISTRY_FILES.items():
+        text = file_text(TEMPLATES / "registry" / source)
+        written(folder / place, text.replace("my-registry", name).replace("VERSION", __version__))
+    written(folder / KEPT, "")
+    commands = [f"su3d-bench {command.format(at=shlex.quote(str(folder)))}" for command in NEXT[REGISTRY]]
+    lines = (f"{folder}: a repository for git; then:", *(f"  {command}" for command in commands))
+    answer_either(arguments, {"file": str(folder), "next": commands}, *lines)
+    return EXIT_DONE

@@ -1,0 +1,254 @@
+"""What verbs print: answers on stdout and in files, remarks and progress on stderr."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from su3d_bench.core.errors import counted, printable
+from su3d_bench.core.printing import Door, escaped_json, one_line, stream_behind, terminal_width
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+    from su3d_bench.formats.tables.table import Prose, Table
+    from su3d_bench.runs.executors import Event, Report
+
+MOST_UNSEEN = 8  # words that are named
+WIDE, BAR, NARROW_BAR = 100, 24, 12  # characters: a terminal with room for a long bar, and both bars
+MOST_OF_A_BAR = 80  # characters of its words
+
+
+def formatted(parts: Sequence[Table | Prose], arguments: argparse.Namespace, *, is_file: bool = False) -> str:
+    """The tables in the form of ``--format``; ``is_file`` where they are not printed."""
+    from su3d_bench.reports.tables.formats import FORMATS, plain
+
+    form = arguments.table_format or ("markdown" if is_file else "text")
+    return plain(parts, terminal_width()) if form == "text" and not is_file else FORMATS[form](parts)
+
+
+def answer(*lines: str) -> None:
+    """Print an answer to stdout, a line each, whatever stands in them."""
+    print("\n".join(map(one_line, lines)))
+
+
+def answer_document(text: str) -> None:
+    """Print to stdout what is of several lines by its form, which lets none of a name's through, such as a table."""
+    answer(*text.rstrip("\n").split("\n"))
+
+
+def answer_json(arguments: argparse.Namespace, value: Any) -> bool:
+    """Print or write ``value`` where ``--json`` asks for it; whether it stands in place of the words."""
+    text = escaped_json(_defined(value), indent=2, allow_nan=False)
+    if arguments.json_file is not None:
+        path = written(arguments.json_file, f"{text}\n")
+        remark(f"written: {path}", quiet=arguments.quiet)
+    if arguments.json:
+        print(text)
+    return bool(arguments.json)
+
+
+def _defined(value: Any) -> Any:
+    """``value`` with null for a number that is none, which JSON does not know."""
+    if isinstance(value, dict):
+        return {name: _defined(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_defined(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def answer_either(arguments: argparse.Namespace, value: Any, *lines: str) -> None:
+    """Print ``value`` where ``--json`` asks for it, else ``lines``."""
+    if not answer_json(arguments, value):
+        answer(*lines)
+
+
+def answer_tables(arguments: argparse.Namespace, value: Any, parts: Sequence[Table | Prose]) -> None:
+    """Print ``value`` where ``--json`` asks for it, else the tables."""
+    if not answer_json(arguments, value):
+        answer_document(formatted(parts, arguments))
+
+
+def show() -> None:
+    """Have what was answered so far shown, before something that takes its time."""
+    sys.stdout.flush()
+
+
+def answer_commands(lines: Sequence[str]) -> None:
+    """Print commands to the machine that runs the job, which escape what they quote."""
+    for line in lines:
+        sys.stdout.write_command(line) if isinstance(sys.stdout, Door) else print(line)
+
+
+def written(path: Path, text: str) -> Path:
+    """Write ``text`` to a file that a flag named, with its folder; its path."""
+    from su3d_bench.core.files.atomic import make_folder, write_text
+    from su3d_bench.store.run_folder import refuse_records
+
+    refuse_records(path)
+    make_folder(path.parent)
+    write_text(path, text)
+    return path
+
+
+def answer_or_write(arguments: argparse.Namespace, value: Any, parts: Sequence[Table | Prose]) -> None:
+    """Write the tables to the file of ``--out``, or give them as ``answer_tables`` does."""
+    if arguments.out is None:
+        answer_tables(arguments, value, parts)
+    else:
+        path = written(arguments.out, formatted(parts, arguments, is_file=True))
+        remark(f"written: {path}", quiet=arguments.quiet)
+        answer_json(arguments, value)
+
+
+def file_name_of(text: str, kind: Literal["text", "question"]) -> str:
+    """What a picture of the answer to ``text`` is called; no two texts of a kind have one name.
+
+    >>> file_name_of("plant on shelf", "text"), file_name_of("Where is it?", "question")
+    ('plant-on-shelf', 'where-is-it')
+    >>> file_name_of("Plant on shelf", "text"), file_name_of("?", "question")
+    ('plant-on-shelf-c4a4222c', 'question-8a8de823')
+    """
+    name = re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:60]
+    words = name.replace("-", " ")
+    is_plain = bool(name) and text == (words if kind == "text" else f"{words.capitalize()}?")
+    return name if is_plain else f"{name or kind}-{_few_digits(text)}"
+
+
+def file_name_of_scene(address: str) -> str:
+    """What a picture of a scene is called; no two addresses have one name.
+
+    >>> file_name_of_scene("replica/room0"), file_name_of_scene("mine/hall/left")
+    ('replica-room0', 'mine-hall-left-f6ee616f')
+    """
+    if re.fullmatch(r"[A-Za-z0-9_]+/[A-Za-z0-9_.-]+", address):
+        return address.replace("/", "-")
+    return f"{re.sub(r'[^A-Za-z0-9_.-]+', '-', address).lstrip('-.')[:120]}-{_few_digits(address)}"
+
+
+def _few_digits(text: str) -> str:
+    from su3d_bench.core.digests import digest_bytes
+
+    return digest_bytes(text.encode("utf-8", "surrogatepass"))[:8]
+
+
+def remark(text: str, *, quiet: bool = False) -> None:
+    """Print a remark to stderr."""
+    if not quiet:
+        print(one_line(text), file=sys.stderr)
+
+
+def remark_unseen(encoder: object, text: str, *, quiet: bool) -> None:
+    """Say which words of ``text`` the encoder never saw, where it knows that."""
+    from su3d_bench.core.interfaces import KnowsItsWords
+
+    if isinstance(encoder, KnowsItsWords) and (words := encoder.unseen_words(text)):
+        named = ", ".join(f"'{printable(word, 40)}'" for word in words[:MOST_UNSEEN])
+        more = f" and {len(words) - MOST_UNSEEN} more" if len(words) > MOST_UNSEEN else ""
+        remark(f"encoder {encoder.name} never saw {named}{more}; what it makes of that is a guess", quiet=quiet)
+
+
+@contextmanager
+def progress(n_scenes: int, *, is_quiet: bool, last_step: str = "") -> Iterator[Report]:
+    """A ``Report`` that draws bars while the block runs; it draws nothing where stderr is no terminal.
+
+    ``last_step`` is what a scene does after its last frame, where no event says it.
+    """
+    with drawn_bars(is_quiet=is_quiet) as bars:
+        yield _Board(bars, n_scenes, last_step).report if bars is not None else lambda event: None
+
+
+@contextmanager
+def drawn_bars(*, is_quiet: bool, tells_time_left: bool = False) -> Iterator[Progress | None]:
+    """Bars on stderr while the block runs, each with a field ``remark``; None where stderr is no terminal."""
+    if is_quiet or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        ProgressColumn,
+        Task,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+    from rich.table import Column
+    from rich.text import Text
+
+    class Description(ProgressColumn):
+        """The words of a bar, which hold names of scenes and methods: no markup, nothing that acts on a terminal."""
+
+        def render(self, task: Task) -> Text:
+            return Text(one_line(task.description)[:MOST_OF_A_BAR], no_wrap=True, overflow="ellipsis")
+
+    console = Console(file=stream_behind(sys.stderr))
+    remarks = TextColumn("{task.fields[remark]}", markup=False)
+    # Where the terminal is narrow, names give way alone: only their column may be folded.
+    time = (TimeRemainingColumn if tells_time_left else TimeElapsedColumn)(table_column=Column(no_wrap=True))
+    width = BAR if console.width >= WIDE else NARROW_BAR
+    bar = BarColumn(bar_width=width, table_column=Column(width=width))
+    columns = (Description(), bar, MofNCompleteColumn(table_column=Column(no_wrap=True)), remarks, time)
+    bars = Progress(*columns, console=console, transient=True, redirect_stdout=False, redirect_stderr=False)
+    with bars, _above(bars):
+        yield bars
+
+
+def _above(bars: Progress) -> AbstractContextManager[None]:
+    """What is printed to stderr in the block stands above the bars."""
+    from rich.text import Text
+
+    def show(text: str) -> None:
+        bars.console.print(Text(text.removesuffix("\n")), soft_wrap=True)
+
+    return sys.stderr.through(show) if isinstance(sys.stderr, Door) else nullcontext()
+
+
+class _Board:
+    """Turns events into bars: one for all scenes, one for the current method of each scene under way."""
+
+    def __init__(self, bars: Progress, n_scenes: int, last_step: str) -> None:
+        self._bars = bars
+        self._last_step = last_step
+        self._scenes = bars.add_task("scenes", total=n_scenes, remark="starting")
+        self._tasks: dict[tuple[str, str], TaskID] = {}
+
+    def report(self, event: Event) -> None:
+        from su3d_bench.runs.executors import SCENE_DONE
+
+        self._bars.update(self._scenes, remark=event.doing if event.label == SCENE_DONE else "")
+        if event.label == SCENE_DONE:
+            if not event.doing:
+                self._bars.update(self._scenes, advance=1)
+                self._remove(event.unit)
+            return
+        key = (event.unit, event.label)
+        if key not in self._tasks:
+            self._remove(event.unit)
+            name = f"  {event.unit} {event.label}"
+            self._tasks[key] = self._bars.add_task(name, total=event.total or None, remark="")
+        task = self._tasks[key]
+        if event.total:
+            self._bars.update(task, total=event.total, completed=event.done)
+        if event.doing or event.done:
+            is_last = event.done == event.total > 0
+            self._bars.update(task, remark=event.doing or (is_last and self._last_step) or self._remark(event))
+
+    def _remove(self, unit: str) -> None:
+        """The bars of a scene that is done, or whose next method begins."""
+        for key in [key for key in self._tasks if key[0] == unit]:
+            self._bars.remove_task(self._tasks.pop(key))
+
+    def _remark(self, event: Event) -> str:
+        own = self._tasks[event.unit, event.label]
+        speed = next(task.speed for task in self._bars.tasks if task.id == own)
+        words = [f"{speed:.1f}/s"] if speed else []
+        return ", ".join(words if event.n_instances is None else [*words, counted(event.n_instances, "instance")])
