@@ -109,7 +109,7 @@ def test_without_a_word_on_it_the_world_stays_and_the_guess_is_said_and_drawn(
     main(["datasets", "check", "rgbd/walk", "--quiet"])
     out = capsys.readouterr().out
     assert "  up            taken to be z; y seems to be, the cameras were held so" in out and said in out
-    assert main(["datasets", "show", "rgbd/walk", "--quiet", "--json", "--out", str(tmp_path / "walk.png")]) == 0
+    assert main(["datasets", "show", "rgbd/walk", "--quiet", "--out", str(tmp_path / "walk.png"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["up"]["axis"] == "y"
     look = look_at(Rgbd(tmp_path), "walk")
     np.testing.assert_allclose(look.poses, [frame.camera_to_world for frame in walk()], atol=1e-12)
