@@ -77,13 +77,6 @@ def test_scene_names_of_the_two_trees_pair_up(scene: str, name: str) -> None:
     assert original_name(scene) == name
 
 
-def test_without_data_the_error_says_how_to_get_it(tmp_path: Path) -> None:
-    with pytest.raises(
-        DataError, match=r"no scene in .*fetch replica frames brings them.*datasets make rooms --layout replica --out"
-    ):
-        Replica(tmp_path).scenes()
-
-
 def test_vertices_take_the_object_of_most_of_their_faces_and_the_lowest_id_on_ties(tmp_path: Path) -> None:
     write_render(tmp_path)
     write_original(tmp_path, QUADS, [0, 5, 5, 5], TWO_OBJECTS)
@@ -187,7 +180,7 @@ IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
         (camera_with(w=11.5), "cam_params.json: the image size 11.5x8 is not in whole pixels"),
         (lambda folder: (folder / "cam_params.json").unlink(), "cam_params.json cannot be read: No such file"),
     ],
-)  # fmt: skip
+)
 def test_each_fault_of_the_input_is_one_clear_line(tmp_path: Path, change: Change, message: str) -> None:
     line = first_line_of(change, tmp_path)
     assert line.startswith("replica/room0: ")
