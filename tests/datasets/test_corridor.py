@@ -81,11 +81,6 @@ def test_the_table_tells_what_the_smallest_and_the_largest_maps_cost(write_perfo
     assert told["stages that grow"] == "match 1.00"
 
 
-def test_a_map_that_does_not_grow_has_no_exponent(write_performance: Any) -> None:
-    head, row = write_performance.growth_table([[walk("corridor/9m", np.full(20, 7.0), match_ms=np.ones(20))]])
-    assert dict(zip(head, row, strict=True))["exponent"] == "-"
-
-
 def test_medians_by_size_are_those_of_ranges_of_one_width_on_a_log_axis() -> None:
     sizes = np.array([1.0, 1.1, 1.2, 500.0, 1024.0, 1024.0])
     x, y = medians_by_size(sizes, np.array([3.0, 9.0, 4.0, 7.0, 10.0, 30.0]))

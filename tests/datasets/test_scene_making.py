@@ -137,15 +137,6 @@ def test_a_scene_of_another_making_is_never_overwritten(name: str, tmp_path: Pat
         write_scene(layout, Stage(), ROOM, tmp_path)
 
 
-def test_a_file_from_elsewhere_in_the_place_of_the_ground_truth_is_left_alone(tmp_path: Path) -> None:
-    theirs = tmp_path / "replica_v1/living_7/habitat/mesh_semantic.ply"
-    theirs.parent.mkdir(parents=True)
-    theirs.write_bytes(b"theirs")
-    with pytest.raises(StoreError, match="was made elsewhere"):
-        write_scene(LAYOUTS["replica"], Stage(), ROOM, tmp_path)
-    assert theirs.read_bytes() == b"theirs"
-
-
 def test_what_scenes_share_is_refused_where_it_is_another(tmp_path: Path) -> None:
     (tmp_path / "scannetv2-labels.combined.tsv").write_text("id\traw_category\n1\twall\n")
     with pytest.raises(StoreError, match=r"combined\.tsv: is another label table"):

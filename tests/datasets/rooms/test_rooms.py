@@ -81,6 +81,7 @@ def test_instance_images_agree_with_the_instance_mesh(rooms: Rooms) -> None:
     assert np.median(np.abs(answer["t_hit"].numpy() - image.depth_m)) < 1e-5
 
 
+@pytest.mark.proof
 def test_every_object_is_seen_and_counts_on_the_default_scan_density(tmp_path: Path) -> None:
     dense = Rooms(tmp_path, Rooms.Options(n_frames=400))
     seen = dense.visible_vertices(SCENE)
