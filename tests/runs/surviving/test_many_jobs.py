@@ -17,7 +17,7 @@ from su3d_bench.metrics.instance import resampling
 from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import runner
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.runs.executors import run_units
+from su3d_bench.runs.clusters import run_units
 from su3d_bench.store import run_folder as store
 
 WORDS = ["run", "--scenes", f"{SCENES}/painted.py:Painted/*", "--methods", f"{SCENES}/painted.py:Collector"]
