@@ -1,4 +1,4 @@
-"""Where units of work run: on the machines of an existing Ray cluster, or as Slurm jobs submitted through submitit.
+"""The executor of a run: this process, processes here, the machines of a Ray cluster, or Slurm jobs through submitit.
 
 Under Ray each unit has a fresh worker process, as with processes here. Ray's own retries are switched off: only a unit
 whose worker or machine was lost runs again, a bounded number of times, and what its work answers is final.
