@@ -22,8 +22,9 @@ from su3d_bench.core.files.atomic import is_file, read_json, remove_file, write_
 from su3d_bench.core.files.scratch import remove_abandoned
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.reports.tables.run import Found
+from su3d_bench.runs.clusters import reached, run_units
 from su3d_bench.runs.distant import distant_jobs, failed_distant, run_distant_scene
-from su3d_bench.runs.executors import SCENE_DONE, Event, Report, reached, run_units
+from su3d_bench.runs.executors import SCENE_DONE, Event, Report
 from su3d_bench.runs.existing import differences, sealed
 from su3d_bench.runs.job import MethodOutcome
 from su3d_bench.runs.plan import Plan

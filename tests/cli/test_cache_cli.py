@@ -16,7 +16,7 @@ from su3d_bench.perception.language.chat import ChatRequest, Reply
 from su3d_bench.perception.language.reply_store import ReplyStore
 from su3d_bench.perception.models.files import file_sha256
 from su3d_bench.perception.profiles import REPLIES
-from su3d_bench.runs.run_place import mirror_of
+from su3d_bench.runs.remote_store import mirror_of
 from su3d_bench.store import caches
 from su3d_bench.store.run_folder import RunFolder
 

@@ -47,7 +47,11 @@ METHODS = {
     "no Python": ("    def start(", "    def start", "SyntaxError"),
     "an end": ("class MyMethod:", "raise SystemExit(0)\n\n\nclass MyMethod:", "ends the program when it is imported"),
     "no update": ("    def update(", "    def _update(", "lacks 'update'; a method has Config, finish, name"),
-    "unknown masks": ('masks="grounded"', 'masks="boxes"', "needs: masks is 'boxes'; 'grounded', 'class-agnostic' or"),
+    "unknown masks": (
+        'masks="grounded"',
+        'masks="boxes"',
+        "needs: masks is 'boxes'; 'grounded', 'class-agnostic', 'none'",
+    ),
     "no map": ("return Instances.of", "Instances.of", "MyMethod.finish gave None; an Instances or a Partition or"),
     "a word": ("clouds = [", "clouds = [None for _ in known] + [", "NameError: name 'known' is not defined"),
     "undefined scores": (
@@ -85,7 +89,7 @@ DATASETS = {
         "depth is uint16; expected",
     ),
     "a pose that scales": ("camera_to_world, INTR", "2 * camera_to_world, INTR", "the pose is no rigid motion"),
-    "no scenes": ('return ("near", "far")', "pass", "MyDataset.scenes gave None; a sequence is expected"),
+    "no scenes": ('return ("near", "far")', "pass", "MyDataset.scenes gave None; a Sequence is expected"),
     "no truth": ("return GroundTruth(", "GroundTruth(", "MyDataset.ground_truth gave None; a GroundTruth is expected"),
     "unknown classes": (
         "[0, *LABELS.ids]",
@@ -155,7 +159,6 @@ def test_a_map_that_the_file_before_made_is_not_taken_up(capsys: pytest.CaptureF
     words = ["run", "--scenes", "rooms/living0", "--set", "rooms.n_frames=8", "--profile", "oracle", "--limit", "1"]
     words += ["--methods", METHOD, "--protocols", "rooms-instance", "--jobs", "1", "--no-pictures", "--out", "out"]
     assert main(words) == 0
-    Path("my_method.py").write_text(text + "\n# nothing that counts\n")
     assert main(words) == 0
     Path("my_method.py").write_text(
         text.replace("least_points: int = 20", "least_points: int = 21").replace("< 0.5", "< 0.6")
