@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError, printable
-from su3d_bench.core.files.atomic import make_folder, replacing
-from su3d_bench.core.files.scratch import TemporaryFolder
+from su3d_bench.core.files.atomic import TemporaryFolder, make_folder, replacing
 from su3d_bench.runs.job import Part, build_dataset
 
 AT_ONCE = 256  # small files that one request to the driver asks for; it fetches them side by side

@@ -14,8 +14,7 @@ from places import ROOT
 
 from su3d_bench.core.config import read_file
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.core.system.files import file_bytes, file_text, opened, opened_text, regular
-from su3d_bench.core.toml import parse_toml
+from su3d_bench.core.system.files import file_bytes, file_text, opened, opened_text, parse_toml, regular
 
 PACKAGES = ("su3d_bench", "baselines", "datasets", "reports")
 # The door; what looks at /proc alone; what a resource of the package hands out.

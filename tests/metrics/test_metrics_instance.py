@@ -21,10 +21,10 @@ from su3d_bench.metrics.instance.average_precision import (
     InstanceCounts,
     combine,
     concatenate,
+    dots,
     encode_ground_truth,
     last_line_of_each_mask_file,
 )
-from su3d_bench.metrics.instance.precision_recall import dots
 from su3d_bench.metrics.instance.scene_counts import per_scene
 from su3d_bench.metrics.instance.score import NO_OBJECT, covered_objects
 from su3d_bench.metrics.protocols.loading import load_protocol

@@ -17,8 +17,8 @@ from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.instance.precision_recall import average_precision
-from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery, confidences, per_scene
+from su3d_bench.metrics.instance.average_precision import average_precision
+from su3d_bench.metrics.open_vocabulary.score import QueryTruth, TextQuery, confidences, per_scene
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, score_scene, unpack_scores

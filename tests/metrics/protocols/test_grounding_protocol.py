@@ -17,7 +17,7 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.scannet.dataset import ScanNet
 from su3d_bench.datasets.scannet.truth import TABLE_NAME
-from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
+from su3d_bench.metrics.open_vocabulary.score import QueryTruth, TextQuery
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.grounding import aligned, box_iou, choose, in_group
 from su3d_bench.metrics.scoring import combine, pack_scores, plain_json, score_scene, unpack_scores

@@ -29,17 +29,20 @@ from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.open_vocabulary import openlex3d, score
 from su3d_bench.metrics.open_vocabulary.openlex3d import (
+    ObjectCounts,
     ObjectLabels,
     OpenLexTruth,
     category_table,
+    combine,
+    concatenate,
     count_categories,
     count_ranks,
     point_categories,
     rank_scores,
     ranked_labels,
+    resampled,
     scored_objects,
 )
-from su3d_bench.metrics.open_vocabulary.query_ap import ObjectCounts, combine, concatenate, resampled
 from su3d_bench.metrics.open_vocabulary.score import voxel_means
 from su3d_bench.metrics.protocols.kinds import CATEGORIES
 from su3d_bench.metrics.protocols.loading import load_protocol
