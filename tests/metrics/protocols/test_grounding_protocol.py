@@ -131,10 +131,6 @@ def test_the_sentences_that_nr3d_counts_and_its_shares_hold_to_the_last_bit(inde
     assert [None if one is None else one * 100 for one in found] == (problem["answer"] or [None] * 5)
 
 
-def test_there_are_thirty_problems_of_each_grounding() -> None:
-    assert [len(one) for one in (PROBLEMS, GROUPED, CHOSEN)] == [30, 30, 30]
-
-
 def test_queries_of_other_files_are_grouped_by_the_classes_of_the_truth() -> None:
     found = values(PERFECT, asking(*ASKED))
     # the lamp is the only one; of two chairs the first is found
