@@ -33,8 +33,8 @@ from su3d_bench.formats.torch_files import read_torch
 from su3d_bench.metrics.matching.nearest import nearest
 from su3d_bench.metrics.open_vocabulary.openlex3d import SPACE as LABELS
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
-from su3d_bench.metrics.open_vocabulary.query_ap import SPACE as QUERIES
-from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
+from su3d_bench.metrics.open_vocabulary.score import SPACE as QUERIES
+from su3d_bench.metrics.open_vocabulary.score import QueryTruth
 
 SAMPLED_DATASET = "scannetpp"
 SAMPLED_FOLDER = "prepared_semantics"  # beside data/ of ScanNet++

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.files.atomic import filling, read_arrays
-from su3d_bench.core.files.unpacking import DAMAGE
+from su3d_bench.core.files.atomic import DAMAGE, filling, read_arrays
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array
 from su3d_bench.datasets.rooms.rendering.mesh import Grid, Patches, RoomMesh, at_rows, caster, cut, merge_equal
 from su3d_bench.datasets.rooms.rendering.render import Renderer, camera_intrinsics

@@ -157,7 +157,7 @@ def loaded(package: str) -> tuple[dict[str, Any], str]:
 
 
 def _folders() -> Iterator[Check]:
-    from su3d_bench.core.files.scratch import scratch_folder
+    from su3d_bench.core.files.atomic import scratch_folder
     from su3d_bench.runs.scenes import cache_root, data_root
 
     named = os.environ.get("SU3D_DATA") or ""

@@ -22,7 +22,7 @@ from typing import Any, BinaryIO, ClassVar, cast
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError, printable, reading, shown
-from su3d_bench.core.files.unpacking import Allowance, UnpackingError
+from su3d_bench.core.files.atomic import Allowance, UnpackingError
 from su3d_bench.core.system.files import opened
 from su3d_bench.formats.numpy_files import plain_array, plain_type
 

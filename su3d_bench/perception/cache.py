@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import StoreError
-from su3d_bench.core.files.atomic import filling, read_arrays
-from su3d_bench.core.files.unpacking import DAMAGE
+from su3d_bench.core.files.atomic import DAMAGE, filling, read_arrays
 from su3d_bench.core.types import BoolArray, Float64Array, Frame, UInt8Array
 from su3d_bench.perception.crops import mask_boxes
 

@@ -27,8 +27,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, model_validator
 
 from su3d_bench.core.errors import ConfigError, DataError
-from su3d_bench.core.files.atomic import make_folder, read_arrays, replacing
-from su3d_bench.core.files.unpacking import DAMAGE
+from su3d_bench.core.files.atomic import DAMAGE, make_folder, read_arrays, replacing
 from su3d_bench.core.interfaces import Encoder, RegionPerception, StageTimer
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Detections, Float32Array, Frame, PerceptionNeeds, Regions, SceneInfo

@@ -12,7 +12,7 @@ from su3d_bench.core.errors import FramesMissing, GroundTruthMissing
 from su3d_bench.core.interfaces import Encoder, HasQueries, KnowsObjects
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import GroundTruth
-from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
+from su3d_bench.metrics.open_vocabulary.score import QueryTruth, TextQuery
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.score import (
     AnnotationTruth,

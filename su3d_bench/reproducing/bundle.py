@@ -22,8 +22,16 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from su3d_bench.core.digests import digest_bytes, digest_file
 from su3d_bench.core.errors import StoreError, counted, printable, shown
-from su3d_bench.core.files.atomic import is_file, make_folder, replacing
-from su3d_bench.core.files.unpacking import Allowance, UnpackingError, allowance_of, check_member, member_bytes
+from su3d_bench.core.files.atomic import (
+    Allowance,
+    UnpackingError,
+    allowance_of,
+    check_member,
+    is_file,
+    make_folder,
+    member_bytes,
+    replacing,
+)
 from su3d_bench.core.printing import escaped_json
 from su3d_bench.core.system.files import opened, regular
 from su3d_bench.core.version import __version__

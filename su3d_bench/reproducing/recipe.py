@@ -9,8 +9,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from su3d_bench.core.errors import ConfigError, printable, reading, suggest
-from su3d_bench.core.system.files import file_bytes
-from su3d_bench.core.toml import parse_toml
+from su3d_bench.core.system.files import file_bytes, parse_toml
 from su3d_bench.reports.tables.paper import Figure, PaperTable, published
 
 FOLDER = Path(__file__).resolve().parent / "recipes"

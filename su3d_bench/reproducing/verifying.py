@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from su3d_bench.core import registry
 from su3d_bench.core.config import MOVES_NO_NUMBER, Setting, Settings
 from su3d_bench.core.errors import StoreError, Su3dError, counted, printable
-from su3d_bench.core.files.atomic import is_file, read_arrays, read_json
-from su3d_bench.core.files.scratch import TemporaryFolder
+from su3d_bench.core.files.atomic import TemporaryFolder, is_file, read_arrays, read_json
 from su3d_bench.core.system.devices import device_for
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.system.timing import processor_digest

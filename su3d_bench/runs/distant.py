@@ -13,9 +13,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from su3d_bench.core.errors import StoreError
-from su3d_bench.core.files.atomic import make_folder
+from su3d_bench.core.files.atomic import TemporaryFolder, make_folder
 from su3d_bench.core.files.locks import is_unfinished
-from su3d_bench.core.files.scratch import TemporaryFolder
 from su3d_bench.runs.executors import ELSEWHERE, Report
 from su3d_bench.runs.job import MethodOutcome, SceneJob
 from su3d_bench.runs.plan import Plan

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from su3d_bench.core.maps import Masks
 from su3d_bench.core.types import Int32Array, Int64Array
 from su3d_bench.metrics.attribution import masks as attribution
+from su3d_bench.metrics.attribution.arrays import Pool, single_mask_errors, single_point_errors
 from su3d_bench.metrics.attribution.masks import (
     KINDS,
     LabelledPoints,
@@ -32,7 +33,6 @@ from su3d_bench.metrics.attribution.overlaps import (
     measure_overlaps,
     true_instances,
 )
-from su3d_bench.metrics.attribution.singles import Pool, single_mask_errors, single_point_errors
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules

@@ -22,8 +22,7 @@ from damage import lacked_memory
 from memory import bounded_addresses, peak_bytes, reset_peak
 
 from su3d_bench.core.errors import DataError, PredictionError, StoreError, Su3dError
-from su3d_bench.core.files.atomic import read_arrays
-from su3d_bench.core.files.unpacking import DAMAGE
+from su3d_bench.core.files.atomic import DAMAGE, read_arrays
 from su3d_bench.evaluation.texts import read_text_features
 from su3d_bench.formats.arrays import MOST_MEMBERS, run_members
 from su3d_bench.formats.images import decode_colour, decode_depth

@@ -21,8 +21,7 @@ from su3d_bench.core.errors import (
     StoreError,
     Su3dError,
 )
-from su3d_bench.core.files.atomic import read_arrays, read_json
-from su3d_bench.core.files.unpacking import DAMAGE
+from su3d_bench.core.files.atomic import DAMAGE, read_arrays, read_json
 from su3d_bench.formats.numpy_files import read_npy
 from su3d_bench.metrics.protocols.loading import read_protocol
 from su3d_bench.metrics.scoring import unpack_scores

@@ -7,8 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.core.system.files import file_text
-from su3d_bench.core.toml import parse_toml
+from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.perception.embedded.naming import COLOURS, vocabulary
 from su3d_bench.perception.embedded.text import words
 

@@ -12,7 +12,7 @@ from su3d_bench.analysis.leaderboard import RankingRow, Refused, entries_of
 from su3d_bench.core.config import DEFAULT_SOURCE, MOVES_NO_NUMBER, KeyPath, RunConfig, toml_value
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError, StoreError, Su3dError, printable, reading, shown
-from su3d_bench.core.files.scratch import TemporaryFolder
+from su3d_bench.core.files.atomic import TemporaryFolder
 from su3d_bench.core.system.files import opened
 from su3d_bench.metrics.costs import MAP, TOTAL, WARM_UP, summarise
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder

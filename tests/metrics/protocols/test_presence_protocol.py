@@ -72,10 +72,6 @@ def test_what_is_absent_is_drawn_as_pope_draws_it(index: int) -> None:
         assert [other for _, other in found] == expected
 
 
-def test_there_are_thirty_problems_of_each() -> None:
-    assert [len(POPE[name]) for name in ("numbers", "negatives")] == [30, 30]
-
-
 def test_auroc_is_the_share_of_pairs_in_the_right_order_equal_ones_by_half() -> None:
     values = once([counts_of([1, 1, 0, 0], [0] * 4, [0.9, 0.4, 0.4, 0.1])])
     assert values["AUROC random"] == (1 + 1 + 0.5 + 1) / 4

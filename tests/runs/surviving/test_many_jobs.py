@@ -13,7 +13,6 @@ from places import SCENES
 from su3d_bench.cli.main import main
 from su3d_bench.core.files import atomic
 from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.instance import resampling
 from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import runner
 from su3d_bench.runs import scene as scene_run
@@ -118,10 +117,10 @@ def test_compiled_curves_give_the_same_bits(
     weights = rng.multinomial(n_scenes, np.full(n_scenes, 1 / n_scenes), size=90)
     found = {}
     for many in (10**9, 0):
-        monkeypatch.setattr(resampling, "MANY_ROWS", many)
+        monkeypatch.setattr(instance_ap, "MANY_ROWS", many)
         together, each = instance_ap.combine(counts), instance_ap.combine_each(counts)
         assert not np.isnan(together.ap)
-        drawn = resampling.resampled_ap(counts, weights)
+        drawn = instance_ap.resampled_ap(counts, weights)
         values = [(one.ap, one.ap50, one.ap25) for one in (together, *each)]
         found[many] = [*(one.table for one in (together, *each)), values, *drawn.values()]
     for plain, compiled in zip(*found.values(), strict=True):

@@ -24,8 +24,7 @@ from places import ROOT, SCENES
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import StoreError
-from su3d_bench.core.files.atomic import filling
-from su3d_bench.core.files.scratch import TemporaryFolder
+from su3d_bench.core.files.atomic import TemporaryFolder, filling
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.run_folder import RunFolder
@@ -238,7 +237,7 @@ def test_the_temporary_folder_of_a_killed_process_goes_when_the_next_is_made(
 def abandoned(folder: Path) -> Path:
     """The temporary folder of a process that was killed."""
     code = (
-        "import os, signal; from su3d_bench.core.files.scratch import TemporaryFolder\n"
+        "import os, signal; from su3d_bench.core.files.atomic import TemporaryFolder\n"
         "folder = TemporaryFolder('su3d-test-'); (folder.path / 'large').write_text('x')\n"
         "os.kill(os.getpid(), signal.SIGKILL)"
     )
