@@ -22,7 +22,7 @@ from typing import Any
 from su3d_bench.core.config import RunConfig
 from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, package_versions
 from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError
-from su3d_bench.core.files.scratch import TemporaryFolder
+from su3d_bench.core.files.atomic import TemporaryFolder
 from su3d_bench.core.system.endings import Ended, ending_in_order, kept_handlers
 from su3d_bench.runs.executors import (
     Outcome,

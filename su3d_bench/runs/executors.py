@@ -23,7 +23,6 @@ from typing import Any, TypeVar
 
 from su3d_bench.core.config import RunConfig, parse_value
 from su3d_bench.core.errors import ConfigError, Su3dError
-from su3d_bench.core.files.atomic import TemporaryFolder
 from su3d_bench.core.printing import doors
 from su3d_bench.core.system.endings import Ended, ending_in_order
 

@@ -22,7 +22,7 @@ from typing import Any
 
 from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError, printable
-from su3d_bench.core.files.atomic import TemporaryFolder, make_folder, replacing
+from su3d_bench.core.files.atomic import TemporaryFolder, make_folder, replacing, write_bytes
 from su3d_bench.runs.job import Part, build_dataset
 from su3d_bench.store.run_folder import JOBS, RECORDS, JobFolder, RunFolder
 
