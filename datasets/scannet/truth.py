@@ -39,9 +39,9 @@ from su3d_bench.core.types import (
     Surface,
 )
 from su3d_bench.datasets.recordings.meshes import face_corners, vertex_positions
+from su3d_bench.formats.arrays import parsed_json, read_text
 from su3d_bench.formats.images import read_bytes
 from su3d_bench.formats.ply import ListColumn, read_ply
-from su3d_bench.formats.text_files import parsed_json, read_text
 
 PREFIX = "scannet."  # before scene ids and file names of the second release, not of the first
 MAX_SEGMENT_ID = 2**32 - 1

@@ -24,8 +24,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, 
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.toml import parse_toml
 from su3d_bench.core.types import Float64Array, GroundTruth
-from su3d_bench.formats.tables.csv_text import meant, separated_rows
-from su3d_bench.formats.text_files import read_text
+from su3d_bench.formats.arrays import read_text
+from su3d_bench.formats.tables.table import meant, separated_rows
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
 
 COLUMNS = ("scene", "text", "objects")

@@ -30,7 +30,7 @@ from su3d_bench.formats.images import decode_colour, decode_depth
 from su3d_bench.formats.numpy_files import read_npz
 from su3d_bench.formats.pcd import read_pcd_points
 from su3d_bench.formats.pickles import read_pickle_file
-from su3d_bench.formats.tables.csv_text import separated_rows
+from su3d_bench.formats.tables.table import separated_rows
 from su3d_bench.formats.torch_files import read_torch
 from su3d_bench.metrics.scoring import unpack_scores
 from su3d_bench.predictions.formats import READERS

@@ -13,9 +13,9 @@ from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import ImageDomain, PerceptionNeeds, SceneInfo
 from su3d_bench.opensu3d.config import OpenSU3DConfig
-from su3d_bench.perception.crops import crop_images, crop_window, mask_boxes
+from su3d_bench.perception.cache import crop_images, crop_window, mask_boxes
 from su3d_bench.perception.detections import is_background, regions_to_keep
-from su3d_bench.perception.embedded.naming import (
+from su3d_bench.perception.embedded.lexicon import (
     Namer,
     NamingConfig,
     colour_word,

@@ -34,8 +34,7 @@ from prediction_files import (
 
 from su3d_bench.core.errors import ConfigError, PredictionError
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
-from su3d_bench.formats.arrays import run_members
-from su3d_bench.formats.text_integers import integer_lines
+from su3d_bench.formats.arrays import integer_lines, run_members
 from su3d_bench.metrics.instance.average_precision import last_line_of_each_mask_file
 from su3d_bench.predictions.base import ScenePrediction, VertexLabels, VertexMasks
 from su3d_bench.predictions.formats import READERS, recognise

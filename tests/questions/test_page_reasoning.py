@@ -12,12 +12,10 @@ from places import CASES
 
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.score import TrueAnswer, are_objects_right, is_answer_right
-from su3d_bench.perception.language.chat import ChatRequest, Reply
-from su3d_bench.perception.language.config import LanguageConfig
-from su3d_bench.questions.language_solver import by_language_model, given_answer
+from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig, Reply
 from su3d_bench.questions.question_files import paper_queries
 from su3d_bench.questions.scene_map import MapObject, SceneMap
-from su3d_bench.questions.solver import Solver
+from su3d_bench.questions.solver import Solver, by_language_model, given_answer
 
 PAGE = json.loads((CASES / "page_reasoning.json").read_text())["cases"]
 RULES = load_protocol("replica-reasoning").answers

@@ -8,10 +8,9 @@ from collections.abc import Sequence
 import pytest
 from bedroom_map import bedroom, box, thing
 
-from su3d_bench.perception.language.chat import ChatRequest, Reply
-from su3d_bench.perception.language.config import LanguageConfig
-from su3d_bench.questions.language_solver import LanguageSolver, by_relevance, context_for, system_prompt
+from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig, Reply
 from su3d_bench.questions.scene_map import SceneMap
+from su3d_bench.questions.solver import LanguageSolver, by_relevance, context_for, system_prompt
 
 
 class Said:

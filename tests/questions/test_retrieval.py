@@ -10,8 +10,8 @@ import pytest
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import DenseFeatures, Instances
 from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
-from su3d_bench.questions import retrieval
-from su3d_bench.questions.retrieval import points_found, rank, rank_all
+from su3d_bench.questions import model as questions_model
+from su3d_bench.questions.model import points_found, rank, rank_all
 
 
 class TwoWords:
@@ -72,7 +72,7 @@ def as_the_program_of_conceptfusion_shows(similarity: Float64Array) -> list[int]
 def test_of_features_alone_the_points_are_found_that_their_own_program_shows(
     rows_at_once: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(retrieval, "BLOCK_ROWS", rows_at_once)
+    monkeypatch.setattr(questions_model, "BLOCK_ROWS", rows_at_once)
     random = np.random.default_rng(3)
     features = random.normal(size=(60, 2)).astype(np.float16)
     features[::9] = 0  # no feature, no part

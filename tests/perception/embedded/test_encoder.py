@@ -17,13 +17,8 @@ from su3d_bench.core.types import UInt8Array
 from su3d_bench.datasets.rooms.classes import MATERIALS
 from su3d_bench.perception.embedded import encoder as embedded_encoder
 from su3d_bench.perception.embedded import lexicon
-from su3d_bench.perception.embedded import text as embedded_text
 from su3d_bench.perception.embedded.encoder import IMAGE_FILE, IMAGE_SIZE, TEXT_FILE, EmbeddedEncoder, log_size, shrink
-from su3d_bench.perception.embedded.text import (
-    DIM,
-    fnv1a,
-    token_ids,
-)
+from su3d_bench.perception.embedded.lexicon import DIM, fnv1a, token_ids
 
 FOLDER = Path(embedded_encoder.__file__).parent / "weights"
 TEXTS = ("an image of a chair", "plant on table", "table on plant", "a green towel", "place to sit")
@@ -114,7 +109,7 @@ def test_the_encoder_leaves_no_file_behind_not_even_for_its_makers(tmp_path: Pat
 
 
 def test_examples_in_docstrings_run() -> None:
-    assert doctest.testmod(embedded_text).failed == 0
+    assert doctest.testmod(lexicon).failed == 0
 
 
 @pytest.mark.parametrize(

@@ -13,11 +13,9 @@ import pytest
 from chat_server import KEY, Answered, ChatServer, chat_server, error, quick_config
 
 from su3d_bench.core.errors import ConfigError, ModelMissing, RunIncomplete, StoreError
-from su3d_bench.perception.language.chat import ChatRequest, Image, fitted
+from su3d_bench.perception.language.chat import ChatRequest, Image, LanguageConfig, Price, ReplyStore, fitted
 from su3d_bench.perception.language.client import HOSTED, ChatClient
-from su3d_bench.perception.language.config import LanguageConfig, Price
 from su3d_bench.perception.language.parsing import CaptionForm
-from su3d_bench.perception.language.reply_store import ReplyStore
 
 pytest.importorskip("openai", reason="the models extra is not installed")
 

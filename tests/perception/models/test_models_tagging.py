@@ -14,7 +14,7 @@ from tiny_models import blocks
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, UInt8Array
-from su3d_bench.perception.embedded.naming import vocabulary
+from su3d_bench.perception.embedded.lexicon import vocabulary
 from su3d_bench.perception.models.catalogue import model_entry
 from su3d_bench.perception.models.files import ModelFiles
 from su3d_bench.perception.models.masks.tagging import (
