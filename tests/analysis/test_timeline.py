@@ -179,7 +179,7 @@ def test_what_is_logged_reaches_the_viewers_library_at_its_place_and_moment() ->
     [
         (None, [], "pip install 'su3d-bench[rerun]'"),
         (SimpleNamespace(__version__="0.22.1"), [], "rerun-sdk 0.41 or later, here is 0.22.1"),
-        (MagicMock(), ["--stride", "0"], "--stride 0: expected 1 or more"),
+        (MagicMock(), ["--stride", "0"], "argument --stride: 0: expected an integer of 1 or more"),
         (MagicMock(), ["--scenes", "painted/z"], "has no scene 'painted/z'"),
     ],
 )
