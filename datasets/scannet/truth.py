@@ -38,18 +38,10 @@ from su3d_bench.core.types import (
     LabelSet,
     Surface,
 )
-from su3d_bench.datasets.recordings.meshes import (
-    check_one_mesh,
-    face_corners,
-    majority,
-    segment_ids,
-    vertex_positions,
-    whole_number,
-    with_segments,
-)
+from su3d_bench.datasets.recordings.meshes import face_corners, vertex_positions
+from su3d_bench.formats.arrays import parsed_json, read_text
 from su3d_bench.formats.images import read_bytes
 from su3d_bench.formats.ply import ListColumn, read_ply
-from su3d_bench.formats.text_files import parsed_json, read_text
 
 PREFIX = "scannet."  # before scene ids and file names of the second release, not of the first
 # Ground truth is label * 1000 + instance, and instances are ids + 1: a larger id would spill into the next label.

@@ -44,7 +44,7 @@ from su3d_bench.datasets.scannetpp.truth import (
     read_surface,
     vertex_truth,
 )
-from su3d_bench.formats.text_files import read_text
+from su3d_bench.formats.arrays import read_text
 
 SCENE_NAMES = r"[0-9a-f]{10}"
 SPLITS_FOLDER = "splits"

@@ -28,8 +28,8 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, GroundTruth, InstanceMesh, Int32Array, Int64Array, LabelSet, Surface
 from su3d_bench.datasets.recordings import meshes
 from su3d_bench.datasets.recordings.recorded_frames import numbers
+from su3d_bench.formats.arrays import parsed_json, read_text
 from su3d_bench.formats.images import read_bytes
-from su3d_bench.formats.text_files import parsed_json, read_text
 
 MESH_NAME = "mesh_aligned_0.05.ply"
 MASK_NAME = "mesh_aligned_0.05_mask.txt"

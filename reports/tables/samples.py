@@ -8,8 +8,7 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal
 
 from su3d_bench.core.errors import ModelMissing
-from su3d_bench.formats.tables.csv_text import csv_lines
-from su3d_bench.formats.tables.table import Table, text_table
+from su3d_bench.formats.tables.table import Table, csv_lines, text_table
 
 Kind = Literal["text", "whole number", "number", "yes or no"]
 _KINDS: Mapping[str, Kind] = {

@@ -40,8 +40,8 @@ from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import EVERY_SCENE, combine, pack_scores, plain_json
 from su3d_bench.predictions.base import Content
+from su3d_bench.predictions.formats import Source
 from su3d_bench.predictions.own_runs import write_content
-from su3d_bench.predictions.scenes import Source
 from su3d_bench.runs.existing import sealed
 from su3d_bench.runs.finished import made_elsewhere
 from su3d_bench.runs.plan import check_folder_name

@@ -18,7 +18,7 @@ from su3d_bench.core.maps import Instances
 from su3d_bench.formats.tables.table import Cell, Prose, Table, TableRow
 from su3d_bench.metrics.costs import summarise
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
-from su3d_bench.questions.retrieval import rank
+from su3d_bench.questions.model import rank
 from su3d_bench.reports.pictures.maps import draw_heat_map
 from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.paper import OPEN, PAPER_PROFILE, PAPER_SCENES, Figure, Shown

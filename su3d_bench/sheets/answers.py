@@ -13,8 +13,7 @@ from pathlib import Path
 
 from su3d_bench.core.errors import DataError, nearest, printable, some, suggest
 from su3d_bench.formats.images import read_bytes
-from su3d_bench.formats.tables.csv_text import meant, separated_rows
-from su3d_bench.formats.tables.workbooks import read_workbook
+from su3d_bench.formats.tables.table import meant, read_workbook, separated_rows
 from su3d_bench.sheets.items import ANSWER_COLUMNS, Key, Sheet, SheetItem
 
 MOST_BYTES = 256 << 20  # of one file: a workbook holds its pictures

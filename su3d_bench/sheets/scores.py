@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from su3d_bench.core.types import Float64Array, Int64Array, Interval
-from su3d_bench.formats.tables.csv_text import csv_lines
+from su3d_bench.formats.tables.table import csv_lines
 from su3d_bench.numerics.statistics import DIFFERENCE, LEAST_ITEMS, mean_interval, share_interval, sign_flip_test
 from su3d_bench.questions.model import ALL_KINDS
 from su3d_bench.questions.query_files import COLUMN

@@ -17,8 +17,17 @@ from hypothesis import strategies as st
 from measured_rows import measured, measured_instances
 
 from su3d_bench.core.errors import printable
-from su3d_bench.formats.tables.csv_text import FORMULA_STARTS, meant, no_formula
-from su3d_bench.formats.tables.table import Cell, Origin, Prose, Table, TableRow, text_table
+from su3d_bench.formats.tables.table import (
+    FORMULA_STARTS,
+    Cell,
+    Origin,
+    Prose,
+    Table,
+    TableRow,
+    meant,
+    no_formula,
+    text_table,
+)
 from su3d_bench.reports.tables.ablation import SweepRow, ablation_table
 from su3d_bench.reports.tables.formats import csv_text, html_page, markdown, plain
 from su3d_bench.reports.tables.latex import escape, latex, origin_comment, printed_cells

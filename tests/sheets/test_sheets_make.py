@@ -17,9 +17,9 @@ from PIL import Image
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, DataError
 from su3d_bench.metrics.questions.score import RefinedNames
-from su3d_bench.questions.language_solver import built_in
 from su3d_bench.questions.model import new_question
 from su3d_bench.questions.scene_map import MapObject, SceneMap
+from su3d_bench.questions.solver import built_in
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs.finished import read_run
 from su3d_bench.sheets import sources as run_source

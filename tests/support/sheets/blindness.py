@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw
 
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import BoolArray, UInt8Array
-from su3d_bench.questions.language_solver import built_in
+from su3d_bench.questions.solver import built_in
 from su3d_bench.reports.pictures.items import (
     CAPTION,
     LOW_HEIGHT,
