@@ -38,7 +38,14 @@ from su3d_bench.core.types import (
     LabelSet,
     Surface,
 )
-from su3d_bench.datasets.recordings.meshes import face_corners, vertex_positions
+from su3d_bench.datasets.recordings.meshes import (
+    check_one_mesh,
+    face_corners,
+    majority,
+    segment_ids,
+    vertex_positions,
+    with_segments,
+)
 from su3d_bench.formats.arrays import parsed_json, read_text
 from su3d_bench.formats.images import read_bytes
 from su3d_bench.formats.ply import ListColumn, read_ply

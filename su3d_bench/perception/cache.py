@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.digests import package_digest
 from su3d_bench.core.errors import StoreError
-from su3d_bench.core.files.atomic import filling, read_arrays
-from su3d_bench.core.files.unpacking import DAMAGE
+from su3d_bench.core.files.atomic import DAMAGE, filling, read_arrays
 from su3d_bench.core.interfaces import Encoder, Segmenter, StageTimer
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, Int64Array, Regions, UInt8Array
 

@@ -20,8 +20,7 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.english import is_countable, is_plural, plural, with_article, words
-from su3d_bench.core.system.files import file_text
-from su3d_bench.core.toml import parse_toml
+from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.core.types import Float64Array, GroundTruth
 from su3d_bench.metrics.questions.presence import SAMPLINGS
 from su3d_bench.metrics.questions.score import AskedThing

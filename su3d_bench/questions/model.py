@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.files.scratch import row_blocks
+from su3d_bench.core.files.atomic import row_blocks
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances
 from su3d_bench.core.types import Float64Array, Int64Array

@@ -26,7 +26,7 @@ from su3d_bench.core.system.files import parse_toml
 from su3d_bench.core.types import Float64Array, GroundTruth
 from su3d_bench.formats.arrays import read_text
 from su3d_bench.formats.tables.table import meant, separated_rows
-from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
+from su3d_bench.metrics.open_vocabulary.score import QueryTruth, TextQuery
 
 COLUMNS = ("scene", "text", "objects")
 MORE_COLUMNS = ("kind", "source")  # may be there, in any order behind the others

@@ -24,11 +24,10 @@ from pydantic import AfterValidator, BaseModel, Field, StringConstraints
 from su3d_bench.core.config import toml_value
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.files.atomic import make_folder, write_text
-from su3d_bench.core.system.files import file_text, opened
-from su3d_bench.core.toml import parse_toml
+from su3d_bench.core.system.files import file_text, opened, parse_toml
 from su3d_bench.formats.arrays import parsed_json, read_text
 from su3d_bench.formats.tables.table import no_formula
-from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
+from su3d_bench.metrics.open_vocabulary.score import TextQuery
 from su3d_bench.questions.beacon3d import chains_of, kind_of_metadata, questions_of_objects, read_metadata
 from su3d_bench.questions.model import ALL_KINDS, KINDS, REASONING, Question, new_question
 from su3d_bench.questions.query_files import (

@@ -15,8 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.core.english import with_article
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.system.files import file_text
-from su3d_bench.core.toml import parse_toml
+from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
 from su3d_bench.perception.cache import content_key
 
