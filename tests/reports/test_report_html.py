@@ -231,28 +231,6 @@ def test_dense_features_have_a_class_a_point_and_no_instance(run: Path, tmp_path
     assert planes["truth"][order.tolist().index(2)] == NO_TRUTH_NEAR
 
 
-def test_what_cannot_be_shown_is_a_reason_on_the_page(run: Path, tmp_path: Path) -> None:
-    changed = tmp_path / "run"
-    shutil.copytree(run, changed)
-    (changed / "scenes" / "painted.b" / "collector" / "prediction.npz").write_bytes(b"damaged")
-    record = json.loads((changed / "run.json").read_text())
-    record["data_digests"]["painted/a"] = "0" * 64
-    (changed / "run.json").write_text(json.dumps(record))
-    text = painted_page(changed, tmp_path / "page.html")
-    found = data_of(text)
-    assert ["damaged" in str(one["reason"]) or "not a readable" in str(one["reason"]) for one in found["maps"]] == [
-        *(False, False),
-        *(True, False),
-    ]
-    assert all(one["reason"] for one in found["errors"])
-    scene = json.loads(elements(text).content["scene-0"])
-    assert scene["thumbnails"] == {}
-    assert any("not those of the run" in line for line in scene["remarks"])
-    _, planes = unpacked(elements(text).content["map-0"])
-    assert "colour" not in planes
-    assert "truth" not in planes
-
-
 @pytest.mark.parametrize(
     "module",
     [html_map, html_page, page_maps, page_numbers, page_scene, scene_look],

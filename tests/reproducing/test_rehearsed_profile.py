@@ -25,17 +25,6 @@ def out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "out"
 
 
-def test_the_embedded_profile_is_rehearsed_and_the_first_line_says_so(
-    out: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main([*WORDS, "--out", str(out)]) == 0
-    said = capsys.readouterr()
-    assert said.err.startswith("rehearsal: the profile 'embedded' in place of 'paper'")
-    assert "everything that is required is here" in said.out
-    assert main([*WORDS, "--out", str(out), "--profile", "paper"]) == 1
-    assert "models fetch" in capsys.readouterr().out, "its models are not here"
-
-
 @needs_models
 def test_the_profile_paper_runs_end_to_end_on_tiny_networks(
     out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -47,17 +36,6 @@ def test_the_profile_paper_runs_end_to_end_on_tiny_networks(
     assert cells and all(cell["measured"] is not None for cell in cells)
     runs = [json.loads(path.read_text()) for path in out.glob("runs/*/run.json")]
     assert {one["encoder"] for one in runs} >= {"ViT-L-14-336/openai"}
-
-
-@pytest.mark.parametrize("device", ["gpu", "cuda:99"])
-def test_a_device_that_is_not_here_is_one_line_before_anything_is_made(
-    out: Path, capsys: pytest.CaptureFixture[str], device: str
-) -> None:
-    words = [word for word in WORDS if word != "--dry-run"]
-    assert main([*words, "--out", str(out), "--device", device]) == 2
-    said = capsys.readouterr()
-    assert said.out == "" and len(said.err.splitlines()) == 1 and device in said.err
-    assert not out.exists()
 
 
 def test_the_device_reaches_every_run_and_the_preflight(out: Path) -> None:

@@ -61,6 +61,7 @@ def seen(run: Path) -> Seen:
     return Seen(source, {kind: asked_alike(source, encoder, kind, 1, MOST) for kind in KINDS})
 
 
+@pytest.mark.proof
 def test_outside_of_the_answer_every_pixel_is_that_of_a_picture_without_a_map(seen: Seen) -> None:
     artist, astray = Artist(seen.source), dict[tuple[str, str], int]()
 
@@ -103,6 +104,7 @@ def test_a_map_that_is_drawn_is_found(seen: Seen) -> None:
     assert min(n_astray) > 1000
 
 
+@pytest.mark.proof
 def test_an_instance_looks_the_same_however_dense_and_complete_its_map_is(seen: Seen) -> None:
     scene = SCENE
     whole = seen.source.instances(scene, "openmask3d")

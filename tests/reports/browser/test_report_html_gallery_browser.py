@@ -178,19 +178,6 @@ def click(browser: Chromium, selector: str) -> None:
 
 
 @needs_browser
-def test_cards_are_sorted_by_the_cost_in_the_chosen_metric(anew: Chromium) -> None:
-    for metric in options(anew, "Metric"):
-        choose(anew, "Metric", metric)
-        found = costs(anew)
-        assert found == sorted(found, reverse=True)
-        assert all(text.endswith(metric) for text in shown(anew, ".cost")) or metric in shown(anew, ".cost")[0]
-    photo = "document.querySelector('#gallery .card img')"
-    anew.run(f"{photo}.scrollIntoView()")
-    anew.until(f"{photo}.complete && {photo}.naturalWidth === {PHOTO[0]}")
-    assert "Frame" in str(anew.run(f"{photo}.alt"))
-
-
-@needs_browser
 @pytest.mark.parametrize("kind", ["missed", "label"])
 def test_a_card_leads_to_what_it_is_about_in_the_map_and_back(anew: Chromium, page: Path, kind: str) -> None:
     choose(anew, "Protocol", "rooms-semantic" if kind == "label" else "rooms-instance")
