@@ -15,7 +15,7 @@ from painted import WordEncoder, colour_perception
 from places import SCENES
 from scored_room import ENCODER, NAMES, instances, noisy, room, truth_as_prediction
 
-import su3d_bench.reports.tables.attribution
+import su3d_bench.reports.tables.samples
 from su3d_bench.analysis.attribution import attribute
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, PredictionError
@@ -273,4 +273,4 @@ def test_the_command_prints_a_table_and_draws_the_plot(capsys: pytest.CaptureFix
 
 def test_the_examples_in_the_docstrings_run() -> None:
     assert doctest.testmod(attribution_semantic).failed == 0
-    assert doctest.testmod(su3d_bench.reports.tables.attribution).failed == 0
+    assert doctest.testmod(su3d_bench.reports.tables.samples).failed == 0

@@ -15,8 +15,7 @@ from places import SCENES
 from scored_room import noisy_scores
 
 import su3d_bench.analysis.sides
-from su3d_bench.analysis.comparison import compare
-from su3d_bench.analysis.planning import plan
+from su3d_bench.analysis.comparison import compare, plan
 from su3d_bench.cli.main import main
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol

@@ -19,8 +19,8 @@ from packed_maps import unpacked
 from painted import Painted, WordEncoder
 from painted_runs import COLLECTOR, painted_page, painted_run
 
+from su3d_bench.analysis.page import contents as page_contents
 from su3d_bench.analysis.page import maps as page_maps
-from su3d_bench.analysis.page import numbers as page_numbers
 from su3d_bench.analysis.page import scene as page_scene
 from su3d_bench.analysis.page.scene import same_objects
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks
@@ -233,7 +233,7 @@ def test_dense_features_have_a_class_a_point_and_no_instance(run: Path, tmp_path
 
 @pytest.mark.parametrize(
     "module",
-    [html_map, html_page, page_maps, page_numbers, page_scene, scene_look],
+    [html_map, html_page, page_maps, page_contents, page_scene, scene_look],
     ids=lambda module: module.__name__,
 )
 def test_the_examples_in_docstrings_hold(module: Any) -> None:

@@ -12,8 +12,7 @@ import pytest
 from registry_bundles import Files, edit_record, painted_bundle, read_bundle, rewrite_bundle
 
 from su3d_bench.cli.main import main
-from su3d_bench.reproducing.registry.folder import read_registry, why_not_beside
-from su3d_bench.reproducing.registry.rows import Weights, rows_of_bundle
+from su3d_bench.reproducing.registry import Weights, read_registry, rows_of_bundle, why_not_beside
 
 STRUCK = "<img src=x onerror=window.struck=1></script><script>window.struck=1</script>"
 

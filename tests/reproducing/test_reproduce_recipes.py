@@ -8,8 +8,7 @@ import pytest
 
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.reports.tables.paper import figures_of, published
-from su3d_bench.reproducing.asked import Asked, asked_runs, method_of_row
-from su3d_bench.reproducing.recipe import load_recipe, recipe_names
+from su3d_bench.reproducing.recipe import Asked, asked_runs, load_recipe, method_of_row, recipe_names
 
 OWN = """
 schema = 1

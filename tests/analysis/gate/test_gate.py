@@ -27,8 +27,7 @@ from gated_runs import (
     without_calibration,
 )
 
-from su3d_bench.analysis.gate.check import HIGHER_IS_BETTER, check, compared
-from su3d_bench.analysis.gate.reference import Reference, Value, learn
+from su3d_bench.analysis.gate import HIGHER_IS_BETTER, Reference, Value, check, compared, learn
 from su3d_bench.cli.main import main
 from su3d_bench.reports.gate import Finding, Verdict, github_lines, junit_xml, markdown, plain_lines
 from su3d_bench.runs.finished import read_run

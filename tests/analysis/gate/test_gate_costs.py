@@ -9,11 +9,11 @@ import pytest
 from painted import DELAY_S, colour_perception
 from places import SCENES
 
-from su3d_bench.analysis.gate.check import check
-from su3d_bench.analysis.gate.reference import (
+from su3d_bench.analysis.gate import (
     LEAST_SHARE,
     Cost,
     Reference,
+    check,
     cost_findings,
     learn,
 )
@@ -100,8 +100,8 @@ def dearer(limit: float = 1.5, **parts: float) -> list[str]:
         methods = ("m",)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("su3d_bench.analysis.gate.reference.why_no_cost", lambda run, method: None)
-        patch.setattr("su3d_bench.analysis.gate.reference.method_cost", lambda *_: COST.model_copy(update=parts))
+        patch.setattr("su3d_bench.analysis.gate.why_no_cost", lambda run, method: None)
+        patch.setattr("su3d_bench.analysis.gate.method_cost", lambda *_: COST.model_copy(update=parts))
         found: list[Finding] = list(cost_findings(Run(), {"m": COST}, 1.0, limit, is_judged=True))  # type: ignore[arg-type]
     return [one.where.partition("cost of ")[2] for one in found]
 

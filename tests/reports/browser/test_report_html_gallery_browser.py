@@ -146,15 +146,6 @@ def anew(browser: Chromium) -> Iterator[Chromium]:
     assert [line for line in browser.faults() if "GL" not in line] == []
 
 
-def options(browser: Chromium, label: str) -> list[str]:
-    found: list[str] = browser.run(f"[...{FIELD.format(label=label)}.options].map((one) => one.text)")
-    return found
-
-
-def chosen(browser: Chromium, label: str) -> str:
-    return str(browser.run(f"{FIELD.format(label=label)}.selectedOptions[0].text"))
-
-
 def choose(browser: Chromium, label: str, text: str) -> None:
     browser.run(
         f"{{ const field = {FIELD.format(label=label)}; field.value = [...field.options].find((one) => one.text === "
@@ -167,10 +158,6 @@ def shown(browser: Chromium, what: str = "") -> list[str]:
         f"[...document.querySelectorAll('#gallery .card {what}')].map((one) => one.innerText)"
     )
     return found
-
-
-def costs(browser: Chromium) -> list[float]:
-    return [float(text.replace("\N{MINUS SIGN}", "-")) for text in shown(browser, ".cost b")]
 
 
 def click(browser: Chromium, selector: str) -> None:
