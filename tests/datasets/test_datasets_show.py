@@ -93,7 +93,7 @@ def test_the_command_writes_the_picture_and_tells_counts(capsys: pytest.CaptureF
     [
         (["replica/*"], "datasets show replica/*: 2 scenes match (replica/room0, replica/room1, ...); name one"),
         (["replica/rom0"], "no scene matches 'replica/rom0'; did you mean 'replica/room0'?"),
-        (["replica/room0", "--stride", "0"], "--stride 0: expected 1 or more"),
+        (["replica/room0", "--stride", "0"], "datasets show: argument --stride: 0: expected an integer of 1 or more"),
         (["replica/room0", "--out", "x.jpg"], "--out x.jpg: the picture is a PNG; expected a file name that ends in"),
         (["replica/room0", "--out", "file/x.png"], "cannot write file: a file stands where a folder should be"),
     ],
