@@ -20,8 +20,7 @@ from su3d_bench.numerics.statistics import DIFFERENCE, LEAST_ITEMS, mean_interva
 from su3d_bench.questions.model import ALL_KINDS
 from su3d_bench.questions.query_files import COLUMN
 from su3d_bench.reports.sheet.page import Entry, list_page
-from su3d_bench.sheets.agreement import Agreement, agreement, cohen_kappa
-from su3d_bench.sheets.answers import LABELS, Judgement
+from su3d_bench.sheets.answers import LABELS, Agreement, Judgement, agreement, cohen_kappa
 from su3d_bench.sheets.items import (
     ARGUABLE,
     CANNOT_TELL,
