@@ -8,8 +8,7 @@ from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal
 
 from su3d_bench.core.errors import ModelMissing, counted
-from su3d_bench.formats.tables.csv_text import csv_lines
-from su3d_bench.formats.tables.table import Prose, Table, percent, signed, text_table
+from su3d_bench.formats.tables.table import Prose, Table, csv_lines, percent, signed, text_table
 
 Kind = Literal["text", "whole number", "number", "yes or no"]
 _KINDS: Mapping[str, Kind] = {

@@ -27,9 +27,19 @@ from su3d_bench.core import registry
 from su3d_bench.core.config import MOVES_NO_NUMBER, Setting, Settings
 from su3d_bench.core.digests import digest_bytes, digest_file
 from su3d_bench.core.errors import StoreError, Su3dError, counted, printable, shown
-from su3d_bench.core.files.atomic import is_file, make_folder, read_arrays, read_json, replacing
-from su3d_bench.core.files.scratch import TemporaryFolder
-from su3d_bench.core.files.unpacking import Allowance, UnpackingError, allowance_of, check_member, member_bytes
+from su3d_bench.core.files.atomic import (
+    Allowance,
+    TemporaryFolder,
+    UnpackingError,
+    allowance_of,
+    check_member,
+    is_file,
+    make_folder,
+    member_bytes,
+    read_arrays,
+    read_json,
+    replacing,
+)
 from su3d_bench.core.printing import escaped_json
 from su3d_bench.core.system.devices import device_for
 from su3d_bench.core.system.files import file_bytes, opened, regular

@@ -18,8 +18,7 @@ from su3d_bench.core.config import Settings
 from su3d_bench.core.errors import ConfigError, Su3dError, printable, reading, suggest
 from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.interfaces import HasGroups
-from su3d_bench.core.system.files import file_bytes
-from su3d_bench.core.toml import parse_toml
+from su3d_bench.core.system.files import file_bytes, parse_toml
 from su3d_bench.evaluation.as_run import evaluate_methods
 from su3d_bench.evaluation.result import Request
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth

@@ -14,8 +14,7 @@ from su3d_bench.analysis.leaderboard import RankingRow, Refused, entries_of, in_
 from su3d_bench.core.config import DEFAULT_SOURCE, MOVES_NO_NUMBER, KeyPath, RunConfig, toml_value
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, DataError, StoreError, Su3dError, counted, printable, reading, shown
-from su3d_bench.core.files.atomic import make_folder, replacing
-from su3d_bench.core.files.scratch import TemporaryFolder
+from su3d_bench.core.files.atomic import TemporaryFolder, make_folder, replacing
 from su3d_bench.core.system.files import opened
 from su3d_bench.metrics.costs import MAP, TOTAL, WARM_UP, summarise
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names

@@ -17,8 +17,7 @@ import numpy as np
 from su3d_bench.core.errors import DataError, nearest, printable, some, suggest
 from su3d_bench.core.types import Float64Array, Int64Array, Interval
 from su3d_bench.formats.images import read_bytes
-from su3d_bench.formats.tables.csv_text import meant, separated_rows
-from su3d_bench.formats.tables.workbooks import read_workbook
+from su3d_bench.formats.tables.table import meant, read_workbook, separated_rows
 from su3d_bench.numerics.statistics import DIFFERENCE, LEAST_ITEMS, jackknife_interval, leave_one_out
 from su3d_bench.sheets.items import ANSWER_COLUMNS, Key, Sheet, SheetItem
 

@@ -19,8 +19,8 @@ from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, UInt8Array
 from su3d_bench.metrics.questions.score import labels_n
-from su3d_bench.questions.language_solver import built_in
-from su3d_bench.questions.retrieval import rank_all
+from su3d_bench.questions.model import rank_all
+from su3d_bench.questions.solver import built_in
 from su3d_bench.reports.pictures.canvas import ROOM_SURFACES, Scale, class_colours, colour, similarity_colours
 from su3d_bench.reports.pictures.figures import Cell, GridRow
 from su3d_bench.reports.pictures.items import (
