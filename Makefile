@@ -59,9 +59,9 @@ reference: demo
 # Draws what docs/architecture.md says of the code from the code, makes docs/verbs.md from the parser and
 # docs/numbers/originals.md from the protocols' files.
 architecture: $(VENV)/test
-	$(BIN)/python tests/support/house.py
-	$(BIN)/python tests/support/verbs_page.py
-	$(BIN)/python tests/support/originals_page.py
+	$(BIN)/python tools/docs/house.py
+	$(BIN)/python tools/docs/verbs_page.py
+	$(BIN)/python tools/docs/originals_page.py
 
 # The documentation site, which works from the disk: open build/site/index.html. Under --quiet mkdocs counts no warnings,
 # and --strict would end nothing.
