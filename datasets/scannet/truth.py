@@ -44,6 +44,7 @@ from su3d_bench.datasets.recordings.meshes import (
     majority,
     segment_ids,
     vertex_positions,
+    whole_number,
     with_segments,
 )
 from su3d_bench.formats.arrays import parsed_json, read_text
