@@ -22,8 +22,7 @@ from su3d_bench.baselines.command.folders import ColourFormat, FrameFolder, as_p
 from su3d_bench.baselines.command.process import ContainerWatch, Finished, Leaving, TreeWatch, run_program
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError, printable
-from su3d_bench.core.files.atomic import is_file
-from su3d_bench.core.files.scratch import TemporaryFolder
+from su3d_bench.core.files.atomic import TemporaryFolder, is_file
 from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, SceneInfo, Surface

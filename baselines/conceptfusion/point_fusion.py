@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, StoreError
-from su3d_bench.core.files.scratch import release_pages, scratch_folder
+from su3d_bench.core.files.atomic import release_pages, scratch_folder
 from su3d_bench.core.geometry import valid_depth
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, Int32Array, Int64Array
 

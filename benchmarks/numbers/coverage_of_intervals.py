@@ -22,11 +22,10 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.types import Float64Array, Int64Array, Interval
-from su3d_bench.metrics.instance import resampling
-from su3d_bench.metrics.instance.average_precision import InstanceCounts
-from su3d_bench.metrics.instance.resampling import resampled_ap
-from su3d_bench.metrics.questions import shares
-from su3d_bench.metrics.questions.shares import ShareCounts, share_counts
+from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.instance.average_precision import InstanceCounts, resampled_ap
+from su3d_bench.metrics.questions import score as asking
+from su3d_bench.metrics.questions.score import ShareCounts, share_counts
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, resampled_semantic
 from su3d_bench.numerics.statistics import (
     DIFFERENCE,
@@ -40,7 +39,7 @@ from su3d_bench.numerics.statistics import (
     t_quantile,
 )
 from su3d_bench.reports.tables.formats import aligned
-from su3d_bench.sheets.agreement import krippendorff_alphas
+from su3d_bench.sheets.answers import krippendorff_alphas
 
 BEGIN, END = "<!-- coverage: written by benchmarks/numbers/coverage_of_intervals.py -->", "<!-- end of coverage -->"
 LOW, HIGH, LEAST = 93.0, 97.0, 90.0  # per cent: the mark, and below what no interval may be shown
@@ -135,10 +134,10 @@ class Shares:
         return [[share_counts([a], [r]) for a, r in zip(n_asked, of_method, strict=True)] for of_method in right]
 
     def values(self, counts: Sequence[ShareCounts], weights: Weights) -> Values:
-        return {"share of questions": shares.resampled(counts, weights)[:, 0]}
+        return {"share of questions": asking.resampled(counts, weights)[:, 0]}
 
     def truth(self, rng: np.random.Generator) -> dict[str, float]:
-        return {"share of questions": float(shares.shares(shares.combine(self.draw(rng, 10 * N_TRUTH)[0]))[0])}
+        return {"share of questions": float(asking.shares(asking.combine(self.draw(rng, 10 * N_TRUTH)[0]))[0])}
 
 
 class Instances:
@@ -361,7 +360,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--write", type=Path, metavar="FILE", help="put the tables between the marks in this page")
     given = parser.parse_args(arguments)
-    resampling.MANY_ROWS = 0  # the compiled loops of large runs, ten times as fast, also for few rows
+    instance_ap.MANY_ROWS = 0  # the compiled loops of large runs, ten times as fast, also for few rows
     lines = [*over_scenes(given.scenes, given.simulations, given.seed), *over_items(given.simulations, given.seed)]
     text = "\n".join(lines)
     print(text)

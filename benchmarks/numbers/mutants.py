@@ -1,7 +1,7 @@
 """Small faults planted in metrics, statistics, comparison and gate, one at a time: do the tests of the module notice?
 
     python benchmarks mutants --mutants 600
-    python benchmarks mutants --mutants 40 --seed 3 --modules analysis/gate
+    python benchmarks mutants --mutants 40 --seed 3 --modules analysis/gate.py
 
 Every place of a module where one operator, constant, condition or statement can be another is a mutant; a sample of all
 of them is drawn by ``--seed``. Each is written into a copy of what git tracks here, and the tests of the module are run
@@ -52,7 +52,7 @@ _GATE = tuple(f"analysis/gate/test_gate{name}" for name in ("", "_costs"))
 # Of each module, or of all in a folder, the tests that must notice: the quick ones first. Names without a folder stand
 # in tests/metrics or below.
 GUARDS: dict[str, tuple[str, ...]] = {
-    "metrics/graphs/": ("test_hovsg_graphs",),
+    "metrics/graphs.py": ("test_hovsg_graphs",),
     "metrics/instance/": (*_CURVES, *_SCORES),
     "metrics/semantic/": ("test_metrics_semantic", "test_metrics_undefined", "test_metrics_hovsg", *_SCORES),
     "metrics/semantic/panoptic.py": ("test_panoptic_protocol", "test_panoptic_labelled_points"),
@@ -66,7 +66,7 @@ GUARDS: dict[str, tuple[str, ...]] = {
     "metrics/matching/labelling.py": (*_TRANSFER, "test_metrics_hovsg"),
     "metrics/matching/": _TRANSFER,
     "metrics/open_vocabulary/": _TEXTS,
-    "metrics/questions/chains.py": ("test_chain_protocol", "questions/test_beacon3d"),
+    "metrics/questions/grounding.py": ("test_chain_protocol", "test_grounding_protocol", "questions/test_beacon3d"),
     "metrics/questions/": _QUESTIONS,
     "metrics/attribution/": ("analysis/test_attribution", "analysis/test_attribution_runs"),
     "metrics/costs.py": ("reports/test_timing_report",),
@@ -79,7 +79,7 @@ GUARDS: dict[str, tuple[str, ...]] = {
     ),
     "analysis/comparison.py": (*_COMPARE, "analysis/test_planning"),
     "analysis/sides.py": (*_COMPARE, "analysis/test_planning"),
-    "analysis/gate/": _GATE,
+    "analysis/gate.py": _GATE,
     "runs/verify.py": ("analysis/gate/test_gate", "analysis/test_leaderboard"),
 }  # fmt: skip
 

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.system.files import file_text
-from su3d_bench.core.toml import parse_toml
+from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.core.types import Float64Array, Int32Array, WholeObject
 from su3d_bench.datasets.openscan import attribute_id
 from su3d_bench.datasets.rooms.classes import CLASS_BY_NAME, CLASS_ID

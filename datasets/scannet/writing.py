@@ -16,8 +16,7 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.files.atomic import make_folder, write_text
-from su3d_bench.core.system.files import file_bytes, file_text
-from su3d_bench.core.toml import parse_toml
+from su3d_bench.core.system.files import file_bytes, file_text, parse_toml
 from su3d_bench.core.types import Float64Array, Frame, Int64Array, UInt8Array
 from su3d_bench.datasets.scannet.sens import (
     FRAME_RECORD,

@@ -24,8 +24,7 @@ from su3d_bench.core.types import GroundTruth
 from su3d_bench.evaluation.scoring import with_confidences_of_files
 from su3d_bench.evaluation.text_truth import FilesOfTruth
 from su3d_bench.evaluation.texts import GivenTexts, read_text_features
-from su3d_bench.metrics.attribution.arrays import EXPLAINED, LookedAt, MendedScene
-from su3d_bench.metrics.attribution.singles import SingleError
+from su3d_bench.metrics.attribution.arrays import EXPLAINED, LookedAt, MendedScene, SingleError
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.metric import Counts, SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules

@@ -120,7 +120,7 @@ def _agreement(held_against: Sequence[str]) -> str:
 
 def plan_row(source: Source, here: Path | None) -> dict[str, Any]:
     """A source as ``--dry-run --json`` gives it: every fact with where it was read."""
-    from su3d_bench.fetching.hub import hub_addresses
+    from su3d_bench.fetching.download import hub_addresses
 
     row = source.model_dump(mode="json", exclude_none=True)
     row["n_bytes"] = source.n_bytes

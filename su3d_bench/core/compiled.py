@@ -20,7 +20,7 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 
 from su3d_bench.core.digests import digest_file
-from su3d_bench.core.files.unpacking import DAMAGE
+from su3d_bench.core.files.atomic import DAMAGE
 
 _digest = remembered(digest_file)
 MAX_WAIT_S = 60.0  # for another process that compiles the same function; then it is compiled here too

@@ -19,8 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.core.printing import one_line
-from su3d_bench.core.system.files import file_text
-from su3d_bench.core.toml import parse_toml
+from su3d_bench.core.system.files import file_text, parse_toml
 
 HEADER = re.compile(r"^\s*\[+([^\[\]]+)\]+\s*(?:#.*)?$")
 ASSIGNMENT = re.compile(r"""^\s*((?:[\w-]+|"[^"]*"|'[^']*')(?:\s*\.\s*(?:[\w-]+|"[^"]*"|'[^']*'))*)\s*=""")

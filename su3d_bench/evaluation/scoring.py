@@ -32,7 +32,7 @@ from su3d_bench.metrics.matching.checks import (
 from su3d_bench.metrics.matching.labelling import class_index_of_ids, encoder_warning, scored_classes
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
-from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
+from su3d_bench.metrics.open_vocabulary.score import QueryTruth
 from su3d_bench.metrics.protocols.loading import protocol_names
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import QuestionTruth, metric_of, score_scene

@@ -19,8 +19,7 @@ from stat import S_ISREG
 from typing import IO, Any, Self
 
 from su3d_bench.core.errors import DataError, StoreError, printable
-from su3d_bench.core.files.atomic import replacing, write_error
-from su3d_bench.core.files.unpacking import Allowance, UnpackingError, allowance_of, check_member
+from su3d_bench.core.files.atomic import Allowance, UnpackingError, allowance_of, check_member, replacing, write_error
 from su3d_bench.core.system.files import opened
 from su3d_bench.fetching.download import Watch
 

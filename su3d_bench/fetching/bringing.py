@@ -27,8 +27,7 @@ from su3d_bench.datasets.replica.folders import (
     find_render_tree,
 )
 from su3d_bench.fetching.archives import members, unpack_tar_gz, unpack_zip
-from su3d_bench.fetching.download import Patience, Stated, Wanted, Watch, bring, checked, part_of, size_of
-from su3d_bench.fetching.hub import hub_files
+from su3d_bench.fetching.download import Patience, Stated, Wanted, Watch, bring, checked, hub_files, part_of, size_of
 from su3d_bench.fetching.sources import Source, Sources
 from su3d_bench.perception.models.catalogue import MODELS, PAPERS_ENCODERS, PROFILE_MODELS
 from su3d_bench.perception.models.files import locate

@@ -12,8 +12,7 @@ from urllib.parse import urlsplit
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from su3d_bench.core.errors import ConfigError, suggest
-from su3d_bench.core.system.files import file_text
-from su3d_bench.core.toml import parse_toml
+from su3d_bench.core.system.files import file_text, parse_toml
 
 Group = Literal["models", "replica", "scannet"]
 TABLE = Path(__file__).with_name("sources.toml")

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, printable, reading, shown
-from su3d_bench.core.files.unpacking import Allowance, UnpackingError, allowance_of, member_bytes
+from su3d_bench.core.files.atomic import Allowance, UnpackingError, allowance_of, member_bytes
 from su3d_bench.core.system.files import file_bytes, opened, regular
 
 # What zipfile raises on a damaged archive; RuntimeError is its answer to a compression that it does not know.

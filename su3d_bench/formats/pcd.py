@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import DataError, printable, reading
-from su3d_bench.core.files.atomic import write_bytes
-from su3d_bench.core.files.unpacking import Allowance, UnpackingError
+from su3d_bench.core.files.atomic import Allowance, UnpackingError, write_bytes
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Float32Array, Float64Array
 

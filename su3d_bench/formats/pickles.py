@@ -22,13 +22,13 @@ from typing import Any, BinaryIO, ClassVar, cast
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError, printable, reading, shown
-from su3d_bench.core.files.unpacking import Allowance, UnpackingError
+from su3d_bench.core.files.atomic import Allowance, UnpackingError
 from su3d_bench.core.system.files import opened
 from su3d_bench.formats.numpy_files import plain_array, plain_type
 
 GZIP_START = b"\x1f\x8b"
 MOST_INFLATED = 16 << 30  # bytes of a gzip stream; a map of ConceptGraphs with all its masks has some GiB
-INFLATED_A_READ, SKIPPED_A_READ = 1 << 20, 1 << 16
+INFLATED_A_READ, SKIPPED_A_READ = 1 << 17, 1 << 16
 # Reads of one byte, one or two an operation; a map of ConceptGraphs takes less than a million of them.
 FREE_STEPS, MOST_STEPS = 2_000_000, 20_000_000
 MOST_NAME = 1024

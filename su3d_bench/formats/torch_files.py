@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, reading, shown
-from su3d_bench.core.files.unpacking import PIECE, allowance_of
+from su3d_bench.core.files.atomic import PIECE, allowance_of
 from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import UInt8Array
 from su3d_bench.formats.numpy_files import checked_shape, opened_zip, read_member

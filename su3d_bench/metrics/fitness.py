@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.maps import Instances, Partition, Prediction
-from su3d_bench.metrics.graphs.places import NEEDS_PLACES
+from su3d_bench.metrics.graphs import NEEDS_PLACES
 from su3d_bench.metrics.labels import LEAST_SEVERAL, under_several_labels
 from su3d_bench.metrics.matching.labelling import has_every_label
 from su3d_bench.metrics.open_vocabulary.score import NEEDS_FEATURES

@@ -16,24 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, PredictionError, printable
-from su3d_bench.core.files.atomic import read_arrays
-from su3d_bench.core.files.unpacking import DAMAGE
+from su3d_bench.core.files.atomic import DAMAGE, read_arrays
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.fitness import why_not_scorable
-from su3d_bench.metrics.graphs.objects import ObjectMetric
-from su3d_bench.metrics.graphs.places import PlaceMetric
+from su3d_bench.metrics.graphs import ObjectMetric, PlaceMetric
 from su3d_bench.metrics.instance.boxes import BoxMetric
 from su3d_bench.metrics.instance.score import InstanceMetric
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.metric import MOST_COUNTED, Counts, Metric, SceneScore, scene_mean
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
-from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
-from su3d_bench.metrics.open_vocabulary.score import CategoriesMetric, QueryMetric
+from su3d_bench.metrics.open_vocabulary.score import CategoriesMetric, QueryMetric, QueryTruth
 from su3d_bench.metrics.protocols.model import Kind, ProtocolRules
-from su3d_bench.metrics.questions.chains import ChainMetric
-from su3d_bench.metrics.questions.grounding import GroundingMetric
+from su3d_bench.metrics.questions.grounding import ChainMetric, GroundingMetric
 from su3d_bench.metrics.questions.presence import PresenceMetric
 from su3d_bench.metrics.questions.score import (
     AnnotationMetric,

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.files.scratch import Scratch
+from su3d_bench.core.files.atomic import Scratch
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Detections, Frame, Int32Array, Int64Array, PerceptionNeeds, SceneInfo

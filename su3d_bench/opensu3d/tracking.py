@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.files.scratch import Scratch, StoredRows
+from su3d_bench.core.files.atomic import Scratch, StoredRows
 from su3d_bench.core.types import Detections, Float32Array, Float64Array, Int32Array, Int64Array
 from su3d_bench.opensu3d.config import BEST_FIT_RATIO, Fusion, MultiScale, MultiView, OverlapRule
 

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, PredictionError, StoreError, converted, shown
-from su3d_bench.core.files.unpacking import Allowance, UnpackingError
+from su3d_bench.core.files.atomic import Allowance, UnpackingError
 from su3d_bench.core.maps import DenseFeatures, Partition
 from su3d_bench.core.types import Float32Array, Int32Array, Int64Array
 from su3d_bench.formats.arrays import MOST_MASKS, checked_points, feature_table, half_rows, kind_of, without_nonfinite

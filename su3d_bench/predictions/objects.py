@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, printable, shown
-from su3d_bench.core.files.unpacking import Allowance, UnpackingError
+from su3d_bench.core.files.atomic import Allowance, UnpackingError
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float32Array, Float64Array
 from su3d_bench.formats.arrays import MOST_MASKS, checked_points, kind_of, without_nonfinite

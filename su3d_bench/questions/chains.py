@@ -22,8 +22,8 @@ import numpy as np
 from su3d_bench.core.english import is_plural, with_article, words
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import GroundTruth
-from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
-from su3d_bench.metrics.questions.chains import CHAINS_EACH, ChainedText, Place
+from su3d_bench.metrics.open_vocabulary.score import QueryTruth
+from su3d_bench.metrics.questions.grounding import CHAINS_EACH, ChainedText, Place
 from su3d_bench.numerics.relations import gap_m
 from su3d_bench.questions.generator import TWICE, generate, is_flat
 from su3d_bench.questions.model import KINDS, Question

@@ -18,8 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.english import last_word, with_article, words
-from su3d_bench.core.system.files import file_text
-from su3d_bench.core.toml import parse_toml
+from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.numerics.relations import RELATIONS
 from su3d_bench.questions.model import BY_NAME, KINDS, MADE_KINDS, Question, new_question
 from su3d_bench.questions.scene_map import MapObject, SceneMap, is_called, meant_by

@@ -13,14 +13,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from su3d_bench.core.errors import StoreError
-from su3d_bench.core.files.atomic import make_folder
+from su3d_bench.core.files.atomic import TemporaryFolder, make_folder
 from su3d_bench.core.files.locks import is_unfinished
-from su3d_bench.core.files.scratch import TemporaryFolder
 from su3d_bench.runs.executors import ELSEWHERE, Report
 from su3d_bench.runs.job import MethodOutcome, SceneJob
 from su3d_bench.runs.plan import Plan
-from su3d_bench.runs.remote_store import RemoteFolder
-from su3d_bench.runs.run_place import SEAL
+from su3d_bench.runs.remote_store import SEAL, RemoteFolder
 from su3d_bench.runs.scene import failed_outcomes, run_scene
 from su3d_bench.runs.scenes import cache_root as own_cache_root
 from su3d_bench.store.run_folder import RunFolder

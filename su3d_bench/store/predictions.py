@@ -10,9 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, StoreError, counted
-from su3d_bench.core.files.atomic import read_npz, remove_file, replacing, write_npz
-from su3d_bench.core.files.scratch import row_blocks
-from su3d_bench.core.files.unpacking import DAMAGE
+from su3d_bench.core.files.atomic import DAMAGE, read_npz, remove_file, replacing, row_blocks, write_npz
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.core.system.files import regular
 

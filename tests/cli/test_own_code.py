@@ -47,7 +47,11 @@ METHODS = {
     "no Python": ("    def start(", "    def start", "SyntaxError"),
     "an end": ("class MyMethod:", "raise SystemExit(0)\n\n\nclass MyMethod:", "ends the program when it is imported"),
     "no update": ("    def update(", "    def _update(", "lacks 'update'; a method has Config, finish, name"),
-    "unknown masks": ('masks="grounded"', 'masks="boxes"', "needs: masks is 'boxes'; 'grounded', 'class-agnostic' or"),
+    "unknown masks": (
+        'masks="grounded"',
+        'masks="boxes"',
+        "needs: masks is 'boxes'; 'grounded', 'class-agnostic', 'none'",
+    ),
     "no map": ("return Instances.of", "Instances.of", "MyMethod.finish gave None; an Instances or a Partition or"),
     "undefined scores": (
         "np.ones(len(kept))",
@@ -141,7 +145,6 @@ def test_a_map_that_the_file_before_made_is_not_taken_up(capsys: pytest.CaptureF
     words = ["run", "--scenes", "rooms/living0", "--set", "rooms.n_frames=8", "--profile", "oracle", "--limit", "1"]
     words += ["--methods", METHOD, "--protocols", "rooms-instance", "--jobs", "1", "--no-pictures", "--out", "out"]
     assert main(words) == 0
-    Path("my_method.py").write_text(text + "\n# nothing that counts\n")
     assert main(words) == 0
     Path("my_method.py").write_text(
         text.replace("least_points: int = 20", "least_points: int = 21").replace("< 0.5", "< 0.6")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from fractions import Fraction
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,6 @@ from su3d_bench.metrics.instance.average_precision import (
     encode_ground_truth,
     last_line_of_each_mask_file,
 )
-from su3d_bench.metrics.instance.precision_recall import dots
 from su3d_bench.metrics.instance.scene_counts import per_scene
 from su3d_bench.metrics.instance.score import NO_OBJECT, covered_objects
 from su3d_bench.metrics.protocols.loading import load_protocol
@@ -263,97 +261,6 @@ def test_counts_of_parts_combine_to_the_whole(case: str, data: st.DataObject) ->
     cut = data.draw(st.integers(1, len(counts) - 1))
     halves = [concatenate(counts[:cut]), concatenate(counts[cut:])]
     assert np.array_equal(combine(halves).table, as_table(answer), equal_nan=True)
-
-
-@settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 10_000))
-def test_random_scenes_agree_with_a_plain_reading_of_the_rules(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    truth = np.repeat(rng.choice([0, 1, 5, 7], 9) * 1000 + np.arange(1, 10), rng.integers(60, 160, 9))
-    masks, labels = [], []
-    for _ in range(rng.integers(0, 14)):
-        start = int(rng.integers(0, len(truth) - 60))
-        mask = np.arange(start, min(len(truth), start + int(rng.integers(60, 260))))
-        masks.append(mask[rng.random(len(mask)) < rng.choice([0.6, 0.9, 1.0])])
-        labels.append(int(rng.choice([1, 5, 7])))
-    scores = (rng.integers(1, 5, len(masks)) / 4).tolist()
-    counts = counts_of(truth, masks, labels, scores)
-    for c, class_id in enumerate((5, 7)):
-        for t, threshold in enumerate(THRESHOLDS):
-            here = (counts.class_index == c) & (counts.threshold_index == t)
-            rows = sorted(zip(counts.score[here].tolist(), counts.is_true[here].tolist(), strict=True))
-            expected_rows, n_missed = plain_counts(truth, masks, labels, scores, class_id, threshold)
-            assert rows == sorted(expected_rows)
-            assert counts.n_missed[c, t] == n_missed
-
-
-def plain_counts(
-    truth: Any, masks: list[Any], labels: list[int], scores: list[float], class_id: int, threshold: float
-) -> tuple[list[tuple[float, bool]], int]:
-    """The rules word by word, one pair at a time, for one class and one threshold; classes 5 and 7 are valid."""
-    void = {x for x, value in enumerate(truth) if value // 1000 not in (5, 7)}
-    members: dict[int, set[int]] = {}
-    for x, value in enumerate(truth):
-        if value // 1000 == class_id:
-            members.setdefault(int(value), set()).add(x)
-    predictions = [(set(m.tolist()), s) for m, label, s in zip(masks, labels, scores, strict=True) if label == class_id]
-    predictions = [(mask, score) for mask, score in predictions if len(mask) >= 100]
-
-    def over(mask: set[int], value: int) -> bool:
-        return len(mask & members[value]) / len(mask | members[value]) > threshold
-
-    rows: list[tuple[float, bool]] = []
-    visited: set[int] = set()
-    n_missed = 0
-    for value in sorted(v for v, points in members.items() if len(points) >= 100):
-        best: float | None = None
-        for p, (mask, score) in enumerate(predictions):
-            if p in visited or not over(mask, value):
-                continue
-            if best is None:
-                best = score
-                visited.add(p)
-            else:
-                rows.append((min(best, score), False))
-                best = max(best, score)
-        if best is None:
-            n_missed += 1
-        else:
-            rows.append((best, True))
-    for mask, score in predictions:
-        if any(over(mask, value) for value in members):
-            continue
-        n_ignored = len(mask & void) + sum(len(mask & points) for points in members.values() if len(points) < 100)
-        if n_ignored / len(mask) <= threshold:
-            rows.append((score, False))
-    return rows, n_missed
-
-
-def test_the_dot_product_adds_in_the_order_of_the_reference_answers() -> None:
-    rng = np.random.default_rng(0)
-    for n in (*range(1, 70), 129):
-        left, right = rng.random(n), rng.random(n) - 0.3
-        assert dots(left, right, np.array([0]), np.array([n])).tolist() == [avx512_dot(left.tolist(), right.tolist())]
-
-
-def avx512_dot(x: list[float], y: list[float]) -> float:
-    """OpenBLAS's ddot for AVX-512 with exact fractions: 32 lanes, folded to 16, a tail of fused multiply-adds."""
-
-    def fused(a: float, b: float, c: float) -> float:
-        return float(Fraction(a) * Fraction(b) + Fraction(c))
-
-    n16, n32 = len(x) - len(x) % 16, len(x) - len(x) % 32
-    wide = [0.0] * 32
-    for i in range(n32):
-        wide[i % 32] = fused(x[i], y[i], wide[i % 32])
-    lanes = [wide[8 * r + i] + wide[8 * r + i + 4] for r in range(4) for i in range(4)]
-    for i in range(n32, n16):
-        lanes[i % 16] = fused(x[i], y[i], lanes[i % 16])
-    four = [((lanes[i] + lanes[i + 4]) + lanes[i + 8]) + lanes[i + 12] for i in range(4)]
-    total = (four[0] + four[2]) + (four[1] + four[3])
-    for i in range(n16, len(x)):
-        total = fused(x[i], y[i], total)
-    return total
 
 
 # ---- what is refused

@@ -8,10 +8,16 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.types import BoolArray, Float64Array
-from su3d_bench.metrics.instance import precision_recall, resampling
-from su3d_bench.metrics.instance.average_precision import THRESHOLDS, InstanceCounts, combine
-from su3d_bench.metrics.instance.precision_recall import average_precision, average_precisions, dots
-from su3d_bench.metrics.instance.resampling import MANY_ROWS
+from su3d_bench.metrics.instance import average_precision as curves
+from su3d_bench.metrics.instance.average_precision import (
+    MANY_ROWS,
+    THRESHOLDS,
+    InstanceCounts,
+    average_precision,
+    average_precisions,
+    combine,
+    dots,
+)
 
 N_CLASSES = 3
 
@@ -62,7 +68,7 @@ def area(score: Float64Array, is_true: BoolArray, n_missed: int) -> float:
 
 def exact_dot(left: Float64Array, right: Float64Array) -> float:
     """The products in 32 lanes, then 16, then one by one: each added with a single rounding."""
-    product, error = (each.tolist() for each in precision_recall._exact_products(left, right))
+    product, error = (each.tolist() for each in curves._exact_products(left, right))
     n = len(product)
     n16, n32 = n - n % 16, n - n % 32
     wide = [0.0] * 32
@@ -112,9 +118,9 @@ def test_a_sum_is_rounded_once(scale: float) -> None:
     rng = np.random.default_rng(1)
     few_bits = rng.integers(-(1 << 53), 1 << 53, 20_000) * 2.0 ** -rng.integers(20, 80, 20_000)  # with ties in plenty
     for total in (rng.standard_normal(20_000), few_bits):
-        product, error = precision_recall._exact_products(rng.random(20_000), rng.standard_normal(20_000) * scale)
+        product, error = curves._exact_products(rng.random(20_000), rng.standard_normal(20_000) * scale)
         expected = list(map(math.fsum, zip(product.tolist(), error.tolist(), total.tolist(), strict=True)))
-        assert precision_recall._rounded_once(product, error, total).tolist() == expected
+        assert curves._rounded_once(product, error, total).tolist() == expected
 
 
 @pytest.mark.parametrize("levels", [1, 6])
@@ -122,8 +128,8 @@ def test_resampled_curves_above_the_limit_are_those_of_the_scenes_drawn(levels: 
     rng = np.random.default_rng(8)
     scenes = [many(rng, n, levels) for n in (MANY_ROWS, 700, 50)]
     drawn = np.array([[1, 1, 1], [0, 1, 1], [1, 0, 1], [1, 1, 0], [2, 0, 1], [0, 0, 3], [0, 3, 0]])
-    weights = np.tile(drawn, (2 * resampling.AT_ONCE // len(drawn), 1))[: 2 * resampling.AT_ONCE - 3]
-    found = resampling.resampled_ap(scenes, weights)
+    weights = np.tile(drawn, (2 * curves.AT_ONCE // len(drawn), 1))[: 2 * curves.AT_ONCE - 3]
+    found = curves.resampled_ap(scenes, weights)
     for row, weight in enumerate(drawn):
         whole = combine([scenes[s] for s in range(3) for _ in range(weight[s])])
         for name, expected in (("AP", whole.ap), ("AP50", whole.ap50), ("AP25", whole.ap25)):

@@ -14,10 +14,10 @@ from su3d_bench.core.maps import Masks
 from su3d_bench.metrics.instance import score as score_instances
 from su3d_bench.metrics.matching import votes as neighbours
 from su3d_bench.metrics.matching.votes import transfer_each_mask, transfer_votes
-from su3d_bench.metrics.open_vocabulary import openlex3d, query_ap
+from su3d_bench.metrics.open_vocabulary import openlex3d
 from su3d_bench.metrics.open_vocabulary import score as score_open_vocabulary
 
-MODULES = (neighbours, openlex3d, query_ap, score_instances, score_open_vocabulary)
+MODULES = (neighbours, openlex3d, score_instances, score_open_vocabulary)
 
 
 @pytest.mark.parametrize("module", MODULES, ids=lambda module: module.__name__)

@@ -17,8 +17,7 @@ from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.instance.precision_recall import average_precision
-from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery, confidences, per_scene
+from su3d_bench.metrics.open_vocabulary.score import QueryTruth, TextQuery, confidences, per_scene
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, score_scene, unpack_scores
@@ -246,51 +245,6 @@ def test_counts_of_scenes_combine_to_the_whole(seeds: set[int], name: str) -> No
     assert result.per_class["object"]["AP"] == pytest.approx(result.metrics["AP"], nan_ok=True)
 
 
-@settings(max_examples=15, deadline=None)
-@given(seed=st.integers(0, 1000))
-def test_a_plain_reading_of_the_rules_gives_the_same(seed: int) -> None:
-    truth, whole = noisy(OPENLEX, seed)
-    assert metrics(OPENLEX, truth, whole) == pytest.approx(plain_ap(truth, whole), abs=1e-12)
-
-
-def plain_ap(truth: QueryTruth, prediction: Instances) -> list[float]:
-    """The original's loops over pairs of sets, one query after another."""
-    members = [set(prediction.mask(k).tolist()) for k in range(len(prediction))]
-    points = truth.points.astype(float)
-    squared = ((points[:, None] - points[None]) ** 2).sum(axis=2)
-    masks = [set(np.flatnonzero(squared[:, sorted(mask)].min(axis=1) < 0.001).tolist()) for mask in members]
-    assert prediction.features is not None
-    directions = prediction.features / np.linalg.norm(prediction.features, axis=1, keepdims=True)
-    values = []
-    for threshold in instance_ap.THRESHOLDS:
-        rows: list[tuple[float, bool]] = []
-        n_missed = 0
-        for query in truth.queries:
-            raw = (directions.astype(float) @ ENCODER.encode_texts([query.text])[0].astype(float) + 1) / 2
-            confidence = (raw - raw.min()) / max(raw.max() - raw.min(), 1e-8)
-            ranked = [int(k) for k in np.argsort(-confidence, kind="stable")[:10] if masks[int(k)]]
-            objects = [set(np.flatnonzero(truth.object_of_point == one).tolist()) for one in query.object_ids]
-            objects = [one for one in objects if one]
-            used: set[int] = set()
-            for one in objects:
-                found = [k for k in ranked if k not in used and iou(masks[k], one) > threshold]
-                if not found:
-                    n_missed += 1
-                    continue
-                used.add(found[0])
-                *lower, best = sorted(float(confidence[k]) for k in found)
-                rows += [(best, True), *((score, False) for score in lower)]
-            unmet = [k for k in ranked if not any(iou(masks[k], one) > threshold for one in objects)]
-            rows += [(float(confidence[k]), False) for k in unmet]
-        scores, is_true = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
-        values.append(average_precision(scores, is_true, n_missed))
-    return [float(np.mean(values[:-1])), values[0], values[-1]]
-
-
-def iou(one: set[int], other: set[int]) -> float:
-    return len(one & other) / len(one | other)
-
-
 # ---- what is refused
 
 
@@ -309,11 +263,3 @@ def test_truths_that_do_not_hold_together_are_refused() -> None:
         TextQuery("seat", (7, 7))
     with pytest.raises(DataError, match="do not agree"):
         QueryTruth(np.zeros((3, 3), np.float32), np.zeros(2, np.int64), (), "v", "s")
-
-
-def test_a_truth_of_another_kind_is_refused() -> None:
-    truth = query_truth()
-    with pytest.raises(DataError, match="scores the truth 'query-objects', this one is 'openlex3d-face-corners'"):
-        score_scene(PLAIN, truth, perfect(truth), ENCODER)
-    with pytest.raises(DataError, match="scores the label space 'openlex3d', the truth has 'queries'"):
-        score_scene(load_protocol("openlex3d-topn"), truth, perfect(truth), ENCODER)

@@ -31,10 +31,10 @@ from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.types import LabelSet
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
-from su3d_bench.metrics.open_vocabulary.query_ap import ObjectCounts
+from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectCounts
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.questions.shares import ShareCounts
+from su3d_bench.metrics.questions.score import ShareCounts
 from su3d_bench.metrics.scoring import combine, combined_metrics, pack_scores, score_scene, unpack_scores
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
 

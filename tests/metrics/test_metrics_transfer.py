@@ -15,7 +15,7 @@ from su3d_bench.core.maps import Masks, Partition
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics import scoring
 from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.instance import precision_recall, resampling, scene_counts
+from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.matching import checks, labelling
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.checks import duplicate_pairs
@@ -31,7 +31,7 @@ from su3d_bench.metrics.semantic import confusion as semantic
 
 @pytest.mark.parametrize(
     "module",
-    [checks, instance_ap, labelling, precision_recall, resampling, scene_counts, scoring, semantic, transfer],
+    [checks, instance_ap, labelling, scene_counts, scoring, semantic, transfer],
     ids=lambda m: m.__name__,
 )
 def test_the_examples_in_the_docstrings_run(module: object) -> None:

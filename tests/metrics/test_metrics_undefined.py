@@ -13,8 +13,7 @@ import pytest
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.metrics.instance import scene_counts
-from su3d_bench.metrics.instance.average_precision import InstanceCounts
-from su3d_bench.metrics.instance.resampling import resampled_ap
+from su3d_bench.metrics.instance.average_precision import InstanceCounts, resampled_ap
 from su3d_bench.metrics.metric import Arrays, Counts, SceneScore, Values, present, scene_mean
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from places import ROOT
 
-from su3d_bench.metrics.instance.average_precision import THRESHOLDS, ap_columns
-from su3d_bench.metrics.instance.precision_recall import average_precision
+from su3d_bench.metrics.instance.average_precision import THRESHOLDS, ap_columns, average_precision
 
 PAGE = (ROOT / "docs" / "numbers" / "how-made.md").read_text(encoding="utf-8")
 ROWS = re.findall(r"^\| [A-C] \| ([\d.]+) \| [^|]* \| ([^|]+) \|$", PAGE, re.MULTILINE)

@@ -12,7 +12,7 @@ import scipy.stats
 import su3d_bench.numerics.statistics
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.instance import resampling, scene_counts
+from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.numerics.statistics import (
     MOST_GROUPS,
@@ -29,7 +29,6 @@ from su3d_bench.numerics.statistics import (
 
 def test_the_examples_in_the_docstrings_run() -> None:
     assert doctest.testmod(su3d_bench.numerics.statistics).failed == 0
-    assert doctest.testmod(resampling).failed == 0
 
 
 def test_of_a_mean_the_interval_is_student_s() -> None:
@@ -138,7 +137,7 @@ def test_resampled_ap_equals_the_ap_of_the_scenes_drawn() -> None:
     rng = np.random.default_rng(11)
     counts = [random_scene(rng) for _ in range(5)]
     weights = np.concatenate([np.ones((1, 5), np.int64), rng.multinomial(5, [0.2] * 5, size=20), [[0, 0, 5, 0, 0]]])
-    resampled = resampling.resampled_ap(counts, weights)
+    resampled = instance_ap.resampled_ap(counts, weights)
     for row, weight in enumerate(weights):
         ap = instance_ap.combine([counts[s] for s in range(5) for _ in range(weight[s])])
         drawn = [resampled["AP"][row], resampled["AP50"][row], resampled["AP25"][row]]

@@ -17,7 +17,7 @@ from su3d_bench.datasets.openlex3d.labels import OpenLexFiles, read_categories, 
 from su3d_bench.datasets.openlex3d.release import LabelledPoints, categories_truth, face_corners_of, queries_truth
 from su3d_bench.datasets.replica.truth import AnnotatedMesh
 from su3d_bench.formats.ply import ListColumn
-from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
+from su3d_bench.metrics.open_vocabulary.score import TextQuery
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 

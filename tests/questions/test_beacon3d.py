@@ -13,8 +13,8 @@ import pytest
 from damage import damages, outcomes, truncations
 from places import CASES
 
-from su3d_bench.metrics.questions import chains as counting
-from su3d_bench.metrics.questions.chains import ChainedText, Place
+from su3d_bench.metrics.questions import grounding as counting
+from su3d_bench.metrics.questions.grounding import ChainedText, Place
 from su3d_bench.questions import beacon3d as answer_matching
 from su3d_bench.questions import beacon3d as answered
 from su3d_bench.questions import beacon3d as beacon3d_files

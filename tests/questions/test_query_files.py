@@ -14,7 +14,7 @@ from replica_scene import QUADS, TWO_OBJECTS, write_original, write_render
 from su3d_bench.cli.main import main
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.datasets.replica.dataset import Replica
-from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
+from su3d_bench.metrics.open_vocabulary.score import TextQuery
 from su3d_bench.questions.query_files import read_query_file
 
 TOML = """[[query]]

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from box_room import INTRINSICS, images, pose
-from painted import colour_perception
-from places import SCENES
 
 from su3d_bench.baselines.conceptfusion import point_fusion as feature_table
 from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig
 from su3d_bench.baselines.conceptfusion.point_fusion import FeatureTable
-from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError, StoreError
 from su3d_bench.core.maps import DenseFeatures
 from su3d_bench.core.system.timing import Timer
@@ -23,7 +19,6 @@ from su3d_bench.core.types import Detections, Frame, SceneInfo
 from su3d_bench.metrics.matching.labelling import most_similar
 from su3d_bench.metrics.semantic.score import has_feature
 from su3d_bench.predictions.own_runs import OwnRuns
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.store import predictions
 from su3d_bench.store.predictions import features_beside, read_prediction, write_prediction
 
@@ -163,38 +158,3 @@ def test_labels_of_a_mapped_table_are_those_of_the_same_rows_in_memory(tmp_path:
 
 
 # ---- runs
-
-
-@pytest.fixture
-def in_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
-
-
-def run(*more: str) -> int:
-    words = ["run", "--scenes", f"{SCENES}/painted.py:Painted/a", "--methods", "conceptfusion", "conceptfusion-sam"]
-    settings = ["--stride", "1", "--set", "conceptfusion.height=24", "--set", "conceptfusion.width=32"]
-    protocols = ["--protocols", "rooms-semantic", "rooms-instance", "--jobs", "1", "--out", "out"]
-    return main([*words, *settings, *protocols, *more])
-
-
-def test_a_run_of_both_is_scored_resumed_and_mended(in_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run() == 0
-    results = json.loads(Path("out/metrics.json").read_text())["results"]
-    assert {one["method"] for one in results} == {"conceptfusion", "conceptfusion-sam"}
-    assert all(one["result"]["metrics"]["mAcc"] > 0.9 for one in results if one["protocol"] == "rooms-semantic")
-    job = Path("out/scenes/painted.a/conceptfusion")
-    assert "needs instances, and the method gives one feature a point" in (job / "done.json").read_text()
-    beside = job / "prediction.features.npy"
-    whole, inode = beside.read_bytes(), beside.stat().st_ino
-    assert run() == 0
-    assert beside.stat().st_ino == inode  # resumed: nothing was written
-    beside.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
-    assert run() == 0
-    assert beside.read_bytes() == whole
-    (job / ".prediction.features.npy.0123456789ab.unfinished").write_bytes(b"half")
-    beside.unlink()
-    assert run() == 0
-    assert beside.read_bytes() == whole
-    assert not list(job.glob(".*"))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from su3d_bench.core.files.scratch import Scratch
+from su3d_bench.core.files.atomic import Scratch
 
 
 @pytest.mark.parametrize("most_in_memory_bytes", [1 << 20, 1])

@@ -14,8 +14,7 @@ from su3d_bench.analysis.attribution import Explained
 from su3d_bench.analysis.page.scene import SKETCH_WIDTH, SceneData, fed_frames
 from su3d_bench.core.errors import Su3dError, printable
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, UInt8Array
-from su3d_bench.metrics.attribution.arrays import LookedAt
-from su3d_bench.metrics.attribution.singles import SingleError
+from su3d_bench.metrics.attribution.arrays import LookedAt, SingleError
 from su3d_bench.metrics.matching.nearest import Points
 from su3d_bench.reports.page.maps import frame_cover
 from su3d_bench.reports.pictures.items import PIXEL_STEP, best_view, draw_outline, fitted, seen_in, window_around

@@ -6,18 +6,19 @@ the one table of the kinds of protocols whose errors can be told apart.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.core.types import BoolArray, GroundTruth, Int64Array
 from su3d_bench.metrics.attribution import masks as corrections
-from su3d_bench.metrics.attribution.masks import LabelledPoints
+from su3d_bench.metrics.attribution.masks import CAUSES, LabelledPoints, MaskError, causes_of, find_errors, repaired
 from su3d_bench.metrics.attribution.overlaps import (
     LabelledMasks,
     Overlaps,
@@ -25,16 +26,213 @@ from su3d_bench.metrics.attribution.overlaps import (
     measure_overlaps,
     true_instances,
 )
-from su3d_bench.metrics.attribution.singles import Pool, SingleError, single_mask_errors, single_point_errors
 from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.instance.score import InstanceMetric, masks_on_truth
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import class_index_of_ids
+from su3d_bench.metrics.metric import C, Metric, Values
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic import confusion
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
 from su3d_bench.metrics.semantic.score import SemanticMetric, call_points, transfer_votes
+
+IntArray = NDArray[np.integer[Any]]
+
+
+@dataclass(frozen=True)
+class SingleError:
+    """An error with its ``gains`` in the headline metrics, as fractions.
+
+    ``true`` and ``called`` are class ids of masks and class indices of points, each once, the first the one that the
+    error is told by; ``masks`` are rows of the prediction. ``score`` is the confidence of the first mask, ``iou`` that
+    of mask and instance, or the highest where one of them is wanting; both are None of points. ``predicted`` are the
+    points of each mask, or the wrong ones, ``truth`` those of each instance.
+    """
+
+    kind: str
+    true: tuple[int, ...]
+    called: tuple[int, ...]
+    masks: tuple[int, ...]
+    score: float | None
+    iou: float | None
+    gains: Values
+    predicted: tuple[IntArray, ...]
+    truth: tuple[IntArray, ...]
+
+
+class Pool(Generic[C]):
+    """The counts of all scenes under a protocol, of which those of one scene are to change."""
+
+    def __init__(self, metric: Metric[C], mine: C, others: Sequence[C], summed: Callable[[Sequence[C]], C]) -> None:
+        self.metric, self.mine, self._sum = metric, mine, summed
+        self.is_pooled = metric.rules.aggregate == "pooled"
+        self._others = others
+        self.before = self.values(mine)
+
+    def values(self, mine: C) -> Values:
+        """The headline metrics with those counts of the scene: over all scenes, or of the scene alone where the
+        protocol reports the mean over scenes."""
+        found = self.metric.combine([mine, *self.others])
+        return {name: found[name] for name in self.metric.rules.headline}
+
+    @cached_property
+    def others(self) -> Sequence[C]:
+        """What joins the counts of the scene before ratios are formed: those of all other scenes as one, or nothing."""
+        return [self._sum(self._others)] if self.is_pooled and self._others else []
+
+    @cached_property
+    def _n_scenes(self) -> Mapping[str, int]:
+        """Of how many scenes each metric is the mean."""
+        if self.is_pooled:
+            return dict.fromkeys(self.before, 1)
+        rows = [*self.metric.combine_each(self._others), self.before] if self._others else [self.before]
+        return {name: max(1, sum(not np.isnan(row[name]) for row in rows)) for name in self.before}
+
+    def gains(self, after: Values) -> Values:
+        """What the reported metrics gain where those of ``values`` become ``after``."""
+        return {name: (after[name] - value) / self._n_scenes[name] for name, value in self.before.items()}
+
+
+def single_mask_errors(
+    truth: Int64Array, overlaps: Overlaps, rules: ScoringRules, pool: Pool[InstanceCounts]
+) -> list[SingleError]:
+    """The errors of the masks of a scene; ``truth`` (N,) is label * 1000 + instance, 0 where void."""
+    errors = find_errors(overlaps)
+    mended = _MendedClasses(truth, overlaps, rules)
+    classes = [mended.of_error(error) for error in errors]
+    gains = [pool.gains(after) for after in _values_after(pool, classes)]
+    return [_told(error, overlaps, gain) for error, gain in zip(errors, gains, strict=True)]
+
+
+class _MendedClasses:
+    """The counts of the classes of a scene that one error moves: masks of other classes are as they were."""
+
+    def __init__(self, truth: Int64Array, overlaps: Overlaps, rules: ScoringRules) -> None:
+        self._overlaps, self._rules = overlaps, rules
+        self._segment_of_point, self._value, self._size = scene_counts.segments_of(truth)
+        masks = overlaps.predicted.masks
+        self._shared = scene_counts.intersections(
+            self._segment_of_point, len(self._value), masks.indptr, masks.indices, np.arange(len(masks))
+        )
+
+    def of_error(self, error: MaskError) -> dict[int, InstanceCounts]:
+        """The counts of each class that mending ``error`` moves, by its place among the scored ones."""
+        rules, predicted = self._rules, self._overlaps.predicted
+        repair = repaired(self._overlaps, [error])
+        touched, shared, size = repair.is_touched, self._shared, predicted.masks.sizes
+        if repair.points or repair.added:
+            shared, size = shared.copy(), size.copy()
+        for k, points in repair.points.items():
+            shared[k], size[k] = self._shared_by(points), len(points)
+        moved = {*predicted.class_ids[touched].tolist(), *repair.class_ids[touched].tolist()}
+        moved |= {class_id for _, class_id, _ in repair.added}
+        kept = repair.is_kept
+        if repair.added:
+            shared = np.concatenate([shared[kept], [self._shared_by(points) for points, _, _ in repair.added]])
+        else:
+            shared = shared[kept]
+        mended = LabelledMasks(
+            predicted.masks,
+            np.append(repair.class_ids[kept], np.array([one for _, one, _ in repair.added], np.int64)),
+            np.append(repair.scores[kept], np.array([one for _, _, one in repair.added], np.float64)),
+        )
+        size = np.append(size[kept], np.array([len(points) for points, _, _ in repair.added], np.int64))
+        is_large = size >= rules.min_region_size
+        answer = {}
+        for index in (index for index, class_id in enumerate(rules.class_ids) if class_id in moved):
+            rows = np.flatnonzero(is_large & (mended.class_ids == rules.class_ids[index]))
+            one = scene_counts.overlaps_of_class(
+                rules.class_ids[index], rows, shared[rows], size[rows], self._value, self._size, rules.class_ids,
+                rules.min_region_size,
+            )  # fmt: skip
+            answer[index] = one.counts(index, mended.scores, rules.thresholds, forgives_void=rules.forgives_void)
+        return answer
+
+    def _shared_by(self, points: IntArray) -> Int64Array:
+        return np.bincount(self._segment_of_point[points], minlength=len(self._value)).astype(np.int64)
+
+
+def _values_after(pool: Pool[InstanceCounts], mended: Sequence[Mapping[int, InstanceCounts]]) -> Iterator[Values]:
+    """The metrics after each mending: the curves of the classes that it moves are formed again, the others stay."""
+    thresholds = pool.metric.rules.thresholds
+    before = instance_ap.combine([pool.mine, *pool.others], thresholds).table
+    others: dict[int, list[InstanceCounts]] = {}
+    changed = []
+    for of_classes in mended:
+        for index, counts in of_classes.items():
+            if index not in others:
+                others[index] = [instance_ap.only(one, index) for one in pool.others]
+            alone = replace(counts, class_index=np.zeros_like(counts.class_index))
+            changed.append(instance_ap.concatenate([alone, *others[index]]))
+    curves = iter(instance_ap.combine_each(changed, thresholds) if changed else [])
+    for of_classes in mended:
+        table = before.copy()
+        for index in of_classes:
+            table[index] = next(curves).table[0]
+        after = instance_ap.of_table(table, thresholds)
+        named = {"AP": after.ap, "AP50": after.ap50, "AP25": after.ap25}
+        yield {name: named[name] for name in pool.before}
+
+
+def _told(error: MaskError, overlaps: Overlaps, gains: Values) -> SingleError:
+    predicted = overlaps.predicted
+    first = error.masks[0] if error.masks else None
+    score = None if first is None else float(predicted.scores[first])
+    # a split object is told by all its parts, a repeated one by the mask that repeats
+    shown = error.masks if error.kind == "split" else error.masks[:1]
+    of_masks = tuple(predicted.masks.mask(k) for k in shown)
+    of_truth = tuple(overlaps.members[g] for g in error.instances)
+    if first is not None:
+        iou = float(overlaps.iou[first, error.instances[0]] if error.instances else overlaps.iou[first].max(initial=0))
+    else:
+        iou = float(overlaps.iou[:, error.instances[0]].max(initial=0))
+    true = dict.fromkeys(int(overlaps.class_of_instance[g]) for g in error.instances)
+    called = dict.fromkeys(int(predicted.class_ids[k]) for k in shown)
+    return SingleError(error.kind, tuple(true), tuple(called), shown, score, iou, gains, of_masks, of_truth)
+
+
+def single_point_errors(
+    points: LabelledPoints, is_counted: BoolArray, pool: Pool[SemanticCounts], *, has_masks: bool, most: int
+) -> tuple[int, list[SingleError]]:
+    """How many errors the points of a scene have, and the ``most`` that cost most of the first headline metric."""
+    cause = causes_of(points, has_masks=has_masks)
+    wrong = np.flatnonzero((cause >= 0) & is_counted[points.true_class])
+    n_classes = len(is_counted)
+    keys = np.stack([points.object_id[wrong], points.true_class[wrong], cause[wrong], points.predicted[wrong]], axis=1)
+    groups, of_group = np.unique(keys, axis=0, return_inverse=True) if len(keys) else (keys, np.zeros(0, np.int64))
+    of_group = of_group.reshape(-1)
+    n_points = np.bincount(of_group, minlength=len(groups))
+    gains = []
+    for (_, true, _, called), n in zip(groups.tolist(), n_points.tolist(), strict=True):
+        confusion = pool.mine.confusion.copy()
+        confusion[true, called if called >= 0 else n_classes] -= n
+        confusion[true, true] += n
+        gains.append(pool.gains(pool.values(SemanticCounts(confusion, pool.mine.is_present))))
+    headline = pool.metric.rules.headline
+    first = np.array([gain[headline[0]] for gain in gains])
+    order = np.lexsort((np.arange(len(groups)), -n_points, -first))[:most].tolist()
+    answer = []
+    for k in order:
+        object_id, true, kind, called = groups[k].tolist()
+        predicted = wrong[of_group == k]
+        truth = np.flatnonzero(points.is_scored & (points.object_id == object_id) & (points.true_class == true))
+        answer.append(
+            SingleError(
+                kind=CAUSES[kind],
+                true=(true,),
+                called=(called,),
+                masks=tuple(np.unique(points.mask[predicted][points.mask[predicted] >= 0]).tolist()),
+                score=None,
+                iou=None,
+                gains=gains[k],
+                predicted=(predicted,),
+                truth=(truth,),
+            )
+        )
+    return len(groups), answer
+
 
 NO_CLASS = "none"
 

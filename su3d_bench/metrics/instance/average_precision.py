@@ -8,7 +8,9 @@ forms ratios.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -17,8 +19,155 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array
-from su3d_bench.metrics.instance.precision_recall import average_precisions
 from su3d_bench.metrics.metric import Arrays, Counts
+from su3d_bench.numerics.statistics import row_means
+
+_SPLITTER = 134217729.0  # 2**27 + 1: Veltkamp's constant, cuts a double into two halves of 26 bits
+ROWS_AT_ONCE = 1 << 20  # of the curves that are formed side by side, which bounds the memory that they take
+
+
+def average_precision(scores: Float64Array, is_true: BoolArray, n_missed: int) -> float:
+    """Area under the raw precision-recall polyline, one vertex a distinct score and the vertex (recall 0, precision 1).
+
+    Rows are the counted predictions of one class; 0 where there is none (pull request 26).
+
+    >>> average_precision(np.array([1.0, 1.0, 1.0]), np.array([True, True, False]), 2)  # recall (1 + precision) / 2
+    0.41666666666666663
+    """
+    cell = np.zeros(len(scores), np.int64)
+    return float(average_precisions(cell, scores, is_true, np.array([n_missed]), np.array([True]))[0])
+
+
+def average_precisions(
+    cell: Int64Array, score: Float64Array, is_true: BoolArray, n_missed: Int64Array, is_wanted: BoolArray
+) -> Float64Array:
+    """``average_precision`` of the rows of each cell, NaN where it is not wanted.
+
+    ``cell`` (E,), ``score`` (E,) and ``is_true`` (E,) are one row a counted prediction, ``n_missed`` and ``is_wanted``
+    one value a cell.
+    """
+    rows = np.flatnonzero(is_wanted[cell])
+    order = rows[np.argsort(score[rows])]  # the order of equal scores moves no curve
+    order = order[np.argsort(cell[order].astype(np.min_scalar_type(len(n_missed))), kind="stable")]
+    bounds = np.searchsorted(cell[order], np.arange(len(n_missed) + 1))
+    score, is_true = score[order], is_true[order]
+    values = np.where(is_wanted, 0.0, np.nan)
+    with_rows = np.flatnonzero(np.diff(bounds))
+    starts, ends = bounds[with_rows], bounds[with_rows + 1]
+    first = 0
+    while first < len(with_rows):
+        last = max(first + 1, int(np.searchsorted(ends, starts[first] + ROWS_AT_ONCE, side="right")))
+        own = slice(starts[first], ends[last - 1])
+        cells = with_rows[first:last]
+        values[cells] = _areas(score[own], is_true[own], starts[first:last] - own.start, n_missed[cells])
+        first = last
+    return values
+
+
+def _areas(score: Float64Array, is_true: BoolArray, starts: Int64Array, n_missed: Int64Array) -> Float64Array:
+    """The area (C,) of each cell; its rows begin at ``starts`` (C,) and come with rising score, and it has some."""
+    n_rows = np.diff(starts, append=len(score))
+    is_vertex = np.append(True, score[1:] != score[:-1])
+    is_vertex[starts] = True
+    row, cell = np.flatnonzero(is_vertex), np.repeat(np.arange(len(starts)), n_rows)[is_vertex]
+    n_true_before = np.append(0, np.cumsum(is_true))
+    n_true = n_true_before[starts + n_rows] - n_true_before[starts]
+    hits = n_true_before[starts + n_rows][cell] - n_true_before[row]
+    # behind the vertices of each cell come the vertex (recall 0, precision 1) and a second recall of 0
+    n_vertices = np.bincount(cell)
+    ends = np.cumsum(n_vertices + 2)
+    at = np.arange(len(row)) + 2 * cell
+    precision, recall = np.ones(ends[-1]), np.zeros(ends[-1])
+    precision[at] = hits / ((starts + n_rows)[cell] - row)
+    # every instance is either a true positive at some score or missed, so the denominator is one constant
+    with np.errstate(invalid="ignore"):
+        recall[at] = hits / (n_true + n_missed)[cell]
+    # convolution with (-1/2, 0, 1/2): halving is exact, so this equals numpy.convolve in every bit
+    width = np.zeros(ends[-1])
+    width[1:-1] = 0.5 * (recall[:-2] - recall[2:])
+    begins = ends - n_vertices - 2
+    width[begins] = 0.5 * (recall[begins] - recall[begins + 1])
+    return dots(precision, width, begins, n_vertices + 1)
+
+
+# numpy hands ``np.dot`` to the BLAS, whose order of additions differs between processors: the same curve ends in
+# another last bit on AVX2 than on AVX-512. The reference answers of the original evaluators come from OpenBLAS's
+# AVX-512 kernel (kernel/x86_64/ddot_microk_skylakex-2.c, and the tail loop of ddot.c): we add in that order,
+# in plain double arithmetic, many curves side by side.
+def dots(left: Float64Array, right: Float64Array, starts: Int64Array, lengths: Int64Array) -> Float64Array:
+    """The sum of products of each stretch, added as OpenBLAS's AVX-512 kernel adds them with fused multiply-adds.
+
+    Values must be far from overflow and underflow, as precisions and recall steps are.
+
+    >>> dots(np.array([1.0, 0.5, 0.25]), np.array([0.5, 0.25, 0.25]), np.array([0, 1]), np.array([3, 2])).tolist()
+    [0.6875, 0.1875]
+    """
+    products = _exact_products(left, right)
+    n_blocked = lengths - lengths % 16
+    n_wide = n_blocked - n_blocked % 32
+    wide = _chains(*products, starts, n_wide // 32, np.zeros((len(starts), 32)))
+    # the halves of each 512-bit register fold into one of 256 bits, which takes the last block of 16
+    halves = wide.reshape(-1, 4, 2, 4)
+    lanes = (halves[:, :, 0] + halves[:, :, 1]).reshape(-1, 16)
+    fours = _chains(*products, starts + n_wide, (n_blocked - n_wide) // 16, lanes).reshape(-1, 4, 4)
+    four = ((fours[:, 0] + fours[:, 1]) + fours[:, 2]) + fours[:, 3]
+    total = (four[:, 0] + four[:, 2]) + (four[:, 1] + four[:, 3])
+    return _chains(*products, starts + n_blocked, lengths - n_blocked, total[:, None])[:, 0]
+
+
+def _chains(
+    product: Float64Array, error: Float64Array, starts: Int64Array, n_steps: Int64Array, totals: Float64Array
+) -> Float64Array:
+    """``totals`` (C, lanes) plus, a step each, the next exact products of every lane, rounded once a step."""
+    order = np.argsort(-n_steps, kind="stable")
+    totals, lanes = totals[order], np.arange(totals.shape[1])
+    n_left = np.searchsorted(-n_steps[order], -np.arange(n_steps.max(initial=0)), side="left")
+    for step, n in enumerate(n_left.tolist()):
+        at = starts[order[:n], None] + (step * len(lanes) + lanes)
+        totals[:n] = _rounded_once(product[at], error[at], totals[:n])
+    back = np.empty_like(totals)
+    back[order] = totals
+    return back
+
+
+def _rounded_once(product: Float64Array, error: Float64Array, total: Float64Array) -> Float64Array:
+    """``product + error + total`` as a fused multiply-add gives it, where ``error`` is what rounding took.
+
+    The sum of what two exact additions leave over is rounded to odd, so that the last addition rounds right (Boldo and
+    Melquiond, Emulation of FMA and correctly rounded sums, IEEE Transactions on Computers 57, 2008).
+    """
+    high, low = _exact_sums(total, error)
+    high, middle = _exact_sums(product, high)
+    rest, lost = _exact_sums(low, middle)
+    bits = rest.view(np.int64)
+    is_even = (lost != 0) & (bits & 1 == 0)
+    bits += np.where(is_even, np.where((lost > 0) == (rest > 0), 1, -1), 0)
+    return high + rest
+
+
+def _exact_sums(left: Float64Array, right: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Knuth's sum: rounded sums and what rounding took from them; the two add up to the exact sums."""
+    total = left + right
+    part = total - left
+    return total, (left - (total - part)) + (right - part)
+
+
+def _exact_products(left: Float64Array, right: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Dekker's product: rounded products and what rounding took from them; the two add up to the exact products."""
+    product = left * right
+    left_high, left_low = _halves(left)
+    right_high, right_low = _halves(right)
+    error = left_low * right_low - (
+        ((product - left_high * right_high) - left_low * right_high) - left_high * right_low
+    )
+    return product, error
+
+
+def _halves(values: Float64Array) -> tuple[Float64Array, Float64Array]:
+    scaled = _SPLITTER * values
+    high = scaled - (scaled - values)
+    return high, values - high
+
 
 # arange(0.5, 0.95, 0.05) excludes its end: nine thresholds up to 0.90, as these doubles; then 0.25
 THRESHOLDS: tuple[float, ...] = (*(float(t) for t in np.arange(0.5, 0.95, 0.05)), 0.25)
@@ -237,3 +386,107 @@ def _nanmean(values: Float64Array) -> float:
     filled = values.copy(order="K")
     filled[is_nan] = 0.0
     return float(filled.sum() / n) if n else float("nan")
+
+
+MANY_ROWS = 20_000  # from there on compiled loops win back the time that they take to load
+AT_ONCE = 64  # resamples that go through the rows side by side: their counts stay in the nearest cache
+_MAX_CELLS = 4_000_000  # of a (resamples, rows) block: 32 MB of float64
+
+
+def resampled_ap(
+    counts: Sequence[InstanceCounts], weights: Int64Array, thresholds: Sequence[float] = THRESHOLDS
+) -> dict[str, Float64Array]:
+    """AP, AP50 and AP25 (R,) of the scenes drawn ``weights`` (R, S) times, equal to ``combine`` up to rounding.
+
+    >>> from su3d_bench.metrics.instance.scene_counts import per_scene
+    >>> hit = per_scene(np.full(120, 7004), np.array([0, 120]), np.arange(120), np.array([7]), np.ones(1), [7])
+    >>> miss = per_scene(np.full(120, 7009), np.array([0]), np.arange(0), np.zeros(0, int), np.ones(0), [7])
+    >>> resampled_ap([hit, miss], np.array([[2, 0], [1, 1], [0, 2]]))["AP"].tolist()
+    [1.0, 0.5, 0.0]
+    """
+    n_classes, n_thresholds = counts[0].n_missed.shape
+    scene = np.concatenate([np.full(len(c.score), s, np.int64) for s, c in enumerate(counts)])
+    score = np.concatenate([c.score for c in counts])
+    is_true = np.concatenate([c.is_true for c in counts])
+    cell = np.concatenate([c.class_index.astype(np.int64) * n_thresholds + c.threshold_index for c in counts])
+    order = np.lexsort((-score, cell))
+    rows = _Rows(scene[order], score[order], is_true[order])
+    bounds = np.searchsorted(cell[order], np.arange(n_classes * n_thresholds + 1))
+    n_truth = weights @ np.stack([c.n_truth for c in counts])
+    resampled_areas = _compiled_areas if len(score) >= MANY_ROWS else _drawn_areas
+    table = resampled_areas(rows, bounds, n_truth, weights).reshape(len(weights), n_classes, n_thresholds)
+    table[n_truth == 0] = np.nan
+    return {
+        "AP": row_means(table[:, :, ap_columns(thresholds)].reshape(len(weights), -1)),
+        "AP50": row_means(table[:, :, tuple(thresholds).index(0.5)]),
+        "AP25": row_means(table[:, :, tuple(thresholds).index(0.25)]),
+    }
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """The counted predictions of one class and threshold after another, with falling score in each."""
+
+    scene: Int64Array
+    score: Float64Array
+    is_true: BoolArray
+
+
+def _drawn_areas(rows: _Rows, bounds: Int64Array, n_truth: Int64Array, weights: Int64Array) -> Float64Array:
+    """Area (R, cells) under each resample's polylines; ``bounds`` of the cells' rows, ``n_truth`` (R, C)."""
+    areas = np.zeros((len(weights), len(bounds) - 1))
+    n_thresholds = areas.shape[1] // n_truth.shape[1]
+    for c in np.flatnonzero(n_truth.any(axis=0)):
+        for cell in range(c * n_thresholds, (c + 1) * n_thresholds):
+            own = slice(bounds[cell], bounds[cell + 1])
+            areas[:, cell] = _weighted_areas(
+                rows.score[own], rows.is_true[own], rows.scene[own], n_truth[:, c], weights
+            )
+    return areas
+
+
+def _compiled_areas(rows: _Rows, bounds: Int64Array, n_truth: Int64Array, weights: Int64Array) -> Float64Array:
+    """``_drawn_areas`` of many rows, up to rounding, by compiled loops on all cores."""
+    from su3d_bench.metrics.instance.kernels import resampled_areas
+
+    areas = np.zeros((len(bounds) - 1, len(weights)))
+    class_of_cell = np.repeat(np.arange(n_truth.shape[1]), len(areas) // n_truth.shape[1])
+    is_last = np.diff(rows.score, append=np.nan) != 0
+    is_last[bounds[1:][bounds[1:] > 0] - 1] = True
+    scene = rows.scene.astype(np.int32)
+
+    def fill(start: int) -> None:
+        own = slice(start, start + AT_ONCE)
+        drawn = np.ascontiguousarray(weights[own].T, np.int32)
+        instances = np.ascontiguousarray(n_truth[own].T, np.int32)
+        areas_of_block = np.empty((len(areas), drawn.shape[1]))
+        resampled_areas(scene, rows.is_true, is_last, bounds, class_of_cell, instances, drawn, areas_of_block)
+        areas[:, own] = areas_of_block
+
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        list(threads.map(fill, range(0, len(weights), AT_ONCE)))  # raises what a thread raised
+    return np.ascontiguousarray(areas.T)  # the order of later sums follows the layout; so does the last bit
+
+
+def _weighted_areas(
+    score: Float64Array, is_true: BoolArray, scene: Int64Array, n_truth: Int64Array, weights: Int64Array
+) -> Float64Array:
+    """Area under each resample's precision-recall polyline; rows come with falling score.
+
+    A vertex without weight repeats its neighbour and adds no area, so all resamples share the vertices of the whole.
+    """
+    if not len(score):
+        return np.zeros(len(weights))
+    last_of_score = np.flatnonzero(np.append(np.diff(score) != 0, True))
+    areas = np.empty(len(weights))
+    step = max(1, _MAX_CELLS // len(score))
+    for start in range(0, len(weights), step):
+        drawn = weights[start : start + step][:, scene]
+        n_counted = np.cumsum(drawn, axis=1)[:, last_of_score].astype(np.float64)
+        n_hit = np.cumsum(drawn * is_true, axis=1)[:, last_of_score].astype(np.float64)
+        precision = np.divide(n_hit, n_counted, out=np.ones_like(n_hit), where=n_counted > 0)
+        recall = n_hit / np.maximum(n_truth[start : start + step, None], 1)
+        precision = np.concatenate([np.ones((len(drawn), 1)), precision], axis=1)
+        recall = np.concatenate([np.zeros((len(drawn), 1)), recall], axis=1)
+        areas[start : start + step] = (np.diff(recall, axis=1) * (precision[:, 1:] + precision[:, :-1]) / 2).sum(axis=1)
+    return areas

@@ -15,8 +15,7 @@ from su3d_bench.core.maps import Instances, Masks, Partition
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import scene_counts
-from su3d_bench.metrics.instance.average_precision import InstanceAP, InstanceCounts
-from su3d_bench.metrics.instance.resampling import resampled_ap
+from su3d_bench.metrics.instance.average_precision import InstanceAP, InstanceCounts, resampled_ap
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.checks import duplicate_pairs
 from su3d_bench.metrics.matching.labelling import (

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.files.scratch import row_blocks
+from su3d_bench.core.files.atomic import row_blocks
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Prediction
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array

@@ -4,25 +4,146 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.files.scratch import release_pages
+from su3d_bench.core.errors import DataError, PredictionError
+from su3d_bench.core.files.atomic import release_pages
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition, Prediction
 from su3d_bench.core.types import Float32Array, Float64Array, Int64Array
+from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.instance import scene_counts
+from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.instance.score import CurveMetric, score_of_masks
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, has_every_label, text_features
 from su3d_bench.metrics.matching.votes import transfer_each_mask
 from su3d_bench.metrics.metric import Metric, Pooled, SceneScore
-from su3d_bench.metrics.open_vocabulary import openlex3d, query_ap
-from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
-from su3d_bench.metrics.open_vocabulary.query_ap import ObjectCounts, QueryTruth
+from su3d_bench.metrics.open_vocabulary import openlex3d
+from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectCounts, OpenLexTruth
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.score import has_feature
+
+SPACE = "queries"
+_SMALLEST_RANGE = 1e-8  # openlex3d's floor of the range over which similarities are stretched
+
+
+@dataclass(frozen=True)
+class TextQuery:
+    """A text and the ids of the objects that it speaks of.
+
+    ``groups``: those in which it is scored apart from others, such as ``unique``; ``name``: what the file calls the
+    object, '' where it does not.
+    """
+
+    text: str
+    object_ids: tuple[int, ...]
+    groups: tuple[str, ...] = ()
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        if len(set(self.object_ids)) != len(self.object_ids):
+            raise DataError(f"query '{self.text[:60]}': an object stands there twice; name each once")
+
+
+@dataclass(frozen=True)
+class QueryTruth:
+    """Objects of a scene and the texts that ask for them.
+
+    ``points`` (N, 3) float32 m, ``object_of_point`` (N,) int64, -1 for none. ``alignment`` (4, 4): the rigid motion
+    into the frame whose axes are the walls, where the dataset has one that its points were not moved by.
+    """
+
+    points: Float32Array
+    object_of_point: Int64Array
+    queries: tuple[TextQuery, ...]
+    variant: str
+    source: str
+    space: str = SPACE
+    alignment: Float64Array | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.points)
+        if self.points.shape != (n, 3) or self.object_of_point.shape != (n,):
+            raise DataError(
+                f"ground truth '{self.variant}': points {self.points.shape} and objects {self.object_of_point.shape} "
+                "do not agree"
+            )
+
+
+def confidences(similarity: Float64Array, rule: Literal["similarity", "similarity-min-max"]) -> Float64Array:
+    """The confidence (K, Q) of each mask for each query: its cosine, or that stretched to 0..1 over the masks.
+
+    Under ``similarity-min-max`` the best mask of every query has confidence 1, however little it resembles the text.
+
+    >>> confidences(np.array([[0.5, 0.1], [0.0, 0.1], [-0.5, 0.1]]), "similarity-min-max").tolist()
+    [[1.0, 0.0], [0.5, 0.0], [0.0, 0.0]]
+    """
+    if rule == "similarity" or not len(similarity):
+        return similarity
+    halved = (similarity + 1.0) / 2.0
+    low, high = halved.min(axis=0), halved.max(axis=0)
+    stretched: Float64Array = (halved - low) / np.maximum(high - low, _SMALLEST_RANGE)
+    return stretched
+
+
+def per_scene(
+    object_of_point: Int64Array,
+    queries: Sequence[TextQuery],
+    masks: Masks,
+    confidence: Float64Array,
+    *,
+    top_k: int | None = None,
+    min_region_size: int = 1,
+    thresholds: Sequence[float] = instance_ap.THRESHOLDS,
+    matches_by_confidence: bool = True,
+) -> InstanceCounts:
+    """The additive counts of one scene: ``masks`` over its points with ``confidence`` (K, Q) for each query.
+
+    The ``top_k`` masks of each query count, the first of equals, and of these those of the minimum size. Objects below
+    it are no instances; a query that is left without one still has its false positives. An object is matched with the
+    masks by falling confidence or, as ScanNet's script and those made from it do, in their own order.
+
+    >>> masks = Masks(np.array([0, 2, 4]), np.array([0, 1, 2, 3]))
+    >>> found = TextQuery("seat", (7,)), TextQuery("lamp", (8,))
+    >>> objects = np.array([7, 7, 8, 8])
+    >>> counts = per_scene(objects, found, masks, np.array([[0.9, 0.2], [0.1, 0.8]]))
+    >>> instance_ap.combine([counts]).ap
+    1.0
+    """
+    ids, segment_of_point, size_of_object = np.unique(object_of_point, return_inverse=True, return_counts=True)
+    n_masks = len(masks)
+    size = masks.sizes
+    shared = scene_counts.intersections(segment_of_point, len(ids), masks.indptr, masks.indices, np.arange(n_masks))
+    iou = shared / (size_of_object[None, :] + size[:, None] - shared)
+    column_of = {int(object_id): column for column, object_id in enumerate(ids) if object_id >= 0}
+    order = np.argsort(-confidence, axis=0, kind="stable")[:top_k]
+    if not matches_by_confidence:
+        order = np.sort(order, axis=0)
+    parts = [_no_counts(thresholds)]
+    for q, query in enumerate(queries):
+        columns = [column_of[object_id] for object_id in query.object_ids if object_id in column_of]
+        takes_part = size_of_object[columns] >= min_region_size
+        rows = order[size[order[:, q]] >= min_region_size, q]
+        of_query = scene_counts.count_class(
+            0,
+            iou=iou[np.ix_(rows, np.array(columns, np.int64)[takes_part])],
+            takes_part=np.ones(int(takes_part.sum()), bool),
+            scores=confidence[rows, q],
+            ignored_share=np.zeros(len(rows)),
+            thresholds=thresholds,
+        )
+        parts.append(of_query)
+    return instance_ap.concatenate(parts)
+
+
+def _no_counts(thresholds: Sequence[float]) -> InstanceCounts:
+    none = np.zeros(0)
+    return scene_counts.count_class(0, np.zeros((0, 0)), none.astype(bool), none, none, thresholds)
+
 
 _NOT_KNOWN = "what the truth itself would score is not known"
 NO_CEILING = (
@@ -64,11 +185,11 @@ class CategoriesMetric(Metric[ObjectCounts]):
         return {"values": len(self.rules.value_names)}
 
     def pooled(self, counts: Sequence[ObjectCounts]) -> Pooled:
-        means = query_ap.combine(counts)
+        means = openlex3d.combine(counts)
         return Pooled(dict(zip(self.rules.value_names, means.tolist(), strict=True)))
 
     def resampled(self, counts: Sequence[ObjectCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
-        values = query_ap.resampled(counts, weights)
+        values = openlex3d.resampled(counts, weights)
         return dict(zip(self.rules.value_names, values.T, strict=True))
 
 
@@ -233,11 +354,11 @@ class QueryMetric(CurveMetric):
             features, known = _features(rules, prediction, encoder)
             text = text_features(rules, [query.text for query in truth.queries], features, known)
             similarity = cosines(features, text, device_of(known))
-        counts = query_ap.per_scene(
+        counts = per_scene(
             truth.object_of_point,
             truth.queries,
             _moved(rules, prediction.points, masks, truth.points),
-            query_ap.confidences(similarity, rules.confidence),
+            confidences(similarity, rules.confidence),
             top_k=rules.top_k,
             min_region_size=rules.min_region_size,
             thresholds=rules.thresholds,

@@ -96,6 +96,7 @@ class BoxRules(ProtocolRules):
     }
     needs_own_points = True
     needs_boxes = True
+    transfers = False
     confidences = ("ones", "prediction")
     needs = ("classes", "vocabulary", "box_axes")
     takes = CURVE_FIELDS
@@ -106,11 +107,6 @@ class BoxRules(ProtocolRules):
             raise ValueError("thresholds: kind 'boxes' takes [0.25, 0.5]")
         if self.box_axes == "aligned":
             raise ValueError("box_axes: kind 'boxes' takes 'truth' or 'world'")
-
-    def _check_transfer(self) -> None:
-        super()._check_transfer()
-        if self.transfer.cap_m is not None or self.transfer.evaluation_voxel_m > 0:
-            raise ValueError("transfer.cap_m: kind 'boxes' transfers nothing; it takes no cap_m, no evaluation_voxel_m")
 
 
 class QueryRules(ProtocolRules):
@@ -161,6 +157,7 @@ class GroundingRules(ProtocolRules):
         "referit3d": ("accuracy", "easy", "hard", "view-dependent", "view-independent"),
     }
     needs_own_points = True
+    transfers = False
     text_metrics = ("scanrefer", "referit3d")
     needs = ("box_axes",)
 
@@ -168,8 +165,6 @@ class GroundingRules(ProtocolRules):
         super()._check_transfer()
         if self.box_axes not in ("world", "aligned"):
             raise ValueError("box_axes: kind 'grounding' takes 'world' or 'aligned'")
-        if self.transfer.cap_m is not None or self.transfer.evaluation_voxel_m > 0:
-            raise ValueError("transfer.cap_m: kind 'grounding' transfers nothing; no cap_m, no evaluation_voxel_m")
 
 
 class RelationRules(ProtocolRules):
@@ -199,11 +194,7 @@ class _GraphRules(ProtocolRules):
     """Parts of a scene graph, matched one to one with the true ones."""
 
     needs_own_points = True
-
-    def _check_transfer(self) -> None:
-        super()._check_transfer()
-        if self.transfer.cap_m is not None or self.transfer.evaluation_voxel_m > 0:
-            raise ValueError(f"transfer.cap_m: kind '{self.kind}' transfers nothing; no cap_m, no evaluation_voxel_m")
+    transfers = False
 
 
 class ObjectRules(_GraphRules):
@@ -287,6 +278,7 @@ class PresenceQuestionRules(ProtocolRules):
 
     is_judged = True
     needs_own_points = True
+    transfers = False
     values_of_metric: ClassVar[ValuesOfMetric] = {
         "pope": tuple(
             f"{measure} {sampling}"
@@ -301,11 +293,6 @@ class PresenceQuestionRules(ProtocolRules):
         if self.questions == "dataset":
             raise ValueError("questions: kind 'presence' takes 'generated'")
         return self.needs
-
-    def _check_transfer(self) -> None:
-        super()._check_transfer()
-        if self.transfer.cap_m is not None or self.transfer.evaluation_voxel_m > 0:
-            raise ValueError("transfer.cap_m: kind 'presence' transfers nothing; no cap_m, no evaluation_voxel_m")
 
 
 class AnnotationRules(_JudgedRules):

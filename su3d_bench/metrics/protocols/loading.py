@@ -16,8 +16,7 @@ from typing import Annotated, Any, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from su3d_bench.core.errors import ConfigError, suggest
-from su3d_bench.core.system.files import file_text
-from su3d_bench.core.toml import parse_toml
+from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.metrics.protocols.kinds import RULES_OF_KIND
 from su3d_bench.metrics.protocols.model import SECTIONS, ProtocolRules
 

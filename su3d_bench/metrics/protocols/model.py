@@ -210,6 +210,7 @@ class ProtocolRules(_Strict):
     names_points: ClassVar[bool] = False  # a class for every point
     needs_instances: ClassVar[bool] = False  # in the truth and in the prediction
     takes_votes: ClassVar[bool] = False  # of several neighbours
+    transfers: ClassVar[bool] = True  # masks or classes to the points of the truth
     text_metrics: ClassVar[tuple[str, ...]] = ()  # compare features with texts whatever labels there are
     ignores_classes: ClassVar[bool] = True  # ``ignore`` and ``prompt_names`` speak of ``classes``
     needs: ClassVar[tuple[str, ...]] = ()  # those of OWN_FIELDS that must be there
@@ -270,6 +271,8 @@ class ProtocolRules(_Strict):
 
     def _check_transfer(self) -> None:
         transfer = self.transfer
+        if not self.transfers and (transfer.cap_m is not None or transfer.evaluation_voxel_m > 0):
+            raise ValueError(f"transfer.cap_m: kind '{self.kind}' transfers nothing; no cap_m, no evaluation_voxel_m")
         if transfer.candidates not in self.candidates:
             names = " or ".join(f"'{name}'" for name in self.candidates)
             raise ValueError(f"transfer.candidates: kind '{self.kind}' takes {names}")

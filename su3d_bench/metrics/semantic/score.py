@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.core.files.scratch import row_blocks
+from su3d_bench.core.files.atomic import row_blocks
 from su3d_bench.core.geometry import voxel_coordinates
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Partition, Prediction

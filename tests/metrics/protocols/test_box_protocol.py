@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float64Array, GroundTruth, LabelSet, ObjectBoxes, OrientedBox
 from su3d_bench.datasets.replica.checks import box_truth
 from su3d_bench.metrics.fitness import ContentFacts, TruthFacts, why_not_content, why_not_truth
-from su3d_bench.metrics.instance.boxes import THRESHOLDS, BoxCounts, box_iou, count_boxes, shared_volume, smallest_box
+from su3d_bench.metrics.instance.boxes import BoxCounts, box_iou, count_boxes, shared_volume, smallest_box
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
@@ -199,54 +198,6 @@ def test_the_class_is_that_of_the_best_instance_on_a_box() -> None:
     assert values(counted([[0.9]], [0], [-1], [0.5]))["class"] == 0.0  # of none of the classes
 
 
-def plain_ap(rows: list[tuple[float, bool]], n_truth: int) -> float:
-    """The area under the envelope, one vertex a confidence, in plain loops."""
-    points = [(0.0, 1.0)]
-    for confidence in sorted({score for score, _ in rows}, reverse=True):
-        taken = [is_true for score, is_true in rows if score >= confidence]
-        points.append((sum(taken) / n_truth, sum(taken) / len(taken)))
-    return sum(
-        (here[0] - before[0]) * max(p for _, p in points[i + 1 :]) for i, (before, here) in enumerate(pairwise(points))
-    )
-
-
-def plain_values(scenes: list[Problem], n_classes: int) -> dict[str, float]:
-    """All numbers of scenes (iou, true, called, scores) in plain loops over one box and instance at a time."""
-    answer, n_true, n_rows = dict[str, float](), dict.fromkeys(THRESHOLDS, 0), 0
-    for threshold in THRESHOLDS:
-        areas, recalls = [], []
-        for c in range(n_classes):
-            rows, n_truth = [], 0
-            for iou, true, called, scores in scenes:
-                columns = [g for g, each in enumerate(true) if each == c]
-                n_truth += len(columns)
-                taken = set()
-                for k in sorted((k for k, each in enumerate(called) if each == c), key=lambda k: -scores[k]):
-                    best = max(columns, key=lambda g: iou[k, g], default=None)
-                    is_true = best is not None and iou[k, best] > threshold and best not in taken
-                    taken |= {best} if is_true else set()
-                    rows.append((scores[k], is_true))
-            n_true[threshold] += sum(is_true for _, is_true in rows)
-            n_rows += len(rows)
-            if n_truth:
-                areas.append(plain_ap(rows, n_truth))
-                recalls.append(sum(is_true for _, is_true in rows) / n_truth)
-        place = f"{100 * threshold:.0f}"
-        answer[f"AP{place}"], answer[f"recall{place}"] = float(np.mean(areas)), float(np.mean(recalls))
-    n_rows //= len(THRESHOLDS)
-    answer |= {f"precision{100 * t:.0f}": n_true[t] / n_rows for t in THRESHOLDS}
-    located = named = centred = n_boxes = 0
-    for iou, true, called, scores in scenes:
-        for g, c in enumerate(true):
-            n_boxes += 1
-            centred += any(iou[k, g] > 0 and called[k] == c for k in range(len(called)))
-            on = [k for k in range(len(called)) if iou[k].argmax() == g and iou[k, g] > 0.25]
-            if on:
-                located += 1
-                named += called[max(on, key=lambda k: (scores[k], iou[k, g]))] == c
-    return answer | {"centroid": centred / n_boxes, "class": named / located}
-
-
 def random_scenes(rng: np.random.Generator, n_classes: int) -> list[Problem]:
     scenes = []
     for _ in range(rng.integers(1, 5)):
@@ -255,23 +206,6 @@ def random_scenes(rng: np.random.Generator, n_classes: int) -> list[Problem]:
         called = rng.integers(-1, n_classes, k).tolist()
         scenes.append((iou, rng.integers(0, n_classes, g).tolist(), called, (rng.integers(0, 6, k) / 5).tolist()))
     return scenes
-
-
-def test_the_numbers_of_random_problems_are_those_of_plain_loops() -> None:
-    rng = np.random.default_rng(8)
-    n_compared = 0
-    for _ in range(200):
-        scenes = random_scenes(rng, 3)
-        counts = [counted(iou.tolist(), true, called, scores, 3) for iou, true, called, scores in scenes]
-        if sum(len(one.score) for one in counts) and sum(one.n_located.sum() for one in counts):
-            expected, found = plain_values(scenes, 3), values(*counts)
-            assert found.keys() == expected.keys()
-            for name, value in expected.items():
-                assert found[name] == pytest.approx(value, abs=1e-12), name
-            n_compared += 1
-        for one in counts:
-            BoxCounts.checked({name: getattr(one, name) for name in BoxCounts.arrays})
-    assert n_compared > 150
 
 
 def test_scenes_drawn_several_times_count_as_so_many_scenes() -> None:
@@ -355,16 +289,6 @@ def test_labels_outside_the_classes_and_an_empty_map_are_scored() -> None:
     for prediction in (map_of(("unicorn", CHAIR, 1.0)), map_of()):
         metrics = combine(RULES, {"a": score_of(truth, prediction)}).metrics
         assert (metrics["AP25"], metrics["centroid"]) == (0.0, 0.0)
-
-
-def test_scenes_together_have_intervals_and_one_confidence_a_warning() -> None:
-    truth = truth_of(("chair", CHAIR), ("sofa", SOFA))
-    both = map_of(("chair", CHAIR, 1.0), ("sofa", SOFA, 1.0))
-    scenes = {name: score_of(truth, both if name != "c" else map_of(("chair", CHAIR, 1.0))) for name in "abc"}
-    result = combine(RULES, scenes)
-    assert result.metrics["AP50"] == pytest.approx((1 + 2 / 3) / 2)
-    assert result.intervals["AP50"] is not None and result.intervals["AP50"][1] <= 1.0
-    assert any("every confidence is 1" in line for line in result.warnings)
 
 
 @pytest.mark.parametrize(

@@ -9,9 +9,9 @@ import pytest
 from scored_room import ENCODER, ID, instances, nothing, room, truth_as_prediction
 
 from su3d_bench.core.types import GroundTruth
-from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
+from su3d_bench.metrics.open_vocabulary.score import QueryTruth
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.metrics.questions.chains import TAGS, ChainedText, Place, judge_chains
+from su3d_bench.metrics.questions.grounding import TAGS, ChainedText, Place, judge_chains
 from su3d_bench.metrics.scoring import combine, pack_scores, plain_json, score_scene, unpack_scores
 from su3d_bench.questions.chains import chain_truth, chains_of
 from su3d_bench.questions.generator import generate

@@ -17,16 +17,18 @@ from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Floor, GroundTruth, LabelSet, Places, Room
 from su3d_bench.datasets.hm3dsem.dataset import Hm3dSem
-from su3d_bench.metrics.graphs.objects import (
+from su3d_bench.metrics.graphs import (
     FEW_LABELS,
+    NEEDS_PLACES,
     Cloud,
     MatchedObjects,
+    PlaceCounts,
     covered_share,
+    floor_bounds,
     larger_share,
     voxel_ids,
     voxel_means,
 )
-from su3d_bench.metrics.graphs.places import NEEDS_PLACES, PlaceCounts, floor_bounds
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ClassEntry
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, score_scene, unpack_scores

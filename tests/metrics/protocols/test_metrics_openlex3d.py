@@ -29,22 +29,25 @@ from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.open_vocabulary import openlex3d, score
 from su3d_bench.metrics.open_vocabulary.openlex3d import (
+    ObjectCounts,
     ObjectLabels,
     OpenLexTruth,
     category_table,
+    combine,
+    concatenate,
     count_categories,
     count_ranks,
     point_categories,
     rank_scores,
     ranked_labels,
+    resampled,
     scored_objects,
 )
-from su3d_bench.metrics.open_vocabulary.query_ap import ObjectCounts, combine, concatenate, resampled
 from su3d_bench.metrics.open_vocabulary.score import voxel_means
 from su3d_bench.metrics.protocols.kinds import CATEGORIES
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine as combine_scenes
-from su3d_bench.metrics.scoring import pack_scores, score_scene, unpack_scores
+from su3d_bench.metrics.scoring import score_scene
 
 GOLDEN = json.loads((CASES / "conceptgraphs_golden.json").read_text())
 TOPN, RANKING = load_protocol("openlex3d-topn"), load_protocol("openlex3d-ranking")
@@ -299,76 +302,6 @@ def noisy(seed: int) -> Any:
     return instances_with(truth.points, masks, whole.features + rng.random(whole.features.shape).astype(np.float32))
 
 
-@settings(max_examples=10, deadline=None)
-@given(seed=st.integers(0, 100), rules=st.sampled_from([TOPN, RANKING]))
-def test_a_plain_reading_of_the_rules_gives_the_same(seed: int, rules: Any) -> None:
-    truth, prediction = lex_truth(seed), noisy(seed)
-    plain = plain_topn if rules is TOPN else plain_ranking
-    assert values_of(rules, truth, prediction) == pytest.approx(plain(truth, prediction), abs=1e-9, nan_ok=True)
-
-
-def plain_units(prediction: Any) -> tuple[np.ndarray, np.ndarray]:
-    """A voxel grid by a dictionary, then the nearest point by comparing with all."""
-    owner = transfer.first_owner(transfer.masks_of(prediction), len(prediction.points))
-    points, owner = prediction.points[owner >= 0].astype(float), owner[owner >= 0]
-    cells: dict[tuple[int, ...], list[np.ndarray]] = {}
-    for point in points:
-        cells.setdefault(tuple(np.floor(point / 0.05).astype(int)), []).append(point)
-    means = np.array([np.mean(members, axis=0) for members in cells.values()])
-    return means, owner[[int(((points - mean) ** 2).sum(axis=1).argmin()) for mean in means]]
-
-
-def plain_nearest(truth: OpenLexTruth, prediction: Any) -> list[tuple[int, float, np.ndarray]]:
-    """Object, distance and prompt order (best first) of every point that has an object."""
-    means, owner = plain_units(prediction)
-    text = ENCODER.encode_texts(list(truth.prompts)).astype(float)
-    rows = []
-    for point, one in zip(truth.points, truth.object_of_point.tolist(), strict=True):
-        squared = ((means - point.astype(float)) ** 2).sum(axis=1)
-        feature = prediction.features[owner[squared.argmin()]].astype(float)
-        similarity = text @ feature / np.linalg.norm(feature)
-        rows.append((one, float(np.sqrt(squared.min())), np.argsort(-similarity, kind="stable")))
-    return rows
-
-
-def plain_topn(truth: OpenLexTruth, prediction: Any) -> dict[str, float]:
-    shares: dict[int, dict[str, float]] = {}
-    for one, distance, order in plain_nearest(truth, prediction):
-        labels = truth.objects.get(one)
-        if labels is None or not labels.synonyms or set(labels.synonyms) & set(TOPN.ignore):
-            continue
-        best = {truth.prompts[index] for index in order[:5]}
-        near = [truth.objects[other] for other in labels.clutter]
-        clutter = {word for o in near for word in (*o.synonyms, *o.depictions, *o.vis_sim)}
-        reached = [best & set(words) for words in (labels.synonyms, labels.depictions, labels.vis_sim, clutter)]
-        names = [name for name, hit in zip(CATEGORIES, reached, strict=False) if hit]
-        category = "missing" if distance > 0.05 else (names or ["incorrect"])[0]
-        share = shares.setdefault(one, dict.fromkeys(CATEGORIES, 0.0))
-        share[category] += 1 / int((truth.object_of_point == one).sum())
-    return {name: float(np.mean([share[name] for share in shares.values()])) for name in CATEGORIES}
-
-
-def plain_ranking(truth: OpenLexTruth, prediction: Any) -> dict[str, float]:
-    found: dict[str, dict[int, list[float]]] = {"overall": {}, "synonyms": {}, "secondary": {}}
-    for one, _, order in plain_nearest(truth, prediction):
-        if one not in truth.objects:
-            continue
-        labels = truth.objects[one]
-        rank = {truth.prompts[index]: place for place, index in enumerate(order)}
-        first = [word for word in labels.synonyms if word in rank]
-        second = [word for word in (*labels.depictions, *labels.vis_sim) if word in rank]
-        bounds = ((first, 0, len(first) - 1), (second, len(first), len(first) + len(second) - 1))
-        for name, (words, low, high) in zip(("synonyms", "secondary"), bounds, strict=True):
-            for word in words:
-                left = 1 + min(0, (rank[word] - low) / (low + 1e-8))
-                right = 1 - max(0, (rank[word] - high) / (len(truth.prompts) - 1 - high))
-                found[name].setdefault(one, []).append(min(left, right))
-                found["overall"].setdefault(one, []).append(min(left, right))
-    return {
-        name: float(np.mean([np.mean(scores) for scores in of_object.values()])) for name, of_object in found.items()
-    }
-
-
 def test_a_cloud_is_reduced_as_open3d_reduces_it() -> None:
     open3d = pytest.importorskip("open3d")
     points = (np.random.default_rng(0).random((2000, 3)) - 0.37).astype(np.float32)
@@ -426,18 +359,6 @@ def test_resampled_means_are_those_of_the_drawn_scenes(seed: int) -> None:
     np.testing.assert_allclose(drawn, combine([counts[0], counts[0], counts[2]]), rtol=1e-12)
 
 
-@pytest.mark.parametrize("aggregate", ["scene-mean", "pooled"])
-def test_a_result_over_scenes_has_its_mean_and_an_interval_around_it(aggregate: str) -> None:
-    rules = TOPN.model_copy(update={"aggregate": aggregate})
-    packed = [pack_scores({rules.name: score_scene(rules, lex_truth(k), noisy(k), ENCODER)}) for k in range(4)]
-    result = combine_scenes(rules, {f"s{k}": unpack_scores(one)[rules.name] for k, one in enumerate(packed)})
-    interval = result.intervals["synonyms"]
-    assert result.metrics == (result.scene_mean if aggregate == "scene-mean" else result.pooled)
-    assert interval is not None
-    assert interval[0] <= result.metrics["synonyms"] <= interval[1]
-    assert sum(result.metrics[name] for name in CATEGORIES) == pytest.approx(1.0)
-
-
 # ---- what a reader is told, and what is refused
 
 
@@ -461,12 +382,6 @@ def test_a_prediction_without_features_cannot_be_ranked() -> None:
         score_scene(RANKING, truth, named, ENCODER)
     with pytest.raises(PredictionError, match="there is no encoder"):
         score_scene(RANKING, truth, perfect(truth), None)
-
-
-def test_features_of_another_encoder_are_refused() -> None:
-    truth = lex_truth()
-    with pytest.raises(PredictionError, match=f"the encoder 'words' has {WordEncoder().dim}"):
-        score_scene(TOPN, truth, instances_with(truth.points, [np.arange(9)], np.ones((1, 3), np.float32)), ENCODER)
 
 
 def test_a_truth_that_does_not_hold_together_is_refused() -> None:

@@ -117,15 +117,6 @@ def test_ranked_classes_have_the_answer_of_the_benchmarks_script(index: int, tmp
     np.testing.assert_array_equal(columns, expected)
 
 
-def test_the_cases_tell_the_rules_apart() -> None:
-    every = [p for of_case in PROBLEMS.values() for p in of_case]
-    assert len(every) == 60
-    assert sum(p["AP"] is not None and 0 < p["AP25"] < 1 for p in PROBLEMS["scannetpp01_instance"]) >= 15
-    assert sum(p["mIoU"] != p["top-3 mIoU"] for p in PROBLEMS["scannetpp02_semantic"]) >= 15
-    masked = [one["masked"].size for case in PROBLEMS for index in range(30) for one in arrays_of(case, index)]
-    assert sum(size > 0 for size in masked) >= 20
-
-
 # ---- rules
 
 

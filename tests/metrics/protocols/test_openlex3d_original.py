@@ -126,14 +126,6 @@ def test_a_made_problem_has_the_three_answers_of_openlex3d(number: int, tmp_path
             assert {key: row[key] for key in known} == pytest.approx(known, rel=0, abs=1e-15, nan_ok=True)
 
 
-def test_the_problems_are_not_trivial() -> None:
-    assert len(PROBLEMS) == 30
-    assert {problem["dataset"] for problem in PROBLEMS} == {"replica", "scannetpp", "hm3d"}
-    assert len({problem["answers"]["openlex3d-queries"]["AP"] for problem in PROBLEMS}) > 20
-    for name in ("openlex3d-topn", "openlex3d-ranking"):
-        assert len({tuple(row.values()) for problem in PROBLEMS for row in problem["answers"][name]}) > 25
-
-
 # ---- the points of each dataset
 
 

@@ -49,13 +49,6 @@ def test_a_made_problem_of_labelled_points_has_the_answer_of_panopticapi(name: s
     assert our_qualities(load_protocol(name), problem["scenes"]).tolist() == problem["answer"]
 
 
-def test_thirty_problems_of_either_protocol_have_each_an_answer_of_its_own() -> None:
-    assert {name: len({str(one["answer"]) for one in rows}) for name, rows in FOUND.items()} == {
-        "scannetpp-panoptic": 30,
-        "hm3dsem-panoptic": 30,
-    }
-
-
 def test_the_splits_are_those_that_are_stated() -> None:
     things = {entry.name for entry in load_protocol("scannetpp-instance").scored}
     rules = load_protocol("scannetpp-panoptic")

@@ -50,10 +50,6 @@ def test_the_answer_of_the_original_holds_to_the_last_bit(name: str, index: int)
     assert {key: float(value[0]) for key, value in means.items()} == {key: answer[key] for key in means}
 
 
-def test_there_are_thirty_problems_of_each_original() -> None:
-    assert [len(problems) for problems in PROBLEMS.values()] == [30, 30]
-
-
 def test_an_iou_of_one_half_is_no_match() -> None:
     truth = segments([0] * 4, [1] * 4)
     half = panoptic.per_scene(truth, segments([0, 0, -1, -1], [5, 5, 0, 0]), ONE_THING)

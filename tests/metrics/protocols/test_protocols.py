@@ -32,7 +32,6 @@ from su3d_bench.metrics.protocols.loading import (
     load_protocol,
     not_comparable_with,
     protocol_names,
-    protocols_for,
     rules_file,
 )
 from su3d_bench.metrics.protocols.model import Kind, MetricName, ProtocolRules
@@ -76,22 +75,6 @@ def test_a_protocol_is_named_as_its_file_and_names_others_that_exist(name: str) 
 def test_every_rule_that_is_taken_from_an_original_says_from_where(name: str) -> None:
     text = rules_file(name).read_text()
     assert "Source" in text or "ConceptGraphs' rules" in text
-
-
-def test_each_dataset_has_its_default_protocols() -> None:
-    assert protocols_for("rooms") == [
-        "replica-mesh-ex6", "replica-openmask3d", "replica-openmask3d-semantic", "rooms-instance", "rooms-semantic",
-    ]  # fmt: skip
-    assert protocols_for("scannet") == [
-        "class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d", "scannet-instance",
-        "scannet-semantic", "scannet200-instance", "scannet200-semantic",
-    ]  # fmt: skip
-    assert protocols_for("scannetpp") == [
-        "class-agnostic-maskclustering-scannetpp", "class-agnostic-open3dis-scannetpp", "scannetpp-instance",
-        "scannetpp-open-vocabulary", "scannetpp-semantic",
-    ]  # fmt: skip
-    assert {"replica-conceptgraphs-ex6", "replica-mesh-ex6", "replica-openmask3d"} <= set(protocols_for("replica"))
-    assert protocols_for("nowhere") == []
 
 
 def test_conceptgraphs_exclusions_leave_51_48_and_46_classes() -> None:
@@ -192,53 +175,6 @@ def test_the_digest_moves_with_every_rule() -> None:
     changed = rules.model_copy(update={"prompt": "a picture of {}"})
     assert rules.digest == load_protocol("rooms-semantic").digest
     assert changed.digest != rules.digest
-
-
-def test_a_rule_that_a_file_leaves_out_asks_for_nothing() -> None:
-    said = {
-        "name": "mine", "version": 1, "summary": "made for a test", "kind": "semantic", "metric": "scannet",
-        "datasets": ("rooms",), "label_space": "rooms", "ground_truth": "mesh-vertices",
-        "classes": ({"id": 0, "name": "chair"},), "vocabulary": "all", "prompt": "{}",
-        "transfer": {"candidates": "object-points"}, "headline": ("mIoU",),
-    }  # fmt: skip
-    rules = RULES_OF_KIND["semantic"].model_validate(said).model_dump()
-    assert rules["transfer"] == {
-        "candidates": "object-points", "neighbours": 1, "votes": "classes", "cap_m": None, "evaluation_voxel_m": 0.0,
-    }  # fmt: skip
-    assert {key: value for key, value in rules.items() if key not in said} == {
-        "by_default": True, "class_numbers": "ids", "class_agnostic": None, "void": None, "labels": None,
-        "unnamed": None,
-        "stuff": (), "ignore": (), "ignore_rule": "exact", "prompts": (), "prompt_names": {}, "encoder": None,
-        "min_region_size": None, "thresholds": (),
-        "confidence": None, "top_k": None, "questions": None, "per_kind": None, "synonyms": None, "merging": None,
-        "answers": None, "box_axes": None, "presence": None, "predicates": (), "relations": None,
-        "aggregate": "pooled", "not_comparable_with": (),
-    }  # fmt: skip
-
-
-KINDS = {
-    "semantic": {"takes_dense", "names_points", "takes_votes", "ignores_classes"},
-    "top-k": {"takes_dense", "names_points", "ignores_classes"},
-    "instance": {"needs_instances", "ignores_classes"},
-    "panoptic": {"needs_instances", "ignores_classes"},
-    "boxes": {"needs_own_points", "needs_boxes", "ignores_classes"},
-    "queries": {"needs_own_points", "ignores_classes"},
-    "categories": {"takes_dense", "needs_own_points"},
-    "grounding": {"needs_own_points", "ignores_classes"},
-    "object-chains": {"is_judged", "needs_own_points", "ignores_classes"},
-    "relations": {"needs_instances", "ignores_classes"},
-    "objects": {"needs_own_points", "ignores_classes"},
-    "places": {"needs_own_points", "ignores_classes"},
-    "retrieval": {"is_judged", "needs_own_points", "ignores_classes"},
-    "presence": {"is_judged", "needs_own_points", "ignores_classes"},
-    "annotation": {"is_judged", "needs_own_points", "goes_by_names", "ignores_classes"},
-    "reasoning": {"is_judged", "needs_own_points", "goes_by_names", "ignores_classes"},
-}
-
-
-def test_kinds_differ_in_what_they_take() -> None:
-    facts = set.union(*KINDS.values())
-    assert {kind: {fact for fact in facts if getattr(rules, fact)} for kind, rules in RULES_OF_KIND.items()} == KINDS
 
 
 def test_every_kind_has_rules_and_a_metric_and_every_metric_belongs_to_a_kind() -> None:

@@ -18,18 +18,19 @@ from su3d_bench.evaluation.scoring import facts_of, score_on_objects
 from su3d_bench.metrics.fitness import why_not_content, why_not_scorable
 from su3d_bench.metrics.instance.score import covered_objects
 from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for, rules_file
-from su3d_bench.metrics.questions import shares
 from su3d_bench.metrics.questions.score import (
     AskedText,
     GivenAnswer,
     ReasoningTruth,
     RetrievalTruth,
+    ShareCounts,
     TrueAnswer,
     are_objects_right,
+    baselines,
     first_instances,
     is_answer_right,
+    share_counts,
 )
-from su3d_bench.metrics.questions.shares import ShareCounts
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, plain_json, score_scene, unpack_scores
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.predictions.base import vertex_masks
@@ -121,7 +122,7 @@ def test_what_a_guess_and_names_alone_get_right_is_a_share_of_what_was_asked() -
     assert (found["chance_instance"], found["names-alone_instance"]) == (0.1875, 0.75)
     assert (found["chance_property"], found["names-alone_property"]) == (0.5, 0.25)
     assert (found["chance_all"], found["chance_relative"]) == (0.875 / 3, None)
-    by_chance, by_name = shares.baselines(shares.share_counts([4, 0], [3, 0], by_name=[1.0, 0.0]))
+    by_chance, by_name = baselines(share_counts([4, 0], [3, 0], by_name=[1.0, 0.0]))
     assert np.isnan(by_chance).all()
     assert by_name[0] == 0.25
     assert np.isnan(by_name[1])

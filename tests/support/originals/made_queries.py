@@ -12,7 +12,7 @@ import numpy as np
 
 from su3d_bench.core.maps import Masks
 from su3d_bench.metrics.instance.average_precision import InstanceAP, combine
-from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery, per_scene
+from su3d_bench.metrics.open_vocabulary.score import TextQuery, per_scene
 from su3d_bench.metrics.protocols.model import ProtocolRules
 
 Scene = dict[str, Any]

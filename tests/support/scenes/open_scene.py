@@ -12,7 +12,7 @@ from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels, OpenLexTruth
-from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
+from su3d_bench.metrics.open_vocabulary.score import QueryTruth, TextQuery
 
 OBJECTS = {
     7: ObjectLabels(("chair", "seat"), ("flower",), ("stool",), (12,)),

@@ -1,1 +1,0 @@
-"""Objects, rooms and floors of a scene graph, matched one to one."""
