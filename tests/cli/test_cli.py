@@ -100,7 +100,7 @@ def test_a_protocol_shows_every_rule(capsys: pytest.CaptureFixture[str]) -> None
             ["run", "--scene-s", "x"],
             "run: unknown argument '--scene-s'; did you mean '--scenes'?; see su3d-bench run --help",
         ),
-        (["run", "--jobs", "x"], "run: argument --jobs: x: expected an integer su3d-bench run --help"),
+        (["run", "--jobs", "x"], "run: argument --jobs: x: expected an integer of 1 or more; see"),
         (["run", "--scenes", "replcia/*"], "no scene matches 'replcia/*'; did you mean 'replica/*'?"),
         (["run", "--scenes", f"{PAINTED}/e"], f"no scene matches '{PAINTED}/e'; did you mean '{PAINTED}/d'?"),
         (["run", "--scenes", "nothing"], "no scene matches 'nothing'; known datasets: rooms, replica"),
