@@ -23,7 +23,7 @@ test-quick: $(VENV)/test
 proofs: $(VENV)/test
 	@mkdir -p build/measured
 	$(BIN)/python -m pytest -q -n auto -m proof
-	SU3D_FUZZ_EXAMPLES=60 $(BIN)/python -m pytest -q -n auto tests/fuzz
+	SU3D_FUZZ_EXAMPLES=60 $(BIN)/python -m pytest -q -n auto tests/test_fuzz.py
 	SU3D_DAMAGES=2000 $(BIN)/python -m pytest -q -n auto -k 'damage or but_nothing_else'
 	$(BIN)/python benchmarks fuzz --inputs 100000 --seed 1 --json build/measured/fuzz.json
 	$(BIN)/python benchmarks coverage_of_intervals
@@ -59,9 +59,9 @@ reference: demo
 # Draws what docs/architecture.md says of the code from the code, makes docs/verbs.md from the parser and
 # docs/numbers/originals.md from the protocols' files.
 architecture: $(VENV)/test
-	$(BIN)/python tests/support/house.py
-	$(BIN)/python tests/support/verbs_page.py
-	$(BIN)/python tests/support/originals_page.py
+	$(BIN)/python tools/docs/house.py
+	$(BIN)/python tools/docs/verbs_page.py
+	$(BIN)/python tools/docs/originals_page.py
 
 # The documentation site, which works from the disk: open build/site/index.html. Under --quiet mkdocs counts no warnings,
 # and --strict would end nothing.

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Detections, Frame, GroundTruth, Int32Array, PerceptionNeeds, SceneInfo, TrueGraph
-from su3d_bench.perception.embedded.naming import scene_caption
+from su3d_bench.perception.embedded.lexicon import scene_caption
 
 
 class Oracle:

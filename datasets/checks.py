@@ -280,15 +280,12 @@ def _read_frames(
 
 def _ask_for_problems(dataset: Dataset, scene: str, findings: _Findings) -> int:
     """Take over what the dataset itself names, and count it."""
-    if not isinstance(dataset, HasProblems):
-        return 0
-    try:
-        for line in dataset.problems(scene):
+
+    def ask() -> None:
+        for line in dataset.problems(scene) if isinstance(dataset, HasProblems) else ():
             findings.add(Finding("error", "file", "", line))
-    except PlugInError:
-        raise
-    except (Su3dError, OSError) as error:
-        findings.add_fault("file", "", error)
+
+    findings.attempt("file", ask)
     return findings.n
 
 

@@ -15,8 +15,8 @@ from typing import Any
 
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.types import LabelSet
+from su3d_bench.formats.arrays import parsed_json
 from su3d_bench.formats.images import read_bytes
-from su3d_bench.formats.text_files import parsed_json
 from su3d_bench.metrics.protocols.loading import load_protocol
 
 # By its protocol, whose label space and ground truth bear the same name: what records call the aspect.

@@ -11,70 +11,50 @@ from typing import TYPE_CHECKING, Any
 from su3d_bench.core.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from su3d_bench.api.lists import list_datasets, list_methods, list_protocols
-    from su3d_bench.api.making import evaluate, run
-    from su3d_bench.api.results import Comparison, Run, Scores, load_run
-    from su3d_bench.core.errors import Su3dError
-    from su3d_bench.core.geometry import back_project
-    from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition
-    from su3d_bench.core.system.timing import Timer
-    from su3d_bench.core.types import Detections, Frame, GroundTruth, InstanceMesh, LabelSet, PerceptionNeeds, SceneInfo
-    from su3d_bench.metrics.protocols.loading import load_protocol
-    from su3d_bench.metrics.scoring import combine, score_scene
-    from su3d_bench.store.predictions import read_prediction
+    from su3d_bench.api.lists import list_datasets as list_datasets
+    from su3d_bench.api.lists import list_methods as list_methods
+    from su3d_bench.api.lists import list_protocols as list_protocols
+    from su3d_bench.api.making import evaluate as evaluate
+    from su3d_bench.api.making import run as run
+    from su3d_bench.api.results import Comparison as Comparison
+    from su3d_bench.api.results import Run as Run
+    from su3d_bench.api.results import Scores as Scores
+    from su3d_bench.api.results import load_run as load_run
+    from su3d_bench.core.errors import Su3dError as Su3dError
+    from su3d_bench.core.geometry import back_project as back_project
+    from su3d_bench.core.maps import DenseFeatures as DenseFeatures
+    from su3d_bench.core.maps import Instances as Instances
+    from su3d_bench.core.maps import Masks as Masks
+    from su3d_bench.core.maps import Partition as Partition
+    from su3d_bench.core.system.timing import Timer as Timer
+    from su3d_bench.core.types import Detections as Detections
+    from su3d_bench.core.types import Frame as Frame
+    from su3d_bench.core.types import GroundTruth as GroundTruth
+    from su3d_bench.core.types import InstanceMesh as InstanceMesh
+    from su3d_bench.core.types import LabelSet as LabelSet
+    from su3d_bench.core.types import PerceptionNeeds as PerceptionNeeds
+    from su3d_bench.core.types import SceneInfo as SceneInfo
+    from su3d_bench.metrics.protocols.loading import load_protocol as load_protocol
+    from su3d_bench.metrics.scoring import combine as combine
+    from su3d_bench.metrics.scoring import score_scene as score_scene
+    from su3d_bench.store.predictions import read_prediction as read_prediction
 
-__all__ = [
-    "Comparison",
-    "DenseFeatures",
-    "Detections",
-    "Frame",
-    "GroundTruth",
-    "InstanceMesh",
-    "Instances",
-    "LabelSet",
-    "Masks",
-    "Partition",
-    "PerceptionNeeds",
-    "Run",
-    "SceneInfo",
-    "Scores",
-    "Su3dError",
-    "Timer",
-    "back_project",
-    "combine",
-    "evaluate",
-    "list_datasets",
-    "list_methods",
-    "list_protocols",
-    "load_protocol",
-    "load_run",
-    "read_prediction",
-    "run",
-    "score_scene",
-]
-# Where those names are that are no types of ``core.types``.
-_ELSEWHERE = {
-    "Comparison": "api.results",
-    "DenseFeatures": "core.maps",
-    "Instances": "core.maps",
-    "Masks": "core.maps",
-    "Partition": "core.maps",
-    "Run": "api.results",
-    "Scores": "api.results",
-    "Su3dError": "core.errors",
-    "Timer": "core.system.timing",
-    "back_project": "core.geometry",
-    "combine": "metrics.scoring",
-    "evaluate": "api.making",
-    "list_datasets": "api.lists",
-    "list_methods": "api.lists",
-    "list_protocols": "api.lists",
-    "load_protocol": "metrics.protocols.loading",
-    "load_run": "api.results",
-    "read_prediction": "store.predictions",
-    "run": "api.making",
-    "score_scene": "metrics.scoring",
+# The public names, by the module in which each is.
+_MODULES = {
+    "api.lists": ("list_datasets", "list_methods", "list_protocols"),
+    "api.making": ("evaluate", "run"),
+    "api.results": ("Comparison", "Run", "Scores", "load_run"),
+    "core.errors": ("Su3dError",),
+    "core.geometry": ("back_project",),
+    "core.maps": ("DenseFeatures", "Instances", "Masks", "Partition"),
+    "core.system.timing": ("Timer",),
+    "core.types": ("Detections", "Frame", "GroundTruth", "InstanceMesh", "LabelSet", "PerceptionNeeds", "SceneInfo"),
+    "metrics.protocols.loading": ("load_protocol",),
+    "metrics.scoring": ("combine", "score_scene"),
+    "store.predictions": ("read_prediction",),
 }
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+__all__ = sorted(_MODULE_OF)
 
 # ONNX Runtime from 1.29 on tells its makers of every session and keeps an identity of the machine in the user's cache;
 # it looks at this once, when it is loaded (microsoft/onnxruntime, pull request 27379). Who wants that sets 0.
@@ -82,9 +62,9 @@ os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 
 def __getattr__(name: str) -> Any:
-    if name not in __all__:
+    if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{_ELSEWHERE.get(name, 'core.types')}"), name)
+    value = getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
     globals()[name] = value
     return value
 

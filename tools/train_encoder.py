@@ -37,8 +37,7 @@ from su3d_bench.core.system.devices import require
 from su3d_bench.core.system.files import file_bytes, file_text
 from su3d_bench.core.types import BoolArray, Float32Array, Int64Array
 from su3d_bench.perception.embedded.encoder import IMAGE_FILE, IMAGE_SIZE, TEXT_FILE, EmbeddedEncoder
-from su3d_bench.perception.embedded.lexicon import ROOM_NAMES, SURFACES, class_words
-from su3d_bench.perception.embedded.text import DIM, N_IDS, N_WORDS, token_ids
+from su3d_bench.perception.embedded.lexicon import DIM, N_IDS, N_WORDS, ROOM_NAMES, SURFACES, class_words, token_ids
 
 PROMPTS = ("an image of {a}", "{a} in a scene", "{}")
 MIN_POSITIVES = 3

@@ -16,7 +16,7 @@ from training_captions import CropTruth, Neighbour
 from su3d_bench.core import registry
 from su3d_bench.core.system.files import file_text, regular
 from su3d_bench.core.types import Float32Array, Frame, Int32Array, Int64Array, Regions, UInt8Array
-from su3d_bench.perception.crops import crop_window, mask_boxes
+from su3d_bench.perception.cache import crop_window, mask_boxes
 from su3d_bench.perception.embedded.encoder import IMAGE_SIZE, log_size, shrink
 from su3d_bench.perception.embedded.join_rules import SegmenterConfig
 from su3d_bench.perception.embedded.segmenter import RgbdSegmenter

@@ -25,7 +25,7 @@ from training_captions import (
 from training_crops import CropSet
 
 from su3d_bench.core.types import Float32Array, Int64Array, UInt8Array
-from su3d_bench.perception.embedded.text import PADDING, token_ids
+from su3d_bench.perception.embedded.lexicon import PADDING, token_ids
 from su3d_bench.perception.embedded.torch_towers import ImageTower, TextTower
 
 logger = logging.getLogger(__name__)

@@ -29,7 +29,7 @@ from su3d_bench.core.types import (
     PerceptionNeeds,
     SceneInfo,
 )
-from su3d_bench.perception.crops import mask_boxes
+from su3d_bench.perception.cache import mask_boxes
 
 
 def prompted_mask(

@@ -39,7 +39,7 @@ from su3d_bench.numerics.statistics import (
     t_quantile,
 )
 from su3d_bench.reports.tables.formats import aligned
-from su3d_bench.sheets.agreement import krippendorff_alphas
+from su3d_bench.sheets.answers import krippendorff_alphas
 
 BEGIN, END = "<!-- coverage: written by benchmarks/numbers/coverage_of_intervals.py -->", "<!-- end of coverage -->"
 LOW, HIGH, LEAST = 93.0, 97.0, 90.0  # per cent: the mark, and below what no interval may be shown

@@ -1,7 +1,7 @@
 """Small faults planted in metrics, statistics, comparison and gate, one at a time: do the tests of the module notice?
 
     python benchmarks mutants --mutants 600
-    python benchmarks mutants --mutants 40 --seed 3 --modules analysis/gate
+    python benchmarks mutants --mutants 40 --seed 3 --modules analysis/gate.py
 
 Every place of a module where one operator, constant, condition or statement can be another is a mutant; a sample of all
 of them is drawn by ``--seed``. Each is written into a copy of what git tracks here, and the tests of the module are run
@@ -77,7 +77,7 @@ GUARDS: dict[str, tuple[str, ...]] = {
     ),
     "analysis/comparison.py": (*_COMPARE, "analysis/test_planning"),
     "analysis/sides.py": (*_COMPARE, "analysis/test_planning"),
-    "analysis/gate/": _GATE,
+    "analysis/gate.py": _GATE,
     "runs/verify.py": ("analysis/gate/test_gate", "analysis/test_leaderboard"),
 }  # fmt: skip
 

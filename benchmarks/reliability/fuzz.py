@@ -1,4 +1,4 @@
-"""Damage for every reader of others' files, by the table of fuzz_targets.py of the tests, in processes that may die.
+"""Damage for every reader of others' files, by the table of fuzzing/fuzz_targets.py, in processes that may die.
 
     python benchmarks fuzz --inputs 100000 --seed 1 --json build/measured/fuzz.json
 

@@ -19,8 +19,7 @@ from pathlib import Path
 
 from measured import write_measured
 
-from su3d_bench.analysis.gate.check import check
-from su3d_bench.analysis.gate.reference import COST_LIMIT, Reference, learn, method_cost
+from su3d_bench.analysis.gate import COST_LIMIT, Reference, check, learn, method_cost
 from su3d_bench.cli.main import main as su3d_bench
 from su3d_bench.core.digests import digest_file
 from su3d_bench.reports.gate import plain_lines

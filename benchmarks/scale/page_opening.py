@@ -23,8 +23,7 @@ from typing import Any
 import numpy as np
 from measured import write_measured
 
-from su3d_bench.analysis.page.contents import Wishes, page_contents
-from su3d_bench.analysis.page.numbers import scored_maps
+from su3d_bench.analysis.page.contents import Wishes, page_contents, scored_maps
 from su3d_bench.reports.page.page import page_html
 from su3d_bench.runs.executors import limit_threads
 from su3d_bench.runs.finished import read_run

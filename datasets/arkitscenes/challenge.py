@@ -17,10 +17,9 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing, PredictionError, converted, printable
 from su3d_bench.core.types import Float32Array, GroundTruth, LabelSet
+from su3d_bench.formats.arrays import integer_lines, read_text
 from su3d_bench.formats.images import read_bytes
-from su3d_bench.formats.tables.csv_text import separated_rows
-from su3d_bench.formats.text_files import read_text
-from su3d_bench.formats.text_integers import integer_lines
+from su3d_bench.formats.tables.table import separated_rows
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS, values_of_numbers
 
 BASES = ("", "arkitscenes", "ARKitScenes", "opensun3d")  # below the data root

@@ -23,8 +23,8 @@ from su3d_bench.datasets.recordings.recorded_frames import (
     pinhole,
     reading,
 )
+from su3d_bench.formats.arrays import read_text
 from su3d_bench.formats.images import Size, decode_colour, decode_depth, read_bytes, sized
-from su3d_bench.formats.text_files import read_text
 
 N_COLUMNS = 7  # time, the axis of the rotation times its angle, translation: DATA.md of apple/ARKitScenes at 7283761
 MOST_ROTATION = 1e3  # rad; half a turn is all that a writer needs

@@ -20,10 +20,9 @@ from su3d_bench.core.errors import DataError, PredictionError, converted, printa
 from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.core.types import Float32Array, Float64Array, Floor, GroundTruth, LabelSet, Places, Room
 from su3d_bench.datasets.hm3dsem.frames import INFO_NAME, OBJECTS
-from su3d_bench.formats.arrays import MOST_POINTS, checked_points
+from su3d_bench.formats.arrays import MOST_POINTS, checked_points, parsed_json, read_text
 from su3d_bench.formats.images import read_bytes
 from su3d_bench.formats.ply import read_ply
-from su3d_bench.formats.text_files import parsed_json, read_text
 from su3d_bench.metrics.protocols.loading import CLASS_TABLES
 
 LABEL_SPACE, VARIANT = "hm3dsem", "hovsg-objects"

@@ -19,8 +19,8 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing, printable
 from su3d_bench.core.types import Float32Array
+from su3d_bench.formats.arrays import parsed_json, read_text
 from su3d_bench.formats.pcd import read_pcd_points
-from su3d_bench.formats.text_files import parsed_json, read_text
 from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels
 from su3d_bench.metrics.open_vocabulary.score import TextQuery
 

@@ -26,9 +26,8 @@ from su3d_bench.datasets.recordings.meshes import vertex_positions
 from su3d_bench.datasets.replica.folders import find_original_scene, original_name
 from su3d_bench.datasets.replica.truth import MESH_NAME, AnnotatedMesh, read_annotated_mesh
 from su3d_bench.datasets.scannetpp.truth import BASES as SCANNETPP_BASES
-from su3d_bench.formats.arrays import MOST_POINTS, checked_points, kind_of
+from su3d_bench.formats.arrays import MOST_POINTS, checked_points, kind_of, parsed_json, read_text
 from su3d_bench.formats.ply import read_ply
-from su3d_bench.formats.text_files import parsed_json, read_text
 from su3d_bench.formats.torch_files import read_torch
 from su3d_bench.metrics.matching.nearest import nearest
 from su3d_bench.metrics.open_vocabulary.openlex3d import SPACE as LABELS

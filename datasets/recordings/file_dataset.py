@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from su3d_bench.core.types import GroundTruth, ImageDomain, InstanceMesh, SceneI
 from su3d_bench.datasets.openlex3d import release as openlex3d
 from su3d_bench.datasets.recordings.recorded_frames import reading
 
+logger = logging.getLogger(__name__)
 MARKER = "rooms.json"  # in a folder of scenes: those that `datasets make` rendered
 DatasetT = TypeVar("DatasetT")
 OptionsT = TypeVar("OptionsT", bound=BaseModel)
@@ -138,6 +140,13 @@ class FileDataset(ABC, Generic[OptionsT]):
     def __init__(self, root: Path, options: OptionsT | None = None) -> None:
         self.root = root
         self.options = options if options is not None else self.Options()
+        self._warned_of: set[str] = set()
+
+    def warn_once(self, scene: str, line: str | None) -> None:
+        """Log a line on the scene, if there is one, and only the first time."""
+        if line and scene not in self._warned_of:
+            self._warned_of.add(scene)
+            logger.warning("%s", line)
 
     def is_scene(self, folder: Path) -> bool:
         """Whether a folder in one of the places is a scene."""

@@ -21,6 +21,7 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.geometry import are_rigid
 from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
 from su3d_bench.datasets.recordings.recorded_frames import square
+from su3d_bench.formats.arrays import read_text
 from su3d_bench.formats.images import (
     MAX_PIXELS,
     Size,
@@ -31,7 +32,6 @@ from su3d_bench.formats.images import (
     read_bytes,
     sized,
 )
-from su3d_bench.formats.text_files import read_text
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,13 @@
-"""Everything that is wrong with the files of a Replica scene, one line each, where a reader stops at the first fault.
+"""What is wrong with the files of a Replica scene, one line each, where a reader stops at the first fault; their key.
 
-Images are judged by their first and last bytes; decoding them is the reader's part. Beside it the key of a scene's
-files, which looks at images in the same way.
+Images are not looked at here: decoding them is the reader's part.
 """
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +18,11 @@ from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.geometry import rotations_of
 from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import Float64Array, GroundTruth, ObjectBoxes, OrientedBox
+from su3d_bench.datasets.recordings.file_dataset import faults_of
 from su3d_bench.datasets.recordings.recorded_frames import reading
 from su3d_bench.datasets.replica.folders import replica_label_set
 from su3d_bench.datasets.replica.frames import (
-    Camera,
     check_frames_complete,
-    colour_name,
-    depth_name,
     read_camera,
     trajectory_lines,
 )
@@ -38,7 +36,7 @@ from su3d_bench.datasets.replica.truth import (
     shown,
     whole_number,
 )
-from su3d_bench.formats.images import JPEG_END, JPEG_END_WITHIN, PNG_SIGNATURE, image_size
+from su3d_bench.formats.images import PNG_SIGNATURE
 from su3d_bench.formats.poses import poses_of_lines
 
 SLACK_M = 0.05
@@ -160,29 +158,17 @@ def objects_outside_boxes(mesh: AnnotatedMesh, boxes: Mapping[int, OrientedBox])
 
 
 MOST_LINES = 20  # of one kind of fault; the rest is counted
-HEAD_BYTES = (4096, 1 << 18)  # a JPEG may carry its size behind the blocks of its camera, each below 64 KB
 PNG_HEAD_BYTES = 64  # signature, and the chunk with the size
 PNG_TAIL_BYTES = 1024  # the end of the pixels, and what little writers put behind it
-PNG_END = b"IEND\xaeB`\x82"  # the last chunk with its checksum
 
 
 def render_problems(tree: Path, scene: str, where: str) -> Iterator[str]:
-    """Faults of camera, trajectory and images of the scene in a render ``tree``."""
-    camera, lines = None, []
-    try:
-        camera = read_camera(tree / "cam_params.json", where)
-    except DataError as error:
-        yield str(error)
-    try:
-        lines = trajectory_lines(tree / scene / "traj.txt", where)
-    except DataError as error:
-        yield str(error)
+    """Faults of camera and trajectory of the scene in a render ``tree``, and images that are missing."""
+    lines: list[str] = []
+    yield from faults_of([lambda: read_camera(tree / "cam_params.json", where),
+                          lambda: lines.extend(trajectory_lines(tree / scene / "traj.txt", where))])  # fmt: skip
     yield from _shortened(_pose_problems(lines, where), f"{where}: traj.txt")
-    try:
-        check_frames_complete(tree / scene, len(lines), where)
-    except DataError as error:
-        yield str(error)
-    yield from _shortened(_image_problems(tree / scene, len(lines), camera, where), f"{where}: results/")
+    yield from faults_of([lambda: check_frames_complete(tree / scene, len(lines), where)])
 
 
 def _shortened(problems: Iterator[str], where: str) -> Iterator[str]:
@@ -198,41 +184,7 @@ def _shortened(problems: Iterator[str], where: str) -> Iterator[str]:
 
 def _pose_problems(lines: list[str], where: str) -> Iterator[str]:
     for number, line in enumerate(lines, 1):
-        try:
-            poses_of_lines([line], f"{where}: traj.txt", number)
-        except DataError as error:
-            yield str(error)
-
-
-def _image_problems(folder: Path, n_frames: int, camera: Camera | None, where: str) -> Iterator[str]:
-    """Images that are there and cannot be right; missing ones are counted elsewhere."""
-    for index in range(n_frames):
-        for name in (colour_name(index), depth_name(index)):
-            try:
-                with opened(folder / name) as file:
-                    head = file.read(HEAD_BYTES[0])
-                    if image_size(head) is None:
-                        head += file.read(HEAD_BYTES[1])
-                    file.seek(max(0, file.seek(0, 2) - JPEG_END_WITHIN))
-                    tail = file.read()
-            except FileNotFoundError:
-                continue
-            except OSError as error:
-                yield f"{where}: {name} cannot be read: {error.strerror}"
-                continue
-            fault = _image_fault(head, tail, camera)
-            if fault:
-                yield f"{where}: {name}{fault}"
-
-
-def _image_fault(head: bytes, tail: bytes, camera: Camera | None) -> str | None:
-    size = image_size(head)
-    is_whole = tail.endswith(PNG_END) if head.startswith(PNG_SIGNATURE) else JPEG_END in tail
-    if size is None or not is_whole:
-        return ": no image, or cut short; copy the file again"
-    if camera is not None and size != (camera.width, camera.height):
-        return f" is {size[0]}x{size[1]} but cam_params.json says {camera.width}x{camera.height}"
-    return None
+        yield from faults_of([partial(poses_of_lines, [line], f"{where}: traj.txt", number)])
 
 
 def original_problems(original: Path | None, where: str) -> Iterator[str]:

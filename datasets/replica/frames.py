@@ -25,9 +25,9 @@ from su3d_bench.datasets.recordings.recorded_frames import (
     depth_m_of_values,
 )
 from su3d_bench.datasets.replica.truth import shown
+from su3d_bench.formats.arrays import parsed_json
 from su3d_bench.formats.images import UInt16Array
 from su3d_bench.formats.poses import poses_of_lines
-from su3d_bench.formats.text_files import parsed_json
 
 CAMERA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
 FRAMES_PER_SECOND = 30.0  # the release has no timestamps

@@ -17,8 +17,8 @@ from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.types import GroundTruth, LabelSet, TrueGraph
 from su3d_bench.datasets.replica.folders import LABEL_SPACE, ORIGINAL_FOLDERS, original_name
 from su3d_bench.datasets.replica.truth import MAX_OBJECT_ID, MESH_NAME, AnnotatedMesh, shown
+from su3d_bench.formats.arrays import parsed_json
 from su3d_bench.formats.images import read_bytes
-from su3d_bench.formats.text_files import parsed_json
 
 VARIANT = "replicassg"
 OBJECTS, RELATIONS, CLASSES = "objects.json", "relationships.json", "replica_to_visual_genome.json"

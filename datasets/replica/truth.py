@@ -24,11 +24,11 @@ from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import Float32Array, GroundTruth, InstanceMesh, Int32Array, Int64Array
 from su3d_bench.datasets.recordings.meshes import check_finite, face_corners, fans, scalar_column, vertex_positions
 from su3d_bench.datasets.replica.folders import FUSED_CLOUD, replica_label_set
+from su3d_bench.formats.arrays import parsed_json
 from su3d_bench.formats.hdf5 import largest_column, read_rows
 from su3d_bench.formats.images import read_bytes
 from su3d_bench.formats.ply import MAX_HEADER_BYTES, ListColumn, read_header, read_ply
 from su3d_bench.formats.poses import moved, read_first_pose
-from su3d_bench.formats.text_files import parsed_json
 
 MESH_NAME = "habitat/mesh_semantic.ply"
 INFO_NAME = "habitat/info_semantic.json"

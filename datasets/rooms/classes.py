@@ -34,14 +34,7 @@ MATERIALS: tuple[str, ...] = tuple(_TABLE["materials"])
 
 def _room_class(name: str, row: Mapping[str, Any]) -> RoomClass:
     colours = tuple(colour for word in row["colours"] for colour in _TABLE["palettes"].get(word, [word]))
-    return RoomClass(
-        row["id"],
-        name,
-        tuple(row["made_of"]),
-        colours,
-        row.get("models", {}),
-        row.get("called", {}),
-    )
+    return RoomClass(row["id"], name, tuple(row["made_of"]), colours, row.get("models", {}), row.get("called", {}))
 
 
 CLASSES = tuple(_room_class(name, row) for name, row in _TABLE["classes"].items())

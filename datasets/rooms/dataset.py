@@ -141,7 +141,7 @@ class BuiltRoom:
     def trajectory(self) -> Float64Array:
         from su3d_bench.datasets.rooms.scan import kept_walk
 
-        return kept_walk(self._kept_in("walk"), self.options.n_frames, self._walk)
+        return kept_walk(self._kept_in("walk"), self._walk)
 
     @property
     def scan(self) -> RoomScan:

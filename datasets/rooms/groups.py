@@ -126,9 +126,8 @@ def seating(plan: Plan) -> Placed | None:
     plan.on(plan.new("blanket", "blanket"), sofa, "seat", turn=6.0)
     side = plan.beside(plan.new("table", "side_table"), sofa)
     stock(plan, side, [("lamp", "table_lamp")])
-    more = some(
-        plan, 5, "cup", "bowl", ("book", "book_stack"), "candle", "plate", "tissue-paper", "laptop", "cup", "vase"
-    )
+    stack = "book", "book_stack"
+    more = some(plan, 5, "cup", "bowl", stack, "candle", "plate", "tissue-paper", "laptop", "cup", "vase")
     stock(plan, low_table, more)
     plan.hang_above(plan.new("picture"), sofa, 1.3, float(plan.rng.uniform(-0.2, 0.2)))
     return sofa
@@ -197,24 +196,15 @@ def desk_place(plan: Plan, laptop: bool = False) -> Placed | None:
         screen = plan.new("monitor")
         shown = plan.on(screen, desk, where="back", turn=0.0)
         if shown:
-            local_x = float(
-                (shown.position - desk.position)
-                @ np.array([np.cos(np.deg2rad(desk.yaw)), np.sin(np.deg2rad(desk.yaw)), 0])
-            )
+            yaw = np.deg2rad(desk.yaw)
+            local_x = float((shown.position - desk.position) @ np.array([np.cos(yaw), np.sin(yaw), 0]))
             before_screen(plan, desk, plan.new("computer-keyboard"), local_x, 0.17)
             before_screen(plan, desk, plan.new("mouse"), local_x + 0.34, 0.17)
-    pool: tuple[Wanted, ...] = (
-        "cup",
-        ("book", "books"),
-        ("book", "book_stack"),
-        "tissue-paper",
-        "indoor-plant",
-        "bottle",
-    )
-    stock(plan, desk, [("lamp", "desk_lamp"), *plan.shuffled(pool)[:3]])
-    plan.facing(
-        plan.new("chair"), desk, float(plan.rng.uniform(0.04, 0.15)), float(plan.rng.uniform(-0.15, 0.15)), jitter=8.0
-    )
+    more = some(plan, 3, "cup", ("book", "books"), ("book", "book_stack"), "tissue-paper", "indoor-plant", "bottle")
+    stock(plan, desk, [("lamp", "desk_lamp"), *more])
+    chair = plan.new("chair")
+    distance, shift = float(plan.rng.uniform(0.04, 0.15)), float(plan.rng.uniform(-0.15, 0.15))
+    plan.facing(chair, desk, distance, shift, jitter=8.0)
     plan.beside(plan.new("bin"), desk, 0.08)
     if not laptop:
         plan.beside(plan.new("desktop-computer"), desk, 0.05)

@@ -283,9 +283,8 @@ def add_shell(plan: Plan, tiled: bool) -> None:
     """Floor, ceiling and the four walls, each an object of its own."""
     rng = plan.rng
     made_of = "stone" if tiled or rng.random() < 0.2 else "wooden"
-    floor_colour = str(
-        rng.choice(["beige", "grey", "white"] if made_of == "stone" else ["brown", "beige", "beige", "grey"])
-    )
+    colours = ["beige", "grey", "white"] if made_of == "stone" else ["brown", "beige", "beige", "grey"]
+    floor_colour = str(rng.choice(colours))
     base = tone(floor_colour, rng)
     seed = int(rng.integers(1, 999))
     if made_of == "stone":
@@ -298,10 +297,8 @@ def add_shell(plan: Plan, tiled: bool) -> None:
     colour = str(rng.choice(["white", "white", "beige", "grey", "yellow", "green", "blue", "pink"]))
     rgb = mix(tone(colour, rng), tone("white"), 0.0 if colour in ("white", "grey") else 0.55)
     style = 2 if tiled else int(rng.choice([0, 0, 1, 3]))
-    second = shade(rgb, 0.8)
-    paint = Material(
-        Texture.WALL, rgb, second, float(rng.uniform(0.12, 0.3)), 0.3 if tiled else 0.02, 0.0, style, seed=seed
-    )
+    scale, gloss = float(rng.uniform(0.12, 0.3)), 0.3 if tiled else 0.02
+    paint = Material(Texture.WALL, rgb, shade(rgb, 0.8), scale, gloss, 0.0, style, seed=seed)
     accent = Material(Texture.WALL, shade(rgb, 0.8), shade(rgb, 0.66), 0.2, 0.02, 0.0, 0, seed=seed)
     accent_wall = int(rng.integers(0, 4)) if not tiled and rng.random() < 0.4 else -1
     corners = ((0.0, plan.depth), (plan.width, plan.depth), (plan.width, 0.0), (0.0, 0.0))

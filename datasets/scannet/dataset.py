@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -109,9 +108,6 @@ def _fault(read: Callable[..., object], *arguments: object) -> list[str]:
     return []
 
 
-logger = logging.getLogger(__name__)
-
-
 class ScannetOptions(BaseModel):
     """``source``: which form of a recording is read where there are several. ``grid``: the camera whose images frames
     have (``Registration``). ``axis_align``: turn poses and mesh along the walls, as ``axisAlignment`` says."""
@@ -141,10 +137,6 @@ class ScanNet(FileDataset[ScannetOptions]):
     variants = ("nyu40-vertices", "scannet200-vertices")
     further_truths = openscan.FURTHER_TRUTHS
     Options = ScannetOptions
-
-    def __init__(self, root: Path, options: ScannetOptions | None = None) -> None:
-        super().__init__(root, options)
-        self._warned_of: set[str] = set()
 
     def find_tree(self) -> ScanFolders:
         return find_scans(self.root)
@@ -177,9 +169,7 @@ class ScanNet(FileDataset[ScannetOptions]):
         """The usable ones among the first of every ``stride`` frames; a line of the log counts the others once."""
         source, walk = self._open(scene)
         registration = make_registration(source.camera, self.options.grid, self.where(scene))
-        if (line := walk.say_what_is_lost(self.where(scene))) and scene not in self._warned_of:
-            self._warned_of.add(scene)
-            logger.warning("%s", line)
+        self.warn_once(scene, walk.say_what_is_lost(self.where(scene)))
         return ScannetFrames(source, registration, walk, walk.every(stride), self._motion(scene))
 
     def recording_files(self, scene: str) -> Sequence[Path]:

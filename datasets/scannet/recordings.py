@@ -39,8 +39,8 @@ from su3d_bench.datasets.recordings.source import (
     read_size,
 )
 from su3d_bench.datasets.scannet.sens import MAX_HEADER_BYTES, SensSource, header_bytes, parse_header
+from su3d_bench.formats.arrays import read_text
 from su3d_bench.formats.images import Size
-from su3d_bench.formats.text_files import read_text
 
 SourceKind = Literal["auto", "sens", "python", "cpp"]
 DEPTH_SHIFT = 1000.0  # of every recording of ScanNet; the Python reader does not export it

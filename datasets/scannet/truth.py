@@ -38,13 +38,19 @@ from su3d_bench.core.types import (
     LabelSet,
     Surface,
 )
-from su3d_bench.datasets.recordings.meshes import face_corners, vertex_positions
+from su3d_bench.datasets.recordings.meshes import (
+    check_one_mesh,
+    face_corners,
+    majority,
+    segment_ids,
+    vertex_positions,
+    with_segments,
+)
+from su3d_bench.formats.arrays import parsed_json, read_text
 from su3d_bench.formats.images import read_bytes
 from su3d_bench.formats.ply import ListColumn, read_ply
-from su3d_bench.formats.text_files import parsed_json, read_text
 
 PREFIX = "scannet."  # before scene ids and file names of the second release, not of the first
-MAX_SEGMENT_ID = 2**32 - 1
 # Ground truth is label * 1000 + instance, and instances are ids + 1: a larger id would spill into the next label.
 MAX_OBJECT_ID = 998
 
@@ -69,11 +75,7 @@ def aggregation_name(scan: str) -> str:
 def read_segments(path: Path, scan: str, where: str) -> Int64Array:
     """The segment id of every vertex, in the order of the mesh; ``where`` begins each message."""
     where = f"{where}: {path.name}"
-    content = _read_table(path, scan, where)
-    values = content.get("segIndices")
-    if not isinstance(values, list):
-        raise DataError(f"{where}: has no list 'segIndices'; copy the file again")
-    return _segment_ids(values, f"{where}: 'segIndices'")
+    return segment_ids(_read_table(path, scan, where).get("segIndices"), f"{where}: 'segIndices'")
 
 
 def read_objects(path: Path, scan: str, where: str) -> list[AnnotatedObject]:
@@ -125,40 +127,21 @@ def _read_table(path: Path, scan: str, where: str) -> dict[str, Any]:
 def _read_object(group: Any, where: str) -> AnnotatedObject:
     if not isinstance(group, dict):
         raise DataError(f"{where} is no JSON object; copy the file again")
-    number = _whole_number(group.get("id"))
+    number = whole_number(group.get("id"))
     if number is None or number > MAX_OBJECT_ID:
         raise DataError(
             f"{where}: 'id' is {_clip(group.get('id'))}; expected 0 to {MAX_OBJECT_ID}, since ground truth is "
             "label * 1000 + id + 1"
         )
-    category, segments = group.get("label"), group.get("segments")
+    category = group.get("label")
     if not isinstance(category, str):
         raise DataError(f"{where}: 'label' is {_clip(category)}; expected a category")
-    if not isinstance(segments, list):
-        raise DataError(f"{where}: has no list 'segments'; copy the file again")
-    return AnnotatedObject(number, category.strip(), _segment_ids(segments, f"{where}: 'segments'"))
-
-
-def _segment_ids(values: list[Any], where: str) -> Int64Array:
-    numbers = [_whole_number(value) for value in values]
-    wrong = next((row for row, number in enumerate(numbers) if number is None or number > MAX_SEGMENT_ID), None)
-    if wrong is not None:
-        raise DataError(f"{where}[{wrong}] is {_clip(values[wrong])}; expected a segment id, 0 to {MAX_SEGMENT_ID}")
-    return np.array(numbers, np.int64)
-
-
-def _whole_number(value: Any) -> int | None:
-    """The value of a number or of one written as text; None where it is neither or below 0."""
-    if isinstance(value, str):
-        return int(value) if re.fullmatch(r"[0-9]{1,18}", value) else None
-    return value if isinstance(value, int) and not isinstance(value, bool) and value >= 0 else None
+    return AnnotatedObject(number, category.strip(), segment_ids(group.get("segments"), f"{where}: 'segments'"))
 
 
 def _clip(value: Any) -> str:
     """The value as it may stand in a message."""
-    return ascii(value[:40] if isinstance(value, str) else str(value)[:40] if not isinstance(value, int) else value)[
-        :80
-    ]
+    return ascii(value)[:80]
 
 
 LABEL_SPACE = "scannet"
@@ -293,7 +276,7 @@ def read_annotated_scan(files: Mapping[str, Path], scan: str, where: str) -> Ann
     segments = read_segments(files[segments_name(scan)], scan, where)
     objects = read_objects(files[aggregation_name(scan)], scan, where)
     vertices, triangles = _mesh(files[mesh_name(scan)], f"{where}: {mesh_name(scan)}")
-    _check_one_mesh(segments, vertices, scan, where)
+    check_one_mesh(len(segments), len(vertices), (segments_name(scan), mesh_name(scan)), where)
     labels = _labels(files[labels_name(scan)], vertices, f"{where}: {labels_name(scan)}", mesh_name(scan))
     return AnnotatedScan(where, vertices, triangles, labels, objects, object_of_vertex(segments, objects))
 
@@ -304,17 +287,8 @@ def read_surface(mesh: Path, segments: Path | None, scan: str, where: str) -> Su
     if segments is None:
         return Surface(vertices, triangles)
     ids = read_segments(segments, scan, where)
-    _check_one_mesh(ids, vertices, scan, where)
-    # Ids may exceed 32 bits, and only which of them are equal is of use.
-    return Surface(vertices, triangles, np.unique(ids, return_inverse=True)[1].reshape(-1).astype(np.int32))
-
-
-def _check_one_mesh(segments: Int64Array, vertices: Float32Array, scan: str, where: str) -> None:
-    if len(segments) != len(vertices):
-        raise DataError(
-            f"{where}: {segments_name(scan)} has {len(segments)} vertices, {mesh_name(scan)} has {len(vertices)}; they "
-            "belong to two meshes"
-        )
+    check_one_mesh(len(ids), len(vertices), (segments_name(scan), mesh_name(scan)), where)
+    return with_segments(Surface(vertices, triangles), ids)
 
 
 def moved(vertices: Float32Array, motion: Float64Array) -> Float32Array:
@@ -431,8 +405,6 @@ def instance_mesh(scan: AnnotatedScan, tables: Sequence[LabelTable]) -> Instance
     if len(scan.triangles) == 0:
         raise DataError(f"{scan.where}: the mesh has no faces to project; copy _vh_clean_2.ply again")
     instance = scan.instance
-    first, second, third = instance[scan.triangles].T
-    of_triangle = np.where((first == second) | (first == third), first, np.where(second == third, second, 0))
     semantic, _ = nyu40_of_vertex(scan, tables)
     n_classes = MAX_NYU40_ID + 1
     ids = np.unique(instance[instance > 0])
@@ -441,7 +413,7 @@ def instance_mesh(scan: AnnotatedScan, tables: Sequence[LabelTable]) -> Instance
     return InstanceMesh(
         scan.vertices,
         scan.triangles,
-        of_triangle.astype(np.int32),
+        majority(instance, scan.triangles),
         {int(instance_id): int(class_id) for instance_id, class_id in zip(ids, classes, strict=True) if class_id > 0},
         nyu40_label_set(),
     )

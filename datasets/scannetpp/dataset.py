@@ -6,7 +6,6 @@ The DSLR's images, which have no depth, are left out.
 from __future__ import annotations
 
 import hashlib
-import logging
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
@@ -45,14 +44,13 @@ from su3d_bench.datasets.scannetpp.truth import (
     read_surface,
     vertex_truth,
 )
-from su3d_bench.formats.text_files import read_text
+from su3d_bench.formats.arrays import read_text
 
 SCENE_NAMES = r"[0-9a-f]{10}"
 SPLITS_FOLDER = "splits"
 IPHONE, SCANS = "iphone", "scans"
 MOST_SCENES = 100_000
 LARGE_BYTES, END_BYTES = 64 << 20, 1 << 20  # of a larger file, a video or a packed recording, the two ends are digested
-logger = logging.getLogger(__name__)
 
 
 class ScannetppOptions(BaseModel):
@@ -85,10 +83,6 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
     further_truths = openlex3d.FURTHER_TRUTHS
     labels_of = "scannetpp"
     Options = ScannetppOptions
-
-    def __init__(self, root: Path, options: ScannetppOptions | None = None) -> None:
-        super().__init__(root, options)
-        self._warned_of: set[str] = set()
 
     def is_scene(self, folder: Path) -> bool:
         is_named = re.fullmatch(SCENE_NAMES, folder.name) is not None
@@ -130,9 +124,7 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
         """Every ``stride``-th of the frames that the poses name, in the order of the video; a line of the log counts
         those that have none once."""
         recording = self.recording(scene)
-        if (line := recording.say_what_is_lost()) and scene not in self._warned_of:
-            self._warned_of.add(scene)
-            logger.warning("%s", line)
+        self.warn_once(scene, recording.say_what_is_lost())
         return IphoneFrames(recording, recording.every(stride), self.options.width)
 
     def recording_files(self, scene: str) -> Sequence[Path]:

@@ -27,8 +27,8 @@ from su3d_bench.core.geometry import are_rigid
 from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.datasets.recordings.recorded_frames import numbers, pinhole, reading
+from su3d_bench.formats.arrays import parsed_json, read_text
 from su3d_bench.formats.images import MAX_PIXELS, Size, read_bytes
-from su3d_bench.formats.text_files import parsed_json, read_text
 
 COLMAP, CAMERAS_NAME, IMAGES_NAME = "colmap", "cameras.txt", "images.txt"
 TRACKING_NAME = "pose_intrinsic_imu.json"

@@ -28,13 +28,12 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, GroundTruth, InstanceMesh, Int32Array, Int64Array, LabelSet, Surface
 from su3d_bench.datasets.recordings import meshes
 from su3d_bench.datasets.recordings.recorded_frames import numbers
+from su3d_bench.formats.arrays import parsed_json, read_text
 from su3d_bench.formats.images import read_bytes
-from su3d_bench.formats.text_files import parsed_json, read_text
 
 MESH_NAME = "mesh_aligned_0.05.ply"
 MASK_NAME = "mesh_aligned_0.05_mask.txt"
 SEGMENTS_NAME, OBJECTS_NAME = "segments.json", "segments_anno.json"
-MAX_SEGMENT_ID = 2**32 - 1  # the toolkit keeps them in 32 bits
 MAX_VERTEX = re.compile(r"[0-9]{1,10}")
 
 
@@ -49,10 +48,7 @@ class AnnotatedObject:
 def read_segments(path: Path, where: str) -> Int64Array:
     """The segment id of every vertex, in the order of the mesh; ``where`` begins each message."""
     where = f"{where}: {path.name}"
-    values = _read_table(path, where).get("segIndices")
-    if not isinstance(values, list):
-        raise DataError(f"{where}: has no list 'segIndices'; copy the file again")
-    return _segment_ids(values, f"{where}: 'segIndices'")
+    return meshes.segment_ids(_read_table(path, where).get("segIndices"), f"{where}: 'segIndices'")
 
 
 def read_objects(path: Path, where: str) -> list[AnnotatedObject]:
@@ -67,12 +63,10 @@ def read_objects(path: Path, where: str) -> list[AnnotatedObject]:
 def _read_object(group: Any, where: str) -> AnnotatedObject:
     if not isinstance(group, dict):
         raise DataError(f"{where} is no JSON object; copy the file again")
-    word, segments = group.get("label"), group.get("segments")
+    word = group.get("label")
     if not isinstance(word, str):
         raise DataError(f"{where}: 'label' is {ascii(word)[:40]}; expected a word")
-    if not isinstance(segments, list):
-        raise DataError(f"{where}: has no list 'segments'; copy the file again")
-    return AnnotatedObject(word, _segment_ids(segments, f"{where}: 'segments'"))
+    return AnnotatedObject(word, meshes.segment_ids(group.get("segments"), f"{where}: 'segments'"))
 
 
 def vertices_of_segments(segments: Int64Array) -> _Members:
@@ -118,19 +112,6 @@ def _read_table(path: Path, where: str) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise DataError(f"{where}: is no JSON object; copy the file again")
     return content
-
-
-def _segment_ids(values: list[Any], where: str) -> Int64Array:
-    wrong = next((row for row, value in enumerate(values) if not _is_segment_id(value)), None)
-    if wrong is not None:
-        raise DataError(
-            f"{where}[{wrong}] is {ascii(values[wrong])[:40]}; expected a segment id, 0 to {MAX_SEGMENT_ID}"
-        )
-    return np.array(values, np.int64)
-
-
-def _is_segment_id(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= MAX_SEGMENT_ID
 
 
 BASES = ("", "scannetpp", "ScanNetPP", "ScanNet++", "scannetpp_v2", "scannetpp_v1", "scannetpp/v2", "scannetpp/v1")
@@ -256,7 +237,7 @@ def read_annotated_scan(files: Mapping[str, Path], classes: BenchmarkClasses, wh
     objects = read_objects(files[OBJECTS_NAME], where)
     surface = read_surface(files[MESH_NAME], None, where)
     n = len(surface.vertices)
-    _check_one_mesh(segments, n, where)
+    meshes.check_one_mesh(len(segments), n, (SEGMENTS_NAME, MESH_NAME), where)
     class_of = {number: classes.id_of[one.word] for number, one in enumerate(objects, 1) if one.word in classes.id_of}
     if any(number > MAX_OBJECTS and class_of[number] in classes.with_instances for number in class_of):
         raise DataError(
@@ -302,12 +283,10 @@ def vertex_truth(scan: AnnotatedScan) -> GroundTruth:
 def instance_mesh(scan: AnnotatedScan) -> InstanceMesh:
     """The triangles, each with the object of most of its vertices, 0 where all three differ; walls and floors are
     objects here."""
-    first, second, third = scan.object_of_vertex[scan.surface.triangles].T
-    of_triangle = np.where((first == second) | (first == third), first, np.where(second == third, second, 0))
     return InstanceMesh(
         scan.surface.vertices,
         scan.surface.triangles,
-        of_triangle.astype(np.int32),
+        meshes.majority(scan.object_of_vertex, scan.surface.triangles),
         dict(scan.class_of_object),
         scan.classes.labels,
     )
@@ -319,16 +298,5 @@ def read_surface(mesh: Path, segments: Path | None, where: str) -> Surface:
     if segments is None:
         return surface
     ids = read_segments(segments, where)
-    _check_one_mesh(ids, len(surface.vertices), where)
-    # Ids may exceed 31 bits, and only which of them are equal is of use.
-    return Surface(
-        surface.vertices, surface.triangles, np.unique(ids, return_inverse=True)[1].reshape(-1).astype(np.int32)
-    )
-
-
-def _check_one_mesh(segments: Int64Array, n_vertices: int, where: str) -> None:
-    if len(segments) != n_vertices:
-        raise DataError(
-            f"{where}: {SEGMENTS_NAME} has {len(segments)} vertices, {MESH_NAME} has {n_vertices}; they belong to two "
-            "meshes"
-        )
+    meshes.check_one_mesh(len(ids), len(surface.vertices), (SEGMENTS_NAME, MESH_NAME), where)
+    return meshes.with_segments(surface, ids)

@@ -37,7 +37,7 @@ from su3d_bench.datasets.recordings.recorded_frames import (
     pinhole,
 )
 from su3d_bench.datasets.tum.timed_poses import pose_at, read_trajectory, rows_of, seconds
-from su3d_bench.formats.text_files import read_text
+from su3d_bench.formats.arrays import read_text
 
 logger = logging.getLogger(__name__)
 UNITS_PER_METRE = 5000.0  # the benchmark's page "file formats"

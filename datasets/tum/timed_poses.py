@@ -11,7 +11,7 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.geometry import rotations_of
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.recordings.recorded_frames import numbers
-from su3d_bench.formats.text_files import read_text
+from su3d_bench.formats.arrays import read_text
 
 
 def rows_of(path: Path, where: str, n_words: int, form: str) -> list[tuple[int, list[str]]]:

@@ -18,17 +18,23 @@ from su3d_bench.reports.pictures.canvas import (
     DARK,
     GREY,
     NO_INSTANCE,
+    Camera,
     Canvas,
     Colour,
+    View,
+    colour,
     drawable,
     figure_bytes,
     hex_of,
     instance_colours,
     paper,
+    project,
+    render,
+    room_bounds,
+    view_cameras,
 )
 from su3d_bench.reports.pictures.items import Tag
 from su3d_bench.reports.pictures.maps import SQUARE_M, Cloud, map_cloud, thinned
-from su3d_bench.reports.pictures.render import Camera, View, colour, project, render, room_bounds, view_cameras
 
 FORMATS = ("pdf", "png", "svg")
 CELL_WIDTH_IN, TITLE_IN, ROW_IN, LEGEND_IN, GAP_IN = 2.4, 0.28, 0.26, 0.42, 0.08

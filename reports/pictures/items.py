@@ -17,8 +17,7 @@ import numpy as np
 from su3d_bench.core.errors import printable
 from su3d_bench.core.geometry import back_project, valid_depth
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, UInt8Array
-from su3d_bench.reports.pictures.canvas import drawable
-from su3d_bench.reports.pictures.render import BACKGROUND
+from su3d_bench.reports.pictures.canvas import BACKGROUND, drawable
 
 WIDTH, MARGIN, CAPTION = 960, 10, 24
 PHOTO_WIDTH, ZOOM_WIDTH = 560, 370

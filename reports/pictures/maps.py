@@ -19,26 +19,24 @@ from su3d_bench.reports.pictures.canvas import (
     DARK,
     GREY,
     NO_INSTANCE,
+    OVERSAMPLING,
+    Camera,
     Canvas,
     Colour,
+    View,
     class_colours,
+    colour,
     heat_colours,
     hex_of,
     instance_colours,
     paper,
-    scale_stops,
-)
-from su3d_bench.reports.pictures.items import OUTLINE, draw_outline
-from su3d_bench.reports.pictures.render import (
-    OVERSAMPLING,
-    Camera,
-    View,
-    colour,
     project,
     render,
     room_bounds,
+    scale_stops,
     view_cameras,
 )
+from su3d_bench.reports.pictures.items import OUTLINE, draw_outline
 
 PALE_GREY = 232
 RENDERED = 1.5  # times the size of the picture, for the room fills only a part of a view from a corner

@@ -26,15 +26,21 @@ from su3d_bench.reports.pictures.canvas import (
     DARK,
     GREY,
     NO_INSTANCE,
+    OVERSAMPLING,
+    Camera,
     Canvas,
     Colour,
     class_colours,
+    colour,
     hex_of,
     instance_colours,
     paper,
+    project,
+    render,
+    room_bounds,
+    view_cameras,
 )
 from su3d_bench.reports.pictures.maps import thinned_rows, truth_owner
-from su3d_bench.reports.pictures.render import OVERSAMPLING, Camera, colour, project, render, room_bounds, view_cameras
 
 CAMERAS = 48  # enough for the shape of a walk
 SHOWN_FRAMES = 6

@@ -1,5 +1,5 @@
 // The pages of a registry: all rankings with filters, one method, one scene. DATA is what
-// su3d_bench/reproducing/registry/site.py gathers.
+// su3d_bench/reproducing/registry_site.py gathers.
 
 const DATA = JSON.parse(byId('data').textContent);
 const ROOT = DATA.kind === 'index' ? '' : '../';

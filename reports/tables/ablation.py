@@ -126,7 +126,8 @@ def _half(sweep: Sequence[SweepRow], members: Mapping[str, Measured], shown: Sho
         row = members[entry.method]
         group = [members[member.method] for member in sweep if member.parameter == entry.parameter]
         best = {name for name in shown.metrics if _is_best(row, own, group, name, compared[name])}
-        cells.append([_beside(cell, compared, name, row) for cell, name in _named_cells(row, shown, best)])
+        own_cells = zip(cells_of(row, shown, best), shown.metrics, strict=True)
+        cells.append([_beside(cell, compared, name, row) for cell, name in own_cells])
     smallest = min((one.smallest_p for of_metric in compared.values() for one in of_metric.values()), default=1.0)
     difference = (
         f"In parentheses: the mean difference to {own_name} over scenes, in points, and its p (two-sided sign-flip "
@@ -174,10 +175,6 @@ def _is_best(
         (found := compared.get(member.method)) is not None and found.p < LEVEL and ahead * found.mean > 0
         for member in rivals
     )
-
-
-def _named_cells(row: Measured, shown: Shown, best: set[str]) -> list[tuple[Cell, str]]:
-    return list(zip(cells_of(row, shown, best), shown.metrics, strict=True))
 
 
 def _beside(cell: Cell, compared: Mapping[str, Mapping[str, _Difference]], metric: str, row: Measured) -> Cell:

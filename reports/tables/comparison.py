@@ -1,12 +1,14 @@
-"""The tables of a comparison, from the value of its JSON form."""
+"""Tables of comparisons of runs, of plans for more scenes, and of comparisons of protocols, from their JSON forms."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from su3d_bench.core.errors import counted
+from su3d_bench.core.config import toml_value
+from su3d_bench.core.errors import counted, printable
 from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, bracketed, percent, signed, text_table
+from su3d_bench.metrics.protocols.mixtures import UNMOVED
 from su3d_bench.reports.tables.model import few_scenes
 
 HEADER = ["p", "p of all", "smallest p", "better / equal / worse", "A", "B", "B - A", "mean over scenes"]
@@ -92,3 +94,126 @@ def _notes(compared: Mapping[str, Any]) -> Sequence[str]:
         if odd:
             notes.append(f"interval and test disagree, and the test decides, for {', '.join(odd)}")
     return notes
+
+
+def plan_tables(plan: Mapping[str, Any]) -> list[Table | Prose]:
+    """One table a protocol, a row a metric and number of seeds; numbers are percentage points, or scenes."""
+    n_seeds = len(plan["seeds"])
+    seeds = "seed " + ", ".join(map(str, plan["seeds"]))
+    title = f"{plan['left']} (A), {plan['right']} (B): {counted(len(plan['scenes']), 'scene')}, {seeds}"
+    tables = [_protocol_table(name, metrics, title) for name, metrics in plan["protocols"].items()]
+    notes = [
+        f"scenes that find a true difference of so many points with a power of {100 * plan['power']:g} %, by a "
+        "two-sided paired test at 5 %; at least 6, of which a sign-flip test can have a p below 0.05",
+        f"[..] behind it: at the ends of the 95 % interval of the variance, which {len(plan['scenes'])} scenes leave "
+        f"wide; {NOT_MEASURED}: no number of scenes up to 100,000, under so many seeds",
+        "SD: standard deviation of the difference B - A over scenes, over seeds, and of what is left; in percentage "
+        "points",
+    ]
+    if any(one["variance"] is None for metrics in plan["protocols"].values() for one in metrics.values()):
+        notes.append("no SD: the difference is the same in every scene and run, or rests on a single scene")
+    if n_seeds < 2:
+        notes.append("one seed: how much seeds move the difference is not known; name runs of other seeds too")
+    if n_seeds == 2:
+        notes.append("two seeds: no interval, for of so few it would hold the truth too seldom; name a run of a third")
+    notes += plan["remarks"]
+    notes += [line for line in (few_scenes(len(plan["scenes"])),) if line]
+    return [*tables, Prose(tuple(notes), is_list=True)]
+
+
+def _protocol_table(protocol: str, metrics: Mapping[str, Any], title: str) -> Table:
+    asked = list(dict.fromkeys(need["points"] for plan in metrics.values() for need in plan["needs"]))
+    header = ["metric", "B - A", "SD of scenes", "of seeds", "of what is left", "seeds"]
+    rows = [[*header, *(f"{points:g} {'point' if points == 1 else 'points'}" for points in asked)]]
+    for name, plan in metrics.items():
+        variance = plan["variance"]
+        difference = f"{signed(plan['difference'])} {bracketed(plan['interval'], signed)}".rstrip()
+        is_one_seed = variance is None or variance["of_seeds"] is None
+        known = ("of_scenes", "", "") if is_one_seed else ("of_scenes", "of_seeds", "of_rest")
+        parts = [_deviation(variance and variance.get(key)) for key in known]
+        seeds = list(dict.fromkeys(need["n_seeds"] for need in plan["needs"]))
+        for n_seeds in seeds:
+            needs = [_need(need) for need in plan["needs"] if need["n_seeds"] == n_seeds]
+            first = [name, difference, *parts] if n_seeds == seeds[0] else [""] * 5
+            rows.append([*first, str(n_seeds), *needs])
+        if not seeds:
+            rows.append([name, difference, *parts, *[NOT_MEASURED] * (1 + len(asked))])
+    return text_table(protocol, rows, heading=protocol, caption=f": {title}")
+
+
+def _deviation(variance: float | None) -> str:
+    return NOT_MEASURED if variance is None else f"{100 * variance**0.5:.1f}"
+
+
+def _need(need: Mapping[str, Any]) -> str:
+    low, high = (NOT_MEASURED if need[end] is None else str(need[end]) for end in ("low", "high"))
+    return NOT_MEASURED if need["n_scenes"] is None else f"{need['n_scenes']} [{low}, {high}]"
+
+
+MOST_OF_A_RULE = 60  # characters
+SUM = "points that a rule adds, the mean over all orders in which rules can be changed; they sum to the difference"
+DRAWN = "points that a rule adds, the mean over {n} orders that were drawn, ± its standard error; the sum is exact"
+
+
+def rules_tables(apart: Mapping[str, Any]) -> list[Table | Prose]:
+    """The rules that differ, and beneath them the way from one number to the other where a prediction was given."""
+    first, second = apart["first"], apart["second"]
+    if not apart["differing"]:
+        return [Prose((f"{first} and {second}: no rule differs that moves a number",))]
+    rows = [["rule", first, second]]
+    rows += [[one["rule"], *_sides(one["rule"], one["first"], one["second"])] for one in apart["differing"]]
+    parts: list[Table | Prose] = [text_table("rules", rows, heading=f"{first} and {second}")]
+    return parts if apart["walk"] is None else [*parts, _walk_table(apart)]
+
+
+def _walk_table(apart: Mapping[str, Any]) -> Table:
+    walk = apart["walk"]
+    names = list(walk["start"])
+    rows = [["", *(cell for name in names for cell in (name, "least to most"))]]
+    rows.append([apart["first"], *(cell for name in names for cell in (percent(walk["start"][name]), ""))])
+    rows += [
+        [", ".join(step["rules"]), *(cell for name in names for cell in _share_cells(step["adds"][name]))]
+        for step in walk["steps"]
+    ]
+    rows.append([apart["second"], *(cell for name in names for cell in (percent(walk["end"][name]), ""))])
+    n = walk["n_orders"]
+    notes = [
+        f"{SUM if n is None else DRAWN.format(n=n)}; beside it the least and the most that it adds anywhere",
+        "rules in one line depend on one another and are changed together",
+    ]
+    if any(one["rule"] in UNMOVED for one in apart["differing"]):
+        notes.append("the encoder is the run's own under both")
+    title = f"{walk['run']}: {walk['method']}, {counted(len(walk['scenes']), 'scene')}"
+    return text_table("walk", rows, heading=title, notes=notes)
+
+
+def _share_cells(share: Mapping[str, Any]) -> tuple[str, str]:
+    error = share["standard_error"]
+    about = f" ± {percent(error)}" if error else ""
+    return signed(share["share"]) + about, f"{signed(share['least'])} to {signed(share['most'])}"
+
+
+def _sides(rule: str, first: Any, second: Any) -> list[str]:
+    """Either value; of long lists how many there are and what the other lacks."""
+    if rule == "classes":
+        names = [[entry["name"] for entry in side] for side in (first, second)]
+        return [f"{len(mine)} classes{_alone(mine, other)}" for mine, other in (names, names[::-1])]
+    if isinstance(first, list) and isinstance(second, list) and max(len(first), len(second)) > 4:
+        return [f"{len(mine)} of them{_alone(mine, other)}" for mine, other in ((first, second), (second, first))]
+    return [_shown(value) for value in (first, second)]
+
+
+def _alone(mine: Sequence[Any], other: Sequence[Any]) -> str:
+    own = [str(item) for item in mine if item not in other]
+    if not own:
+        return ""
+    rest = f" and {len(own) - 3} more" if len(own) > 3 else ""
+    return f", it alone: {printable(', '.join(own[:3]), MOST_OF_A_RULE)}{rest}"
+
+
+def _shown(value: Any) -> str:
+    if value is None or value in ([], {}):
+        return "none"
+    if isinstance(value, Mapping):
+        return printable(", ".join(f"{key} = {_shown(item)}" for key, item in value.items()), MOST_OF_A_RULE)
+    return printable(toml_value(value), MOST_OF_A_RULE)

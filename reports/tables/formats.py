@@ -15,8 +15,7 @@ from itertools import zip_longest
 from typing import Any
 
 from su3d_bench.core.errors import printable
-from su3d_bench.formats.tables.csv_text import MOST_OF_A_CELL, csv_lines
-from su3d_bench.formats.tables.table import Cell, Prose, Table, blocks_of
+from su3d_bench.formats.tables.table import MOST_OF_A_CELL, Cell, Prose, Table, blocks_of, csv_lines
 from su3d_bench.reports.tables.latex import latex
 
 CSV_COLUMNS = (

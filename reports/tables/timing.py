@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from su3d_bench.core.errors import counted
-from su3d_bench.formats.tables.csv_text import csv_lines
-from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, percent, text_table
+from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, csv_lines, percent, text_table
 from su3d_bench.metrics.costs import MethodSummary, StageSummary
 from su3d_bench.numerics.statistics import Growth
 

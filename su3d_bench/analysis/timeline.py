@@ -20,8 +20,14 @@ from su3d_bench.metrics.matching.nearest import nearest
 from su3d_bench.metrics.metric import n_predictions
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.reports.page.maps import Cloud, point_owners, thinned
-from su3d_bench.reports.pictures.canvas import Colour, class_colours, instance_colours
-from su3d_bench.reports.pictures.render import CUT_BELOW_TOP_M, ROOM_HEIGHT_M, room_bounds
+from su3d_bench.reports.pictures.canvas import (
+    CUT_BELOW_TOP_M,
+    ROOM_HEIGHT_M,
+    Colour,
+    class_colours,
+    instance_colours,
+    room_bounds,
+)
 from su3d_bench.reports.pictures.scene import evenly
 from su3d_bench.reports.timeline import (
     BOXES,

@@ -104,7 +104,7 @@ def call_check(arguments: argparse.Namespace) -> int:
 
 
 def _learn(arguments: argparse.Namespace) -> int:
-    from su3d_bench.analysis.gate.reference import ACROSS_MACHINES, COST_LIMIT, MOST_COST_LIMIT, learn, why_no_cost
+    from su3d_bench.analysis.gate import ACROSS_MACHINES, COST_LIMIT, MOST_COST_LIMIT, learn, why_no_cost
     from su3d_bench.core.errors import counted, printable
     from su3d_bench.core.files.atomic import json_text
     from su3d_bench.runs.finished import read_run
@@ -139,8 +139,7 @@ def _learn(arguments: argparse.Namespace) -> int:
 def _check(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from su3d_bench.analysis.gate.check import check
-    from su3d_bench.analysis.gate.reference import read_reference
+    from su3d_bench.analysis.gate import check, read_reference
     from su3d_bench.core.printing import terminal_width
     from su3d_bench.reports.gate import github_lines, plain_parts
     from su3d_bench.reports.tables.formats import plain

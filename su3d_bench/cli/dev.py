@@ -190,7 +190,7 @@ def _add_registry(verbs: Verbs) -> None:
 def call_registry_add(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from su3d_bench.reproducing.registry.folder import add_bundle, lines_of
+    from su3d_bench.reproducing.registry import add_bundle, lines_of
 
     if arguments.name is not None and len(arguments.bundles) > 1:
         raise ConfigError("--name: is of one bundle; add them one after the other")
@@ -205,8 +205,8 @@ def call_registry_add(arguments: argparse.Namespace) -> int:
 
 
 def call_registry_build(arguments: argparse.Namespace) -> int:
-    from su3d_bench.reproducing.registry.folder import read_registry
-    from su3d_bench.reproducing.registry.site import TITLE, write_site
+    from su3d_bench.reproducing.registry import read_registry
+    from su3d_bench.reproducing.registry_site import TITLE, write_site
 
     registry = read_registry(arguments.folder)
     title = TITLE if arguments.title is None else printable(arguments.title, 120)

@@ -223,7 +223,7 @@ def _datasets() -> Iterator[Check]:
 def _models() -> Check:
     from su3d_bench.perception.models.catalogue import MODELS
     from su3d_bench.perception.models.files import models_folder
-    from su3d_bench.perception.models.inspection import model_state
+    from su3d_bench.perception.models.loading import model_state
 
     here = [name for name, entry in MODELS.items() if model_state(entry).files]
     found = f"{len(here)} of {len(MODELS)} in {shown(models_folder(None))} and the Hugging Face cache"

@@ -82,7 +82,7 @@ def add_parser(verbs: Verbs) -> None:
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.evaluation.as_run import evaluate_methods
     from su3d_bench.evaluation.evaluate import evaluate, said_of
-    from su3d_bench.reports.tables.evaluation import evaluation_tables, side_by_side_tables
+    from su3d_bench.reports.tables.run import evaluation_tables, side_by_side_tables
     from su3d_bench.store.records import plain
 
     requests = {method: _request(paths, arguments) for method, paths in _named(arguments).items()}

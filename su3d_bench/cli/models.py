@@ -14,7 +14,7 @@ from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
     from su3d_bench.perception.models.files import ModelFiles
-    from su3d_bench.perception.models.inspection import ModelState, WarmUp
+    from su3d_bench.perception.models.loading import ModelState, WarmUp
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -80,7 +80,7 @@ def call_list(arguments: argparse.Namespace) -> int:
 
 def _states(arguments: argparse.Namespace, names: tuple[str, ...]) -> list[ModelState]:
     from su3d_bench.perception.models.catalogue import MODELS, model_entry
-    from su3d_bench.perception.models.inspection import model_state
+    from su3d_bench.perception.models.loading import model_state
 
     config = perception_config(arguments).models
     entries = [model_entry(name) for name in names] or list(MODELS.values())
@@ -118,7 +118,7 @@ def call_check(arguments: argparse.Namespace) -> int:
 
 
 def _checked(files: ModelFiles) -> dict[str, Any]:
-    from su3d_bench.perception.models.inspection import problems_of
+    from su3d_bench.perception.models.loading import problems_of
 
     return {
         "name": files.entry.name,
@@ -152,8 +152,7 @@ def call_warm(arguments: argparse.Namespace) -> int:
 
 def _warm(arguments: argparse.Namespace) -> WarmUp:
     from su3d_bench.core.system.devices import device_for
-    from su3d_bench.perception.models.inspection import warm_encoder, warm_perception, warm_scene
-    from su3d_bench.perception.models.loading import load_encoder
+    from su3d_bench.perception.models.loading import load_encoder, warm_encoder, warm_perception, warm_scene
 
     config = perception_config(arguments)
     if arguments.name is not None:

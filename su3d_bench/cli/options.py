@@ -14,9 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from su3d_bench.core.maps import Prediction
-    from su3d_bench.perception.language.chat import ChatRequest
+    from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig
     from su3d_bench.perception.language.client import ChatClient
-    from su3d_bench.perception.language.config import LanguageConfig
     from su3d_bench.perception.profiles import PerceptionConfig
     from su3d_bench.store.run_folder import JobFolder, RunFolder
 
@@ -281,9 +280,8 @@ def chat_client(
     is asked where none of them names a model.
     """
     from su3d_bench.core.config import Setting, Settings, read_assignments, read_file, resolve
+    from su3d_bench.perception.language.chat import LanguageConfig, ReplyStore
     from su3d_bench.perception.language.client import ChatClient
-    from su3d_bench.perception.language.config import LanguageConfig
-    from su3d_bench.perception.language.reply_store import ReplyStore
 
     settings = Settings() if arguments.config is None else read_file(arguments.config)
     assigned = read_assignments(arguments.set, (), ())

@@ -112,7 +112,7 @@ def _original_lines(stated: Stated | None) -> list[str]:
 def call_diff(arguments: argparse.Namespace) -> int:
     from su3d_bench.analysis.rules_walk import Walker, rules_apart
     from su3d_bench.metrics.protocols.loading import load_protocol
-    from su3d_bench.reports.tables.rules import rules_tables
+    from su3d_bench.reports.tables.comparison import rules_tables
 
     if arguments.out is not None and arguments.prediction is None:
         raise ConfigError("protocols diff: --out draws the steps of a --prediction; name one")

@@ -26,8 +26,7 @@ if TYPE_CHECKING:
 
     from su3d_bench.core.maps import Instances
     from su3d_bench.metrics.questions.score import RefinedNames
-    from su3d_bench.questions.model import Answer
-    from su3d_bench.questions.retrieval import Ranking
+    from su3d_bench.questions.model import Answer, Ranking
     from su3d_bench.questions.scene_map import SceneMap
     from su3d_bench.store.run_folder import JobFolder, RunFolder
 
@@ -65,7 +64,7 @@ def _add_text(verbs: Verbs) -> None:
 
 def call_text(arguments: argparse.Namespace) -> int:
     from su3d_bench.core.maps import DenseFeatures, Instances
-    from su3d_bench.questions.retrieval import rank
+    from su3d_bench.questions.model import rank
     from su3d_bench.runs.finished import encoder_of
 
     if not arguments.text.strip():
@@ -198,7 +197,7 @@ def _refined(job: JobFolder, wanted: str) -> tuple[RefinedNames | None, str]:
 
 
 def _estimate(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.language_solver import LanguageSolver
+    from su3d_bench.questions.solver import LanguageSolver
 
     if arguments.solver != "llm":
         return answer_estimate(arguments, None, ())
@@ -210,9 +209,8 @@ def _solve(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> An
     import numpy as np
 
     from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
-    from su3d_bench.questions.language_solver import LanguageSolver
     from su3d_bench.questions.scene_map import nearest_by
-    from su3d_bench.questions.solver import Solver
+    from su3d_bench.questions.solver import LanguageSolver, Solver
 
     if arguments.solver == "llm":
         return LanguageSolver(scene, *chat_client(arguments, run)).answer(arguments.question)

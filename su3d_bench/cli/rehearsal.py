@@ -12,8 +12,7 @@ from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import ConfigError, some
 from su3d_bench.core.files.atomic import make_folder
 from su3d_bench.datasets.layouts import LAYOUTS
-from su3d_bench.reproducing.asked import Asked
-from su3d_bench.reproducing.recipe import Experiment, Recipe
+from su3d_bench.reproducing.recipe import Asked, Experiment, Recipe
 from su3d_bench.runs.scenes import split_address
 from su3d_bench.store.run_folder import RunFolder
 

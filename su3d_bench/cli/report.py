@@ -317,7 +317,7 @@ def _add_attribution(verbs: Verbs) -> None:
 
 def call_attribution(arguments: argparse.Namespace) -> int:
     from su3d_bench.analysis.attribution import attribute
-    from su3d_bench.reports.tables.attribution import attribution_tables
+    from su3d_bench.reports.tables.samples import attribution_tables
 
     attribution = attribute(
         arguments.run,
@@ -363,8 +363,8 @@ def _add_power(verbs: Verbs) -> None:
 
 
 def call_power(arguments: argparse.Namespace) -> int:
-    from su3d_bench.analysis.planning import plan
-    from su3d_bench.reports.tables.planning import plan_tables
+    from su3d_bench.analysis.comparison import plan
+    from su3d_bench.reports.tables.comparison import plan_tables
 
     made = plan(
         arguments.runs,

@@ -226,8 +226,7 @@ def _add_bundle(verbs: Verbs) -> None:
 
 def call_bundle(arguments: argparse.Namespace) -> int:
     from su3d_bench.core.digests import digest_file
-    from su3d_bench.reproducing.bundle import bundle_runs, is_bundle
-    from su3d_bench.reproducing.verifying import refuse_own_code, refuse_own_truth
+    from su3d_bench.reproducing.bundle import bundle_runs, is_bundle, refuse_own_code, refuse_own_truth
     from su3d_bench.runs.finished import read_run
 
     for path in arguments.runs:
@@ -277,7 +276,7 @@ def call_verify(arguments: argparse.Namespace) -> int:
 
 
 def _verify_bundles(bundles: list[Path], arguments: argparse.Namespace) -> int:
-    from su3d_bench.reproducing.verifying import verify_bundle
+    from su3d_bench.reproducing.bundle import verify_bundle
 
     if arguments.root is not None:
         raise ConfigError("--root: a bundle brings its runs; leave it out")

@@ -14,9 +14,8 @@ from su3d_bench.cli.output import answer, answer_document, answer_json, formatte
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, RunIncomplete, counted, printable
 
 if TYPE_CHECKING:
-    from su3d_bench.reproducing.asked import Asked, AskedRun
     from su3d_bench.reproducing.preflight import Preflight
-    from su3d_bench.reproducing.recipe import Experiment, Recipe
+    from su3d_bench.reproducing.recipe import Asked, AskedRun, Experiment, Recipe
 
 VARIABLES = ("SU3D_DATA",)  # where a rehearsal's own data lie
 OF_A_RUN = ("jobs", "limit", "solver", "offline", "executor", "ray_address", "gpus_per_job", "retries", "slurm")
@@ -85,7 +84,7 @@ def call(arguments: argparse.Namespace) -> int:
     if not arguments.rehearse:
         return _reproduce(recipe, experiments, _asked(arguments), out, arguments)
     from su3d_bench.cli.rehearsal import places, rehearsed
-    from su3d_bench.reproducing.asked import environment
+    from su3d_bench.reproducing.recipe import environment
 
     asked = rehearsed(recipe, experiments, _asked(arguments), out, arguments)
     with environment(**places(out)):
@@ -118,7 +117,7 @@ def _list_recipes(arguments: argparse.Namespace) -> int:
 
 
 def _asked(arguments: argparse.Namespace) -> Asked:
-    from su3d_bench.reproducing.asked import Asked
+    from su3d_bench.reproducing.recipe import Asked
 
     values = {name: getattr(arguments, name) for name in OF_A_RUN if getattr(arguments, name) is not None}
     return Asked(arguments.profile, arguments.encoder, arguments.device, values, tuple(arguments.set))
@@ -127,8 +126,8 @@ def _asked(arguments: argparse.Namespace) -> Asked:
 def _reproduce(
     recipe: Recipe, experiments: Sequence[Experiment], asked: Asked, out: Path, arguments: argparse.Namespace
 ) -> int:
-    from su3d_bench.reproducing.asked import asked_runs, evaluate_predictions, named_predictions
     from su3d_bench.reproducing.preflight import preflight
+    from su3d_bench.reproducing.recipe import asked_runs, evaluate_predictions, named_predictions
 
     runs = asked_runs(recipe, experiments, asked)
     named = named_predictions(experiments, arguments.predictions, arguments.text_features)
@@ -171,7 +170,7 @@ def _say(known: Preflight, arguments: argparse.Namespace) -> None:
 def _carry_out(run: AskedRun, out: Path, arguments: argparse.Namespace) -> list[str]:
     """Lines of what failed."""
     from su3d_bench.cli.output import progress
-    from su3d_bench.reproducing.asked import carry_out, plan_of
+    from su3d_bench.reproducing.recipe import carry_out, plan_of
 
     plan = plan_of(run, out)
     with progress(len(plan.jobs), is_quiet=arguments.quiet) as report:

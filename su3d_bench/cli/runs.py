@@ -63,7 +63,7 @@ def _add_list(verbs: Verbs) -> None:
 def call_list(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from su3d_bench.analysis.run_list import list_runs, runs_table
+    from su3d_bench.analysis.leaderboard import list_runs, runs_table
 
     if not arguments.folder.is_dir() and arguments.folder != DEFAULT:
         raise ConfigError(f"{arguments.folder}: there is no such folder; name one that holds runs")
@@ -89,7 +89,7 @@ def _add_show(verbs: Verbs) -> None:
 def call_show(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from su3d_bench.analysis.run_list import run_entry, size_bytes
+    from su3d_bench.analysis.leaderboard import run_entry, size_bytes
     from su3d_bench.core.config import DEFAULT_SOURCE
     from su3d_bench.core.errors import StoreError, printable, printable_json
     from su3d_bench.formats.tables.table import percent
@@ -132,7 +132,7 @@ def _add_remove(verbs: Verbs) -> None:
 
 
 def call_remove(arguments: argparse.Namespace) -> int:
-    from su3d_bench.analysis.run_list import removable, run_entry, size_bytes
+    from su3d_bench.analysis.leaderboard import removable, run_entry, size_bytes
 
     folders = [removable(path) for path in dict.fromkeys(arguments.runs)]  # all of them, before the first goes
     lines = []

@@ -208,7 +208,7 @@ def call_pictures(arguments: argparse.Namespace) -> int:
     from su3d_bench.reports.pictures.canvas import scale_stops
     from su3d_bench.reports.pictures.figures import draw_grid
     from su3d_bench.runs.finished import read_run
-    from su3d_bench.sheets.figures import Figures
+    from su3d_bench.sheets.drawing import Figures
     from su3d_bench.sheets.sources import RunSource
 
     of_figure = () if arguments.figure is None else figure_texts(arguments.figure)

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
     from su3d_bench.core.interfaces import Encoder
     from su3d_bench.perception.language.chat import ChatRequest
-    from su3d_bench.questions.language_solver import AskMap
     from su3d_bench.questions.model import Question
+    from su3d_bench.questions.solver import AskMap
     from su3d_bench.sheets.drafts import Draft
     from su3d_bench.sheets.drawing import PictureSource
     from su3d_bench.sheets.items import SheetKind
@@ -247,7 +247,7 @@ def _drafts(
 
 def _ask_map(source: RunSource, encoder: Encoder | None, arguments: argparse.Namespace) -> tuple[AskMap, str]:
     """Who answers the questions of reasoning sheets, and how the key calls them."""
-    from su3d_bench.questions.language_solver import BUILT_IN, built_in, by_language_model
+    from su3d_bench.questions.solver import BUILT_IN, built_in, by_language_model
 
     if arguments.solver != "llm":
         return built_in(encoder), BUILT_IN

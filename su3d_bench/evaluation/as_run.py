@@ -40,8 +40,8 @@ from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import EVERY_SCENE, combine, pack_scores, plain_json
 from su3d_bench.predictions.base import Content
+from su3d_bench.predictions.formats import Source
 from su3d_bench.predictions.own_runs import write_content
-from su3d_bench.predictions.scenes import Source
 from su3d_bench.runs.existing import sealed
 from su3d_bench.runs.finished import made_elsewhere
 from su3d_bench.runs.plan import check_folder_name
@@ -318,7 +318,9 @@ def _seal(kept: _Kept, evaluation: Evaluation, address: str, record: RunRecord, 
         if kept.truths.address(scene) == address
     }
     write_bytes(job.counts, pack_scores(scores))
-    unscored = {each.protocol: each.reason for each in record.unscored if _is_of(each, address, kept.method)}
+    unscored = {
+        each.protocol: each.reason for each in record.unscored if (each.scene, each.method) == (address, kept.method)
+    }
     write_text(job.log, "".join(f"{line}\n" for line in (made_elsewhere(kept.formats), "done")))
     key = {"data": record.data_digests[address], "method": kept.method, "predictions": digest_json(kept.files[address])}
     job.seal("predict", key, [job.prediction, job.updates])
@@ -328,10 +330,6 @@ def _seal(kept: _Kept, evaluation: Evaluation, address: str, record: RunRecord, 
         [job.counts, job.log],
         {"unscored": unscored, "warnings": [], "doubts": []},
     )
-
-
-def _is_of(unscored: UnscoredRecord, scene: str, method: str) -> bool:
-    return (unscored.scene, unscored.method) == (scene, method)
 
 
 def _write_ceilings(kept: Sequence[_Kept], evaluations: Mapping[str, Evaluation], folder: RunFolder) -> None:

@@ -43,9 +43,9 @@ from su3d_bench.metrics.fitness import (
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
+from su3d_bench.predictions.formats import Source, open_sources
 from su3d_bench.predictions.own_runs import OwnRuns
 from su3d_bench.predictions.scannet_text import ScannetText
-from su3d_bench.predictions.scenes import Source, open_sources
 
 __all__ = ["Evaluation", "ProtocolEvaluation", "Request", "evaluate", "said_of"]
 

@@ -228,7 +228,7 @@ def formed(rules: ProtocolRules, kept: SceneOutcomes, *, file_confidences: bool)
     lines = [*_scene_warnings(kept), *_confidence_warnings(rules, evaluation, file_confidences), *kept.warnings]
     # of kind 'instance' said above, for all scenes at once
     lines += [line for line in result.warnings if not (rules.needs_instances and CONSTANT_CONFIDENCE in line)]
-    return replace(evaluation, warnings=tuple(_once(lines)))
+    return replace(evaluation, warnings=tuple(dict.fromkeys(lines)))
 
 
 def _with_ones(rules: ProtocolRules, kept: SceneOutcomes) -> dict[str, float] | None:
@@ -286,10 +286,6 @@ def _confidence_warnings(rules: ProtocolRules, evaluation: ProtocolEvaluation, f
 def some_names(names: Sequence[str]) -> str:
     """The first five of ``names``, and how many more there are."""
     return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-
-
-def _once(lines: Sequence[str]) -> list[str]:
-    return list(dict.fromkeys(lines))
 
 
 def _key(name: str) -> str:

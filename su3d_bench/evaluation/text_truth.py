@@ -30,15 +30,14 @@ from su3d_bench.evaluation.truth import (
     dataset_of_names,
     why_no_queries,
 )
-from su3d_bench.formats.arrays import MOST_POINTS
-from su3d_bench.formats.text_integers import integer_lines
+from su3d_bench.formats.arrays import MOST_POINTS, integer_lines
 from su3d_bench.metrics.fitness import ID_LISTS, LARGEST_NYU40_ID, TruthFacts, list_of_ids, why_not_truth
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS, values_of_numbers
 from su3d_bench.metrics.instance.score import OBJECT
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.predictions.base import scene_files
+from su3d_bench.predictions.formats import Source, match_scenes
 from su3d_bench.predictions.own_runs import OwnRuns, read_stored
-from su3d_bench.predictions.scenes import Source, match_scenes
 from su3d_bench.questions.query_files import VARIANT as QUERY_OBJECTS
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.records import TruthRecord

@@ -131,7 +131,7 @@ def encoder_for(rules: ProtocolRules, n_dimensions: int, given: TextFeatures | N
 def _real_encoder(name: str) -> Encoder | None:
     """The foundation model that protocols call ``name``; None where it is none or its files are not here."""
     from su3d_bench.perception.models.catalogue import encoder_known_as
-    from su3d_bench.perception.models.inspection import model_state
+    from su3d_bench.perception.models.loading import model_state
 
     entry = encoder_known_as(name)
     forms = () if entry is None else model_state(entry).files

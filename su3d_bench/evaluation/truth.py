@@ -27,7 +27,7 @@ from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
 from su3d_bench.metrics.open_vocabulary.score import TextQuery
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth
-from su3d_bench.predictions.scenes import Match, Source, is_known, match_scenes, planned_scenes
+from su3d_bench.predictions.formats import Match, Source, is_known, match_scenes, planned_scenes
 from su3d_bench.questions.query_files import VARIANT as QUERY_OBJECTS
 from su3d_bench.questions.query_files import query_truth, read_query_file
 from su3d_bench.questions.question_files import is_foreign, read_foreign_queries

@@ -28,7 +28,7 @@ from su3d_bench.formats.numpy_files import plain_array, plain_type
 
 GZIP_START = b"\x1f\x8b"
 MOST_INFLATED = 16 << 30  # bytes of a gzip stream; a map of ConceptGraphs with all its masks has some GiB
-INFLATED_A_READ, SKIPPED_A_READ = 1 << 20, 1 << 16
+INFLATED_A_READ, SKIPPED_A_READ = 1 << 17, 1 << 16
 # Reads of one byte, one or two an operation; a map of ConceptGraphs takes less than a million of them.
 FREE_STEPS, MOST_STEPS = 2_000_000, 20_000_000
 MOST_NAME = 1024

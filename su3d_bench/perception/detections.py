@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from su3d_bench.core.english import head_phrases, words
 from su3d_bench.core.interfaces import Encoder, StageTimer
 from su3d_bench.core.types import Detections, Float32Array, Frame, PerceptionNeeds, Regions
-from su3d_bench.perception.cache import FrameCache
-from su3d_bench.perception.embedded.naming import Namer, colour_word, scene_caption
-from su3d_bench.perception.regions import CropEncoder
+from su3d_bench.perception.cache import CropEncoder, FrameCache
+from su3d_bench.perception.embedded.lexicon import Namer, colour_word, scene_caption
 
 # Words that end in the same noun and mean something else.
 _OTHER_THINGS = frozenset((("coffee", "ground"), ("video", "wall")))

@@ -26,10 +26,17 @@ from su3d_bench.core.types import (
     UInt8Array,
 )
 from su3d_bench.numerics.open3d_core import compiled_open3d
-from su3d_bench.perception.cache import CODE, FrameCache, array_digest, content_key
-from su3d_bench.perception.crops import mask_boxes
+from su3d_bench.perception.cache import (
+    CODE,
+    FrameCache,
+    RegionsOnDemand,
+    array_digest,
+    cached_regions,
+    content_key,
+    mask_boxes,
+    region_under,
+)
 from su3d_bench.perception.detections import Assembler
-from su3d_bench.perception.regions import RegionsOnDemand, cached_regions, region_under
 
 
 class OracleNoise(BaseModel):

@@ -8,8 +8,7 @@ from dataclasses import replace
 from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.core.interfaces import Encoder, RegionPerception, Segmenter, StageTimer
 from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, Regions
-from su3d_bench.perception.cache import FrameCache, content_key
-from su3d_bench.perception.crops import crop_images
+from su3d_bench.perception.cache import FrameCache, cached_regions, content_key, crop_images
 from su3d_bench.perception.detections import Assembler, captioned
 from su3d_bench.perception.language.captioner import Captioner
 from su3d_bench.perception.models.catalogue import MODELS
@@ -23,7 +22,6 @@ from su3d_bench.perception.models.masks.grounded_sam import (
     Networks,
     SamRegions,
 )
-from su3d_bench.perception.regions import cached_regions
 
 # opensu3d.tex, section IV-A.
 PAPER_ENCODER, PAPER_SEGMENTER, PAPER_VISION_MODEL = "clip-vit-h-14", "sam-vit-h", "gpt-4-vision-preview"

@@ -20,15 +20,14 @@ from su3d_bench.core.types import (
     Regions,
     SceneInfo,
 )
-from su3d_bench.perception.cache import FrameCache, content_key
+from su3d_bench.perception.cache import FrameCache, RegionsOnDemand, cached_regions, content_key
 from su3d_bench.perception.detections import Assembler, captioned_by_colour
 from su3d_bench.perception.embedded.join_rules import SegmenterConfig
-from su3d_bench.perception.embedded.naming import Namer, NamingConfig
+from su3d_bench.perception.embedded.lexicon import Namer, NamingConfig
 from su3d_bench.perception.embedded.segmenter import RgbdSegmenter
-from su3d_bench.perception.language.config import LanguageConfig
+from su3d_bench.perception.language.chat import LanguageConfig
 from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, PaperConfig
 from su3d_bench.perception.oracle import OracleConfig, OraclePerception
-from su3d_bench.perception.regions import RegionsOnDemand, cached_regions
 from su3d_bench.perception.stored import NpzFiles, StoredConfig, StoredPerception
 from su3d_bench.perception.stored_masks import LabelImages
 
@@ -195,8 +194,8 @@ def _paper(
     captioner = None
     if config.paper.captions == "model":
         from su3d_bench.perception.language.captioner import Captioner
+        from su3d_bench.perception.language.chat import ReplyStore
         from su3d_bench.perception.language.client import ChatClient
-        from su3d_bench.perception.language.reply_store import ReplyStore
 
         client = ChatClient(config.language, ReplyStore(replies), offline=is_offline)
         captioner = Captioner(client, config.language)

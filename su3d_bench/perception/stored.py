@@ -31,10 +31,9 @@ from su3d_bench.core.files.atomic import DAMAGE, make_folder, read_arrays, repla
 from su3d_bench.core.interfaces import Encoder, RegionPerception, StageTimer
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Detections, Float32Array, Frame, PerceptionNeeds, Regions, SceneInfo
-from su3d_bench.perception.cache import FrameCache, content_key
+from su3d_bench.perception.cache import FrameCache, RegionsOnDemand, content_key
 from su3d_bench.perception.detections import Assembler, captioned_by_colour
-from su3d_bench.perception.embedded.naming import Namer
-from su3d_bench.perception.regions import RegionsOnDemand
+from su3d_bench.perception.embedded.lexicon import Namer
 
 INDEX = "{index}"
 MOST_REGIONS = 2_000  # of one image; SAM gives some hundred

@@ -27,7 +27,7 @@ from su3d_bench.core.system.files import file_bytes, file_text, parse_toml
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, Regions, SceneInfo
 from su3d_bench.formats.images import decoded, whole_png_header
 from su3d_bench.formats.pickles import read_pickle_file
-from su3d_bench.perception.crops import mask_boxes
+from su3d_bench.perception.cache import mask_boxes
 from su3d_bench.perception.stored import StoredFrame, check_masks, numbered_files
 
 MAX_NAMES_BYTES = 1 << 20

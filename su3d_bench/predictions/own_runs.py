@@ -63,13 +63,9 @@ class OwnRuns(Reader):
 def write_content(path: Path, content: Content) -> None:
     """Store what a reader gave at ``path``, so that ``OwnRuns`` reads the same."""
     if isinstance(content, VertexLabels):
-        labels = {
-            "kind": np.array("VertexLabels"),
-            "class_ids": content.class_ids,
-            "further": content.further,
-            "numbering": np.array(content.numbering) if content.numbering != "id" else None,
-        }
-        write_npz(path, {name: array for name, array in labels.items() if array is not None})
+        numbering = np.array(content.numbering) if content.numbering != "id" else None
+        labels = {"kind": np.array("VertexLabels"), "class_ids": content.class_ids, "further": content.further}
+        _write_present(path, {**labels, "numbering": numbering})
     elif isinstance(content, VertexMasks):
         arrays = {
             "kind": np.array("VertexMasks"),
@@ -82,9 +78,13 @@ def write_content(path: Path, content: Content) -> None:
             "features": content.features,
             "keys": np.array(content.keys, dtype=np.str_),
         }
-        write_npz(path, {name: array for name, array in arrays.items() if array is not None})
+        _write_present(path, arrays)
     else:
         write_prediction(path, content)
+
+
+def _write_present(path: Path, arrays: Mapping[str, NDArray[Any] | None]) -> None:
+    write_npz(path, {name: array for name, array in arrays.items() if array is not None})
 
 
 def read_stored(path: Path) -> Content:

@@ -21,8 +21,7 @@ import numpy as np
 from su3d_bench.core.errors import PredictionError, counted, printable, reading, shown
 from su3d_bench.core.system.files import file_bytes, opened
 from su3d_bench.core.types import Int32Array
-from su3d_bench.formats.arrays import MOST_POINTS, check_members, run_members
-from su3d_bench.formats.text_integers import integer_lines
+from su3d_bench.formats.arrays import MOST_POINTS, check_members, integer_lines, run_members
 from su3d_bench.metrics.instance.average_precision import last_line_of_each_mask_file
 from su3d_bench.predictions.base import SceneFiles, ScenePrediction, VertexLabels, VertexMasks, vertex_masks
 

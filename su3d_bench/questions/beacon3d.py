@@ -26,14 +26,13 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictInt
 
 from su3d_bench.core.errors import ConfigError, DataError, counted, printable
 from su3d_bench.core.types import Float64Array
+from su3d_bench.formats.arrays import parsed_json
 from su3d_bench.formats.images import read_bytes
 from su3d_bench.formats.tables.table import Cell, Table, TableRow, percent
-from su3d_bench.formats.text_files import parsed_json
 from su3d_bench.metrics.questions.grounding import CHAINS_EACH, ChainedText, Place, judge_chains
-from su3d_bench.perception.language.chat import ChatRequest
+from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig
 from su3d_bench.perception.language.chat import Reply as ModelReply
 from su3d_bench.perception.language.client import LanguageModel
-from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.questions.query_files import ObjectId, Words, validated
 
 PAGE = "https://github.com/beacon-3d/beacon-3d"

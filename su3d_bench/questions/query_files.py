@@ -24,8 +24,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, 
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.system.files import parse_toml
 from su3d_bench.core.types import Float64Array, GroundTruth
-from su3d_bench.formats.tables.csv_text import meant, separated_rows
-from su3d_bench.formats.text_files import read_text
+from su3d_bench.formats.arrays import read_text
+from su3d_bench.formats.tables.table import meant, separated_rows
 from su3d_bench.metrics.open_vocabulary.score import QueryTruth, TextQuery
 
 COLUMNS = ("scene", "text", "objects")
@@ -103,9 +103,7 @@ class QueryRow:
 def read_query_rows(path: Path) -> list[QueryRow]:
     """Every query of a file in its order; ``objects`` is empty where nobody knows them."""
     where = printable(str(path), 200)
-    if path.is_file() and path.stat().st_size > MOST_BYTES:
-        raise DataError(f"{where}: has more than {MOST_BYTES >> 20} MiB; split it")
-    text = read_text(path, where, ADVICE)
+    text = read_text(path, where, ADVICE, MOST_BYTES)
     rows = list(_csv_rows(text, where) if path.suffix.lower() == ".csv" else _toml_rows(text, where))
     for row in rows:
         if len(set(row.objects)) != len(row.objects):
@@ -165,11 +163,15 @@ def _toml_rows(text: str, where: str) -> Iterator[QueryRow]:
         yield QueryRow(f"{where}: query {number}", **query.model_dump())
 
 
-def _csv_rows(text: str, where: str) -> Iterator[QueryRow]:
+def _rows(text: str, where: str, separator: str = ",") -> list[list[str]]:
     try:
-        rows = separated_rows(text)
+        return separated_rows(text, separator)
     except csv.Error as error:
         raise DataError(f"{where}: not CSV ({printable(str(error), 120)})") from error
+
+
+def _csv_rows(text: str, where: str) -> Iterator[QueryRow]:
+    rows = _rows(text, where)
     header = tuple(word.strip() for word in rows[0]) if rows else ()
     more = header[len(COLUMNS) :]
     if header[: len(COLUMNS)] != COLUMNS or not set(more) <= set(MORE_COLUMNS) or len(set(more)) < len(more):
@@ -309,14 +311,8 @@ _ID = re.compile(r"[0-9a-f]{12}")
 def read_left_out(path: Path) -> frozenset[str]:
     """The ids in the column ``question_id``, separated by ``,`` ``;`` or tab, as spreadsheets save it too."""
     where = printable(str(path), 200)
-    if path.is_file() and path.stat().st_size > MOST_BYTES:
-        raise DataError(f"{where}: has more than {MOST_BYTES >> 20} MiB; it lists no questions")
-    text = read_text(path, where, "name a CSV file, such as sheets score --disputed writes")
-    separator = max(",;\t", key=text.partition("\n")[0].count)
-    try:
-        rows = separated_rows(text, separator)
-    except csv.Error as error:
-        raise DataError(f"{where}: not CSV ({printable(str(error), 120)})") from error
+    text = read_text(path, where, "name a CSV file, such as sheets score --disputed writes", MOST_BYTES)
+    rows = _rows(text, where, max(",;\t", key=text.partition("\n")[0].count))
     header = [word.strip() for word in rows[0]] if rows else []
     if header.count(COLUMN) != 1:
         raise DataError(f"{where}: the first line must name one column {COLUMN}, as sheets score --disputed writes it")

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,8 +25,8 @@ from su3d_bench.core.config import toml_value
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.files.atomic import make_folder, write_text
 from su3d_bench.core.system.files import file_text, opened, parse_toml
-from su3d_bench.formats.images import read_bytes
-from su3d_bench.formats.tables.csv_text import no_formula
+from su3d_bench.formats.arrays import parsed_json, read_text
+from su3d_bench.formats.tables.table import no_formula
 from su3d_bench.metrics.open_vocabulary.score import TextQuery
 from su3d_bench.questions.beacon3d import chains_of, kind_of_metadata, questions_of_objects, read_metadata
 from su3d_bench.questions.model import ALL_KINDS, KINDS, REASONING, Question, new_question
@@ -211,10 +210,10 @@ def is_foreign(path: Path) -> bool:
 def read_foreign(path: Path) -> tuple[Question, ...]:
     """The sentences of a file: descriptions and utterances as relative queries, SQA3D's as reasoning questions."""
     where = printable(str(path), 200)
-    text = _text_of(path, where)
+    text = read_text(path, where, ADVICE, MOST_BYTES)
     if path.suffix.lower() == ".csv":
         return tuple(_nr3d(text, where))
-    content = _json_of(text, where)
+    content = parsed_json(text, where, ADVICE)
     if kind_of_metadata(content) is not None:
         return tuple(_of_objects(content, where))
     if isinstance(content, list):
@@ -253,20 +252,6 @@ def _of_objects(content: Any, where: str) -> Iterator[Question]:
         yield new_question(f"{DATASET}/{asked.scene}", REASONING, text, None, "Beacon3D", reply)
 
 
-def _text_of(path: Path, where: str) -> str:
-    try:
-        return read_bytes(path, where, ADVICE, MOST_BYTES).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{where}: not a text file in UTF-8; {ADVICE}") from error
-
-
-def _json_of(text: str, where: str) -> Any:
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{where}: not JSON ({printable(str(error), 120)}); {ADVICE}") from error
-
-
 def _scanrefer(rows: list[Any], where: str) -> Iterator[Question]:
     for row in _rows(_ScanRefer, rows, where, "entry"):
         question = new_question(
@@ -302,7 +287,7 @@ def _replies(path: Path) -> dict[str, str]:
     if beside == path or not beside.is_file():
         return {}
     where = printable(str(beside), 200)
-    content = _json_of(_text_of(beside, where), where)
+    content = parsed_json(read_text(beside, where, ADVICE, MOST_BYTES), where, ADVICE)
     rows = content.get("annotations") if isinstance(content, dict) else None
     if not isinstance(rows, list):
         raise DataError(f"{where}: has no 'annotations'")

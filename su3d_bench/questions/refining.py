@@ -27,9 +27,8 @@ from su3d_bench.metrics.questions.score import RefinedNames
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.perception.detections import is_background
 from su3d_bench.perception.language.captioner import REFINE, REFINE_FORM, list_of_names, reason_of
-from su3d_bench.perception.language.chat import ChatRequest
+from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig
 from su3d_bench.perception.language.client import LanguageModel
-from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.perception.language.parsing import chosen_name
 from su3d_bench.store.run_folder import JobFolder
 

@@ -28,8 +28,7 @@ from su3d_bench.numerics.relations import (
     is_between,
     may_be_between,
 )
-from su3d_bench.perception.embedded.lexicon import GROUPS, SYNONYMS
-from su3d_bench.perception.embedded.naming import vocabulary
+from su3d_bench.perception.embedded.lexicon import GROUPS, SYNONYMS, vocabulary
 from su3d_bench.questions.sight import WITHOUT_COLOUR, Looks, Sight, instance_rows, looks_of
 
 MOST_NAME, MOST_CAPTION = 80, 400  # characters; a hostile map may hold texts of any length

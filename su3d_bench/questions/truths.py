@@ -26,14 +26,13 @@ from su3d_bench.metrics.questions.score import (
 )
 from su3d_bench.metrics.scoring import QuestionTruth
 from su3d_bench.questions.chains import chain_truth
-from su3d_bench.questions.generated import generate_questions
+from su3d_bench.questions.generated import counted_rooms, generate_questions, presence_questions
 from su3d_bench.questions.generator import chosen, generate, right_by_name
-from su3d_bench.questions.language_solver import BUILT_IN, MapSolver, built_in, given_answer
 from su3d_bench.questions.model import Question, new_question
-from su3d_bench.questions.presence import counted_rooms, presence_questions
 from su3d_bench.questions.refining import voted_names
 from su3d_bench.questions.scene_map import SceneMap, is_called, known_objects, map_of
 from su3d_bench.questions.sight import Sight, sights
+from su3d_bench.questions.solver import BUILT_IN, MapSolver, built_in, given_answer
 
 Refine = Callable[[Instances], RefinedNames | None]
 MIN_VERTICES = 100  # ScanNet's smallest instance that counts

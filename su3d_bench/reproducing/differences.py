@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -18,13 +18,12 @@ from su3d_bench.core.maps import Instances
 from su3d_bench.formats.tables.table import Cell, Prose, Table, TableRow
 from su3d_bench.metrics.costs import summarise
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
-from su3d_bench.questions.retrieval import rank
+from su3d_bench.questions.model import rank
 from su3d_bench.reports.pictures.maps import draw_heat_map
 from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.paper import OPEN, PAPER_PROFILE, PAPER_SCENES, Figure, Shown
 from su3d_bench.reports.tables.timing import timing_tables
-from su3d_bench.reproducing.asked import method_of_row, methods_of
-from su3d_bench.reproducing.recipe import Experiment, Recipe
+from su3d_bench.reproducing.recipe import Experiment, Recipe, method_of_row, methods_of
 from su3d_bench.runs.finished import FinishedRun, encoder_of, read_run, read_update_times
 from su3d_bench.store.predictions import read_prediction
 
@@ -121,11 +120,11 @@ def _cell(experiment: Experiment, figure: Figure, printed: str, results: Results
     )  # fmt: skip
     row = _measured(experiment, figure, method, name, results)
     if row is None:
-        return _with(blank, why_not=_why_not(experiment, figure, method, name, results))
+        return replace(blank, why_not=_why_not(experiment, figure, method, name, results))
     interval = row.intervals.get(name)
     value = row.metrics[name]
     assert value is not None
-    return _with(
+    return replace(
         blank,
         measured=100.0 * value,
         interval=None if interval is None else (100.0 * interval[0], 100.0 * interval[1]),
@@ -135,10 +134,6 @@ def _cell(experiment: Experiment, figure: Figure, printed: str, results: Results
         n_scenes=len(row.per_scene),
         causes=tuple(causes(figure, row, results.runs.get(row.run))),
     )
-
-
-def _with(cell: Compared, **values: Any) -> Compared:
-    return Compared(**{**vars(cell), **values})
 
 
 def _measured(experiment: Experiment, figure: Figure, method: str, metric: str, results: Results) -> Measured | None:
@@ -172,7 +167,8 @@ def _why_not(experiment: Experiment, figure: Figure, method: str, metric: str, r
 
 def causes(figure: Figure, row: Measured, run: FinishedRun | None) -> Iterator[str]:
     """In what the row of a run was made otherwise than the printed number, as far as both sides say."""
-    yield from _of_judges(figure, row)
+    if "judged by a person" in figure.setup and not row.is_by_people:
+        yield "judges: the ground truth in place of a person, on questions of its own"
     yield from _of_protocol(figure, row)
     yield from _of_scenes(figure, row)
     yield from _of_encoder(figure, row)
@@ -181,11 +177,6 @@ def causes(figure: Figure, row: Measured, run: FinishedRun | None) -> Iterator[s
     yield from _of_labels(figure, row, run)
     if row.changed and not (figure.row and "=" in figure.row):
         yield f"settings: {some(row.changed, 4)}"
-
-
-def _of_judges(figure: Figure, row: Measured) -> Iterator[str]:
-    if "judged by a person" in figure.setup and not row.is_by_people:
-        yield "judges: the ground truth in place of a person, on questions of its own"
 
 
 def _of_protocol(figure: Figure, row: Measured) -> Iterator[str]:
@@ -387,7 +378,7 @@ def draw_queries(experiments: Sequence[Experiment], results: Results, out: Path,
         if not experiment.queries:
             continue
         for run in results.of(experiment).runs.values():
-            if experiment.queries and set(methods_of(experiment)) <= set(run.methods):
+            if set(methods_of(experiment)) <= set(run.methods):
                 yield from _of_run(experiment, run, out / experiment.name, device)
                 break
 

@@ -14,11 +14,11 @@ from su3d_bench.core.system.devices import require_installed
 from su3d_bench.fetching.sources import built_in
 from su3d_bench.formats.tables.table import Table, text_table
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.perception.models.catalogue import PAPERS_ENCODERS, PROFILE_MODELS, FormName, model_entry
+from su3d_bench.perception.models.catalogue import PAPERS_ENCODERS, PROFILE_MODELS, FormName
 from su3d_bench.perception.models.files import locate
 from su3d_bench.perception.models.loading import DETECTOR, PACKAGES, TAGGER
 from su3d_bench.perception.profiles import PerceptionConfig
-from su3d_bench.reproducing.asked import AskedRun, dataset_named, known_scenes, scene_names
+from su3d_bench.reproducing.recipe import AskedRun, dataset_named, known_scenes, scene_names
 from su3d_bench.runs.frame_loop import surface_of
 from su3d_bench.runs.job import build_method
 from su3d_bench.runs.plan import method_part, named_method
@@ -27,14 +27,13 @@ from su3d_bench.runs.scenes import data_root
 PAPER = "paper"
 FETCHED_FOR_PAPER = (*PROFILE_MODELS[PAPER], *PAPERS_ENCODERS)
 CAN_DO_WITHOUT = (TAGGER,)  # without RAM++ a list of words names what is looked for
-MB = 1_000_000
 
 
 @dataclass(frozen=True)
 class Need:
-    """One thing that runs need: ``kind`` is package, model, scene, mesh, truth or GPU memory.
+    """One thing that runs need: ``kind`` is package, model, scene, mesh or truth.
 
-    ``n_bytes``: the size of the download, or of the memory needed; None where it is unknown.
+    ``n_bytes``: the size of the download; None where it is unknown.
     ``is_required`` false: the run does without it, and ``remark`` says how.
     """
 
@@ -67,7 +66,7 @@ def preflight(runs: Sequence[AskedRun]) -> Preflight:
     for run in runs:
         for need in (*_models(run), *_data(run)):
             needs.setdefault((need.kind, need.name), need)
-    return Preflight((*needs.values(), *_gpu(runs)))
+    return Preflight(tuple(needs.values()))
 
 
 def _fetched(dataset: str) -> tuple[float | None, str]:
@@ -166,34 +165,6 @@ def _model(name: str, config: PerceptionConfig, *, is_required: bool) -> Need:
         how = f"su3d-bench models fetch {'--for paper' if name in FETCHED_FOR_PAPER else name}"
         return Need("model", name, is_here=False, n_bytes=n_bytes, how=how, is_required=is_required, remark=remark)
     return Need("model", name, is_here=True, n_bytes=0.0, remark=str(files.folder))
-
-
-def _gpu(runs: Sequence[AskedRun]) -> Iterator[Need]:
-    """The memory that the weights take on a GPU, where a run asks for one."""
-    on_gpu = [run for run in runs if (run.device or "cpu").startswith("cuda")]
-    if on_gpu:
-        needed, free = max(sum(_weights(run)) for run in on_gpu), _gpu_bytes()
-        remark = "no GPU is seen by torch here" if free is None else f"{free / 1e9:.1f} GB are free"
-        is_enough = free is not None and needed <= free
-        yield Need(
-            "GPU memory", "weights alone, images come on top", is_enough, needed, is_required=free is None,
-            remark=remark,
-        )  # fmt: skip
-
-
-def _weights(run: AskedRun) -> Iterator[float]:
-    """Bytes of the weights of a run's models on a GPU, in float16."""
-    for need in _models(run):
-        if need.kind == "model":
-            yield model_entry(need.name).memory_mb(2) * float(MB)
-
-
-def _gpu_bytes() -> float | None:
-    try:
-        import torch
-    except ImportError:
-        return None
-    return float(torch.cuda.mem_get_info()[0]) if torch.cuda.is_available() else None
 
 
 # ---- shown

@@ -1,16 +1,37 @@
-"""A paper's experiments as a recipe: a small TOML with methods, scenes, protocols and the figures that it printed."""
+"""A paper's experiments as a recipe, a small TOML with methods, scenes, protocols and printed figures, and its runs."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import fnmatch
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from su3d_bench.core.errors import ConfigError, printable, reading, suggest
+from su3d_bench.core import registry
+from su3d_bench.core.config import Settings
+from su3d_bench.core.errors import ConfigError, Su3dError, printable, reading, suggest
+from su3d_bench.core.files.atomic import is_file
+from su3d_bench.core.interfaces import HasGroups
 from su3d_bench.core.system.files import file_bytes, parse_toml
+from su3d_bench.evaluation.as_run import evaluate_methods
+from su3d_bench.evaluation.result import Request
+from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.reports.tables.ablation import SweepRow
 from su3d_bench.reports.tables.paper import Figure, PaperTable, published
+from su3d_bench.runs.ablation import ablation_rows, write_rows
+from su3d_bench.runs.executors import Report
+from su3d_bench.runs.existing import Into
+from su3d_bench.runs.job import build_dataset, part_of
+from su3d_bench.runs.plan import Plan, asked_settings, make_plan, named_method
+from su3d_bench.runs.runner import RunResult, run_plan
+from su3d_bench.runs.scenes import data_root, split_address
 
 FOLDER = Path(__file__).resolve().parent / "recipes"
 MOST_BYTES = 1 << 20
@@ -180,3 +201,270 @@ def _explained(error: ValidationError) -> str:
         known = [field.alias or name for name, field in fields.items()]
         return f"{where}: unknown key{suggest(places[-1], known)}"
     return f"{where}: {printable(reason, 200)}"
+
+
+RUNS = "runs"
+
+
+@dataclass(frozen=True)
+class Asked:
+    """How the recipe is carried out this time: None stands for what it says itself.
+
+    ``values`` are further values of a run by key (``jobs``, ``limit``, ``executor`` and the like), ``assignments`` as
+    ``run --set`` takes them. ``scenes``: dataset -> addresses in place of the recipe's, as a rehearsal has them.
+    """
+
+    profile: str | None = None
+    encoder: str | None = None
+    device: str | None = None
+    values: Mapping[str, Any] = ()  # type: ignore[assignment]
+    assignments: tuple[str, ...] = ()
+    scenes: Mapping[str, tuple[str, ...]] | None = None
+
+
+@dataclass(frozen=True)
+class AskedRun:
+    """One run: ``name`` is its folder's below ``runs/``; ``rows`` are those of sweeps."""
+
+    name: str
+    dataset: str
+    profile: str
+    encoder: str
+    stride: int
+    scenes: tuple[str, ...]
+    methods: tuple[str, ...]
+    protocols: tuple[str, ...]
+    settings: tuple[str, ...]
+    experiments: tuple[str, ...]
+    rows: tuple[SweepRow, ...] = ()
+    device: str | None = None
+    values: Mapping[str, Any] = ()  # type: ignore[assignment]
+
+    def folder(self, out: Path) -> Path:
+        return out / RUNS / self.name
+
+
+def sweep_rows(experiment: Experiment) -> tuple[SweepRow, ...]:
+    """The rows of an experiment that varies settings; none of another."""
+    return ablation_rows(experiment.varied, experiment.vary, is_grid=False) if experiment.vary else ()
+
+
+def methods_of(experiment: Experiment) -> tuple[str, ...]:
+    """What an experiment runs, a sweep's variants first."""
+    return tuple(dict.fromkeys([*(row.method for row in sweep_rows(experiment)), *experiment.methods]))
+
+
+def method_of_row(experiment: Experiment, method: str, row: str | None) -> str:
+    """What stands for a printed row: a variant of a sweep, ``METHOD@ROW`` where that is run, else the method."""
+    for swept in sweep_rows(experiment):
+        if row == f"{swept.parameter}={swept.value.strip('[]')}".replace(" ", ""):
+            return swept.method
+    variant = f"{method}@{row}"
+    return variant if variant in experiment.methods else method
+
+
+def asked_runs(recipe: Recipe, experiments: Sequence[Experiment], asked: Asked) -> tuple[AskedRun, ...]:
+    """The runs that give all ``experiments``; those of one dataset, encoder and stride are one.
+
+    A ``ConfigError`` for a method, protocol or dataset that is not known.
+    """
+    found: dict[tuple[str, str, int], AskedRun] = {}
+    for experiment in experiments:
+        methods = methods_of(experiment)
+        for method in methods:
+            named_method(method)
+        encoder = asked.encoder or experiment.encoder or recipe.encoder
+        for dataset, scenes in _by_dataset(experiment, asked).items():
+            key = dataset, encoder, experiment.stride
+            run = found.get(key) or AskedRun(
+                name="",
+                dataset=dataset,
+                profile=asked.profile or recipe.profile,
+                encoder=encoder,
+                stride=experiment.stride,
+                scenes=(),
+                methods=(),
+                protocols=(),
+                settings=(*recipe.settings, f"perception.models.encoder={encoder}", *asked.assignments),
+                experiments=(),
+                device=asked.device,
+                values=dict(asked.values),
+            )
+            found[key] = replace(
+                run,
+                scenes=_joined(run.scenes, scenes),
+                methods=_joined(run.methods, methods),
+                protocols=_joined(run.protocols, _fitting(experiment, dataset)),
+                experiments=_joined(run.experiments, (experiment.name,)),
+                rows=_joined(run.rows, sweep_rows(experiment)),
+            )
+    usual = asked.encoder or recipe.encoder
+    return tuple(replace(run, name=_name(run, usual)) for run in found.values() if run.methods)
+
+
+def _joined(first: Sequence[Any], second: Sequence[Any]) -> tuple[Any, ...]:
+    return tuple(dict.fromkeys([*first, *second]))
+
+
+def _name(run: AskedRun, usual: str) -> str:
+    stride = f"stride{run.stride}" if run.stride else ""
+    return "-".join(filter(None, (run.dataset, run.encoder if run.encoder != usual else "", stride)))
+
+
+def _by_dataset(experiment: Experiment, asked: Asked) -> dict[str, tuple[str, ...]]:
+    by_dataset: dict[str, tuple[str, ...]] = {}
+    for address in experiment.scenes:
+        dataset, scene = split_address(address)
+        if not scene or (dataset not in registry.names("dataset") and ".py:" not in dataset):
+            raise ConfigError(f"experiment {experiment.name}: '{printable(address, 100)}' is no scene of a dataset")
+        by_dataset[dataset] = (*by_dataset.get(dataset, ()), address)
+    if asked.scenes is None:
+        return by_dataset
+    return {dataset: asked.scenes[dataset] for dataset in by_dataset if dataset in asked.scenes}
+
+
+def _fitting(experiment: Experiment, dataset: str) -> tuple[str, ...]:
+    """The experiment's protocols that score a dataset; a ``ConfigError`` where none does."""
+    truth = TruthFacts.of_dataset(registry.load("dataset", dataset))
+    names = tuple(name for name in experiment.protocols if why_not_truth(load_protocol(name), truth) is None)
+    if experiment.protocols and not names:
+        raise ConfigError(f"experiment {experiment.name}: none of its protocols fits the dataset '{dataset}'")
+    return names
+
+
+def dataset_named(name: str) -> Any:
+    return build_dataset(part_of("dataset", name, Settings()), data_root())
+
+
+def known_scenes(dataset: Any) -> tuple[str, ...]:
+    try:
+        return tuple(dataset.scenes())
+    except Su3dError:
+        return ()
+
+
+def scene_names(dataset_name: str, addresses: Sequence[str]) -> Iterator[str]:
+    """The scenes that ``addresses`` of a dataset name; a group's members, and what of a pattern is here."""
+    dataset = dataset_named(dataset_name)
+    groups = dataset.groups() if isinstance(dataset, HasGroups) else {}
+    for address in addresses:
+        _, name = split_address(address)
+        if any(character in name for character in "*?["):
+            yield from (scene for scene in known_scenes(dataset) if fnmatch.fnmatchcase(scene, name))
+        else:
+            yield from groups.get(name, (name,))
+
+
+def plan_of(run: AskedRun, out: Path) -> Plan:
+    """The plan of a run; what its folder holds already is joined with, so that a table more makes it longer."""
+    values = dict(run.values) | {
+        "scenes": run.scenes,
+        "methods": run.methods,
+        "protocols": run.protocols,
+        "profile": run.profile,
+        "stride": run.stride or None,
+        "pictures": False,
+    }
+    settings: Settings = asked_settings(values, device=run.device, config=None, source_of=lambda key: f"recipe, {key}")
+    folder = run.folder(out)
+    into: Into = "extend" if is_file(folder / "run.toml") else "own"
+    return make_plan(settings, run.settings, folder, into=into)
+
+
+def carry_out(run: AskedRun, plan: Plan, report: Report) -> RunResult:
+    """Do what of ``plan`` is not done yet; the rows of a sweep are left beside its metrics."""
+    result = run_plan(plan, report)
+    if run.rows and result.is_complete:
+        write_rows(plan.folder.path, run.rows, joins=True)
+        plan.place.publish()
+    return result
+
+
+@contextmanager
+def environment(**values: str) -> Iterator[None]:
+    """Variables of the environment, which the workers inherit, for the time of the block."""
+    before = {name: os.environ.get(name) for name in values}
+    os.environ.update(values)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@dataclass(frozen=True)
+class Given:
+    """The predictions of one method: where they lie, and what its encoder makes of texts, where that is given."""
+
+    place: Path
+    text_features: Path | None = None
+
+
+def named_predictions(
+    experiments: Sequence[Experiment], texts: Sequence[str], text_features: Sequence[str] = ()
+) -> dict[str, Given]:
+    """What ``METHOD=DIR`` and ``METHOD=FILE`` give, by printed method.
+
+    Raises ``ConfigError`` for a method of which no experiment takes predictions or that is named twice, for what is
+    not there, and for one folder under two names.
+    """
+    places = _named(
+        "--predictions", "DIR", dict.fromkeys(name for one in experiments for name in one.predictions), texts
+    )
+    features = _named("--text-features", "FILE", places, text_features)
+    methods: dict[Path, str] = {}
+    for method, place in places.items():
+        other = methods.setdefault(place.resolve(), method)
+        if other != method:
+            raise ConfigError(
+                f"--predictions {printable(method, 60)}: {printable(str(place), 200)} was given for "
+                f"{printable(other, 60)}; each method has a folder of its own"
+            )
+    return {method: Given(place, features.get(method)) for method, place in places.items()}
+
+
+def _named(flag: str, kind: str, known: Mapping[str, object], texts: Sequence[str]) -> dict[str, Path]:
+    named: dict[str, Path] = {}
+    for text in texts:
+        method, equals, path = text.partition("=")
+        if not equals or not path:
+            raise ConfigError(f"{flag} {printable(text, 80)}: expected METHOD={kind}")
+        if method not in known:
+            hint = suggest(method, known, "it takes") if known else "; name its --predictions too"
+            raise ConfigError(f"{flag}: this recipe takes none of '{printable(method, 60)}'{hint}")
+        if method in named:
+            raise ConfigError(f"{flag}: '{printable(method, 60)}' is given twice; give it once")
+        if not Path(path).exists():
+            raise ConfigError(f"{flag} {printable(method, 60)}: there is no {printable(path, 200)}")
+        named[method] = Path(path)
+    return named
+
+
+def evaluate_predictions(
+    named: Mapping[str, Given], experiments: Sequence[Experiment], asked: Asked, out: Path
+) -> list[Path]:
+    """The run folders of predictions, one a method and dataset; a folder that holds the same stays as it is."""
+    folders: list[Path] = []
+    for method, given in named.items():
+        mine = [one for one in experiments if method in one.predictions]
+        for dataset in dict.fromkeys(split_address(scene)[0] for one in mine for scene in one.scenes):
+            protocols = dict.fromkeys(name for one in mine for name in one.protocols)
+            fitting = tuple(name for name in protocols if dataset in load_protocol(name).datasets)
+            name = re.sub(r"[^A-Za-z0-9-]+", "-", method).strip("-").lower()
+            folder = out / RUNS / f"{dataset}-predictions-{name}"
+            scenes = _scenes(mine, asked, dataset)
+            request = Request((given.place,), dataset, None, None, fitting, scenes, None, given.text_features)
+            evaluate_methods({method: request}, folder)
+            folders.append(folder)
+    return folders
+
+
+def _scenes(experiments: Sequence[Experiment], asked: Asked, dataset: str) -> tuple[str, ...]:
+    """The recipe's scenes of ``dataset``: what else was predicted is of no row of its tables."""
+    addresses = asked.scenes.get(dataset) if asked.scenes else None
+    if addresses is None:
+        addresses = tuple(scene for one in experiments for scene in one.scenes if split_address(scene)[0] == dataset)
+    return tuple(dict.fromkeys(scene_names(dataset, addresses)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -18,10 +19,10 @@ from su3d_bench.core.errors import ConfigError, StoreError, suggest
 from su3d_bench.core.files.atomic import read_json, write_json
 from su3d_bench.core.interfaces import HasShortNames
 from su3d_bench.reports.tables.ablation import SweepRow
+from su3d_bench.runs.plan import COMMA_OUTSIDE_BRACKETS
 
 FILE = "ablation.json"
 MOST_VARIANTS = 1000
-_COMMA_OUTSIDE_BRACKETS = re.compile(r",(?![^\[]*\])")
 Short = tuple[str, Callable[[Any], Any]]
 
 
@@ -44,19 +45,12 @@ def ablation_rows(method: str, vary: Sequence[str], *, is_grid: bool) -> tuple[S
     """
     method_class = registry.load("method", method)
     choices = [_choices(method, method_class, text) for text in vary]
-    n_rows = _product(map(len, choices)) if is_grid else sum(map(len, choices))
+    n_rows = math.prod(map(len, choices)) if is_grid else sum(map(len, choices))
     if n_rows > MOST_VARIANTS:
         raise ConfigError(f"ablate: {n_rows} variants; at most {MOST_VARIANTS} make one run")
     combinations = itertools.product(*choices) if is_grid else ((choice,) for each in choices for choice in each)
     names = {_effective(method_class.Config()): str(method_class.name)}
     return tuple(_row(method_class, combination, names) for combination in combinations)
-
-
-def _product(counts: Any) -> int:
-    total = 1
-    for count in counts:
-        total *= count
-    return total
 
 
 def _choices(method: str, method_class: Any, text: str) -> list[_Choice]:
@@ -70,7 +64,7 @@ def _choices(method: str, method_class: Any, text: str) -> list[_Choice]:
         raise ConfigError(f"--vary {text}: {method} has no setting '{parameter}'{suggest(parameter, known)}")
     key, change = shorts.get(parameter, (parameter, lambda value: value))
     choices = []
-    for part in _COMMA_OUTSIDE_BRACKETS.split(values):
+    for part in COMMA_OUTSIDE_BRACKETS.split(values):
         try:
             choices.append(_Choice(parameter, part.strip(), key, change(parse_value(part))))
         except (TypeError, ValueError) as error:

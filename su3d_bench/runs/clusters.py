@@ -1,4 +1,4 @@
-"""Where units of work run: on the machines of an existing Ray cluster, or as Slurm jobs submitted through submitit.
+"""The executor of a run: this process, processes here, the machines of a Ray cluster, or Slurm jobs through submitit.
 
 Under Ray each unit has a fresh worker process, as with processes here. Ray's own retries are switched off: only a unit
 whose worker or machine was lost runs again, a bounded number of times, and what its work answers is final.
@@ -22,8 +22,22 @@ from typing import Any
 from su3d_bench.core.config import RunConfig
 from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, package_versions
 from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError
+from su3d_bench.core.files.atomic import TemporaryFolder
 from su3d_bench.core.system.endings import Ended, ending_in_order, kept_handlers
-from su3d_bench.runs.executors import Outcome, Report, Unit, Work, answer_of, limit_threads, unwrap
+from su3d_bench.runs.executors import (
+    Outcome,
+    Report,
+    Unit,
+    Work,
+    answer_of,
+    executor_of,
+    limit_threads,
+    run_inline,
+    run_processes,
+    slurm_parameters,
+    unwrap,
+)
+from su3d_bench.store.run_folder import refuse_links
 
 CONNECT_S = 5.0  # a machine of a cluster in one network answers within milliseconds
 ENDED = "ended"  # the kind of answer of a worker that was asked to end
@@ -265,3 +279,44 @@ def _last_line(error: Exception) -> str:
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     rules = [k for k, line in enumerate(lines) if set(line) == {"-"}]
     return (lines[rules[-1] - 1] if len(rules) > 1 else lines[0])[:200] if lines else type(error).__name__
+
+
+@contextmanager
+def reached(config: RunConfig, n_workers: int) -> Iterator[Any]:
+    """What the executor of ``config`` works through, for ``run_units`` in the block; a ``Su3dError`` where no cluster
+    answers, before a run has left anything."""
+    executor = executor_of(config, n_workers)
+    if executor == "ray":
+        with connected(config) as ray:
+            yield ray
+    elif executor == "slurm":
+        with TemporaryFolder("su3d-slurm-") as scratch:  # submitit makes the folder when it only looks
+            slurm_executor(scratch, slurm_parameters(config), int(config.gpus_per_job), n_workers)
+        yield None
+    else:
+        yield None
+
+
+def run_units(
+    work: Work[Unit, Outcome],
+    units: Sequence[Unit],
+    report: Report,
+    *,
+    config: RunConfig,
+    n_workers: int,
+    folder: Path,
+    through: Any,
+    lost: Callable[[Unit, str], Outcome],
+) -> Iterator[Outcome]:
+    """Outcomes of ``units`` as they come in, from the executor of ``config``; ``folder`` is the run's, and ``through``
+    what ``reached`` gave."""
+    executor = executor_of(config, n_workers)
+    if executor == "inline":
+        return run_inline(work, units, report)
+    if executor == "processes":
+        return run_processes(work, units, report, jobs=n_workers, lost=lost)
+    if executor == "ray":
+        return run_ray(work, units, report, jobs=n_workers, config=config, ray=through, lost=lost)
+    at, parameters = folder.absolute() / "slurm", slurm_parameters(config)
+    refuse_links(at.parent, at)
+    return run_slurm(work, units, report, jobs=n_workers, config=config, folder=at, parameters=parameters, lost=lost)

@@ -18,8 +18,7 @@ from su3d_bench.core.files.locks import is_unfinished
 from su3d_bench.runs.executors import ELSEWHERE, Report
 from su3d_bench.runs.job import MethodOutcome, SceneJob
 from su3d_bench.runs.plan import Plan
-from su3d_bench.runs.remote_store import RemoteFolder
-from su3d_bench.runs.run_place import SEAL
+from su3d_bench.runs.remote_store import SEAL, RemoteFolder
 from su3d_bench.runs.scene import failed_outcomes, run_scene
 from su3d_bench.runs.scenes import cache_root as own_cache_root
 from su3d_bench.store.run_folder import RunFolder

@@ -19,15 +19,12 @@ from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from pathlib import Path
 from typing import Any, TypeVar
 
 from su3d_bench.core.config import RunConfig, parse_value
 from su3d_bench.core.errors import ConfigError, Su3dError
-from su3d_bench.core.files.atomic import TemporaryFolder
 from su3d_bench.core.printing import doors
 from su3d_bench.core.system.endings import Ended, ending_in_order
-from su3d_bench.store.run_folder import refuse_links
 
 ENDING_S = 20.0  # for a worker without a parent to let go of what it holds; Slurm ends what it asked to end after 30 s
 # For a worker whose parent was asked to end. One that loads a library or searches a tree hears of nothing meanwhile; it
@@ -280,52 +277,3 @@ def slurm_parameters(config: RunConfig) -> dict[str, Any]:
             raise ConfigError(f"--slurm {text}: expected KEY=VALUE, such as slurm_partition=gpu timeout_min=60")
         parameters[key.strip()] = parse_value(value)
     return parameters
-
-
-@contextmanager
-def reached(config: RunConfig, n_workers: int) -> Iterator[Any]:
-    """What the executor of ``config`` works through, for ``run_units`` in the block; a ``Su3dError`` where no cluster
-    answers, before a run has left anything."""
-    executor = executor_of(config, n_workers)
-    if executor == "ray":
-        from su3d_bench.runs.clusters import connected
-
-        with connected(config) as ray:
-            yield ray
-    elif executor == "slurm":
-        from su3d_bench.runs.clusters import slurm_executor
-
-        with TemporaryFolder("su3d-slurm-") as scratch:  # submitit makes the folder when it only looks
-            slurm_executor(scratch, slurm_parameters(config), int(config.gpus_per_job), n_workers)
-        yield None
-    else:
-        yield None
-
-
-def run_units(
-    work: Work[Unit, Outcome],
-    units: Sequence[Unit],
-    report: Report,
-    *,
-    config: RunConfig,
-    n_workers: int,
-    folder: Path,
-    through: Any,
-    lost: Callable[[Unit, str], Outcome],
-) -> Iterator[Outcome]:
-    """Outcomes of ``units`` as they come in, from the executor of ``config``; ``folder`` is the run's, and ``through``
-    what ``reached`` gave."""
-    executor = executor_of(config, n_workers)
-    if executor == "inline":
-        return run_inline(work, units, report)
-    if executor == "processes":
-        return run_processes(work, units, report, jobs=n_workers, lost=lost)
-    if executor == "ray":
-        from su3d_bench.runs.clusters import run_ray
-
-        return run_ray(work, units, report, jobs=n_workers, config=config, ray=through, lost=lost)
-    from su3d_bench.runs.clusters import run_slurm
-
-    at, parameters = folder.absolute() / "slurm", slurm_parameters(config)
-    refuse_links(at.parent, at)
-    return run_slurm(work, units, report, jobs=n_workers, config=config, folder=at, parameters=parameters, lost=lost)

@@ -18,7 +18,7 @@ from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.errors import ConfigError, StoreError, counted, printable, shown
 from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.system.files import file_bytes
-from su3d_bench.questions.language_solver import MOVES_ANSWERS
+from su3d_bench.questions.solver import MOVES_ANSWERS
 from su3d_bench.runs.job import FIELDS_KNOWN_LATER, INSTEAD, NOT_IN_KEY, Part, SceneJob, build_method, config_key
 from su3d_bench.store.records import RequestRecord, read_record
 from su3d_bench.store.run_folder import JobFolder, RunFolder

@@ -199,18 +199,12 @@ class FinishedRun:
         return here
 
     def _own_rules(self, then: ProtocolRecord) -> ProtocolRules:
-        """Somebody's own rules; of a run that an earlier version made those in the file that its request names."""
+        """User-defined rules, which ``run.json`` keeps."""
         where = f"{self.name}: the rules of {printable(then.name, 80)}"
-        if then.rules is not None:
-            own = read_rules(then.rules, where)
-            if own.name == then.name:
-                return own
-        asked = self.settings.get(("protocols",), ())
-        for name in asked if isinstance(asked, list | tuple) else ():
-            with suppress(ConfigError):
-                if str(name).endswith(".toml") and (found := load_protocol(str(name))).name == then.name:
-                    return found
-        raise ConfigError(f"{where} are neither the program's nor in run.json; run its command again")
+        own = None if then.rules is None else read_rules(then.rules, where)
+        if own is None or own.name != then.name:
+            raise ConfigError(f"{where} are neither the program's nor in run.json; run its command again")
+        return own
 
     def check_method(self, method: str) -> None:
         """A ``ConfigError`` where the run holds no scores of ``method``."""
@@ -247,17 +241,6 @@ class FinishedRun:
         return scores
 
 
-class _Rules(dict[str, ProtocolRecord]):
-    """Protocols by name; one that the run's record does not name is a ``StoreError``."""
-
-    def __init__(self, rules: Mapping[str, ProtocolRecord], shown: str) -> None:
-        super().__init__(rules)
-        self._shown = shown
-
-    def __missing__(self, protocol: str) -> ProtocolRecord:
-        raise StoreError(f"{self._shown}: run.json does not name the protocol '{protocol}'; run its command again")
-
-
 def record_of_rules(rules: ProtocolRules) -> ProtocolRecord:
     """What ``run.json`` says of the rules that scored a run."""
     own = None if rules.name in protocol_names() else rules.as_json
@@ -277,10 +260,13 @@ def read_run(path: Path) -> FinishedRun:
     _named_once(f"{shown}: run.json", "scene", record.scenes)
     _named_once(f"{shown}: run.json", "method", record.methods)
     _named_once(f"{shown}: metrics.json", "result", [f"{one.method} / {one.protocol}" for one in metrics.results])
+    protocols = {rules.name: rules for rules in record.protocols}
+    if unnamed := [one.protocol for one in metrics.results if one.protocol not in protocols]:
+        raise StoreError(f"{shown}: run.json does not name the protocol '{unnamed[0]}'; run its command again")
     return FinishedRun(
         folder=RunFolder(path),
         record=record,
-        protocols=_Rules({rules.name: rules for rules in record.protocols}, shown),
+        protocols=protocols,
         results={(result.method, result.protocol): result for result in metrics.results},
         limit=metrics.limit,
         data=RunData(read_file(path / "run.toml"), record.data_digests, _path_of(record.ground_truth)),

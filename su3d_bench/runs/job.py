@@ -21,8 +21,8 @@ from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth
 from su3d_bench.metrics.semantic.panoptic import told_truth
 from su3d_bench.perception.profiles import Perception, PerceptionConfig
-from su3d_bench.questions.language_solver import answers_digest
 from su3d_bench.questions.refining import refined_digest
+from su3d_bench.questions.solver import answers_digest
 from su3d_bench.runs.plugins import checked_dataset, checked_method, made, settings_model, told
 from su3d_bench.store.records import SealRecord
 from su3d_bench.store.run_folder import JobFolder

@@ -49,8 +49,7 @@ from su3d_bench.runs.existing import (
     replaced_jobs,
 )
 from su3d_bench.runs.job import FIELDS_KNOWN_LATER, Part, SceneJob, options_model, own_code, part_of, refuse_other_run
-from su3d_bench.runs.remote_store import DataPlace, RemoteData, data_place, is_url
-from su3d_bench.runs.run_place import LocalRun, RunPlace, StoredRun
+from su3d_bench.runs.remote_store import DataPlace, LocalRun, RemoteData, RunPlace, StoredRun, data_place, is_url
 from su3d_bench.runs.scenes import cache_root, data_root, dataset_targets, expand_scenes, looks_like_scene
 from su3d_bench.store.run_folder import JobFolder, RunFolder, scene_of_folder
 
@@ -72,7 +71,7 @@ def asked_settings(
 
 MOST_NAMED = 4  # scenes and methods whose maps go
 MOST_CHARACTERS = 120  # the name is a folder's name too
-_COMMA_OUTSIDE_BRACKETS = re.compile(r",(?![^\[]*\])")
+COMMA_OUTSIDE_BRACKETS = re.compile(r",(?![^\[]*\])")
 
 
 @dataclass(frozen=True)
@@ -121,7 +120,7 @@ def _preset(text: str, base: str, method: Any, variant: str) -> Mapping[str, Any
 
 def _assigned(text: str, variant: str) -> Mapping[str, Any]:
     values: dict[str, Any] = {}
-    for part in _COMMA_OUTSIDE_BRACKETS.split(variant):
+    for part in COMMA_OUTSIDE_BRACKETS.split(variant):
         key, equals, value = part.partition("=")
         if not equals or not key.strip():
             raise ConfigError(f"--methods {text}: '{part}' is no KEY=VALUE")

@@ -69,7 +69,7 @@ def fault_of(found: Any) -> str | None:
         case InstanceMesh() | Surface():
             return _fault_of_arrays(found) or _fault_of_mesh(found)
         case PerceptionNeeds():
-            return _fault_of_needs(found)
+            return _fault_of_choice("masks", found.masks, ("grounded", "class-agnostic", "none"))
         case Instances() | Partition() | DenseFeatures():
             return _fault_of_prediction(found)
     return None
@@ -117,9 +117,11 @@ def _fault_of_info(info: SceneInfo) -> str | None:
         value = getattr(info, name)
         if not isinstance(value, int | np.integer) or value < least:
             return f"{name} is {value!r}; a whole number from {least} on is expected"
-    if info.image_domain not in get_args(ImageDomain):
-        return f"image_domain is {info.image_domain!r}; {' or '.join(map(repr, get_args(ImageDomain)))} is expected"
-    return None
+    return _fault_of_choice("image_domain", info.image_domain, get_args(ImageDomain))
+
+
+def _fault_of_choice(name: str, value: Any, known: Sequence[str]) -> str | None:
+    return None if value in known else f"{name} is {value!r}; {', '.join(map(repr, known))} are known"
 
 
 def _fault_of_arrays(found: GroundTruth | InstanceMesh | Surface) -> str | None:
@@ -196,55 +198,30 @@ def _fault_of_prediction(prediction: Instances | Partition | DenseFeatures) -> s
     return None
 
 
-def _fault_of_needs(needs: PerceptionNeeds) -> str | None:
-    known = ("grounded", "class-agnostic", "none")
-    if needs.masks not in known:
-        return f"masks is {needs.masks!r}; {', '.join(map(repr, known[:-1]))} or 'none' is expected"
-    is_ratios = isinstance(needs.crop_ratios, tuple) and all(
-        isinstance(ratio, int | float) and ratio > 0 for ratio in needs.crop_ratios
-    )
-    return None if is_ratios else f"crop_ratios is {needs.crop_ratios!r}; a tuple of numbers above 0 is expected"
-
-
 # ---- where user-defined datasets and methods answer
 
 Kinds = tuple[type, ...]
-# What each of their functions must give; nothing is asked of what is handed nothing back. A sequence has a length and
-# gives its k-th. Those that nobody must have are watched where they are.
+# What each function of a dataset and of a method returns; nothing is asked of those that return nothing. A sequence has
+# a length and gives its k-th. Optional functions are checked where they are there.
 OF_DATASETS: dict[str, Kinds] = {
-    "scenes": (Sequence,),
-    "files": (Sequence,),
-    "digest": (str,),
+    **dict.fromkeys(("scenes", "files", "frames", "places", "problems", "whole_objects", "queries"), (Sequence,)),
+    **dict.fromkeys(("digest", "status"), (str,)),
     "info": (SceneInfo,),
-    "frames": (Sequence,),
     "ground_truth": (GroundTruth,),
     "instance_mesh": (InstanceMesh,),
-    "places": (Sequence,),
-    "status": (str,),
     "groups": (Mapping,),
-    "problems": (Sequence,),
     "up": (WorldUp,),
     "surface": (Surface,),
-    "whole_objects": (Sequence,),
-    "queries": (Sequence,),
 }
 OF_METHODS: dict[str, Kinds] = {
-    "receive_tools": (),
-    "receive_truth": (),
-    "start": (),
-    "update": (),
+    **dict.fromkeys(("receive_tools", "receive_truth", "start", "update", "close"), ()),
     "finish": (Instances, Partition, DenseFeatures),
-    "close": (),
 }
 # What a method says without being called.
 OF_PROPERTIES: dict[str, Kinds] = {
     "needs": (PerceptionNeeds,),
-    "n_points": (int, np.integer),
-    "n_instances": (int, np.integer),
-    "map_bytes": (int, np.integer),
-    "losses": (Mapping,),
-    "finish_costs": (Mapping,),
-    "inputs": (Mapping,),
+    **dict.fromkeys(("n_points", "n_instances", "map_bytes"), (int, np.integer)),
+    **dict.fromkeys(("losses", "finish_costs", "inputs"), (Mapping,)),
     "caveat": (str, NoneType),
 }
 
@@ -376,21 +353,19 @@ class _Frames(Sequence[Frame]):
 
 
 def _expect(place: str, found: Any, kinds: Kinds) -> None:
-    is_sequence = kinds == (Sequence,)
     is_listed = hasattr(found, "__len__") and hasattr(found, "__getitem__")
-    fits = is_listed and not isinstance(found, str | bytes | Mapping) if is_sequence else isinstance(found, kinds)
+    fits = (
+        is_listed and not isinstance(found, str | bytes | Mapping) if kinds == (Sequence,) else isinstance(found, kinds)
+    )
     if not fits:
-        raise PlugInError(f"{place} gave {_described(found)}; {_wanted(kinds)} is expected")
+        wanted = " or ".join(_with_article(kind) for kind in kinds if kind is not np.integer)
+        raise PlugInError(f"{place} gave {_described(found)}; {wanted} is expected")
 
 
 def _described(value: Any) -> str:
-    if value is None:
-        return "None"
-    name = "class" if isinstance(value, type) else type(value).__name__
-    return f"{'an' if name[0] in 'aeiouAEIOU' else 'a'} {name}"
+    return "a class" if isinstance(value, type) else _with_article(type(value))
 
 
-def _wanted(kinds: Kinds) -> str:
-    names = ["None" if kind is NoneType else kind.__name__ for kind in kinds if kind is not np.integer]
-    words = {"Sequence": "a sequence", "int": "an int", "Instances": "an Instances", "InstanceMesh": "an InstanceMesh"}
-    return " or ".join(words.get(name, name if name == "None" else f"a {name}") for name in names)
+def _with_article(kind: type) -> str:
+    name = "None" if kind is NoneType else kind.__name__
+    return name if name == "None" else f"{'an' if name[0] in 'aeiouAEIOU' else 'a'} {name}"

@@ -38,7 +38,7 @@ class _Remarks:
 
 def judged(jobs: Sequence[SceneJob]) -> tuple[SceneJob, ...]:
     """The jobs with what is to be said of their poses; ``PosesContradicted`` where one of them must not be run."""
-    with _unheard(), ThreadPoolExecutor(os.cpu_count()) as threads:
+    with silent(), ThreadPoolExecutor(os.cpu_count()) as threads:
         remarks = list(threads.map(_remarks, jobs))
     pairs = list(zip(jobs, remarks, strict=True))
     wrong = [said.lines[0] for job, said in pairs if said.is_wrong and not job.accepts_poses]
@@ -76,8 +76,8 @@ def _remarks(job: SceneJob) -> _Remarks:
 
 
 @contextmanager
-def _unheard() -> Iterator[None]:
-    """What readers say of a scene's data in the block is left to its work, which says it again."""
+def silent() -> Iterator[None]:
+    """What is logged of a scene's data in the block is not shown: its own work says it."""
     package = logging.getLogger("su3d_bench")
     package.addHandler(handler := logging.NullHandler())
     try:

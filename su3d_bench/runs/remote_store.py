@@ -3,6 +3,10 @@
 Names that a store lists are checked before they become paths here. What a driver of fsspec raises is its own; here it
 is a ``StoreError`` that names the store.
 
+The folder of a run lies on a disk (``LocalRun``), or in a store whose small files are mirrored on this machine
+(``StoredRun``). A plan or a run works in ``folder`` and tells the place when its records change, when the results of
+jobs are wanted, and when jobs go.
+
 Datasets look for scenes by the names of files. So a plan is made over an *outline* of a data root in a store: its tree
 as empty files. A job gets the real files of its scene alone.
 """
@@ -16,9 +20,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError, printable
-from su3d_bench.core.files.atomic import TemporaryFolder, make_folder, replacing
+from su3d_bench.core.files.atomic import TemporaryFolder, make_folder, replacing, write_bytes
 from su3d_bench.runs.job import Part, build_dataset
+from su3d_bench.store.run_folder import JOBS, RECORDS, JobFolder, RunFolder
 
 AT_ONCE = 256  # small files that one request to the driver asks for; it fetches them side by side
 BUCKETS = ("s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "oss")  # have no folders, and to make one makes a bucket
@@ -207,3 +213,97 @@ def _keys(part: str) -> Iterable[str]:
 
 def _key(scene: str) -> str:
     return "".join(re.split(r"[._-]+", scene))
+
+
+# ---- where the folder of a run lies
+
+
+SEAL = "done.json"
+LARGE = ("prediction.npz", ".features.npy", ".png")  # ends of names that no table or comparison reads
+
+
+@dataclass(frozen=True)
+class LocalRun:
+    """A run whose folder is on a disk: all is where it is needed."""
+
+    folder: RunFolder
+    url: None = None
+
+    @property
+    def name(self) -> str:
+        """What messages call it."""
+        return str(self.folder.path)
+
+    def publish(self) -> None:
+        """Bring the run's records up to those of ``folder``."""
+
+    def fetch_results(self) -> None:
+        """Bring every file of the run's jobs that aggregation, tables and comparisons read to ``folder``."""
+
+    def remove(self, jobs: Sequence[JobFolder]) -> None:
+        """Remove jobs with all their files."""
+        for job in jobs:
+            job.remove()
+
+
+@dataclass(frozen=True)
+class StoredRun:
+    """A run whose folder is in the store at ``url``; ``folder`` mirrors its small files."""
+
+    url: str
+    folder: RunFolder
+
+    @classmethod
+    def opened(cls, url: str, cache_root: Path) -> StoredRun:
+        """The run at ``url``; the mirror then holds its records and seals, and no others."""
+        place = cls(url, RunFolder(mirror_of(url, cache_root)))
+        mirror, store = place.folder.path, RemoteFolder(url)
+        seal = re.compile(rf"{JOBS}/[^/]+/[^/]+/{SEAL}")
+        names = [name for name in store.files() if name in RECORDS or seal.fullmatch(name)]
+        if names or mirror.exists():
+            with place.folder.locked():
+                for path in (*mirror.glob(f"{JOBS}/*/*/{SEAL}"), *(mirror / name for name in RECORDS)):
+                    path.unlink(missing_ok=True)
+                place._fetch(store, names)
+        return place
+
+    @property
+    def name(self) -> str:
+        return self.url
+
+    def publish(self) -> None:
+        store, mirror = RemoteFolder(self.url), self.folder.path
+        store.remove(name for name in RECORDS if not (mirror / name).is_file())
+        store.send(mirror, [name for name in RECORDS if (mirror / name).is_file()])
+
+    def fetch_results(self) -> None:
+        store = RemoteFolder(self.url)
+        self._fetch(store, [name for name in store.files(JOBS) if not _is_large(name)])
+
+    def remove(self, jobs: Sequence[JobFolder]) -> None:
+        """First their seals, without which their other files count for nothing; jobs without a seal go with them."""
+        store, mirror = RemoteFolder(self.url), self.folder.path
+        kept = {job.path for job in self.folder.jobs()} - {job.path for job in jobs}
+        names = [name for name in store.files(JOBS) if mirror.joinpath(*Path(name).parts[:3]) not in kept]
+        store.remove(sorted(names, key=lambda name: (not name.endswith(f"/{SEAL}"), name)))
+        for job in jobs:
+            job.remove()
+
+    def _fetch(self, store: RemoteFolder, names: Sequence[str]) -> None:
+        for name, content in store.read(names):
+            make_folder((self.folder.path / name).parent)
+            write_bytes(self.folder.path / name, content)
+
+
+RunPlace = LocalRun | StoredRun
+
+
+def mirror_of(url: str, cache_root: Path) -> Path:
+    """Where this machine keeps the small files of the run folder at ``url``."""
+    return cache_root / "runs" / f"{url.rstrip('/').rpartition('/')[2]}-{digest_bytes(url.rstrip('/').encode())[:8]}"
+
+
+def _is_large(name: str) -> bool:
+    file = name.rpartition("/")[2]
+    is_early_map = file.startswith("anytime-") and not file.endswith("-counts.npz")
+    return is_early_map or file.endswith(LARGE)

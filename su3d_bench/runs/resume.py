@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from functools import cache, lru_cache
 from typing import Any
@@ -19,6 +18,7 @@ from su3d_bench.runs.job import (
     config_key,
     stride_of,
 )
+from su3d_bench.runs.poses import silent
 from su3d_bench.store.records import SealRecord
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
@@ -45,14 +45,11 @@ class FinishedScenes:
         seals = [folder.seals() for folder in folders]
         if any("predict" not in seal or "score" not in seal for seal in seals):
             return None
-        package = logging.getLogger("su3d_bench")
-        package.addHandler(unheard := logging.NullHandler())  # what is said of a scene's data was said in its first run
         try:
-            outcomes = [self._outcome(job, *each) for each in zip(job.parts, folders, seals, strict=True)]
+            with silent():
+                outcomes = [self._outcome(job, *each) for each in zip(job.parts, folders, seals, strict=True)]
         except Exception:  # noqa: BLE001 - a plug-in may raise anything; a worker tells it as ever
             return None
-        finally:
-            package.removeHandler(unheard)
         return None if None in outcomes else tuple(outcome for outcome in outcomes if outcome is not None)
 
     def _outcome(

@@ -21,8 +21,9 @@ from su3d_bench.core.errors import StoreError
 from su3d_bench.core.files.atomic import is_file, read_json, remove_abandoned, remove_file, write_json, write_text
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.reports.tables.run import Found
+from su3d_bench.runs.clusters import reached, run_units
 from su3d_bench.runs.distant import distant_jobs, failed_distant, run_distant_scene
-from su3d_bench.runs.executors import SCENE_DONE, Event, Report, reached, run_units
+from su3d_bench.runs.executors import SCENE_DONE, Event, Report
 from su3d_bench.runs.existing import differences, sealed
 from su3d_bench.runs.job import MethodOutcome
 from su3d_bench.runs.plan import Plan

@@ -36,11 +36,11 @@ from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth, pack_scores, score_scene
+from su3d_bench.perception.language.chat import ReplyStore
 from su3d_bench.perception.language.client import ChatClient
-from su3d_bench.perception.language.reply_store import ReplyStore
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
-from su3d_bench.questions.language_solver import MapSolver, by_language_model
 from su3d_bench.questions.refining import refined_names
+from su3d_bench.questions.solver import MapSolver, by_language_model
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.reports.pictures.maps import draw_scene
 from su3d_bench.reports.tables.run import Unscored, not_scored_lines

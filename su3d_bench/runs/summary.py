@@ -173,7 +173,7 @@ def _join(texts: Iterable[str | None], separator: str = ", ") -> str | None:
 def _model_files(plan: Plan, outcomes: Sequence[MethodOutcome]) -> dict[str, dict[str, str]]:
     """SHA-256 of every weight file of the profiles that the run used, by model and file name."""
     from su3d_bench.perception.models.catalogue import PROFILE_MODELS
-    from su3d_bench.perception.models.inspection import models_record
+    from su3d_bench.perception.models.loading import models_record
 
     used = [profile for outcome in outcomes for profile in (outcome.profile or "").split(", ")]
     names = [name for profile in dict.fromkeys(used) for name in PROFILE_MODELS.get(profile, ())]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.digests import digest_file
@@ -117,12 +116,8 @@ def _damage(job: JobFolder) -> str | None:
             return f"{file.name} is missing"
         if digest_file(file) != sealed[file.name]:
             return f"{file.name} is not the file that the run wrote"
-    return _unreadable(job.prediction)
-
-
-def _unreadable(file: Path) -> str | None:
     try:
-        read_stored(file)
+        read_stored(job.prediction)
     except Su3dError as error:
         return f"holds no map: {error}"
     return None

@@ -10,8 +10,7 @@ from typing import Any
 from su3d_bench.core.errors import DataError, StoreError, printable, suggest
 from su3d_bench.core.files.atomic import make_folder, write_bytes, write_text
 from su3d_bench.formats.images import read_bytes
-from su3d_bench.formats.tables.csv_text import csv_lines
-from su3d_bench.formats.tables.table import Cell, Table, TableRow, bracketed, percent
+from su3d_bench.formats.tables.table import Cell, Table, TableRow, bracketed, csv_lines, percent
 from su3d_bench.numerics.statistics import share_interval
 from su3d_bench.questions.audit import AuditedQuestion
 from su3d_bench.reports.sheet.page import Entry, list_page

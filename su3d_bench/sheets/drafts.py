@@ -30,16 +30,23 @@ from su3d_bench.metrics.questions.score import (
     judge_retrieval,
     labels_n,
 )
-from su3d_bench.perception.language.chat import ChatRequest
+from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig
 from su3d_bench.perception.language.client import LanguageModel
-from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.questions.audit import held_against
 from su3d_bench.questions.generated import generate_questions
 from su3d_bench.questions.generator import chosen, generate
-from su3d_bench.questions.language_solver import AskMap, LanguageSolver, given_answer
-from su3d_bench.questions.model import KINDS, REASONING, Answer, Question, question_id, unsettled
-from su3d_bench.questions.retrieval import points_found, rank_all
+from su3d_bench.questions.model import (
+    KINDS,
+    REASONING,
+    Answer,
+    Question,
+    points_found,
+    question_id,
+    rank_all,
+    unsettled,
+)
 from su3d_bench.questions.scene_map import MapObject, SceneMap
+from su3d_bench.questions.solver import AskMap, LanguageSolver, given_answer
 from su3d_bench.questions.truths import MIN_VERTICES, own_questions, question_truth, scene_objects
 from su3d_bench.questions.truths import questions_of as questions_of_scene
 from su3d_bench.sheets.items import ASKS, RIGHT, WRONG, SheetKind

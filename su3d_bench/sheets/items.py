@@ -19,8 +19,8 @@ from su3d_bench.core.digests import digest_json
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.files.atomic import write_json
 from su3d_bench.core.system.files import file_text
+from su3d_bench.formats.arrays import parsed_json
 from su3d_bench.formats.images import read_bytes
-from su3d_bench.formats.text_files import parsed_json
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

@@ -15,13 +15,12 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from su3d_bench.core.types import Float64Array, Int64Array, Interval
-from su3d_bench.formats.tables.csv_text import csv_lines
+from su3d_bench.formats.tables.table import csv_lines
 from su3d_bench.numerics.statistics import DIFFERENCE, LEAST_ITEMS, mean_interval, share_interval, sign_flip_test
 from su3d_bench.questions.model import ALL_KINDS
 from su3d_bench.questions.query_files import COLUMN
 from su3d_bench.reports.sheet.page import Entry, list_page
-from su3d_bench.sheets.agreement import Agreement, agreement, cohen_kappa
-from su3d_bench.sheets.answers import LABELS, Judgement
+from su3d_bench.sheets.answers import LABELS, Agreement, Judgement, agreement, cohen_kappa
 from su3d_bench.sheets.items import (
     ARGUABLE,
     CANNOT_TELL,

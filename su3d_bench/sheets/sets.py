@@ -18,7 +18,7 @@ from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.errors import ConfigError, ModelMissing, printable
 from su3d_bench.core.files.atomic import is_file, make_folder, write_bytes, write_text
 from su3d_bench.core.system.files import file_bytes
-from su3d_bench.formats.tables.csv_text import csv_lines
+from su3d_bench.formats.tables.table import csv_lines
 from su3d_bench.reports.sheet.page import page_html
 from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.items import (

@@ -17,7 +17,7 @@ from scored_room import noisy_scores
 
 from su3d_bench.analysis.comparison import Difference, compare, form_difference
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import ConfigError, StoreError
+from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
@@ -192,14 +192,6 @@ def test_only_common_scenes_are_compared_and_said() -> None:
     assert "a single scene says nothing of other scenes" in text
 
 
-def test_partial_and_incomplete_runs_are_marked() -> None:
-    assert "PARTIAL: partial has only the first 2 frames of each scene" in compare("a", "partial").remarks
-    found = compare("a", "failed")
-    assert "INCOMPLETE: failed lacks scenes that failed" in found.remarks
-    assert "INCOMPLETE: failed:collector failed on painted/b" in found.protocols[0].remarks
-    assert found.protocols[0].scenes == ("painted/a", "painted/c")
-
-
 REFUSED = [
     (
         ("a", "other-data"),
@@ -221,28 +213,6 @@ def test_what_cannot_be_compared_is_refused_with_the_field(sides: tuple[str, str
     with pytest.raises(ConfigError) as caught:
         compare(*sides)
     assert message in str(caught.value)
-
-
-def test_runs_without_a_common_scene_or_protocol_are_refused() -> None:
-    copy_as("a", "only-d", "run.json", lambda text: text.replace("painted/", "painted/x"))
-    with pytest.raises(ConfigError, match="no scene in common that is scored under rooms-semantic"):
-        compare("a:collector", "only-d:collector")
-    with pytest.raises(ConfigError, match="was not scored under 'rooms-instanse'; did you mean 'rooms-instance'"):
-        compare("a", "b", protocols=["rooms-instanse"])
-
-
-def test_what_is_no_finished_run_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(StoreError, match=r"holds no run\.json; name the folder of a run"):
-        compare("a", str(tmp_path))
-    shutil.copy("a/run.json", tmp_path)
-    with pytest.raises(StoreError, match=r"holds no metrics\.json, so the run is not finished"):
-        compare("a", str(tmp_path))
-    (tmp_path / "metrics.json").write_text('{"limit": 0, "results": [{"method": 5}]}')
-    with pytest.raises(StoreError, match=r"metrics\.json: results\.0\.\w+ is not as a run writes it"):
-        compare("a", str(tmp_path))
-    (tmp_path / "metrics.json").write_text("[" * 100_000)
-    with pytest.raises(StoreError, match=r"metrics\.json: "):
-        compare("a", str(tmp_path))
 
 
 def test_the_command_prints_tables_or_json(capsys: pytest.CaptureFixture[str]) -> None:

@@ -126,14 +126,6 @@ def test_counts_that_no_scene_gives_are_refused_by_every_reader(
     assert {one.run for one in refused} == {"bob"} and all(line in one.reason for one in refused)
 
 
-def test_of_two_sets_of_data_the_one_that_most_have_is_ranked(runs: Path) -> None:
-    shutil.copytree(runs / "bob", runs / "carl")
-    edit(runs / "ann/first" / "run.json", lambda r: r["data_digests"].update({"painted/a": "other"}))
-    found = leaderboard(runs)
-    assert [[one.run for one in board] for board in found.boards] == [["bob", "carl"]] * 2
-    assert {one.reason for one in found.refused} == {"other data of painted/a than 2 of 3 entries have"}
-
-
 def test_the_command_prints_marks_the_best_and_says_what_is_left_out(
     runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -15,8 +15,7 @@ from places import SCENES
 from scored_room import noisy_scores
 
 import su3d_bench.analysis.sides
-from su3d_bench.analysis.comparison import compare
-from su3d_bench.analysis.planning import plan
+from su3d_bench.analysis.comparison import compare, plan
 from su3d_bench.cli.main import main
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
@@ -137,16 +136,6 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("name", REFUSED)
-def test_what_tells_nothing_is_refused_in_one_line(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    words, message = REFUSED[name]
-    if not Path("copied").exists():
-        shutil.copytree("seed-0", "copied")
-    assert main(["report", "power", *words]) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.count("\n") == 1
-
-
 # comparisons of several seeds
 
 
@@ -172,26 +161,6 @@ def test_a_side_of_several_seeds_stands_for_their_mean_and_says_how_far_seeds_al
     assert found.deviations_of_seeds == pytest.approx([np.std(side, ddof=1) for side in whole])
     assert list(found.per_scene.values()) == pytest.approx(list(alone[1] - alone[0]))
     assert found.test == sign_flip_test(alone[1] - alone[0])
-
-
-@pytest.mark.parametrize(
-    ("sides", "message"),
-    [
-        (["seed-0,copied", "seed-1"], "copied: has the seed 0, as seed-0 has; a repeat tells nothing of other seeds"),
-        (["seed-0", "seed-1,partial"], "partial: has other frames than seed-1; name runs that differ in --seed alone"),
-        (["seed-0,other-data", "seed-1"], "other-data: differs from seed-0 in dataset.painted.n_frames"),
-        (["seed-0,seed-1", "seed-1,seed-2"], "both sides are the same"),
-        (["seed-0,nowhere:collector", "seed-1"], "seed-0,nowhere:collector: there is no such folder"),
-    ],
-)
-def test_runs_that_are_no_seeds_of_one_request_are_no_side(
-    sides: list[str], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    if not Path("copied").exists():
-        shutil.copytree("seed-0", "copied")
-    assert main(["compare", *sides]) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.count("\n") == 1
 
 
 def test_the_examples_in_the_docstrings_run() -> None:

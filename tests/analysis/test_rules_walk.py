@@ -70,11 +70,6 @@ def test_each_rule_gets_what_it_moves_and_the_way_back_is_its_reverse(made: Path
     assert {step.rules: -step.adds["mAcc"].share for step in back.steps} == pytest.approx(shares, abs=1e-12)
 
 
-def test_scenes_side_by_side_give_the_same(made: Path) -> None:
-    walker = Walker.of(load_protocol("rooms-instance"), load_protocol("replica-openmask3d"), f"{made}:oracle")
-    assert walker.walk(jobs=2) == walker.walk(jobs=1)
-
-
 def test_the_command_prints_draws_and_answers_in_json(
     made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -97,12 +92,3 @@ REFUSED = [
     (["rooms-semantic", "replica-mesh-ex6", "--prediction", "{run}:nobody"], "no scores of the method 'nobody'"),
     (["rooms-retrieval", "replica-retrieval", "--prediction", "{run}:collector"], "--prediction takes protocols of"),
 ]
-
-
-@pytest.mark.parametrize(("words", "message"), REFUSED)
-def test_what_cannot_be_walked_is_one_line(
-    words: list[str], message: str, made: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["protocols", "diff", *(word.format(run=made) for word in words)]) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.count("\n") == 1

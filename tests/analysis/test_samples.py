@@ -20,9 +20,8 @@ from scored_room import ENCODER, noisy
 import su3d_bench.metrics.instance.average_precision
 import su3d_bench.reports.tables.samples
 from su3d_bench.analysis.attribution import attribute
-from su3d_bench.analysis.samples import Chosen, _OfPoints, samples
+from su3d_bench.analysis.samples import _OfPoints, samples
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import DenseFeatures, Instances
 from su3d_bench.metrics.attribution.arrays import ScoredPoints, scored_masks
 from su3d_bench.metrics.attribution.masks import KINDS, LabelledPoints, count_masks, errors_of, mend_scene
@@ -30,7 +29,7 @@ from su3d_bench.metrics.attribution.overlaps import measure_overlaps, true_insta
 from su3d_bench.metrics.instance.scene_counts import hits
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
-from su3d_bench.reports.tables.samples import COLUMNS, Sample, csv_of
+from su3d_bench.reports.tables.samples import Sample
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
 
@@ -162,16 +161,6 @@ def test_points_are_told_by_what_names_them_and_by_what_they_are() -> None:
     assert (rows[0].centre_x_m, rows[0].size_x_m) == (1.5, 3.0)
 
 
-def test_counts_that_are_not_those_of_the_run_are_refused(run: Path, tmp_path: Path) -> None:
-    import shutil
-
-    other = tmp_path / "other"
-    shutil.copytree(run, other)
-    shutil.copy(other / "scenes/painted.a/oracle/prediction.npz", other / "scenes/painted.a/collector/prediction.npz")
-    with pytest.raises(PredictionError, match="the counts of the run are not those"):
-        samples([other], Chosen(["collector"]))
-
-
 def test_the_verb_writes_one_row_each(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "samples.csv"
     assert main(["report", "samples", str(run), "--out", str(file), f"--json={tmp_path / 'rows.json'}"]) == 0
@@ -198,31 +187,3 @@ def test_parquet_holds_the_same_with_what_each_column_means(run: Path, tmp_path:
     table = parquet.read_table(file)
     assert [Sample(**row) for row in table.to_pylist()] == list(samples([run]).rows)
     assert table.schema.field("best_iou").metadata[b"meaning"].startswith(b"highest IoU")
-
-
-@pytest.mark.parametrize(
-    ("words", "line"),
-    [
-        ([], "report samples: name the folder of a run"),
-        (["RUN", "--columns"], "--columns speaks of no run"),
-        (["RUN", "--format", "parquet"], "--format parquet: is no text; say where with --out"),
-        (["RUN", "--methods", "none"], "holds no scores of the method 'none'; it has collector, oracle"),
-        (["RUN", "--protocols", "rooms-retrieval"], "was not scored under 'rooms-retrieval'"),
-        (["RUN", "--scenes", "painted/c"], "holds no scene 'painted/c'; did you mean"),
-    ],
-)
-def test_a_wrong_request_is_one_line(
-    words: list[str], line: str, run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["report", "samples", *(str(run) if word == "RUN" else word for word in words)]) == 2
-    (said,) = capsys.readouterr().err.splitlines()
-    assert line in said
-
-
-def test_every_column_is_told_and_no_cell_is_a_formula(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["report", "samples", "--columns"]) == 0
-    printed = capsys.readouterr().out
-    assert all(f"| {column.name} " in printed for column in COLUMNS)
-    values = {column.name: 0 for column in COLUMNS} | {"class_name": "=1+1", "name": "a;=b\n@c", "score": None}
-    (cells,) = csv.DictReader(io.StringIO(csv_of([Sample(**values)])))  # type: ignore[arg-type]
-    assert (cells["class_name"], cells["name"], cells["score"]) == ("'=1+1", "a;'=b @c", "")

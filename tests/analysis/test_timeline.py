@@ -6,10 +6,9 @@ import os
 import socket
 import subprocess
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
@@ -19,7 +18,7 @@ from painted import WordEncoder
 from painted_runs import painted_run
 
 from su3d_bench.analysis.page.maps import Spaces
-from su3d_bench.analysis.timeline import MOST_POINTS, SEEN_M, SceneTimeline, ids_of, in_view, smaller
+from su3d_bench.analysis.timeline import MOST_POINTS, SEEN_M, SceneTimeline, in_view
 from su3d_bench.cli.main import main
 from su3d_bench.core.types import Frame
 from su3d_bench.reports import timeline as places
@@ -120,18 +119,6 @@ def test_masks_are_of_the_size_of_their_photo_and_name_what_stands_there(run: Pa
     assert all({logged.values[1].shape} == sizes and logged.values[1].any() for logged in notes.of("masks"))
 
 
-@pytest.mark.usefixtures("_words_are_known")
-def test_without_the_data_the_map_stands_alone_and_it_is_said(run: Path) -> None:
-    one = timeline(run)
-    changed = replace(one._run, data=replace(one._run.data, digests={}))
-    alone = SceneTimeline(changed, one.scene, ["collector"], 0, Spaces(()))
-    notes = written(alone)
-    assert any("data are not those of the run" in line for line in alone.remarks)
-    assert (alone.n_frames, alone.n_maps) == (0, 1)
-    assert notes.of("points") and all(logged.frame is None for logged in notes.logged)
-    assert "data are not those of the run" in notes.of("close")[0].values[0]
-
-
 def frame(depth_m: float = 2.0, size: tuple[int, int] = (40, 60)) -> Frame:
     intrinsics = np.array([[50.0, 0, 29.5], [0, 50.0, 19.5], [0, 0, 1]])
     return Frame(0, 0.0, np.zeros((*size, 3), np.uint8), np.full(size, depth_m, np.float32), np.eye(4), intrinsics)
@@ -140,17 +127,6 @@ def frame(depth_m: float = 2.0, size: tuple[int, int] = (40, 60)) -> Frame:
 def test_a_point_is_in_view_where_the_camera_measured_it_alone() -> None:
     points = np.array([[0, 0, 2], [0, 0, 2 + 2 * SEEN_M], [0, 0, 1], [9, 0, 2], [0, 0, -2]], np.float32)
     assert in_view(points, frame()).tolist() == [True, False, False, False, False]
-
-
-def test_a_smaller_frame_shows_the_same_place_at_the_same_share_of_its_width() -> None:
-    full = frame()
-    small = smaller(full, 20)
-    assert small.rgb.shape == (13, 20, 3)
-    ray = np.array([0.3, -0.2, 1.0])
-    (u, v, _), (x, y, _) = full.intrinsics @ ray, small.intrinsics @ ray
-    assert ((u + 0.5) / 60, (v + 0.5) / 40) == pytest.approx(((x + 0.5) / 20, (y + 0.5) / 13))
-    assert smaller(full, 60) is full
-    assert ids_of(np.array([-1, 0, 65533, 65534, 1 << 20])).tolist() == [0, 1, 65534, 0, 0], "16 bits"
 
 
 def test_what_is_logged_reaches_the_viewers_library_at_its_place_and_moment() -> None:
@@ -172,26 +148,6 @@ def test_what_is_logged_reaches_the_viewers_library_at_its_place_and_moment() ->
     assert "0.41.0" in sdk.TextDocument.call_args.args[0], "which version reads it"
     assert not sdk.init.called and not sdk.spawn.called
     assert stream.getvalue().startswith(b"part")
-
-
-@pytest.mark.parametrize(
-    ("module", "words", "said"),
-    [
-        (None, [], "pip install 'su3d-bench[rerun]'"),
-        (SimpleNamespace(__version__="0.22.1"), [], "rerun-sdk 0.41 or later, here is 0.22.1"),
-        (MagicMock(), ["--stride", "0"], "--stride 0: expected 1 or more"),
-        (MagicMock(), ["--scenes", "painted/z"], "has no scene 'painted/z'"),
-    ],
-)
-def test_a_wrong_request_is_one_line(
-    module: Any, words: list[str], said: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
-    monkeypatch.setitem(sys.modules, "rerun", module)
-    assert main(["report", "rerun", str(run), "--out", str(tmp_path / "a.rrd"), *words]) == 2
-    (line,) = capsys.readouterr().err.strip().splitlines()
-    assert said in line
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.usefixtures("_words_are_known")

@@ -18,6 +18,7 @@ def test_the_notebook_is_kept_without_answers() -> None:
     assert [cell["id"] for cell in code if cell["outputs"] or cell["execution_count"] is not None] == []
 
 
+@pytest.mark.proof
 def test_every_cell_of_the_notebook_runs(rooms_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     nbclient = pytest.importorskip("nbclient", reason="nbclient and ipykernel come with the test extra")
     pytest.importorskip("ipykernel", reason="nbclient and ipykernel come with the test extra")

@@ -35,7 +35,7 @@ from su3d_bench.core.maps import Instances, Proposals
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, Int64Array, SceneInfo, Surface
 from su3d_bench.metrics.matching.labelling import most_similar
-from su3d_bench.perception.regions import region_under
+from su3d_bench.perception.cache import region_under
 from su3d_bench.runs.frame_loop import no_detections
 
 WIDTH, HEIGHT, FOCAL = 12, 8, 10.0

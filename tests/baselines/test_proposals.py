@@ -16,7 +16,6 @@ from su3d_bench.baselines.openmask3d.proposals import (
     ProposalConfig,
     chosen_nodes,
     contrast,
-    density_clusters,
     linked_within,
     make_proposals,
     read_proposals,
@@ -89,16 +88,6 @@ class TestParts:
         """0, 0.9 and 1.8 are linked by gaps of 0.9, 3.0 and 3.5 by 0.5; from 1.8 to 3.0 it is too far."""
         assert linked_within(self.ROW, 0.95).tolist() == [0, 0, 0, 1, 1, 2]
         assert linked_within(self.ROW[:2], 0.9).tolist() == [0, 0]  # a gap of eps itself links
-
-    @pytest.mark.parametrize("min_points", [1, 2, 5])
-    def test_clusters_are_those_of_dbscan(self, min_points: int) -> None:
-        from sklearn.cluster import DBSCAN
-
-        rng = np.random.default_rng(0)
-        for eps_m in (0.1, 0.2, 1.0):
-            points = (rng.random((300, 3)) * (2, 2, 0.3)).astype(np.float32)
-            expected = DBSCAN(eps=eps_m, min_samples=min_points).fit_predict(points.astype(np.float64))
-            assert density_clusters(points, eps_m, min_points).tolist() == expected.tolist()
 
     def test_each_part_is_a_mask_with_its_masks_score_the_best_first(self) -> None:
         proposals = made_proposals(self.ROW, [0, 1, 3, 4], [5], [1, 2], scores=[0.2, 0.9, 0.2])

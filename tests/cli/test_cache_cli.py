@@ -12,11 +12,10 @@ from su3d_bench.cli.dev import KIND_NAMES
 from su3d_bench.cli.main import main
 from su3d_bench.core.files.atomic import write_bytes, write_json
 from su3d_bench.perception.cache import FrameCache, content_key
-from su3d_bench.perception.language.chat import ChatRequest, Reply
-from su3d_bench.perception.language.reply_store import ReplyStore
+from su3d_bench.perception.language.chat import ChatRequest, Reply, ReplyStore
 from su3d_bench.perception.models.files import file_sha256
 from su3d_bench.perception.profiles import REPLIES
-from su3d_bench.runs.run_place import mirror_of
+from su3d_bench.runs.remote_store import mirror_of
 from su3d_bench.store import caches
 from su3d_bench.store.run_folder import RunFolder
 

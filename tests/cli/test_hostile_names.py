@@ -182,7 +182,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory, rooms_data: Path) -> Path:
     return folder
 
 
-@pytest.fixture(params=POISONS)
+@pytest.fixture(params=["texts", pytest.param("keys", marks=pytest.mark.proof)])
 def place(request: pytest.FixtureRequest, whole: Path, tmp_path: Path) -> Iterator[dict[str, str]]:
     """A folder with a poisoned run and hostile files; what stands for RUN, SCENE and METHOD."""
     with pytest.MonkeyPatch.context() as patch:

@@ -10,8 +10,7 @@ import pytest
 from places import ROOT
 
 from su3d_bench.core.english import is_countable, is_plural, plural, singular, with_article, words
-from su3d_bench.perception.embedded.lexicon import SYNONYMS
-from su3d_bench.perception.embedded.naming import vocabulary
+from su3d_bench.perception.embedded.lexicon import SYNONYMS, vocabulary
 from su3d_bench.questions.scene_map import plain_name
 
 

@@ -62,12 +62,6 @@ def test_no_side_of_a_square_of_the_scan_exceeds_the_option() -> None:
     assert 0.25 < sides.max() <= 0.3 + 1e-5
 
 
-def test_a_metre_of_the_scan_has_about_five_thousand_vertices() -> None:
-    dataset = corridor()
-    shorter, longer = (len(dataset.surface(scene).vertices) for scene in ("20m", "120m"))
-    assert 4500 < (longer - shorter) / 100 < 6000
-
-
 def walk(scene: str, n_points: Float64Array, **stages_ms: Float64Array) -> UpdateTimes:
     columns = {"n_points": n_points, **stages_ms, "total_ms": np.sum(list(stages_ms.values()), axis=0)}
     return UpdateTimes("r", scene, "m", columns, (), None, None)
@@ -87,28 +81,8 @@ def test_the_table_tells_what_the_smallest_and_the_largest_maps_cost(write_perfo
     assert told["stages that grow"] == "match 1.00"
 
 
-def test_walks_of_several_lengths_make_one_row(write_performance: Any) -> None:
-    sizes = {10: 1e5, 100: 6e5, 1000: 5e6}
-    walks = [walk(f"corridor/{m}m", np.full(20, n), project_ms=np.full(20, n / 3e4)) for m, n in sizes.items()]
-    head, row = write_performance.growth_table([walks])
-    told = dict(zip(head, row, strict=True))
-    assert (told["m"], told["updates"], told["to"]) == ("10, 100, 1000", "60", "5,000,000")
-    assert (told["ms, smallest tenth"], told["largest"]) == ("3.3", "166.7")
-    assert told["stages that grow"] == "project 1.00"
-
-
-def test_a_map_that_does_not_grow_has_no_exponent(write_performance: Any) -> None:
-    head, row = write_performance.growth_table([[walk("corridor/9m", np.full(20, 7.0), match_ms=np.ones(20))]])
-    assert dict(zip(head, row, strict=True))["exponent"] == "-"
-
-
 def test_medians_by_size_are_those_of_ranges_of_one_width_on_a_log_axis() -> None:
     sizes = np.array([1.0, 1.1, 1.2, 500.0, 1024.0, 1024.0])
     x, y = medians_by_size(sizes, np.array([3.0, 9.0, 4.0, 7.0, 10.0, 30.0]))
     np.testing.assert_allclose(x, [1.1, 500.0, 1024.0])
     np.testing.assert_allclose(y, [4.0, 7.0, 20.0])
-
-
-def test_maps_of_one_size_are_one_marker() -> None:
-    x, y = medians_by_size(np.full(5, 8.0), np.arange(5.0))
-    assert (x.tolist(), y.tolist()) == ([8.0], [2.0])

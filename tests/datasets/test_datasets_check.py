@@ -12,7 +12,7 @@ import box_room
 import numpy as np
 import painted
 import pytest
-from box_room import write_box_room, write_poses, write_truth
+from box_room import write_box_room, write_poses
 from painted import Painted
 
 from su3d_bench.cli.main import main
@@ -24,7 +24,6 @@ from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 
 N_FRAMES = 8
-TREE = Path("replica_v1/room_0/habitat")
 
 
 @pytest.fixture(scope="session")
@@ -78,11 +77,6 @@ def test_every_damaged_file_is_named(root: Path) -> None:
     assert look(root).n_read == N_FRAMES - 3
 
 
-def test_counts_that_disagree_are_an_error(root: Path) -> None:
-    write_poses(root / "Replica/room0", [box_room.pose(index) for index in range(N_FRAMES - 2)])
-    assert any("6" in one and "8" in one for one in texts(look(root)))
-
-
 def test_a_wrong_depth_scale_is_an_error_and_what_would_be_right_is_said(root: Path) -> None:
     path = root / "Replica/cam_params.json"
     table = json.loads(path.read_text())
@@ -96,13 +90,6 @@ def test_a_wrong_depth_scale_is_an_error_and_what_would_be_right_is_said(root: P
     assert "depth-scale" in checks(look(root))
 
 
-def test_a_nan_pose_is_an_error(root: Path) -> None:
-    poses = [box_room.pose(index) for index in range(N_FRAMES)]
-    poses[5][0, 3] = np.nan
-    write_poses(root / "Replica/room0", poses)
-    assert any("nan" in one and "6" in one for one in texts(look(root)))
-
-
 def test_cameras_outside_the_mesh_are_an_error(root: Path) -> None:
     moved = [box_room.pose(index) for index in range(N_FRAMES)]
     for matrix in moved:
@@ -113,12 +100,6 @@ def test_cameras_outside_the_mesh_are_an_error(root: Path) -> None:
         "8 of 8 cameras lie outside the ground truth's box by more than 1 m, first frame 0 at (51.5"
     )
     assert "only 0.0%" in said[1] and "the clouds do not overlap" in said[1]
-
-
-def test_clouds_that_do_not_meet_are_an_error_though_the_cameras_are_inside(root: Path) -> None:
-    write_truth(root / TREE, offset=(0.5, 0.4, 0.6))
-    (said,) = texts(look(root))
-    assert "of what the frames see lies within" in said
 
 
 def test_rooms_made_on_demand_have_no_finding(tmp_path: Path) -> None:
@@ -134,8 +115,6 @@ def test_rooms_made_on_demand_have_no_finding(tmp_path: Path) -> None:
     [
         ("missing-frame", "error", "frame 2 is missing; copy it again"),
         ("nan-pose", "error", "the pose is not a finite 4x4 matrix"),
-        ("depth-size", "error", "depth is 32x23 and colour is 32x24"),
-        ("empty-depth", "error", "depth is empty, no pixel is above 0 m"),
         ("unknown-class", "error", "class id 777 is unknown"),
         ("crash", "error", "ZeroDivisionError: a mistake in a plug-in"),
     ],
@@ -189,15 +168,8 @@ def found_in(*frames: Frame) -> list[tuple[str, str, str]]:
     [
         ({"camera_to_world": 2 * np.eye(4)}, ("error", "pose", "frame 1")),
         ({"camera_to_world": np.diag([1.0, 1, -1, 1])}, ("error", "pose", "frame 1")),
-        ({"camera_to_world": np.eye(4) + np.eye(4)[::-1] * 0.1}, ("error", "pose", "frame 1")),
-        ({"depth_m": np.full((24, 32), -1, np.float32)}, ("error", "depth", "frame 1")),
         ({"depth_m": np.eye(24, 32, dtype=np.float32)}, ("warning", "depth", "frame 1")),
         ({"intrinsics": np.diag([0.0, 30, 1])}, ("error", "intrinsics", "frame 1")),
-        ({"rgb": np.zeros((24, 32, 3), np.uint8)}, ("warning", "colour", "frame 1")),
-        (
-            {"rgb": np.full((12, 16, 3), 90, np.uint8), "depth_m": np.ones((12, 16), np.float32)},
-            ("error", "size", "frame 1"),
-        ),
         ({"camera_to_world": np.array([[1.0, 0, 0, 500], *np.eye(4)[1:]])}, ("warning", "motion", "")),
     ],
 )

@@ -15,11 +15,9 @@ from su3d_bench.core import registry
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Frame
 from su3d_bench.datasets.layouts import LAYOUTS
-from su3d_bench.datasets.replica.truth import INFO_NAME, MESH_NAME
 from su3d_bench.datasets.rooms.classes import CLASSES
 from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.datasets.scannet.writing import categories, scan_name, segment_of_vertex
-from su3d_bench.formats.ply import read_ply
 
 ROOM, SCAN, N_FRAMES = "bathroom0", "scene9400_00", 6
 ADDRESS = {"replica": ROOM, "scannet": SCAN}
@@ -96,13 +94,6 @@ def test_ground_truth_of_a_scan_is_that_of_the_room_in_scannets_classes(
     assert len(set(theirs.semantic.tolist())) > 8
 
 
-def test_the_mesh_of_a_scan_has_the_triangles_of_the_room(made: dict[str, Path], rooms: Rooms) -> None:
-    mesh, scan = reader(made, "scannet").instance_mesh(SCAN), rooms.scan(ROOM)
-    assert mesh.triangles[:2].tolist() == [scan.faces[0, [0, 1, 2]].tolist(), scan.faces[0, [0, 2, 3]].tolist()]
-    assert len(mesh.triangles) == 2 * len(scan.faces)
-    np.testing.assert_array_equal(mesh.instance_of_triangle[::2], scan.object_id)
-
-
 def test_segments_cut_objects_into_pieces_and_never_cross_one(made: dict[str, Path], rooms: Rooms) -> None:
     scan = rooms.scan(ROOM)
     segments, owner = segment_of_vertex(scan), scan.object_of_vertex()
@@ -110,33 +101,6 @@ def test_segments_cut_objects_into_pieces_and_never_cross_one(made: dict[str, Pa
     assert json.loads(path.read_text())["segIndices"] == segments.tolist()
     assert all(len(set(owner[segments == one].tolist())) == 1 for one in np.unique(segments))
     assert np.median([len(np.unique(segments[owner == one])) for one in np.unique(owner)]) >= 3
-
-
-def test_the_annotated_mesh_of_replica_has_the_types_of_the_release(made: dict[str, Path]) -> None:
-    header = (made["replica"] / f"replica_v1/bathroom_0/{MESH_NAME}").read_bytes().partition(b"end_header")[0].decode()
-    lines = [line for line in header.splitlines() if not line.startswith("element")]
-    assert lines == [
-        "ply",
-        "format binary_little_endian 1.0",
-        *(f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")),
-        *(f"property uchar {name}" for name in ("red", "green", "blue")),
-        "property list uchar int vertex_indices",
-        "property ushort object_id",
-    ]
-    info = json.loads((made["replica"] / f"replica_v1/bathroom_0/{INFO_NAME}").read_text())
-    assert [row["id"] for row in info["classes"]] == list(range(1, 102))
-    assert info["gravity_dir"] == [0, 0, -1]
-
-
-def test_a_scan_has_the_label_colours_and_the_table_of_the_release(made: dict[str, Path]) -> None:
-    labels = read_ply(made["scannet"] / "scans" / SCAN / f"{SCAN}_vh_clean_2.labels.ply").element("vertex")
-    assert labels is not None
-    is_wall = np.asarray(labels.columns["label"]) == 1
-    assert np.asarray(labels.columns["green"])[is_wall].tolist() == [199] * int(is_wall.sum())
-    header, *rows = (made["scannet"] / "scannetv2-labels.combined.tsv").read_text().splitlines()
-    assert header.split("\t")[:5] == ["id", "raw_category", "category", "count", "nyu40id"]
-    assert {row.count("\t") for row in rows} == {header.count("\t")} == {16}
-    assert set(categories()) == {known.name for known in CLASSES}
 
 
 def test_every_room_has_a_scan_name_of_its_own_outside_scannets() -> None:

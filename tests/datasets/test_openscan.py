@@ -13,8 +13,6 @@ from scannet_scans import dataset, write_scan
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.datasets.openscan import KEYS, RAW_NAME, attribute_id, attribute_ids, label_set, read_attributes
-from su3d_bench.datasets.rooms.dataset import Rooms
-from su3d_bench.datasets.rooms.truth import attribute_of_object
 from su3d_bench.datasets.scannet.dataset import ScanNet
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.protocols.loading import load_protocol
@@ -106,12 +104,7 @@ def test_a_missing_file_or_scan_says_how_to_get_it(scan: Path, tmp_path: Path) -
     [
         ("{", "not JSON"),
         ({}, "holds no list of 1 to 1000000 records; download it again"),
-        ([1], "record 1 is no table; expected scene_id, object_id"),
-        ([RECORD | {"scene_id": None}], "record 1: 'scene_id' must be a few words"),
         ([RECORD, RECORD], "record 2: object 0 of scene0000_00 has a record already"),
-        ([RECORD | {"object_id": "-1"}], "'object_id' must be a whole number; found -1"),
-        ([RECORD | {"type": ["seat"]}], "record 1: 'type' must be a few words"),
-        ([RECORD | {"material": "w" * 300}], "record 1: 'material' must be a few words"),
         ([RECORD | {"material": "woood"}], "object 0 has the material 'woood', which is none of the 10 of OpenScan"),
     ],
 )
@@ -120,19 +113,3 @@ def test_what_is_wrong_with_the_file_is_one_line(records: Any, line: str, tmp_pa
     with pytest.raises(DataError) as error:
         attribute_ids(read_attributes(path)[SCAN], "openscan-material", "here")
     assert line in str(error.value) and "\n" not in str(error.value)
-
-
-def test_objects_of_a_room_have_the_attributes_of_their_class_and_of_what_they_are_made(tmp_path: Path) -> None:
-    objects = Rooms(tmp_path).objects("office0")
-    for one, affordance, material in zip(
-        objects,
-        attribute_of_object(objects, "openscan-affordance")[1:],
-        attribute_of_object(objects, "openscan-material")[1:],
-        strict=True,
-    ):
-        if one.class_name == "chair":
-            assert label_set("openscan-affordance").name_of(affordance) == "This term is used for sit"
-        if one.material in ("wooden", "metal"):
-            sentence = label_set("openscan-material").name_of(material)
-            assert sentence.endswith({"wooden": "wood", "metal": "metal"}[one.material])
-    assert {one.class_name for one in objects} >= {"chair"} and {one.material for one in objects} >= {"wooden"}

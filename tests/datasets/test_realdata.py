@@ -102,12 +102,6 @@ def test_fifteen_labelled_frames_give_exactly_the_two_labelled_objects_never_swa
             assert nearer.mean() > 0.75, (frame.index, value)
 
 
-def test_labelled_frames_without_names_give_the_same_two_objects(root: Path) -> None:
-    found = run("rgbd/shelf", *stored_labels())
-    views = [found.views[found.view_indptr[k] : found.view_indptr[k + 1], 1].tolist() for k in range(len(found))]
-    assert sorted(views) == [[0] * 15, [1] * 15]
-
-
 @pytest.mark.parametrize(
     ("scene", "data", "extent_m"),
     [("tum/tum_fr1desk_9", REAL_RECORDINGS, (2.6, 1.6, 1.3)), ("rgbd/chair", None, (1.5, 1.6, 2.6))],

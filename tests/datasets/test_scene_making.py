@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
-from scanned_stage import N_FRAMES, Stage, Surface, files_below, write_scene
+from scanned_stage import N_FRAMES, Stage, files_below, write_scene
 
 from su3d_bench.core import registry
 from su3d_bench.core.errors import DataError, StoreError
@@ -139,22 +137,6 @@ def test_a_scene_of_another_making_is_never_overwritten(name: str, tmp_path: Pat
         write_scene(layout, Stage(), ROOM, tmp_path)
 
 
-def test_a_file_from_elsewhere_in_the_place_of_the_ground_truth_is_left_alone(tmp_path: Path) -> None:
-    theirs = tmp_path / "replica_v1/living_7/habitat/mesh_semantic.ply"
-    theirs.parent.mkdir(parents=True)
-    theirs.write_bytes(b"theirs")
-    with pytest.raises(StoreError, match="was made elsewhere"):
-        write_scene(LAYOUTS["replica"], Stage(), ROOM, tmp_path)
-    assert theirs.read_bytes() == b"theirs"
-
-
-def test_two_rooms_share_a_folder_and_its_marker(tmp_path: Path) -> None:
-    for room in (ROOM, "office0"):
-        write_scene(LAYOUTS["scannet"], Stage(), room, tmp_path)
-    assert scenes("scannet", tmp_path) == ["scene9007_00", "scene9300_00"]
-    assert list(json.loads((tmp_path / "scans/rooms.json").read_text())["scenes"]) == ["scene9007_00", "scene9300_00"]
-
-
 def test_what_scenes_share_is_refused_where_it_is_another(tmp_path: Path) -> None:
     (tmp_path / "scannetv2-labels.combined.tsv").write_text("id\traw_category\n1\twall\n")
     with pytest.raises(StoreError, match=r"combined\.tsv: is another label table"):
@@ -162,13 +144,6 @@ def test_what_scenes_share_is_refused_where_it_is_another(tmp_path: Path) -> Non
     write_scene(LAYOUTS["replica"], Stage(), ROOM, tmp_path)
     with pytest.raises(StoreError, match=r"cam_params\.json: is another camera .*20x12"):
         write_scene(LAYOUTS["replica"], Stage(width=20), "living8", tmp_path)
-
-
-def test_object_ids_beyond_sixteen_bits_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    stage = Stage()
-    monkeypatch.setattr(stage, "scan", lambda scene: Surface(object_id=np.array([1, 1, 70_000], np.int32)))
-    with pytest.raises(DataError, match="70000"):
-        write_scene(LAYOUTS["replica"], stage, ROOM, tmp_path)
 
 
 @pytest.mark.parametrize("name", LAYOUTS)

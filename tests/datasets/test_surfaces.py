@@ -55,13 +55,6 @@ def write_quads(path: Path, n_vertices: int, corners: tuple[int, ...] = (0, 1, 4
     write_ply(path, [vertex, PlyElement("face", len(corners) // 4, {"vertex_indices": indices})])
 
 
-def test_a_mesh_that_names_a_missing_vertex_is_one_line(tmp_path: Path) -> None:
-    write_render(tmp_path)
-    write_quads(tmp_path / "Replica" / "room0_mesh.ply", 5)
-    with pytest.raises(DataError, match=r"replica/room0: room0_mesh\.ply: face 1 names vertex 5, the mesh has 5"):
-        Replica(tmp_path).surface("room0")
-
-
 def scannet(root: Path, **options: object) -> ScanNet:
     return ScanNet(root, ScannetOptions(**options))  # type: ignore[arg-type]
 
@@ -94,15 +87,6 @@ def test_a_scan_without_annotation_has_a_surface_and_without_segments_too(tmp_pa
     (folder / f"{SCAN}_vh_clean_2.ply").unlink()
     with pytest.raises(DataError, match=rf"scannet/{SCAN}: no mesh; {SCAN}_vh_clean_2\.ply is missing, copy it into"):
         dataset.surface(SCAN)
-
-
-def test_axis_alignment_moves_the_surface_with_the_frames(tmp_path: Path) -> None:
-    folder = write_scan(tmp_path, [7] * 24)
-    turn = "0 -1 0 2 1 0 0 3 0 0 1 0 0 0 0 1"
-    (folder / f"{SCAN}.txt").write_text(f"axisAlignment = {turn}\n")
-    moved = scannet(tmp_path, axis_align=True).surface(SCAN).vertices
-    x, y, z = grid()[0].T
-    assert np.allclose(moved, np.stack([2 - y, 3 + x, z], axis=1))
 
 
 def test_a_described_folder_may_name_a_mesh(tmp_path: Path) -> None:

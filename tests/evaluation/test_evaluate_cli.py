@@ -61,54 +61,27 @@ def test_the_json_file_has_the_promised_form(capsys: pytest.CaptureFixture[str])
     assert one["per_scene"]["scene0001_01"]["ap"] == 0.5
 
 
-@pytest.mark.parametrize(
-    ("words", "line"),
-    [
-        (["evaluate"], "evaluate: no predictions were named; give a folder or files, or --name METHOD=PREDICTIONS"),
-        (
-            [*WORDS, "--name", "a", "b"],
-            "evaluate: --name a: expected METHOD=PREDICTIONS of each method, or PREDICTIONS",
-        ),
-        (
-            [*WORDS, "--name", "mine"],
-            "evaluate: --name calls a method of a run; give --out DIR too, or several methods",
-        ),
-        ([*WORDS, "--out", "runs/mine", "--name", "oracle"], "--name: 'oracle' is what the truth itself scores"),
-        ([*WORDS, "--out", "runs/mine", "--name", "../up"], "--name: '../up' cannot be the name of a folder"),
-        (
-            ["evaluate", "prde", "--ground-truth", "gt"],
-            "prde: no such file or folder; give the folder of the predictions",
-        ),
-        (
-            ["evaluate", "pred"],
-            "evaluate: against which ground truth? name one with --dataset scannet or --ground-truth DIR",
-        ),
-        (
-            ["evaluate", "pred", "--ground-truth", "g"],
-            "g: no such folder; give the one with <scene>.txt, one value a point",
-        ),
-        (["evaluate", "pred", "--ground-truth", "."], ".: has no .txt file; expected <scene>.txt, one value a point"),
-        ([*WORDS[:-1], "scannet-instances"], "unknown protocol 'scannet-instances'; did you mean 'scannet-instance'?"),
-        ([*WORDS, "--format", "scanet-text"], "unknown format 'scanet-text'; did you mean 'scannet-text'? known: "),
-        ([*WORDS, "--dataset", "scanet"], "unknown dataset 'scanet'; did you mean 'scannet'?"),
-        ([*WORDS, "--scenes", "scene0009_00"], "no scene of gt matches 'scene0009_00'; did you mean 'scene0001_00'?"),
-        ([*WORDS, "--text-features", "none.npz"], "none.npz: cannot be read: No such file or directory"),
-        (
-            [*WORDS[:-1], "replica-mesh-ex6"],
-            "pred: scene0001_00: replica-mesh-ex6: needs a class for every point, the prediction has masks; name a "
-            "--dataset to make them a map",
-        ),
-    ],
-)
-def test_wrong_input_is_one_line_and_exit_code_2(
-    words: list[str], line: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main([*words, "--json", "out.json"]) == 2
-    answer = capsys.readouterr()
-    assert answer.out == ""
-    assert answer.err.startswith(f"su3d-bench: {line}")
-    assert answer.err.count("\n") == 1
-    assert not Path("out.json").exists()
+WRONG = {
+    "": "evaluate: no predictions were named; give a folder or files, or --name METHOD=PREDICTIONS",
+    "pred --out runs/mine --name ../up --ground-truth gt": "--name: '../up' cannot be the name of a folder",
+    "prde --ground-truth gt": "prde: no such file or folder; give the folder of the predictions",
+    "pred": "evaluate: against which ground truth? name one with --dataset scannet or --ground-truth DIR",
+    "pred --ground-truth .": ".: has no .txt file; expected <scene>.txt, one value a point",
+    "pred --ground-truth gt --protocol scannet-instances": "unknown protocol 'scannet-instances'; did you mean",
+    "pred --ground-truth gt --format scanet-text": "unknown format 'scanet-text'; did you mean 'scannet-text'?",
+    "pred --ground-truth gt --scenes scene0009_00": "no scene of gt matches 'scene0009_00'; did you mean",
+    "pred --ground-truth gt --text-features none.npz": "none.npz: cannot be read: No such file or directory",
+    "pred --ground-truth gt --protocol replica-mesh-ex6": "pred: scene0001_00: replica-mesh-ex6: needs a class for",
+}
+
+
+def test_wrong_input_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
+    for words, line in WRONG.items():
+        assert main(["evaluate", *words.split(), "--json", "out.json"]) == 2
+        answer = capsys.readouterr()
+        assert answer.out == ""
+        assert answer.err.startswith(f"su3d-bench: {line}") and answer.err.count("\n") == 1
+        assert not Path("out.json").exists()
 
 
 def test_the_oracle_of_the_rooms_says_exactly_one(

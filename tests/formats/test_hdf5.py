@@ -5,13 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import cv2
 import h5py
 import numpy as np
 import pytest
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.formats import hdf5
-from su3d_bench.formats.hdf5 import largest_column, read_rows, row_blocks
+from su3d_bench.formats.hdf5 import largest_column, read_rows
+from su3d_bench.formats.images import decode_colour
 
 NAME = "pc_points"
 WHERE = f"replica/room0: {NAME}.h5"
@@ -32,17 +34,6 @@ def test_rows_come_back_as_they_were_written(tmp_path: Path, dtype: str) -> None
     found = read_rows(write(tmp_path, data), 3, WHERE)
     assert found.dtype == np.float32
     np.testing.assert_array_equal(found, data.astype(np.float32))
-
-
-def test_a_large_table_comes_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(hdf5, "BLOCK_BYTES", 16 * 12)
-    path = write(tmp_path)
-    assert [len(block) for block in row_blocks(path, 3, WHERE)] == [16, 16, 8]
-    np.testing.assert_array_equal(read_rows(path, 3, WHERE), ROWS)
-
-
-def test_an_empty_table_has_no_rows(tmp_path: Path) -> None:
-    assert read_rows(write(tmp_path, np.zeros((0, 3), np.float32)), 3, WHERE).shape == (0, 3)
 
 
 def test_the_first_maximum_wins_and_a_row_of_zeros_is_column_0(tmp_path: Path) -> None:
@@ -137,3 +128,32 @@ def test_each_unfit_file_is_one_clear_line(tmp_path: Path, make: Any, message: s
     assert line.startswith(WHERE)
     assert message in line
     assert "\n" not in line
+
+
+RANDOM = np.random.default_rng(0)
+BGR = cv2.GaussianBlur(RANDOM.integers(0, 256, (61, 77, 3), np.uint8), (0, 0), 2)
+HALVED = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420]
+FULL = [cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "pixels", "options"),
+    [
+        (".jpg", BGR, HALVED),
+        (".jpg", BGR, FULL),
+        (".jpg", BGR, [cv2.IMWRITE_JPEG_PROGRESSIVE, 1]),
+        (".jpg", BGR[:, :, 0], []),
+        (".png", BGR, []),
+        (".png", BGR[:, :, 0], []),
+        (".png", np.dstack([BGR, BGR[:, :, 0]]), []),
+        (".png", BGR.astype(np.uint16) * 257, []),
+    ],
+    ids=["halved chroma", "full chroma", "progressive", "grey JPEG", "PNG", "grey PNG", "alpha", "16 bits"],
+)
+def test_pixels_are_red_green_blue(suffix: str, pixels: np.ndarray, options: list[int]) -> None:
+    content = cv2.imencode(suffix, pixels, options)[1]
+    rgb = decode_colour(content.tobytes(), "here")
+    assert rgb.flags.c_contiguous
+    assert np.array_equal(rgb, np.asarray(cv2.imdecode(content, cv2.IMREAD_COLOR))[:, :, ::-1])
+    if suffix == ".png":
+        assert np.array_equal(rgb, (BGR if pixels.ndim == 3 else np.dstack([pixels] * 3))[:, :, ::-1])

@@ -14,15 +14,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from damage import damages, outcomes, truncations
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from same_values import assert_same
+from damage import assert_same, damages, outcomes, truncations
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.formats import pickles
-from su3d_bench.formats.pickles import NAMES, Forgotten, Inert, read_pickle_file
-from su3d_bench.formats.torch_files import TORCH_NAMES
+from su3d_bench.formats.pickles import Forgotten, Inert, read_pickle_file
 
 PROTOCOLS = range(2, 6)
 
@@ -72,24 +68,6 @@ def test_plain_values_arrays_and_scalars_come_back(tmp_path: Path, protocol: int
     special = [OrderedDict(a=1), defaultdict(list, {1: [2]}), PosixPath("/etc/passwd")]
     ordered, default, path = read(tmp_path, pickle.dumps(special, protocol))
     assert (ordered, default) == ({"a": 1}, {1: [2]}) and type(path) is Inert and not vars(path)
-
-
-PLAIN = st.recursive(
-    st.none()
-    | st.booleans()
-    | st.integers(-(1 << 200), 1 << 200)
-    | st.floats(allow_nan=False)
-    | st.text()
-    | st.binary(),
-    lambda inner: st.lists(inner) | st.dictionaries(st.text() | st.integers(-9, 9), inner) | st.tuples(inner, inner),
-    max_leaves=20,
-)
-
-
-@settings(max_examples=50, deadline=None)
-@given(value=PLAIN, protocol=st.sampled_from(PROTOCOLS))
-def test_any_plain_value_round_trips(tmp_path_factory: pytest.TempPathFactory, value: object, protocol: int) -> None:
-    assert_same(read(tmp_path_factory.getbasetemp(), pickle.dumps(value, protocol)), value)
 
 
 def test_settings_become_one_inert_place_and_gzip_is_unpacked(tmp_path: Path) -> None:
@@ -147,42 +125,23 @@ HUGE = b"\x8a\x06" + (10**12).to_bytes(6, "little")
 ENCODE = b"c_codecs\nencode\n"
 FAULTS = {
     "empty": b"",
-    "newer protocol": b"\x80\x06N.",
     "no value": b".",
-    "no mark": b"t.",
     "empty stack": b"R.",
-    "never remembered": b"h\x05.",
     "instance": b"ios\nsystem\n.",
-    "object": b"(o.",
-    "extension": b"\x82\x01.",
-    "buffer": b"\x97.",
-    "text of a reference": b"P12\n.",
     "reference": b"K\x01Q.",
-    "long integer": b"\x8b\xff\xff\xff\x7f.",
     "long bytes": b"\x8e" + b"\xff" * 8 + b".",
-    "long array of bytes": b"\x96" + struct.pack("<Q", 10**12) + b".",
     "no text": b"X\x02\x00\x00\x00\xff\xff.",
     "list as key": b"}]K\x01s.",
-    "float as key": b"}G?\xf0\x00\x00\x00\x00\x00\x00K\x01s.",
     "tuple as key": b"}" + b"N" + b"2\x86" * 3 + b"K\x01s.",
     "crafted key": b"}\x8a\x08\xff\xff\xff\xff\xff\xff\xff\x1fK\x01s.",
-    "odd items": b"}(K\x01u.",
-    "items of a number": b"K\x01K\x02a.",
     "items set of a list": b"]K\x00K\x02s.",
     "state of a number": b"K\x01}b.",
     "call of a type": b"cbuiltins\nlist\n)R.",
-    "object of a type": b"cbuiltins\nlist\n)\x81.",
     "escape": b"cos\n\x1b[31m\nsystem\n.",
-    "names that are none": b"K\x01K\x02\x93.",
     "larger array": ARRAY + b"(K\x01(" + HUGE + b"t" + DTYPE + b"\x89C\x04aaaatb.",
-    "negative size": ARRAY + b"(K\x01(J\xff\xff\xff\xfft" + DTYPE + b"\x89C\x00tb.",
-    "no type": ARRAY + b"(K\x01(K\x01tK\x01\x89C\x00tb.",
     "sizes beyond NumPy": ARRAY + b"(K\x01(K\x00" + HUGE * 7 + b"t" + DTYPE + b"\x89C\x00tb.",
     "type of shapes": b"cnumpy\ndtype\n(" + short(b"(9,)f4") + b"tR(K\x03\x8c\x01<NNNtb.",
-    "type of fields": b"cnumpy\ndtype\n(" + short(b"f4") + b"tR(K\x03\x8c\x01<K\x01NNNNNtb.",
-    "wrong byte order": b"cnumpy\ndtype\n(" + short(b"f4") + b"tR(K\x03\x8c\x01xNNNNNNtb.",
     "another encoding": ENCODE + short(b"a") + short(b"rot13") + b"\x86R.",
-    "bytes beyond 255": ENCODE + short("\u4e2d".encode()) + short(b"latin1") + b"\x86R.",
     "character beyond Unicode": ARRAY
     + b"(K\x01(K\x01t"
     + DTYPE.replace(b"f4", b"U1")
@@ -246,33 +205,3 @@ def test_cut_and_damaged_pickles_are_read_or_refused_but_nothing_else(tmp_path: 
     cuts = list(truncations(content))[:: 1 + len(content) // 300]
     assert outcomes(again, iter(cuts), must_name="map.pkl", refusal=PredictionError)[0] == 0
     outcomes(again, damages(content), must_name="map.pkl", refusal=PredictionError)
-
-
-VALUES = (
-    *(short(text) for text in (b"latin1", b"<", b"f4", b"U1", b"F", b"storage", b"0", b"torch.sparse_coo")),
-    *(b"N", b"\x88", b")", b"]", b"}", b"K\x00", b"K\x01", HUGE, b"J\xff\xff\xff\xff", b"G" + bytes(8), DTYPE),
-    *(b"C\x04aaaa", ARRAY + b"(K\x01(K\x01t" + DTYPE + b"\x89C\x04aaaatb", b"]\x94h\x00a", b"N" + b"2\x86" * 90),
-)
-STEPS = st.sampled_from(VALUES) | st.sampled_from([bytes([code]) for code in b"(0R\x81bt\x85\x86\x87aesuQ"])
-CALLS = st.builds(
-    lambda name, args, state: name + b"(" + b"".join(args) + b"tR" + (b"(" + b"".join(state) + b"tb" if state else b""),
-    st.sampled_from([f"c{full.rpartition('.')[0]}\n{full.rpartition('.')[2]}\n".encode() for full in TORCH_NAMES]),
-    st.lists(st.sampled_from(VALUES), max_size=7),
-    st.lists(st.sampled_from(VALUES), max_size=6),
-)
-
-
-@settings(max_examples=300, deadline=None)
-@given(steps=st.lists(STEPS | CALLS, min_size=1, max_size=8))
-def test_programs_of_valid_parts_are_read_or_refused_but_nothing_else(steps: list[bytes]) -> None:
-    import io
-
-    from su3d_bench.formats.pickles import unpickled
-    from su3d_bench.formats.torch_files import Storages
-
-    content = b"\x80\x04(" + b"".join(steps) + b"t."
-    for names, find in ((NAMES, None), (TORCH_NAMES, Storages(99).find)):
-        try:
-            unpickled(io.BytesIO(content), len(content), len(content), "here", names, find)
-        except PredictionError:
-            continue

@@ -6,14 +6,12 @@ Memory is measured by the peak of what is resident, beneath a limit on addresses
 from __future__ import annotations
 
 import bz2
-import csv
 import gzip
 import io
 import struct
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,11 +27,9 @@ from su3d_bench.formats.images import decode_colour, decode_depth
 from su3d_bench.formats.numpy_files import read_npz
 from su3d_bench.formats.pcd import read_pcd_points
 from su3d_bench.formats.pickles import read_pickle_file
-from su3d_bench.formats.tables.csv_text import separated_rows
 from su3d_bench.formats.torch_files import read_torch
 from su3d_bench.metrics.scoring import unpack_scores
 from su3d_bench.predictions.formats import READERS
-from su3d_bench.questions.query_files import read_query_file
 from su3d_bench.store.predictions import read_prediction
 
 MOST_GROWN = 320 * MIB
@@ -103,15 +99,6 @@ def test_an_npz_that_swells_is_refused_by_each_of_its_readers(tmp_path: Path, ki
     refused(lambda: read_text_features(path), DataError)
 
 
-def test_masks_that_pack_well_are_read(tmp_path: Path) -> None:
-    masks = np.zeros((1 << 16, 600), np.bool_)
-    masks[:1000, :5] = True
-    np.savez_compressed(tmp_path / "scene0001_00.npz", pred_masks=masks, pred_score=np.ones(600))
-    assert masks.nbytes > 100 * (tmp_path / "scene0001_00.npz").stat().st_size
-    read: Any = READERS["maskclustering"].read(tmp_path, "scene0001_00").content
-    assert read.sizes[:6].tolist() == [1000] * 5 + [0]
-
-
 def test_a_torch_archive_whose_pickle_swells_is_refused(tmp_path: Path) -> None:
     n = 1500 * MIB
     packed = deflated(b"\x80\x02B" + struct.pack("<I", n), 1500, last=b".")
@@ -170,15 +157,6 @@ def test_an_image_that_swells_is_refused_before_it_is_decoded(
     assert "not a readable" in refused(lambda: decode(made, "here"), DataError)
 
 
-def test_compressed_points_that_swell_are_refused(tmp_path: Path) -> None:
-    n = 50_000_000
-    packed = bytes([0, 0]) + bytes([7 << 5, 255, 0]) * (3 * n // 264 + 1)
-    lines = ["VERSION 0.7", "FIELDS x y z", "SIZE 1 1 1", "TYPE U U U", "COUNT 1 1 1", f"WIDTH {n}", "HEIGHT 1"]
-    head = "\n".join([*lines, f"POINTS {n}", "DATA binary_compressed", ""]).encode()
-    path = kept(tmp_path, "a.pcd", head + struct.pack("<II", len(packed), 3 * n) + packed)
-    assert "unpacks to more than" in refused(lambda: read_pcd_points(path), DataError)
-
-
 @pytest.mark.parametrize("n", [MOST_MEMBERS + 1, 99_999_999])
 def test_runs_of_points_have_a_bound_together(n: int, tmp_path: Path) -> None:
     assert "points together" in refused(lambda: run_members(10**8, f"1 {n}", "here"), PredictionError)
@@ -187,15 +165,6 @@ def test_runs_of_points_have_a_bound_together(n: int, tmp_path: Path) -> None:
     (tmp_path / "scene0001_00.txt").write_text("".join(f"{k}.json 3 1.0\n" for k in range(8)))
     said = refused(lambda: READERS["scannet-text"].read(tmp_path, "scene0001_00"), PredictionError)
     assert "points together" in said
-
-
-def test_rows_of_text_have_a_bound(tmp_path: Path) -> None:
-    text = "a\n" + "\n" * (3 * MIB)
-    assert "more than 200000 rows" in refused(lambda: separated_rows(text), csv.Error)
-    wide = (",".join([""] * 1000) + "\n") * 5000
-    assert "4000000 cells" in refused(lambda: separated_rows(wide), csv.Error)
-    path = kept(tmp_path, "queries.csv", text.encode())
-    assert "not CSV" in refused(lambda: read_query_file(path), DataError)
 
 
 def test_a_member_is_read_whole_and_with_its_checksum(tmp_path: Path) -> None:
@@ -212,3 +181,12 @@ def test_a_member_is_read_whole_and_with_its_checksum(tmp_path: Path) -> None:
     path.write_bytes(bytes(content))
     with pytest.raises(PredictionError, match="not a whole zip archive"):
         read_npz(path)
+
+
+def test_compressed_points_that_swell_are_refused(tmp_path: Path) -> None:
+    n = 50_000_000
+    packed = bytes([0, 0]) + bytes([7 << 5, 255, 0]) * (3 * n // 264 + 1)
+    lines = ["VERSION 0.7", "FIELDS x y z", "SIZE 1 1 1", "TYPE U U U", "COUNT 1 1 1", f"WIDTH {n}", "HEIGHT 1"]
+    head = "\n".join([*lines, f"POINTS {n}", "DATA binary_compressed", ""]).encode()
+    path = kept(tmp_path, "a.pcd", head + struct.pack("<II", len(packed), 3 * n) + packed)
+    assert "unpacks to more than" in refused(lambda: read_pcd_points(path), DataError)

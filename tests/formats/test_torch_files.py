@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from damage import damages, outcomes, truncations
+from damage import assert_same, damages, outcomes, truncations
 from places import CASES
-from same_values import assert_same
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.formats.torch_files import SparseTensor, read_torch
@@ -137,24 +136,18 @@ def test_views_within_their_storage_are_read_and_other_members_left_alone(
 
 FAULTS = {
     "beyond": tensor((7,), (1,)),
-    "stride beyond": tensor((2,), (6,)),
     "offset beyond": tensor((1,), (1,), offset=6),
-    "offset below": tensor((1,), (1,), offset=-1),
     "fewer strides": tensor((2, 3), (1,)),
     "negative stride": tensor((2,), (-1,), offset=1),
     "repeated": tensor((10**12,), (0,)),
-    "repeated twice": tensor((10**9, 10**9), (0, 0)),
     "larger storage": tensor((6,), (1,), n=10**12),
-    "smaller storage": tensor((5,), (1,), n=5),
     "quantised": tensor((6,), (1,), kind="QInt8Storage"),
     "dimensions": tensor((1,) * 9, (1,) * 9),
     "path": b"\x80\x02" + storage(6, key="../../x") + b".",
-    "no member": b"\x80\x02" + storage(6, key="7") + b".",
     "two sizes": b"\x80\x02(" + storage(6) + storage(5) + b"t.",
     "no storage": b"\x80\x02K\x01Q.",
     "call": b"\x80\x02cposix\nsystem\n" + text("true") + b"\x85R.",
     "load": b"\x80\x02ctorch.storage\n_load_from_bytes\nC\x00\x85R.",
-    "layout": b"\x80\x02ctorch.serialization\n_get_layout\n" + text("torch.sparse_csr") + b"\x85R.",
     "sparse": b"\x80\x02ctorch._utils\n_rebuild_sparse_tensor\nK\x01\x85R.",
 }
 

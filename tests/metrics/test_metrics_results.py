@@ -31,7 +31,7 @@ from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.types import LabelSet
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
-from su3d_bench.metrics.open_vocabulary.score import ObjectCounts
+from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectCounts
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.score import ShareCounts

@@ -21,7 +21,7 @@ from su3d_bench.opensu3d.pipeline import OpenSU3D
 
 SIDE_BY_SIDE = SUPPORT / "literal_paper" / "side_by_side.py"
 ROOMS = ("living0", "bedroom0", "kitchen0", "office0")
-N_PROBLEMS, OF_ONE_TEST = 300, 50
+OF_ONE_TEST = 60
 SCENE = SceneInfo("made", "random", 5, 7, "rendered-rooms")
 
 
@@ -31,7 +31,7 @@ def both(problem: Problem) -> tuple[OpenSU3D, PaperProgram]:
     return method, program
 
 
-@pytest.mark.parametrize("first", range(0, N_PROBLEMS, OF_ONE_TEST))
+@pytest.mark.parametrize("first", [0, *(pytest.param(n, marks=pytest.mark.proof) for n in (60, 120, 180, 240))])
 def test_the_pipeline_gives_the_map_of_the_papers_text_on_random_problems(first: int) -> None:
     for seed in range(first, first + OF_ONE_TEST):
         problem = random_problem(seed)
@@ -43,22 +43,6 @@ def test_the_pipeline_gives_the_map_of_the_papers_text_on_random_problems(first:
             assert (where, method.n_points, method.n_instances) == (where, len(program.scene.ids), len(program.tracks))
         assert (seed, differences(method.finish(), program)) == (seed, [])
         method.close()
-
-
-def test_random_problems_hold_what_could_come_out_otherwise() -> None:
-    """Instances seen again, split, of equal scores, without a caption, and images that show nothing."""
-    problems = [random_problem(seed) for seed in range(40)]
-    things = []
-    for problem in problems:
-        program = PaperProgram(problem.settings)
-        for frame, detections in problem.images:
-            program.add_image(frame, detections)
-        things += program.things()
-    assert sum(len(thing.views) > 1 for thing in things) > 40
-    assert sum(thing.part > 0 for thing in things) > 20
-    assert any(thing.caption.endswith(" in a scene") for thing in things)
-    assert any(len({view[0] for view in thing.views}) < len(thing.views) for thing in things)  # healed over-splits
-    assert any(not len(detections) for problem in problems for _, detections in problem.images)
 
 
 FAULTS: dict[str, Callable[[Instances], Instances]] = {
@@ -75,8 +59,7 @@ FAULTS: dict[str, Callable[[Instances], Instances]] = {
 }
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_map_that_is_not_the_papers_is_noticed(fault: str) -> None:
+def test_a_map_that_is_not_the_papers_is_noticed() -> None:
     problem = random_problem(16)
     method, program = both(problem)
     for frame, detections in problem.images:
@@ -85,7 +68,7 @@ def test_a_map_that_is_not_the_papers_is_noticed(fault: str) -> None:
     found = method.finish()
     assert len(found) > 1
     assert differences(found, program) == []
-    assert differences(FAULTS[fault](found), program) != []
+    assert [name for name, fault in FAULTS.items() if not differences(fault(found), program)] == []
 
 
 def test_the_defaults_are_the_papers() -> None:
@@ -101,7 +84,7 @@ def run_side_by_side(out: Path, profile: str, *words: str) -> None:
     assert len(list(out.glob("scenes/*/side-by-side@*/prediction.npz"))) == len(methods)
 
 
-@pytest.mark.parametrize("profile", ["oracle", "embedded"])
+@pytest.mark.parametrize("profile", ["oracle", pytest.param("embedded", marks=pytest.mark.proof)])
 def test_a_room_is_what_the_papers_text_makes_of_it(
     profile: str, tmp_path: Path, rooms_data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

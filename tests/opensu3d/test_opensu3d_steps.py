@@ -241,12 +241,6 @@ def test_labels_are_those_of_scikit_learn_on_lattices(
     assert_same_labels(np.array(points, np.float64) * eps / 4 + offset, eps, min_points)
 
 
-@settings(max_examples=40, deadline=None)
-@given(st.lists(st.tuples(*[st.floats(-0.4, 0.4)] * 3), min_size=1, max_size=80), st.integers(1, 8))
-def test_labels_are_those_of_scikit_learn_on_any_floats(points: list[tuple[float, ...]], min_points: int) -> None:
-    assert_same_labels(np.array(points, np.float64), 0.1, min_points)
-
-
 def test_a_border_point_between_two_clusters_belongs_to_the_first() -> None:
     row = np.column_stack([np.arange(5) * 0.02, np.zeros((5, 2))])
     other = row + np.array([0.26, 0, 0])

@@ -15,7 +15,7 @@ from PIL import Image
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Float32Array, PerceptionNeeds, SceneInfo
-from su3d_bench.perception.crops import crop_window
+from su3d_bench.perception.cache import crop_window
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
 from su3d_bench.perception.stored_masks import GsaFiles
 

@@ -126,16 +126,6 @@ def test_features_of_another_encoder_or_length_are_refused(tmp_path: Path) -> No
         read_stored(path, still_life(40), CountingEncoder())
 
 
-def test_a_missing_and_a_damaged_file_are_data_errors(tmp_path: Path) -> None:
-    path = stored_path(tmp_path, "replica", "room0", 40)
-    with pytest.raises(DataError, match=r"frame 40: there is no file .*frame000040\.npz"):
-        read_stored(path, still_life(40), CountingEncoder())
-    path.parent.mkdir()
-    path.write_bytes(b"nothing")
-    with pytest.raises(DataError, match="is not an npz file of plain arrays"):
-        read_stored(path, still_life(40), CountingEncoder())
-
-
 def test_pickled_objects_are_refused(tmp_path: Path) -> None:
     path = written(tmp_path, with_features=False)
     arrays = dict(np.load(path))

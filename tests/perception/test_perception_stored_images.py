@@ -88,39 +88,6 @@ def test_what_is_no_label_image_is_said(tmp_path: Path, image: np.ndarray, messa
     assert str(caught.value).startswith("rgbd/desk: frame-0040.segm.png") and message in str(caught.value)
 
 
-def test_missing_and_doubled_images_are_said(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="cannot be read: No such file or directory; it should hold label images"):
-        images(tmp_path / "none")
-    with pytest.raises(DataError, match=r"no label image in .* matches 'frame-{index}\.segm\.png'"):
-        images(tmp_path)
-    write_image(tmp_path)
-    with pytest.raises(DataError, match=r"no label image for frame 41 matches .*has an image of zeros"):
-        images(tmp_path).regions(still_life(41))
-    write_image(tmp_path, name="frame-40.segm.png")
-    with pytest.raises(DataError, match=r"frame-0040\.segm\.png and frame-40\.segm\.png are of one frame"):
-        images(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("pattern", "names", "message"),
-    [
-        ("frame.png", None, r"perception\.stored\.images = 'frame\.png': expected one {index} in the file's name"),
-        (
-            "../{index}.png",
-            None,
-            r"rgbd/desk: perception\.stored\.images: '\.\.' leads out of .*; name files inside it",
-        ),
-        (PATTERN, "none.toml", r"none\.toml cannot be read: No such file"),
-    ],
-)
-def test_what_is_wrong_with_the_names_of_files_is_said(
-    tmp_path: Path, pattern: str, names: str | None, message: str
-) -> None:
-    write_image(tmp_path)
-    with pytest.raises((ConfigError, DataError), match=message):
-        images(tmp_path, pattern, names)
-
-
 def test_an_image_that_links_out_of_the_folder_is_refused(tmp_path: Path) -> None:
     outside = write_image(tmp_path / "outside")
     (tmp_path / "labels").mkdir()
@@ -133,7 +100,6 @@ def test_an_image_that_links_out_of_the_folder_is_refused(tmp_path: Path) -> Non
     ("file", "text", "message"),
     [
         ("names.toml", "48", "not a TOML or JSON table of names by value"),
-        ("names.json", "[" * 100_000, "not a TOML or JSON table of names by value"),
         ("names.toml", 'book = "48"', "'book' is no value of a label image; expected 1 to 65535"),
         ("names.toml", '70000 = "book"', "'70000' is no value of a label image"),
         ("names.json", '{"48": "a\\nb"}', "the name of 48 is"),

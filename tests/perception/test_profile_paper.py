@@ -161,17 +161,6 @@ def test_auto_is_paper_on_camera_images_where_the_models_are(models: Path, no_mo
     assert caveat is not None and "rendered rooms only" in caveat
 
 
-def test_the_command_line_says_it_too(no_models: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
-    monkeypatch.chdir(no_models)
-    words = ["run", "--scenes", "rooms/living0", "--profile", "paper", "--limit", "1", "--out", "out", "--quiet"]
-    assert main(words) == 2
-    said = capsys.readouterr().err
-    assert said.startswith("su3d-bench: model 'clip-vit-h-14': not found below") and len(said.splitlines()) == 1
-    assert not (no_models / "out").exists(), "no frame was read"
-    assert main([*words, "--set", "perception.models.encoder=embedded"]) == 2
-    assert "run: su3d-bench models fetch sam-vit-h" in capsys.readouterr().err
-
-
 def test_a_tagger_that_was_asked_for_is_looked_for_before_any_frame(models: Path, no_models: Path) -> None:
     check_models("paper", config_of(models))
     with pytest.raises(ModelMissing, match=r"model 'ram-plus': not found .*run: python tools/export_onnx\.py ram-plus"):

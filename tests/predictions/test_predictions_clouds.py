@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +28,7 @@ from cloud_files import (
     write_tensor,
 )
 from painted import Painted, WordEncoder
-from places import CASES, SCENES
+from places import SCENES
 from prediction_files import refused
 
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
@@ -35,7 +37,6 @@ from su3d_bench.evaluation.result import Request
 from su3d_bench.formats.pcd import write_pcd_points
 from su3d_bench.formats.ply import PlyElement, write_ply
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.predictions import dense as gradslam
 from su3d_bench.predictions.base import ScenePrediction
 from su3d_bench.predictions.formats import READERS, recognise
 
@@ -121,13 +122,6 @@ def test_a_map_comes_back_object_by_object(tmp_path: Path, monkeypatch: pytest.M
     assert not found.boxes[1].any() and not found.centroids[1].any()
     assert any("1 for every object" in remark for remark in prediction.remarks)
     assert any("1 background objects (wall) have their own names as labels" in said for said in prediction.remarks)
-
-
-def test_the_settings_that_omegaconf_itself_pickles_are_read_past() -> None:
-    # written with omegaconf 2.3.1 and Python 3.11: nested settings with paths, lists, None and a missing value
-    prediction = read(CASES / "full_pcd_omegaconf.pkl.gz", "full_pcd_omegaconf")
-    found = instances(prediction)
-    assert found.points.tolist() == np.arange(12.0).reshape(4, 3).tolist() and found.names == ("lamp",)
 
 
 def test_the_streamlined_variant_is_read(tmp_path: Path) -> None:
@@ -220,16 +214,6 @@ def test_the_first_pose_beside_the_points_brings_them_to_the_world(tmp_path: Pat
     assert "first_pose.txt line 1 has 3 values; expected 16" in refused(tmp_path, "room0", "gradslam")
 
 
-def test_large_tables_are_mapped_and_not_held(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gradslam, "HELD_IN_MEMORY", 1 << 20)
-    n, d = 40_000, 256  # 20 MB of float16
-    features = RNG.random((n, d), np.float32)
-    write_gradslam(tmp_path / "room0", np.zeros((n, 3), np.float32), features)
-    content = read(tmp_path).content
-    assert isinstance(content, DenseFeatures) and isinstance(content.features, np.memmap)
-    np.testing.assert_array_equal(content.features, features.astype(np.float16))
-
-
 def test_rows_that_float16_cannot_hold_have_no_feature(tmp_path: Path) -> None:
     features = np.ones((4, 2), np.float32)
     features[0, 0], features[1, 1], features[2, 0] = np.nan, np.inf, 1e6
@@ -245,9 +229,7 @@ def test_rows_that_float16_cannot_hold_have_no_feature(tmp_path: Path) -> None:
         (np.full((4, 3), np.nan), np.ones((4, 2)), "pc_points.h5: point 0 is at [nan, nan, nan]"),
         (np.zeros((4, 2)), np.ones((4, 2)), "pc_points.h5: has the shape (4, 2); expected (N, 3)"),
         (np.zeros((4, 3)), np.ones((5, 2)), "pc_embeddings.h5: has other rows than pc_points.h5, which has 4"),
-        (np.zeros((4, 3)), np.ones((3, 2)), "pc_embeddings.h5: has other rows"),
         (np.zeros((4, 3)), np.ones(4), "pc_embeddings.h5: has the shape (4,); expected (N, D)"),
-        (np.zeros((4, 3)), np.ones((4, 0)), "expected (N, D)"),
         (np.zeros((4, 3)), np.ones((4, 2), int), "pc_embeddings.h5: holds values of type int64"),
     ],
 )
@@ -326,16 +308,50 @@ def test_of_several_clouds_the_one_that_the_original_reads_counts(tmp_path: Path
     ("index", "features", "message"),
     [
         (np.array([0, -1]), np.ones((2, 4)), "index.npy: point 1 is of object -1, embeddings.npy has 2 rows"),
-        (np.array([0, 2]), np.ones((2, 4)), "point 1 is of object 2"),
         (np.array([0, 2**63], np.uint64), np.ones((2, 4)), "point 1 is of object 9223372036854775808"),
         (np.array([0, 1, 1]), np.ones((2, 4)), "expected an integer for each of the 2 points of point_cloud.pcd"),
-        (np.array([[0, 1]]), np.ones((2, 4)), "holds an array of shape (1, 2) int64"),
         (np.array([0.0, 1.0]), np.ones((2, 4)), "holds an array of shape (2,) float64"),
         (np.array([0, 1]), np.ones(4), "embeddings.npy: holds an array of shape (4,)"),
-        (np.array([0, 1]), np.ones((2, 0)), "expected a row of features an object"),
         (np.array([0, 1]), np.array([[{}]]), "embeddings.npy: not a whole .npy array"),
     ],
 )
 def test_each_fault_of_the_three_files_is_one_line(tmp_path: Path, index: Any, features: Any, message: str) -> None:
     write_openlex(tmp_path / "room0", np.zeros((2, 3)), index, features)
     assert message in refused(tmp_path, "room0", "openlex3d")
+
+
+class Bomb:
+    """What a hostile map holds: a call, hidden in an object's state."""
+
+    def __init__(self, function: Any, *args: Any) -> None:
+        self.call = function, args
+
+    def __reduce__(self) -> Any:
+        return self.call
+
+
+def fire(*_: object) -> None:
+    raise AssertionError("the pickle ran code")
+
+
+CALLS: list[tuple[Any, ...]] = [
+    (os.system, "touch {}"),
+    (eval, "open('{}', 'w')"),
+    (open, "{}", "w"),
+    (fire,),
+    (np.load, "{}"),
+    (pickle.loads, b"."),
+]
+
+
+@pytest.mark.parametrize("place", ["cfg", "mask", "pcd_np"])
+@pytest.mark.parametrize("call", CALLS, ids=lambda call: getattr(call[0], "__name__", "call"))
+def test_no_call_in_a_map_is_made(tmp_path: Path, call: tuple[Any, ...], place: str) -> None:
+    proof = tmp_path / "proof"
+    args = [one.format(proof) if isinstance(one, str) else one for one in call[1:]]
+    value = a_map()
+    holder = value if place == "cfg" else value["objects"][0]
+    holder[place] = Bomb(call[0], *args)
+    path = write_map(tmp_path / "pcd_x.pkl.gz", value, 5)
+    assert "no plain data" in refused(path, "pcd_x", "conceptgraphs")
+    assert not proof.exists()

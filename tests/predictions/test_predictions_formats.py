@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from places import CASES
+from places import CASES, ROOT
 from prediction_files import (
     FEATURES,
     OURS,
@@ -34,8 +35,7 @@ from prediction_files import (
 
 from su3d_bench.core.errors import ConfigError, PredictionError
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
-from su3d_bench.formats.arrays import run_members
-from su3d_bench.formats.text_integers import integer_lines
+from su3d_bench.formats.arrays import integer_lines, run_members
 from su3d_bench.metrics.instance.average_precision import last_line_of_each_mask_file
 from su3d_bench.predictions.base import ScenePrediction, VertexLabels, VertexMasks
 from su3d_bench.predictions.formats import READERS, recognise
@@ -309,12 +309,6 @@ def test_each_format_is_recognised_as_itself_alone(tmp_path: Path, format: str) 
     assert recognise(folder, format).name == format
 
 
-def test_every_format_has_a_name_and_one_line(tmp_path: Path) -> None:
-    assert set(OURS) <= set(READERS)
-    for name, reader in READERS.items():
-        assert reader.name == name and "\n" not in reader.summary and len(reader.summary) < 120
-
-
 def test_a_path_in_no_format_or_in_two_is_an_error_that_says_so(tmp_path: Path) -> None:
     with pytest.raises(PredictionError, match="no such file or folder"):
         recognise(tmp_path / "none")
@@ -345,3 +339,18 @@ def test_integer_lines_refuse_what_python_refuses(content: bytes) -> None:
     except PredictionError:
         ours = None
     assert ours == expected
+
+
+PAGE = (ROOT / "docs/evaluate.md").read_text(encoding="utf-8")
+SECTIONS = dict(re.findall(r"^### `([^`]+)`\n(.*?)(?=^### |\Z)", PAGE, re.DOTALL | re.MULTILINE))
+
+
+def test_the_page_has_a_section_of_each_format_and_of_no_other() -> None:
+    assert list(SECTIONS) == list(READERS)
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_a_format_has_its_files_and_a_command(name: str) -> None:
+    assert "```text\n" in SECTIONS[name] and "```sh\nsu3d-bench evaluate " in SECTIONS[name]
+    suffixes = getattr(READERS[name], "suffixes", ())
+    assert any(suffix in SECTIONS[name] for suffix in suffixes) or not suffixes

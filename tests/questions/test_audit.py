@@ -17,7 +17,7 @@ from painted import Painted
 from places import SCENES
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import DataError, StoreError
+from su3d_bench.core.errors import DataError
 from su3d_bench.questions.audit import AuditedQuestion, audited_questions, sample
 from su3d_bench.questions.model import MADE_KINDS, Question, new_question
 from su3d_bench.questions.scene_map import MapObject, SceneMap
@@ -142,12 +142,6 @@ def test_the_verb_leaves_sheets_a_page_and_a_table_to_fill_in(folder: Path) -> N
     pictures = re.findall(r'src="([^"]*)"', page)
     assert len(pictures) == 14 and all((folder / name).is_file() for name in pictures)
     assert "<script" not in page and all(row["answer"] in page for row in rows)
-
-
-def test_verdicts_are_not_written_over(folder: Path, tmp_path: Path) -> None:
-    judged(folder, tmp_path / "audit.csv", ["right", *[""] * 13])
-    with pytest.raises(StoreError, match="holds verdicts; choose another --out"):
-        make_audit([plain("painted/a", "count", 0)], lambda _: None, tmp_path)
 
 
 def test_hostile_texts_are_escaped_on_the_page_and_read_back(tmp_path: Path) -> None:

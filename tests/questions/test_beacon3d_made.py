@@ -14,9 +14,8 @@ from chat_server import KEY, Answered, ChatServer
 from places import CASES
 
 from su3d_bench.cli.main import main
-from su3d_bench.perception.language.chat import ChatRequest
+from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig
 from su3d_bench.perception.language.chat import Reply as ModelReply
-from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.questions import beacon3d as judge
 from su3d_bench.questions import chains as made_questions
 from su3d_bench.questions import truths

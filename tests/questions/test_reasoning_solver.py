@@ -2,21 +2,35 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from bedroom_map import bedroom, box, thing
+from places import CASES
 from scored_room import instances
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.datasets.rooms.dataset import Rooms
-from su3d_bench.metrics.questions.score import RefinedNames
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.questions.score import RefinedNames, TrueAnswer, are_objects_right, is_answer_right
+from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig, Reply
 from su3d_bench.questions.generated import generate_questions
 from su3d_bench.questions.model import Answer
+from su3d_bench.questions.question_files import paper_queries
 from su3d_bench.questions.scene_map import MapObject, SceneMap, map_of
-from su3d_bench.questions.solver import Solver
+from su3d_bench.questions.solver import (
+    LanguageSolver,
+    Solver,
+    by_language_model,
+    by_relevance,
+    context_for,
+    given_answer,
+    system_prompt,
+)
 
 
 @pytest.fixture(scope="module")
@@ -182,3 +196,128 @@ def test_a_map_is_named_by_n_prime_then_by_label_then_by_n() -> None:
     assert [one.name for one in map_of(sound, RefinedNames(("a", "b"), "test")).objects] == ["a", "b"]
     with pytest.raises(PredictionError, match="two instances of one id"):
         map_of(replace(sound, ids=np.array([3, 3], np.int32)))
+
+
+class Said:
+    """A language model that says one thing."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self.requests: list[ChatRequest] = []
+
+    def ask_all(self, requests: Sequence[ChatRequest]) -> list[Reply]:
+        self.requests += requests
+        return [Reply(self.text, "stop")] * len(requests)
+
+
+def test_the_prompt_holds_the_paper_s_six_rules_and_every_object() -> None:
+    for rule in (
+        "Use `Name' & `Description' to understand object.",
+        "Use `ID' to refer object.",
+        "Use `Cartesian Coordinates'.",
+        "Get `Centroid' & `Bounding Box' information.",
+        "Compute `Euclidean Distance' if necessary.",
+        "Assume `Tolerance' if necessary.",
+    ):
+        assert rule in system_prompt()
+    model = Said('{"reasoning": "3.59 < 5.32", "answer": "the kitchen sink", "object_ids": [9, 999]}')
+    found = LanguageSolver(bedroom(), model, LanguageConfig()).answer("Which sink is closer to bed?")
+    assert (found.text, found.object_ids, found.solver) == ("the kitchen sink", (9,), "llm")
+    lines = [json.loads(line) for line in model.requests[0].text.splitlines() if line.startswith("{")]
+    assert [line["ID"] for line in lines] == list(bedroom().ids)
+    assert lines[0] == {
+        "ID": 1, "Name": "bed", "Description": "", "Centroid": [1.0, 0.8, 0.25],
+        "Bounding Box": [[0.0, 0.0, 0.0], [2.0, 1.6, 0.5]],
+    }  # fmt: skip
+
+
+def test_a_map_larger_than_the_context_is_cut_by_relevance_and_it_is_said() -> None:
+    filler = [thing(100 + k, "plate", box(9, k, 0, 0.1, 0.1, 0.1)) for k in range(300)]
+    scene = SceneMap((*filler, *bedroom().objects))
+    config = LanguageConfig(context_tokens=2000, max_answer_tokens=200)
+    context = context_for(scene, "Which sink is closer to bed?", config)
+    assert {1, 9, 10} <= {one.id for one in context.objects}
+    assert 3 < len(context.objects) < 100
+    found = LanguageSolver(scene, Said("sink #9"), config).answer("Which sink is closer to bed?")
+    assert found.object_ids == (9,)
+    assert found.notes[0].startswith(
+        f"the map has 318 objects, more than the model reads at once; it was given the {len(context.objects)} "
+    )
+    assert {one.id for one in by_relevance(scene, "Which sink is closer to bed?")[:3]} == {1, 9, 10}
+    assert context_for(bedroom(), "x", LanguageConfig()).note == ""
+
+
+@pytest.mark.parametrize("text", ["I'm sorry, I can't help with that.", ""])
+def test_a_model_that_refuses_leaves_the_question_unsettled(text: str) -> None:
+    found = LanguageSolver(bedroom(), Said(text), LanguageConfig()).answer("Which sink is closer to bed?")
+    assert not found.is_settled
+    assert found.text.startswith("I cannot settle this: gpt-4-1106-preview: ")
+
+
+PAGE = json.loads((CASES / "page_reasoning.json").read_text())["cases"]
+RULES = load_protocol("replica-reasoning").answers
+each_case = pytest.mark.parametrize("case", PAGE, ids=[case["question"] for case in PAGE])
+
+
+def shown_map(case: Any) -> SceneMap:
+    """The objects that the page shows, each a box of the case's size about its centroid; row k is the k-th."""
+    things = []
+    for row, one in enumerate(case["objects"]):
+        centre, half = np.array(one["centroid"], np.float64), np.array(one["size"], np.float64) / 2
+        box = np.stack([centre - half, centre + half])
+        things.append(MapObject(one["id"], one["name"], one["caption"], centre, box, row))
+    return SceneMap(tuple(things))
+
+
+def truth_of(case: Any) -> TrueAnswer:
+    return TrueAnswer(case["question"], "page", case["value"], tuple(sorted(case["object_ids"])))
+
+
+def objects_of_rows(scene: SceneMap) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
+    """Each instance stands for the object that bears its id."""
+    return np.array(scene.ids, np.int64)
+
+
+class PageModel:
+    """A language model that says what the page shows."""
+
+    def __init__(self, case: Any) -> None:
+        self.case = case
+        self.requests: list[ChatRequest] = []
+
+    def ask_all(self, requests: Sequence[ChatRequest]) -> list[Reply]:
+        self.requests += requests
+        told = {name: self.case[name] for name in ("object_ids", "reference_ids")}
+        return [Reply(json.dumps({"reasoning": "as shown", "answer": self.case["told"], **told}), "stop")]
+
+
+def test_there_are_seven_and_they_are_asked_of_the_paper_s_scenes() -> None:
+    assert len(PAGE) == 7
+    asked = [question for question in paper_queries() if question.kind == "reasoning" and question.reply]
+    assert {(one.scene, one.text) for one in asked} == {(one["scene"], one["question"]) for one in PAGE}
+
+
+@each_case
+def test_the_built_in_solver_gives_the_page_s_answer_or_says_that_it_cannot(case: Any) -> None:
+    scene = shown_map(case)
+    found = Solver(scene).answer(case["question"])
+    assert found.is_settled is case["is_settled_by_geometry"]
+    if found.is_settled:
+        given, true = given_answer(truth_of(case), found, scene), truth_of(case)
+        assert RULES is not None and is_answer_right(RULES, true, given, objects_of_rows(scene))
+        assert are_objects_right(true, given, objects_of_rows(scene))
+
+
+@each_case
+def test_the_page_s_answer_in_a_model_s_words_is_right_and_another_is_wrong(case: Any) -> None:
+    scene, model = shown_map(case), PageModel(case)
+    solver = by_language_model(model, LanguageConfig())
+    (found,) = solver.ask(scene, [case["question"]])
+    given, true = given_answer(truth_of(case), found, scene), truth_of(case)
+    assert RULES is not None and is_answer_right(RULES, true, given, objects_of_rows(scene))
+    assert are_objects_right(true, given, objects_of_rows(scene))
+    assert list(found.reference_ids) == case["reference_ids"]
+    assert all(f'"ID": {one["id"]}' in model.requests[0].text for one in case["objects"])
+    wrong = {**case, "told": "No, 77 of them", "object_ids": [one["id"] for one in case["objects"]][:1]}
+    (found,) = by_language_model(PageModel(wrong), LanguageConfig()).ask(scene, [case["question"]])
+    assert not is_answer_right(RULES, true, given_answer(true, found, scene), objects_of_rows(scene))

@@ -10,8 +10,9 @@ import pytest
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import DenseFeatures, Instances
 from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
-from su3d_bench.questions import retrieval
-from su3d_bench.questions.retrieval import points_found, rank, rank_all
+from su3d_bench.questions import model as questions_model
+from su3d_bench.questions.model import points_found, rank, rank_all
+from su3d_bench.questions.refining import FilterConfig, undesired
 
 
 class TwoWords:
@@ -72,7 +73,7 @@ def as_the_program_of_conceptfusion_shows(similarity: Float64Array) -> list[int]
 def test_of_features_alone_the_points_are_found_that_their_own_program_shows(
     rows_at_once: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(retrieval, "BLOCK_ROWS", rows_at_once)
+    monkeypatch.setattr(questions_model, "BLOCK_ROWS", rows_at_once)
     random = np.random.default_rng(3)
     features = random.normal(size=(60, 2)).astype(np.float16)
     features[::9] = 0  # no feature, no part
@@ -89,3 +90,33 @@ def test_where_every_point_is_equally_similar_none_is_found() -> None:
     for n, features in ((0, np.zeros((0, 2))), (3, np.zeros((3, 2))), (3, np.ones((3, 2)))):
         dense = DenseFeatures(np.zeros((n, 3), np.float32), features.astype(np.float16))
         assert points_found(dense, ["east"], TwoWords()).sizes.tolist() == [0]
+
+
+def plan_of(*sides_m: tuple[float, float]) -> Instances:
+    """Instances whose boxes have these sides from above, in a map of 10 m by 10 m with points of no instance."""
+    clouds = [np.array([[0, 0, 0], [x, y, 1]], np.float32) for x, y in sides_m]
+    corners = np.array([[0, 0, 0], [10, 10, 2]], np.float32)
+    masks = [np.array([2 * k, 2 * k + 1]) for k in range(len(clouds))]
+    return Instances.of(np.concatenate([*clouds, corners]), masks)
+
+
+@pytest.mark.parametrize("name", ["wall", "walls", "Wall", "hardwood floor", "the ground", "false ceiling", "roof"])
+def test_names_of_background_are_left_out(name: str) -> None:
+    assert undesired(plan_of((1, 1)), (name,), FilterConfig()) == (f"'{name}' is background",)
+    assert undesired(plan_of((1, 1)), (name,), FilterConfig(background_names=())) == ("",)
+
+
+@pytest.mark.parametrize("name", ["wall lamp", "floor mat", "ceiling fan", "wall-mounted shelf", "sofa", "", "<wall>x"])
+def test_things_on_walls_and_floors_stay(name: str) -> None:
+    assert undesired(plan_of((1, 1)), (name,), FilterConfig()) == ("",)
+
+
+def test_a_box_that_covers_the_map_from_above_is_left_out() -> None:
+    made = plan_of((9.8, 9.8), (9.7, 9.7), (1, 10))  # 96 %, 94 %, 10 %
+    assert undesired(made, ("rug", "rug", "rug"), FilterConfig()) == (
+        "its box has 96 % of the map's area from above",
+        "",
+        "",
+    )
+    assert undesired(made, ("rug",) * 3, FilterConfig(max_map_fraction=1.0)) == ("", "", "")
+    assert undesired(made, ("rug",) * 3, FilterConfig(max_map_fraction=0.05))[2] != ""

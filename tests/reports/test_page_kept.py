@@ -20,7 +20,7 @@ from su3d_bench.analysis.page import contents
 from su3d_bench.analysis.page.kept import FOLDER, packed, unpacked
 from su3d_bench.analysis.page.maps import PageScene, page_scene
 from su3d_bench.analysis.page.scene import SceneData
-from su3d_bench.cli.main import EXIT_INTERRUPTED, main
+from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs.finished import read_run
@@ -94,15 +94,6 @@ def test_a_damaged_piece_counts_as_absent(run: Path) -> None:
     assert page() == first
 
 
-def test_a_link_is_neither_read_nor_written_through(run: Path) -> None:
-    Path("other").mkdir()
-    (run / FOLDER.parts[0]).symlink_to(Path("other").resolve())
-    first = page()
-    assert not list(Path("other").iterdir())
-    (run / FOLDER.parts[0]).unlink()
-    assert page() == first
-
-
 def test_another_map_is_made_anew_and_the_other_scene_is_not(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page("--no-errors", *WORDS)
     place = run / "scenes" / "painted.a" / "collector" / "prediction.npz"
@@ -126,26 +117,6 @@ def test_what_could_not_be_had_is_asked_for_again(run: Path, monkeypatch: pytest
     assert b"the encoder is not here" in page()
     monkeypatch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
     assert page() == first
-
-
-def test_an_interrupt_says_that_the_page_goes_on_and_it_does(
-    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    made: list[str] = []
-
-    def interrupted(scene: str, *rest: Any) -> Any:
-        if made:
-            raise KeyboardInterrupt
-        return noting(made)(scene, *rest)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(contents, "page_scene", interrupted)
-        assert main(["report", "html", "run", "--out", "page.html", "--jobs", "1", *WORDS]) == EXIT_INTERRUPTED
-    assert capsys.readouterr().err.endswith("su3d-bench: interrupted; the same command takes it up again\n")
-    assert not Path("page.html").exists()
-    monkeypatch.setattr(contents, "page_scene", noting(made))
-    page()
-    assert made == ["painted/a", "painted/b"]
 
 
 def test_processes_side_by_side_give_the_same_bytes(run: Path) -> None:

@@ -17,7 +17,6 @@ from su3d_bench.reports.page.maps import (
     NOT_SCORED,
     index_plane,
     nearest_classes,
-    nearest_colours,
     pack_map,
     point_owners,
     thinned,
@@ -89,11 +88,3 @@ def test_the_truth_of_a_point_is_the_nearest_within_five_centimetres() -> None:
     points = np.array([[0.04, 0, 0], [0.06, 0, 0], [1, 0, 0]], np.float32)
     assert nearest_classes(points, Candidates(truth), np.array([7, -1])).tolist() == [7, NO_TRUTH_NEAR, NOT_SCORED]
     assert nearest_classes(points, Candidates(truth[:0]), np.zeros(0, np.int64)).tolist() == [NO_TRUTH_NEAR] * 3
-
-
-def test_a_point_that_no_frame_saw_is_grey() -> None:
-    seen, colours = np.zeros((1, 3), np.float32), np.array([[10, 20, 30]], np.uint8)
-    found = nearest_colours(np.array([[0.05, 0, 0], [0.07, 0, 0]], np.float32), Candidates(seen), colours)
-    assert found is not None
-    assert found.tolist() == [[10, 20, 30], [128, 128, 128]]
-    assert nearest_colours(seen, Candidates(seen[:0]), colours[:0]) is None

@@ -12,16 +12,13 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from measured_rows import measured, measured_instances
 
 from su3d_bench.core.errors import printable
-from su3d_bench.formats.tables.csv_text import FORMULA_STARTS, meant, no_formula
-from su3d_bench.formats.tables.table import Cell, Origin, Prose, Table, TableRow, text_table
+from su3d_bench.formats.tables.table import Cell, Origin, Prose, Table, TableRow
 from su3d_bench.reports.tables.ablation import SweepRow, ablation_table
-from su3d_bench.reports.tables.formats import csv_text, html_page, markdown, plain
-from su3d_bench.reports.tables.latex import escape, latex, origin_comment, printed_cells
+from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
+from su3d_bench.reports.tables.latex import latex, origin_comment, printed_cells
 from su3d_bench.reports.tables.paper import Figure, Shown, paper_table, protocol_table
 
 HOSTILE = (
@@ -61,22 +58,6 @@ def test_no_text_can_be_a_latex_command() -> None:
     assert not re.search(r"(?<!\\)[#$^~]", body)
     rows = [line for line in text.splitlines() if line.strip() == r"\\"]
     assert len(rows) == len(HOSTILE) + 3
-
-
-@pytest.mark.parametrize(
-    ("text", "shown"),
-    [
-        ("a_b%c", r"a\_b\%c"),
-        ("--", "-{}-"),
-        ("[x]*", "{[}x{]}{*}"),
-        ("\\", r"\textbackslash{}"),
-        ("é ß ł", r"\'{e} U+00DF U+0142"),
-        ("ï", r"\"{\i}"),
-        ("?`", r"?{}\textasciigrave{}"),
-    ],
-)
-def test_letters_are_shown_as_they_are(text: str, shown: str) -> None:
-    assert escape(text) == shown
 
 
 class _Page(HTMLParser):
@@ -125,15 +106,6 @@ def test_markdown_shows_a_text_letter_for_letter(text: str) -> None:
     page.feed(markdown_it.MarkdownIt("commonmark").enable("table").render(markdown(parts)))
     assert page.tags <= {"p", "ul", "li", "table", "thead", "tbody", "tr", "th", "td"}
     assert [word for line in page.words if (word := line.strip())] == [printable(text)] * 8
-
-
-@given(st.text())
-def test_a_text_that_a_spreadsheet_would_compute_is_read_back(text: str) -> None:
-    kept = no_formula(text)
-    assert text == "-" or not kept.startswith(FORMULA_STARTS)
-    assert not re.search(r";[=+@-]", kept)
-    if "';" not in text and not re.match(r"'[-=+@\t\r]", text) and not re.search(r";'[-=+@]", text):
-        assert meant(kept) == text
 
 
 def test_no_text_can_be_a_formula_of_a_spreadsheet() -> None:
@@ -204,20 +176,3 @@ def test_the_tables_compile_without_a_warning(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stdout[-2000:]
     faults = re.findall(r".*(?:Warning|Overfull|Underfull).*", done.stdout)
     assert not faults, faults
-
-
-def test_a_table_whose_cells_are_texts_stands_as_lists() -> None:
-    table = text_table("t", [["scene", "names"], ["rooms/living0", "chair, " * 20 + "sofa"]])
-    lines = plain([table], 40).splitlines()
-    assert lines[0] == "scene: rooms/living0" and lines[1] == "  names  chair, chair, chair, chair,"
-    assert max(map(len, lines)) <= 40
-
-
-@given(
-    st.lists(st.lists(st.text("ab ,1|", min_size=1, max_size=30), min_size=5, max_size=5), min_size=2, max_size=4),
-    st.integers(10, 120),
-)
-def test_no_word_is_lost_however_narrow_a_terminal_is(rows: list[list[str]], width: int) -> None:
-    words = sorted(word for row in rows[1:] for cell in row for word in printable(cell).split())
-    shown = plain([text_table("t", rows)], width).replace("|", " ").split()
-    assert all(shown.count(word) >= words.count(word) for word in set(words) if "|" not in word)

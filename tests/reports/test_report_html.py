@@ -19,8 +19,8 @@ from packed_maps import unpacked
 from painted import Painted, WordEncoder
 from painted_runs import COLLECTOR, painted_page, painted_run
 
+from su3d_bench.analysis.page import contents as page_contents
 from su3d_bench.analysis.page import maps as page_maps
-from su3d_bench.analysis.page import numbers as page_numbers
 from su3d_bench.analysis.page import scene as page_scene
 from su3d_bench.analysis.page.scene import same_objects
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks
@@ -231,31 +231,9 @@ def test_dense_features_have_a_class_a_point_and_no_instance(run: Path, tmp_path
     assert planes["truth"][order.tolist().index(2)] == NO_TRUTH_NEAR
 
 
-def test_what_cannot_be_shown_is_a_reason_on_the_page(run: Path, tmp_path: Path) -> None:
-    changed = tmp_path / "run"
-    shutil.copytree(run, changed)
-    (changed / "scenes" / "painted.b" / "collector" / "prediction.npz").write_bytes(b"damaged")
-    record = json.loads((changed / "run.json").read_text())
-    record["data_digests"]["painted/a"] = "0" * 64
-    (changed / "run.json").write_text(json.dumps(record))
-    text = painted_page(changed, tmp_path / "page.html")
-    found = data_of(text)
-    assert ["damaged" in str(one["reason"]) or "not a readable" in str(one["reason"]) for one in found["maps"]] == [
-        *(False, False),
-        *(True, False),
-    ]
-    assert all(one["reason"] for one in found["errors"])
-    scene = json.loads(elements(text).content["scene-0"])
-    assert scene["thumbnails"] == {}
-    assert any("not those of the run" in line for line in scene["remarks"])
-    _, planes = unpacked(elements(text).content["map-0"])
-    assert "colour" not in planes
-    assert "truth" not in planes
-
-
 @pytest.mark.parametrize(
     "module",
-    [html_map, html_page, page_maps, page_numbers, page_scene, scene_look],
+    [html_map, html_page, page_maps, page_contents, page_scene, scene_look],
     ids=lambda module: module.__name__,
 )
 def test_the_examples_in_docstrings_hold(module: Any) -> None:

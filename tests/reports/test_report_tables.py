@@ -57,11 +57,6 @@ def test_the_best_is_marked_in_each_column_and_equal_ones_together() -> None:
     assert best(protocol_table([measured()], Shown(), [])) == [[False, False]]
 
 
-def test_a_method_that_knows_the_truth_competes_with_none() -> None:
-    rows = [measured("oracle", 1.0), measured(), measured("sam3d", 0.3)]
-    assert best(protocol_table(rows, Shown(), [])) == [[False, False], [True, True], [False, False]]
-
-
 def test_only_a_significant_best_is_marked_on_request() -> None:
     clear = [measured(), measured("sam3d", 0.5)]
     table = protocol_table(clear, Shown(only_significant=True), [])

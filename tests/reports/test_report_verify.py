@@ -126,22 +126,3 @@ def test_runs_on_other_data_do_not_stand_in_one_table(sweep: Path, tmp_path: Pat
     with pytest.raises(ConfigError, match="cannot be compared: data digest of painted/a"):
         measured_results([sweep, copy])
     assert len(measured_results([sweep, sweep])) == len(measured_results([sweep]))
-
-
-@pytest.mark.parametrize(
-    ("words", "line"),
-    [
-        (["--table", "IV"], "Table IV: needs protocol rooms-retrieval "),
-        (["--table", "V"], "or scores of sheets of kind annotation; there are rooms-semantic"),
-        (["--methods", "colector"], "hold no scores of the method 'colector'; did you mean 'collector'?"),
-        (["--protocols", "rooms"], "hold no scores of the protocol 'rooms'"),
-        (["--metrics", "mAc"], "has no metric 'mAc'; did you mean 'mAcc'?"),
-    ],
-)
-def test_what_a_run_cannot_tell_is_one_line(
-    sweep: Path, capsys: pytest.CaptureFixture[str], words: list[str], line: str
-) -> None:
-    assert main(["report", "tables", str(sweep), *words]) == 2
-    error = capsys.readouterr().err
-    assert line in error
-    assert error.count("\n") == 1

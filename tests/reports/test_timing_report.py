@@ -15,7 +15,7 @@ from places import SCENES
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.types import Float64Array
-from su3d_bench.metrics.costs import UpdateTimes, pooled, summarise
+from su3d_bench.metrics.costs import UpdateTimes, summarise
 from su3d_bench.numerics.statistics import growth_exponent
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run, read_update_times
@@ -68,12 +68,6 @@ def test_percentiles_leave_the_first_updates_out_and_the_share_counts_them() -> 
     assert stages_of(summary)["match"].share == 0.5
     assert summary.updates_per_s == pytest.approx(6 / 0.22)
     assert summary.frames_per_s == pytest.approx(60 / 0.22)
-
-
-def test_updates_of_several_scenes_are_pooled_without_the_first_of_each() -> None:
-    first, second = times(np.array([9.0, 1.0, 2.0])), times(np.array([8.0, 3.0]))
-    assert pooled([first, second], "total", 1).tolist() == [1.0, 2.0, 3.0]
-    assert pooled([], "total", 1).tolist() == []
 
 
 def test_sizes_are_the_largest_over_scenes_and_the_finish_that_of_the_last_maps() -> None:

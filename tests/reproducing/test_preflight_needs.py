@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from su3d_bench.cli.main import main
-from su3d_bench.reproducing.asked import Asked, asked_runs
 from su3d_bench.reproducing.preflight import Need, preflight
-from su3d_bench.reproducing.recipe import load_recipe
+from su3d_bench.reproducing.recipe import Asked, asked_runs, load_recipe
 
 ROOM = ["--set", "n_frames=8", "width=64", "height=48", "mesh_spacing_m=0.2"]
 

@@ -12,8 +12,7 @@ import pytest
 from registry_bundles import Files, edit_record, painted_bundle, read_bundle, rewrite_bundle
 
 from su3d_bench.cli.main import main
-from su3d_bench.reproducing.registry.folder import read_registry, why_not_beside
-from su3d_bench.reproducing.registry.rows import Weights, rows_of_bundle
+from su3d_bench.reproducing.registry import Weights, read_registry, rows_of_bundle, why_not_beside
 
 STRUCK = "<img src=x onerror=window.struck=1></script><script>window.struck=1</script>"
 
@@ -44,16 +43,6 @@ def test_rows_of_several_bundles_stand_in_one_ranking_a_protocol_the_best_first(
         assert values == sorted(values, reverse=True)
         assert {row.bundle.name for row in board} == {"ann", "bob"}
         assert all(row.ranks is not None for row in board)
-
-
-def test_a_row_says_its_command_times_weights_and_digests(registry: Path) -> None:
-    rows, refused = rows_of_bundle(registry / "bundles" / "ann.zip")
-    assert refused == []
-    (row, *_) = rows
-    assert row.command.startswith("su3d-bench run --scenes ") and "--methods collector@drop=1" in row.command
-    assert row.said_trained_on.startswith("my own photos") and row.trained_on == row.said_trained_on
-    assert row.n_updates > 0 and row.update_s is not None and row.map_s is not None and row.map_s <= row.update_s
-    assert [scene for scene, _ in row.values_of_scenes] == list(row.scenes)
 
 
 @pytest.mark.parametrize(
@@ -144,26 +133,3 @@ def test_the_site_holds_a_page_a_method_and_scene_and_no_text_of_a_bundle_is_mar
     (registry / "bundles" / "ann.zip").unlink()
     assert main(words) == 0
     assert len([*(tmp_path / "site" / "methods").iterdir()]) == 1, "pages of what is gone are gone"
-
-
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (["build", "."], "holds no bundle; bring one in"),
-        (["build", "registry", "--bundles-at", "javascript:x"], "expected an address that begins with https://"),
-        (["add", "full/pointer.zip", "--to", "registry"], "is a pointer of Git LFS, not the bundle itself"),
-        (["add", "full/link.zip", "--to", "registry"], "is a link"),
-        (["add", "full/free.zip", "--to", "registry", "--name", "../x"], "cannot be the name of a bundle"),
-    ],
-)
-def test_wrong_words_are_one_line(
-    registry: Path, words: list[str], says: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(registry.parent)
-    Path("full").mkdir()
-    Path("full/pointer.zip").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
-    Path("full/link.zip").symlink_to(registry / "bundles" / "ann.zip")
-    shutil.copy(registry / "bundles" / "ann.zip", "full/free.zip")
-    assert main(["dev", "registry", *words]) == 2
-    said = capsys.readouterr().err
-    assert says in said and said.count("\n") == 1

@@ -9,8 +9,7 @@ from pathlib import Path
 import pytest
 from registry_bundles import ROOM, Files, flip_labels, read_bundle, rewrite_bundle, room_bundle
 
-from su3d_bench.cli.main import build_parser, main
-from su3d_bench.reproducing.registry.rows import rows_of_bundle
+from su3d_bench.cli.main import main
 
 yaml = pytest.importorskip("yaml", reason="PyYAML comes with transformers and ray")
 RUN = "runs/room"
@@ -37,18 +36,6 @@ def test_a_bundle_that_holds_comes_in_to_the_last_bit_once(
     assert (tmp_path / "bundles" / "opensu3d.zip").read_bytes() == bundle.read_bytes()
     assert main(words) == 1
     assert "is there already as opensu3d.zip" in capsys.readouterr().out
-
-
-def test_its_rows_name_the_command_that_makes_them_and_what_the_weights_were_trained_on(bundle: Path) -> None:
-    rows, _ = rows_of_bundle(bundle)
-    by_method = {row.method: row for row in rows}
-    assert by_method["oracle"].trained_on == "none: it was told the truth"
-    row = by_method["opensu3d"]
-    assert "profile oracle: none: masks of the ground truth" in row.trained_on
-    assert "su3d-embedded: rooms that the program rendered" in row.trained_on
-    asked = build_parser().parse_args(row.command.split()[1:])
-    assert (asked.scenes, asked.methods, asked.profile, asked.stride) == ([ROOM], ["opensu3d"], "oracle", 2)
-    assert "rooms.n_frames=8" in asked.set
 
 
 def other_rules(files: Files) -> None:

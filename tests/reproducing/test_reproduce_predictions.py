@@ -11,10 +11,7 @@ from cloud_files import write_hovsg
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.config import Settings
-from su3d_bench.core.errors import ConfigError
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.reproducing.asked import named_predictions
-from su3d_bench.reproducing.recipe import load_recipe
 from su3d_bench.runs.job import build_dataset, part_of
 
 ROOM = ["--rooms", "bedroom0", "--room-settings", "n_frames=20", "width=160", "height=120", "mesh_spacing_m=0.1"]
@@ -54,23 +51,3 @@ def test_maps_of_hovsg_fill_its_row_and_a_scene_of_another_name_is_refused(
     own = [cell for cell in cells if cell["method"] == "HOV-SG"]
     assert own and all(cell["measured"] is not None and cell["measured"] > 90 for cell in own), "the truth itself"
     assert (out / "bundle.zip").is_file()
-
-
-@pytest.mark.parametrize(
-    ("predictions", "features", "said"),
-    [
-        (["HOV-SG"], [], "--predictions HOV-SG: expected METHOD=DIR"),
-        (["HOVSG={}"], [], "this recipe takes none of 'HOVSG'; did you mean 'HOV-SG'?"),
-        (["HOV-SG={}/none"], [], "--predictions HOV-SG: there is no .*none"),
-        (["HOV-SG={}", "HOV-SG={}"], [], "'HOV-SG' is given twice"),
-        (["HOV-SG={}", "OVO-mapping={}/../{name}"], [], "was given for HOV-SG; each method has a folder of its own"),
-        ([], ["HOV-SG={}"], "--text-features: this recipe takes none of 'HOV-SG'; name its --predictions too"),
-        (["HOV-SG={}"], ["HOV-SG={}/none.npz"], "--text-features HOV-SG: there is no .*none.npz"),
-    ],
-)
-def test_what_predictions_cannot_be_taken_is_one_line(
-    predictions: list[str], features: list[str], said: str, tmp_path: Path
-) -> None:
-    filled = [[text.format(tmp_path, name=tmp_path.name) for text in texts] for texts in (predictions, features)]
-    with pytest.raises(ConfigError, match=said):
-        named_predictions(load_recipe("ovo").experiments, *filled)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.reports.tables.paper import figures_of, published
-from su3d_bench.reproducing.asked import Asked, asked_runs, method_of_row
-from su3d_bench.reproducing.differences import Results
-from su3d_bench.reproducing.recipe import Experiment, load_recipe, recipe_names
+from su3d_bench.reproducing.recipe import Asked, asked_runs, load_recipe, method_of_row, recipe_names
 
 OWN = """
 schema = 1
@@ -70,32 +67,3 @@ def test_a_wrong_recipe_is_one_line(tmp_path: Path, change: tuple[str, str], say
     with pytest.raises(ConfigError) as raised:
         load_recipe(str(file))
     assert str(raised.value).startswith("mine.toml: ") and says in str(raised.value)
-
-
-def test_an_unknown_recipe_or_table_is_named_with_what_is_near() -> None:
-    with pytest.raises(ConfigError, match="no recipe is called 'opensu'; did you mean 'opensu3d'"):
-        load_recipe("opensu")
-    with pytest.raises(ConfigError, match="recipe 'opensu3d' has no table 'VI'"):
-        load_recipe("opensu3d").chosen(["VI"])
-
-
-def test_an_experiment_looks_at_the_runs_of_its_own_encoder_and_stride_and_at_predictions() -> None:
-    """Rows of two encoders under one protocol cannot stand in one table; two experiments may be of two."""
-    encoder, stride = ("perception", "models", "encoder"), ("stride",)
-    settings = {
-        "large": {encoder: "clip-vit-h-14", stride: 0},
-        "small": {encoder: "clip-vit-l-14-336", stride: 0},
-        "denser": {encoder: "clip-vit-l-14-336", stride: 2},
-        "given": {},
-    }
-    first, second = load_recipe("opensu3d").chosen(["I", "II"])
-    assert (first.encoder, second.encoder) == ("clip-vit-l-14-336", "clip-vit-h-14")
-
-    def looked_at(experiment: Experiment, *names: str) -> set[str]:
-        results = Results(tuple(map(Path, names)))
-        vars(results)["runs"] = {name: SimpleNamespace(settings=settings[name]) for name in names}
-        return set(map(str, results.of(experiment).folders))
-
-    assert looked_at(first, *settings) == {"small", "given"}
-    assert looked_at(second, *settings) == {"large", "given"}
-    assert looked_at(second, "small", "given") == {"small", "given"}  # another encoder was asked for

@@ -6,9 +6,8 @@ import numpy as np
 
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float32Array
-from su3d_bench.reports.pictures.canvas import instance_colours
+from su3d_bench.reports.pictures.canvas import Camera, instance_colours, render, room_bounds, view_cameras
 from su3d_bench.reports.pictures.maps import draw_scene
-from su3d_bench.reports.pictures.render import Camera, render, room_bounds, view_cameras
 
 
 def plate(z: float, half: float = 0.5) -> Float32Array:

@@ -7,9 +7,9 @@ import doctest
 import numpy as np
 import pytest
 
-import su3d_bench.sheets.agreement as module
+import su3d_bench.sheets.answers as module
 from su3d_bench.core.types import Int64Array
-from su3d_bench.sheets.agreement import agreement, cohen_kappa, fleiss_kappa, krippendorff_alpha
+from su3d_bench.sheets.answers import agreement, cohen_kappa, fleiss_kappa, krippendorff_alpha
 
 # Fleiss 1971, Psychological Bulletin 76, table 1: 30 patients, 6 psychiatrists each, 5 diagnoses; kappa = .430
 FLEISS = """00060 03003 01401 00006 03030 20400 00402 20310 20040 00006 10050 11040 03300 10050 02031 00501 30012 51000

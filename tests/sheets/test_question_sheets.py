@@ -15,11 +15,9 @@ from made_sheets import PAINTED
 from painted import LABELS, Painted
 from simulated_annotators import SET_ID
 
-from su3d_bench.analysis.tables import measured_results
 from su3d_bench.cli.main import main
 from su3d_bench.questions.generated import generate_questions
 from su3d_bench.questions.model import MADE_KINDS, REASONING, question_id
-from su3d_bench.questions.query_files import read_left_out
 from su3d_bench.questions.truths import fullest_truth, scene_objects
 from su3d_bench.sheets.answers import Judgement, check_key
 from su3d_bench.sheets.drafts import question_drafts
@@ -38,7 +36,7 @@ from su3d_bench.sheets.items import (
     write_key,
     write_sheet,
 )
-from su3d_bench.sheets.scores import OF_ALL_KINDS, WHOLE, Scores, read_scores, score, whole_verdicts
+from su3d_bench.sheets.scores import OF_ALL_KINDS, WHOLE, Scores, score, whole_verdicts
 from su3d_bench.sheets.sources import TruthSource, truth_of_addresses
 
 SCENE = f"{PAINTED}/a"
@@ -182,25 +180,3 @@ def answered(tmp_path: Path) -> tuple[Key, list[str]]:
             for one in judgements(sheet, **{name: said}):
                 rows.writerow((sheet.id, one.item_id, name, one.ask, one.answer, checks[one.item_id]))
     return key, ["sheets", "score", "ann.csv", "bob.csv", "--key", "key"]
-
-
-def test_what_not_everybody_calls_right_is_written_for_leave_out(
-    answered: tuple[Key, list[str]], capsys: pytest.CaptureFixture[str]
-) -> None:
-    key, words = answered
-    assert main([*words, "--disputed", "disputed.csv", "--out", "scores"]) == 0
-    told = capsys.readouterr()
-    assert "2 where annotators disagree, 2 that nobody calls right" in told.out and "disputed.csv" in told.err
-    ids = [item.question_id for item in key.items]
-    assert read_left_out(Path("disputed.csv")) == frozenset(ids[1:])
-    with Path("disputed.csv").open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    assert [row["question_id"] for row in rows] == ids[1:]
-    assert rows[2]["why"] == "sense: arguable, right; answer: right, wrong" and rows[2]["kind"] == "closer"
-    assert all(row["text"].startswith("'=") and "\u202e" not in row["text"] for row in rows)
-    assert read_scores(Path("scores")).kind == "questions"
-    assert {row.method for row in measured_results([Path("scores")])} == {"instance", "closer", OF_ALL_KINDS}
-    assert main(["report", "tables", "scores"]) == 0
-    assert main([*words[:2], "--key", "key", "--disputed", "x.csv"]) == 2
-    assert "--disputed: lists what people say" in capsys.readouterr().err
-    assert not Path("x.csv").exists()

@@ -14,7 +14,6 @@ from painted import colour_perception
 
 from su3d_bench.cli.main import main
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.questions.model import question_id
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.sheets.items import read_key, read_sheet
@@ -94,14 +93,3 @@ def test_a_language_model_answers_reasoning_sheets_and_its_replies_stay(
     assert 1 <= n_asked <= len(METHODS)  # equal maps are asked about once
     (again,) = told(capsys, *asked(made, server, "--offline"))
     assert again["sheet_id"] == first["sheet_id"] and server.n_asked == n_asked
-
-
-def test_a_dry_run_tells_the_cost_and_makes_nothing(
-    folder: Path, made: Path, server: ChatServer, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(["sheets", "make", "run", *asked(made, server, "--dry-run")]) == 0
-    assert "request" in capsys.readouterr().out
-    assert server.n_asked == 0 and not (folder / "out").exists()
-    Path("gone.csv").write_text(f"question_id\n{question_id('painted/a', 'reasoning', QUESTION)}\n")
-    assert main(["sheets", "make", "run", *asked(made, server, "--dry-run", "--leave-out", "gone.csv")]) == 0
-    assert "0 requests" in capsys.readouterr().out

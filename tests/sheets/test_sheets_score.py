@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -11,14 +10,13 @@ import pytest
 from counted_sheets import both, scored, workbook
 from simulated_annotators import RATES, annotation_set, answered, as_csv, retrieval_set
 
-from su3d_bench.cli.main import main
 from su3d_bench.core.types import Float64Array
 from su3d_bench.numerics.statistics import sign_flip_test
 from su3d_bench.questions.model import KINDS
 from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
 from su3d_bench.reports.tables.judged import sheet_tables
 from su3d_bench.sheets.items import Key, Sheet, write_key, write_sheet
-from su3d_bench.sheets.scores import ScoreCell, Scores, paired_p, read_scores, second_looks_csv, second_looks_page
+from su3d_bench.sheets.scores import ScoreCell, Scores, paired_p, second_looks_csv, second_looks_page
 
 
 def cells_of(scores: Scores, judge: str = "people") -> dict[tuple[str, str], ScoreCell]:
@@ -134,18 +132,6 @@ def test_labels_and_merging_of_the_paper_come_from_the_blinded_questions() -> No
     }
 
 
-def test_a_judgement_against_the_truth_is_listed_for_a_second_look() -> None:
-    sheet, key = retrieval_set(8)
-    rows = answered(sheet, key, {"ann": 0.0})
-    rows[3] = replace(rows[3], answer="right" if rows[3].answer == "wrong" else "wrong")
-    (look,) = scored(sheet, key, rows).second_looks
-    assert (look.item_id, look.reason, look.automatic) == (
-        "item-0003",
-        "against the truth",
-        key.items[3].automatic["retrieval"],
-    )
-
-
 # What is shown
 
 
@@ -179,16 +165,3 @@ def folder(tmp_path: Path, small: tuple[Sheet, Key]) -> Path:
     (tmp_path / "answers" / "ann.csv").write_text(as_csv([one for one in rows if one.annotator == "ann"]))
     (tmp_path / "answers" / "bob.xlsx").write_bytes(workbook([one for one in rows if one.annotator == "bob"]))
     return tmp_path
-
-
-def test_files_are_scored_from_the_command_line(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    files = [str(folder / "answers" / name) for name in ("ann.csv", "bob.xlsx")]
-    words = ["sheets", "score", *files, "--key", str(folder / "key"), "--out", str(folder / "scores")]
-    assert main(words) == 0
-    shown = capsys.readouterr().out
-    assert "Retrieval by text" in shown and "To look at again: 0 where annotators disagree" in shown
-    names = {one.name for one in (folder / "scores").iterdir()}
-    assert names == {"scores.json", "tables.md", "tables.csv", "tables.html", "second_looks.csv", "second_looks.html"}
-    assert main([*words[:-2], "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["n_judged"] == found["n_items"] == read_scores(folder / "scores").n_judged > 0

@@ -9,7 +9,6 @@ import numpy as np
 from su3d_bench.datasets.rooms.objects.items import Assembly
 from su3d_bench.datasets.rooms.objects.materials import (
     Material,
-    Rgb,
     Texture,
     ceramic,
     chrome,
@@ -54,26 +53,11 @@ def table_lamp(build: Assembly) -> None:
     foot, tall = build.size(0.075, 0.1), build.size(0.2, 0.3)
     body = ceramic(build.other("white", "blue", "green", "brown", "black"))
     if build.chance(0.5):
-        build.add(
-            body,
-            lathe(
-                [
-                    (0, 0),
-                    (foot * 0.7, 0),
-                    (foot, tall * 0.3),
-                    (foot * 0.8, tall * 0.6),
-                    (0.02, tall * 0.85),
-                    (0.02, tall),
-                    (0, tall),
-                ],
-                20,
-            ),
-        )
+        belly = [(0, 0), (foot * 0.7, 0), (foot, tall * 0.3), (foot * 0.8, tall * 0.6)]
+        build.add(body, lathe([*belly, (0.02, tall * 0.85), (0.02, tall), (0, tall)], 20))
     else:
-        build.add(
-            metal(tone("black"), build.rng),
-            lathe([(0, 0), (foot, 0), (foot, 0.015), (0.014, 0.025), (0.014, tall), (0, tall)], 20),
-        )
+        stand = lathe([(0, 0), (foot, 0), (foot, 0.015), (0.014, 0.025), (0.014, tall), (0, tall)], 20)
+        build.add(metal(tone("black"), build.rng), stand)
     build.add(chrome(build.rng), cylinder(0.009, 0.12, z=tall - 0.005))
     _shade(build, build.size(0.13, 0.17), build.size(0.15, 0.2), tall + 0.02)
 
@@ -121,62 +105,43 @@ def indoor_plant(build: Assembly) -> None:
     r = build.size(0.08, 0.12)
     pot_height = r * build.rng.uniform(1.4, 1.9)
     pot_colour = build.other("white", "orange", "brown", "blue", "grey", "black", "yellow")
-    rim = [
-        (0, 0),
-        (r * 0.72, 0),
-        (r * 0.98, pot_height * 0.85),
-        (r * 1.06, pot_height * 0.86),
-        (r * 1.06, pot_height),
-        (r * 0.93, pot_height),
-        (r * 0.93, pot_height * 0.9),
-        (0, pot_height * 0.9),
-    ]
-    build.add(ceramic(pot_colour), lathe(rim, 22))
-    build.add(
-        Material(Texture.CARPET, linear((62, 42, 28)), linear((30, 20, 14)), 0.01),
-        cylinder(r * 0.92, 0.006, z=pot_height * 0.9),
-    )
-    habit = int(build.rng.integers(0, 3))
-    tall = build.size(0.28, 0.5)
     base = pot_height * 0.9
-    green = build.rgb
-    if habit == 0:
-        _broad_leaves(build, green, base, tall)
-    elif habit == 1:
-        _bush(build, green, base, tall, r)
-    else:
-        _blades(build, green, base, tall, r)
+    profile = [(0, 0), (0.72, 0), (0.98, 0.85), (1.06, 0.86), (1.06, 1), (0.93, 1), (0.93, 0.9), (0, 0.9)]
+    build.add(ceramic(pot_colour), lathe([(r * out, pot_height * up) for out, up in profile], 22))
+    soil = Material(Texture.CARPET, linear((62, 42, 28)), linear((30, 20, 14)), 0.01)
+    build.add(soil, cylinder(r * 0.92, 0.006, z=base))
+    habit = int(build.rng.integers(0, 3))
+    (_broad_leaves, _bush, _blades)[habit](build, base, build.size(0.28, 0.5), r)
 
 
-def _leaf_material(green: Rgb, build: Assembly) -> Material:
-    tinted = mix(green, linear((150, 180, 60)), float(build.rng.uniform(0, 0.35)))
+def _leaf_material(build: Assembly) -> Material:
+    tinted = mix(build.rgb, linear((150, 180, 60)), float(build.rng.uniform(0, 0.35)))
     return Material(Texture.LEAF, shade(tinted, float(build.rng.uniform(0.7, 1.15))), shade(tinted, 1.7), 0.02, 0.15)
 
 
-def _broad_leaves(build: Assembly, green: Rgb, base: float, tall: float) -> None:
+def _broad_leaves(build: Assembly, base: float, tall: float, r: float) -> None:
     n = int(build.rng.integers(9, 14))
     for i in range(n):
         turn = 360 * i * 0.381966 + build.rng.uniform(-12, 12)  # the golden angle spreads leaves evenly
         lift = tall * (0.25 + 0.6 * i / n)
         stem_end = (0.0, 0.045, base + lift)
         stem = tube([(0, 0, base), (0, 0.02, base + lift * 0.6), stem_end], 0.005, 5)
-        leaf = _leaf(
-            tall * build.rng.uniform(0.42, 0.6), tall * build.rng.uniform(0.24, 0.34), build.rng.uniform(0.5, 0.95)
-        )
-        build.add(_leaf_material(green, build), join([stem, leaf.moved(*stem_end)]).turned("z", turn))
+        length, width = tall * build.rng.uniform(0.42, 0.6), tall * build.rng.uniform(0.24, 0.34)
+        leaf = _leaf(length, width, build.rng.uniform(0.5, 0.95))
+        build.add(_leaf_material(build), join([stem, leaf.moved(*stem_end)]).turned("z", turn))
 
 
-def _bush(build: Assembly, green: Rgb, base: float, tall: float, r: float) -> None:
+def _bush(build: Assembly, base: float, tall: float, r: float) -> None:
     trunk = wood(tone("brown"), build.rng, 2)
     build.add(trunk, tube([(0, 0, base), (0.01, 0, base + tall * 0.35), (0, 0.01, base + tall * 0.6)], 0.012, 6))
     for i in range(26):
         turn, rise = 360 * i * 0.381966, build.rng.uniform(0.3, 0.95)
         out = r * 0.5 * np.sin(np.pi * rise) * build.rng.uniform(0.4, 1.0)
         leaf = _leaf(build.rng.uniform(0.13, 0.18), build.rng.uniform(0.07, 0.1), build.rng.uniform(-0.2, 0.8))
-        build.add(_leaf_material(green, build), leaf.moved(0, float(out), base + tall * float(rise)).turned("z", turn))
+        build.add(_leaf_material(build), leaf.moved(0, float(out), base + tall * float(rise)).turned("z", turn))
 
 
-def _blades(build: Assembly, green: Rgb, base: float, tall: float, r: float) -> None:
+def _blades(build: Assembly, base: float, tall: float, r: float) -> None:
     for i in range(int(build.rng.integers(10, 15))):
         length, turn = tall * build.rng.uniform(0.7, 1.15), 360 * i * 0.381966
         t = np.linspace(0, 1, 6)
@@ -184,7 +149,7 @@ def _blades(build: Assembly, green: Rgb, base: float, tall: float, r: float) -> 
         lean = build.rng.uniform(0.05, 0.3)
         y, z = r * 0.3 + lean * length * t**2, length * t * (1 - 0.2 * lean)
         grid = np.stack([np.stack([half * side, y, z], axis=-1) for side in (-1, 0, 1)], axis=1)
-        build.add(_leaf_material(green, build), sheet(grid, 0.005).moved(z=base - 0.01).turned("z", turn))
+        build.add(_leaf_material(build), sheet(grid, 0.005).moved(z=base - 0.01).turned("z", turn))
 
 
 def vase(build: Assembly) -> None:
@@ -198,13 +163,8 @@ def vase(build: Assembly) -> None:
     inner = [(radius * 0.86, z) for radius, z in reversed(outer[1:])]
     wall = build.main()
     if build.chance(0.4):
-        wall = replace(
-            wall,
-            texture=Texture(int(build.rng.choice([Texture.STRIPES, Texture.ZIGZAG]))),
-            b=mix(build.rgb, (0.85, 0.85, 0.85), 0.7),
-            scale=0.05,
-            axis=1,
-        )
+        pattern = Texture(int(build.rng.choice([Texture.STRIPES, Texture.ZIGZAG])))
+        wall = replace(wall, texture=pattern, b=mix(build.rgb, (0.85, 0.85, 0.85), 0.7), scale=0.05, axis=1)
     build.add(wall, lathe([(0, 0), *outer, *inner, (0, h * 0.12)], 24))
     if build.chance(0.5):
         for i in range(5):
@@ -237,27 +197,21 @@ def clock(build: Assembly) -> None:
     r = build.size(0.14, 0.19)
     rim = lathe([(0, 0), (r, 0), (r, 0.03), (r * 0.9, 0.036), (r * 0.88, 0.024), (0, 0.024)], 30)
     build.add(build.main(), rim.turned("x", 90).moved(z=r))
-    face = Material(
-        Texture.CLOCK_FACE, tone("white"), tone("black"), 1.0, 0.2, 0.0, 0, (-r * 0.88, r * 0.88, r * 0.12, r * 1.88)
-    )
+    extent = (-r * 0.88, r * 0.88, r * 0.12, r * 1.88)
+    face = Material(Texture.CLOCK_FACE, tone("white"), tone("black"), 1.0, 0.2, extent=extent)
     build.add(face, cylinder(r * 0.87, 0.003).turned("x", 90).moved(0, -0.0245, r))
     hands = paint(tone("black"))
-    for length, thick, turn in (
-        (r * 0.5, 0.016, build.rng.uniform(0, 360)),
-        (r * 0.72, 0.011, build.rng.uniform(0, 360)),
-    ):
+    for length, thick in ((r * 0.5, 0.016), (r * 0.72, 0.011)):
+        turn = build.rng.uniform(0, 360)
         build.add(hands, block(thick, 0.003, length, 0, 0, -0.02).turned("y", turn).moved(0, -0.031, r))
 
 
 def candle(build: Assembly) -> None:
     r, h = build.size(0.038, 0.05), build.size(0.12, 0.2)
-    build.add(
-        metal(linear((176, 140, 70)), build.rng),
-        lathe([(0, 0), (r * 1.6, 0), (r * 1.75, 0.018), (r * 1.6, 0.018), (r * 1.4, 0.008), (0, 0.008)], 20),
-    )
-    build.add(
-        paint(build.rgb, 0.2), lathe([(0, 0), (r, 0), (r, h), (r * 0.8, h - 0.008), (0, h - 0.012)], 18).moved(z=0.009)
-    )
+    dish = lathe([(0, 0), (r * 1.6, 0), (r * 1.75, 0.018), (r * 1.6, 0.018), (r * 1.4, 0.008), (0, 0.008)], 20)
+    build.add(metal(linear((176, 140, 70)), build.rng), dish)
+    wax = lathe([(0, 0), (r, 0), (r, h), (r * 0.8, h - 0.008), (0, h - 0.012)], 18)
+    build.add(paint(build.rgb, 0.2), wax.moved(z=0.009))
     build.add(paint(tone("black")), cylinder(0.003, 0.02, z=h - 0.004))
     flame = Material(Texture.PLAIN, linear((255, 190, 70)), linear((255, 170, 50)), glow=1.0)
     build.add(flame, ellipsoid(0.009, 0.009, 0.02).moved(z=h + 0.03))
@@ -269,44 +223,20 @@ def sculpture(build: Assembly) -> None:
     build.add(paint(tone("black"), 0.3), block(0.13, 0.13, 0.04))
     kind = int(build.rng.integers(0, 3))
     if kind == 0:  # a bust
-        build.add(
-            body,
-            lathe(
-                [
-                    (0, 0),
-                    (0.05, 0),
-                    (0.045, h * 0.18),
-                    (0.1, h * 0.3),
-                    (0.09, h * 0.42),
-                    (0.032, h * 0.52),
-                    (0.03, h * 0.6),
-                    (0, h * 0.6),
-                ],
-                18,
-            )
-            .stretched(1.0, 0.7, 1.0)
-            .moved(z=0.04),
-        )
-        build.add(
-            body,
-            ellipsoid(0.055, 0.065, 0.08).moved(0, -0.005, 0.04 + h * 0.75),
-            soft_block(0.02, 0.03, 0.03, 0, -0.07, 0.025 + h * 0.75, 0.009),
-        )
+        outline = [(0, 0), (0.05, 0), (0.045, 0.18), (0.1, 0.3), (0.09, 0.42), (0.032, 0.52), (0.03, 0.6), (0, 0.6)]
+        bust = lathe([(out, h * up) for out, up in outline], 18).stretched(1.0, 0.7, 1.0).moved(z=0.04)
+        head = ellipsoid(0.055, 0.065, 0.08).moved(0, -0.005, 0.04 + h * 0.75)
+        build.add(body, bust, head, soft_block(0.02, 0.03, 0.03, 0, -0.07, 0.025 + h * 0.75, 0.009))
     elif kind == 1:  # a standing ring
         angle = np.linspace(0, 2 * np.pi, 25)
         r = h * 0.42
-        build.add(
-            body, tube([(r * float(np.sin(a)), 0, 0.04 + r + 0.02 - r * float(np.cos(a))) for a in angle], 0.028, 10)
-        )
+        ring = [(r * float(np.sin(a)), 0, 0.04 + r + 0.02 - r * float(np.cos(a))) for a in angle]
+        build.add(body, tube(ring, 0.028, 10))
     else:  # stacked pebbles
         z = 0.04
         for share in (0.085, 0.066, 0.05, 0.035):
-            build.add(
-                body,
-                ellipsoid(share, share * 0.9, share * 0.6).moved(
-                    float(build.rng.uniform(-0.012, 0.012)), 0, z + share * 0.6
-                ),
-            )
+            pebble = ellipsoid(share, share * 0.9, share * 0.6)
+            build.add(body, pebble.moved(float(build.rng.uniform(-0.012, 0.012)), 0, z + share * 0.6))
             z += share * 1.17
 
 
@@ -337,19 +267,16 @@ def blanket(build: Assembly) -> None:
         build.add(cover, soft_block(width + grow, depth + grow, 0.034, x, 0, i * 0.0345, 0.0165))
     fringe = plain_cloth(shade(build.rgb, 0.6), build.rng)
     for i in range(int(width / 0.03)):
-        build.add(
-            fringe,
-            block(0.011, 0.04, 0.006, -width / 2 + 0.02 + i * 0.03, -depth / 2 - 0.022, (n - 1) * 0.0345 + 0.012),
-        )
+        x, y, z = -width / 2 + 0.02 + i * 0.03, -depth / 2 - 0.022, (n - 1) * 0.0345 + 0.012
+        build.add(fringe, block(0.011, 0.04, 0.006, x, y, z))
 
 
 def rolled_blanket(build: Assembly) -> None:
     """A thick roll with a fringe at one end."""
     length, r = build.size(0.44, 0.52), build.size(0.075, 0.085)
     spiral = [(r * 0.2, 0.004), (r * 0.3, -0.004), (r * 0.55, -0.004), (r * 0.65, 0.005), (r * 0.8, 0.005), (r, 0.014)]
-    build.add(
-        cloth(build.rgb, build.rng, large=True), lathe([(0, 0), *spiral, (r, length), (0, length)], 20).turned("y", 90)
-    )
+    roll = lathe([(0, 0), *spiral, (r, length), (0, length)], 20)
+    build.add(cloth(build.rgb, build.rng, large=True), roll.turned("y", 90))
     fringe = plain_cloth(shade(build.rgb, 0.6), build.rng)
     for i in range(14):
         strand = block(0.03, 0.008, 0.006, length + 0.016, 0, r * 0.9).turned("x", 360 * i / 14)
@@ -370,47 +297,23 @@ def folded_towel(build: Assembly) -> None:
 def rolled_towel(build: Assembly) -> None:
     length, r = build.size(0.34, 0.42), build.size(0.055, 0.07)
     soft = plain_cloth(build.rgb, build.rng)
-    spiral = [
-        (r * 0.2, 0.003),
-        (r * 0.25, 0.003),
-        (r * 0.35, -0.004),
-        (r * 0.55, -0.004),
-        (r * 0.62, 0.004),
-        (r * 0.8, 0.004),
-        (r, 0.012),
-    ]
+    turns = [(0.2, 0.003), (0.25, 0.003), (0.35, -0.004), (0.55, -0.004), (0.62, 0.004), (0.8, 0.004), (1, 0.012)]
+    spiral = [(r * share, x) for share, x in turns]
     build.add(soft, lathe([(0, 0), *spiral, (r, length), (0, length)], 18).turned("y", 90))
-    band = plain_cloth(mix(build.rgb, (0.9, 0.9, 0.9), 0.6), build.rng)
-    build.add(
-        band,
-        lathe([(r, 0), (r + 0.003, 0), (r + 0.003, 0.03), (r, 0.03), (r, 0)], 18).turned("y", 90).moved(length * 0.75),
-    )
+    band = lathe([(r, 0), (r + 0.003, 0), (r + 0.003, 0.03), (r, 0.03), (r, 0)], 18).turned("y", 90)
+    build.add(plain_cloth(mix(build.rgb, (0.9, 0.9, 0.9), 0.6), build.rng), band.moved(length * 0.75))
 
 
 def rug(build: Assembly) -> None:
     width, depth = build.size(1.5, 2.0), build.size(1.1, 1.4)
     second = build.other(*(c for c in ("red", "blue", "beige", "white", "brown", "orange") if c != build.colour))
-    pile = Material(
-        Texture.RUG,
-        build.rgb,
-        second,
-        build.rng.uniform(0.12, 0.22),
-        0.0,
-        0.0,
-        2,
-        (-width / 2, width / 2, -depth / 2, depth / 2),
-        int(build.rng.integers(1, 999)),
-    )
+    extent, scale = (-width / 2, width / 2, -depth / 2, depth / 2), build.rng.uniform(0.12, 0.22)
+    seed = int(build.rng.integers(1, 999))
+    pile = Material(Texture.RUG, build.rgb, second, scale, 0.0, axis=2, extent=extent, seed=seed)
     build.add(pile, block(width, depth, 0.012))
     fringe = plain_cloth(tone("beige"), build.rng)
-    for sx in (-1, 1):
-        build.add(
-            fringe,
-            *[
-                block(0.05, 0.012, 0.005, sx * (width / 2 + 0.026), y, 0)
-                for y in np.arange(-depth / 2 + 0.02, depth / 2, 0.05)
-            ],
-        )
+    for x in both(width / 2 + 0.026):
+        build.add(fringe, *[block(0.05, 0.012, 0.005, x, y) for y in np.arange(-depth / 2 + 0.02, depth / 2, 0.05)])
 
 
 def mat(build: Assembly) -> None:
@@ -430,19 +333,12 @@ def backpack(build: Assembly) -> None:
     build.add(trim, soft_block(width * 0.9, depth * 0.9, 0.03, 0, -0.02, height * 0.72, 0.012))
     build.add(trim, *[soft_block(0.06, depth * 0.6, height * 0.3, x, 0, 0.04, 0.025) for x in both(width / 2 + 0.015)])
     angle = np.linspace(0, np.pi, 7)
-    build.add(
-        trim,
-        tube([(0.05 * float(np.cos(a)), depth * 0.2, height - 0.01 + 0.05 * float(np.sin(a))) for a in angle], 0.01, 7),
-    )
+    loop = [(0.05 * float(np.cos(a)), depth * 0.2, height - 0.01 + 0.05 * float(np.sin(a))) for a in angle]
+    build.add(trim, tube(loop, 0.01, 7))
     build.add(chrome(build.rng), block(width * 0.66, 0.006, 0.008, 0, -depth / 2 - 0.056, height * 0.36))
-    for sx in (-1, 1):
-        x = sx * width * 0.27
-        strap = [
-            (x, depth / 2 - 0.01, height * 0.9),
-            (x, depth / 2 + 0.04, height * 0.6),
-            (x, depth / 2 - 0.005, height * 0.12),
-        ]
-        build.add(trim, tube(strap, 0.017, 6))
+    strap = (-0.01, 0.9), (0.04, 0.6), (-0.005, 0.12)
+    for x in both(width * 0.27):
+        build.add(trim, tube([(x, depth / 2 + back, height * up) for back, up in strap], 0.017, 6))
 
 
 def umbrella(build: Assembly) -> None:
@@ -453,19 +349,12 @@ def umbrella(build: Assembly) -> None:
     folds = 8
     angle = np.linspace(0, 2 * np.pi, folds * 6 + 1)
     ring = 1 + 0.22 * np.cos(folds * angle)
-    heights, radii = [0.06, 0.15, 0.45, 0.62, 0.66], [0.012, r * 0.55, r, r * 0.9, 0.014]
-    grid = np.stack(
-        [
-            np.stack([ring * rad * np.cos(angle), ring * rad * np.sin(angle), np.full_like(angle, h * z)], axis=-1)
-            for z, rad in zip(heights, radii, strict=True)
-        ],
-        axis=1,
-    )
+    outline = (0.06, 0.012), (0.15, r * 0.55), (0.45, r), (0.62, r * 0.9), (0.66, 0.014)
+    rings = [(ring * rad * np.cos(angle), ring * rad * np.sin(angle), np.full_like(angle, h * z)) for z, rad in outline]
+    grid = np.stack([np.stack(each, axis=-1) for each in rings], axis=1)
     build.add(plain_cloth(build.rgb, build.rng), sheet(grid, 0.004))
-    build.add(
-        plain_cloth(shade(build.rgb, 0.4), build.rng),
-        lathe([(r * 0.9, 0), (r * 1.24, 0), (r * 1.24, 0.03), (r * 0.9, 0.03)], 18).moved(z=h * 0.42),
-    )
+    band = lathe([(r * 0.9, 0), (r * 1.24, 0), (r * 1.24, 0.03), (r * 0.9, 0.03)], 18)
+    build.add(plain_cloth(shade(build.rgb, 0.4), build.rng), band.moved(z=h * 0.42))
     turn = np.linspace(0, np.pi, 8)
     crook = [(0.04 - 0.04 * float(np.cos(a)), 0.0, h * 0.9 + 0.04 * float(np.sin(a))) for a in turn]
     build.add(wood(tone("brown"), build.rng, 2), tube([(0, 0, h * 0.66), *crook, (0.08, 0, h * 0.85)], 0.013, 8))

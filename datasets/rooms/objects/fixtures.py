@@ -63,17 +63,8 @@ def window(build: Assembly) -> None:
     width, height = build.size(1.15, 1.5), build.rng.uniform(1.05, 1.25)
     frame = paint(build.rgb)
     extent = (-width / 2, width / 2, 0.0, height)
-    sky = Material(
-        Texture.SKY,
-        linear((150, 190, 235)),
-        linear((236, 242, 250)),
-        1.0,
-        0.5,
-        0.75,
-        0,
-        extent,
-        int(build.rng.integers(1, 999)),
-    )
+    above, below, seed = linear((150, 190, 235)), linear((236, 242, 250)), int(build.rng.integers(1, 999))
+    sky = Material(Texture.SKY, above, below, 1.0, 0.5, 0.75, extent=extent, seed=seed)
     build.add(sky, block(width - 0.06, 0.012, height - 0.06, 0, 0.014, 0.03))
     bar = 0.055
     for x in (-width / 2 + bar / 2, 0.0, width / 2 - bar / 2):
@@ -127,10 +118,8 @@ def wall_plug(build: Assembly) -> None:
     build.add(plastic(build.rgb), soft_block(0.21, 0.014, 0.11, 0, 0, 0, 0.006))
     dark = paint(tone("black"))
     for x in (-0.05, 0.05):
-        ring = lathe([(0, 0), (0.038, 0), (0.038, 0.008), (0.031, 0.008), (0.031, 0.002), (0, 0.002)], 18).turned(
-            "x", 90
-        )
-        build.add(plastic(shade(build.rgb, 0.75)), ring.moved(x, -0.0075, 0.055))
+        ring = lathe([(0, 0), (0.038, 0), (0.038, 0.008), (0.031, 0.008), (0.031, 0.002), (0, 0.002)], 18)
+        build.add(plastic(shade(build.rgb, 0.75)), ring.turned("x", 90).moved(x, -0.0075, 0.055))
         for dx in (-0.012, 0.012):
             build.add(dark, cylinder(0.006, 0.004).turned("x", 90).moved(x + dx, -0.0095, 0.055))
 
@@ -192,20 +181,8 @@ def kitchen_sink(build: Assembly) -> None:
 def toilet(build: Assembly) -> None:
     white = ceramic(build.rgb)
     seat = 0.4
-    bowl = lathe(
-        [
-            (0, 0),
-            (0.13, 0),
-            (0.11, 0.08),
-            (0.13, 0.2),
-            (0.19, 0.34),
-            (0.2, 0.385),
-            (0.15, 0.385),
-            (0.1, 0.28),
-            (0, 0.24),
-        ],
-        24,
-    )
+    outside = [(0, 0), (0.13, 0), (0.11, 0.08), (0.13, 0.2), (0.19, 0.34), (0.2, 0.385)]
+    bowl = lathe([*outside, (0.15, 0.385), (0.1, 0.28), (0, 0.24)], 24)
     build.add(white, bowl.stretched(0.95, 1.3, 1.0).moved(0, -0.12, 0))
     ring = lathe([(0.13, 0.0), (0.205, 0.0), (0.207, 0.022), (0.13, 0.022), (0.13, 0.0)], 24).stretched(0.97, 1.3, 1.0)
     build.add(plastic(build.rgb), ring.moved(0, -0.12, seat - 0.012))
@@ -227,16 +204,14 @@ def bathtub(build: Assembly) -> None:
     w, d, rim = length / 2, depth / 2, 0.075
     build.add(white, box(-w + 0.01, w - 0.01, -d + 0.01, d - 0.01, 0, 0.14))
     build.add(white, *[soft_block(rim, depth, tall - 0.141, x, 0, 0.141, 0.03) for x in both(w - rim / 2)])
-    build.add(
-        white, *[soft_block(length - 2 * rim + 0.04, rim, tall - 0.141, 0, y, 0.141, 0.03) for y in both(d - rim / 2)]
-    )
+    inner = length - 2 * rim + 0.04
+    build.add(white, *[soft_block(inner, rim, tall - 0.141, 0, y, 0.141, 0.03) for y in both(d - rim / 2)])
     build.add(chrome(build.rng), cylinder(0.03, 0.005, -w * 0.6, 0, 0.141))
     steel = chrome(build.rng)
     build.add(steel, soft_block(0.05, 0.22, 0.05, -w + 0.04, 0, tall + 0.04, 0.02))
     build.add(steel, tube([(-w + 0.04, 0, tall), (-w + 0.04, 0, tall + 0.05)], 0.015))
-    build.add(
-        steel, tube([(-w + 0.05, 0, tall + 0.065), (-w + 0.16, 0, tall + 0.06), (-w + 0.18, 0, tall + 0.02)], 0.014)
-    )
+    spout = (0.05, 0.065), (0.16, 0.06), (0.18, 0.02)
+    build.add(steel, tube([(-w + x, 0, tall + z) for x, z in spout], 0.014))
     build.spot((-w + 0.6, w - 0.1), (-d + 0.005, -d + rim - 0.005), tall, role="rim")
 
 
@@ -250,14 +225,8 @@ def towel_rail(build: Assembly) -> None:
     """A towel over a rail, for a wall."""
     width, front, back = build.size(0.34, 0.46), build.size(0.45, 0.6), 0.3
     angle = np.linspace(0, np.pi, 7)
-    path = [
-        (-0.06, -front),
-        (-0.058, -0.02),
-        *[(-0.035 - 0.022 * np.cos(a), 0.022 * np.sin(a)) for a in angle],
-        (-0.014, -0.02),
-        (-0.012, -back),
-    ]
-    profile = np.array(path)
+    over = [(-0.035 - 0.022 * np.cos(a), 0.022 * np.sin(a)) for a in angle]
+    profile = np.array([(-0.06, -front), (-0.058, -0.02), *over, (-0.014, -0.02), (-0.012, -back)])
     u = np.linspace(-width / 2, width / 2, 9)
     grid = np.empty((len(u), len(profile), 3))
     wave = 0.006 * np.sin(u * 18.0)[:, None] * np.clip(-profile[:, 1] * 3, 0, 1)[None, :]
@@ -313,20 +282,13 @@ def microwave(build: Assembly) -> None:
     y = -depth / 2
     dark = glass(linear((18, 19, 22)))
     build.add(dark, block(width * 0.6, 0.012, height * 0.68, -width * 0.15, y - 0.006, 0.012 + height * 0.16))
-    build.add(
-        plastic(shade(tone("grey"), 0.5)),
-        block(width * 0.2, 0.008, height * 0.86, width * 0.36, y - 0.004, 0.012 + height * 0.07),
-    )
-    build.add(
-        Material(Texture.PLAIN, linear((70, 220, 150)), linear((60, 190, 130)), glow=0.6),
-        block(width * 0.14, 0.004, 0.03, width * 0.36, y - 0.0105, height * 0.82),
-    )
-    grey = plastic(tone("white"))
-    for i in range(3):
-        for j in range(3):
-            build.add(
-                grey, block(0.02, 0.006, 0.016, width * 0.36 + (i - 1) * 0.028, y - 0.0115, height * 0.3 + j * 0.04)
-            )
+    x = width * 0.36
+    panel = block(width * 0.2, 0.008, height * 0.86, x, y - 0.004, 0.012 + height * 0.07)
+    build.add(plastic(shade(tone("grey"), 0.5)), panel)
+    digits = Material(Texture.PLAIN, linear((70, 220, 150)), linear((60, 190, 130)), glow=0.6)
+    build.add(digits, block(width * 0.14, 0.004, 0.03, x, y - 0.0105, height * 0.82))
+    keys = [(x + (i - 1) * 0.028, y - 0.0115, height * 0.3 + j * 0.04) for i in range(3) for j in range(3)]
+    build.add(plastic(tone("white")), *[block(0.02, 0.006, 0.016, *place) for place in keys])
     heights = [height * share for share in (0.25, 0.27, 0.83, 0.85)]
     build.add(chrome(build.rng), _handle(width * 0.18, y - 0.012, y - 0.035, heights, 0.008))
     build.add(paint(tone("black")), *[block(0.04, 0.04, 0.014, *foot) for foot in corners(width * 0.4, depth * 0.38)])
@@ -335,17 +297,8 @@ def microwave(build: Assembly) -> None:
 
 def _screen(build: Assembly, width: float, z0: float, z1: float, lively: float, glow: float) -> Material:
     base = linear((52, 108, 172)) if build.chance(0.5) else linear((38, 132, 120))
-    return Material(
-        Texture.SCREEN,
-        base,
-        linear((236, 238, 242)),
-        lively,
-        0.5,
-        glow,
-        0,
-        (-width / 2, width / 2, z0, z1),
-        int(build.rng.integers(1, 999)),
-    )
+    extent, seed = (-width / 2, width / 2, z0, z1), int(build.rng.integers(1, 999))
+    return Material(Texture.SCREEN, base, linear((236, 238, 242)), lively, 0.5, glow, extent=extent, seed=seed)
 
 
 def tv_screen(build: Assembly) -> None:
@@ -381,17 +334,11 @@ def monitor(build: Assembly) -> None:
     height, lift = width * 0.6, 0.13
     case = plastic(build.rgb)
     build.add(case, soft_block(width, 0.035, height, 0, 0, lift, 0.012))
-    build.add(
-        _screen(build, width - 0.03, lift + 0.02, lift + height, 1.0, 0.55),
-        block(width - 0.03, 0.006, height - 0.045, 0, -0.02, lift + 0.03),
-    )
+    view = block(width - 0.03, 0.006, height - 0.045, 0, -0.02, lift + 0.03)
+    build.add(_screen(build, width - 0.03, lift + 0.02, lift + height, 1.0, 0.55), view)
     build.add(case, soft_block(0.06, 0.03, lift + height * 0.4, 0, 0.034, 0.012, 0.01))
-    build.add(
-        case,
-        lathe([(0, 0), (0.115, 0), (0.115, 0.01), (0.03, 0.018), (0, 0.018)], 24)
-        .stretched(1.1, 0.8, 1.0)
-        .moved(0, 0.02, 0),
-    )
+    foot = lathe([(0, 0), (0.115, 0), (0.115, 0.01), (0.03, 0.018), (0, 0.018)], 24)
+    build.add(case, foot.stretched(1.1, 0.8, 1.0).moved(0, 0.02, 0))
 
 
 def laptop(build: Assembly) -> None:
@@ -423,12 +370,8 @@ def keyboard(build: Assembly) -> None:
 def mouse(build: Assembly) -> None:
     s = max(1.0, build.scale) * 1.12
     body = plastic(build.rgb)
-    build.add(
-        body,
-        lathe([(0, 0), (0.95, 0), (1, 0.18), (0.86, 0.6), (0.5, 0.92), (0, 1.0)], 22).stretched(
-            0.038 * s, 0.063 * s, 0.042 * s
-        ),
-    )
+    shell = lathe([(0, 0), (0.95, 0), (1, 0.18), (0.86, 0.6), (0.5, 0.92), (0, 1.0)], 22)
+    build.add(body, shell.stretched(0.038 * s, 0.063 * s, 0.042 * s))
     build.add(plastic(tone("grey")), soft_block(0.012, 0.03, 0.014, 0, -0.032 * s, 0.031 * s, 0.005))
     build.add(plastic(shade(build.rgb, 0.5)), block(0.003, 0.05 * s, 0.006, 0, -0.006 * s, 0.0375 * s))
 

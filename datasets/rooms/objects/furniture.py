@@ -83,10 +83,8 @@ def _shell_chair(build: Assembly, width: float, depth: float, seat: float, back:
 
 def stool(build: Assembly) -> None:
     radius, height = build.size(0.16, 0.2), build.rng.uniform(0.42, 0.62) * build.scale
-    build.add(
-        build.main(),
-        lathe([(0, 0), (radius * 0.96, 0), (radius, 0.02), (radius, 0.05), (0, 0.055)]).moved(z=height - 0.05),
-    )
+    seat = lathe([(0, 0), (radius * 0.96, 0), (radius, 0.02), (radius, 0.05), (0, 0.055)])
+    build.add(build.main(), seat.moved(z=height - 0.05))
     legs = chrome(build.rng) if build.material == "metal" else build.main(axis=2)
     reach = radius * 0.95
     for x, y in corners(reach, reach):
@@ -213,13 +211,10 @@ def desk(build: Assembly) -> None:
     for i in range(3):
         z = 0.075 + i * drawer
         build.add(build.main(axis=0), block(0.395, 0.018, drawer - 0.02, x, front - 0.009, z))
-        build.add(
-            pull, box(x - 0.07, x + 0.07, front - 0.04, front - 0.018, z + drawer * 0.5, z + drawer * 0.5 + 0.014)
-        )
-    build.add(
-        build.main(axis=2),
-        *[block(0.05, 0.05, height - 0.036, -side * (width / 2 - 0.045), y) for y in both(depth / 2 - 0.045)],
-    )
+        middle = z + drawer * 0.5
+        build.add(pull, box(x - 0.07, x + 0.07, front - 0.04, front - 0.018, middle, middle + 0.014))
+    legs = [block(0.05, 0.05, height - 0.036, -side * (width / 2 - 0.045), y) for y in both(depth / 2 - 0.045)]
+    build.add(build.main(axis=2), *legs)
     build.add(build.main(axis=0), block(width - 0.55, 0.018, 0.3, -side * 0.2, depth / 2 - 0.06, height - 0.36))
     build.spot(both(width / 2 - 0.02), both(depth / 2 - 0.02), height)
 
@@ -319,13 +314,8 @@ def tv_stand(build: Assembly) -> None:
     width, depth, height = build.size(1.25, 1.55), build.rng.uniform(0.38, 0.44), build.rng.uniform(0.44, 0.52)
     for z in (0.06, height - 0.035):
         build.add(build.main(axis=0), block(width, depth, 0.035, 0, 0, z))
-    build.add(
-        build.main(axis=2),
-        *[
-            block(0.03, depth - 0.004, height - 0.13, x, 0, 0.095)
-            for x in (-width / 2 + 0.015, -width / 6, width / 6, width / 2 - 0.015)
-        ],
-    )
+    walls = -width / 2 + 0.015, -width / 6, width / 6, width / 2 - 0.015
+    build.add(build.main(axis=2), *[block(0.03, depth - 0.004, height - 0.13, x, 0, 0.095) for x in walls])
     build.add(build.main(axis=0), block(width - 0.06, 0.01, height - 0.13, 0, depth / 2 - 0.008, 0.095))
     for sx in (-1, 1):
         x = sx * width / 3

@@ -42,9 +42,8 @@ def _cover(rgb: Rgb, size: float, seed: int) -> Material:
 
 def _volume(build: Assembly, rgb: Rgb, thick: float, depth: float, tall: float, x: float) -> None:
     label = _cover(rgb, tall, seed=int(build.rng.integers(1, 999)))
-    build.add(
-        label, block(0.003, depth, tall, x - thick / 2 + 0.0015), block(0.003, depth, tall, x + thick / 2 - 0.0015)
-    )
+    for side in (x - thick / 2 + 0.0015, x + thick / 2 - 0.0015):
+        build.add(label, block(0.003, depth, tall, side))
     build.add(label, block(thick - 0.0062, 0.003, tall, x, -depth / 2 + 0.0015))
     build.add(paper(linear((232, 224, 204))), block(thick - 0.0064, depth - 0.01, tall - 0.008, x, 0.002, 0.004))
 
@@ -60,10 +59,8 @@ def book_stack(build: Assembly) -> None:
         boards = [block(width, depth, 0.003, 0, 0, z), block(width, depth, 0.003, 0, 0, z + thick - 0.003)]
         boards.append(block(width, 0.003, thick - 0.0064, 0, -depth / 2 + 0.0015, z + 0.0032))
         build.add(cover, *[shape.turned("z", turn) for shape in boards])
-        build.add(
-            paper(linear((232, 224, 204))),
-            block(width - 0.01, depth - 0.008, thick - 0.0066, 0, 0.001, z + 0.0033).turned("z", turn),
-        )
+        pages = block(width - 0.01, depth - 0.008, thick - 0.0066, 0, 0.001, z + 0.0033)
+        build.add(paper(linear((232, 224, 204))), pages.turned("z", turn))
         z += thick + 0.001
 
 
@@ -93,19 +90,8 @@ def basket(build: Assembly) -> None:
     weave = wicker(build.rgb, build.rng)
     build.add(weave, lathe([(0, 0), (r * 0.8, 0), (r, h), (r - 0.018, h), (r * 0.8 - 0.018, 0.016), (0, 0.016)], 28))
     rim = wicker(shade(build.rgb, 0.75), build.rng)
-    build.add(
-        rim,
-        lathe(
-            [
-                (r + 0.001, h - 0.02),
-                (r + 0.012, h - 0.01),
-                (r + 0.012, h + 0.008),
-                (r - 0.02, h + 0.008),
-                (r - 0.02, h + 0.001),
-            ],
-            28,
-        ),
-    )
+    edge = [(0.001, -0.02), (0.012, -0.01), (0.012, 0.008), (-0.02, 0.008), (-0.02, 0.001)]
+    build.add(rim, lathe([(r + out, h + up) for out, up in edge], 28))
     angle = np.linspace(0, np.pi, 9)
     for sx in (-1, 1):
         arc = [(sx * (r + 0.004), 0.07 * float(np.cos(a)), h + 0.005 + 0.06 * float(np.sin(a))) for a in angle]
@@ -119,48 +105,28 @@ def bin_(build: Assembly) -> None:
     body = build.main()
     if build.chance(0.4):  # pedal bin with a domed lid
         build.add(body, lathe([(0, 0), (r, 0), (r, h), (0, h)], 24))
-        build.add(
-            plastic(tone("black")),
-            lathe([(0, 0), (r + 0.006, 0), (r + 0.006, 0.025), (r * 0.6, 0.07), (0, 0.08)], 24).moved(z=h + 0.001),
-        )
-        build.add(
-            plastic(tone("black")),
-            soft_block(0.09, 0.06, 0.018, 0, -r - 0.02, 0.008, 0.007),
-            lathe([(r, 0), (r + 0.006, 0), (r + 0.006, 0.03), (r, 0.03)], 24),
-        )
+        lid = lathe([(0, 0), (r + 0.006, 0), (r + 0.006, 0.025), (r * 0.6, 0.07), (0, 0.08)], 24)
+        pedal = soft_block(0.09, 0.06, 0.018, 0, -r - 0.02, 0.008, 0.007)
+        foot = lathe([(r, 0), (r + 0.006, 0), (r + 0.006, 0.03), (r, 0.03)], 24)
+        build.add(plastic(tone("black")), lid.moved(z=h + 0.001), pedal, foot)
         return
-    build.add(
-        body,
-        lathe(
-            [
-                (0, 0),
-                (r * 0.78, 0),
-                (r, h),
-                (r + 0.01, h),
-                (r + 0.01, h + 0.012),
-                (r - 0.012, h + 0.012),
-                (r * 0.77 - 0.01, 0.01),
-                (0, 0.01),
-            ],
-            24,
-        ),
-    )
+    outside = [(0, 0), (r * 0.78, 0), (r, h), (r + 0.01, h), (r + 0.01, h + 0.012)]
+    inside = [(r - 0.012, h + 0.012), (r * 0.77 - 0.01, 0.01), (0, 0.01)]
+    build.add(body, lathe([*outside, *inside], 24))
     liner = plastic(mix(build.rgb, tone("black"), 0.6))
     build.add(liner, lathe([(0, 0), (r * 0.8, 0), (r * 0.8, 0.004), (0, 0.004)], 20).moved(z=h * 0.35))
     scrap = paper(tone("white"))
     for i in range(3):
-        build.add(
-            scrap, ellipsoid(r * 0.33, r * 0.3, r * 0.3).moved(r * 0.38, 0, h * 0.35 + r * 0.3).turned("z", 120 * i)
-        )
+        ball = ellipsoid(r * 0.33, r * 0.3, r * 0.3).moved(r * 0.38, 0, h * 0.35 + r * 0.3)
+        build.add(scrap, ball.turned("z", 120 * i))
 
 
 def exercise_ball(build: Assembly) -> None:
     r = build.size(0.26, 0.33)
     skin = Material(Texture.GORES, build.rgb, shade(build.rgb, 0.7), 0.05, 0.45)
     build.add(skin, ellipsoid(r, r, r))
-    build.add(
-        plastic(tone("white")), cylinder(0.02, 0.012).turned("x", 60).moved(0, -r * 0.866 + 0.004, r * 0.5 - 0.002)
-    )
+    valve = cylinder(0.02, 0.012).turned("x", 60)
+    build.add(plastic(tone("white")), valve.moved(0, -r * 0.866 + 0.004, r * 0.5 - 0.002))
 
 
 def pan(build: Assembly) -> None:
@@ -179,30 +145,22 @@ def pot(build: Assembly) -> None:
     body = metal(build.rgb, build.rng) if build.colour == "grey" else ceramic(build.rgb)
     build.add(body, lathe([(0, 0), (r * 0.96, 0), (r, 0.012), (r, h), (0, h)], 26))
     lid = chrome(build.rng) if build.colour == "grey" else ceramic(shade(build.rgb, 0.9))
-    build.add(
-        lid, lathe([(0, 0), (r + 0.006, 0), (r + 0.006, 0.008), (r * 0.6, 0.028), (0, 0.036)], 26).moved(z=h + 0.0005)
-    )
+    cover = lathe([(0, 0), (r + 0.006, 0), (r + 0.006, 0.008), (r * 0.6, 0.028), (0, 0.036)], 26)
+    build.add(lid, cover.moved(z=h + 0.0005))
     black = plastic(tone("black"))
-    build.add(
-        black,
-        lathe([(0, 0), (0.012, 0), (0.012, 0.012), (0.022, 0.024), (0.018, 0.034), (0, 0.036)], 14).moved(z=h + 0.035),
-    )
+    knob = lathe([(0, 0), (0.012, 0), (0.012, 0.012), (0.022, 0.024), (0.018, 0.034), (0, 0.036)], 14)
+    build.add(black, knob.moved(z=h + 0.035))
+    grip = [(r - 0.003, -0.045, h * 0.78), (r + 0.035, -0.035, h * 0.8)]
+    grip += [(x, -y, z) for x, y, z in reversed(grip)]
     for sx in (-1, 1):
-        grip = [
-            (sx * (r - 0.003), -0.045, h * 0.78),
-            (sx * (r + 0.035), -0.035, h * 0.8),
-            (sx * (r + 0.035), 0.035, h * 0.8),
-            (sx * (r - 0.003), 0.045, h * 0.78),
-        ]
-        build.add(black, tube(grip, 0.009, 7))
+        build.add(black, tube([(sx * x, y, z) for x, y, z in grip], 0.009, 7))
 
 
 def plate(build: Assembly) -> None:
     r = build.size(0.115, 0.14)
     body = ceramic(build.rgb)
-    build.add(
-        body, lathe([(0, 0), (r * 0.55, 0), (r * 0.7, 0.006), (r, 0.02), (r, 0.024), (r * 0.68, 0.011), (0, 0.009)], 28)
-    )
+    profile = [(0, 0), (r * 0.55, 0), (r * 0.7, 0.006), (r, 0.02), (r, 0.024), (r * 0.68, 0.011), (0, 0.009)]
+    build.add(body, lathe(profile, 28))
     ring = ceramic(mix(build.rgb, tone("blue") if build.colour == "white" else tone("white"), 0.75))
     build.add(ring, lathe([(r * 0.84, 0.0178), (r * 0.84, 0.0185), (r * 0.93, 0.0222), (r * 0.93, 0.0215)], 28))
 
@@ -211,17 +169,13 @@ def bowl(build: Assembly) -> None:
     r = build.size(0.085, 0.125)
     h = r * build.rng.uniform(0.62, 0.75)
     outer = [(0, 0), (r * 0.45, 0), (r * 0.45, 0.01), (r * 0.78, h * 0.4), (r, h)]
-    build.add(
-        ceramic(build.rgb), lathe([*outer, (r - 0.008, h), (r * 0.74, h * 0.45), (r * 0.4, 0.022), (0, 0.018)], 26)
-    )
+    inner = [(r - 0.008, h), (r * 0.74, h * 0.45), (r * 0.4, 0.022), (0, 0.018)]
+    build.add(ceramic(build.rgb), lathe([*outer, *inner], 26))
     if build.chance(0.4):
         for i in range(4):
-            fruit = build.other("orange", "red", "yellow", "green")
-            size = r * 0.36
-            build.add(
-                replace(plastic(fruit), gloss=0.2),
-                ellipsoid(size, size, size).moved(r * 0.4, 0, h * 0.78).turned("z", 90 * i),
-            )
+            skin = replace(plastic(build.other("orange", "red", "yellow", "green")), gloss=0.2)
+            fruit = ellipsoid(r * 0.36, r * 0.36, r * 0.36).moved(r * 0.4, 0, h * 0.78)
+            build.add(skin, fruit.turned("z", 90 * i))
 
 
 def cup(build: Assembly) -> None:
@@ -239,16 +193,8 @@ def cup(build: Assembly) -> None:
 
 def bottle(build: Assembly) -> None:
     r, h = build.size(0.036, 0.046), build.size(0.25, 0.31)
-    outline = [
-        (0, 0),
-        (r, 0),
-        (r, h * 0.58),
-        (r * 0.75, h * 0.68),
-        (r * 0.36, h * 0.78),
-        (r * 0.36, h * 0.95),
-        (0, h * 0.95),
-    ]
-    build.add(build.main(), lathe(outline, 20))
+    outline = [(0, 0), (1, 0), (1, 0.58), (0.75, 0.68), (0.36, 0.78), (0.36, 0.95), (0, 0.95)]
+    build.add(build.main(), lathe([(r * out, h * up) for out, up in outline], 20))
     label = Material(Texture.LABEL, tone("white"), build.other("red", "blue", "green", "yellow"), h * 0.3, 0.05, seed=5)
     build.add(label, lathe([(r, h * 0.16), (r + 0.0015, h * 0.16), (r + 0.0015, h * 0.46), (r, h * 0.46)], 20))
     cap = build.other("red", "white", "black", "yellow")
@@ -294,7 +240,5 @@ def tissue_box(build: Assembly) -> None:
     build.add(paper(shade(second, 0.5)), block(width * 0.6, depth * 0.4, 0.0015, 0, 0, tall + 0.001))
     white = paper(tone("white"))
     for turn, lean in ((0, 12), (70, -14), (130, 8)):
-        build.add(
-            white,
-            block(0.085, 0.004, 0.075).tapered(0.45).turned("x", lean).turned("z", turn).moved(0, 0, tall + 0.003),
-        )
+        tissue = block(0.085, 0.004, 0.075).tapered(0.45).turned("x", lean).turned("z", turn)
+        build.add(white, tissue.moved(0, 0, tall + 0.003))

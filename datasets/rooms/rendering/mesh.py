@@ -197,11 +197,8 @@ def _bake(
 
 def _fill_buried(light: Float64Array, buried: NDArray[np.bool_], triangles: NDArray[np.intp]) -> Float64Array:
     """Light of vertices that lie inside another solid, from their neighbours, so that no darkness bleeds out."""
-    tail, head = (
-        np.concatenate([triangles, triangles[:, [1, 2, 0]]]),
-        np.concatenate([triangles[:, [1, 2, 0]], triangles]),
-    )
-    tail, head = tail.ravel(), head.ravel()
+    turned = triangles[:, [1, 2, 0]]
+    tail, head = np.concatenate([triangles, turned]).ravel(), np.concatenate([turned, triangles]).ravel()
     filled, unknown = light.copy(), buried.copy()
     for _ in range(10):
         use = unknown[tail] & ~unknown[head]

@@ -1,15 +1,20 @@
-"""All that a page of some runs holds: its scenes are made side by side, or taken as they were kept."""
+"""All that a page of some runs holds: their numbers, and their scenes, made side by side or taken as they were kept."""
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from su3d_bench.analysis.attribution import Explained, explained_of
+from su3d_bench.analysis.comparison import compare
 from su3d_bench.analysis.page.gallery import GalleryOfScene, SceneGallery, photos_of_each
 from su3d_bench.analysis.page.kept import (
     Job,
@@ -23,13 +28,246 @@ from su3d_bench.analysis.page.kept import (
     state_of_scene,
 )
 from su3d_bench.analysis.page.maps import MapOfRun, PageMap, PageScene, Spaces, page_scene, points_of_each
-from su3d_bench.analysis.page.numbers import are_all_read, is_scored, page_numbers, scored_maps
 from su3d_bench.analysis.page.scene import SceneData
-from su3d_bench.core.errors import DataError, Su3dError, printable
+from su3d_bench.analysis.sides import Side, SideNumbers
+from su3d_bench.core.config import KeyPath
+from su3d_bench.core.errors import ConfigError, DataError, Su3dError, printable, printable_json
 from su3d_bench.core.files.atomic import is_file
+from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.metrics.attribution.arrays import LookedAt
+from su3d_bench.metrics.costs import MAP, TOTAL, MethodSummary, StageSummary, UpdateTimes, summarise
+from su3d_bench.metrics.protocols.model import ProtocolRules
+from su3d_bench.metrics.semantic.confusion import SemanticCounts, concatenate
+from su3d_bench.numerics.statistics import Growth
+from su3d_bench.reports.tables.run import Found, Unscored, not_scored_lines
 from su3d_bench.runs.executors import SCENE_DONE, Event, Report, run_inline, run_processes
-from su3d_bench.runs.finished import FinishedRun, read_run
+from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
+from su3d_bench.runs.summary import found_in, without_score
+from su3d_bench.store.records import ResultRecord, plain
+
+MOST_BINS = 160  # points of a line: more than a plot has room for
+DIGITS = 4  # of a time
+
+
+def confusion_cells(confusion: Int64Array) -> list[list[int]]:
+    """Rows (true class, predicted class, points) of what is not 0; a predicted class -1 is none of the classes.
+
+    >>> confusion_cells(np.array([[3, 0, 1], [0, 2, 0]]))
+    [[0, 0, 3], [0, -1, 1], [1, 1, 2]]
+    """
+    n_classes = len(confusion)
+    return [
+        [int(true), int(called) if called < n_classes else -1, int(confusion[true, called])]
+        for true, called in np.argwhere(confusion)
+    ]
+
+
+def series_of(times: UpdateTimes) -> dict[str, Any]:
+    """The course of a scene's updates as means of ``per`` updates each, in ms, with the map's points where known."""
+    per = max(1, -(-len(times) // MOST_BINS))
+    series: dict[str, Any] = {"per": per, "n": len(times)}
+    series |= {stage: _binned(times.ms(stage), per) for stage in (TOTAL, MAP)}
+    if "n_points" in times.columns:
+        series["points"] = [int(value) for value in _binned(times.columns["n_points"], per)]
+    return series
+
+
+def _binned(values: Float64Array, per: int) -> list[float]:
+    starts = np.arange(0, len(values), per)
+    sums = np.add.reduceat(values, starts) if len(values) else values
+    sizes = np.diff(np.append(starts, len(values)))
+    return [short(value) for value in sums / sizes]
+
+
+def short(value: float) -> float:
+    """``value`` with ``DIGITS`` digits, which is more than a plot or a table shows.
+
+    >>> short(12.34567)
+    12.35
+    """
+    return float(f"{value:.{DIGITS}g}")
+
+
+def summary_data(summary: MethodSummary) -> dict[str, Any]:
+    """A method's costs; times in ms, null where nothing was measured."""
+    shown = {name: value for name, value in vars(summary).items() if name not in ("run", "frames_per_s")}
+    numbers = {name: _number(value) if isinstance(value, float) else value for name, value in shown.items()}
+    return numbers | {"stages": [_stage_data(stage) for stage in summary.stages]}
+
+
+def _stage_data(stage: StageSummary) -> dict[str, Any]:
+    numbers: Mapping[str, float] = {"first": stage.first, "p50": stage.p50, "p95": stage.p95, "max": stage.worst}
+    return {
+        "name": stage.name,
+        **{name: _number(value) for name, value in numbers.items()},
+        "share": _number(stage.share),
+        "by_points": _growth_data(stage.against_points),
+        "by_updates": _growth_data(stage.against_frames),
+    }
+
+
+def _growth_data(growth: Growth | None) -> dict[str, Any] | None:
+    return None if growth is None else {**asdict(growth), "words": growth.words}
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None or not np.isfinite(value) else short(value)
+
+
+MOST_PAIRS = 40  # pairs of methods that are compared: all of nine methods, and a few seconds
+# Jobs (a scene under a method) up to which each is read. The courses and comparisons of more take minutes to make and
+# are no more to be looked at one by one.
+MOST_JOBS = 500
+MOST_MAPS = 16  # of a page of more jobs: two scenes under eight methods
+LEFT_OUT = (
+    "what each job's own files say is left out: errors (su3d-bench report attribution), confusions, times (report "
+    f"timing), comparisons (compare) and all maps but those of the first scenes, at most {MOST_MAPS}"
+)
+# Of a record of results: what the page says elsewhere, or not at all.
+NOT_SHOWN = ("encoder_digest", "anytime")
+NUMBERS_NOT_SHOWN = ("protocol", "version", "headline", "n_scenes", "scene_mean")
+
+
+def page_numbers(runs: Sequence[FinishedRun], errors: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Plain values for the page of ``runs``, every text in them on one line and printable.
+
+    Of more than ``MOST_JOBS`` jobs the page shows what the runs' own records say, and ``left_out`` says what it lacks.
+    """
+    n_jobs, reads_all = _n_jobs(runs), are_all_read(runs)
+    results: list[dict[str, Any]] = []
+    confusions: list[dict[str, Any]] = []
+    timing: list[dict[str, Any]] = []
+    for index, run in enumerate(runs):
+        results += [{"run": index, **_shown(result)} for result in run.results.values()]
+        if reads_all:
+            timing += [{"run": index, **times} for method in run.methods if (times := _times(run, method)) is not None]
+            confusions += [{"run": index, **one} for method in run.methods for one in _confusions(run, method)]
+    told = {result["protocol"] for result in results if result["result"] is not None or result["failed"]}
+    numbers = {
+        "left_out": None if reads_all else f"{n_jobs} jobs, more than {MOST_JOBS}: {LEFT_OUT}",
+        "runs": [_about(run) for run in runs],
+        "results": [result for result in results if result["protocol"] in told],
+        "found": [{"run": index, **asdict(one)} for index, run in enumerate(runs) for one in _found(run, reads_all)],
+        "confusions": confusions,
+        "errors": errors,
+        "timing": timing,
+        "comparisons": _comparisons(runs) if reads_all and any(map(is_scored, runs)) else [],
+    }
+    plain: dict[str, Any] = printable_json(numbers)
+    return plain
+
+
+def are_all_read(runs: Sequence[FinishedRun]) -> bool:
+    """Whether the files of each job are read, or there are too many."""
+    return _n_jobs(runs) <= MOST_JOBS
+
+
+def is_scored(run: FinishedRun) -> bool:
+    return any(result.result is not None for result in run.results.values())
+
+
+def _shown(result: ResultRecord) -> dict[str, Any]:
+    shown: dict[str, Any] = {key: value for key, value in plain(result).items() if key not in NOT_SHOWN}
+    if result.result is not None:
+        shown["result"] = {key: value for key, value in shown["result"].items() if key not in NUMBERS_NOT_SHOWN}
+    return shown | {"anytime": [plain(midway) for midway in result.anytime or ()]}
+
+
+def _about(run: FinishedRun) -> dict[str, Any]:
+    record = run.record
+    of_record = plain(record)
+    shared = ("profile", "encoder", "encoder_digest", "code", "git", "seed", "hardware", "packages", "data_digests")
+    return {
+        "name": run.name,
+        "is_partial": record.is_partial,
+        "is_incomplete": run.is_incomplete,
+        "limit": run.limit,
+        "scenes": run.scenes,
+        "methods": run.methods,
+        **{key: of_record[key] for key in shared},
+        "protocols": [{key: rules[key] for key in ("name", "version", "digest")} for rules in of_record["protocols"]],
+        "settings": [{"key": _dotted(path), "value": value} for path, value in run.settings.items()],
+        "failed": [f"{failure.scene} {failure.method} {failure.error}" for failure in record.failed],
+        "warnings": list(record.warnings),
+        "unscored": not_scored_lines(Unscored(*vars(one).values()) for one in record.unscored),
+    }
+
+
+def _found(run: FinishedRun, reads_all: bool) -> Iterator[Found]:
+    return found_in(run.folder, without_score(run) if reads_all else ())
+
+
+def _dotted(path: KeyPath) -> str:
+    return ".".join(path)
+
+
+def _confusions(run: FinishedRun, method: str) -> list[dict[str, Any]]:
+    """The confusion of every semantic protocol, its scenes added up; none where the rules here are not the run's."""
+    confusions = []
+    for name, of_scene in run.scores(method).items():
+        rules: ProtocolRules | None = None
+        counts = [score.counts for score in of_scene.values() if isinstance(score.counts, SemanticCounts)]
+        if not counts:
+            continue
+        confusion: dict[str, Any] = {"method": method, "protocol": name}
+        with suppress(ConfigError):
+            rules = run.rules(name, to_the_letter=True)
+        if rules is None or any(len(c.is_present) != len(rules.classes) for c in counts):
+            confusions.append(confusion | {"reason": f"the rules of {name} here are not those that scored the run"})
+            continue
+        names = [entry.name for entry in rules.classes]
+        confusions.append(confusion | {"names": names, "cells": confusion_cells(concatenate(counts).confusion)})
+    return confusions
+
+
+def _times(run: FinishedRun, method: str) -> dict[str, Any] | None:
+    if not run.has_scores(method):
+        return None
+    times = read_update_times(run, method)
+    if not times:
+        return None
+    return {**summary_data(summarise(times)), "series": {of_scene.scene: series_of(of_scene) for of_scene in times}}
+
+
+def _comparisons(runs: Sequence[FinishedRun]) -> list[dict[str, Any]]:
+    """The first ``MOST_PAIRS`` pairs: methods of one name in two runs, then methods within a run."""
+    pairs: list[tuple[Side, Side]] = []
+    for left, right in itertools.combinations(runs, 2):
+        pairs += [(Side(left, method), Side(right, method)) for method in left.methods if method in right.methods]
+    for run in runs:
+        pairs += itertools.combinations((Side(run, method) for method in run.methods), 2)
+    numbers = SideNumbers()
+    return [_compared(runs, numbers, *pair) for pair in pairs[:MOST_PAIRS]]
+
+
+def _compared(runs: Sequence[FinishedRun], numbers: SideNumbers, left: Side, right: Side) -> dict[str, Any]:
+    sides = {"left": [runs.index(left.run), left.method], "right": [runs.index(right.run), right.method]}
+    try:
+        addresses = (f"{side.run.folder.path}:{side.method}" for side in (left, right))
+        comparison = compare(*addresses, numbers=numbers).to_json()
+    except Su3dError as error:
+        return {**sides, "protocols": [], "remarks": [], "reason": str(error)}
+    return {**sides, "protocols": comparison["protocols"], "remarks": comparison["remarks"], "reason": None}
+
+
+def _n_jobs(runs: Sequence[FinishedRun]) -> int:
+    return sum(len(run.scenes) * len(run.methods) for run in runs)
+
+
+def scored_maps(runs: Sequence[FinishedRun]) -> list[tuple[int, FinishedRun, str, str]]:
+    """Index of the run, run, scene and method of every map there is, all methods of a scene together.
+
+    Of more than ``MOST_JOBS`` jobs only the maps of the first scenes, at most ``MOST_MAPS``.
+    """
+    maps = (
+        (index, run, scene, method)
+        for index, run in enumerate(runs)
+        for scene in run.scenes
+        for method in run.methods
+        if run.folder.job(scene, method).prediction.is_file()
+    )
+    return list(maps if are_all_read(runs) else itertools.islice(maps, MOST_MAPS))
+
 
 QUERIES = (
     "somewhere to sit",

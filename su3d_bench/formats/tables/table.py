@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import csv
+import io
+import re
+import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.types import Interval
+from su3d_bench.formats.numpy_files import ZIP_DAMAGE
 
 NOT_MEASURED = "-"
 What = Literal["value", "ceiling", "scenes"]
@@ -142,3 +148,132 @@ def blocks_of(rows: Sequence[TableRow]) -> list[list[TableRow]]:
         else:
             blocks.append([row])
     return blocks
+
+
+MOST_ROWS = 200_000
+MOST_CELLS = 4_000_000
+
+MOST_OF_A_CELL = 2000
+# A spreadsheet takes what begins so for a formula (OWASP, "CSV Injection"); an apostrophe before it makes it text.
+FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r", "\uff1d", "\uff0b", "\uff0d", "\uff20")
+# Where the semicolon parts cells, as in half of Europe, one begins behind it.
+_CELL_WITHIN = re.compile(r"(?<=;)(?=[=+\-@])")
+_CELL_MENDED = re.compile(r"(?<=;)'(?=[=+\-@])")
+
+
+def separated_rows(text: str, separator: str = ",", most_rows: int = MOST_ROWS) -> list[list[str]]:
+    """The rows of a CSV text; ``csv.Error`` where it is none, or has more rows or cells than any that people fill in.
+
+    They are counted as they are read: a row takes one byte in a file and fifty in memory.
+    """
+    rows: list[list[str]] = []
+    n_cells = 0
+    for row in csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True):
+        n_cells += len(row)
+        if len(rows) == most_rows or n_cells > MOST_CELLS:
+            raise csv.Error(f"it has more than {most_rows} rows or {MOST_CELLS} cells")
+        rows.append(row)
+    return rows
+
+
+def csv_lines(rows: Iterable[Iterable[object]]) -> str:
+    """Rows of cells as CSV, each cell ``harmless``."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(map(harmless, row) for row in rows)
+    return text.getvalue()
+
+
+def harmless(value: object) -> object:
+    """A cell on one line that no spreadsheet takes for a formula.
+
+    >>> harmless("=1+1"), harmless("-"), harmless(-1)
+    ("'=1+1", '-', -1)
+    """
+    if not isinstance(value, str):
+        return value
+    return no_formula(printable(value, MOST_OF_A_CELL))
+
+
+def no_formula(text: str) -> str:
+    """``text`` as a spreadsheet takes it for text; ``meant`` gives it back."""
+    apart = _CELL_WITHIN.sub("'", text)
+    return f"'{apart}" if apart.startswith(FORMULA_STARTS) and apart != "-" else apart
+
+
+def meant(cell: str) -> str:
+    """What ``no_formula`` was given.
+
+    >>> meant("'=1+1"), meant("'chair'")
+    ('=1+1', "'chair'")
+    """
+    text = cell[1:] if cell[:1] == "'" and cell[1:2] in FORMULA_STARTS else cell
+    return _CELL_MENDED.sub("", text)
+
+
+MOST_XML_BYTES = 32 << 20  # of all that is in the archive, beside pictures, which do not shrink in it
+MOST_SHEET_CELLS = 2_000_000  # of all worksheets
+MOST_COLUMNS = 64  # beyond which nothing is looked at
+# What openpyxl raises on damaged workbooks, beside what zipfile does.
+WORKBOOK_DAMAGE = (
+    *ZIP_DAMAGE,
+    LookupError,
+    TypeError,
+    AttributeError,
+    OSError,
+    SyntaxError,
+    OverflowError,
+    RecursionError,
+)
+
+Row = tuple[int, list[str | None]]  # its number from 1 on, and its cells from column A on
+
+
+@dataclass(frozen=True)
+class Worksheet:
+    """The rows of a worksheet that have cells, in the order of the file."""
+
+    name: str
+    rows: list[Row]
+
+
+def read_workbook(content: bytes, where: str) -> list[Worksheet]:
+    """Every worksheet in the order of the workbook; ``DataError``, which begins with ``where``, for anything else."""
+    try:
+        import defusedxml  # without which openpyxl would define entities
+        import openpyxl
+    except ImportError as error:
+        raise DataError(f"{where}: reading .xlsx needs {error.name}; pip install 'su3d-bench[sheets]'") from error
+    assert openpyxl.DEFUSEDXML, defusedxml.__name__
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            n_bytes = sum(info.file_size for info in archive.infolist())
+        if n_bytes > 2 * len(content) + MOST_XML_BYTES:
+            raise DataError(f"{where}: unpacks to {n_bytes >> 20} MiB; no workbook of su3d-bench sheets make does")
+        book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, keep_links=False)
+        n_cells, found = 0, []
+        for sheet in book.worksheets:
+            rows: list[Row] = []
+            sheet.reset_dimensions()  # the file may state any
+            for number, cells in enumerate(
+                sheet.iter_rows(max_row=MOST_ROWS, max_col=MOST_COLUMNS, values_only=True), 1
+            ):
+                texts = [_text(cell) for cell in cells]
+                n_cells += len(texts) - texts.count(None)
+                if n_cells > MOST_SHEET_CELLS:
+                    raise DataError(f"{where}: has more than {MOST_SHEET_CELLS} cells; a file of answers is smaller")
+                if any(text is not None for text in texts):
+                    rows.append((number, texts))
+            found.append(Worksheet(sheet.title, rows))
+        return found
+    except WORKBOOK_DAMAGE as error:
+        reason = printable(f"{type(error).__name__}: {error}", 120)
+        raise DataError(f"{where}: is no whole .xlsx file ({reason}); save the workbook as .xlsx again") from error
+
+
+def _text(value: object) -> str | None:
+    """A cell as a text: of a formula itself, of a number as many digits as a spreadsheet shows."""
+    if isinstance(value, bool):
+        return str(value).upper()
+    if isinstance(value, float):
+        return f"{value:.15g}"
+    return None if value is None or value == "" else str(value)

@@ -17,7 +17,7 @@ from su3d_bench.core.errors import ModelMissing
 from su3d_bench.core.system.devices import require
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import Float32Array, UInt8Array
-from su3d_bench.perception.embedded.text import DIM, TOKENIZER_VERSION, token_ids, unknown_words
+from su3d_bench.perception.embedded.lexicon import DIM, TOKENIZER_VERSION, token_ids, unknown_words
 from su3d_bench.perception.models.encoders.images import check_image
 from su3d_bench.perception.models.onnx import open_session
 

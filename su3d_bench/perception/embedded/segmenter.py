@@ -17,8 +17,7 @@ from su3d_bench.core.types import (
     Regions,
     UInt8Array,
 )
-from su3d_bench.perception.cache import CODE, content_key
-from su3d_bench.perception.crops import mask_boxes
+from su3d_bench.perception.cache import CODE, content_key, mask_boxes
 from su3d_bench.perception.embedded.join_rules import SegmenterConfig, join_objects, region_quality, take_out_structure
 from su3d_bench.perception.embedded.surface_graph import Graph, Pieces, measure_borders
 

@@ -15,7 +15,7 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from su3d_bench.core.system.devices import make_deterministic, require
 from su3d_bench.core.types import Float32Array
-from su3d_bench.perception.embedded.text import DIM, N_ROWS, PADDING
+from su3d_bench.perception.embedded.lexicon import DIM, N_ROWS, PADDING
 
 WORD_DIM = 64
 TEXT_DIM = 128

@@ -13,10 +13,9 @@ from typing import Literal
 
 from su3d_bench.core.types import UInt8Array
 from su3d_bench.perception.cache import content_key
-from su3d_bench.perception.embedded.naming import scene_caption
-from su3d_bench.perception.language.chat import ChatRequest, Reply, fitted
+from su3d_bench.perception.embedded.lexicon import scene_caption
+from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig, Reply, fitted
 from su3d_bench.perception.language.client import LanguageModel
-from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.perception.language.parsing import CaptionForm, described, is_refusal
 
 # opensu3d.tex, section III-A.

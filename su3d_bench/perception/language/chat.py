@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, field_validator
 
 from su3d_bench.core.digests import digest_bytes, digest_json
+from su3d_bench.core.files.atomic import json_text, make_folder, write_bytes, write_error, write_text
+from su3d_bench.core.files.locks import hold_folder
+from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import UInt8Array
+from su3d_bench.store.run_folder import refuse_links
 
 Purpose = Literal["caption", "refine", "ask", "judge"]
 CHARACTERS_A_TOKEN = 4  # OpenAI's rule of thumb for English
@@ -141,3 +152,149 @@ class Reply:
     dropped: tuple[str, ...] = ()
     failure: str = ""
     was_stored: bool = field(default=False, compare=False)
+
+
+Seconds = Annotated[float, Field(gt=0, le=3600, allow_inf_nan=False)]
+
+
+class Price(BaseModel):
+    """US dollars for a million tokens."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+
+    input_usd: float = Field(ge=0, allow_inf_nan=False)
+    output_usd: float = Field(ge=0, allow_inf_nan=False)
+
+
+# OpenAI's price list of November 2023: 0.01 US dollars for 1,000 tokens in, 0.03 for 1,000 out, for both models.
+_GPT4_TURBO = Price(input_usd=10.0, output_usd=30.0)
+
+
+class LanguageConfig(BaseModel):
+    """Which models are asked, how long one waits for them, and what a command may spend.
+
+    ``base_url`` empty: ``$OPENAI_BASE_URL``, else the service of OpenAI. The key is read from the environment variable
+    ``key_variable`` and stands nowhere else. ``budget_tokens``, ``budget_usd`` and ``requests_per_minute`` 0: no limit.
+    """
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+
+    base_url: str = ""
+    key_variable: str = Field(default="OPENAI_API_KEY", pattern=r"^[A-Za-z_][A-Za-z0-9_]{0,80}$")
+    # The paper's models (section IV-A); OpenAI has withdrawn both since.
+    vision_model: str = Field(default="gpt-4-vision-preview", min_length=1, max_length=200)
+    text_model: str = Field(default="gpt-4-1106-preview", min_length=1, max_length=200)
+    temperature: float = Field(default=0.0, ge=0, le=2)  # 0: the paper's
+    # Sent where a server takes it; the paper names none.
+    seed: int | None = Field(default=0, ge=0, lt=2**31)
+    max_answer_tokens: int = Field(default=1000, ge=1, le=100_000)
+    # Tokens that the text model reads and writes in all: 128,000 of gpt-4-1106-preview.
+    context_tokens: int = Field(default=128_000, ge=1000)
+    image_detail: Literal["auto", "low", "high"] = "auto"
+    # A larger crop is scaled down: OpenAI's models see the shorter side of an image at 768 pixels at most.
+    max_image_px: int = Field(default=768, ge=32, le=4096)
+    timeout_s: Seconds = 120.0  # without a byte of the answer
+    max_retries: int = Field(default=4, ge=0, le=20)  # of the client library, with growing pauses
+    max_answer_bytes: int = Field(default=1_000_000, ge=1000, le=100_000_000)
+    requests_per_minute: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+    max_concurrent: int = Field(default=4, ge=1, le=64)
+    # So many requests given up one after the other end the command: the server is down, not the request bad.
+    max_failures_in_a_row: int = Field(default=5, ge=1)
+    budget_tokens: int = Field(default=0, ge=0)
+    budget_usd: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+    prices: dict[str, Price] = {"gpt-4-vision-preview": _GPT4_TURBO, "gpt-4-1106-preview": _GPT4_TURBO}
+
+    @field_validator("base_url")
+    @classmethod
+    def _is_a_plain_address(cls, value: str) -> str:
+        check_address(value)
+        return value
+
+
+def check_address(address: str) -> None:
+    """A ``ValueError`` where ``address`` is no http or https address, or holds a user name or a password."""
+    if not address:
+        return
+    try:
+        parts = urlsplit(address)
+        is_address = parts.scheme in ("http", "https") and bool(parts.hostname)
+        has_secret = parts.username is not None or parts.password is not None or bool(parts.query)
+    except ValueError:
+        is_address = has_secret = False
+    if not is_address:
+        raise ValueError("expected an http or https address, such as http://localhost:8000/v1")
+    if has_secret:
+        raise ValueError("holds a name, a password or a query; keys belong in the environment")
+
+
+SCHEMA = 1
+IMAGES = "images"
+MOST_ENTRY_BYTES = 200_000_000  # twice the largest answer that a configuration can allow
+
+
+_REPLY = TypeAdapter(Reply)
+
+
+class ReplyStore:
+    """The folder ``language`` of a run."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def path(self, key: str) -> Path:
+        return self.folder / f"{key}.json"
+
+    def load(self, key: str) -> Reply | None:
+        """The reply under ``key``; None where there is none, or one that is damaged."""
+        path = self.path(key)
+        try:
+            if not path.is_file() or path.stat().st_size > MOST_ENTRY_BYTES:
+                return None
+            entry: Any = json.loads(file_text(path))
+            digests = digest_json(entry["request"]), digest_json(entry["reply"])
+            if entry["schema"] != SCHEMA or digests != (key, entry["reply_sha256"]):
+                return None
+            return dataclasses.replace(_REPLY.validate_python(entry["reply"]), was_stored=True)
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+            return None
+
+    def save(self, request: ChatRequest, reply: Reply, server: str, *, replace: bool = False) -> Reply:
+        """The reply that is kept: ``reply``, or the one that another process stored meanwhile unless ``replace``."""
+        refuse_links(self.folder.parent, self.folder / IMAGES)
+        make_folder(self.folder)
+        with self._locked():
+            earlier = None if replace else self.load(request.key)
+            if earlier is not None:
+                return earlier
+            self._save_images(request)
+            answer = _REPLY.dump_python(reply, mode="json", exclude={"was_stored"})
+            entry = {
+                "schema": SCHEMA,
+                "purpose": request.purpose,
+                "server": server,
+                "request": request.record(),
+                "reply": answer,
+                "reply_sha256": digest_json(answer),
+            }
+            write_text(self.path(request.key), json_text(entry))
+        return reply
+
+    def _save_images(self, request: ChatRequest) -> None:
+        if request.images:
+            make_folder(self.folder / IMAGES)
+        for image in request.images:
+            path = self.folder / IMAGES / f"{image.digest}.png"
+            if not path.is_file():
+                write_bytes(path, image.png)
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Hold the folder against other threads and processes; the lock leaves no file behind."""
+        try:
+            handle = hold_folder(self.folder, waits=True)
+        except OSError as error:
+            raise write_error(self.folder, error) from error
+        try:
+            yield
+        finally:
+            os.close(handle)

@@ -18,9 +18,7 @@ from pydantic import BaseModel, Field, ValidationError
 
 from su3d_bench.core.errors import ConfigError, ModelMissing, RunIncomplete, StoreError, printable
 from su3d_bench.core.system.devices import require
-from su3d_bench.perception.language.chat import ChatRequest, Reply, n_tokens
-from su3d_bench.perception.language.config import LanguageConfig, check_address
-from su3d_bench.perception.language.reply_store import ReplyStore
+from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig, Reply, ReplyStore, check_address, n_tokens
 
 HOSTED = "https://api.openai.com/v1"
 NO_KEY = "none"  # servers on one's own machine ask for no key, the client library for any text

@@ -15,7 +15,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from su3d_bench.core.errors import printable
-from su3d_bench.perception.embedded.text import words
+from su3d_bench.perception.embedded.lexicon import words
 
 MOST_READ = 8000  # characters of an answer; a name, a caption or an answer stands within
 MOST_NAME_CHARACTERS, MOST_NAME_WORDS = 60, 5

@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import json
 import threading
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from painted import DELAY_S, colour_perception
 from places import SCENES
 
-from su3d_bench.analysis.gate.check import check
-from su3d_bench.analysis.gate.reference import (
+from su3d_bench.analysis.gate import (
     LEAST_SHARE,
     Cost,
     Reference,
+    check,
     cost_findings,
     learn,
-    read_reference,
 )
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.system.timing import MethodClock
 from su3d_bench.reports.gate import Finding
 from su3d_bench.runs import scene as scene_run
@@ -105,8 +100,8 @@ def dearer(limit: float = 1.5, **parts: float) -> list[str]:
         methods = ("m",)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("su3d_bench.analysis.gate.reference.why_no_cost", lambda run, method: None)
-        patch.setattr("su3d_bench.analysis.gate.reference.method_cost", lambda *_: COST.model_copy(update=parts))
+        patch.setattr("su3d_bench.analysis.gate.why_no_cost", lambda run, method: None)
+        patch.setattr("su3d_bench.analysis.gate.method_cost", lambda *_: COST.model_copy(update=parts))
         found: list[Finding] = list(cost_findings(Run(), {"m": COST}, 1.0, limit, is_judged=True))  # type: ignore[arg-type]
     return [one.where.partition("cost of ")[2] for one in found]
 
@@ -126,47 +121,3 @@ def test_a_part_that_hardly_shows_in_the_whole_is_none() -> None:
     assert dearer(start=10 + least + 0.1, whole=157.6) == ["start and the first 3 updates"]
     assert dearer(1.001, whole=151) == []
     assert dearer(1.001, whole=151.1) == ["all together"]
-
-
-@pytest.mark.parametrize(("n", "what"), [("3", "has 3 updates a scene at most")])
-def test_fewer_than_four_updates_are_told_to_learn_no_cost(
-    n: str, what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run, reference = made_in(tmp_path / "run", "--limit", n), tmp_path / "r.json"
-    capsys.readouterr()
-    assert main(["check", "--learn", str(run), "--out", str(reference)]) == 0
-    assert f"delayed: no cost is learnt: it {what}, and a cost is learnt from 4 on" in capsys.readouterr().err
-    assert read_reference(reference).costs == {}
-    assert main(["check", str(run), "--against", str(reference)]) == 0
-    assert f"delayed: no cost is judged: it {what}" in capsys.readouterr().err
-
-
-def test_a_run_that_measured_a_cost_that_the_reference_lacks_fails(made: Path, reference: Reference) -> None:
-    verdict = check(read_run(made), reference.model_copy(update={"costs": {}}))
-    assert [one.where for one in verdict.failures] == ["delayed / cost"]
-    assert "learn a new reference" in verdict.failures[0].text
-
-
-def _result(change: Callable[[Any], None]) -> Callable[[Any], None]:
-    return lambda reference: change(reference["results"][0])
-
-
-HOLLOW: dict[str, tuple[Callable[[Any], None], str]] = {
-    "no value": (_result(lambda r: r.update(metrics={})), "results.0.metrics"),
-    "a value beyond 1": (_result(lambda r: r["metrics"]["mAcc"].update(value=7e300)), "'mAcc' is 7e\\+300"),
-    "a result twice": (lambda r: r["results"].append(r["results"][0]), "a method stands twice under one protocol"),
-    "an endless cost": (lambda r: r["costs"]["delayed"].update(whole=7e300), "costs.delayed.whole"),
-    "costs without their unit": (lambda r: r.update(calibration_ms=None), "costs without calibration_ms"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", HOLLOW)
-def test_a_reference_that_holds_nothing_or_the_impossible_is_none(
-    name: str, reference: Reference, tmp_path: Path
-) -> None:
-    change, said = HOLLOW[name]
-    value = reference.model_dump(mode="json")
-    change(value)
-    (tmp_path / "r.json").write_text(json.dumps(value))
-    with pytest.raises(ConfigError, match=rf"is no reference of this version: .*{said}"):
-        read_reference(tmp_path / "r.json")

@@ -122,11 +122,8 @@ def test_the_challenge_may_lie_elsewhere_and_its_scenes_are_known_without_it(tmp
     [
         (TRUTH, POINTER, f"{SCENE}.txt: is a pointer of Git LFS, not the file; run git lfs pull in its repository"),
         (TRUTH, "0\n1\n", f"{SCENE}.txt has 2 lines, the mesh has 8 vertices; both must be of one scene"),
-        (TRUTH, "0\n" * 7 + "-1\n", f"{SCENE}.txt:8: -1 is no number of an object; copy it from"),
-        (QUERIES, "video_id,query\n", "queries_development_scenes.csv: the first line must be video_id,visit_id,query"),
         (QUERIES, "video_id,visit_id,query\n1,2,a\n", "row 2: expected video_id,visit_id,query, the video of eight"),
         (QUERIES, f"video_id,visit_id,query\n{SCENE},2,a\n{SCENE},2,b\n", f"row 3: scene {SCENE} has two queries"),
-        (QUERIES, f"video_id,visit_id,query\n{SCENE},2,\n", "row 2: '' is no query; expected the words to search for"),
     ],
 )
 def test_a_fault_in_the_challenges_files_is_one_line(name: str, content: str, message: str, tmp_path: Path) -> None:
@@ -140,15 +137,12 @@ def test_a_fault_in_the_challenges_files_is_one_line(name: str, content: str, me
     ("name", "content", "message"),
     [
         ("lowres_wide.traj", "1 2 3\n", "lowres_wide.traj line 1: has 3 values; expected time, axis-angle and transl"),
-        ("lowres_wide.traj", "1 nan 0 0 0 0 0\n", "line 1: is 1 nan 0 0 0 0 0; expected seconds, radians and metres"),
-        ("lowres_wide.traj", "\n", "lowres_wide.traj: has no pose; copy the file again"),
         ("lowres_wide.traj", "900 0 0 0 0 0 0\n", "3 images have no pose nearer than 0.3 s in lowres_wide.traj"),
         (
             f"lowres_wide_intrinsics/{SCENE}_{time_of(0)}.pincam",
             "64 48 60\n",
             "pincam: has 3 values; expected one line",
         ),
-        (f"lowres_wide_intrinsics/{SCENE}_{time_of(0)}.pincam", "6.5 48 60 60 1 1\n", "the image has 6.5x48 pixels"),
         (
             f"lowres_wide_intrinsics/{SCENE}_{time_of(0)}.pincam",
             "32 24 60 60 1 1\n",

@@ -83,14 +83,9 @@ def change(walk: Path, edit: Callable[[Any], object]) -> None:
     ("edit", "words"),
     [
         (lambda c: c.pop("levels"), "has no list 'levels'"),
-        (lambda c: c["objects"].clear(), "has no object"),
         (lambda c: c["objects"].insert(0, 5), "objects[0] is 5"),
-        (lambda c: c["objects"][1].update(id=-1), "objects[1]: 'id' is -1"),
         (lambda c: c["objects"][1].update(obb_dims=[1, -1, 1]), "are no centre and sides of a box"),
-        (lambda c: c["regions"][0].update(floor_id=9), "'floor_id' names no level"),
         (lambda c: c["regions"][0].update(bev_region_points=[[0, 1]]), "has the shape (1, 2)"),
-        (lambda c: c["regions"][0].update(min_height=True), "'min_height' is True; expected metres"),
-        (lambda c: c["levels"][0].update(upper=1e99), "'upper' is 1e+99"),
     ],
 )
 def test_a_damaged_scene_info_is_one_line_that_says_where(
@@ -105,12 +100,8 @@ def test_a_damaged_scene_info_is_one_line_that_says_where(
     ("name", "content", "words"),
     [
         (f"pose/{SHORT}_000001.txt", None, r"pose/..._000001.txt is missing"),
-        (f"pose/{SHORT}_000001.txt", "1 2 3", "has 3 values"),
         (f"pose/{SHORT}_000001.txt", " ".join(["2"] * 16), "is no rigid pose"),
-        (f"pose/{SHORT}_000001.txt", " ".join(["nan"] * 16), "is no rigid pose"),
-        (f"rgb/{SHORT}_000001.png", None, r"rgb/..._000001.png is missing"),
         ("depth/notes.txt", "x", "belongs to no frame"),
-        ("objects/7.ply", None, "objects/7.ply"),
         ("objects/7.ply", "ply", "objects/7.ply"),
     ],
 )
@@ -125,7 +116,6 @@ def test_a_damaged_file_of_a_walk_is_one_line(
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("ids\n", "does not begin with 'HM3D Semantic Annotations'"),
         ("HM3D Semantic Annotations\n3,0A0B0C,chair\n", ":2: is '3,0A0B0C,chair'"),
         ('HM3D Semantic Annotations\n3,0A0B0C,"chair",5\n3,0A0B0C,"wall",5\n', ":3: object 3 stands there twice"),
         ('HM3D Semantic Annotations\n3,0A0B0C,"sofa, old",5\n', "object 3 is not that of the scene's .semantic.txt"),
@@ -164,15 +154,10 @@ def test_objects_come_in_the_order_of_their_files_names_as_the_original_loads_th
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
-        ("floors/0.json", "{", "not JSON"),
         ("floors/0.json", "[]", "is no JSON object"),
-        ("floors/0.json", '{"vertices": [1, 2]}', "expected corners of a box"),
         ("rooms/0_0.json", '{"room_height": [1], "room_zero_level": 0}', "must be one number each"),
-        ("rooms/0_0.ply", None, "has no .ply beside it"),
         ("objects/0_0_0.json", None, "has no .json beside it"),
         ("objects/0_0_0.json", '{"embedding": "x"}', "'embedding' is no list of numbers"),
-        ("objects/0_0_0.json", '{"name": 5}', "'name' is 5"),
-        ("objects/3_1_0.json", "{}", "has no .ply beside it"),
     ],
 )
 def test_a_damaged_scene_graph_is_one_line(tmp_path: Path, name: str, content: str | None, words: str) -> None:

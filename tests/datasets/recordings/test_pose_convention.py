@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.types import Float64Array, Frame
-from su3d_bench.datasets.recordings.pose_convention import FLIP, judge_convention, judge_scene
+from su3d_bench.datasets.recordings.pose_convention import FLIP, judge_convention
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 
 Reading = Callable[[Float64Array], Float64Array]
@@ -37,9 +37,7 @@ def read_as(frames: Sequence[Frame], reading: Reading, depth_factor: float = 1.0
     ]
 
 
-@pytest.mark.parametrize(
-    ("scene", "noise"), [("living0", 0), ("living0", 2), ("bathroom0", 1), ("bathroom0", 2), ("kitchen1", 1)]
-)
+@pytest.mark.parametrize(("scene", "noise"), [("living0", 0), ("bathroom0", 2)])
 def test_a_right_reading_is_never_refused(scene: str, noise: int) -> None:
     frames = walk(scene, noise)
     for stride in (1, 4, 15):
@@ -63,7 +61,7 @@ def test_a_wrong_reading_of_the_poses_is_named(scene: str, noise: int, reading: 
     assert finding.share_otherwise > finding.share_as_read + 0.2
 
 
-@pytest.mark.parametrize("factor", [0.001, 0.1, 0.125, 0.2, 5.0, 8.0, 10.0, 1000.0])
+@pytest.mark.parametrize("factor", [0.001, 0.125, 8.0, 1000.0])
 def test_a_wrong_unit_of_depth_is_named(factor: float) -> None:
     finding = judge_convention(read_as(walk("living0", 2), lambda pose: pose, factor))
     assert finding is not None and finding.motion == "as read"
@@ -71,16 +69,6 @@ def test_a_wrong_unit_of_depth_is_named(factor: float) -> None:
         assert finding.depth_factor == pytest.approx(1 / factor)
     else:
         assert finding.depth_factor < 1
-
-
-def test_the_line_says_which_reading_agrees_and_both_shares() -> None:
-    rooms = Rooms(Path("unused"))
-    verdict = judge_scene(rooms, "living0", read_as(walk("living0", 0), inverse))
-    assert verdict is not None and verdict.is_wrong
-    assert verdict.line.startswith("rooms/living0: poses and depth contradict each other: ")
-    assert verdict.line.endswith("% with the inverse poses; check whether they are camera-to-world or world-to-camera")
-    verdict = judge_scene(rooms, "living0", read_as(walk("living0", 0), lambda pose: pose, 0.1))
-    assert verdict is not None and verdict.line.endswith("with depth times 10; check the unit of the depth")
 
 
 @pytest.mark.parametrize("reading", [lambda pose: pose, inverse, lambda pose: pose @ FLIP])

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import doctest
 import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from replica_scene import QUADS, TWO_OBJECTS, info_table, write_original, write_render
 
-from su3d_bench.core import geometry
 from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.replica.dataset import Replica
 
@@ -66,23 +63,13 @@ def test_a_box_is_turned_and_then_shifted_without_the_mesh(tmp_path: Path) -> No
     assert replica.status("room0").startswith("3 frames, 1 boxes of objects, no mesh (")
 
 
-def test_the_examples_of_the_geometry_hold() -> None:
-    found = doctest.testmod(geometry)
-    assert found.attempted and not found.failed
-
-
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         (box(rotation=(0, 0, 0, 0)), "'rotation' has the length 0; expected a unit quaternion x y z w"),
-        (box(rotation=(0, 0, 0, 2)), "'rotation' has the length 2; expected a unit quaternion"),
         (box(rotation=(0, 0, 1)), "'rotation' is 'list' of length 3; expected 4 numbers"),
-        (box(centre=(0, 0, "x\n")), "'center' is 'list' of length 3; expected 3 numbers"),
-        (box(translation=(float("inf"), 0, 0)), "'translation' holds 'inf'; expected numbers within"),
         (box(sizes=(1, -1, 1)), "'sizes' are [1.0, -1.0, 1.0]; expected 0 m or more"),
-        (box(sizes=(True, 1, 1)), "'sizes' is 'list' of length 3; expected 3 numbers"),
         ([1, 2], "'oriented_bbox' is incomplete"),
-        ("text", "'oriented_bbox' is incomplete"),
     ],
 )
 def test_each_damaged_box_is_one_clear_line(tmp_path: Path, content: Any, message: str) -> None:
@@ -101,12 +88,6 @@ def test_each_damaged_box_is_one_clear_line(tmp_path: Path, content: Any, messag
 FITTING = {0: box((0.5, 1, 0), (1, 2, 0)), 5: box((1.5, 1, 0), (1, 2, 0))}
 
 
-def test_a_whole_scene_has_no_problem(tmp_path: Path) -> None:
-    write_render(tmp_path)
-    write_boxes(tmp_path, FITTING)
-    assert list(Replica(tmp_path).problems("room0")) == []
-
-
 def test_face_centres_within_5_cm_of_a_box_are_inside_and_others_are_named(tmp_path: Path) -> None:
     write_render(tmp_path)
     # face centres of object 0 are at y = 0.5 and 1.5; the box ends at 1.46 and at 1.44
@@ -120,14 +101,6 @@ def test_face_centres_within_5_cm_of_a_box_are_inside_and_others_are_named(tmp_p
     ]
 
 
-def resized(name: str) -> Change:
-    return lambda root: cv2.imwrite(str(root / name), np.ones((4, 6, 3), np.uint8))
-
-
-def cut(name: str, n_bytes: int) -> Change:
-    return lambda root: (root / name).write_bytes((root / name).read_bytes()[:-n_bytes])
-
-
 def no_poses(root: Path) -> None:
     path = root / "Replica/room0/traj.txt"
     path.write_text("\n".join(["nan " * 16, *path.read_text().splitlines()[1:], "1 2 3"]) + "\n")
@@ -137,19 +110,15 @@ def no_poses(root: Path) -> None:
     ("change", "messages"),
     [
         (no_poses, ["traj.txt line 1: the pose holds 'nan'", "traj.txt line 4 has 3 values", "has 4 poses but"]),
-        (resized("Replica/room0/results/frame000001.jpg"), ["frame000001.jpg is 6x4 but cam_params.json says 12x8"]),
-        (cut("Replica/room0/results/frame000002.jpg", 5), ["results/frame000002.jpg: no image, or cut short"]),
-        (with_text("Replica/room0/results/depth000000.png", b""), ["results/depth000000.png: no image, or cut short"]),
         (with_text("Replica/cam_params.json", "{}"), ["cam_params.json: has no table 'camera'"]),
         (lambda root: (root / "Replica/room0/results/depth000001.png").unlink(), ["depth000001.png is missing"]),
         (
             lambda root: (root / "replica_v1/room_0/habitat/info_semantic.json").unlink(),
             ["habitat/info_semantic.json is missing in"],
         ),
-        (with_text("replica_v1/room_0/habitat/mesh_semantic.ply", b"ply\n"), ["mesh_semantic.ply: its header has"]),
         (with_text("replica_v1/room_0/habitat/info_semantic.json", b"{"), ["habitat/info_semantic.json: not JSON"]),
     ],
-)  # fmt: skip
+)
 def test_each_problem_of_a_scene_is_a_line_and_none_hides_another(
     tmp_path: Path, change: Change, messages: list[str]
 ) -> None:

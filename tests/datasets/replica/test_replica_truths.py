@@ -76,16 +76,11 @@ INSTANCES, CLASSES = "Replica/ground_truth/room0.txt", "Replica/semantic_gt/room
     ("variant", "text", "message"),
     [
         ("openmask3d", b"20001\n" * 3, "room0.txt: has 3 labels, room0_mesh.ply 2 and habitat/mesh_semantic.ply 9"),
-        ("openmask3d", b"", "room0.txt: has 0 labels, room0_mesh.ply 2 and habitat/mesh_semantic.ply 9 vertices"),
         ("openmask3d", b"20001\n102005\n", "room0.txt: 102005 is of class 102, Replica has 1 to 101; an inst"),
-        ("openmask3d", b"20001\n\n", "room0.txt: line 2 is ''; expected one whole number a line"),
-        ("openmask3d", b"20001\n99999999999\n", "room0.txt: line 2 is '99999999999'; expected one whole number"),
         ("openmask3d", b"20001\n\x1b[31m\n", r"room0.txt: line 2 is '\x1b[31m'; expected one whole number"),
-        ("openmask3d", b"2" * 3_000_000, "room0.txt: line 1 is '22222222222222222222'; expected one whole number"),
-        ("ovo-51", b"20\n52\n20\n", "room0.txt: has 3 labels, room0_mesh.ply 2 and"),
         ("ovo-51", b"20\n1\n", "room0.txt: holds the class 1, none of the 51 Replica ids"),
     ],
-)  # fmt: skip
+)
 def test_each_fault_of_a_label_file_is_one_clear_line(tmp_path: Path, variant: str, text: bytes, message: str) -> None:
     write_render(tmp_path)
     write_mesh(tmp_path / "Replica/room0_mesh.ply", 2)

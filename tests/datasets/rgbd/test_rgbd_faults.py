@@ -46,16 +46,11 @@ def camera_with(**values: Any) -> Change:
     ("change", "message"),
     [
         (keys(depth=None, dept="a"), "rgbd.toml:6: unknown key 'dept'; did you mean 'depth'?"),
-        (keys(depth_unit_m="mm"), "rgbd.toml:6: depth_unit_m = 'mm': input should be a valid number"),
         (keys(colour="**/*.png"), "expected a pattern with one {index}, or with * or ?"),
-        (keys(colour="colour/{index}.jpg"), "rgbd.toml: no file matches 'colour/{index}.jpg'"),
-        (lambda folder: (folder / "rgbd.toml").write_text("colour = "), "rgbd.toml: not valid TOML: Invalid value"),
-        (lambda folder: (folder / "data/colour/frame-01.png").touch(), "frame-01.png and frame-1.png have one number"),
         (log_with(1, " ".join("0" * 16)), 'expected three integers, or set trajectory_format = "matrix"'),
         (camera_with(width=640), "frame-0.png is 12x8, the camera file says 640x8; intrinsics"),
-        (file("intrinsics.txt", "6 0 5", intrinsics=None, intrinsics_file="intrinsics.txt"), "has 3 values; expected"),
     ],
-)  # fmt: skip
+)
 def test_each_fault_is_one_clear_line(tmp_path: Path, change: Change, message: str) -> None:
     change(write_scene(tmp_path))
     with pytest.raises(DataError) as caught:
@@ -76,8 +71,6 @@ def test_a_link_out_of_the_folder_is_not_followed(tmp_path: Path, name: str) -> 
 
 TRUE_AND_DESCRIBED = [
     (("camera_to_world", "opencv"), ("world_to_camera", "opencv"), 'with pose_direction = "camera_to_world"; set'),
-    (("camera_to_world", "opencv"), ("camera_to_world", "opengl"), 'with camera_axes = "opencv"; set that in'),
-    (("world_to_camera", "opengl"), ("camera_to_world", "opengl"), 'with pose_direction = "world_to_camera"; set'),
     (("world_to_camera", "opencv"), ("camera_to_world", "opengl"),
      'with pose_direction = "world_to_camera" and camera_axes = "opencv"; set that'),
     (("world_to_camera", "opengl"), ("world_to_camera", "opengl"), None),
@@ -134,13 +127,7 @@ def write_room(root: Path, direction: str, axes: str) -> Path:
 
 @pytest.mark.parametrize(
     ("header", "said"),
-    [
-        ("World2CamPose", "world_to_camera"),
-        ("# camera-to-world", "camera_to_world"),
-        ("T_w2c", "world_to_camera"),
-        ("Cam2World matrix of frame 7", "camera_to_world"),
-        ("pose", None),
-    ],
+    [("World2CamPose", "world_to_camera"), ("# camera-to-world", "camera_to_world"), ("pose", None)],
 )
 def test_a_header_before_a_pose_is_no_number_and_one_that_says_otherwise_is_named(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, header: str, said: str | None

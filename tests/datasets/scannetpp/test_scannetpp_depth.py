@@ -5,8 +5,6 @@ from __future__ import annotations
 import base64
 import json
 import zlib
-from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +13,7 @@ from places import CASES
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.scannetpp.images import (
-    N_KEPT,
     DepthFile,
-    ForwardReader,
     NotLz4,
     millimetres,
     packed_metres,
@@ -87,22 +83,3 @@ def test_what_is_packed_is_unpacked_to_the_same_millimetres() -> None:
 def test_a_file_of_no_form_is_one_line(tmp_path: Path, content: bytes) -> None:
     with pytest.raises(DataError, match=r"^here: depth.bin: (is none of the forms|ends within an image)"):
         opened(tmp_path / "depth.bin", content).values(1)
-
-
-def test_a_forward_reader_begins_anew_only_for_what_it_has_not_kept() -> None:
-    begun, unpacked = [], []
-
-    def begin() -> Iterator[Callable[[], int]]:
-        begun.append(1)
-        return iter([partial(unpack, k) for k in range(100)])
-
-    def unpack(k: int) -> int:
-        unpacked.append(k)
-        return k * k
-
-    reader = ForwardReader(begin, frozenset(range(0, 100, 5)))
-    assert [reader.at(k) for k in (10, 5, 0, 15)] == [100, 25, 0, 225]
-    assert len(begun) == 1 and unpacked == [0, 5, 10, 15]
-    assert reader.at(5 * (N_KEPT + 3)) == (5 * (N_KEPT + 3)) ** 2
-    assert reader.at(0) == 0 and len(begun) == 2
-    assert reader.at(100) is None

@@ -22,7 +22,7 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.presence import MEASURES, SAMPLINGS, PresenceCounts, measured, relevancies
 from su3d_bench.metrics.questions.score import AskedThing, PresenceTruth
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, plain_json, score_scene, unpack_scores
-from su3d_bench.questions.presence import absent_names, counted_rooms, drawn, presence_questions
+from su3d_bench.questions.generated import absent_names, counted_rooms, drawn, presence_questions
 from su3d_bench.questions.scene_map import is_called, is_room_surface, known_objects, plain_name
 
 RULES = load_protocol("rooms-presence")

@@ -5,9 +5,6 @@ from __future__ import annotations
 import doctest
 import hashlib
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,13 +14,8 @@ from su3d_bench.core.types import UInt8Array
 from su3d_bench.datasets.rooms.classes import MATERIALS
 from su3d_bench.perception.embedded import encoder as embedded_encoder
 from su3d_bench.perception.embedded import lexicon
-from su3d_bench.perception.embedded import text as embedded_text
 from su3d_bench.perception.embedded.encoder import IMAGE_FILE, IMAGE_SIZE, TEXT_FILE, EmbeddedEncoder, log_size, shrink
-from su3d_bench.perception.embedded.text import (
-    DIM,
-    fnv1a,
-    token_ids,
-)
+from su3d_bench.perception.embedded.lexicon import DIM, token_ids
 
 FOLDER = Path(embedded_encoder.__file__).parent / "weights"
 TEXTS = ("an image of a chair", "plant on table", "table on plant", "a green towel", "place to sit")
@@ -98,23 +90,8 @@ def test_weights_need_nothing_but_standard_operators() -> None:
         assert [(entry.domain, entry.version) for entry in model.opset_import] == [("", 17)]
 
 
-def test_the_encoder_leaves_no_file_behind_not_even_for_its_makers(tmp_path: Path) -> None:
-    """ONNX Runtime tells its makers of every session, and for that keeps files in $TMPDIR and the user's cache."""
-    code = (
-        "from su3d_bench.perception.embedded.encoder import EmbeddedEncoder\n"
-        "print(EmbeddedEncoder().encode_texts(['chair']).shape)"
-    )
-    here = {"HOME": str(tmp_path), "TMPDIR": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    environment = here | {"PATH": os.environ["PATH"], "PYTHONDONTWRITEBYTECODE": "1"}  # no CI: it is silent there
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
-    )
-    assert done.stdout == "(1, 128)\n"
-    assert list(tmp_path.rglob("*")) == []
-
-
 def test_examples_in_docstrings_run() -> None:
-    assert doctest.testmod(embedded_text).failed == 0
+    assert doctest.testmod(lexicon).failed == 0
 
 
 @pytest.mark.parametrize(
@@ -151,13 +128,6 @@ def test_words_that_no_caption_holds_are_named() -> None:
 
 def test_the_words_for_materials_are_those_of_the_rooms() -> None:
     assert lexicon.MATERIALS == MATERIALS
-
-
-def test_hash_is_fnv1a() -> None:
-    # Test vectors of the FNV reference, http://www.isthe.com/chongo/tech/comp/fnv
-    assert fnv1a("") == 0x811C9DC5
-    assert fnv1a("a") == 0xE40C292C
-    assert fnv1a("foobar") == 0xBF9CF968
 
 
 @pytest.mark.slow

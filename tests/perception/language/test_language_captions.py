@@ -12,8 +12,7 @@ from scored_room import instances
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import Instances
 from su3d_bench.perception.language.captioner import Captioner
-from su3d_bench.perception.language.chat import ChatRequest, Reply
-from su3d_bench.perception.language.config import LanguageConfig
+from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig, Reply
 from su3d_bench.perception.language.parsing import Described, answered, chosen_name, described
 from su3d_bench.questions.refining import ModelRefiner, TopNames, top_names, vote
 

@@ -12,7 +12,7 @@ import pytest
 from tiny_models import N_TOKENS, blocks, needs_models, write_clip_tokenizer
 
 from su3d_bench.core.types import BoolArray
-from su3d_bench.perception.crops import mask_boxes
+from su3d_bench.perception.cache import mask_boxes
 from su3d_bench.perception.models.encoders.images import (
     normalised_bytes,
     resized,

@@ -14,7 +14,6 @@ from tiny_models import blocks
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, UInt8Array
-from su3d_bench.perception.embedded.naming import vocabulary
 from su3d_bench.perception.models.catalogue import model_entry
 from su3d_bench.perception.models.files import ModelFiles
 from su3d_bench.perception.models.masks.tagging import (
@@ -64,13 +63,6 @@ def test_tags_that_contain_a_stop_word_go_and_added_ones_come_last() -> None:
     assert chosen_tags(found, STOP_WORDS, (*ADDED_TAGS, *BACKGROUND_TAGS)) == expected
     assert chosen_tags(found, (), ()) == ("bed", "lamp", "bedroom", "Blue", "wall lamp")
     assert len(STOP_WORDS) == 26
-
-
-def test_a_word_list_is_read_without_empty_lines_and_remarks(tmp_path: Path) -> None:
-    path = tmp_path / "words.txt"
-    path.write_text("# things\nbed\n\n  coffee table \n")
-    assert read_word_list(path) == ("bed", "coffee table")
-    assert read_word_list(None) == vocabulary()
 
 
 @pytest.mark.parametrize(

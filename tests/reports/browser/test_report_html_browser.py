@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from chromium import Chromium, find_chromium
-from looks import WHOLE, complaints
-from runs_page import choose, column, open_maps, options, picture, press, text_of, type_into
+from looks import complaints
+from runs_page import choose, column, open_maps, options, picture, press, text_of
 
 pytestmark = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
 MIDDLE_SECTIONS = ("Scenes", "Classes", "Confusion", "Errors", "Timing", "Compare")
@@ -49,45 +48,6 @@ def test_a_header_sorts_and_turns_by_mouse_and_keyboard(browser: Chromium) -> No
     browser.call("Input.dispatchKeyEvent", {"type": "keyDown", "key": "Enter", "text": "\r"})
     browser.call("Input.dispatchKeyEvent", {"type": "keyUp", "key": "Enter"})
     assert [float(value.split()[0]) for value in column(browser, "summary", 1)] == sorted(values)
-
-
-def test_a_filter_leaves_the_rows_that_hold_its_text(browser: Chromium) -> None:
-    everything = column(browser, "classes", 0)
-    type_into(browser, "#classes input", "SOFA")
-    assert column(browser, "classes", 0) == ["sofa"]
-    assert text_of(browser, "#classes .count") == f"1 of {len(everything)} rows"
-    type_into(browser, "#classes input", "")
-    assert column(browser, "classes", 0) == everything
-
-
-def test_swapping_the_sides_turns_the_sign(browser: Chromium) -> None:
-    sides = options(browser, "compare", "A")
-    choose(browser, "compare", "A", next(one for one in sides if "noise" not in one and "one" in one))
-    choose(browser, "compare", "B", next(one for one in sides if "noise" in one))
-    before = column(browser, "compare", 6)[0].split()[0]
-    browser.run("[...document.querySelectorAll('#compare button')].find((one) => one.textContent === 'Swap').click()")
-    after = column(browser, "compare", 6)[0].split()[0]
-    assert before[0] == "\N{MINUS SIGN}"
-    assert after == "+" + before[1:]
-    choose(browser, "compare", "A", sides[0])
-    choose(browser, "compare", "B", sides[0])
-    assert "Choose two different sides" in text_of(browser, "#compare [role=status]")
-
-
-def test_every_control_has_a_name_and_the_page_no_sideways_scroll_on_a_phone(
-    browser: Chromium, runs_page: Path, tmp_path: Path
-) -> None:
-    nameless = browser.run(
-        "[...document.querySelectorAll('select, input, button, canvas')].filter((one) => !(one.labels?.length"
-        " || one.getAttribute('aria-label') || one.textContent.trim())).length"
-    )
-    assert nameless == 0
-    with Chromium(tmp_path / "phone", width=390, height=844, is_phone=True) as phone:
-        phone.open(runs_page)
-        phone.until(WHOLE)
-        assert phone.run("document.documentElement.scrollWidth <= innerWidth")
-        assert phone.run("document.querySelectorAll('section.part').length") == 10
-        assert complaints(phone) == []
 
 
 # Every control of the page, by its section, kind and name; column headers and rows of tables apart.

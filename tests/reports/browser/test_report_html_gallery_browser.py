@@ -146,15 +146,6 @@ def anew(browser: Chromium) -> Iterator[Chromium]:
     assert [line for line in browser.faults() if "GL" not in line] == []
 
 
-def options(browser: Chromium, label: str) -> list[str]:
-    found: list[str] = browser.run(f"[...{FIELD.format(label=label)}.options].map((one) => one.text)")
-    return found
-
-
-def chosen(browser: Chromium, label: str) -> str:
-    return str(browser.run(f"{FIELD.format(label=label)}.selectedOptions[0].text"))
-
-
 def choose(browser: Chromium, label: str, text: str) -> None:
     browser.run(
         f"{{ const field = {FIELD.format(label=label)}; field.value = [...field.options].find((one) => one.text === "
@@ -169,25 +160,8 @@ def shown(browser: Chromium, what: str = "") -> list[str]:
     return found
 
 
-def costs(browser: Chromium) -> list[float]:
-    return [float(text.replace("\N{MINUS SIGN}", "-")) for text in shown(browser, ".cost b")]
-
-
 def click(browser: Chromium, selector: str) -> None:
     browser.run(f"document.querySelector({json.dumps(selector)}).click()")
-
-
-@needs_browser
-def test_cards_are_sorted_by_the_cost_in_the_chosen_metric(anew: Chromium) -> None:
-    for metric in options(anew, "Metric"):
-        choose(anew, "Metric", metric)
-        found = costs(anew)
-        assert found == sorted(found, reverse=True)
-        assert all(text.endswith(metric) for text in shown(anew, ".cost")) or metric in shown(anew, ".cost")[0]
-    photo = "document.querySelector('#gallery .card img')"
-    anew.run(f"{photo}.scrollIntoView()")
-    anew.until(f"{photo}.complete && {photo}.naturalWidth === {PHOTO[0]}")
-    assert "Frame" in str(anew.run(f"{photo}.alt"))
 
 
 @needs_browser

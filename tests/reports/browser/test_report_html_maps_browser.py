@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import chromium
 import pytest
 from chromium import Chromium, find_chromium
 from looks import complaints
-from runs_page import SELECT, choose, column, headers, open_maps, options, picture, press, text_of
+from runs_page import SELECT, choose, column, headers, open_maps, options, picture, text_of
 
 pytestmark = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
 
@@ -43,39 +42,6 @@ def test_every_colouring_draws_another_picture_and_says_what_it_means(browser: C
     choose(browser, "maps", "Colour by", kinds[0])
     assert browser.run(f"{SELECT.format(part='maps', label='Text')}.closest('.field').hidden")
     assert headers(browser, "maps") == ["Instance", "Score", "Points"]
-
-
-def pointer(browser: Chromium, kind: str, x: float, y: float, **more: Any) -> None:
-    values = {"type": kind, "x": x, "y": y, "button": "left", "buttons": 1, "clickCount": 1, **more}
-    browser.call("Input.dispatchMouseEvent", values)
-
-
-def middle(browser: Chromium) -> tuple[float, float]:
-    box = browser.run(
-        "(() => { const c = document.querySelector('#maps canvas'); c.scrollIntoView({ block: 'center' });"
-        " const b = c.getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]; })()"
-    )
-    return box[0], box[1]
-
-
-def test_the_mouse_turns_moves_zooms_and_picks(browser: Chromium) -> None:
-    open_maps(browser)
-    x, y = middle(browser)
-    seen = [picture(browser)]
-    for more in ({}, {"modifiers": 8}, {"button": "right", "buttons": 2}):
-        pointer(browser, "mousePressed", x, y, **more)
-        pointer(browser, "mouseMoved", x + 30, y + 20, **more)
-        pointer(browser, "mouseReleased", x + 30, y + 20, **more)
-        seen.append(picture(browser))
-    browser.run("document.querySelector('#maps canvas').focus()")
-    browser.call("Input.dispatchMouseEvent", {"type": "mouseWheel", "x": x, "y": y, "deltaX": 0, "deltaY": -50})
-    seen.append(picture(browser))
-    assert len(set(seen)) == 5
-    press(browser, "#maps canvas", "Escape", "Home")
-    pointer(browser, "mousePressed", x, y)
-    pointer(browser, "mouseReleased", x, y)
-    browser.until("document.querySelector('#maps .detail h3') !== null")
-    assert browser.run("document.querySelectorAll('#maps tr[aria-selected=true]').length") == 1
 
 
 def test_without_webgl_the_page_says_so_and_keeps_its_numbers(

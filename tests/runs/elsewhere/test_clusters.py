@@ -109,6 +109,7 @@ def test_a_machine_that_dies_in_mid_run_costs_no_scene_and_no_byte(cluster: Any)
     assert_equal_runs("inline", "ray")
 
 
+@pytest.mark.proof
 def test_a_scene_that_takes_every_worker_down_fails_alone_after_its_retries(
     cluster: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:

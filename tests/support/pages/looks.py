@@ -16,13 +16,9 @@ from chromium import Chromium
 SCRIPT = Path(__file__).with_name("looks.js").read_text(encoding="utf-8")
 PHONE, DESKTOP = (390, 844), (1300, 900)
 LEAST_TARGET, LEAST_TEXT = 24, 12  # px on a phone: WCAG 2.5.8; what is smaller is not read at arm's length
-IDLE_MS = 400
-MOST_FRAMES = 6  # that a page at rest may ask for in that time
 # A page is at rest once its sections are made and its views are drawn.
 REST = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(done))))"
 WHOLE = "!document.querySelector('[aria-busy=true]')"
-COUNT_FRAMES = """(() => { const ask = window.requestAnimationFrame.bind(window); window.nFrames = 0;
-  window.requestAnimationFrame = (work) => { window.nFrames += 1; return ask(work); }; })()"""
 # A browser without a graphics card says of itself that it reads canvases slowly.
 OF_THE_BROWSER = "GL Driver Message (OpenGL, Performance"
 
@@ -50,24 +46,21 @@ def unfold(browser: Chromium) -> None:
 
 
 @contextmanager
-def seen_as(
-    browser: Chromium, *, scheme: str = "light", size: tuple[int, int] = DESKTOP, media: str = "", motion: str = ""
-) -> Iterator[None]:
-    """The page in light or dark, on a screen of this size, on paper, or for who wants nothing to move."""
-    features = {"prefers-color-scheme": scheme, "prefers-reduced-motion": motion}
+def seen_as(browser: Chromium, *, scheme: str = "light", size: tuple[int, int] = DESKTOP) -> Iterator[None]:
+    """The page in light or dark, on a screen of this size."""
 
-    def show(features: Mapping[str, str], media: str, size: tuple[int, int]) -> None:
-        named = [{"name": name, "value": value} for name, value in features.items()]
-        browser.call("Emulation.setEmulatedMedia", {"media": media, "features": named})
+    def show(scheme: str, size: tuple[int, int]) -> None:
+        features = [{"name": "prefers-color-scheme", "value": scheme}]
+        browser.call("Emulation.setEmulatedMedia", {"media": "", "features": features})
         shape = {"width": size[0], "height": size[1], "deviceScaleFactor": 1, "mobile": size == PHONE}
         browser.call("Emulation.setDeviceMetricsOverride", shape)
         browser.run(REST)
 
-    show(features, media, size)
+    show(scheme, size)
     try:
         yield
     finally:
-        show({}, "", DESKTOP)
+        show("", DESKTOP)
 
 
 def pale_in_light(browser: Chromium) -> list[str]:
@@ -81,21 +74,6 @@ def pale_in_dark(browser: Chromium) -> list[str]:
     with seen_as(browser, scheme="dark"):
         found: list[str] = look(browser, "paleTexts()")
         return found
-
-
-def light_in_dark(browser: Chromium) -> list[str]:
-    """What stays light where everything is dark: grounds that are as they were, and the page itself."""
-    with seen_as(browser):
-        before = {(text, tuple(colour)) for text, colour, _ in look(browser, "grounds()")}
-    with seen_as(browser, scheme="dark"):
-        found = [
-            f"{text}: stays light in the dark"
-            for text, colour, luminance in look(browser, "grounds()")
-            if luminance > 0.5 and (text, tuple(colour)) in before
-        ]
-        if look(browser, "isLight()"):
-            found.append("the page is light in the dark")
-        return list(dict.fromkeys(found))
 
 
 def on_a_phone(browser: Chromium) -> list[str]:
@@ -112,27 +90,6 @@ def on_a_desktop(browser: Chromium) -> list[str]:
     with seen_as(browser):
         found: list[str] = look(browser, f"sideways({DESKTOP[0]})")
         return [*found, *look(browser, "cutTexts()")]
-
-
-def on_paper(browser: Chromium) -> list[str]:
-    """What a printed page would leave out, or show too pale."""
-    with seen_as(browser, media="print"):
-        found: list[str] = look(browser, "unprinted()")
-        return [*found, *look(browser, "paleTexts()")]
-
-
-def moving(browser: Chromium) -> list[str]:
-    """What moves though nothing shall."""
-    counted = browser.call("Page.addScriptToEvaluateOnNewDocument", {"source": COUNT_FRAMES})
-    with seen_as(browser, motion="reduce"):
-        browser.reload("window.nFrames !== undefined")
-        unfold(browser)
-        found: list[str] = look(browser, "moving()")
-        n = browser.run(
-            f"new Promise((done) => {{ const n = nFrames; setTimeout(() => done(nFrames - n), {IDLE_MS}); }})"
-        )
-        browser.call("Page.removeScriptToEvaluateOnNewDocument", counted)
-        return found + ([f"the page at rest draws {n} times in {IDLE_MS} ms"] if n > MOST_FRAMES else [])
 
 
 def structure(browser: Chromium) -> list[str]:
@@ -154,7 +111,7 @@ def structure(browser: Chromium) -> list[str]:
 def by_keyboard(browser: Chromium) -> list[str]:
     """What Tab does not reach once and in the order of the page, and what only a mouse can do."""
     with seen_as(browser):
-        found: list[str] = look(browser, "order()") + _mouse_only(browser)
+        found: list[str] = look(browser, "order()")
         browser.run("document.activeElement.blur(); getSelection().removeAllRanges(); scrollTo(0, 0)")
         names: list[str] = look(browser, "list()")
         at = (
@@ -189,42 +146,11 @@ def by_keyboard(browser: Chromium) -> list[str]:
         return found
 
 
-def _mouse_only(browser: Chromium) -> list[str]:
-    """Elements that a mouse can click and that no key reaches or answers."""
-    root = browser.call("Runtime.evaluate", {"expression": "document.body"})["result"]["objectId"]
-    heard = browser.call("DOMDebugger.getEventListeners", {"objectId": root, "depth": -1})["listeners"]
-    kinds: dict[int, set[str]] = {}
-    for one in heard:
-        kinds.setdefault(one["backendNodeId"], set()).add(one["type"])
-    found = []
-    for node, types in kinds.items():
-        if not types & {"click", "dblclick", "mousedown", "pointerdown", "mouseup"}:
-            continue
-        element = browser.call("DOM.resolveNode", {"backendNodeId": node})["object"]["objectId"]
-        body = (
-            "function (hasKeys) { const own = 'a[href], button, select, input, textarea, summary, label, option';"
-            " if (!looks.isShown(this) || looks.isOff(this) || this.matches(own)) return '';"
-            " if (this.tabIndex >= 0) return hasKeys ? '' : `${looks.told(this)}: no key does what a click does`;"
-            " return this.querySelector(`${own}, [tabindex]`) ? ''"
-            " : `${looks.told(this)}: a click does something, and no key reaches it`; }"
-        )
-        arguments = [{"value": bool(types & {"keydown", "keyup", "keypress"})}]
-        values = {"objectId": element, "functionDeclaration": body, "arguments": arguments, "returnByValue": True}
-        found.append(browser.call("Runtime.callFunctionOn", values)["result"]["value"])
-    return sorted({one for one in found if one})
-
-
-# What a keyboard does with a control; what none of them is, is clicked.
-
-
 CHECKS: Mapping[str, Callable[[Chromium], list[str]]] = {
     "is a whole document": structure,
     "can be read in light": pale_in_light,
     "can be read in the dark": pale_in_dark,
-    "is dark in the dark": light_in_dark,
     "fits a desktop": on_a_desktop,
     "fits a phone": on_a_phone,
-    "can be printed": on_paper,
-    "rests where nothing shall move": moving,
     "can be reached by keyboard": by_keyboard,
 }

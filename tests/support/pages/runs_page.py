@@ -24,13 +24,6 @@ def choose(browser: Chromium, part: str, label: str, text: str) -> None:
     )
 
 
-def type_into(browser: Chromium, selector: str, value: str) -> None:
-    browser.run(
-        f"{{ const one = document.querySelector({json.dumps(selector)}); one.value = {json.dumps(value)};"
-        " one.dispatchEvent(new Event('input')); }"
-    )
-
-
 def text_of(browser: Chromium, selector: str) -> str:
     return str(browser.run(f"document.querySelector({json.dumps(selector)}).innerText"))
 

@@ -83,18 +83,9 @@ def write_truth(
     segments_file = f"{scan}_vh_clean_2.0.010000.segs.json"
     parameters = {"kThresh": "0.0100000000", "segMinVerts": "20"}
     write_json(folder / segments_file, {"params": parameters, "sceneId": scan, "segIndices": list(segments)})
-    write_json(
-        folder / f"{scan}.aggregation.json",
-        {
-            "sceneId": prefix + scan,
-            "appId": "Aggregator.v2",
-            "segGroups": [
-                {"id": one, "objectId": one, "segments": list(parts), "label": category}
-                for one, category, parts in groups
-            ],
-            "segmentsFile": prefix + segments_file,
-        },
-    )
+    rows = [{"id": one, "objectId": one, "segments": list(parts), "label": word} for one, word, parts in groups]
+    aggregation = {"sceneId": prefix + scan, "appId": "Aggregator.v2", "segGroups": rows}
+    write_json(folder / f"{scan}.aggregation.json", aggregation | {"segmentsFile": prefix + segments_file})
 
 
 def write_floor_truth(folder: Path, scan: str = SCAN, spacing_m: float = 0.1) -> None:

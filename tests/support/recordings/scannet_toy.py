@@ -67,10 +67,7 @@ def assert_is_the_toy(source: RgbdSource, digits: float) -> None:
         np.testing.assert_array_equal(source.depth(i), toy.depth(i))
     assert np.isneginf(source.pose(2)).all()
     ours, theirs = source.camera, toy.camera
-    assert (ours.colour_size, ours.depth_size, ours.depth_shift) == (
-        theirs.colour_size,
-        theirs.depth_size,
-        theirs.depth_shift,
-    )
+    for name in ("colour_size", "depth_size", "depth_shift"):
+        assert getattr(ours, name) == getattr(theirs, name)
     for name in ("colour_intrinsics", "depth_intrinsics", "colour_extrinsic", "depth_extrinsic"):
         np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), rtol=digits, atol=digits)

@@ -14,7 +14,7 @@ import pytest
 from painted import colour_perception
 from places import SCENES
 
-from su3d_bench.analysis.gate.reference import Reference, learn
+from su3d_bench.analysis.gate import Reference, learn
 from su3d_bench.cli.main import main
 from su3d_bench.core.digests import digest_file
 from su3d_bench.metrics.protocols.loading import load_protocol

@@ -11,7 +11,7 @@ from su3d_bench.baselines.conceptgraphs.objects import MapObject, MappingConfig,
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, Frame, SceneInfo
-from su3d_bench.perception.crops import mask_boxes
+from su3d_bench.perception.cache import mask_boxes
 
 SCENE = SceneInfo("made", "plates", 4, 1, "rendered-rooms", seed=7)
 WIDTH, HEIGHT, FOCAL = 96, 72, 72.0

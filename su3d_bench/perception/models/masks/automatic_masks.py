@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.core.system.devices import Batches
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, Regions, UInt8Array
-from su3d_bench.perception.crops import mask_boxes
+from su3d_bench.perception.cache import mask_boxes
 from su3d_bench.perception.models.masks.grounding_dino import suppress
 from su3d_bench.perception.models.masks.sam import (
     FULL_SIZE_AT_ONCE,

@@ -12,14 +12,12 @@ from pydantic import BaseModel, ConfigDict
 
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import BoolArray, Frame, Int64Array, Regions
-from su3d_bench.perception.cache import content_key
-from su3d_bench.perception.crops import mask_boxes
+from su3d_bench.perception.cache import CropsOnDemand, OfLastFrame, content_key, mask_boxes
 from su3d_bench.perception.models.encoders.images import Resample
 from su3d_bench.perception.models.masks.automatic_masks import AutomaticMaskConfig, AutomaticMasks
 from su3d_bench.perception.models.masks.grounding_dino import CONCEPTGRAPHS_BOXES, BoxConfig, GroundingDino
 from su3d_bench.perception.models.masks.sam import Sam
 from su3d_bench.perception.models.masks.tagging import ADDED_TAGS, BACKGROUND_TAGS, STOP_WORDS, Tagger, chosen_tags
-from su3d_bench.perception.regions import CropsOnDemand, OfLastFrame
 
 # Moves the digest when what lies between the networks changes.
 FRONT_END_VERSION = "2"

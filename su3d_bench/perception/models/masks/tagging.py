@@ -16,7 +16,7 @@ from su3d_bench.core.system.devices import make_deterministic, require
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.perception.cache import content_key
-from su3d_bench.perception.embedded.naming import PromptedWords, listed_words, vocabulary
+from su3d_bench.perception.embedded.lexicon import PromptedWords, listed_words, vocabulary
 from su3d_bench.perception.models.catalogue import ONNX_MANIFEST
 from su3d_bench.perception.models.encoders.images import Resample, normalised, resized
 from su3d_bench.perception.models.files import ModelFiles, bounded, read_weights, what_to_fetch

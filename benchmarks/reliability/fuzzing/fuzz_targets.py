@@ -302,8 +302,7 @@ def _verbs(folder: Path) -> Read:
 
 
 def _bundle(folder: Path) -> Read:
-    from su3d_bench.reproducing.bundle import bundle_runs
-    from su3d_bench.reproducing.verifying import verify_bundle
+    from su3d_bench.reproducing.bundle import bundle_runs, verify_bundle
 
     bundle_runs(folder / "a.zip", [_made_run()])
     return partial(verify_bundle, folder / "a.zip")

@@ -12,7 +12,7 @@ from types import MappingProxyType
 
 from su3d_bench.core.printing import escaped
 
-ROOT = Path(__file__).resolve().parents[3]
+ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 # Files of the repository's root that are pages of the site; README.md is its first where docs/ has no index.md.
 _README = "readme.md" if (DOCS / "index.md").is_file() else "index.md"

@@ -1,7 +1,10 @@
-"""What fuzzing found readers and the command line to stumble over: each is one clear line now."""
+"""Damage for the readers of the table of targets; ``python benchmarks fuzz`` is the long mode of the same."""
 
 from __future__ import annotations
 
+import json
+import os
+import random
 import time
 import zipfile
 from collections.abc import Callable
@@ -10,7 +13,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fuzz_targets import copied_run
+from cli_calls import Declined, called
+from fuzz_targets import TARGETS, copied_run
+from fuzz_words import ODD, drawn_words, verbs
+from fuzzing import ENDLESS, MOST_ADDRESSES_BYTES, Input, Sample, alarm
+from memory import bounded_addresses
 from numpy.typing import NDArray
 
 from su3d_bench.core.config import read_file
@@ -27,6 +34,58 @@ from su3d_bench.metrics.protocols.loading import read_protocol
 from su3d_bench.metrics.scoring import unpack_scores
 from su3d_bench.questions.query_files import read_query_file
 from su3d_bench.store.predictions import read_prediction
+
+N_INPUTS = 10  # of each reader, beside a pipe and the like; python benchmarks fuzz draws many more
+USUAL = (
+    *("prediction scannet-text", "prediction openmask3d", "prediction conceptgraphs", "prediction hovsg"),
+    *("prediction su3d-bench", "file ascii.ply", "file binary_compressed.pcd", "file a.png", "file a.npz"),
+    *("file map.pkl.gz", "file q.toml", "dataset replica", "run", "answers ann.xlsx", "archive a.tar.gz"),
+)
+N_VECTORS = int(os.environ.get("SU3D_FUZZ_EXAMPLES", "4"))  # of words behind each verb
+# A verb whose work could begin with nothing more than its name ends with words that keep it from that.
+HELD_BACK = {"run": ["--scenes", "replica/none", "--dry-run"], "ablate": ["--scenes", "replica/none", "--dry-run"]}
+HELD_BACK |= {"questions": ["--scenes", "replica/none"], "make": ["--scenes", "none/none", "--out", "folder/out"]}
+
+
+@pytest.fixture(autouse=True)
+def _own_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("SU3D_DATA", "SU3D_CACHE", "SU3D_MODELS", "HF_HOME", "XDG_CACHE_HOME"):
+        monkeypatch.setenv(name, str(tmp_path / "data"))
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in USUAL else pytest.param(name, marks=pytest.mark.proof) for name in TARGETS]
+)
+def test_a_reader_meets_damage_with_nothing_but_typed_errors_soon_and_in_little_memory(
+    name: str, tmp_path: Path
+) -> None:
+    """So it does where a pipe or a device stands in place of the file."""
+    sample = Sample(TARGETS[name], tmp_path / "sample")
+    with bounded_addresses(MOST_ADDRESSES_BYTES):
+        sample.read()  # the sample itself is fine
+        inputs = [sample.input(0, index) for index in range(N_INPUTS)]
+        inputs += [Input(0, file, None, shape) for file, shape in zip(sorted(sample.whole), ENDLESS, strict=False)]
+        faults = [(one.index, one.file, one.shape, fault) for one in inputs if (fault := sample.meet(one).fault)]
+    assert not faults, f"python benchmarks fuzz --only '{name}' --first {faults[0][0]} --inputs 1: {faults[0]}"
+
+
+@pytest.mark.parametrize("words", [words for words, _ in verbs()], ids=" ".join)
+def test_any_words_behind_a_verb_are_done_or_declined_in_one_line(words: tuple[str, ...]) -> None:
+    for name, text in (("a.toml", "[method.opensu3d]\ntop_m = 3\n"), ("a.json", json.dumps({"a": 1}))):
+        Path(name).write_text(text)
+    Path("a.csv").write_text("a,b\n1,2\n")
+    Path("folder").mkdir()
+    parser, rng = dict(verbs())[words], random.Random(" ".join(words))
+    for _ in range(N_VECTORS):
+        try:
+            with alarm(60):
+                called([*words, *drawn_words(parser, rng), *HELD_BACK.get(words[-1], [])])
+        except Declined:
+            continue
+    with pytest.raises(Declined):
+        called([rng.choice(ODD), rng.choice(ODD)])
+
 
 DEEP, LONG = "[" * 100_000, "1" * 5000
 NO_TEXT = np.array([0x3F800000], np.uint32).tobytes()  # a float's bits where a character should be

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from places import ROOT
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def cell(text: str | None) -> str:

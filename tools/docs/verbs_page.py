@@ -1,6 +1,6 @@
 """docs/verbs.md, made from the parser: every verb with what it does, its examples and its flags.
 
-``python tests/support/verbs_page.py`` writes the page; ``--check`` says whether it still holds.
+``python tools/docs/verbs_page.py`` writes the page; ``--check`` says whether it still holds.
 """
 
 from __future__ import annotations
@@ -9,8 +9,7 @@ import argparse
 import sys
 from collections.abc import Iterator
 
-from made_documents import cell, write_or_check
-from places import ROOT
+from made_documents import ROOT, cell, write_or_check
 
 from su3d_bench.cli.main import build_parser
 

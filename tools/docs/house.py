@@ -1,6 +1,6 @@
 """The shape of the code base: its folders, the layers they stand on, and who imports whom.
 
-``python tests/support/house.py`` writes what of docs/architecture.md is drawn from the code; ``--check`` says whether
+``python tools/docs/house.py`` writes what of docs/architecture.md is drawn from the code; ``--check`` says whether
 it still holds.
 """
 
@@ -13,8 +13,7 @@ from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
-from made_documents import write_or_check
-from places import ROOT
+from made_documents import ROOT, write_or_check
 
 PACKAGE = ROOT / "su3d_bench"
 LINKED = ("datasets", "baselines", "reports")  # root folders, reached through links in the package

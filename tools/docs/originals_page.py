@@ -1,6 +1,6 @@
 """docs/numbers/originals.md, made from the protocols' files: whose evaluation each repeats, and how both were compared.
 
-``python tests/support/originals_page.py`` writes the page; ``--check`` says whether it still holds.
+``python tools/docs/originals_page.py`` writes the page; ``--check`` says whether it still holds.
 """
 
 from __future__ import annotations
@@ -9,8 +9,7 @@ import sys
 from collections import defaultdict
 from collections.abc import Sequence
 
-from made_documents import cell, write_or_check
-from places import ROOT
+from made_documents import ROOT, cell, write_or_check
 
 from su3d_bench.metrics.protocols.loading import Original, original_of, protocol_names
 

@@ -15,8 +15,7 @@ from su3d_bench.formats.tables.table import NOT_MEASURED, Cell, Prose, Table, Ta
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.reports.page.page import PAGE, page_name, registry_page_html
 from su3d_bench.reports.tables.model import confidence_notes, few_scenes
-from su3d_bench.reproducing.registry.folder import SUFFIX, Registry
-from su3d_bench.reproducing.registry.rows import Row
+from su3d_bench.reproducing.registry import SUFFIX, Registry, Row
 
 INDEX, DATA = "index.html", "registry.json"
 METHODS, SCENES = "methods", "scenes"
