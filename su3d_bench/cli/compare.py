@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from su3d_bench.cli.options import Verbs, add_options, add_verb
+from su3d_bench.cli.options import Verbs, add_options, add_out, add_verb
 from su3d_bench.cli.output import (
     answer_commands,
     answer_document,
@@ -76,7 +76,7 @@ def _add_check(verbs: Verbs) -> None:
     parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="the run to check")
     parser.add_argument("--against", type=Path, metavar="FILE", help="the reference")
     parser.add_argument("--learn", nargs="+", type=Path, metavar="RUN", help="repeats of one run to learn from")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="where --learn writes the reference")
+    add_out(parser, "FILE", "where --learn writes the reference")
     parser.add_argument(
         "--cost-limit", type=float, metavar="TIMES", help="how many times as long a method may take (with --learn)"
     )

@@ -11,7 +11,7 @@ from typing import Any
 
 from su3d_bench.cli import fetch
 from su3d_bench.cli.new import add_new
-from su3d_bench.cli.options import Verbs, add_group, add_options, add_verb, count
+from su3d_bench.cli.options import Verbs, add_group, add_options, add_out, add_verb, count
 from su3d_bench.cli.output import answer_either
 from su3d_bench.core.errors import EXIT_DONE
 
@@ -98,7 +98,7 @@ def _add_show(verbs: Verbs) -> None:
         _later("scenes", "show"),
     )
     parser.add_argument("scene", metavar="SCENE", help="the scene's address, such as rooms/living0")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="the PNG to write (default: DATASET-SCENE.png here)")
+    add_out(parser, "FILE", "the PNG to write (default: DATASET-SCENE.png here)")
     parser.add_argument("--stride", type=count, metavar="N", help="draw every Nth camera (default: 48 cameras in all)")
     add_options(parser, "--set")
 
@@ -125,7 +125,7 @@ def _add_make(verbs: Verbs) -> None:
         "replica: every file of Replica, the render and the original release, about 300 MB a room; scannet: scans with "
         ".sens, mesh and annotation (default: native)",
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="the data root to make (native: default $SU3D_DATA)")
+    add_out(parser, "DIR", "the data root to make (native: default $SU3D_DATA)")
     add_options(parser, "--set", "--jobs")
 
 

@@ -50,15 +50,11 @@ def call(arguments: argparse.Namespace) -> int:
     checks = examine()
     missing = [check for check in checks if check.state == "missing"]
     width = max(len(check.what) for check in checks)
-    lines = []
-    for check in checks:
-        text = "; ".join(part for part in (check.found, check.to_do) if part)
-        lines.append(f"{check.state:<7}  {check.what:<{width}}  {text}")
-    verdict = (
-        f"the main job cannot run: {counted(len(missing), 'thing')} missing" if missing else "the main job can run"
-    )
+    texts = ("; ".join(part for part in (check.found, check.to_do) if part) for check in checks)
+    lines = [f"{check.state:<7}  {check.what:<{width}}  {text}" for check, text in zip(checks, texts, strict=True)]
+    verdict = f"cannot run: {counted(len(missing), 'thing')} missing" if missing else "can run"
     value = {"can_run": not missing, "checks": [asdict(check) for check in checks]}
-    answer_either(arguments, value, *lines, "", verdict)
+    answer_either(arguments, value, *lines, "", f"the main job {verdict}")
     return EXIT_CHECK_FAILED if missing else EXIT_DONE
 
 
@@ -118,16 +114,17 @@ def _libraries() -> Iterator[Check]:
             to_do = FOR_OPEN3D if name == "open3d" else f"pip install --force-reinstall {name}"
             yield Check(name, state, f"{installed} cannot be loaded: {fault}", to_do)
         else:
-            yield Check(name, "ok", "; ".join((installed, *_abilities(found_by))))
+            yield Check(name, "ok", f"{installed}{_abilities(found_by)}")
 
 
-def _abilities(found: dict[str, Any]) -> Iterator[str]:
+def _abilities(found: dict[str, Any]) -> str:
     """What a library says that it can compute on."""
     if "providers" in found:
-        yield f"computes by {', '.join(name.removesuffix('ExecutionProvider') for name in found['providers'])}"
-    if "gpus" in found:
-        built = f"built for CUDA {found['cuda']}" if found["cuda"] else "built for CPUs alone"
-        yield ", ".join(found["gpus"]) or f"no GPU ({built}), see docs/running/gpu.md"
+        return f"; computes by {', '.join(name.removesuffix('ExecutionProvider') for name in found['providers'])}"
+    if "gpus" not in found:
+        return ""
+    built = f"built for CUDA {found['cuda']}" if found["cuda"] else "built for CPUs alone"
+    return f"; {', '.join(found['gpus']) or f'no GPU ({built}), see docs/running/gpu.md'}"
 
 
 def loaded(package: str) -> tuple[dict[str, Any], str]:
@@ -160,8 +157,7 @@ def _folders() -> Iterator[Check]:
     from su3d_bench.core.files.atomic import scratch_folder
     from su3d_bench.runs.scenes import cache_root, data_root
 
-    named = os.environ.get("SU3D_DATA") or ""
-    if "://" in named:
+    if "://" in (named := os.environ.get("SU3D_DATA", "")):
         yield Check("data", "ok", f"{shown(Path(named))}: a store, which run and ablate read")
     else:
         yield _folder("data", data_root(), "SU3D_DATA")
@@ -185,21 +181,18 @@ def _folder(what: str, folder: Path, setting: str) -> Check:
             return Check(what, "note", f"{where}: its disk has no locks", f"best on another disk: {setting}")
         reason = error.strerror or str(error)
         return Check(what, "missing", f"{where}: cannot be written: {reason}", f"choose another with {setting}")
-    free = shutil.disk_usage(existing).free
-    is_enough = free >= LEAST_FREE
-    to_do = "" if is_enough else f"make room, or another with {setting}"
-    return Check(what, "ok" if is_enough else "note", f"{where}: {size_text(free)} free", to_do)
+    found = f"{where}: {size_text(free := shutil.disk_usage(existing).free)} free"
+    if free >= LEAST_FREE:
+        return Check(what, "ok", found)
+    return Check(what, "note", found, f"make room, or another with {setting}")
 
 
 def _kernels() -> Check:
     from su3d_bench.store.caches import kernel_folders, why_slow
 
-    line = why_slow()
-    if line is not None:
-        return Check("compiled code", "note", line)
-    return Check(
-        "compiled code", "ok", f"is kept in the first that takes it: {', '.join(map(shown, kernel_folders()))}"
-    )
+    slow = why_slow()
+    kept = f"is kept in the first that takes it: {', '.join(map(shown, kernel_folders()))}"
+    return Check("compiled code", "note" if slow else "ok", slow or kept)
 
 
 def _datasets() -> Iterator[Check]:
@@ -214,10 +207,8 @@ def _datasets() -> Iterator[Check]:
             n_scenes = len(dataset_class(data_root(), dataset_class.Options()).scenes())
         except Su3dError:  # datasets list says why
             n_scenes = 0
-        if n_scenes:
-            yield Check(f"dataset {name}", "ok", counted(n_scenes, "scene"))
-        else:
-            yield Check(f"dataset {name}", "note", "no scene is here", "su3d-bench datasets list says where it looks")
+        hint = "" if n_scenes else "su3d-bench datasets list says where it looks"
+        yield Check(f"dataset {name}", "note" if hint else "ok", counted(n_scenes, "scene"), hint)
 
 
 def _models() -> Check:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from su3d_bench.cli.options import Verbs, add_options, add_verb
+from su3d_bench.cli.options import Verbs, add_options, add_out, add_verb
 from su3d_bench.cli.output import answer_tables, remark
 from su3d_bench.core.errors import EXIT_DONE, ConfigError
 
@@ -44,11 +44,10 @@ def add_parser(verbs: Verbs) -> None:
         metavar="METHOD=PREDICTIONS",
         help="several methods side by side; METHOD alone names PREDICTIONS (default: as the folder of --out)",
     )
-    parser.add_argument(
-        "--out",
-        type=Path,
-        metavar="DIR",
-        help="write a run folder there, which compare, attribute, report, check, sheets, query and export take",
+    add_out(
+        parser,
+        "DIR",
+        "write a run folder there, which compare, attribute, report, check, sheets, query and export take",
     )
     parser.add_argument(
         "--dataset", metavar="NAME", help="whose ground truth, below $SU3D_DATA: replica, scannet, rooms"

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.options import Verbs, add_options, add_verb
+from su3d_bench.cli.options import Verbs, add_options, add_out, add_verb
 from su3d_bench.cli.output import answer, answer_json, remark
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, counted, printable, suggest
 
@@ -43,7 +43,7 @@ def add_parser(verbs: Verbs) -> None:
         "scannetpp: such lists with run-length masks, or with a --protocol of kind top-k the classes of every vertex; "
         "opensun3d: the masks that answer the query of each scene of arkitscenes, with confidences",
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder for the files")
+    add_out(parser, "DIR", "a new folder for the files", required=True)
     parser.add_argument("--method", help="whose maps of a run (default: the only one that it was asked for)")
     add_options(parser, "--scenes")
     parser.add_argument("--format", help="the format of the prediction (default: found from its files)")

@@ -114,7 +114,9 @@ def count(text: str) -> int:
 
 def index(text: str) -> int:
     """The type of an option that is a number from 0 on."""
-    return 0 if text == "0" else count(text)
+    if text.isdecimal():
+        return int(text)
+    raise argparse.ArgumentTypeError(f"{text}: expected an integer of 0 or more")
 
 
 def positive(text: str) -> float:

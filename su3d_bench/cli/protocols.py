@@ -11,7 +11,7 @@ from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.new import add_new
-from su3d_bench.cli.options import Verbs, add_group, add_options, add_verb, perception_config
+from su3d_bench.cli.options import Verbs, add_group, add_options, add_out, add_verb, perception_config
 from su3d_bench.cli.output import answer_either, answer_tables, progress, remark, show
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, shown, suggest
 
@@ -62,7 +62,7 @@ def add_parser(verbs: Verbs) -> None:
         metavar="RUN[:METHOD]",
         help="score it under every choice of the rules, and split the difference of its numbers among them",
     )
-    parser.add_argument("--out", type=Path, metavar="PNG", help="with --prediction: draw the steps to this file")
+    add_out(parser, "PNG", "with --prediction: draw the steps to this file")
     add_options(parser, "--jobs", "--format")
     _add_texts(actions)
     add_new(actions, "protocol")
@@ -190,7 +190,7 @@ def _add_texts(verbs: Verbs) -> None:
     )
     add_options(parser, "--queries")
     add_options(parser, "--device", "--set")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="where names and features go")
+    add_out(parser, "FILE", "where names and features go", required=True)
 
 
 def call_texts(arguments: argparse.Namespace) -> int:

@@ -12,6 +12,7 @@ from su3d_bench.cli.options import (
     add_group,
     add_language_options,
     add_options,
+    add_out,
     add_verb,
     answer_estimate,
     chat_client,
@@ -59,7 +60,7 @@ def _add_text(verbs: Verbs) -> None:
     add_options(parser, "--run", "--method")
     parser.add_argument("--top", type=count, default=10, metavar="N", help="how many instances to list (default: 10)")
     add_options(parser, "--device")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="where the picture goes (default: beside the map)")
+    add_out(parser, "FILE", "where the picture goes (default: beside the map)")
 
 
 def call_text(arguments: argparse.Namespace) -> int:
@@ -149,7 +150,7 @@ def _add_ask(verbs: Verbs) -> None:
         metavar=("X", "Y", "Z"),
         help="where one stands for left and right, in metres (default: the middle of the map)",
     )
-    parser.add_argument("--out", type=Path, metavar="FILE", help="where the picture goes (default: beside the map)")
+    add_out(parser, "FILE", "where the picture goes (default: beside the map)")
     add_language_options(parser)
 
 

@@ -12,6 +12,7 @@ from su3d_bench.cli.options import (
     Verbs,
     add_language_options,
     add_options,
+    add_out,
     add_verb,
     answer_estimate,
     chat_client,
@@ -52,13 +53,7 @@ def _add_make(verbs: Verbs) -> None:
         _make,
     )
     _add_scenes(parser, required=True)
-    parser.add_argument(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="FILE",
-        help="a .toml or .csv file; .json in a form of Beacon3D",
-    )
+    add_out(parser, "FILE", "a .toml or .csv file; .json in a form of Beacon3D", required=True)
     parser.add_argument(
         "--per-kind",
         type=count,
@@ -105,7 +100,7 @@ def _add_audit(verbs: Verbs) -> None:
         _audit,
     )
     _add_scenes(parser)
-    parser.add_argument("--out", type=Path, metavar="DIR", help="where page, pictures and table go")
+    add_out(parser, "DIR", "where page, pictures and table go")
     parser.add_argument("--n", type=count, default=200, metavar="N", help="so many questions (default: 200)")
     add_options(parser, "--seed")
     parser.add_argument(

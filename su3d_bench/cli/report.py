@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli import report_files
-from su3d_bench.cli.options import Verbs, add_group, add_options, add_verb
+from su3d_bench.cli.options import Verbs, add_group, add_options, add_out, add_runs, add_verb, index, positive
 from su3d_bench.cli.output import (
     answer,
     answer_document,
@@ -87,7 +87,7 @@ def _add_tables(verbs: Verbs) -> None:
         action=argparse.BooleanOptionalAction,
         help="show what papers report beneath (default: with --table)",
     )
-    parser.add_argument("--out", type=Path, metavar="FILE", help="write there instead of printing")
+    add_out(parser, "FILE", "write there instead of printing")
 
 
 def call_tables(arguments: argparse.Namespace) -> int:
@@ -131,32 +131,25 @@ def _add_timing(verbs: Verbs) -> None:
         ("su3d-bench report timing runs/demo", "su3d-bench report timing runs/a runs/b --out timing --camera-rate 20"),
         call_timing,
     )
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders of finished runs")
+    add_runs(parser)
     add_options(parser, "--methods")
     parser.add_argument(
-        "--warm-up", type=int, default=3, metavar="N", help="first updates of a scene that stand apart (default: 3)"
+        "--warm-up", type=index, default=3, metavar="N", help="first updates of a scene that stand apart (default: 3)"
     )
     parser.add_argument(
-        "--camera-rate", type=float, default=30.0, metavar="HZ", help="frames a second of the camera (default: 30)"
+        "--camera-rate", type=positive, default=30.0, metavar="HZ", help="frames a second of the camera (default: 30)"
     )
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="write timing.md, timing.csv, methods.csv and the plots there"
-    )
+    add_out(parser, "DIR", "write timing.md, timing.csv, methods.csv and the plots there")
     add_options(parser, "--format")
 
 
 def call_timing(arguments: argparse.Namespace) -> int:
-    from dataclasses import asdict
-
     from su3d_bench.analysis.tables import anytime_points
-    from su3d_bench.core.errors import ConfigError
     from su3d_bench.metrics.costs import summarise
     from su3d_bench.reports.tables.formats import markdown
     from su3d_bench.reports.tables.timing import csv_text, methods_csv, timing_tables
     from su3d_bench.runs.finished import read_run, read_update_times
 
-    if arguments.warm_up < 0 or not arguments.camera_rate > 0:
-        raise ConfigError("--warm-up is a count from 0, --camera-rate a number above 0")
     runs = [read_run(path) for path in arguments.runs]
     timed = [read_update_times(run, method) for run in runs for method in arguments.methods or run.methods]
     times = [each for each in timed if each]
@@ -209,12 +202,12 @@ def _add_samples(verbs: Verbs) -> None:
         ),
         call_samples,
     )
-    parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="folders of finished runs")
+    add_runs(parser, "*")
     add_options(parser, "--methods", "--protocols", "--scenes")
     parser.add_argument(
         "--format", choices=FORMATS, help="of the rows (default: parquet where --out ends so, else csv)"
     )
-    parser.add_argument("--out", type=Path, metavar="FILE", help="write there instead of printing CSV")
+    add_out(parser, "FILE", "write there instead of printing CSV")
     parser.add_argument("--columns", action="store_true", help="say what each column holds, and list nothing")
     add_options(parser, "--table-format")
 
@@ -278,12 +271,10 @@ def _add_leaderboard(verbs: Verbs) -> None:
     add_options(parser, "--protocols")
     parser.add_argument("--intervals", action="store_true", help="show 95 %% intervals: over scenes, and of ranks")
     add_options(parser, "--format")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="write there instead of printing")
+    add_out(parser, "FILE", "write there instead of printing")
 
 
 def call_leaderboard(arguments: argparse.Namespace) -> int:
-    from dataclasses import asdict
-
     from su3d_bench.analysis.leaderboard import leaderboard, tables
 
     board = leaderboard(arguments.folder, arguments.protocols, with_ranks=arguments.intervals)
@@ -305,13 +296,13 @@ def _add_attribution(verbs: Verbs) -> None:
         ),
         call_attribution,
     )
-    parser.add_argument("run", type=Path, metavar="RUN", help="the folder of a run")
+    add_runs(parser, None)
     parser.add_argument("--method", help="whose predictions (default: the run's only method)")
     add_options(parser, "--protocols")
     parser.add_argument(
         "--oracle", type=Path, metavar="RUN", help="the same run with --profile oracle: what perfect 2D masks give"
     )
-    parser.add_argument("--out", type=Path, metavar="PNG", help="draw the plot to this file")
+    add_out(parser, "PNG", "draw the plot to this file")
     add_options(parser, "--format")
 
 

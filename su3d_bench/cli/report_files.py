@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.options import Verbs, add_options, add_verb, count
+from su3d_bench.cli.options import Verbs, add_options, add_out, add_runs, add_verb, count
 from su3d_bench.cli.output import answer_either, drawn_bars, progress, remark, written
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable
 
@@ -45,10 +45,8 @@ def _add_html(verbs: Verbs) -> None:
         call_html,
         takes_up=True,
     )
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders of finished runs")
-    parser.add_argument(
-        "--out", type=Path, metavar="FILE", default=Path("page.html"), help="the page (default: page.html)"
-    )
+    add_runs(parser)
+    add_out(parser, "FILE", "the page (default: page.html)", default=Path("page.html"))
     parser.add_argument("--title", metavar="TEXT", help="of the page (default: the folders of the runs)")
     parser.add_argument(
         "--queries", nargs="+", metavar="TEXT", help="texts to which instances are compared (default: eight)"
@@ -150,7 +148,7 @@ def _add_rerun(verbs: Verbs) -> None:
         ),
         call_rerun,
     )
-    parser.add_argument("run", type=Path, metavar="RUN", help="the folder of a finished run")
+    add_runs(parser, None)
     add_options(parser, "--scenes", "--methods")
     parser.add_argument(
         "--stride",
@@ -158,7 +156,7 @@ def _add_rerun(verbs: Verbs) -> None:
         metavar="N",
         help="every Nth of the frames that the methods were given (default: at most 60 of a scene)",
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the .rrd file, read by rerun's viewer")
+    add_out(parser, "FILE", "the .rrd file, read by rerun's viewer", required=True)
 
 
 def call_rerun(arguments: argparse.Namespace) -> int:
@@ -219,8 +217,8 @@ def _add_bundle(verbs: Verbs) -> None:
         ),
         call_bundle,
     )
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders of finished runs")
-    parser.add_argument("--out", type=Path, metavar="FILE", help="the archive (default: the first run's name.zip)")
+    add_runs(parser)
+    add_out(parser, "FILE", "the archive (default: the first run's name.zip)")
     parser.add_argument("--trained-on", metavar="TEXT", default="", help="the data of your weights, for a registry")
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from su3d_bench.cli.options import EXECUTOR, Verbs, add_options, add_verb
+from su3d_bench.cli.options import EXECUTOR, Verbs, add_options, add_out, add_verb
 from su3d_bench.cli.output import answer, answer_document, answer_json, formatted, remark, show, written
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, RunIncomplete, counted, printable
 
@@ -37,7 +37,7 @@ def add_parser(verbs: Verbs) -> None:
         "recipe", metavar="RECIPE", nargs="?", help="its name, or a file of your own (default: list them)"
     )
     parser.add_argument("--table", nargs="+", default=[], metavar="NAME", help="these experiments alone (default: all)")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="where all goes (default: reproduced/<recipe>)")
+    add_out(parser, "DIR", "where all goes (default: reproduced/<recipe>)")
     add_options(parser, "--dry-run")
     parser.add_argument(
         "--rehearse", action="store_true", help="the same on rooms made in the same layouts, with embedded perception"

@@ -17,6 +17,7 @@ from su3d_bench.cli.options import (
     add_group,
     add_language_options,
     add_options,
+    add_runs,
     add_verb,
     answer_estimate,
     chat_client,
@@ -83,7 +84,7 @@ def _add_show(verbs: Verbs) -> None:
         ("su3d-bench runs show runs/demo", "su3d-bench runs show runs/demo --json"),
         call_show,
     )
-    parser.add_argument("run", type=Path, metavar="RUN", help="a run folder")
+    add_runs(parser, None)
 
 
 def call_show(arguments: argparse.Namespace) -> int:
@@ -177,7 +178,7 @@ def _add_refine(verbs: Verbs) -> None:
         ),
         call_refine,
     )
-    parser.add_argument("run", type=Path, metavar="RUN", help="the folder of a run")
+    add_runs(parser, None)
     parser.add_argument("--method", default="opensu3d", help="whose maps (default: opensu3d)")
     parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="these scenes alone (default: all of the run)")
     parser.add_argument(

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import sheets_make
-from su3d_bench.cli.options import Verbs, add_group, add_options, add_verb
+from su3d_bench.cli.options import Verbs, add_group, add_options, add_out, add_runs, add_verb
 from su3d_bench.cli.output import answer_either, answer_json, answer_tables, remark, remark_unseen, written
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, counted
 
@@ -58,9 +58,7 @@ def _add_score(verbs: Verbs) -> None:
         metavar="FILE",
         help="sheet.json of the set, or its folder (default: looked for around the key and the answers)",
     )
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="write scores.json, tables and a list of what to look at again there"
-    )
+    add_out(parser, "DIR", "write scores.json, tables and a list of what to look at again there")
     parser.add_argument(
         "--disputed",
         type=Path,
@@ -189,8 +187,8 @@ def _add_pictures(verbs: Verbs) -> None:
         ),
         call_pictures,
     )
-    parser.add_argument("run", type=Path, metavar="RUN", help="the folder of a run")
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="a .pdf, .png or .svg file")
+    add_runs(parser, None)
+    add_out(parser, "FILE", "a .pdf, .png or .svg file", required=True)
     parser.add_argument("--what", choices=SUBJECTS, default="similarity", help="what is drawn (default: similarity)")
     parser.add_argument("--queries", nargs="+", default=[], metavar="TEXT", help="texts, or questions to be answered")
     parser.add_argument(

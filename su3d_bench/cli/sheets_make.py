@@ -12,6 +12,7 @@ from su3d_bench.cli.options import (
     Verbs,
     add_language_options,
     add_options,
+    add_out,
     add_verb,
     answer_estimate,
     chat_client,
@@ -63,7 +64,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.add_argument(
         "--kind", nargs="+", choices=KINDS, required=True, help="what is judged; several give a folder each in DIR"
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the sheets go")
+    add_out(parser, "DIR", "where the sheets go", required=True)
     parser.add_argument("--key", type=Path, metavar="DIR", help="where the key goes (default: DIR-key)")
     parser.add_argument(
         "--questions",
