@@ -85,7 +85,7 @@ def call_list(arguments: argparse.Namespace) -> int:
 
 
 def call_show(arguments: argparse.Namespace) -> int:
-    from su3d_bench.metrics.labels import labels_taken
+    from su3d_bench.metrics.fitness import labels_taken
     from su3d_bench.metrics.protocols.loading import load_protocol, original_of, rules_files
 
     rules = load_protocol(arguments.name)
@@ -147,7 +147,7 @@ def _answer_names(arguments: argparse.Namespace, rules: ProtocolRules) -> int:
 def _rules_lines(rules: ProtocolRules, files: Sequence[Path]) -> list[str]:
     """Every rule as a line, beneath it what the file that sets it says of it: its source, or that it is ours."""
     from su3d_bench.core.config import flatten, toml_value
-    from su3d_bench.metrics.labels import labels_taken
+    from su3d_bench.metrics.fitness import labels_taken
     from su3d_bench.metrics.protocols.loading import HEADING, not_comparable_with, remarks_of
 
     remarks = remarks_of(files)

@@ -33,12 +33,13 @@ from su3d_bench.evaluation.texts import TextFeatures, encoder_for, read_text_fea
 from su3d_bench.evaluation.truth import NOT_MEANT, DatasetTruths, OpenLexTruths, SceneTruths, VertexTruth
 from su3d_bench.metrics.fitness import (
     ContentFacts,
+    labels_counted,
     n_feature_dimensions,
+    under_several_labels,
     why_not_content,
     why_not_length,
     why_not_numbers,
 )
-from su3d_bench.metrics.labels import labels_counted, under_several_labels
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks

@@ -9,9 +9,9 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
+from su3d_bench.metrics.fitness import LEAST_SEVERAL, labels_counted
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
-from su3d_bench.metrics.labels import LEAST_SEVERAL, labels_counted
 from su3d_bench.metrics.matching.checks import MaskFacts
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules

@@ -32,7 +32,7 @@ from su3d_bench.core.maps import Prediction
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.metrics.costs import UpdateTimes
-from su3d_bench.metrics.labels import labels_counted
+from su3d_bench.metrics.fitness import labels_counted
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names, read_rules
 from su3d_bench.metrics.protocols.model import ProtocolRules

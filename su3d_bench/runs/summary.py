@@ -23,8 +23,8 @@ from su3d_bench.core.maps import Instances, Partition, Prediction
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.system.timing import hardware_line, processor_digest
+from su3d_bench.metrics.fitness import labels_counted
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
-from su3d_bench.metrics.labels import labels_counted
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules

@@ -18,8 +18,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import Instances, Masks
 from su3d_bench.evaluation.evaluate import Scoring
-from su3d_bench.metrics.fitness import ContentFacts
-from su3d_bench.metrics.labels import labels_counted, under_several_labels
+from su3d_bench.metrics.fitness import ContentFacts, labels_counted, under_several_labels
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.predictions.base import ScenePrediction
 

@@ -89,8 +89,8 @@ def test_a_damaged_piece_counts_as_absent(run: Path) -> None:
         content[place] ^= 1
         piece.write_bytes(content)
     assert page() == first
-    for piece, content in zip(pieces(run), (b"", b"{}"), strict=True):
-        piece.write_bytes(content)
+    for piece, other in zip(pieces(run), (b"", b"{}"), strict=True):
+        piece.write_bytes(other)
     assert page() == first
 
 

@@ -39,7 +39,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def test_an_instance_looks_the_same_however_dense_and_complete_its_map_is(run: Path) -> None:
-    scene, source = SCENE, RunSource(read_run(run))
+    scene, source = SCENE, RunSource(read_run(run), METHODS[:2])
     whole = source.instances(scene, "openmask3d")
     row = int(np.argsort(whole.sizes)[len(whole) // 2])
     mask, random = whole.mask(row), np.random.default_rng(0)

@@ -166,7 +166,7 @@ def test_sheets_are_made_from_the_command_line(
         ([*words, "--methods", "colector"], "has no method 'colector'; did you mean 'collector'?"),
         ([*words, "--scenes", "painted/x"], "has no scene 'painted/x'"),
         ([*words, "--per-kind", "0"], "expected an integer of 1 or more"),
-        ([*words, "--seed", "-1"], "--seed -1"),
+        ([*words, "--seed", "-1"], "argument --seed: -1"),
         (["sheets", "make", "run", "--kind", "annotation", "--questions", "paper", "--out", "o"], "leave it out"),
     ):
         assert main(wrong) == 2

@@ -155,6 +155,3 @@ def test_labels_of_a_mapped_table_are_those_of_the_same_rows_in_memory(tmp_path:
     text = rng.normal(size=(9, 16)).astype(np.float32)
     np.testing.assert_array_equal(most_similar(mapped.features, text), most_similar(features, text))
     np.testing.assert_array_equal(has_feature(mapped), np.arange(20_000) % 7 != 0)
-
-
-# ---- runs

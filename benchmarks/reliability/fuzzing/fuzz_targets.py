@@ -82,7 +82,7 @@ def _arrays(path: Path) -> object:
     from su3d_bench.formats.pickles import read_pickle_file
     from su3d_bench.formats.torch_files import read_torch
 
-    readers = {".npy": read_npy, ".npz": read_npz, ".pkl": read_pickle_file, ".gz": read_pickle_file}
+    readers: dict[str, Any] = {".npy": read_npy, ".npz": read_npz, ".pkl": read_pickle_file, ".gz": read_pickle_file}
     return readers.get(path.suffix, read_torch)(path)
 
 
@@ -352,8 +352,8 @@ def _archive(name: str) -> Make:
             with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
                 archive.write(content / "room0/traj.txt", "Replica/room0/traj.txt")
         else:
-            with tarfile.open(path, "w:gz") as archive:
-                archive.add(content, "Replica")
+            with tarfile.open(path, "w:gz") as tar:
+                tar.add(content, "Replica")
 
         def read() -> None:
             shutil.rmtree(out, ignore_errors=True)

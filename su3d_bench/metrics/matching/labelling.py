@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,12 @@ from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Ar
 from su3d_bench.metrics.matching.nearest import remembered
 from su3d_bench.metrics.protocols.model import ProtocolRules
 
+if TYPE_CHECKING:
+    from torch import Tensor
+
 CPU = "cpu"
+# Sums of 4096 products of unit vectors differ between two orders by less than 1e-12; 1e-9 leaves room.
+SURE_GAP = 1e-9
 _BLOCK_ROWS = 8192  # 34 MB of float64 at 512 dimensions, whatever the size of the map
 
 
@@ -150,11 +155,8 @@ def cosines(features: NDArray[Any], text: NDArray[Any], device: str = CPU) -> Fl
     [[0.0, 1.0], [0.0, 0.0]]
     """
     if device != CPU:
-        from su3d_bench.metrics.matching import kernels as similarity_kernels
-
-        return similarity_kernels.cosines(
-            *(similarity_kernels.directions_on(device, rows) for rows in (features, text))
-        )
+        there, text_there = (_directions_on(device, rows) for rows in (features, text))
+        return np.asarray((there @ text_there.T).cpu().numpy(), np.float64)
     # one thread: the last bit of a cosine may not depend on the machine's number of cores
     with threadpool_limits(1, user_api="blas"):
         product: Float64Array = (
@@ -208,10 +210,33 @@ def _sure_on(device: str, text: np.ndarray) -> Callable[[np.ndarray], Int64Array
     """What finds the row of ``text`` most similar to each row of a block; it gives None where it cannot be sure."""
     if device == CPU:
         return lambda _: None
-    from su3d_bench.metrics.matching import kernels as kernels
+    directions = _directions_on(device, text)
+    return lambda block: _sure_most_similar(_directions_on(device, block), directions)
 
-    directions = kernels.directions_on(device, text)
-    return lambda block: kernels.sure_most_similar(kernels.directions_on(device, block), directions)
+
+def _directions_on(device: str, rows: NDArray[Any]) -> Tensor:
+    """``rows`` (N, D) at length 1 on ``device``; those of no direction, or that hold what is no number, are 0."""
+    import torch
+
+    there = torch.from_numpy(np.require(rows, requirements=["C", "W"])).to(device).double()
+    there = torch.where(there.isfinite().all(dim=1, keepdim=True), there, 0.0)
+    length = (there * there).sum(dim=1, keepdim=True).sqrt()
+    return there / torch.where(length > 0, length, 1.0)
+
+
+def _sure_most_similar(features: Tensor, text: Tensor) -> Int64Array | None:
+    """For each direction of ``features`` (K, D) that of ``text`` (C, D) of highest cosine; row 0 where it is 0.
+
+    None where the two highest of a row are so near that another order of the sums might choose the other.
+    """
+    import torch
+
+    n_highest = min(2, len(text))
+    highest, index = (features @ text.T).topk(n_highest, dim=1)
+    has_none = (features == 0).all(dim=1)
+    if n_highest == 2 and bool((~has_none & (highest[:, 0] - highest[:, 1] < SURE_GAP)).any()):
+        return None
+    return np.asarray(torch.where(has_none, 0, index[:, 0]).cpu().numpy(), np.int64)
 
 
 def _normalised(rows: Float64Array) -> Float64Array:

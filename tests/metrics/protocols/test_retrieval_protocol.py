@@ -41,10 +41,6 @@ from su3d_bench.runs.plan import protocols_of_run
 
 RULES = load_protocol("rooms-retrieval")
 REASONING = load_protocol("rooms-reasoning")
-DRAWN = (
-    'questions = "generated"  # ours: questions/generator.py, over the whole objects and what the frames show of them\n'
-    'synonyms = "lexicon"'
-)
 TRUTH = room()
 # Objects 1..8 are NAMES in order: 2 and 3 are chairs, 4 the table, 5 the lamp.
 ASKED = (

@@ -121,7 +121,12 @@ def test_the_published_package_gets_its_weights_as_plain_tensors(
             return [" | ".join(names)], ["..."]
 
     models: Any = ModuleType("ram.models")
-    models.ram_plus = lambda **settings: (asked.append(settings), Network())[1]
+
+    def ram_plus(**settings: Any) -> Network:
+        asked.append(settings)
+        return Network()
+
+    models.ram_plus = ram_plus
     monkeypatch.setitem(sys.modules, "ram", ModuleType("ram"))
     monkeypatch.setitem(sys.modules, "ram.models", models)
     # An older name of the head, and a buffer of another window, as the published file has them.
