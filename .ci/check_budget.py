@@ -1,7 +1,8 @@
 """Whether the code keeps to its budget: ``check_budget.py [--write]``.
 
 ``.ci/budget.toml`` holds the most lines of code of each package, of product, tests and test support together, and the
-most files. Lines count that hold something other than a comment or a docstring. ``--write`` sets the present counts.
+most files. Lines count that hold something other than a comment or a docstring. ``--write`` sets the present counts,
+rounded up to the next ten.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from collections import Counter
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
+STEP = 10
 BUDGET = ROOT / ".ci" / "budget.toml"
 PRODUCT = ("su3d_bench", "datasets", "baselines", "reports")
 FOLDERS = (*PRODUCT, "tests", "benchmarks", ".ci", "tools")
@@ -58,7 +60,8 @@ def counts() -> Counter[str]:
 def main(arguments: list[str]) -> int:
     found = counts()
     if "--write" in arguments:
-        BUDGET.write_text("".join(f'"{name}" = {n}\n' for name, n in sorted(found.items())), encoding="utf-8")
+        lines = (f'"{name}" = {-(-n // STEP) * STEP}\n' for name, n in sorted(found.items()))
+        BUDGET.write_text("".join(lines), encoding="utf-8")
         return 0
     budget = tomllib.loads(BUDGET.read_text(encoding="utf-8"))
     over = [f"{name}: {n:,}, budget {budget.get(name, 0):,}" for name, n in found.items() if n > budget.get(name, 0)]

@@ -18,6 +18,7 @@ def test_a_package_over_its_budget_is_named(
     spec.loader.exec_module(check)
     monkeypatch.setattr(check, "ROOT", tmp_path)
     monkeypatch.setattr(check, "BUDGET", tmp_path / "budget.toml")
+    monkeypatch.setattr(check, "STEP", 1)
     code = tmp_path / "su3d_bench/core/a.py"
     code.parent.mkdir(parents=True)
     code.write_text('"""Words.\n\nMore."""\n\n# a remark\nx = """two\nlines"""\n')
