@@ -1,29 +1,45 @@
-"""Pictures of annotation sheets tell no method: of a map they show what is judged, and of questions nothing."""
+"""Pictures of annotation sheets tell no method: outside of the answer they are those of a room without any map."""
 
 from __future__ import annotations
 
+import io
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from blindness import Drafts, all_checked, asked_alike, differs
+from PIL import Image
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import BoolArray, UInt8Array
+from su3d_bench.reports.pictures.items import ItemParts, png_bytes
 from su3d_bench.runs.finished import read_run
-from su3d_bench.sheets.drafts import annotation_drafts
+from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.drawing import Artist
+from su3d_bench.sheets.items import SheetKind
 from su3d_bench.sheets.sources import RunSource
 
 METHODS = ("openmask3d", "sam3d", "conceptfusion")  # the last makes features without instances
 SCENE = "rooms/bathroom0"
+KINDS: tuple[SheetKind, ...] = ("retrieval", "annotation", "reasoning")
+MOST = 4  # things of each kind
 RUN = (
     "--profile oracle --protocols rooms-instance --stride 50 --jobs 1 --no-pictures --quiet --set rooms.width=120 "
     "rooms.height=90 rooms.n_frames=200 rooms.mesh_spacing_m=0.03"
 )
+
+
+@dataclass
+class Seen:
+    """What all methods show, of each kind."""
+
+    source: RunSource
+    drafts: dict[str, Drafts] = field(default_factory=dict)
 
 
 @pytest.fixture(scope="module")
@@ -38,9 +54,61 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield path / "run"
 
 
-def test_an_instance_looks_the_same_however_dense_and_complete_its_map_is(run: Path) -> None:
-    scene, source = SCENE, RunSource(read_run(run), METHODS[:2])
-    whole = source.instances(scene, "openmask3d")
+@pytest.fixture(scope="module")
+def seen(run: Path) -> Seen:
+    source = RunSource(read_run(run))
+    encoder = source.run.encoder("cpu")
+    return Seen(source, {kind: asked_alike(source, encoder, kind, 1, MOST) for kind in KINDS})
+
+
+@pytest.mark.proof
+def test_outside_of_the_answer_every_pixel_is_that_of_a_picture_without_a_map(seen: Seen) -> None:
+    artist, astray = Artist(seen.source), dict[tuple[str, str], int]()
+
+    def check(draft: Draft, picture: UInt8Array, blank: UInt8Array, zone: BoolArray) -> None:
+        files = [png_bytes(one, palette=artist.room(draft.scene).palette) for one in (picture, blank)]
+        shown, plain = (np.asarray(Image.open(io.BytesIO(one))) for one in files)
+        n = int((differs(picture, blank) & ~zone).sum()) + int(((shown != plain) & ~zone).sum())
+        astray[draft.kind, draft.methods[0]] = astray.get((draft.kind, draft.methods[0]), 0) + n
+
+    for drafts in seen.drafts.values():
+        all_checked(artist, drafts, check)
+    assert {kind for kind, _ in astray} == set(KINDS) and len(astray) >= 5
+    assert set(astray.values()) == {0}
+
+
+class OwnMap(Artist):
+    """Draws the whole map of the method that is judged into the room, as pictures once did."""
+
+    def parts(self, draft: Draft) -> ItemParts:
+        parts, room = super().parts(draft), self.room(draft.scene)
+        instances = self._source.instances(draft.scene, draft.methods[0])
+        view = parts.room_view.picture.copy()
+        corner = next(one for one in room.corners if one.shown.point.shape[0] // 2 == len(view))
+        for row in range(len(instances)):
+            shade = [(37 * row) % 256, (91 * row) % 256, (153 * row) % 256]
+            view[corner.shows(room.region(instances.points[instances.mask(row)]).is_member)] = shade
+        return replace(parts, room_view=replace(parts.room_view, picture=view))
+
+
+@pytest.mark.proof
+def test_a_map_that_is_drawn_is_found(seen: Seen) -> None:
+    artist = OwnMap(seen.source)
+    shown = list(seen.drafts["retrieval"].items())[:3]
+    drafts = {thing: {"openmask3d": of_method["openmask3d"]} for thing, of_method in shown}
+    n_astray: list[int] = []
+
+    def check(draft: Draft, picture: UInt8Array, blank: UInt8Array, zone: BoolArray) -> None:
+        n_astray.append(int((differs(picture, blank) & ~zone).sum()))
+
+    all_checked(artist, drafts, check)
+    assert min(n_astray) > 1000
+
+
+@pytest.mark.proof
+def test_an_instance_looks_the_same_however_dense_and_complete_its_map_is(seen: Seen) -> None:
+    scene = SCENE
+    whole = seen.source.instances(scene, "openmask3d")
     row = int(np.argsort(whole.sizes)[len(whole) // 2])
     mask, random = whole.mask(row), np.random.default_rng(0)
     own = whole.points[mask]
@@ -51,8 +119,7 @@ def test_an_instance_looks_the_same_however_dense_and_complete_its_map_is(run: P
     members[0, : len(own)] = members[0, -len(own) :] = True
     members[1] = ~members[0]
     dense = Instances.of(twice, list(members), names=("y", "z"), ids=[700, 3])
-    drafts = annotation_drafts(source, scene, 4, np.random.default_rng(0))
-    draft = next(one for one in drafts if one.methods[0] == "openmask3d")
+    draft = next(iter(seen.drafts["annotation"].values()))["openmask3d"]
 
     @dataclass(frozen=True)
     class Shown:
@@ -63,7 +130,7 @@ def test_an_instance_looks_the_same_however_dense_and_complete_its_map_is(run: P
             return self.a_map
 
         def frames(self, scene: str) -> Any:
-            return source.frames(scene)
+            return seen.source.frames(scene)
 
     drawn = {
         Artist(Shown(one)).draw(replace(draft, scene=scene, rows=(k,)))
