@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -152,3 +153,14 @@ def test_each_fault_of_the_header_is_one_line(tmp_path: Path, changes: dict[str,
 def test_each_fault_of_compressed_points_is_one_line(tmp_path: Path, packed: bytes) -> None:
     message = refused(tmp_path / "a.pcd", compressed(POINTS, packed))
     assert "compressed points are damaged" in message or "cut short or damaged" in message
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary", "binary_compressed"])
+def test_promises_of_more_than_is_there_allocate_nothing(tmp_path: Path, form: str) -> None:
+    content = header(form, 10**12 - 1).encode() + struct.pack("<II", 100, 0xFFFFFFFF) + b"1 2 3\n" * 20
+    tracemalloc.start()
+    try:
+        refused(tmp_path / "a.pcd", content)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 22
+    finally:
+        tracemalloc.stop()

@@ -19,6 +19,7 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.predictions.base import VertexLabels, VertexMasks, vertex_masks
 from su3d_bench.predictions.export import (
+    file_name,
     masks_as_they_are,
     masks_on_truth,
     openlex_parts,
@@ -234,6 +235,12 @@ def test_what_scannets_list_cannot_hold_is_refused() -> None:
         masks_on_truth(vertex_masks("x", [np.array([1], np.int32)], 9), RULES, room(), None)
     with pytest.raises(PredictionError, match="NaN or infinite"):
         masks_on_truth(replace(labelled_room(), scores=np.full(8, np.nan)), RULES, room(), None)
+
+
+@pytest.mark.parametrize("scene", ["", "..", "a/b", "a\nb", "-x", "/etc"])
+def test_a_scene_whose_name_leads_elsewhere_is_refused(scene: str, tmp_path: Path) -> None:
+    with pytest.raises(PredictionError, match="cannot be the name of a file"):
+        file_name(scene)
 
 
 def test_a_folder_is_filled_whole_or_not_at_all(tmp_path: Path) -> None:

@@ -263,3 +263,9 @@ def test_pictures_are_keyed_by_their_pixels_and_counted_by_the_rule_of_the_model
     assert Image(np.zeros((1024, 1024, 3), np.uint8)).n_tokens("high") == 765
     assert Image(np.zeros((4096, 2048, 3), np.uint8)).n_tokens("high") == 1105
     assert Image(np.zeros((4096, 2048, 3), np.uint8)).n_tokens("low") == 85
+
+
+@pytest.mark.parametrize("address", ["ftp://x", "http://user:secret@host/v1", "localhost:8000", "http://h/v1?key=1"])
+def test_an_address_that_is_none_or_holds_a_secret_is_refused(address: str) -> None:
+    with pytest.raises(ValueError, match=r"expected an http|keys belong in the environment"):
+        LanguageConfig(base_url=address)
