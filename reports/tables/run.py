@@ -137,7 +137,8 @@ def not_scored_lines(reasons: Iterable[Unscored]) -> list[str]:
     protocols: dict[tuple[str, str, int], list[str]] = {}
     for (protocol, _), alike in of_kind.items():
         first = alike[0]
-        why = first.why if first.why.startswith(first.scene) else f"{first.scene}: {first.why}"
+        scene = printable(first.scene)
+        why = first.why if first.why.startswith((first.scene, scene)) else f"{scene}: {first.why}"
         methods = ", ".join(dict.fromkeys(reason.method for reason in alike))
         n_scenes = len({reason.scene for reason in alike})
         protocols.setdefault((methods, why, n_scenes), []).append(protocol)

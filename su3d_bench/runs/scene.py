@@ -15,7 +15,7 @@ from dataclasses import replace
 from functools import cache, cached_property, partial
 from typing import Any
 
-from su3d_bench.core.errors import GroundTruthMissing, StoreError, counted, error_line
+from su3d_bench.core.errors import GroundTruthMissing, StoreError, counted, error_line, printable
 from su3d_bench.core.files.atomic import write_bytes, write_text
 from su3d_bench.core.interfaces import (
     Closes,
@@ -136,7 +136,8 @@ def _guarded(scene: _Scene, part: Part) -> MethodOutcome:
         raise
     except Exception as error:  # noqa: BLE001 - a plug-in may raise anything; the traceback goes to the scene's log
         line = error_line(error)
-        line = line if line.startswith(job.scene) else f"{job.scene}: {line}"
+        name = printable(job.scene)
+        line = line if line.startswith(name) else f"{name}: {line}"
         log.lines.append("".join(traceback.format_exception(error)) + f"failed: {line}")
         outcome = MethodOutcome(job.scene, part.name, error=line)
     finally:

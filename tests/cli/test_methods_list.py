@@ -33,7 +33,7 @@ def told(capsys: pytest.CaptureFixture[str], *words: str) -> str:
 def test_every_method_says_where_it_is_from_what_it_needs_and_what_was_shown(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    rows = {row["name"]: row for row in json.loads(told(capsys, "--json"))}
+    rows = {row["name"]: row for row in json.loads(told(capsys, "list", "--json"))}
     assert tuple(rows)[: len(SYSTEMS)] == SYSTEMS
     for name in SYSTEMS:
         row = rows[name]
@@ -42,11 +42,11 @@ def test_every_method_says_where_it_is_from_what_it_needs_and_what_was_shown(
 
 
 def test_a_method_shows_its_settings_and_what_papers_report(capsys: pytest.CaptureFixture[str]) -> None:
-    text = told(capsys, "conceptgraphs-detector")
+    text = told(capsys, "show", "conceptgraphs-detector")
     assert "[method.conceptgraphs-detector]" in text
     assert "# mAcc 38.72, F-mIoU 35.82: ConceptGraphs (Gu et al.), Table II" in text
     assert "# as reported, each in its own set-up; no two need be comparable" in text
-    value = json.loads(told(capsys, "conceptgraphs-detector", "--json"))
+    value = json.loads(told(capsys, "show", "conceptgraphs-detector", "--json"))
     assert len(value["published"]) == len(figures_of(method="conceptgraphs-detector"))
     assert value["settings"]
 
@@ -56,7 +56,7 @@ def test_the_settings_that_are_shown_can_be_used_as_they_stand(
 ) -> None:
     from su3d_bench.core.config import read_file
 
-    (tmp_path / "mine.toml").write_text(told(capsys, "opensu3d"))
+    (tmp_path / "mine.toml").write_text(told(capsys, "show", "opensu3d"))
     assert read_file(tmp_path / "mine.toml").under(("method", "opensu3d"))
 
 
