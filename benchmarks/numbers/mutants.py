@@ -73,7 +73,7 @@ GUARDS: dict[str, tuple[str, ...]] = {
     "metrics/metric.py": ("test_metrics_undefined", *_SCORES, "analysis/test_compare_pairs"),
     "metrics/scoring.py": ("test_metrics_undefined", *_SCORES),
     "numerics/statistics.py": (
-        "numerics/test_growth", "numerics/test_statistics", "test_metrics_undefined", *_COMPARE,
+        "numerics/test_statistics", "test_metrics_undefined", *_COMPARE,
     ),
     "analysis/comparison.py": (*_COMPARE, "analysis/test_planning"),
     "analysis/sides.py": (*_COMPARE, "analysis/test_planning"),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import doctest
+import math
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -15,7 +17,12 @@ from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.numerics.statistics import (
+    EXACT_STEPS,
+    MIN_FIT,
     MOST_GROUPS,
+    N_ORDERS,
+    choices,
+    growth_exponent,
     holm,
     jackknife_interval,
     leave_one_out,
@@ -23,6 +30,7 @@ from su3d_bench.numerics.statistics import (
     pseudo_values,
     rank_intervals,
     share_interval,
+    shares,
     t_quantile,
 )
 
@@ -165,3 +173,89 @@ def test_resampled_semantic_metrics_equal_those_of_the_scenes_drawn(metric: str)
         drawn = [resampled["mAcc"][row], resampled["mIoU"][row], resampled["F-mIoU"][row]]
         values = [expected.mean_accuracy, expected.mean_iou, expected.frequency_weighted_iou]
         np.testing.assert_allclose(drawn, values, rtol=0, atol=1e-12)
+
+
+def drawn_values(n_steps: int, seed: int = 1) -> list[float]:
+    return list(map(float, np.random.default_rng(seed).random(1 << n_steps)))
+
+
+@pytest.mark.parametrize("n_steps", [1, 2, 3, 5])
+def test_a_share_is_the_mean_over_every_order(n_steps: int) -> None:
+    values = drawn_values(n_steps)
+    added: list[list[float]] = [[] for _ in range(n_steps)]
+    for order in permutations(range(n_steps)):
+        bits = 0
+        for step in order:
+            added[step].append(values[bits | 1 << step] - values[bits])
+            bits |= 1 << step
+    for found, of_step in zip(shares(n_steps, values.__getitem__), added, strict=True):
+        assert found.share == pytest.approx(np.mean(of_step), abs=1e-14)
+        assert (found.least, found.most) == (min(of_step), max(of_step))
+        assert found.standard_error == 0.0
+
+
+@pytest.mark.parametrize("n_steps", [EXACT_STEPS, EXACT_STEPS + 1, 12])
+def test_shares_sum_to_the_difference(n_steps: int) -> None:
+    values = drawn_values(n_steps)
+    asked = []
+    found = shares(n_steps, lambda bits: asked.append(bits) or values[bits])  # type: ignore[func-returns-value]
+    assert math.fsum(one.share for one in found) == pytest.approx(values[-1] - values[0], abs=1e-12)
+    assert set(asked) == set(choices(n_steps))
+
+
+def test_drawn_shares_lie_about_those_of_all_orders_as_their_errors_say() -> None:
+    # A step's share of a sum of its own part and of those of pairs is known without drawing.
+    n_steps = 10
+    generator = np.random.default_rng(0)
+    alone, pairs = generator.normal(size=n_steps), np.triu(generator.normal(size=(n_steps, n_steps)), 1)
+
+    def value(bits: int) -> float:
+        has = np.array([bits >> step & 1 for step in range(n_steps)])
+        return float(alone @ has + has @ pairs @ has)
+
+    known = alone + (pairs.sum(axis=0) + pairs.sum(axis=1)) / 2
+    found = shares(n_steps, value)
+    errors = np.array([one.standard_error for one in found])
+    assert (errors > 0).all() and errors.max() < 4 / math.sqrt(N_ORDERS)
+    assert (np.abs([one.share for one in found] - known) < 4 * errors).all()
+    assert shares(n_steps, value) == found
+    assert shares(n_steps, value, seed=1) != found
+
+
+def slope(x: np.ndarray, y: np.ndarray) -> float:
+    return float(((x - x.mean()) * (y - y.mean())).sum() / ((x - x.mean()) ** 2).sum())
+
+
+def test_the_interval_leaves_out_a_fortieth_of_the_slopes_on_either_side() -> None:
+    rng = np.random.default_rng(2)
+    sizes = np.cumsum(rng.integers(1, 9, 50)).astype(np.float64)
+    costs = sizes**0.3 * np.exp(rng.normal(0, 0.4, 50))
+    growth = growth_exponent(sizes, costs, n_resamples=2000)
+    assert growth is not None
+    # other draws of blocks of seven neighbours, one after another, until there are as many as the data
+    x, y, n, length = np.log(sizes), np.log(costs), 50, 7
+    slopes = []
+    for _ in range(4000):
+        drawn = np.concatenate([np.arange(start, start + length) for start in rng.integers(0, n - length + 1, 8)])[:n]
+        slopes.append(slope(x[drawn], y[drawn]))
+    assert growth.exponent == pytest.approx(slope(x, y), abs=1e-12)
+    assert np.mean(np.array(slopes) < growth.low) == pytest.approx(0.025, abs=0.012)
+    assert np.mean(np.array(slopes) > growth.high) == pytest.approx(0.025, abs=0.012)
+
+
+def test_nothing_is_said_of_too_few_points_or_of_sizes_that_hardly_differ() -> None:
+    sizes = np.linspace(1.0, 2.0, MIN_FIT)
+    assert growth_exponent(sizes, sizes) is not None
+    assert growth_exponent(sizes[1:], sizes[1:]) is None
+    assert growth_exponent(np.linspace(1.0, np.nextafter(2.0, 0), MIN_FIT), sizes) is None
+    assert growth_exponent(np.linspace(10.0, 19.0, MIN_FIT), sizes) is None
+    assert growth_exponent(np.append(sizes, 0.0), np.append(sizes, 1.0)) == growth_exponent(sizes, sizes)
+    assert growth_exponent(np.append(sizes, 1.0), np.append(sizes, 0.0)) == growth_exponent(sizes, sizes)
+
+
+def test_resamples_whose_sizes_hardly_vary_have_no_part_in_the_interval() -> None:
+    sizes = np.array([1.0 + 1e-6 * k for k in range(30)])  # by a billionth of what the last one varies from them
+    sizes[-1] = 1000.0
+    growth = growth_exponent(sizes, np.append(sizes[:-1] ** 3, 1000.0))
+    assert growth is not None
+    assert (growth.exponent, growth.low, growth.high) == pytest.approx((1.0, 1.0, 1.0), abs=1e-3)
