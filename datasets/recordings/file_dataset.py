@@ -149,8 +149,8 @@ class FileDataset(ABC, Generic[OptionsT]):
             logger.warning("%s", line)
 
     def is_scene(self, folder: Path) -> bool:
-        """Whether a folder in one of the places is a scene."""
-        raise NotImplementedError
+        """Whether a folder in one of the places is a scene; of use to ``find_tree`` alone."""
+        raise AssertionError(f"{type(self).__name__} defines neither is_scene nor find_tree")
 
     def find_tree(self) -> SceneTree:
         """Where the scenes are; none is no error here."""
@@ -219,7 +219,7 @@ class FileDataset(ABC, Generic[OptionsT]):
 
     def own_truth(self, scene: str, variant: str) -> GroundTruth:
         """The ground truth under one of ``variants``."""
-        raise NotImplementedError
+        raise AssertionError(f"{type(self).__name__} has variants and no own_truth")
 
     def instance_mesh(self, scene: str) -> InstanceMesh:
         self.folder(scene)
