@@ -58,11 +58,11 @@ def words_of(command: str | Sequence[str]) -> list[str]:
 
 
 def check_placeholders(command: str | Sequence[str], *, is_shell: bool) -> None:
-    """A ``ValueError`` where a placeholder stands for nothing, or where its value would be read as a program."""
+    """Raises ``ValueError`` for an unknown placeholder, or one whose value a program would read as code."""
     if isinstance(command, str) and is_shell:
         for name, place in _misplaced(command):
             right = f'write {{{name}}} outside of quotes, or "${variable_of(name)}"'
-            raise ValueError(f"'{{{name}}}' stands {place}, where a shell would read its value as commands; {right}")
+            raise ValueError(f"'{{{name}}}' is {place}, where a shell would read its value as commands; {right}")
         return
     words = shlex.split(command) if isinstance(command, str) else command
     for k, word in enumerate(words):
@@ -70,10 +70,10 @@ def check_placeholders(command: str | Sequence[str], *, is_shell: bool) -> None:
         if not names:
             continue
         if unknown := [name for name in names if name not in PLACEHOLDERS]:
-            raise ValueError(f"'{{{unknown[0]}}}' stands for nothing; known: {{{'}, {'.join(PLACEHOLDERS)}}}")
+            raise ValueError(f"'{{{unknown[0]}}}' is an unknown placeholder; known: {{{'}, {'.join(PLACEHOLDERS)}}}")
         if not BESIDE.fullmatch(PLACEHOLDER.sub("", word)) or _is_code(words, k):
             raise ValueError(
-                f"'{{{names[0]}}}' stands within what a program may read as code; make it a word of its own, or use "
+                f"'{{{names[0]}}}' is inside what a program may read as code; make it an argument of its own, or use "
                 f"the environment variable {variable_of(names[0])} there"
             )
 

@@ -1,7 +1,7 @@
 """PointFusion as gradslam has it: a map of points that images are associated with by projection and averaged into.
 
 Source: gradslam, branch conceptfusion at 59ca872 (slam/fusionutils.py, structures/rgbdimages.py). Colours are left out:
-nothing that is scored reads them. One feature a point stands in a table of half precision, in memory or on disk.
+nothing that is scored reads them. The table holds one half-precision feature per point, in memory or on disk.
 """
 
 from __future__ import annotations

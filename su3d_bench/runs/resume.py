@@ -48,7 +48,7 @@ class FinishedScenes:
         try:
             with silent():
                 outcomes = [self._outcome(job, *each) for each in zip(job.parts, folders, seals, strict=True)]
-        except Exception:  # noqa: BLE001 - a plug-in may raise anything; a worker tells it as ever
+        except Exception:  # noqa: BLE001 - a plug-in may raise anything; the worker reports it
             return None
         return None if None in outcomes else tuple(outcome for outcome in outcomes if outcome is not None)
 

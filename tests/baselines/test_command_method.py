@@ -185,7 +185,7 @@ def test_a_shell_gets_what_a_scene_is_called_as_a_value_alone(tmp_path: Path, li
 def test_a_placeholder_that_a_shell_would_read_as_commands_is_refused(line: str, place: str) -> None:
     with pytest.raises(ValueError, match="where a shell would read its value as commands; write ") as caught:
         check_placeholders(line, is_shell=True)
-    assert f"}}' stands {place}," in str(caught.value)
+    assert f"}}' is {place}," in str(caught.value)
 
 
 def test_finish_midway_gives_the_map_of_the_frames_so_far_and_changes_nothing(tmp_path: Path) -> None:
