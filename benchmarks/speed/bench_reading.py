@@ -44,9 +44,13 @@ HEADER = SensHeader("StructureSensor", IDENTITY, IDENTITY, IDENTITY, IDENTITY, "
 
 
 @pytest.fixture(scope="module")
-def replica(tmp_path_factory: pytest.TempPathFactory) -> ReplicaFrames:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("replica")
+
+
+@pytest.fixture(scope="module")
+def replica(folder: Path) -> ReplicaFrames:
     """Frames of a room as large as Replica's, in its files."""
-    folder = tmp_path_factory.mktemp("replica")
     room = Rooms(folder, RoomOptions(width=1200, height=680, n_frames=800))
     views = room.frames("living0", 800 // N_DIFFERENT)
     return write_replica(folder, [views[i] for i in range(N_DIFFERENT)], N_REPLICA)
@@ -81,10 +85,10 @@ def read_all(frames: Sequence[object]) -> None:
 
 
 @pytest.mark.parametrize("how", ["plain imread, 1 thread", "ours, 1 thread", "ours, 2 threads ahead"])
-def test_replica_frames(benchmark: BenchmarkFixture, replica: ReplicaFrames, how: str) -> None:
+def test_replica_frames(benchmark: BenchmarkFixture, folder: Path, replica: ReplicaFrames, how: str) -> None:
     benchmark.group = f"{N_REPLICA} Replica frames of 1200x680, JPEG and 16-bit PNG"
     benchmark.name = how
-    plain = PlainReplica(replica._folder)
+    plain = PlainReplica(folder)
     work: dict[str, Callable[[], None]] = {
         "plain imread, 1 thread": lambda: read_all(plain),
         "ours, 1 thread": lambda: read_all(replica),
