@@ -85,11 +85,11 @@ $(VENV)/docs: $(VENV)/core
 	@touch $@
 
 $(VENV)/test: $(VENV)/core
-	$(PIP) -e '.[models,sheets,ray,slurm,stores,parquet,test]'
+	$(PIP) -e '.[models,sheets,ray,slurm,stores,parquet,rerun,test]'
 	@touch $@
 
 $(VENV)/dev: $(VENV)/test
-	$(PIP) -e '.[models,sheets,ray,slurm,stores,parquet,test,dev]'
+	$(PIP) -e '.[models,sheets,ray,slurm,stores,parquet,rerun,test,dev]'
 	@touch $@
 
 clean:

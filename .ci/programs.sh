@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# A browser, an office and shells for the tests that drive them, where this machine lets us; those tests skip where it does not.
+# A browser, an office and LaTeX for the tests that drive them, where they can be installed; without them those tests skip.
 set -u
 
 has() { for name in "$@"; do command -v "$name" >/dev/null && return 0; done; return 1; }
@@ -19,7 +19,7 @@ offices=(soffice libreoffice)
 missing=()
 has "${browsers[@]}" || missing+=("chromium")
 has "${offices[@]}" || missing+=("libreoffice-calc python3-uno")
-for shell in zsh fish; do has "$shell" || missing+=("$shell"); done
+has pdflatex || missing+=("texlive-latex-base texlive-latex-recommended")
 [ ${#missing[@]} = 0 ] || as_root apt-get update -qq >/dev/null 2>&1 </dev/null
 for packages in "${missing[@]}"; do
     # shellcheck disable=SC2086 - one word a package
