@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import argparse
 import os
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from su3d_bench.cli.options import Verbs, add_options, add_out, add_verb
+from su3d_bench.cli.options import Verbs, add_verb
 from su3d_bench.cli.output import (
     answer_commands,
     answer_document,
@@ -29,25 +28,21 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def _add_compare(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "compare",
-        "Compare two runs over their common scenes: exact test, and differences with interval.",
-        (
-            "su3d-bench compare runs/before runs/after --per-class",
-            "su3d-bench compare runs/old-0,runs/old-1 runs/new-0,runs/new-1 --protocols rooms-instance --json",
-        ),
-        call_compare,
-    )
-    parser.add_argument("left", metavar="A", help="the folder of a run, or FOLDER:METHOD; FOLDER,FOLDER: several seeds")
-    parser.add_argument("right", metavar="B", help="the run that is held against it; differences are B - A")
-    parser.add_argument("--method", help="compare this method alone (default: all of the same name)")
-    add_options(parser, "--protocols")
-    parser.add_argument("--per-class", action="store_true", help="each class too")
-    add_options(parser, "--format")
+    parser = add_verb(verbs, "compare", call_compare)
+    parser.option("left A", "the folder of a run, or FOLDER:METHOD; FOLDER,FOLDER: several seeds")
+    parser.option("right B", "the run that is held against it; differences are B - A")
+    parser.option("--method METHOD", "compare this method alone (default: all of the same name)")
+    parser.shared("--protocols")
+    parser.option("--per-class", "each class too")
+    parser.shared("--format")
 
 
 def call_compare(arguments: argparse.Namespace) -> int:
+    """Compare two runs over their common scenes: exact test, and differences with interval.
+
+    su3d-bench compare runs/before runs/after --per-class
+    su3d-bench compare runs/old-0,runs/old-1 runs/new-0,runs/new-1 --protocols rooms-instance --json
+    """
     from su3d_bench.analysis.comparison import compare
     from su3d_bench.reports.tables.comparison import comparison_tables
 
@@ -63,37 +58,30 @@ def call_compare(arguments: argparse.Namespace) -> int:
 
 
 def _add_check(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "check",
-        "Hold a run against a reference and fail where a number got worse; or learn a reference from runs.",
-        (
-            "su3d-bench check --learn runs/a runs/b runs/c --out reference.json",
-            "su3d-bench check runs/mine --against reference.json --markdown comment.md --junit check.xml",
-        ),
-        call_check,
-    )
-    parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="the run to check")
-    parser.add_argument("--against", type=Path, metavar="FILE", help="the reference")
-    parser.add_argument("--learn", nargs="+", type=Path, metavar="RUN", help="repeats of one run to learn from")
-    add_out(parser, "FILE", "where --learn writes the reference")
-    parser.add_argument(
-        "--cost-limit", type=float, metavar="TIMES", help="how many times as long a method may take (with --learn)"
-    )
-    parser.add_argument(
-        "--across-machines",
+    parser = add_verb(verbs, "check", call_check)
+    parser.option("runs [RUN...]", "the run to check")
+    parser.option("--against FILE", "the reference")
+    parser.option("--learn RUN...", "repeats of one run to learn from")
+    parser.option("--out FILE", "where --learn writes the reference")
+    parser.option("--cost-limit TIMES", "how many times as long a method may take (with --learn)", type=float)
+    parser.option(
+        "--across-machines POINTS",
+        "by how many points headline values may differ on another machine (with --learn; default: 2)",
         type=float,
-        metavar="POINTS",
-        help="by how many points headline values may differ on another machine (with --learn; default: 2)",
     )
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the table for a pull request")
-    parser.add_argument("--junit", type=Path, metavar="FILE", help="write JUnit XML")
-    parser.add_argument(
-        "--github", action=argparse.BooleanOptionalAction, help="print GitHub annotations (default: in its workflows)"
+    parser.option("--markdown FILE", "write the table for a pull request")
+    parser.option("--junit FILE", "write JUnit XML")
+    parser.option(
+        "--github", "print GitHub annotations (default: in its workflows)", action=argparse.BooleanOptionalAction
     )
 
 
 def call_check(arguments: argparse.Namespace) -> int:
+    """Hold a run against a reference and fail where a number got worse; or learn a reference from runs.
+
+    su3d-bench check --learn runs/a runs/b runs/c --out reference.json
+    su3d-bench check runs/mine --against reference.json --markdown comment.md --junit check.xml
+    """
     if arguments.learn:
         return _learn(arguments)
     if len(arguments.runs) != 1 or arguments.against is None:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from su3d_bench.cli.options import Verbs, add_options, add_out, add_verb
+from su3d_bench.cli.options import Verbs, add_verb
 from su3d_bench.cli.output import answer_tables, remark
 from su3d_bench.core.errors import EXIT_DONE, ConfigError
 
@@ -19,66 +19,48 @@ SCHEMA = 1  # of the JSON file of several methods
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "evaluate",
-        "Score predictions made elsewhere, under every protocol that fits; the format is recognised.",
-        (
-            "su3d-bench evaluate pred/ --ground-truth gt/ --protocols scannet-instance --out runs/mine",
-            "su3d-bench evaluate --name mine=predA theirs=predB --dataset replica --out runs/both",
-        ),
-        call,
-    )
-    parser.add_argument(
-        "predictions",
-        nargs="*",
-        type=Path,
-        metavar="PREDICTIONS",
-        help="a folder of predictions, a run folder, or files",
-    )
-    parser.add_argument(
-        "--name",
-        nargs="+",
+    parser = add_verb(verbs, "evaluate", call)
+    parser.option("predictions [PREDICTIONS...]", "a folder of predictions, a run folder, or files", type=Path)
+    parser.option(
+        "--name METHOD=PREDICTIONS...",
+        "several methods side by side; METHOD alone names PREDICTIONS (default: as the folder of --out)",
         action="extend",
         default=[],
-        metavar="METHOD=PREDICTIONS",
-        help="several methods side by side; METHOD alone names PREDICTIONS (default: as the folder of --out)",
     )
-    add_out(
-        parser,
-        "DIR",
-        "write a run folder there, which compare, attribute, report, check, sheets, query and export take",
+    parser.option(
+        "--out DIR", "write a run folder there, which compare, attribute, report, check, sheets, query and export take"
     )
-    parser.add_argument(
-        "--dataset", metavar="NAME", help="whose ground truth, below $SU3D_DATA: replica, scannet, rooms"
-    )
-    parser.add_argument(
-        "--ground-truth",
-        type=Path,
-        metavar="DIR",
-        help="ground truth as text instead, <scene>.txt with label * 1000 + instance a vertex, or label ids; or "
+    parser.option("--dataset NAME", "whose ground truth, below $SU3D_DATA: replica, scannet, rooms")
+    parser.option(
+        "--ground-truth DIR",
+        "ground truth as text instead, <scene>.txt with label * 1000 + instance a vertex, or label ids; or "
         "OpenLex3D's release",
     )
-    parser.add_argument(
+    parser.option(
         "--truth-values",
-        choices=("classes", "instances", "numbers"),
-        help="what that text holds, where its values do not tell: class ids, label * 1000 + instance, or numbers of "
+        "what that text holds, where its values do not tell: class ids, label * 1000 + instance, or numbers of "
         "objects alone (0 for none), as in the OpenSUN3D challenge",
+        choices=("classes", "instances", "numbers"),
     )
-    add_options(parser, "--protocols", "--scenes")
-    parser.add_argument("--format", metavar="FORMAT", help="of the predictions, where it cannot be recognised")
-    add_options(parser, "--text-features")
-    parser.add_argument(
+    parser.shared("--protocols", "--scenes")
+    parser.option("--format FORMAT", "of the predictions, where it cannot be recognised")
+    parser.shared("--text-features")
+    parser.option(
         "--confidences",
+        "where a protocol has 1 for every mask: its rule, or the files' (default: file for ScanNet's text)",
         choices=("protocol", "file"),
-        help="where a protocol has 1 for every mask: its rule, or the files' (default: file for ScanNet's text)",
     )
-    add_options(parser, "--queries")
-    parser.add_argument("--per-class", action="store_true", help="print the table of every class too")
-    add_options(parser, "--table-format")
+    parser.shared("--queries")
+    parser.option("--per-class", "print the table of every class too")
+    parser.shared("--table-format")
 
 
 def call(arguments: argparse.Namespace) -> int:
+    """Score predictions made elsewhere, under every protocol that fits; the format is recognised.
+
+    su3d-bench evaluate pred/ --ground-truth gt/ --protocols scannet-instance --out runs/mine
+    su3d-bench evaluate --name mine=predA theirs=predB --dataset replica --out runs/both
+    """
     from su3d_bench.evaluation.as_run import evaluate_methods
     from su3d_bench.evaluation.evaluate import evaluate, said_of
     from su3d_bench.reports.tables.run import evaluation_tables, side_by_side_tables

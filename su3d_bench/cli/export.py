@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.options import Verbs, add_options, add_out, add_verb
+from su3d_bench.cli.options import Verbs, add_verb
 from su3d_bench.cli.output import answer, answer_json, remark
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, counted, printable, suggest
 
@@ -24,34 +24,25 @@ QUERY_RULES = "opensun3d-queries"
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "export",
-        "Write predictions, our own or another program's, as the files that another evaluator takes.",
-        (
-            "su3d-bench runs export runs/my-run --to openlex3d --method opensu3d --out exported/opensu3d",
-            "su3d-bench runs export results/open3dis --to scannet --scenes 'replica/*' --out exported/open3dis",
-        ),
-        call,
-    )
-    parser.add_argument("path", type=Path, metavar="RUN_OR_PREDICTION", help="a run folder, or files of predictions")
-    parser.add_argument(
+    parser = add_verb(verbs, "export", call)
+    parser.option("path RUN_OR_PREDICTION", "a run folder, or files of predictions", type=Path)
+    parser.option(
         "--to",
-        required=True,
-        choices=TARGETS,
-        help="openlex3d: a cloud, the object of each point and features; scannet: lists of masks with class and score; "
+        "openlex3d: a cloud, the object of each point and features; scannet: lists of masks with class and score; "
         "scannetpp: such lists with run-length masks, or with a --protocol of kind top-k the classes of every vertex; "
         "opensun3d: the masks that answer the query of each scene of arkitscenes, with confidences",
+        required=True,
+        choices=TARGETS,
     )
-    add_out(parser, "DIR", "a new folder for the files", required=True)
-    parser.add_argument("--method", help="whose maps of a run (default: the only one that it was asked for)")
-    add_options(parser, "--scenes")
-    parser.add_argument("--format", help="the format of the prediction (default: found from its files)")
-    parser.add_argument(
-        "--protocol",
-        help="for scannet and scannetpp: whose classes and ground truth (default: the dataset's only one of instances)",
+    parser.option("--out DIR", "a new folder for the files", required=True)
+    parser.option("--method METHOD", "whose maps of a run (default: the only one that it was asked for)")
+    parser.shared("--scenes")
+    parser.option("--format FORMAT", "the format of the prediction (default: found from its files)")
+    parser.option(
+        "--protocol PROTOCOL",
+        "for scannet and scannetpp: whose classes and ground truth (default: the dataset's only one of instances)",
     )
-    add_options(parser, "--text-features")
+    parser.shared("--text-features")
 
 
 @dataclass(frozen=True)
@@ -69,6 +60,11 @@ class Source:
 
 
 def call(arguments: argparse.Namespace) -> int:
+    """Write predictions, our own or another program's, as the files that another evaluator takes.
+
+    su3d-bench runs export runs/my-run --to openlex3d --method opensu3d --out exported/opensu3d
+    su3d-bench runs export results/open3dis --to scannet --scenes 'replica/*' --out exported/open3dis
+    """
     from su3d_bench.predictions.export import whole_folder, write_openlex
 
     is_openlex = arguments.to == "openlex3d"

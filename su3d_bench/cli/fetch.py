@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.options import Verbs, add_group, add_options, add_verb, perception_config
+from su3d_bench.cli.options import Verbs, add_group, add_verb, perception_config
 from su3d_bench.cli.output import answer_either, drawn_bars, remark
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, suggest
 
@@ -24,32 +24,24 @@ MB = 1_000_000
 
 def _add_fetch_options(parser: argparse.ArgumentParser, *, has_servers: bool = True) -> None:
     """``--accept``, ``--dry-run``, ``--retries``; where servers are in the table, ``--mirror`` and ``--sources``."""
-    parser.add_argument(
-        "--accept",
-        nargs="+",
+    parser.option(
+        "--accept NAME...",
+        "accept the licence of what has this name, or the licence itself, such as MIT (default: you are asked)",
         action="extend",
         default=[],
-        metavar="NAME",
-        help="accept the licence of what has this name, or the licence itself, such as MIT (default: you are asked)",
     )
-    add_options(parser, "--dry-run")
-    parser.add_argument(
-        "--retries", type=int, default=3, metavar="N", help="how often a broken download is taken up again (default: 3)"
-    )
+    parser.shared("--dry-run")
+    parser.option("--retries N", "how often a broken download is taken up again (default: 3)", type=int, default=3)
     if has_servers:
-        parser.add_argument(
-            "--mirror",
-            nargs="+",
+        parser.option(
+            "--mirror NAME=URL...",
+            "take its files from this folder of another server; for a repository of the hub, another endpoint",
             action="extend",
             default=[],
-            metavar="NAME=URL",
-            help="take its files from this folder of another server; for a repository of the hub, another endpoint",
         )
-        parser.add_argument(
-            "--sources",
-            type=Path,
-            metavar="FILE",
-            help="a TOML file of your own in the form of the program's table, whose entries take the place of its own",
+        parser.option(
+            "--sources FILE",
+            "a TOML file of your own in the form of the program's table, whose entries take the place of its own",
         )
 
 
@@ -200,24 +192,19 @@ def watching(arguments: argparse.Namespace) -> Iterator[Watch]:
 
 
 def add_models(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "fetch",
-        "Fetch foundation models into $SU3D_MODELS: from the Hugging Face hub, or where their authors publish them.",
-        (
-            "su3d-bench models fetch --for paper --accept MIT Apache-2.0",
-            "su3d-bench models fetch sam-vit-h --dry-run",
-        ),
-        call_models,
-        takes_up=True,
-    )
-    parser.add_argument("names", nargs="*", metavar="MODEL", help="short names, as models list has them")
-    parser.add_argument("--for", dest="profile", metavar="PROFILE", help="every model that this profile loads: paper")
+    parser = add_verb(verbs, "fetch", call_models, takes_up=True)
+    parser.option("names [MODEL...]", "short names, as models list has them")
+    parser.option("--for PROFILE", "every model that this profile loads: paper", dest="profile")
     _add_fetch_options(parser)
-    add_options(parser, "--set")
+    parser.shared("--set")
 
 
 def call_models(arguments: argparse.Namespace) -> int:
+    """Fetch foundation models into $SU3D_MODELS: from the Hugging Face hub, or where their authors publish them.
+
+    su3d-bench models fetch --for paper --accept MIT Apache-2.0
+    su3d-bench models fetch sam-vit-h --dry-run
+    """
     from su3d_bench.fetching.bringing import plan_models
     from su3d_bench.perception.models.files import models_folder
 
@@ -226,32 +213,29 @@ def call_models(arguments: argparse.Namespace) -> int:
 
 
 def add_data(verbs: Verbs) -> None:
-    """``datasets fetch`` with a sub-verb for each dataset that can be fetched."""
-    actions = add_group(
-        verbs,
-        "fetch",
-        "Fetch published data: shown first, resumed, checked, unpacked where it is looked for.",
-        ("su3d-bench datasets fetch replica --dry-run", "su3d-bench datasets fetch scannet --dry-run"),
-    )
+    """Fetch published data: shown first, resumed, checked, unpacked where it is looked for.
+
+    su3d-bench datasets fetch replica --dry-run
+    su3d-bench datasets fetch scannet --dry-run
+    """
+    actions = add_group(verbs, "fetch", add_data)
     _add_replica(actions)
     _add_scannet(actions)
 
 
 def _add_replica(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "replica",
-        "Fetch Replica into $SU3D_DATA: NICE-SLAM's RGB-D frames, and the annotated meshes of the release.",
-        ("su3d-bench datasets fetch replica --dry-run", "su3d-bench datasets fetch replica frames --accept replica"),
-        call_replica,
-        takes_up=True,
-    )
-    parser.add_argument("parts", nargs="*", metavar="PART", help="frames, meshes (default: both)")
-    parser.add_argument("--keep-archives", action="store_true", help="keep what was unpacked, in .fetched")
+    parser = add_verb(verbs, "replica", call_replica, takes_up=True)
+    parser.option("parts [PART...]", "frames, meshes (default: both)")
+    parser.option("--keep-archives", "keep what was unpacked, in .fetched")
     _add_fetch_options(parser)
 
 
 def call_replica(arguments: argparse.Namespace) -> int:
+    """Fetch Replica into $SU3D_DATA: NICE-SLAM's RGB-D frames, and the annotated meshes of the release.
+
+    su3d-bench datasets fetch replica --dry-run
+    su3d-bench datasets fetch replica frames --accept replica
+    """
     from su3d_bench.fetching.bringing import plan_replica
     from su3d_bench.runs.scenes import data_root
 
@@ -259,20 +243,8 @@ def call_replica(arguments: argparse.Namespace) -> int:
 
 
 def _add_scannet(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "scannet",
-        "Fetch scans of ScanNet into $SU3D_DATA by your own official script or link, or say how to sign its terms.",
-        (
-            "su3d-bench datasets fetch scannet --script download-scannet.py",
-            "su3d-bench datasets fetch scannet val --from https://example.org/scannet --accept scannet",
-        ),
-        call_scannet,
-        takes_up=True,
-    )
-    parser.add_argument(
-        "scans", nargs="*", metavar="SCAN", help="scene0000_00, paper, train, val or test (default: paper)"
-    )
+    parser = add_verb(verbs, "scannet", call_scannet, takes_up=True)
+    parser.option("scans [SCAN...]", "scene0000_00, paper, train, val or test (default: paper)")
     given = parser.add_mutually_exclusive_group()
     given.add_argument("--script", type=Path, metavar="FILE", help="your official download script")
     given.add_argument(
@@ -282,6 +254,11 @@ def _add_scannet(verbs: Verbs) -> None:
 
 
 def call_scannet(arguments: argparse.Namespace) -> int:
+    """Fetch scans of ScanNet into $SU3D_DATA by your own official script or link, or say how to sign its terms.
+
+    su3d-bench datasets fetch scannet --script download-scannet.py
+    su3d-bench datasets fetch scannet val --from https://example.org/scannet --accept scannet
+    """
     from su3d_bench.fetching.scannet import fetch_by_script, fetch_from, how_to_sign, plan_scans
     from su3d_bench.fetching.sources import built_in
     from su3d_bench.runs.scenes import data_root

@@ -22,40 +22,26 @@ WIDTH = 118
 
 
 def add_parser(verbs: Verbs) -> None:
-    actions = add_group(
-        verbs,
-        "methods",
-        "List the methods that can be run, show the settings of one, try one on two frames, or write one of your own.",
-        ("su3d-bench methods list", "su3d-bench methods show opensu3d"),
-        lists=True,
-    )
-    add_verb(
-        actions,
-        "list",
-        "List the methods that can be run: where they come from, their licence, what they need.",
-        ("su3d-bench methods list", "su3d-bench methods list --json"),
-        call_list,
-    )
-    parser = add_verb(
-        actions,
-        "show",
-        "Show the settings of a method, its presets and what papers report of it.",
-        ("su3d-bench methods show opensu3d", "su3d-bench methods show my_method.py:MyMethod"),
-        call_show,
-    )
-    parser.add_argument("name", metavar="METHOD", help="its name, or file.py:Class")
-    parser = add_verb(
-        actions,
-        "check",
-        "Try a method on two frames of a room, and name what is wrong with what it gives.",
-        ("su3d-bench methods check oracle", "su3d-bench methods check my_method.py:MyMethod"),
-        call_check,
-    )
-    parser.add_argument("name", metavar="METHOD", help="its name, or file.py:Class")
+    """List the methods that can be run, show the settings of one, try one on two frames, or write one of your own.
+
+    su3d-bench methods list
+    su3d-bench methods show opensu3d
+    """
+    actions = add_group(verbs, "methods", add_parser, lists=True)
+    add_verb(actions, "list", call_list)
+    parser = add_verb(actions, "show", call_show)
+    parser.option("name METHOD", "its name, or file.py:Class")
+    parser = add_verb(actions, "check", call_check)
+    parser.option("name METHOD", "its name, or file.py:Class")
     add_new(actions, "method")
 
 
 def call_list(arguments: argparse.Namespace) -> int:
+    """List the methods that can be run: where they come from, their licence, what they need.
+
+    su3d-bench methods list
+    su3d-bench methods list --json
+    """
     from su3d_bench.runs.catalogue import known_methods
 
     rows = known_methods()
@@ -64,6 +50,11 @@ def call_list(arguments: argparse.Namespace) -> int:
 
 
 def call_check(arguments: argparse.Namespace) -> int:
+    """Try a method on two frames of a room, and name what is wrong with what it gives.
+
+    su3d-bench methods check oracle
+    su3d-bench methods check my_method.py:MyMethod
+    """
     from su3d_bench.runs.trial import try_method
 
     trial = try_method(arguments.name)
@@ -85,6 +76,11 @@ def _lines(row: dict[str, Any]) -> list[str]:
 
 
 def call_show(arguments: argparse.Namespace) -> int:
+    """Show the settings of a method, its presets and what papers report of it.
+
+    su3d-bench methods show opensu3d
+    su3d-bench methods show my_method.py:MyMethod
+    """
     from su3d_bench.core import registry
     from su3d_bench.core.config import flatten, write_toml
     from su3d_bench.reports.tables.paper import figures_of

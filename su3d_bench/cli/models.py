@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli import fetch
-from su3d_bench.cli.options import Verbs, add_group, add_options, add_verb, perception_config
+from su3d_bench.cli.options import Verbs, add_group, add_verb, perception_config
 from su3d_bench.cli.output import answer, answer_either, answer_json, remark
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
 
@@ -18,48 +18,34 @@ if TYPE_CHECKING:
 
 
 def add_parser(verbs: Verbs) -> None:
-    actions = add_group(
-        verbs,
-        "models",
-        "List the foundation models, fetch them, check their files, or run them once.",
-        ("su3d-bench models list", "su3d-bench models fetch --for paper --dry-run"),
-        lists=True,
-    )
-    listing = add_verb(
-        actions,
-        "list",
-        "List every model: size, licence, which profile loads it, and where it lies or that it is missing.",
-        ("su3d-bench models list", "su3d-bench models list --json"),
-        call_list,
-    )
-    add_options(listing, "--set")
-    checking = add_verb(
-        actions,
-        "check",
-        "Tell the SHA-256 of every file of models, as run records carry them, and name all that is wrong.",
-        ("su3d-bench models check", "su3d-bench models check clip-vit-h-14 sam-vit-h --json"),
-        call_check,
-    )
-    checking.add_argument("names", nargs="*", metavar="MODEL", help="short names (default: every model that is here)")
-    add_options(checking, "--set")
+    """List the foundation models, fetch them, check their files, or run them once.
+
+    su3d-bench models list
+    su3d-bench models fetch --for paper --dry-run
+    """
+    actions = add_group(verbs, "models", add_parser, lists=True)
+    listing = add_verb(actions, "list", call_list)
+    listing.shared("--set")
+    checking = add_verb(actions, "check", call_check)
+    checking.option("names [MODEL...]", "short names (default: every model that is here)")
+    checking.shared("--set")
     _add_warm(actions)
     fetch.add_models(actions)
 
 
 def _add_warm(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "warm",
-        "Load the models of a profile, or one encoder, run them on a made frame, and tell time and memory.",
-        ("su3d-bench models warm --profile paper --device cuda", "su3d-bench models warm clip-vit-b-32"),
-        call_warm,
-    )
-    parser.add_argument("name", nargs="?", metavar="ENCODER", help="an encoder alone (default: the profile's models)")
-    parser.add_argument("--profile", help="whose models (default: paper)")
-    add_options(parser, "--device", "--set")
+    parser = add_verb(verbs, "warm", call_warm)
+    parser.option("name [ENCODER]", "an encoder alone (default: the profile's models)")
+    parser.option("--profile PROFILE", "whose models (default: paper)")
+    parser.shared("--device", "--set")
 
 
 def call_list(arguments: argparse.Namespace) -> int:
+    """List every model: size, licence, which profile loads it, and where it lies or that it is missing.
+
+    su3d-bench models list
+    su3d-bench models list --json
+    """
     states = _states(arguments, ())
     if answer_json(arguments, [_state_row(state) for state in states]):
         return EXIT_DONE
@@ -107,6 +93,11 @@ def _state_row(state: ModelState) -> dict[str, Any]:
 
 
 def call_check(arguments: argparse.Namespace) -> int:
+    """Tell the SHA-256 of every file of models, as run records carry them, and name all that is wrong.
+
+    su3d-bench models check
+    su3d-bench models check clip-vit-h-14 sam-vit-h --json
+    """
     names = tuple(dict.fromkeys(arguments.names))
     states = _states(arguments, names)
     rows = [_checked(files) for state in states for files in state.files]
@@ -142,6 +133,11 @@ def _check_lines(row: dict[str, Any]) -> list[str]:
 
 
 def call_warm(arguments: argparse.Namespace) -> int:
+    """Load the models of a profile, or one encoder, run them on a made frame, and tell time and memory.
+
+    su3d-bench models warm --profile paper --device cuda
+    su3d-bench models warm clip-vit-b-32
+    """
     result = _warm(arguments)
     lines = [f"{result.what}: loaded and first run {result.load_s:.1f} s, next run {result.run_s:.3f} s"]
     lines += [f"  {name:<10} {ms:>10.1f} ms" for name, ms in result.stages_ms.items()]

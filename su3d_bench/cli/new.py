@@ -35,18 +35,17 @@ def add_new(verbs: Verbs, what: str) -> None:
     """The sub-verb ``new`` of methods, datasets, protocols and registries."""
     group = {REGISTRY: "dev registry"}.get(what, f"{what}s")
     place = "my-registry" if what == REGISTRY else f"my_{what}{SUFFIX[what]}"
-    parser = add_verb(
-        verbs,
-        "new",
-        f"Write a {what} of your own that works as it is, to begin from.",
-        (f"su3d-bench {group} new {place}", f"su3d-bench {group} new {place} --json"),
-        call,
-    )
+    about = f"""Write a {what} of your own that works as it is, to begin from.
+
+    su3d-bench {group} new {place}
+    su3d-bench {group} new {place} --json
+    """
+    parser = add_verb(verbs, "new", call, about)
     parser.set_defaults(what=what)
     if what == REGISTRY:
-        parser.add_argument("file", type=Path, metavar="DIR", help="the folder to write")
+        parser.option("file DIR", "the folder to write")
     else:
-        parser.add_argument("file", type=Path, metavar="FILE", help="to write; its name becomes the name in it")
+        parser.option("file FILE", "to write; its name becomes the name in it")
 
 
 def call(arguments: argparse.Namespace) -> int:

@@ -11,7 +11,7 @@ from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.new import add_new
-from su3d_bench.cli.options import Verbs, add_group, add_options, add_out, add_verb, perception_config
+from su3d_bench.cli.options import Verbs, add_group, add_verb, perception_config
 from su3d_bench.cli.output import answer_either, answer_tables, progress, remark, show
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, shown, suggest
 
@@ -21,54 +21,36 @@ if TYPE_CHECKING:
 
 
 def add_parser(verbs: Verbs) -> None:
-    actions = add_group(
-        verbs,
-        "protocols",
-        "List the protocols, show the rules of one, compare the rules of two, or write one of your own.",
-        ("su3d-bench protocols show rooms-semantic", "su3d-bench protocols diff rooms-semantic replica-mesh-ex6"),
-        lists=True,
+    """List the protocols, show the rules of one, compare the rules of two, or write one of your own.
+
+    su3d-bench protocols show rooms-semantic
+    su3d-bench protocols diff rooms-semantic replica-mesh-ex6
+    """
+    actions = add_group(verbs, "protocols", add_parser, lists=True)
+    add_verb(actions, "list", call_list)
+    parser = add_verb(actions, "show", call_show)
+    parser.option("name PROTOCOL", "its name, or a .toml file of the same form")
+    parser.option("--names", "the texts, one a line, to encode elsewhere")
+    parser.shared("--queries")
+    parser = add_verb(actions, "diff", call_diff)
+    parser.option("name A", "a protocol's name, or a .toml file of the same form")
+    parser.option("other B", "the protocol that it is compared with")
+    parser.option(
+        "--prediction RUN[:METHOD]",
+        "score it under every choice of the rules, and split the difference of its numbers among them",
     )
-    add_verb(
-        actions,
-        "list",
-        "List the protocols and whose evaluations they repeat.",
-        ("su3d-bench protocols list", "su3d-bench protocols list --json"),
-        call_list,
-    )
-    parser = add_verb(
-        actions,
-        "show",
-        "Print every rule of a protocol with its source, or the texts that features are compared with.",
-        ("su3d-bench protocols show rooms-semantic", "su3d-bench protocols show rooms-semantic --names"),
-        call_show,
-    )
-    parser.add_argument("name", metavar="PROTOCOL", help="its name, or a .toml file of the same form")
-    parser.add_argument("--names", action="store_true", help="the texts, one a line, to encode elsewhere")
-    add_options(parser, "--queries")
-    parser = add_verb(
-        actions,
-        "diff",
-        "Print the rules in which two protocols differ, and with --prediction what each does to the numbers.",
-        (
-            "su3d-bench protocols diff rooms-semantic replica-mesh-ex6",
-            "su3d-bench protocols diff rooms-semantic replica-mesh-ex6 --prediction runs/demo --out steps.png",
-        ),
-        call_diff,
-    )
-    parser.add_argument("name", metavar="A", help="a protocol's name, or a .toml file of the same form")
-    parser.add_argument("other", metavar="B", help="the protocol that it is compared with")
-    parser.add_argument(
-        "--prediction",
-        metavar="RUN[:METHOD]",
-        help="score it under every choice of the rules, and split the difference of its numbers among them",
-    )
-    add_out(parser, "PNG", "with --prediction: draw the steps to this file")
-    add_options(parser, "--jobs", "--format")
+    parser.option("--out PNG", "with --prediction: draw the steps to this file")
+    parser.shared("--jobs", "--format")
     _add_texts(actions)
     add_new(actions, "protocol")
 
 
 def call_list(arguments: argparse.Namespace) -> int:
+    """List the protocols and whose evaluations they repeat.
+
+    su3d-bench protocols list
+    su3d-bench protocols list --json
+    """
     from su3d_bench.metrics.protocols.loading import load_protocol, original_of, protocol_names
 
     rows = [(load_protocol(name), original_of(name)) for name in protocol_names()]
@@ -85,6 +67,11 @@ def call_list(arguments: argparse.Namespace) -> int:
 
 
 def call_show(arguments: argparse.Namespace) -> int:
+    """Print every rule of a protocol with its source, or the texts that features are compared with.
+
+    su3d-bench protocols show rooms-semantic
+    su3d-bench protocols show rooms-semantic --names
+    """
     from su3d_bench.metrics.fitness import labels_taken
     from su3d_bench.metrics.protocols.loading import load_protocol, original_of, rules_files
 
@@ -110,6 +97,11 @@ def _original_lines(stated: Stated | None) -> list[str]:
 
 
 def call_diff(arguments: argparse.Namespace) -> int:
+    """Print the rules in which two protocols differ, and with --prediction what each does to the numbers.
+
+    su3d-bench protocols diff rooms-semantic replica-mesh-ex6
+    su3d-bench protocols diff rooms-semantic replica-mesh-ex6 --prediction runs/demo --out steps.png
+    """
     from su3d_bench.analysis.rules_walk import Walker, rules_apart
     from su3d_bench.metrics.protocols.loading import load_protocol
     from su3d_bench.reports.tables.comparison import rules_tables
@@ -174,26 +166,20 @@ FORMS_OF_EVALUATE = (".toml", ".csv")  # of queries, with the objects that they 
 
 
 def _add_texts(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "texts",
-        "Encode every text of a protocol: its classes under its prompts, or queries, for evaluate --text-features.",
-        (
-            "su3d-bench protocols texts --protocol rooms-semantic --encoder embedded --out texts.npz",
-            "su3d-bench protocols texts --protocol replica-openmask3d --encoder clip-vit-l-14-336 --out texts.npz",
-        ),
-        call_texts,
-    )
-    parser.add_argument("--protocol", required=True, metavar="P", help="whose texts; a name, or a .toml file")
-    parser.add_argument(
-        "--encoder", metavar="E", help="what encodes them, a name of su3d-bench models list (default: the protocol's)"
-    )
-    add_options(parser, "--queries")
-    add_options(parser, "--device", "--set")
-    add_out(parser, "FILE", "where names and features go", required=True)
+    parser = add_verb(verbs, "texts", call_texts)
+    parser.option("--protocol P", "whose texts; a name, or a .toml file", required=True)
+    parser.option("--encoder E", "what encodes them, a name of su3d-bench models list (default: the protocol's)")
+    parser.shared("--queries")
+    parser.shared("--device", "--set")
+    parser.option("--out FILE", "where names and features go", required=True)
 
 
 def call_texts(arguments: argparse.Namespace) -> int:
+    """Encode every text of a protocol: its classes under its prompts, or queries, for evaluate --text-features.
+
+    su3d-bench protocols texts --protocol rooms-semantic --encoder embedded --out texts.npz
+    su3d-bench protocols texts --protocol replica-openmask3d --encoder clip-vit-l-14-336 --out texts.npz
+    """
     from su3d_bench.core.files.atomic import make_folder, write_npz
     from su3d_bench.evaluation.texts import distinct_texts, named_texts, text_arrays
     from su3d_bench.metrics.protocols.loading import load_protocol

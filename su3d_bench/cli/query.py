@@ -11,8 +11,6 @@ from su3d_bench.cli.options import (
     Verbs,
     add_group,
     add_language_options,
-    add_options,
-    add_out,
     add_verb,
     answer_estimate,
     chat_client,
@@ -33,37 +31,33 @@ if TYPE_CHECKING:
 
 
 def add_parser(verbs: Verbs) -> None:
-    actions = add_group(
-        verbs,
-        "query",
-        "Ask the map of a scene for a text or a question, and make, show, audit or score sets of questions.",
-        ('su3d-bench query text rooms/living0 "plant on shelf"', "su3d-bench query show paper"),
-    )
+    """Ask the map of a scene for a text or a question, and make, show, audit or score sets of questions.
+
+    su3d-bench query text rooms/living0 "plant on shelf"
+    su3d-bench query show paper
+    """
+    actions = add_group(verbs, "query", add_parser)
     _add_text(actions)
     _add_ask(actions)
     questions.add_parser(actions)
 
 
 def _add_text(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "text",
-        "Rank the instances of a scene's map by their similarity to a text and draw the heat map.",
-        (
-            'su3d-bench query text rooms/living0 "plant on shelf"',
-            'su3d-bench query text rooms/living0 "place to sit" --top 3 --method opensu3d --json',
-        ),
-        call_text,
-    )
-    parser.add_argument("scene", help="the scene's address, such as rooms/living0")
-    parser.add_argument("text", help="what to look for")
-    add_options(parser, "--run", "--method")
-    parser.add_argument("--top", type=count, default=10, metavar="N", help="how many instances to list (default: 10)")
-    add_options(parser, "--device")
-    add_out(parser, "FILE", "where the picture goes (default: beside the map)")
+    parser = add_verb(verbs, "text", call_text)
+    parser.option("scene", "the scene's address, such as rooms/living0")
+    parser.option("text", "what to look for")
+    parser.shared("--run", "--method")
+    parser.option("--top N", "how many instances to list (default: 10)", type=count, default=10)
+    parser.shared("--device")
+    parser.option("--out FILE", "where the picture goes (default: beside the map)")
 
 
 def call_text(arguments: argparse.Namespace) -> int:
+    """Rank the instances of a scene's map by their similarity to a text and draw the heat map.
+
+    su3d-bench query text rooms/living0 "plant on shelf"
+    su3d-bench query text rooms/living0 "place to sit" --top 3 --method opensu3d --json
+    """
     from su3d_bench.core.maps import DenseFeatures, Instances
     from su3d_bench.questions.model import rank
     from su3d_bench.runs.finished import encoder_of
@@ -121,40 +115,34 @@ NAMES = ("auto", "label", "refined")
 
 
 def _add_ask(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "ask",
-        "Answer a question about a scene from its map: by geometry, or by a language model.",
-        (
-            'su3d-bench query ask rooms/living0 "Which lamp is closer to the sofa?"',
-            'su3d-bench query ask rooms/living0 "I am feeling cold, what should I do?" --solver llm --dry-run',
-        ),
-        call_ask,
-    )
-    parser.add_argument("scene", help="the scene's address, such as rooms/living0")
-    parser.add_argument("question", help="the question, in English")
-    add_options(parser, "--run", "--method")
-    parser.add_argument(
-        "--solver", choices=SOLVERS, default="built-in", help="who answers: geometry alone, or a language model"
-    )
-    parser.add_argument(
+    parser = add_verb(verbs, "ask", call_ask)
+    parser.option("scene", "the scene's address, such as rooms/living0")
+    parser.option("question", "the question, in English")
+    parser.shared("--run", "--method")
+    parser.option("--solver", "who answers: geometry alone, or a language model", choices=SOLVERS, default="built-in")
+    parser.option(
         "--names",
+        "the map's labels n, or n' of su3d-bench runs refine (default: n' where it is there)",
         choices=NAMES,
         default="auto",
-        help="the map's labels n, or n' of su3d-bench runs refine (default: n' where it is there)",
     )
-    parser.add_argument(
+    parser.option(
         "--eye",
+        "where one stands for left and right, in metres (default: the middle of the map)",
         nargs=3,
         type=float,
         metavar=("X", "Y", "Z"),
-        help="where one stands for left and right, in metres (default: the middle of the map)",
     )
-    add_out(parser, "FILE", "where the picture goes (default: beside the map)")
+    parser.option("--out FILE", "where the picture goes (default: beside the map)")
     add_language_options(parser)
 
 
 def call_ask(arguments: argparse.Namespace) -> int:
+    """Answer a question about a scene from its map: by geometry, or by a language model.
+
+    su3d-bench query ask rooms/living0 "Which lamp is closer to the sofa?"
+    su3d-bench query ask rooms/living0 "I am feeling cold, what should I do?" --solver llm --dry-run
+    """
     from su3d_bench.core.maps import Instances
     from su3d_bench.questions.scene_map import map_of
 

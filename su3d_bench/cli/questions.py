@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Any
 from su3d_bench.cli.options import (
     Verbs,
     add_language_options,
-    add_options,
-    add_out,
     add_verb,
     answer_estimate,
     chat_client,
@@ -42,108 +40,63 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def _add_make(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "make",
-        "Make a set of questions with known answers from the ground truth of scenes.",
-        (
-            "su3d-bench query make --scenes 'rooms/*' --per-kind 40 --leave-out disputed.csv --out queries.toml",
-            "su3d-bench query make --scenes 'rooms/*' --form beacon3d-qa --out metadata_qa.json",
-        ),
-        _make,
-    )
+    parser = add_verb(verbs, "make", _make)
     _add_scenes(parser, required=True)
-    add_out(parser, "FILE", "a .toml or .csv file; .json in a form of Beacon3D", required=True)
-    parser.add_argument(
-        "--per-kind",
-        type=count,
-        metavar="N",
-        help="at most N questions of each kind and scene, or objects of a scene (default: all)",
+    parser.option("--out FILE", "a .toml or .csv file; .json in a form of Beacon3D", required=True)
+    parser.option(
+        "--per-kind N", "at most N questions of each kind and scene, or objects of a scene (default: all)", type=count
     )
-    parser.add_argument(
+    parser.option(
         "--source",
+        "auto: what the dataset itself knows, else generated from classes and boxes (default: auto)",
         default=SOURCES[0],
         choices=SOURCES,
-        help="auto: what the dataset itself knows, else generated from classes and boxes (default: auto)",
     )
-    add_options(parser, "--leave-out")
-    parser.add_argument(
+    parser.shared("--leave-out")
+    parser.option(
         "--form",
+        "own sets of queries, or Beacon3D's metadata_*.json of grounding or of answers in words (default: own)",
         default=FORMS[0],
         choices=FORMS,
-        help="own sets of queries, or Beacon3D's metadata_*.json of grounding or of answers in words (default: own)",
     )
 
 
 def _add_show(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "show",
-        "Show a set of questions: how many of each kind, and the first of them.",
-        ("su3d-bench query show queries.toml", "su3d-bench query show paper --json"),
-        _show,
-    )
-    parser.add_argument(
-        "file", metavar="FILE", help="a set (.toml, .csv, ScanRefer, Nr3D, SQA3D, Beacon3D), or 'paper'"
-    )
+    parser = add_verb(verbs, "show", _show)
+    parser.option("file FILE", "a set (.toml, .csv, ScanRefer, Nr3D, SQA3D, Beacon3D), or 'paper'", type=str)
 
 
 def _add_audit(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "audit",
-        "Draw a sample of the questions of scenes with pictures for people, or add up what they said of them.",
-        (
-            "su3d-bench query audit --scenes 'rooms/*' --n 200 --out audit",
-            "su3d-bench query audit --score audit/audit.csv",
-        ),
-        _audit,
-    )
+    parser = add_verb(verbs, "audit", _audit)
     _add_scenes(parser)
-    add_out(parser, "DIR", "where page, pictures and table go")
-    parser.add_argument("--n", type=count, default=200, metavar="N", help="so many questions (default: 200)")
-    add_options(parser, "--seed")
-    parser.add_argument(
-        "--kinds", nargs="+", default=[], metavar="KIND", help="these alone, such as retrieval, property, 'what on'"
-    )
-    parser.add_argument("--per-page", type=count, default=12, metavar="N", help="questions of a sheet (default: 12)")
-    parser.add_argument("--score", type=Path, metavar="FILE", help="add up the verdicts in this audit.csv instead")
-    add_options(parser, "--format")
+    parser.option("--out DIR", "where page, pictures and table go")
+    parser.option("--n N", "so many questions (default: 200)", type=count, default=200)
+    parser.shared("--seed")
+    parser.option("--kinds KIND...", "these alone, such as retrieval, property, 'what on'", default=[])
+    parser.option("--per-page N", "questions of a sheet (default: 12)", type=count, default=12)
+    parser.option("--score FILE", "add up the verdicts in this audit.csv instead")
+    parser.shared("--format")
 
 
 def _add_score(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "score",
-        "Score answers to the questions of a metadata_*.json of Beacon3D.",
-        (
-            "su3d-bench query score metadata_qa.json --answers answers.json",
-            "su3d-bench query score metadata_qa.json --answers answers.json --judge --dry-run",
-        ),
-        _score_answers,
-    )
-    parser.add_argument("file", type=Path, metavar="FILE", help="a metadata_*.json of Beacon3D")
-    parser.add_argument(
-        "--answers",
-        type=Path,
-        required=True,
-        metavar="FILE",
-        help="JSON with what a system answered, in Beacon3D's order",
-    )
-    parser.add_argument(
-        "--judge", action="store_true", help="let a language model score the answers that match no right one"
-    )
+    parser = add_verb(verbs, "score", _score_answers)
+    parser.option("file FILE", "a metadata_*.json of Beacon3D")
+    parser.option("--answers FILE", "JSON with what a system answered, in Beacon3D's order", required=True)
+    parser.option("--judge", "let a language model score the answers that match no right one")
     add_language_options(parser, JUDGE_MODEL)
-    add_options(parser, "--format")
+    parser.shared("--format")
 
 
 def _add_scenes(parser: argparse.ArgumentParser, *, required: bool = False) -> None:
-    parser.add_argument(
-        "--scenes", nargs="+", required=required, metavar="SCENE", help="addresses or patterns, such as 'rooms/*'"
-    )
+    parser.option("--scenes SCENE...", "addresses or patterns, such as 'rooms/*'", required=required)
 
 
 def _make(arguments: argparse.Namespace) -> int:
+    """Make a set of questions with known answers from the ground truth of scenes.
+
+    su3d-bench query make --scenes 'rooms/*' --per-kind 40 --leave-out disputed.csv --out queries.toml
+    su3d-bench query make --scenes 'rooms/*' --form beacon3d-qa --out metadata_qa.json
+    """
     from su3d_bench.questions.question_files import check_form, write_questions
 
     if arguments.form != FORMS[0]:
@@ -201,6 +154,11 @@ def _made(arguments: argparse.Namespace) -> list[Question]:
 
 
 def _show(arguments: argparse.Namespace) -> int:
+    """Show a set of questions: how many of each kind, and the first of them.
+
+    su3d-bench query show queries.toml
+    su3d-bench query show paper --json
+    """
     from su3d_bench.questions.question_files import paper_queries, read_questions
 
     questions: Sequence[Question]
@@ -251,6 +209,11 @@ def _counts(questions: Sequence[Question]) -> tuple[dict[str, Any], str]:
 
 
 def _audit(arguments: argparse.Namespace) -> int:
+    """Draw a sample of the questions of scenes with pictures for people, or add up what they said of them.
+
+    su3d-bench query audit --scenes 'rooms/*' --n 200 --out audit
+    su3d-bench query audit --score audit/audit.csv
+    """
     from su3d_bench.cli.scenes import chosen_scenes
     from su3d_bench.questions.audit import audited_questions, n_of_each, of_kinds, sample
     from su3d_bench.sheets.audit import make_audit
@@ -296,6 +259,11 @@ def _score(arguments: argparse.Namespace) -> int:
 
 
 def _score_answers(arguments: argparse.Namespace) -> int:
+    """Score answers to the questions of a metadata_*.json of Beacon3D.
+
+    su3d-bench query score metadata_qa.json --answers answers.json
+    su3d-bench query score metadata_qa.json --answers answers.json --judge --dry-run
+    """
     from su3d_bench.questions.beacon3d import answered_file, answered_json, answered_table, answers_to_questions
 
     asked = arguments.file

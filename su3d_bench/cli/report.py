@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli import report_files
-from su3d_bench.cli.options import Verbs, add_group, add_options, add_out, add_runs, add_verb, index, positive
+from su3d_bench.cli.options import Verbs, add_group, add_verb, index, positive
 from su3d_bench.cli.output import (
     answer,
     answer_document,
@@ -29,12 +28,12 @@ PAPER_TABLES = ("I", "II", "III", "IV", "V", "reasoning")
 
 
 def add_parser(verbs: Verbs) -> None:
-    actions = add_group(
-        verbs,
-        "report",
-        "Make tables, pages and archives from finished runs, and check a paper against them.",
-        ("su3d-bench report tables runs/my-run --format latex --table II", "su3d-bench report verify paper.tex"),
-    )
+    """Make tables, pages and archives from finished runs, and check a paper against them.
+
+    su3d-bench report tables runs/my-run --format latex --table II
+    su3d-bench report verify paper.tex
+    """
+    actions = add_group(verbs, "report", add_parser)
     _add_tables(actions)
     _add_timing(actions)
     report_files.add_pages(actions)
@@ -46,26 +45,11 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def _add_tables(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "tables",
-        "Make tables for a paper from runs: those of OpenSU3D's paper by number, or one for each protocol.",
-        (
-            "su3d-bench report tables runs/my-run --table II III --format latex --out tables.tex",
-            "su3d-bench report tables runs/my-run scores --table IV V --intervals",
-        ),
-        call_tables,
-    )
-    parser.add_argument(
-        "runs", nargs="+", type=Path, metavar="RUN", help="folders of finished runs, or of what sheets score wrote"
-    )
-    add_options(parser, "--format")
-    parser.add_argument(
-        "--table",
-        nargs="+",
-        choices=PAPER_TABLES,
-        default=[],
-        help="of the paper, or its reasoning scores (default: none)",
+    parser = add_verb(verbs, "tables", call_tables)
+    parser.option("runs RUN...", "folders of finished runs, or of what sheets score wrote")
+    parser.shared("--format")
+    parser.option(
+        "--table ...", "of the paper, or its reasoning scores (default: none)", choices=PAPER_TABLES, default=[]
     )
     for name, what in (
         ("methods", "these rows, in this order, alone (default: all)"),
@@ -73,24 +57,23 @@ def _add_tables(verbs: Verbs) -> None:
         ("protocols", "under these alone (default: all)"),
         ("metrics", "these columns (default: the headline ones)"),
     ):
-        parser.add_argument(f"--{name}", nargs="+", default=[], metavar=name[:-1].upper(), help=what)
-    parser.add_argument("--intervals", action="store_true", help="show the 95 %% interval over scenes")
-    parser.add_argument("--truth-scores", action="store_true", help="show what the truth itself scores")
-    parser.add_argument(
-        "--scenes-count", action="store_true", help="show the number of scenes even where none is missing"
+        parser.option(f"--{name} {name[:-1].upper()}...", what, default=[])
+    parser.option("--intervals", "show the 95 %% interval over scenes")
+    parser.option("--truth-scores", "show what the truth itself scores")
+    parser.option("--scenes-count", "show the number of scenes even where none is missing")
+    parser.option("--significant", "mark the best only where it differs from the second (p < 0.05)")
+    parser.option(
+        "--published", "show what papers report beneath (default: with --table)", action=argparse.BooleanOptionalAction
     )
-    parser.add_argument(
-        "--significant", action="store_true", help="mark the best only where it differs from the second (p < 0.05)"
-    )
-    parser.add_argument(
-        "--published",
-        action=argparse.BooleanOptionalAction,
-        help="show what papers report beneath (default: with --table)",
-    )
-    add_out(parser, "FILE", "write there instead of printing")
+    parser.option("--out FILE", "write there instead of printing")
 
 
 def call_tables(arguments: argparse.Namespace) -> int:
+    """Make tables for a paper from runs: those of OpenSU3D's paper by number, or one for each protocol.
+
+    su3d-bench report tables runs/my-run --table II III --format latex --out tables.tex
+    su3d-bench report tables runs/my-run scores --table IV V --intervals
+    """
     tables = _tables(arguments)
     answer_or_write(arguments, list(map(asdict, tables)), tables)
     return EXIT_DONE
@@ -124,26 +107,21 @@ def _tables(arguments: argparse.Namespace) -> list[Table]:
 
 
 def _add_timing(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "timing",
-        "Say what an update costs, stage by stage, and whether it grows with the map.",
-        ("su3d-bench report timing runs/demo", "su3d-bench report timing runs/a runs/b --out timing --camera-rate 20"),
-        call_timing,
-    )
-    add_runs(parser)
-    add_options(parser, "--methods")
-    parser.add_argument(
-        "--warm-up", type=index, default=3, metavar="N", help="first updates of a scene that stand apart (default: 3)"
-    )
-    parser.add_argument(
-        "--camera-rate", type=positive, default=30.0, metavar="HZ", help="frames a second of the camera (default: 30)"
-    )
-    add_out(parser, "DIR", "write timing.md, timing.csv, methods.csv and the plots there")
-    add_options(parser, "--format")
+    parser = add_verb(verbs, "timing", call_timing)
+    parser.shared("runs")
+    parser.shared("--methods")
+    parser.option("--warm-up N", "first updates of a scene that stand apart (default: 3)", type=index, default=3)
+    parser.option("--camera-rate HZ", "frames a second of the camera (default: 30)", type=positive, default=30.0)
+    parser.option("--out DIR", "write timing.md, timing.csv, methods.csv and the plots there")
+    parser.shared("--format")
 
 
 def call_timing(arguments: argparse.Namespace) -> int:
+    """Say what an update costs, stage by stage, and whether it grows with the map.
+
+    su3d-bench report timing runs/demo
+    su3d-bench report timing runs/a runs/b --out timing --camera-rate 20
+    """
     from su3d_bench.analysis.tables import anytime_points
     from su3d_bench.metrics.costs import summarise
     from su3d_bench.reports.tables.formats import markdown
@@ -192,27 +170,21 @@ FORMATS = ("csv", "parquet")
 
 
 def _add_samples(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "samples",
-        "List every instance of runs, predicted and true: class, confidence, best IoU, kind of error, box.",
-        (
-            "su3d-bench report samples runs/my-run --out samples.csv",
-            "su3d-bench report samples runs/a runs/b --methods opensu3d --format parquet --out samples.parquet",
-        ),
-        call_samples,
-    )
-    add_runs(parser, "*")
-    add_options(parser, "--methods", "--protocols", "--scenes")
-    parser.add_argument(
-        "--format", choices=FORMATS, help="of the rows (default: parquet where --out ends so, else csv)"
-    )
-    add_out(parser, "FILE", "write there instead of printing CSV")
-    parser.add_argument("--columns", action="store_true", help="say what each column holds, and list nothing")
-    add_options(parser, "--table-format")
+    parser = add_verb(verbs, "samples", call_samples)
+    parser.shared("runs", nargs="*")
+    parser.shared("--methods", "--protocols", "--scenes")
+    parser.option("--format", "of the rows (default: parquet where --out ends so, else csv)", choices=FORMATS)
+    parser.option("--out FILE", "write there instead of printing CSV")
+    parser.option("--columns", "say what each column holds, and list nothing")
+    parser.shared("--table-format")
 
 
 def call_samples(arguments: argparse.Namespace) -> int:
+    """List every instance of runs, predicted and true: class, confidence, best IoU, kind of error, box.
+
+    su3d-bench report samples runs/my-run --out samples.csv
+    su3d-bench report samples runs/a runs/b --methods opensu3d --format parquet --out samples.parquet
+    """
     from su3d_bench.reports.tables.samples import COLUMNS, columns_table
 
     if arguments.columns:
@@ -257,24 +229,20 @@ def _list(arguments: argparse.Namespace) -> int:
 
 
 def _add_leaderboard(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "leaderboard",
-        "Rank the runs below a folder that agree in protocol, data, counts and labels (one label or the top k).",
-        (
-            "su3d-bench report leaderboard runs",
-            "su3d-bench report leaderboard submissions --protocols rooms-instance --format html --out board.html",
-        ),
-        call_leaderboard,
-    )
-    parser.add_argument("folder", type=Path, metavar="DIR", help="a folder with runs anywhere below it")
-    add_options(parser, "--protocols")
-    parser.add_argument("--intervals", action="store_true", help="show 95 %% intervals: over scenes, and of ranks")
-    add_options(parser, "--format")
-    add_out(parser, "FILE", "write there instead of printing")
+    parser = add_verb(verbs, "leaderboard", call_leaderboard)
+    parser.option("folder DIR", "a folder with runs anywhere below it")
+    parser.shared("--protocols")
+    parser.option("--intervals", "show 95 %% intervals: over scenes, and of ranks")
+    parser.shared("--format")
+    parser.option("--out FILE", "write there instead of printing")
 
 
 def call_leaderboard(arguments: argparse.Namespace) -> int:
+    """Rank the runs below a folder that agree in protocol, data, counts and labels (one label or the top k).
+
+    su3d-bench report leaderboard runs
+    su3d-bench report leaderboard submissions --protocols rooms-instance --format html --out board.html
+    """
     from su3d_bench.analysis.leaderboard import leaderboard, tables
 
     board = leaderboard(arguments.folder, arguments.protocols, with_ranks=arguments.intervals)
@@ -286,27 +254,21 @@ def call_leaderboard(arguments: argparse.Namespace) -> int:
 
 
 def _add_attribution(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "attribution",
-        "Show where a run loses its points: the gain when each kind of error alone is corrected.",
-        (
-            "su3d-bench report attribution runs/my-run --out errors.png",
-            "su3d-bench report attribution runs/my-run --protocols rooms-instance --oracle runs/my-oracle-run --json",
-        ),
-        call_attribution,
-    )
-    add_runs(parser, None)
-    parser.add_argument("--method", help="whose predictions (default: the run's only method)")
-    add_options(parser, "--protocols")
-    parser.add_argument(
-        "--oracle", type=Path, metavar="RUN", help="the same run with --profile oracle: what perfect 2D masks give"
-    )
-    add_out(parser, "PNG", "draw the plot to this file")
-    add_options(parser, "--format")
+    parser = add_verb(verbs, "attribution", call_attribution)
+    parser.shared("run")
+    parser.option("--method METHOD", "whose predictions (default: the run's only method)")
+    parser.shared("--protocols")
+    parser.option("--oracle RUN", "the same run with --profile oracle: what perfect 2D masks give")
+    parser.option("--out PNG", "draw the plot to this file")
+    parser.shared("--format")
 
 
 def call_attribution(arguments: argparse.Namespace) -> int:
+    """Show where a run loses its points: the gain when each kind of error alone is corrected.
+
+    su3d-bench report attribution runs/my-run --out errors.png
+    su3d-bench report attribution runs/my-run --protocols rooms-instance --oracle runs/my-oracle-run --json
+    """
     from su3d_bench.analysis.attribution import attribute
     from su3d_bench.reports.tables.samples import attribution_tables
 
@@ -327,33 +289,25 @@ def call_attribution(arguments: argparse.Namespace) -> int:
 
 
 def _add_power(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "power",
-        "Tell how many scenes and seeds show a difference of so many points between two methods.",
-        (
-            "su3d-bench report power runs/my-run --methods opensu3d conceptgraphs --points 1 2 5",
-            "su3d-bench report power runs/seed-0 runs/seed-1 runs/seed-2 --protocols rooms-instance --json",
-        ),
-        call_power,
-    )
-    parser.add_argument(
-        "runs", nargs="+", type=Path, metavar="RUN", help="a finished run, and others that differ in --seed alone"
-    )
-    parser.add_argument("--methods", nargs=2, default=(), metavar=("A", "B"), help="whose (default: the only two)")
-    parser.add_argument(
-        "--points",
-        nargs="+",
+    parser = add_verb(verbs, "power", call_power)
+    parser.option("runs RUN...", "a finished run, and others that differ in --seed alone")
+    parser.option("--methods", "whose (default: the only two)", nargs=2, default=(), metavar=("A", "B"))
+    parser.option(
+        "--points N...",
+        "differences to be found, in percentage points (default: 1 2 5)",
         type=float,
         default=[1.0, 2.0, 5.0],
-        metavar="N",
-        help="differences to be found, in percentage points (default: 1 2 5)",
     )
-    parser.add_argument("--power", type=float, default=0.8, metavar="P", help="to find it (default: 0.8)")
-    add_options(parser, "--protocols", "--format")
+    parser.option("--power P", "to find it (default: 0.8)", type=float, default=0.8)
+    parser.shared("--protocols", "--format")
 
 
 def call_power(arguments: argparse.Namespace) -> int:
+    """Tell how many scenes and seeds show a difference of so many points between two methods.
+
+    su3d-bench report power runs/my-run --methods opensu3d conceptgraphs --points 1 2 5
+    su3d-bench report power runs/seed-0 runs/seed-1 runs/seed-2 --protocols rooms-instance --json
+    """
     from su3d_bench.analysis.comparison import plan
     from su3d_bench.reports.tables.comparison import plan_tables
 

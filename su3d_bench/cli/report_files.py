@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.options import Verbs, add_options, add_out, add_runs, add_verb, count
+from su3d_bench.cli.options import Verbs, add_verb, count
 from su3d_bench.cli.output import answer_either, drawn_bars, progress, remark, written
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable
 
@@ -34,35 +34,24 @@ def add_archives(verbs: Verbs) -> None:
 
 
 def _add_html(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "html",
-        "Make one page that needs no network: numbers, errors, times, comparisons and the maps in 3D.",
-        (
-            "su3d-bench report html runs/my-run --out page.html",
-            'su3d-bench report html runs/a runs/b --queries "a place to sit" "a plant" --no-errors',
-        ),
-        call_html,
-        takes_up=True,
-    )
-    add_runs(parser)
-    add_out(parser, "FILE", "the page (default: page.html)", default=Path("page.html"))
-    parser.add_argument("--title", metavar="TEXT", help="of the page (default: the folders of the runs)")
-    parser.add_argument(
-        "--queries", nargs="+", metavar="TEXT", help="texts to which instances are compared (default: eight)"
-    )
-    parser.add_argument("--no-maps", action="store_true", help="leave the maps out")
-    parser.add_argument(
-        "--no-errors", action="store_true", help="leave out what errors cost, and their gallery (quicker)"
-    )
-    parser.add_argument("--no-gallery", action="store_true", help="leave out the single errors and their photos")
-    parser.add_argument(
-        "--most-megabytes", type=float, default=30.0, metavar="MB", help="maps are thinned for it (default: 30)"
-    )
-    add_options(parser, "--jobs")
+    parser = add_verb(verbs, "html", call_html, takes_up=True)
+    parser.shared("runs")
+    parser.option("--out FILE", "the page (default: page.html)", default=Path("page.html"))
+    parser.option("--title TEXT", "of the page (default: the folders of the runs)")
+    parser.option("--queries TEXT...", "texts to which instances are compared (default: eight)")
+    parser.option("--no-maps", "leave the maps out")
+    parser.option("--no-errors", "leave out what errors cost, and their gallery (quicker)")
+    parser.option("--no-gallery", "leave out the single errors and their photos")
+    parser.option("--most-megabytes MB", "maps are thinned for it (default: 30)", type=float, default=30.0)
+    parser.shared("--jobs")
 
 
 def call_html(arguments: argparse.Namespace) -> int:
+    """Make one page that needs no network: numbers, errors, times, comparisons and the maps in 3D.
+
+    su3d-bench report html runs/my-run --out page.html
+    su3d-bench report html runs/a runs/b --queries "a place to sit" "a plant" --no-errors
+    """
     from su3d_bench.analysis.page.contents import QUERIES, Wishes, page_contents
     from su3d_bench.analysis.page.gallery import told_of
     from su3d_bench.reports.page.page import page_html
@@ -138,28 +127,21 @@ class _Progress:
 
 
 def _add_rerun(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "rerun",
-        "Write frames, masks, maps and truth of a run on one timeline, for rerun's viewer.",
-        (
-            "su3d-bench report rerun runs/my-run --out my-run.rrd",
-            "su3d-bench report rerun runs/my-run --scenes rooms/office0 --methods opensu3d --stride 2 --out office.rrd",
-        ),
-        call_rerun,
+    parser = add_verb(verbs, "rerun", call_rerun)
+    parser.shared("run")
+    parser.shared("--scenes", "--methods")
+    parser.option(
+        "--stride N", "every Nth of the frames that the methods were given (default: at most 60 of a scene)", type=count
     )
-    add_runs(parser, None)
-    add_options(parser, "--scenes", "--methods")
-    parser.add_argument(
-        "--stride",
-        type=count,
-        metavar="N",
-        help="every Nth of the frames that the methods were given (default: at most 60 of a scene)",
-    )
-    add_out(parser, "FILE", "the .rrd file, read by rerun's viewer", required=True)
+    parser.option("--out FILE", "the .rrd file, read by rerun's viewer", required=True)
 
 
 def call_rerun(arguments: argparse.Namespace) -> int:
+    """Write frames, masks, maps and truth of a run on one timeline, for rerun's viewer.
+
+    su3d-bench report rerun runs/my-run --out my-run.rrd
+    su3d-bench report rerun runs/my-run --scenes rooms/office0 --methods opensu3d --stride 2 --out office.rrd
+    """
     from su3d_bench.analysis.page.maps import Spaces
     from su3d_bench.analysis.timeline import SceneTimeline, refuse_nothing
     from su3d_bench.core.files.atomic import make_folder, replacing
@@ -207,22 +189,18 @@ def call_rerun(arguments: argparse.Namespace) -> int:
 
 
 def _add_bundle(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "bundle",
-        "Pack finished runs into one archive that report verify scores anew and a registry takes in.",
-        (
-            "su3d-bench report bundle runs/my-run --out my-run.zip",
-            "su3d-bench report bundle runs/mine --trained-on 'ScanNet v2, training scenes' --out mine.zip",
-        ),
-        call_bundle,
-    )
-    add_runs(parser)
-    add_out(parser, "FILE", "the archive (default: the first run's name.zip)")
-    parser.add_argument("--trained-on", metavar="TEXT", default="", help="the data of your weights, for a registry")
+    parser = add_verb(verbs, "bundle", call_bundle)
+    parser.shared("runs")
+    parser.option("--out FILE", "the archive (default: the first run's name.zip)")
+    parser.option("--trained-on TEXT", "the data of your weights, for a registry", default="")
 
 
 def call_bundle(arguments: argparse.Namespace) -> int:
+    """Pack finished runs into one archive that report verify scores anew and a registry takes in.
+
+    su3d-bench report bundle runs/my-run --out my-run.zip
+    su3d-bench report bundle runs/mine --trained-on 'ScanNet v2, training scenes' --out mine.zip
+    """
     from su3d_bench.core.digests import digest_file
     from su3d_bench.reproducing.bundle import bundle_runs, is_bundle, refuse_own_code, refuse_own_truth
     from su3d_bench.runs.finished import read_run
@@ -247,26 +225,17 @@ BUNDLE = ".zip"
 
 
 def _add_verify(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "verify",
-        "Recompute the cells of LaTeX tables from their runs, or score a bundle anew; exit code 1 where one differs.",
-        ("su3d-bench report verify paper.tex", "su3d-bench report verify reproduced/opensu3d/bundle.zip --json"),
-        call_verify,
-    )
-    parser.add_argument(
-        "files",
-        nargs="+",
-        type=Path,
-        metavar="FILE",
-        help="LaTeX by report tables, or around it; or bundle.zip of reproduce",
-    )
-    parser.add_argument(
-        "--root", type=Path, metavar="DIR", help="where the runs' folders are (default: here, then beside the file)"
-    )
+    parser = add_verb(verbs, "verify", call_verify)
+    parser.option("files FILE...", "LaTeX by report tables, or around it; or bundle.zip of reproduce")
+    parser.option("--root DIR", "where the runs' folders are (default: here, then beside the file)")
 
 
 def call_verify(arguments: argparse.Namespace) -> int:
+    """Recompute the cells of LaTeX tables from their runs, or score a bundle anew; exit code 1 where one differs.
+
+    su3d-bench report verify paper.tex
+    su3d-bench report verify reproduced/opensu3d/bundle.zip --json
+    """
     bundles = [file for file in arguments.files if file.suffix.lower() == BUNDLE]
     if bundles and len(bundles) < len(arguments.files):
         raise ConfigError("report verify: bundles and LaTeX are verified apart; name the one or the other")

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from su3d_bench.cli.options import EXECUTOR, Verbs, add_options, add_out, add_verb
+from su3d_bench.cli.options import EXECUTOR, Verbs, add_verb
 from su3d_bench.cli.output import answer, answer_document, answer_json, formatted, remark, show, written
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, RunIncomplete, counted, printable
 
@@ -22,54 +22,33 @@ OF_A_RUN = ("jobs", "limit", "solver", "offline", "executor", "ray_address", "gp
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "reproduce",
-        "Do a paper's experiments again: what is missing, the runs, its tables beside the printed ones, one archive.",
-        (
-            "su3d-bench reproduce opensu3d --table II III --dry-run",
-            "su3d-bench reproduce opensu3d --table I II III IV V reasoning --rehearse",
-        ),
-        call,
-        takes_up=True,
-    )
-    parser.add_argument(
-        "recipe", metavar="RECIPE", nargs="?", help="its name, or a file of your own (default: list them)"
-    )
-    parser.add_argument("--table", nargs="+", default=[], metavar="NAME", help="these experiments alone (default: all)")
-    add_out(parser, "DIR", "where all goes (default: reproduced/<recipe>)")
-    add_options(parser, "--dry-run")
-    parser.add_argument(
-        "--rehearse", action="store_true", help="the same on rooms made in the same layouts, with embedded perception"
-    )
-    parser.add_argument("--rooms", nargs="+", metavar="ROOM", help="of a rehearsal (default: the recipe's)")
-    parser.add_argument(
-        "--room-settings", nargs="+", metavar="KEY=VALUE", help="options of the rooms, such as n_frames=80 width=160"
-    )
-    parser.add_argument(
-        "--predictions",
-        nargs="+",
+    parser = add_verb(verbs, "reproduce", call, takes_up=True)
+    parser.option("recipe [RECIPE]", "its name, or a file of your own (default: list them)")
+    parser.option("--table NAME...", "these experiments alone (default: all)", default=[])
+    parser.option("--out DIR", "where all goes (default: reproduced/<recipe>)")
+    parser.shared("--dry-run")
+    parser.option("--rehearse", "the same on rooms made in the same layouts, with embedded perception")
+    parser.option("--rooms ROOM...", "of a rehearsal (default: the recipe's)")
+    parser.option("--room-settings KEY=VALUE...", "options of the rooms, such as n_frames=80 width=160")
+    parser.option("--predictions METHOD=DIR...", "of methods that are none here, as evaluate takes", default=[])
+    parser.option(
+        "--text-features METHOD=FILE...",
+        "what the encoder of its predictions makes of texts, as evaluate --text-features",
         default=[],
-        metavar="METHOD=DIR",
-        help="of methods that are none here, as evaluate takes",
     )
-    parser.add_argument(
-        "--text-features",
-        nargs="+",
-        default=[],
-        metavar="METHOD=FILE",
-        help="what the encoder of its predictions makes of texts, as evaluate --text-features",
-    )
-    add_options(parser, "--profile")
-    parser.add_argument("--encoder", help="of all runs, such as embedded (default: the recipe's)")
-    add_options(parser, "--device", "--jobs", "--limit", "--solver", "--offline", *EXECUTOR, "--set")
-    parser.add_argument(
-        "--bundle", type=Path, metavar="FILE", help="the archive (default: bundle.zip in the folder of --out)"
-    )
-    add_options(parser, "--format")
+    parser.shared("--profile")
+    parser.option("--encoder ENCODER", "of all runs, such as embedded (default: the recipe's)")
+    parser.shared("--device", "--jobs", "--limit", "--solver", "--offline", *EXECUTOR, "--set")
+    parser.option("--bundle FILE", "the archive (default: bundle.zip in the folder of --out)")
+    parser.shared("--format")
 
 
 def call(arguments: argparse.Namespace) -> int:
+    """Do a paper's experiments again: what is missing, the runs, its tables beside the printed ones, one archive.
+
+    su3d-bench reproduce opensu3d --table II III --dry-run
+    su3d-bench reproduce opensu3d --table I II III IV V reasoning --rehearse
+    """
     from su3d_bench.reproducing.recipe import load_recipe
 
     if arguments.recipe is None:

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from su3d_bench.cli.options import EXECUTOR, Verbs, add_options, add_verb
+from su3d_bench.cli.options import EXECUTOR, Verbs, add_verb
 from su3d_bench.cli.output import answer, answer_document, answer_json, formatted, progress, remark
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE, counted
 
@@ -19,72 +19,39 @@ if TYPE_CHECKING:
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "run",
-        "Run methods over scenes and score them; the same command again resumes.",
-        (
-            "su3d-bench run rooms/living0 --methods opensu3d oracle",
-            "su3d-bench run --scenes 'rooms/*' --limit 5 --set opensu3d.top_m=10 --dry-run",
-        ),
-        call_run,
-        takes_up=True,
-    )
-    parser.add_argument(
-        "--methods", nargs="+", metavar="METHOD", help="names, variants, file.py:Class, or all (default: opensu3d)"
-    )
+    parser = add_verb(verbs, "run", call_run, takes_up=True)
+    parser.option("--methods METHOD...", "names, variants, file.py:Class, or all (default: opensu3d)")
     _add_run_options(parser)
-    parser = add_verb(
-        verbs,
-        "ablate",
-        "Vary settings of a method, each on its own, over scenes; perception is computed once.",
-        (
-            "su3d-bench ablate --vary m=1,5,10 k=1,3,5 --beside conceptgraphs --scenes 'rooms/*' --out runs/sweep",
-            "su3d-bench ablate --method conceptgraphs --vary sim_threshold=1.0,1.2 stride=5,10 --grid --dry-run",
-        ),
-        call_ablate,
-        takes_up=True,
-    )
-    parser.add_argument("--vary", nargs="+", required=True, metavar="KEY=V1,V2", help="settings and their values")
-    parser.add_argument("--method", default="opensu3d", help="name or file.py:Class (default: opensu3d)")
-    parser.add_argument(
-        "--beside",
-        nargs="+",
-        default=[],
-        metavar="METHOD",
-        help="other methods in the same run, as run --methods takes",
-    )
-    parser.add_argument("--grid", action="store_true", help="every combination, instead of one setting at a time")
+    parser = add_verb(verbs, "ablate", call_ablate, takes_up=True)
+    parser.option("--vary KEY=V1,V2...", "settings and their values", required=True)
+    parser.option("--method METHOD", "name or file.py:Class (default: opensu3d)", default="opensu3d")
+    parser.option("--beside METHOD...", "other methods in the same run, as run --methods takes", default=[])
+    parser.option("--grid", "every combination, instead of one setting at a time")
     _add_run_options(parser)
 
 
 def _add_run_options(parser: argparse.ArgumentParser) -> None:
     """The options of both verbs; what is not given comes from ``--config`` or has its default."""
-    parser.add_argument("scene", nargs="*", metavar="SCENE", help="addresses or patterns, as --scenes takes them")
-    parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="addresses or patterns (default: 'rooms/*')")
-    parser.add_argument(
-        "--protocols", nargs="+", metavar="PROTOCOL", help="evaluations (default: those of the dataset)"
+    parser.option("scene [SCENE...]", "addresses or patterns, as --scenes takes them")
+    parser.option("--scenes SCENE...", "addresses or patterns (default: 'rooms/*')")
+    parser.option("--protocols PROTOCOL...", "evaluations (default: those of the dataset)")
+    parser.shared("--profile", "--device", "--jobs", "--limit", "--solver", "--offline", *EXECUTOR)
+    parser.shared("--seed", type=int, default=None)
+    parser.option("--stride N", "frames between updates (default: the method's own)", type=int)
+    parser.option(
+        "--pictures", "draw the maps into the run folder (default: yes)", action=argparse.BooleanOptionalAction
     )
-    add_options(parser, "--profile", "--device", "--jobs", "--limit", "--solver", "--offline", *EXECUTOR)
-    add_options(parser, "--seed", type=int, default=None)
-    parser.add_argument("--stride", type=int, metavar="N", help="frames between updates (default: the method's own)")
-    parser.add_argument(
-        "--pictures", action=argparse.BooleanOptionalAction, help="draw the maps into the run folder (default: yes)"
-    )
-    parser.add_argument(
+    parser.option(
         "--accept-poses",
+        "run recordings whose depth contradicts their poses all the same, with a warning (default: refuse them)",
         action=argparse.BooleanOptionalAction,
-        help="run recordings whose depth contradicts their poses all the same, with a warning (default: refuse them)",
     )
-    parser.add_argument(
-        "--anytime", nargs="+", type=float, metavar="SHARE", help="score the map after these shares of the updates too"
-    )
-    add_options(parser, "--set", "--config", "--dry-run", "--format")
-    parser.add_argument(
-        "--out",
+    parser.option("--anytime SHARE...", "score the map after these shares of the updates too", type=float)
+    parser.shared("--set", "--config", "--dry-run", "--format")
+    parser.option(
+        "--out DIR",
+        "run folder, or URL of one such as s3://bucket/run (default: runs/<name made from the request>)",
         type=run_place,
-        metavar="DIR",
-        help="run folder, or URL of one such as s3://bucket/run (default: runs/<name made from the request>)",
     )
     into = parser.add_mutually_exclusive_group()
     into.add_argument(
@@ -101,6 +68,11 @@ def run_place(text: str) -> Path | str:
 
 
 def call_run(arguments: argparse.Namespace) -> int:
+    """Run methods over scenes and score them; the same command again resumes.
+
+    su3d-bench run rooms/living0 --methods opensu3d oracle
+    su3d-bench run --scenes 'rooms/*' --limit 5 --set opensu3d.top_m=10 --dry-run
+    """
     plan = plan_of(arguments)
     for note in plan.notes:
         remark(note, quiet=arguments.quiet)
@@ -196,6 +168,11 @@ def show_plan(plan: Plan, arguments: argparse.Namespace) -> int:
 
 
 def call_ablate(arguments: argparse.Namespace) -> int:
+    """Vary settings of a method, each on its own, over scenes; perception is computed once.
+
+    su3d-bench ablate --vary m=1,5,10 k=1,3,5 --beside conceptgraphs --scenes 'rooms/*' --out runs/sweep
+    su3d-bench ablate --method conceptgraphs --vary sim_threshold=1.0,1.2 stride=5,10 --grid --dry-run
+    """
     from su3d_bench.core import registry
     from su3d_bench.runs.ablation import ablation_rows, write_rows
 

@@ -16,8 +16,6 @@ from su3d_bench.cli.options import (
     Verbs,
     add_group,
     add_language_options,
-    add_options,
-    add_runs,
     add_verb,
     answer_estimate,
     chat_client,
@@ -35,13 +33,12 @@ DEFAULT = Path("runs")
 
 
 def add_parser(verbs: Verbs) -> None:
-    actions = add_group(
-        verbs,
-        "runs",
-        "List, show, remove, refine and export what runs leave.",
-        ("su3d-bench runs list", "su3d-bench runs show runs/demo"),
-        lists=True,
-    )
+    """List, show, remove, refine and export what runs leave.
+
+    su3d-bench runs list
+    su3d-bench runs show runs/demo
+    """
+    actions = add_group(verbs, "runs", add_parser, lists=True)
     _add_list(actions)
     _add_show(actions)
     _add_remove(actions)
@@ -50,18 +47,17 @@ def add_parser(verbs: Verbs) -> None:
 
 
 def _add_list(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "list",
-        "List the runs below a folder: when they were written, how far they came, their first numbers.",
-        ("su3d-bench runs list", "su3d-bench runs list /shared/runs --json"),
-        call_list,
-    )
-    parser.add_argument("folder", type=Path, nargs="?", default=DEFAULT, metavar="DIR", help="(default: runs)")
-    add_options(parser, "--format")
+    parser = add_verb(verbs, "list", call_list)
+    parser.option("folder [DIR]", "(default: runs)", default=DEFAULT)
+    parser.shared("--format")
 
 
 def call_list(arguments: argparse.Namespace) -> int:
+    """List the runs below a folder: when they were written, how far they came, their first numbers.
+
+    su3d-bench runs list
+    su3d-bench runs list /shared/runs --json
+    """
     from dataclasses import asdict
 
     from su3d_bench.analysis.leaderboard import list_runs, runs_table
@@ -77,17 +73,16 @@ def call_list(arguments: argparse.Namespace) -> int:
 
 
 def _add_show(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "show",
-        "Show what a run was asked for, how far it came, and the command that takes it up again.",
-        ("su3d-bench runs show runs/demo", "su3d-bench runs show runs/demo --json"),
-        call_show,
-    )
-    add_runs(parser, None)
+    parser = add_verb(verbs, "show", call_show)
+    parser.shared("run")
 
 
 def call_show(arguments: argparse.Namespace) -> int:
+    """Show what a run was asked for, how far it came, and the command that takes it up again.
+
+    su3d-bench runs show runs/demo
+    su3d-bench runs show runs/demo --json
+    """
     from dataclasses import asdict
 
     from su3d_bench.analysis.leaderboard import run_entry, size_bytes
@@ -121,18 +116,17 @@ def call_show(arguments: argparse.Namespace) -> int:
 
 
 def _add_remove(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "remove",
-        "Remove run folders, once it is known that they hold nothing but a run; asks before it does.",
-        ("su3d-bench runs remove runs/demo", "su3d-bench runs remove runs/a runs/b --yes"),
-        call_remove,
-    )
-    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="run folders")
-    parser.add_argument("--yes", action="store_true", help="do not ask; needed where nobody sits at a terminal")
+    parser = add_verb(verbs, "remove", call_remove)
+    parser.option("runs RUN...", "run folders")
+    parser.option("--yes", "do not ask; needed where nobody sits at a terminal")
 
 
 def call_remove(arguments: argparse.Namespace) -> int:
+    """Remove run folders, once it is known that they hold nothing but a run; asks before it does.
+
+    su3d-bench runs remove runs/demo
+    su3d-bench runs remove runs/a runs/b --yes
+    """
     from su3d_bench.analysis.leaderboard import removable, run_entry, size_bytes
 
     folders = [removable(path) for path in dict.fromkeys(arguments.runs)]  # all of them, before the first goes
@@ -167,44 +161,37 @@ REFINERS = ("vote", "model")
 
 
 def _add_refine(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "refine",
-        "Give each instance of a run's maps one name out of the names of its best views (label n'), and leave out what "
-        "is large background under it.",
-        (
-            "su3d-bench runs refine runs/my-run",
-            "su3d-bench runs refine runs/my-run --refiner model --model llama3.1 --base-url http://localhost:11434/v1",
-        ),
-        call_refine,
-    )
-    add_runs(parser, None)
-    parser.add_argument("--method", default="opensu3d", help="whose maps (default: opensu3d)")
-    parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="these scenes alone (default: all of the run)")
-    parser.add_argument(
+    parser = add_verb(verbs, "refine", call_refine)
+    parser.shared("run")
+    parser.option("--method METHOD", "whose maps (default: opensu3d)", default="opensu3d")
+    parser.option("--scenes SCENE...", "these scenes alone (default: all of the run)")
+    parser.option(
         "--refiner",
+        "vote: by the sum of the scores, without a model; model: a language model, as in the paper",
         choices=REFINERS,
         default="vote",
-        help="vote: by the sum of the scores, without a model; model: a language model, as in the paper",
     )
-    parser.add_argument("--top-m", type=count, default=5, metavar="N", help="views that have a say (default: 5)")
-    parser.add_argument(
-        "--background-names",
-        nargs="*",
-        metavar="NAME",
-        help="nouns of what label n' leaves out (default: those that the paper leaves out of images); none: nothing",
+    parser.option("--top-m N", "views that have a say (default: 5)", type=count, default=5)
+    parser.option(
+        "--background-names [NAME...]",
+        "nouns of what label n' leaves out (default: those that the paper leaves out of images); none: nothing",
     )
-    parser.add_argument(
-        "--max-map-fraction",
-        type=float,
-        metavar="SHARE",
-        help="an instance whose box covers more of the map from above is left out (default: 0.95, the paper's share of "
+    parser.option(
+        "--max-map-fraction SHARE",
+        "an instance whose box covers more of the map from above is left out (default: 0.95, the paper's share of "
         "an image); 1: none is",
+        type=float,
     )
     add_language_options(parser)
 
 
 def call_refine(arguments: argparse.Namespace) -> int:
+    """Give each instance of a run's maps one name out of the names of its best views (label n'), and leave out what is
+    large background under it.
+
+    su3d-bench runs refine runs/my-run
+    su3d-bench runs refine runs/my-run --refiner model --model llama3.1 --base-url http://localhost:11434/v1
+    """
     from su3d_bench.questions.refining import records_of, top_names, write_records
 
     config = _filter(arguments)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from su3d_bench.cli import sheets_make
-from su3d_bench.cli.options import Verbs, add_group, add_options, add_out, add_runs, add_verb
+from su3d_bench.cli.options import Verbs, add_group, add_verb
 from su3d_bench.cli.output import answer_either, answer_json, answer_tables, remark, remark_unseen, written
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, counted
 
@@ -19,56 +19,39 @@ SHOWN_FAULTS = 200  # lines; the number of all is told
 
 
 def add_parser(verbs: Verbs) -> None:
-    actions = add_group(
-        verbs,
-        "sheets",
-        "Make sheets for people to judge a run, score their answers, and draw figures.",
-        (
-            "su3d-bench sheets make runs/my-run --kind retrieval --out sheets",
-            "su3d-bench sheets score ann.csv bob.xlsx --key key/key.json",
-        ),
-    )
+    """Make sheets for people to judge a run, score their answers, and draw figures.
+
+    su3d-bench sheets make runs/my-run --kind retrieval --out sheets
+    su3d-bench sheets score ann.csv bob.xlsx --key key/key.json
+    """
+    actions = add_group(verbs, "sheets", add_parser)
     sheets_make.add_parser(actions)
     _add_score(actions)
     _add_pictures(actions)
 
 
 def _add_score(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "score",
-        "Check the answers of all annotators and add them up: accuracies, tests, agreement, people beside the truth.",
-        (
-            "su3d-bench sheets score ann.csv bob.xlsx --key key/key.json --out scores",
-            "su3d-bench sheets score ann.csv bob.csv --key key --disputed disputed.csv",
-        ),
-        call_score,
+    parser = add_verb(verbs, "score", call_score)
+    parser.option(
+        "files [FILE...]", "answers: .csv or .xlsx, in any mixture (default: none, what the ground truth alone says)"
     )
-    parser.add_argument(
-        "files",
-        nargs="*",
-        type=Path,
-        metavar="FILE",
-        help="answers: .csv or .xlsx, in any mixture (default: none, what the ground truth alone says)",
+    parser.option("--key FILE", "key.json of the set, or its folder", required=True)
+    parser.option(
+        "--sheet FILE", "sheet.json of the set, or its folder (default: looked for around the key and the answers)"
     )
-    parser.add_argument("--key", type=Path, required=True, metavar="FILE", help="key.json of the set, or its folder")
-    parser.add_argument(
-        "--sheet",
-        type=Path,
-        metavar="FILE",
-        help="sheet.json of the set, or its folder (default: looked for around the key and the answers)",
+    parser.option("--out DIR", "write scores.json, tables and a list of what to look at again there")
+    parser.option(
+        "--disputed FILE", "sheets of questions: write those that not everybody calls right there, for --leave-out"
     )
-    add_out(parser, "DIR", "write scores.json, tables and a list of what to look at again there")
-    parser.add_argument(
-        "--disputed",
-        type=Path,
-        metavar="FILE",
-        help="sheets of questions: write those that not everybody calls right there, for --leave-out",
-    )
-    add_options(parser, "--format")
+    parser.shared("--format")
 
 
 def call_score(arguments: argparse.Namespace) -> int:
+    """Check the answers of all annotators and add them up: accuracies, tests, agreement, people beside the truth.
+
+    su3d-bench sheets score ann.csv bob.xlsx --key key/key.json --out scores
+    su3d-bench sheets score ann.csv bob.csv --key key --disputed disputed.csv
+    """
     from dataclasses import asdict
 
     from su3d_bench.formats.tables.table import Prose
@@ -177,31 +160,27 @@ FIGURES = ("comparison", "schemes", "teaser")  # as questions/files/files.py has
 
 
 def _add_pictures(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "pictures",
-        "Draw a figure of a run for print: similarity to texts, labels n and n', or answers with their objects.",
-        (
-            "su3d-bench sheets pictures runs/my-run --queries 'plant on shelf' 'place to sit' --out heat.pdf",
-            "su3d-bench sheets pictures runs/my-run --figure schemes --scenes replica/room0 --out schemes.pdf",
-        ),
-        call_pictures,
+    parser = add_verb(verbs, "pictures", call_pictures)
+    parser.shared("run")
+    parser.option("--out FILE", "a .pdf, .png or .svg file", required=True)
+    parser.option("--what", "what is drawn (default: similarity)", choices=SUBJECTS, default="similarity")
+    parser.option("--queries TEXT...", "texts, or questions to be answered", default=[])
+    parser.option(
+        "--figure", "the texts of the paper's figure, or of its page's teaser, before --queries", choices=FIGURES
     )
-    add_runs(parser, None)
-    add_out(parser, "FILE", "a .pdf, .png or .svg file", required=True)
-    parser.add_argument("--what", choices=SUBJECTS, default="similarity", help="what is drawn (default: similarity)")
-    parser.add_argument("--queries", nargs="+", default=[], metavar="TEXT", help="texts, or questions to be answered")
-    parser.add_argument(
-        "--figure", choices=FIGURES, help="the texts of the paper's figure, or of its page's teaser, before --queries"
-    )
-    add_options(parser, "--scenes", "--methods")
-    parser.add_argument("--photo", action="store_true", help="a first column with the colours that the frames saw")
-    parser.add_argument("--view", choices=("corner", "above"), default="corner", help="from where (default: a corner)")
-    parser.add_argument("--colours", choices=("paper", "cividis"), default="paper", help="of similarity")
-    add_options(parser, "--device")
+    parser.shared("--scenes", "--methods")
+    parser.option("--photo", "a first column with the colours that the frames saw")
+    parser.option("--view", "from where (default: a corner)", choices=("corner", "above"), default="corner")
+    parser.option("--colours", "of similarity", choices=("paper", "cividis"), default="paper")
+    parser.shared("--device")
 
 
 def call_pictures(arguments: argparse.Namespace) -> int:
+    """Draw a figure of a run for print: similarity to texts, labels n and n', or answers with their objects.
+
+    su3d-bench sheets pictures runs/my-run --queries 'plant on shelf' 'place to sit' --out heat.pdf
+    su3d-bench sheets pictures runs/my-run --figure schemes --scenes replica/room0 --out schemes.pdf
+    """
     from su3d_bench.questions.question_files import figure_texts
     from su3d_bench.reports.pictures.canvas import scale_stops
     from su3d_bench.reports.pictures.figures import draw_grid

@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Any, Final
 from su3d_bench.cli.options import (
     Verbs,
     add_language_options,
-    add_options,
-    add_out,
     add_verb,
     answer_estimate,
     chat_client,
@@ -44,65 +42,50 @@ PER_KIND = {"retrieval": 5, "annotation": 30, "reasoning": 1, QUESTIONS: 2}
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "make",
-        "Make sheets on which people judge a run, or questions: an offline page, a workbook and a table with pictures.",
-        (
-            "su3d-bench sheets make runs/my-run --kind retrieval annotation reasoning --annotators 3 --out sheets",
-            "su3d-bench sheets make --kind questions --scenes 'rooms/*' --annotators 2 --overlap 1 --out sheets",
-        ),
-        call,
+    parser = add_verb(verbs, "make", call)
+    parser.option(
+        "run [RUN]", "the folder of a run; variants stand side by side in it (--kind questions can do with --scenes)"
     )
-    parser.add_argument(
-        "run",
-        nargs="?",
-        type=Path,
-        metavar="RUN",
-        help="the folder of a run; variants stand side by side in it (--kind questions can do with --scenes)",
-    )
-    parser.add_argument(
-        "--kind", nargs="+", choices=KINDS, required=True, help="what is judged; several give a folder each in DIR"
-    )
-    add_out(parser, "DIR", "where the sheets go", required=True)
-    parser.add_argument("--key", type=Path, metavar="DIR", help="where the key goes (default: DIR-key)")
-    parser.add_argument(
-        "--questions",
+    parser.option("--kind ...", "what is judged; several give a folder each in DIR", choices=KINDS, required=True)
+    parser.option("--out DIR", "where the sheets go", required=True)
+    parser.option("--key DIR", "where the key goes (default: DIR-key)")
+    parser.option(
+        "--questions FILE",
+        "a file of questions, 'paper' for those of its page, or 'generated' from the ground truth (default)",
         default="generated",
-        metavar="FILE",
-        help="a file of questions, 'paper' for those of its page, or 'generated' from the ground truth (default)",
+        type=str,
     )
-    add_options(parser, "--methods")
-    parser.add_argument(
-        "--scenes",
-        nargs="+",
+    parser.shared("--methods")
+    parser.option(
+        "--scenes S...",
+        "these alone (default: all of the run); without RUN addresses or patterns such as 'rooms/*'",
         default=[],
-        metavar="S",
-        help="these alone (default: all of the run); without RUN addresses or patterns such as 'rooms/*'",
     )
-    add_options(parser, "--leave-out")
-    parser.add_argument(
-        "--per-kind",
-        type=count,
-        metavar="N",
-        help="most items of a scene: questions of a kind (default: 5), instances (30), questions of a template (1); "
+    parser.shared("--leave-out")
+    parser.option(
+        "--per-kind N",
+        "most items of a scene: questions of a kind (default: 5), instances (30), questions of a template (1); "
         "in sheets of questions 2 of each kind and template",
+        type=count,
     )
-    parser.add_argument("--annotators", type=int, default=1, metavar="N", help="people who share the work")
-    parser.add_argument(
-        "--overlap", type=float, default=0.25, metavar="SHARE", help="of all items that everybody gets (default: 0.25)"
-    )
-    add_options(parser, "--seed", "--jobs", "--device")
-    parser.add_argument(
+    parser.option("--annotators N", "people who share the work", type=int, default=1)
+    parser.option("--overlap SHARE", "of all items that everybody gets (default: 0.25)", type=float, default=0.25)
+    parser.shared("--seed", "--jobs", "--device")
+    parser.option(
         "--solver",
+        "who answers in reasoning sheets: geometry alone (default), or a language model, as in query ask",
         choices=("built-in", "llm"),
         default="built-in",
-        help="who answers in reasoning sheets: geometry alone (default), or a language model, as in query ask",
     )
     add_language_options(parser)
 
 
 def call(arguments: argparse.Namespace) -> int:
+    """Make sheets on which people judge a run, or questions: an offline page, a workbook and a table with pictures.
+
+    su3d-bench sheets make runs/my-run --kind retrieval annotation reasoning --annotators 3 --out sheets
+    su3d-bench sheets make --kind questions --scenes 'rooms/*' --annotators 2 --overlap 1 --out sheets
+    """
     from su3d_bench.questions.query_files import read_left_out
     from su3d_bench.runs.finished import read_run
     from su3d_bench.sheets.sources import RunSource
