@@ -12,7 +12,6 @@ from su3d_bench.cli import fetch
 from su3d_bench.cli.new import add_new
 from su3d_bench.cli.options import Verbs, add_group, add_verb, count
 from su3d_bench.cli.output import answer_either
-from su3d_bench.core.errors import EXIT_DONE
 
 LAYOUTS = ("native", "replica", "scannet")  # as those of su3d_bench.datasets.layouts, which take long to load
 MAX_LISTED = 40
@@ -88,7 +87,7 @@ def call_make(arguments: argparse.Namespace) -> None:
     make_scenes.make(arguments)
 
 
-def call_list(arguments: argparse.Namespace) -> int:
+def call_list(arguments: argparse.Namespace) -> None:
     """List every dataset and the scenes that are there; of those named also how to get what is not.
 
     su3d-bench datasets list
@@ -103,7 +102,6 @@ def call_list(arguments: argparse.Namespace) -> int:
     lines = [f"data root: {root}", *(line for row in rows if row not in absent for line in _lines(row))]
     lines += _absent_lines(absent, root)
     answer_either(arguments, {"data_root": str(root), "datasets": rows}, *lines)
-    return EXIT_DONE
 
 
 def data_root() -> Path:

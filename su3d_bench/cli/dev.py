@@ -52,7 +52,7 @@ def _add_cache(verbs: Verbs) -> None:
     parser.shared("--dry-run")
 
 
-def call_cache_list(arguments: argparse.Namespace) -> int:
+def call_cache_list(arguments: argparse.Namespace) -> None:
     """List what is kept by kind: how many files, how large, how old.
 
     su3d-bench dev cache list
@@ -77,7 +77,6 @@ def call_cache_list(arguments: argparse.Namespace) -> int:
         lines.append(f"  {row['kind']:<13}  {size_text(row['n_bytes']):>9}  {n_files:>13}  {old}")
         lines.append(f"  {'':<13}  {KINDS[row['kind']].what}")
     answer_either(arguments, {"folder": str(root), "n_bytes": n_bytes, "kinds": rows}, *lines)
-    return EXIT_DONE
 
 
 def _ago(written: float) -> str:
@@ -85,7 +84,7 @@ def _ago(written: float) -> str:
     return counted(round(seconds / DAY_S), "day") if seconds >= DAY_S else counted(round(seconds / 3600), "hour")
 
 
-def call_cache_clear(arguments: argparse.Namespace) -> int:
+def call_cache_clear(arguments: argparse.Namespace) -> None:
     """Remove what is kept, of some kinds or all; nothing but files of the cache's own form, never through links.
 
     su3d-bench dev cache clear all --dry-run
@@ -114,10 +113,9 @@ def call_cache_clear(arguments: argparse.Namespace) -> int:
     if "all" in wanted and "replies" not in wanted and any(cache_entries(root, KINDS["replies"])):
         text = "replies of language models stay; su3d-bench dev cache clear replies removes them"
         remark(text, quiet=arguments.quiet)
-    return EXIT_DONE
 
 
-def call_completion(arguments: argparse.Namespace) -> int:
+def call_completion(arguments: argparse.Namespace) -> None:
     """Print a script that completes verbs, options and choices in a shell.
 
     eval "$(su3d-bench dev completion bash)"
@@ -127,7 +125,6 @@ def call_completion(arguments: argparse.Namespace) -> int:
 
     script = shellcode(["su3d-bench"], shell=arguments.shell)
     answer_either(arguments, {"shell": arguments.shell, "script": script}, *script.splitlines())
-    return EXIT_DONE
 
 
 def _add_registry(verbs: Verbs) -> None:
@@ -184,8 +181,7 @@ def call_registry_build(arguments: argparse.Namespace) -> int:
     title = TITLE if arguments.title is None else printable(arguments.title, 120)
     pages = write_site(registry, arguments.out, title, arguments.bundles_at)
     refused = [f"left out: {one.run}, {one.what}: {one.reason}" for one in registry.refused]
-    for line in refused[:MOST_REFUSED]:
-        remark(line)
+    remark(*refused[:MOST_REFUSED])
     if len(refused) > MOST_REFUSED:
         remark(f"left out: {len(refused) - MOST_REFUSED} more")
     counts = f"{counted(len(registry.rows), 'row')} of {counted(registry.n_bundles, 'bundle')} in "

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from su3d_bench.cli.options import Verbs, add_verb
 from su3d_bench.cli.output import answer_tables, remark
-from su3d_bench.core.errors import EXIT_DONE, ConfigError
+from su3d_bench.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from su3d_bench.evaluation.result import Request
@@ -55,7 +55,7 @@ def add_parser(verbs: Verbs) -> None:
     parser.shared("--table-format")
 
 
-def call(arguments: argparse.Namespace) -> int:
+def call(arguments: argparse.Namespace) -> None:
     """Score predictions made elsewhere, under every protocol that fits; the format is recognised.
 
     su3d-bench evaluate pred/ --ground-truth gt/ --protocols scannet-instance --out runs/mine
@@ -82,11 +82,9 @@ def call(arguments: argparse.Namespace) -> int:
         tables = side_by_side_tables(plain(run.metrics), documents, per_class=arguments.per_class)
     answer_tables(arguments, document, tables)
     for method, result in results.items():
-        for line in said_of(result):
-            remark(f"{method}: {line}" if len(results) > 1 else line, quiet=arguments.quiet)
+        remark(*(f"{method}: {line}" if len(results) > 1 else line for line in said_of(result)), quiet=arguments.quiet)
     if arguments.out is not None:
         _say_next(arguments.out, list(results), was_there=was_there, is_quiet=arguments.quiet)
-    return EXIT_DONE
 
 
 def _request(paths: Sequence[Path], arguments: argparse.Namespace) -> Request:

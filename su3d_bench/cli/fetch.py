@@ -10,9 +10,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.options import Verbs, add_group, add_verb, perception_config
+from su3d_bench.cli.options import Parser, Verbs, add_group, add_verb, perception_config
 from su3d_bench.cli.output import answer_either, drawn_bars, remark
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, suggest
+from su3d_bench.core.errors import ConfigError, suggest
 
 if TYPE_CHECKING:
     from su3d_bench.fetching.bringing import Brought, Planned
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 MB = 1_000_000
 
 
-def _add_fetch_options(parser: argparse.ArgumentParser, *, has_servers: bool = True) -> None:
+def _add_fetch_options(parser: Parser, *, has_servers: bool = True) -> None:
     """``--accept``, ``--dry-run``, ``--retries``; where servers are in the table, ``--mirror`` and ``--sources``."""
     parser.option(
         "--accept NAME...",
@@ -67,7 +67,7 @@ def size_text(n_bytes: int | None) -> str:
     return f"{n_bytes / MB:,.0f} MB" if n_bytes < 10_000 * MB else f"{n_bytes / MB / 1000:,.1f} GB"
 
 
-def fetch_planned(arguments: argparse.Namespace, planned: Sequence[Planned]) -> int:
+def fetch_planned(arguments: argparse.Namespace, planned: Sequence[Planned]) -> None:
     """Show, ask, bring what is missing, and answer; with ``--dry-run`` only show."""
     from su3d_bench.fetching.bringing import fetch
 
@@ -75,7 +75,7 @@ def fetch_planned(arguments: argparse.Namespace, planned: Sequence[Planned]) -> 
     if arguments.dry_run:
         lines = [line for entry in planned for line in plan_lines(entry.source, entry.here)]
         answer_either(arguments, [plan_row(entry.source, entry.here) for entry in planned], *lines)
-        return EXIT_DONE
+        return
     patience = patience_of(arguments)
     missing = [entry for entry in planned if entry.here is None]
     accept(arguments, [entry.source for entry in missing])
@@ -83,7 +83,6 @@ def fetch_planned(arguments: argparse.Namespace, planned: Sequence[Planned]) -> 
     with watching(arguments) as watch:
         brought = [fetch(entry, watch, patience, keep_archives=keep) for entry in missing]
     answer_brought(arguments, [(entry.source.name, entry.here) for entry in planned if entry.here], brought)
-    return EXIT_DONE
 
 
 def answer_brought(arguments: argparse.Namespace, here: Sequence[tuple[str, Path]], brought: Sequence[Brought]) -> None:
@@ -101,8 +100,7 @@ def answer_brought(arguments: argparse.Namespace, here: Sequence[tuple[str, Path
         )
         lines.append(f"{entry.source.name}: {entry.place}")
         lines += [f"  {file.sha256}  {file.name}{_agreement(file.held_against)}" for file in entry.files]
-        for text in entry.remarks:
-            remark(f"{entry.source.name}: {text}", quiet=arguments.quiet)
+        remark(*(f"{entry.source.name}: {text}" for text in entry.remarks), quiet=arguments.quiet)
     answer_either(arguments, rows, *lines)
 
 
@@ -199,7 +197,7 @@ def add_models(verbs: Verbs) -> None:
     parser.shared("--set")
 
 
-def call_models(arguments: argparse.Namespace) -> int:
+def call_models(arguments: argparse.Namespace) -> None:
     """Fetch foundation models into $SU3D_MODELS: from the Hugging Face hub, or where their authors publish them.
 
     su3d-bench models fetch --for paper --accept MIT Apache-2.0
@@ -230,7 +228,7 @@ def _add_replica(verbs: Verbs) -> None:
     _add_fetch_options(parser)
 
 
-def call_replica(arguments: argparse.Namespace) -> int:
+def call_replica(arguments: argparse.Namespace) -> None:
     """Fetch Replica into $SU3D_DATA: NICE-SLAM's RGB-D frames, and the annotated meshes of the release.
 
     su3d-bench datasets fetch replica --dry-run
@@ -253,7 +251,7 @@ def _add_scannet(verbs: Verbs) -> None:
     _add_fetch_options(parser, has_servers=False)
 
 
-def call_scannet(arguments: argparse.Namespace) -> int:
+def call_scannet(arguments: argparse.Namespace) -> None:
     """Fetch scans of ScanNet into $SU3D_DATA by your own official script or link, or say how to sign its terms.
 
     su3d-bench datasets fetch scannet --script download-scannet.py
@@ -271,10 +269,10 @@ def call_scannet(arguments: argparse.Namespace) -> int:
         row = plan_row(source, here) | {"missing": missing, "label_table": scans.label_table}
         counts = f"  {scans.n_files} files of {scans.n_asked} scans are missing below {root}"
         answer_either(arguments, [row], *plan_lines(source, here), counts, *(f"  {name}" for name in missing))
-        return EXIT_DONE
+        return
     if scans.is_here:
         answer_brought(arguments, [(source.name, root)], [])
-        return EXIT_DONE
+        return
     if arguments.script is None and arguments.address is None:
         raise how_to_sign(source)
     for name in arguments.accept:
@@ -287,4 +285,3 @@ def call_scannet(arguments: argparse.Namespace) -> int:
         else:
             brought = fetch_from(source, scans, arguments.address, watch, patience_of(arguments))
     answer_brought(arguments, [], [brought])
-    return EXIT_DONE

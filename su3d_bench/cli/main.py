@@ -113,8 +113,8 @@ def _exit_code(words: Sequence[str]) -> int:
         if not arguments.uses_all_cores:
             limit_threads()  # before numerical libraries are loaded
         with ending_in_order():
-            code: int = arguments.call(arguments)
-        return code
+            code: int | None = arguments.call(arguments)
+        return EXIT_DONE if code is None else code
     except KeyboardInterrupt as end:
         how = f"ended by {end}" if isinstance(end, Ended) else "interrupted"
         again = "takes it up again" if getattr(arguments, "takes_up", False) else "begins anew"

@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 from su3d_bench.cli.output import answer_either, drawn_bars, remark
 from su3d_bench.core import registry
 from su3d_bench.core.config import read_assignments
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, nearest
+from su3d_bench.core.errors import ConfigError, DataError, nearest
 from su3d_bench.core.files.atomic import make_folder
 from su3d_bench.datasets.layouts import LAYOUTS
 from su3d_bench.datasets.writing import SceneTarget, finish_scene, plan_scenes, write_frames
@@ -47,7 +47,7 @@ class Unit:
         return 1 if self.indices is None else len(self.indices)
 
 
-def make(arguments: argparse.Namespace) -> int:
+def make(arguments: argparse.Namespace) -> None:
     """Make what was asked for and print, scene by scene, whether it was made or was there already."""
     part = dataset_part(arguments.dataset, arguments.set)
     scenes = _scenes(part, arguments.scenes)
@@ -70,7 +70,6 @@ def make(arguments: argparse.Namespace) -> int:
     lines = [f"{row['scene']:<16} {row['status']:<17} {row['address']}" for row in rows]
     answer_either(arguments, {"out": str(out), "layout": arguments.layout, "scenes": rows}, *lines)
     remark(f"to use them: SU3D_DATA={out} su3d-bench run --scenes '{reader}/*'", quiet=arguments.quiet)
-    return EXIT_DONE
 
 
 def dataset_part(name: str, assignments: Sequence[str]) -> Part:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from su3d_bench.cli.new import add_new
 from su3d_bench.cli.options import Verbs, add_group, add_verb
 from su3d_bench.cli.output import answer, answer_document, answer_either, answer_json
-from su3d_bench.core.errors import EXIT_DONE, counted
+from su3d_bench.core.errors import counted
 from su3d_bench.core.printing import one_line
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def add_parser(verbs: Verbs) -> None:
     add_new(actions, "method")
 
 
-def call_list(arguments: argparse.Namespace) -> int:
+def call_list(arguments: argparse.Namespace) -> None:
     """List the methods that can be run: where they come from, their licence, what they need.
 
     su3d-bench methods list
@@ -46,10 +46,9 @@ def call_list(arguments: argparse.Namespace) -> int:
 
     rows = known_methods()
     answer_either(arguments, rows, *[line for row in rows for line in ("", *_lines(row))][1:])
-    return EXIT_DONE
 
 
-def call_check(arguments: argparse.Namespace) -> int:
+def call_check(arguments: argparse.Namespace) -> None:
     """Try a method on two frames of a room, and name what is wrong with what it gives.
 
     su3d-bench methods check oracle
@@ -63,7 +62,6 @@ def call_check(arguments: argparse.Namespace) -> int:
     features = "with features" if trial.has_features else "without features"
     text = f"{trial.method}: two frames of {trial.scene} gave {made}, {features}: nothing found wrong"
     answer_either(arguments, asdict(trial), text)
-    return EXIT_DONE
 
 
 def _lines(row: dict[str, Any]) -> list[str]:
@@ -75,7 +73,7 @@ def _lines(row: dict[str, Any]) -> list[str]:
     return lines
 
 
-def call_show(arguments: argparse.Namespace) -> int:
+def call_show(arguments: argparse.Namespace) -> None:
     """Show the settings of a method, its presets and what papers report of it.
 
     su3d-bench methods show opensu3d
@@ -93,7 +91,7 @@ def call_show(arguments: argparse.Namespace) -> int:
     presets = {name: dict(settings) for name, settings in _presets_of(method).items()}
     published = [figure.model_dump(mode="json", exclude_none=True) for figure in figures]
     if answer_json(arguments, {**row, "settings": defaults, "presets": presets, "published": published}):
-        return EXIT_DONE
+        return
     leaves = [(("method", method.name, *path), value, _remark(method, path)) for path, value in flatten(defaults)]
     answer(*(f"# {line}" for line in _lines(row)))
     answer_document("\n" + write_toml(leaves) if leaves else f"# {one_line(method.name)} has no settings")
@@ -103,7 +101,6 @@ def call_show(arguments: argparse.Namespace) -> int:
     if figures:
         answer("", "# as reported, each in its own set-up; no two need be comparable")
         answer(*(f"# {line}" for figure in figures for line in _figure_lines(figure)))
-    return EXIT_DONE
 
 
 def _presets_of(method: Any) -> Mapping[str, Mapping[str, Any]]:

@@ -40,7 +40,7 @@ def _add_warm(verbs: Verbs) -> None:
     parser.shared("--device", "--set")
 
 
-def call_list(arguments: argparse.Namespace) -> int:
+def call_list(arguments: argparse.Namespace) -> None:
     """List every model: size, licence, which profile loads it, and where it lies or that it is missing.
 
     su3d-bench models list
@@ -48,7 +48,7 @@ def call_list(arguments: argparse.Namespace) -> int:
     """
     states = _states(arguments, ())
     if answer_json(arguments, [_state_row(state) for state in states]):
-        return EXIT_DONE
+        return
     width = max(len(state.entry.name) for state in states)
     for state in states:
         entry = state.entry
@@ -61,7 +61,6 @@ def call_list(arguments: argparse.Namespace) -> int:
             f"{len(missing)} missing; su3d-bench models check {missing[0].entry.name} says what to fetch",
             quiet=arguments.quiet,
         )
-    return EXIT_DONE
 
 
 def _states(arguments: argparse.Namespace, names: tuple[str, ...]) -> list[ModelState]:
@@ -132,7 +131,7 @@ def _check_lines(row: dict[str, Any]) -> list[str]:
     return [f"{row['name']} ({row['form']}): {row['folder']}: {state}", *digests, *(f"  {p}" for p in row["problems"])]
 
 
-def call_warm(arguments: argparse.Namespace) -> int:
+def call_warm(arguments: argparse.Namespace) -> None:
     """Load the models of a profile, or one encoder, run them on a made frame, and tell time and memory.
 
     su3d-bench models warm --profile paper --device cuda
@@ -143,7 +142,6 @@ def call_warm(arguments: argparse.Namespace) -> int:
     lines += [f"  {name:<10} {ms:>10.1f} ms" for name, ms in result.stages_ms.items()]
     lines.append(f"memory: {result.memory_mb:.0f} MB at most ({result.memory_of}); digest {result.digest[:12]}")
     answer_either(arguments, asdict(result), *lines)
-    return EXIT_DONE
 
 
 def _warm(arguments: argparse.Namespace) -> WarmUp:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, nearest, suggest
+from su3d_bench.core.errors import ConfigError, nearest, suggest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -296,7 +296,7 @@ def chat_client(
     return ChatClient(config, store, offline=arguments.offline, ask_failed_again=arguments.ask_failed_again), config
 
 
-def answer_estimate(arguments: argparse.Namespace, client: ChatClient | None, requests: Sequence[ChatRequest]) -> int:
+def answer_estimate(arguments: argparse.Namespace, client: ChatClient | None, requests: Sequence[ChatRequest]) -> None:
     """Print what asking a language model all ``requests`` would cost, nothing without a client; the exit code."""
     from su3d_bench.cli.output import answer_either
     from su3d_bench.perception.language.client import Estimate
@@ -307,4 +307,3 @@ def answer_estimate(arguments: argparse.Namespace, client: ChatClient | None, re
     else:
         estimate = client.estimate(requests)
         answer_either(arguments, estimate.to_json(), estimate.line())
-    return EXIT_DONE

@@ -138,10 +138,10 @@ def _few_digits(text: str) -> str:
     return digest_bytes(text.encode("utf-8", "surrogatepass"))[:8]
 
 
-def remark(text: str, *, quiet: bool = False) -> None:
-    """Print a remark to stderr."""
-    if not quiet:
-        print(one_line(text), file=sys.stderr)
+def remark(*lines: str, quiet: bool = False) -> None:
+    """Print remarks to stderr, a line each."""
+    for line in () if quiet else lines:
+        print(one_line(line), file=sys.stderr)
 
 
 def remark_unseen(encoder: object, text: str, *, quiet: bool) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from su3d_bench.cli.new import add_new
 from su3d_bench.cli.options import Verbs, add_group, add_verb, perception_config
 from su3d_bench.cli.output import answer_either, answer_tables, progress, remark, show
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, shown, suggest
+from su3d_bench.core.errors import ConfigError, shown, suggest
 
 if TYPE_CHECKING:
     from su3d_bench.metrics.protocols.loading import Stated
@@ -45,7 +45,7 @@ def add_parser(verbs: Verbs) -> None:
     add_new(actions, "protocol")
 
 
-def call_list(arguments: argparse.Namespace) -> int:
+def call_list(arguments: argparse.Namespace) -> None:
     """List the protocols and whose evaluations they repeat.
 
     su3d-bench protocols list
@@ -63,10 +63,9 @@ def call_list(arguments: argparse.Namespace) -> int:
         if stated is not None:
             lines += [f"    {line}" for line in wrap(stated.in_short, 116, break_on_hyphens=False)]
     answer_either(arguments, values, *lines)
-    return EXIT_DONE
 
 
-def call_show(arguments: argparse.Namespace) -> int:
+def call_show(arguments: argparse.Namespace) -> None:
     """Print every rule of a protocol with its source, or the texts that features are compared with.
 
     su3d-bench protocols show rooms-semantic
@@ -77,14 +76,14 @@ def call_show(arguments: argparse.Namespace) -> int:
 
     rules = load_protocol(arguments.name)
     if arguments.names:
-        return _answer_names(arguments, rules)
+        _answer_names(arguments, rules)
+        return
     if arguments.queries is not None:
         raise ConfigError("protocols show: --queries belongs to --names")
     stated = original_of(arguments.name)
     value = rules.model_dump(mode="json") | {"digest": rules.digest, "labels_taken": labels_taken(rules)}
     lines = [*_rules_lines(rules, rules_files(arguments.name)), *_original_lines(stated)]
     answer_either(arguments, value | {"original": _plain(stated)}, *lines)
-    return EXIT_DONE
 
 
 def _plain(stated: Stated | None) -> dict[str, Any] | None:
@@ -96,7 +95,7 @@ def _original_lines(stated: Stated | None) -> list[str]:
     return ["", *(f"{name:<28} {text}" for name, text in facts.items())]
 
 
-def call_diff(arguments: argparse.Namespace) -> int:
+def call_diff(arguments: argparse.Namespace) -> None:
     """Print the rules in which two protocols differ, and with --prediction what each does to the numbers.
 
     su3d-bench protocols diff rooms-semantic replica-mesh-ex6
@@ -123,17 +122,15 @@ def call_diff(arguments: argparse.Namespace) -> int:
         show()  # the plot takes longer than the answer
         draw_walk(value, arguments.out)
         remark(f"plot: {arguments.out}", quiet=arguments.quiet)
-    return EXIT_DONE
 
 
-def _answer_names(arguments: argparse.Namespace, rules: ProtocolRules) -> int:
+def _answer_names(arguments: argparse.Namespace, rules: ProtocolRules) -> None:
     from su3d_bench.evaluation.texts import distinct_texts, named_texts
 
     named = named_texts(rules, arguments.queries)
     names = [{"name": name, "texts": list(texts)} for name, texts in named.items()]
     value = {"protocol": rules.name, "encoder": rules.encoder, "names": names}
     answer_either(arguments, value, *distinct_texts(named))
-    return EXIT_DONE
 
 
 def _rules_lines(rules: ProtocolRules, files: Sequence[Path]) -> list[str]:
@@ -174,7 +171,7 @@ def _add_texts(verbs: Verbs) -> None:
     parser.option("--out FILE", "where names and features go", required=True)
 
 
-def call_texts(arguments: argparse.Namespace) -> int:
+def call_texts(arguments: argparse.Namespace) -> None:
     """Encode every text of a protocol: its classes under its prompts, or queries, for evaluate --text-features.
 
     su3d-bench protocols texts --protocol rooms-semantic --encoder embedded --out texts.npz
@@ -219,7 +216,6 @@ def call_texts(arguments: argparse.Namespace) -> int:
     if arguments.queries is not None and arguments.queries.suffix.lower() in FORMS_OF_EVALUATE:
         words += ["--queries", str(arguments.queries)]
     remark(f"use: su3d-bench evaluate PREDICTIONS {shlex.join(words)}", quiet=arguments.quiet)
-    return EXIT_DONE
 
 
 def _encoder_name(said: str | None, protocol: str, of_protocol: str | None) -> str:

@@ -18,7 +18,7 @@ from su3d_bench.cli.options import (
     open_map,
 )
 from su3d_bench.cli.output import answer, answer_json, file_name_of, remark, remark_unseen, show
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, StoreError
+from su3d_bench.core.errors import ConfigError, PredictionError, StoreError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -52,7 +52,7 @@ def _add_text(verbs: Verbs) -> None:
     parser.option("--out FILE", "where the picture goes (default: beside the map)")
 
 
-def call_text(arguments: argparse.Namespace) -> int:
+def call_text(arguments: argparse.Namespace) -> None:
     """Rank the instances of a scene's map by their similarity to a text and draw the heat map.
 
     su3d-bench query text rooms/living0 "plant on shelf"
@@ -85,7 +85,6 @@ def call_text(arguments: argparse.Namespace) -> int:
     value = {"scene": arguments.scene, "text": arguments.text, "picture": str(picture), "ranking": rows}
     if not answer_json(arguments, value):
         remark(f"heat map: {picture}", quiet=arguments.quiet)
-    return 0
 
 
 def _draw_text(instances: Instances, ranking: Ranking, rows: list[dict[str, Any]], picture: Path, title: str) -> None:
@@ -137,7 +136,7 @@ def _add_ask(verbs: Verbs) -> None:
     add_language_options(parser)
 
 
-def call_ask(arguments: argparse.Namespace) -> int:
+def call_ask(arguments: argparse.Namespace) -> None:
     """Answer a question about a scene from its map: by geometry, or by a language model.
 
     su3d-bench query ask rooms/living0 "Which lamp is closer to the sofa?"
@@ -156,19 +155,18 @@ def call_ask(arguments: argparse.Namespace) -> int:
     refined, note = _refined(job, arguments.names)
     scene = map_of(instances, refined)
     if arguments.dry_run:
-        return _estimate(scene, run, arguments)
+        _estimate(scene, run, arguments)
+        return
     reply = _solve(scene, run, arguments)
     if not arguments.json:
         answer(reply.text)
-        for line in (*reply.notes, f"names: {note}"):
-            remark(line, quiet=arguments.quiet)
+        remark(*reply.notes, f"names: {note}", quiet=arguments.quiet)
         show()  # the picture takes longer than the answer
     picture = _draw_ask(instances, scene, reply, job, arguments)
     value = {"scene": arguments.scene, "question": arguments.question} | reply.to_json()
     is_json = answer_json(arguments, value | {"names": note, "picture": None if picture is None else str(picture)})
     if picture is not None and not is_json:
         remark(f"picture: {picture}", quiet=arguments.quiet)
-    return EXIT_DONE
 
 
 def _refined(job: JobFolder, wanted: str) -> tuple[RefinedNames | None, str]:
@@ -185,7 +183,7 @@ def _refined(job: JobFolder, wanted: str) -> tuple[RefinedNames | None, str]:
     return records.refined, f"labels n' by {records.model or 'vote'}{without}"
 
 
-def _estimate(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> int:
+def _estimate(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> None:
     from su3d_bench.questions.solver import LanguageSolver
 
     if arguments.solver != "llm":

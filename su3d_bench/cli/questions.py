@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.options import (
+    Parser,
     Verbs,
     add_language_options,
     add_verb,
@@ -18,7 +19,7 @@ from su3d_bench.cli.options import (
     given_language_option,
 )
 from su3d_bench.cli.output import answer, answer_either, answer_json, answer_tables, remark
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, counted
+from su3d_bench.core.errors import ConfigError, DataError, counted
 
 if TYPE_CHECKING:
     from su3d_bench.questions.model import Question
@@ -87,11 +88,11 @@ def _add_score(verbs: Verbs) -> None:
     parser.shared("--format")
 
 
-def _add_scenes(parser: argparse.ArgumentParser, *, required: bool = False) -> None:
+def _add_scenes(parser: Parser, *, required: bool = False) -> None:
     parser.option("--scenes SCENE...", "addresses or patterns, such as 'rooms/*'", required=required)
 
 
-def _make(arguments: argparse.Namespace) -> int:
+def _make(arguments: argparse.Namespace) -> None:
     """Make a set of questions with known answers from the ground truth of scenes.
 
     su3d-bench query make --scenes 'rooms/*' --per-kind 40 --leave-out disputed.csv --out queries.toml
@@ -100,16 +101,16 @@ def _make(arguments: argparse.Namespace) -> int:
     from su3d_bench.questions.question_files import check_form, write_questions
 
     if arguments.form != FORMS[0]:
-        return _make_beacon3d(arguments)
+        _make_beacon3d(arguments)
+        return
     check_form(arguments.out)
     made = _made(arguments)
     write_questions(arguments.out, made)
     remark(f"{counted(len(made), 'question')}: {arguments.out}", quiet=arguments.quiet)
     answer_either(arguments, *_counts(made))
-    return EXIT_DONE
 
 
-def _make_beacon3d(arguments: argparse.Namespace) -> int:
+def _make_beacon3d(arguments: argparse.Namespace) -> None:
     """Write one of Beacon3D's metadata files over objects of the scenes."""
     from su3d_bench.cli.scenes import chosen_scenes
     from su3d_bench.core.files.atomic import write_json
@@ -132,7 +133,6 @@ def _make_beacon3d(arguments: argparse.Namespace) -> int:
     n = sum(len(of_class) for of_scene in content.values() for of_class in of_scene.values())
     line = f"{counted(n, 'object')} on {counted(len(content), 'scene')}: {arguments.out}"
     answer_either(arguments, {"n_objects": n, "n_scenes": len(content), "out": str(arguments.out)}, line)
-    return EXIT_DONE
 
 
 def _made(arguments: argparse.Namespace) -> list[Question]:
@@ -153,7 +153,7 @@ def _made(arguments: argparse.Namespace) -> list[Question]:
     return made
 
 
-def _show(arguments: argparse.Namespace) -> int:
+def _show(arguments: argparse.Namespace) -> None:
     """Show a set of questions: how many of each kind, and the first of them.
 
     su3d-bench query show queries.toml
@@ -164,13 +164,12 @@ def _show(arguments: argparse.Namespace) -> int:
     questions: Sequence[Question]
     questions = paper_queries() if arguments.file == PAPER else read_questions(Path(arguments.file), "")
     if answer_json(arguments, [_row(question) for question in questions]):
-        return EXIT_DONE
+        return
     answer(_counts(questions)[1])
     for question in questions[:N_SHOWN]:
         answer("  ".join(str(value) for value in _printable_row(question)))
     if len(questions) > N_SHOWN:
         answer(f"... and {len(questions) - N_SHOWN} more; --json shows all")
-    return EXIT_DONE
 
 
 def _row(question: Question) -> dict[str, Any]:
@@ -208,7 +207,7 @@ def _counts(questions: Sequence[Question]) -> tuple[dict[str, Any], str]:
     return content, text
 
 
-def _audit(arguments: argparse.Namespace) -> int:
+def _audit(arguments: argparse.Namespace) -> None:
     """Draw a sample of the questions of scenes with pictures for people, or add up what they said of them.
 
     su3d-bench query audit --scenes 'rooms/*' --n 200 --out audit
@@ -219,7 +218,8 @@ def _audit(arguments: argparse.Namespace) -> int:
     from su3d_bench.sheets.audit import make_audit
 
     if arguments.score is not None:
-        return _score(arguments)
+        _score(arguments)
+        return
     if not arguments.scenes or arguments.out is None:
         raise ConfigError("query audit: needs --scenes and --out DIR, or --score DIR/audit.csv")
     scenes = chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet)
@@ -247,18 +247,16 @@ def _audit(arguments: argparse.Namespace) -> int:
         f"su3d-bench query audit --score {arguments.out}/audit.csv",
     )
     answer_either(arguments, {"n": len(drawn), "kinds": counts, "page": str(page)}, *lines)
-    return EXIT_DONE
 
 
-def _score(arguments: argparse.Namespace) -> int:
+def _score(arguments: argparse.Namespace) -> None:
     from su3d_bench.sheets.audit import audit_json, audit_table, read_verdicts
 
     verdicts = read_verdicts(arguments.score)
     answer_tables(arguments, audit_json(verdicts), [audit_table(verdicts)])
-    return EXIT_DONE
 
 
-def _score_answers(arguments: argparse.Namespace) -> int:
+def _score_answers(arguments: argparse.Namespace) -> None:
     """Score answers to the questions of a metadata_*.json of Beacon3D.
 
     su3d-bench query score metadata_qa.json --answers answers.json
@@ -279,7 +277,7 @@ def _score_answers(arguments: argparse.Namespace) -> int:
         client, config = chat_client(arguments, folder, JUDGE_MODEL)
         if arguments.dry_run:
             requests = judge_requests(answers_to_questions(asked, arguments.answers), config)
-            return answer_estimate(arguments, client, list(requests.values()))
+            answer_estimate(arguments, client, list(requests.values()))
+            return
         answered = answered_file(asked, arguments.answers, lambda replies: judged(replies, client, config))
     answer_tables(arguments, answered_json(answered), [answered_table(answered)])
-    return EXIT_DONE

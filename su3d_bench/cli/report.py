@@ -4,25 +4,15 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from su3d_bench.cli import report_files
+from su3d_bench.cli import output, report_files
 from su3d_bench.cli.options import Verbs, add_group, add_verb, index, positive
-from su3d_bench.cli.output import (
-    answer,
-    answer_document,
-    answer_json,
-    answer_or_write,
-    answer_tables,
-    progress,
-    remark,
-    show,
-)
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, counted
+from su3d_bench.cli.output import remark
+from su3d_bench.core.errors import ConfigError, counted
 
 if TYPE_CHECKING:
     from su3d_bench.formats.tables.table import Table
-    from su3d_bench.metrics.costs import UpdateTimes
 
 PAPER_TABLES = ("I", "II", "III", "IV", "V", "reasoning")
 
@@ -68,15 +58,14 @@ def _add_tables(verbs: Verbs) -> None:
     parser.option("--out FILE", "write there instead of printing")
 
 
-def call_tables(arguments: argparse.Namespace) -> int:
+def call_tables(arguments: argparse.Namespace) -> None:
     """Make tables for a paper from runs: those of OpenSU3D's paper by number, or one for each protocol.
 
     su3d-bench report tables runs/my-run --table II III --format latex --out tables.tex
     su3d-bench report tables runs/my-run scores --table IV V --intervals
     """
     tables = _tables(arguments)
-    answer_or_write(arguments, list(map(asdict, tables)), tables)
-    return EXIT_DONE
+    output.answer_or_write(arguments, list(map(asdict, tables)), tables)
 
 
 def _tables(arguments: argparse.Namespace) -> list[Table]:
@@ -116,14 +105,16 @@ def _add_timing(verbs: Verbs) -> None:
     parser.shared("--format")
 
 
-def call_timing(arguments: argparse.Namespace) -> int:
+def call_timing(arguments: argparse.Namespace) -> None:
     """Say what an update costs, stage by stage, and whether it grows with the map.
 
     su3d-bench report timing runs/demo
     su3d-bench report timing runs/a runs/b --out timing --camera-rate 20
     """
     from su3d_bench.analysis.tables import anytime_points
+    from su3d_bench.core.files.atomic import make_folder, write_text
     from su3d_bench.metrics.costs import summarise
+    from su3d_bench.reports.pictures.plots import draw_timing
     from su3d_bench.reports.tables.formats import markdown
     from su3d_bench.reports.tables.timing import csv_text, methods_csv, timing_tables
     from su3d_bench.runs.finished import read_run, read_update_times
@@ -140,30 +131,17 @@ def call_timing(arguments: argparse.Namespace) -> int:
     hardware = {run.name: run.record.hardware for run in runs}
     tables = timing_tables(summaries, anytime, hardware, arguments.camera_rate)
     value = {"hardware": hardware, "methods": [asdict(summary) for summary in summaries]}
-    answer_tables(arguments, value, tables)
-    if arguments.out is not None:
-        files = {
-            "timing.md": markdown(tables),
-            "timing.csv": csv_text(summaries, hardware),
-            "methods.csv": methods_csv(summaries, hardware, arguments.camera_rate),
-        }
-        _write(arguments, files, times, anytime)
-    return 0
-
-
-def _write(
-    arguments: argparse.Namespace, files: dict[str, str], times: list[list[UpdateTimes]], anytime: list[Any]
-) -> None:
-    from su3d_bench.core.files.atomic import make_folder, write_text
-    from su3d_bench.reports.pictures.plots import draw_timing
-
-    show()  # the plots take longer than the tables
+    output.answer_tables(arguments, value, tables)
+    if arguments.out is None:
+        return
+    output.show()  # the plots take longer than the tables
     make_folder(arguments.out)
-    for name, text in files.items():
-        write_text(arguments.out / name, text)
+    write_text(arguments.out / "timing.md", markdown(tables))
+    write_text(arguments.out / "timing.csv", csv_text(summaries, hardware))
+    write_text(arguments.out / "methods.csv", methods_csv(summaries, hardware, arguments.camera_rate))
     pictures = draw_timing(times, anytime, arguments.warm_up, arguments.out)
-    for path in (*(arguments.out / name for name in files), *pictures):
-        remark(f"wrote {path}", quiet=arguments.quiet)
+    files = [arguments.out / name for name in ("timing.md", "timing.csv", "methods.csv")]
+    remark(*(f"wrote {path}" for path in (*files, *pictures)), quiet=arguments.quiet)
 
 
 FORMATS = ("csv", "parquet")
@@ -179,53 +157,44 @@ def _add_samples(verbs: Verbs) -> None:
     parser.shared("--table-format")
 
 
-def call_samples(arguments: argparse.Namespace) -> int:
+def call_samples(arguments: argparse.Namespace) -> None:
     """List every instance of runs, predicted and true: class, confidence, best IoU, kind of error, box.
 
     su3d-bench report samples runs/my-run --out samples.csv
     su3d-bench report samples runs/a runs/b --methods opensu3d --format parquet --out samples.parquet
     """
-    from su3d_bench.reports.tables.samples import COLUMNS, columns_table
-
-    if arguments.columns:
-        if arguments.runs:
-            raise ConfigError("report samples: --columns speaks of no run; leave one of them out")
-        answer_tables(arguments, [asdict(column) for column in COLUMNS], [columns_table()])
-        return EXIT_DONE
-    if not arguments.runs:
-        raise ConfigError("report samples: name the folder of a run, such as runs/my-run; or --columns")
-    return _list(arguments)
-
-
-def _list(arguments: argparse.Namespace) -> int:
     from su3d_bench.analysis.samples import Chosen, samples
     from su3d_bench.core.files.atomic import make_folder, write_bytes
-    from su3d_bench.reports.tables.samples import csv_of, parquet_of
+    from su3d_bench.reports.tables.samples import COLUMNS, columns_table, csv_of, parquet_of
     from su3d_bench.runs.finished import read_run
 
-    is_named = arguments.out is not None and arguments.out.suffix == ".parquet"
-    form = arguments.format or ("parquet" if is_named else "csv")
+    if arguments.columns == bool(arguments.runs):
+        raise ConfigError("report samples: name the folder of a run, such as runs/my-run; or --columns alone")
+    if arguments.columns:
+        output.answer_tables(arguments, [asdict(column) for column in COLUMNS], [columns_table()])
+        return
+    out = arguments.out
+    form = arguments.format or ("parquet" if out is not None and out.suffix == ".parquet" else "csv")
     if form == "parquet":
-        if arguments.out is None:
+        if out is None:
             raise ConfigError("--format parquet: is no text; say where with --out samples.parquet")
         parquet_of(())  # before minutes of work: is it installed?
     chosen = Chosen(tuple(arguments.methods), tuple(arguments.protocols), tuple(arguments.scenes))
     n_scenes = sum(len(chosen.scenes or read_run(run).scenes) for run in arguments.runs)
-    with progress(n_scenes, is_quiet=arguments.quiet) as report:
+    with output.progress(n_scenes, is_quiet=arguments.quiet) as report:
         found = samples(arguments.runs, chosen, report)
-    for line in found.remarks:
-        remark(line, quiet=arguments.quiet)
-    if arguments.out is None:
-        if not answer_json(arguments, [asdict(row) for row in found.rows]):
-            answer_document(csv_of(found.rows))
-        return EXIT_DONE
-    make_folder(arguments.out.parent)
-    write_bytes(arguments.out, parquet_of(found.rows) if form == "parquet" else csv_of(found.rows).encode())
-    if not answer_json(arguments, [asdict(row) for row in found.rows]):
+    remark(*found.remarks, quiet=arguments.quiet)
+    if out is not None:
+        make_folder(out.parent)
+        write_bytes(out, parquet_of(found.rows) if form == "parquet" else csv_of(found.rows).encode())
+    if output.answer_json(arguments, [asdict(row) for row in found.rows]):
+        return
+    if out is None:
+        output.answer_document(csv_of(found.rows))
+    else:
         n_predicted = sum(row.kind == "predicted" for row in found.rows)
         n_true = len(found.rows) - n_predicted
-        answer(f"{arguments.out}: {counted(n_predicted, 'predicted instance')}, {n_true} true")
-    return EXIT_DONE
+        output.answer(f"{out}: {counted(n_predicted, 'predicted instance')}, {n_true} true")
 
 
 def _add_leaderboard(verbs: Verbs) -> None:
@@ -237,7 +206,7 @@ def _add_leaderboard(verbs: Verbs) -> None:
     parser.option("--out FILE", "write there instead of printing")
 
 
-def call_leaderboard(arguments: argparse.Namespace) -> int:
+def call_leaderboard(arguments: argparse.Namespace) -> None:
     """Rank the runs below a folder that agree in protocol, data, counts and labels (one label or the top k).
 
     su3d-bench report leaderboard runs
@@ -247,10 +216,9 @@ def call_leaderboard(arguments: argparse.Namespace) -> int:
 
     board = leaderboard(arguments.folder, arguments.protocols, with_ranks=arguments.intervals)
     parts = tables(board, intervals=arguments.intervals)
-    answer_or_write(arguments, asdict(board), parts)
+    output.answer_or_write(arguments, asdict(board), parts)
     entries = f"{counted(sum(map(len, board.boards)), 'entry')} in {counted(len(board.boards), 'ranking')}"
     remark(f"{entries}, {len(board.refused)} left out", quiet=arguments.quiet)
-    return EXIT_DONE
 
 
 def _add_attribution(verbs: Verbs) -> None:
@@ -263,7 +231,7 @@ def _add_attribution(verbs: Verbs) -> None:
     parser.shared("--format")
 
 
-def call_attribution(arguments: argparse.Namespace) -> int:
+def call_attribution(arguments: argparse.Namespace) -> None:
     """Show where a run loses its points: the gain when each kind of error alone is corrected.
 
     su3d-bench report attribution runs/my-run --out errors.png
@@ -272,20 +240,15 @@ def call_attribution(arguments: argparse.Namespace) -> int:
     from su3d_bench.analysis.attribution import attribute
     from su3d_bench.reports.tables.samples import attribution_tables
 
-    attribution = attribute(
-        arguments.run,
-        method=arguments.method,
-        protocols=arguments.protocols,
-        oracle=arguments.oracle,
-    ).to_json()
-    answer_tables(arguments, attribution, attribution_tables(attribution))
+    chosen = {name: getattr(arguments, name) for name in ("method", "protocols", "oracle")}
+    attribution = attribute(arguments.run, **chosen).to_json()
+    output.answer_tables(arguments, attribution, attribution_tables(attribution))
     if arguments.out is not None:
         from su3d_bench.reports.pictures.plots import draw_attribution
 
-        show()  # the plot takes longer than the answer
+        output.show()  # the plot takes longer than the answer
         draw_attribution(attribution, arguments.out)
         remark(f"plot: {arguments.out}", quiet=arguments.quiet)
-    return EXIT_DONE
 
 
 def _add_power(verbs: Verbs) -> None:
@@ -302,7 +265,7 @@ def _add_power(verbs: Verbs) -> None:
     parser.shared("--protocols", "--format")
 
 
-def call_power(arguments: argparse.Namespace) -> int:
+def call_power(arguments: argparse.Namespace) -> None:
     """Tell how many scenes and seeds show a difference of so many points between two methods.
 
     su3d-bench report power runs/my-run --methods opensu3d conceptgraphs --points 1 2 5
@@ -311,12 +274,6 @@ def call_power(arguments: argparse.Namespace) -> int:
     from su3d_bench.analysis.comparison import plan
     from su3d_bench.reports.tables.comparison import plan_tables
 
-    made = plan(
-        arguments.runs,
-        arguments.methods,
-        points=arguments.points,
-        protocols=arguments.protocols,
-        power=arguments.power,
-    ).to_json()
-    answer_tables(arguments, made, plan_tables(made))
-    return EXIT_DONE
+    chosen = {name: getattr(arguments, name) for name in ("points", "protocols", "power")}
+    made = plan(arguments.runs, arguments.methods, **chosen).to_json()
+    output.answer_tables(arguments, made, plan_tables(made))

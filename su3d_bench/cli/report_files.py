@@ -46,7 +46,7 @@ def _add_html(verbs: Verbs) -> None:
     parser.shared("--jobs")
 
 
-def call_html(arguments: argparse.Namespace) -> int:
+def call_html(arguments: argparse.Namespace) -> None:
     """Make one page that needs no network: numbers, errors, times, comparisons and the maps in 3D.
 
     su3d-bench report html runs/my-run --out page.html
@@ -89,7 +89,6 @@ def call_html(arguments: argparse.Namespace) -> int:
         "page": str(arguments.out), "n_bytes": n_bytes, "n_maps": len(maps), "most_points": contents.most_points,
     }  # fmt: skip
     answer_either(arguments, about, f"{arguments.out}: {n_bytes / MEGABYTE:.1f} MB, {counted(len(maps), 'map')}")
-    return EXIT_DONE
 
 
 class _Progress:
@@ -136,7 +135,7 @@ def _add_rerun(verbs: Verbs) -> None:
     parser.option("--out FILE", "the .rrd file, read by rerun's viewer", required=True)
 
 
-def call_rerun(arguments: argparse.Namespace) -> int:
+def call_rerun(arguments: argparse.Namespace) -> None:
     """Write frames, masks, maps and truth of a run on one timeline, for rerun's viewer.
 
     su3d-bench report rerun runs/my-run --out my-run.rrd
@@ -170,8 +169,7 @@ def call_rerun(arguments: argparse.Namespace) -> int:
             one.write(Recording(sdk, one.scene, methods, stream), partial(tell, one.scene))
         refuse_nothing(timelines, run.name)
     for one in timelines:
-        for line in one.remarks:
-            remark(f"{printable(one.scene, 120)}: {line}", quiet=arguments.quiet)
+        remark(*(f"{printable(one.scene, 120)}: {line}" for line in one.remarks), quiet=arguments.quiet)
     n_bytes, n_frames = arguments.out.stat().st_size, sum(one.n_frames for one in timelines)
     n_maps = sum(one.n_maps for one in timelines)
     about = {
@@ -185,7 +183,6 @@ def call_rerun(arguments: argparse.Namespace) -> int:
         f"{arguments.out}: {n_bytes / MEGABYTE:.1f} MB, {shown}",
         f"look at it: rerun {shlex.quote(str(arguments.out))} (version {sdk.__version__}; others may not read it)",
     )
-    return EXIT_DONE
 
 
 def _add_bundle(verbs: Verbs) -> None:
@@ -195,7 +192,7 @@ def _add_bundle(verbs: Verbs) -> None:
     parser.option("--trained-on TEXT", "the data of your weights, for a registry", default="")
 
 
-def call_bundle(arguments: argparse.Namespace) -> int:
+def call_bundle(arguments: argparse.Namespace) -> None:
     """Pack finished runs into one archive that report verify scores anew and a registry takes in.
 
     su3d-bench report bundle runs/my-run --out my-run.zip
@@ -218,7 +215,6 @@ def call_bundle(arguments: argparse.Namespace) -> int:
     line = f"{place}: {counted(len(arguments.runs), 'run')}, {n_bytes / 1e6:.1f} MB, SHA-256 {value['sha256']}"
     answer_either(arguments, value, line)
     remark(f"next: su3d-bench report verify {place}", quiet=arguments.quiet)
-    return EXIT_DONE
 
 
 BUNDLE = ".zip"

@@ -9,15 +9,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from su3d_bench.cli import output
 from su3d_bench.cli.options import EXECUTOR, Verbs, add_verb
-from su3d_bench.cli.output import answer, answer_document, answer_json, formatted, remark, show, written
+from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, RunIncomplete, counted, printable
 
 if TYPE_CHECKING:
-    from su3d_bench.reproducing.preflight import Preflight
     from su3d_bench.reproducing.recipe import Asked, AskedRun, Experiment, Recipe
 
-VARIABLES = ("SU3D_DATA",)  # where a rehearsal's own data lie
 OF_A_RUN = ("jobs", "limit", "solver", "offline", "executor", "ray_address", "gpus_per_job", "retries", "slurm")
 
 
@@ -90,8 +89,7 @@ def _list_recipes(arguments: argparse.Namespace) -> int:
     value = [
         {"name": one.name, "title": one.title, "tables": [each.name for each in one.experiments]} for one in recipes
     ]
-    if not answer_json(arguments, value):
-        answer(*(f"{one['name']:<14} {', '.join(one['tables'])}" for one in value))
+    output.answer_either(arguments, value, *(f"{one['name']:<14} {', '.join(one['tables'])}" for one in value))
     return EXIT_DONE
 
 
@@ -105,16 +103,16 @@ def _asked(arguments: argparse.Namespace) -> Asked:
 def _reproduce(
     recipe: Recipe, experiments: Sequence[Experiment], asked: Asked, out: Path, arguments: argparse.Namespace
 ) -> int:
-    from su3d_bench.reproducing.preflight import preflight
+    from su3d_bench.reproducing.preflight import preflight, preflight_tables, summary
     from su3d_bench.reproducing.recipe import asked_runs, evaluate_predictions, named_predictions
 
     runs = asked_runs(recipe, experiments, asked)
     named = named_predictions(experiments, arguments.predictions, arguments.text_features)
     known = preflight(runs)
     if arguments.dry_run:
-        _show(known, arguments)
+        output.answer_tables(arguments, known.to_json(), preflight_tables(known))
         return EXIT_CHECK_FAILED if known.missing else EXIT_DONE
-    _say(known, arguments)
+    remark(*summary(known), quiet=arguments.quiet)
     if known.missing:
         first = known.missing[0]
         more = f" and {len(known.missing) - 1} more" if len(known.missing) > 1 else ""
@@ -132,30 +130,14 @@ def _reproduce(
     return EXIT_DONE
 
 
-def _show(known: Preflight, arguments: argparse.Namespace) -> None:
-    from su3d_bench.reproducing.preflight import preflight_tables
-
-    if not answer_json(arguments, known.to_json()):
-        answer_document(formatted(preflight_tables(known), arguments))
-
-
-def _say(known: Preflight, arguments: argparse.Namespace) -> None:
-    from su3d_bench.reproducing.preflight import summary
-
-    for line in summary(known):
-        remark(line, quiet=arguments.quiet)
-
-
 def _carry_out(run: AskedRun, out: Path, arguments: argparse.Namespace) -> list[str]:
     """Lines of what failed."""
-    from su3d_bench.cli.output import progress
     from su3d_bench.reproducing.recipe import carry_out, plan_of
 
     plan = plan_of(run, out)
-    with progress(len(plan.jobs), is_quiet=arguments.quiet) as report:
+    with output.progress(len(plan.jobs), is_quiet=arguments.quiet) as report:
         result = carry_out(run, plan, report)
-    for line in result.remarks:
-        remark(line, quiet=arguments.quiet)
+    remark(*result.remarks, quiet=arguments.quiet)
     remark(f"run folder: {plan.folder.path}", quiet=arguments.quiet)
     return [line for _, _, line in result.failures]
 
@@ -173,16 +155,17 @@ def _answer(
     cells = compared_all(experiments, results)
     tables = result_tables(experiments, cells, results)
     value = compared_json(recipe, cells)
-    written(out / "tables.md", formatted(tables, argparse.Namespace(table_format="markdown"), is_file=True))
+    output.written(
+        out / "tables.md", output.formatted(tables, argparse.Namespace(table_format="markdown"), is_file=True)
+    )
     write_json(out / "compared.json", value)
-    if not answer_json(arguments, value):
-        answer_document(formatted(tables, arguments))
-        show()
+    if not output.answer_json(arguments, value):
+        output.answer_document(output.formatted(tables, arguments))
+        output.show()
     for picture in draw_queries(experiments, results, out / "pictures", arguments.device or "cpu"):
         remark(f"picture: {picture}", quiet=arguments.quiet)
     bundle = arguments.bundle or out / "bundle.zip"
     write_bundle(bundle, recipe.name, recipe_bytes(arguments.recipe), folders, out)
     remark(f"bundle: {bundle}", quiet=arguments.quiet)
-    names = [name for name in VARIABLES if arguments.rehearse and name in os.environ]
-    where = "".join(f"{name}={shlex.quote(os.environ[name])} " for name in names)
+    where = f"SU3D_DATA={shlex.quote(os.environ['SU3D_DATA'])} " if arguments.rehearse else ""
     remark(f"next: {where}su3d-bench report verify {shlex.quote(str(bundle))}", quiet=arguments.quiet)

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from su3d_bench.cli.options import EXECUTOR, Verbs, add_verb
+from su3d_bench.cli.options import EXECUTOR, Parser, Verbs, add_verb
 from su3d_bench.cli.output import answer, answer_document, answer_json, formatted, progress, remark
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE, counted
 
@@ -30,7 +30,7 @@ def add_parser(verbs: Verbs) -> None:
     _add_run_options(parser)
 
 
-def _add_run_options(parser: argparse.ArgumentParser) -> None:
+def _add_run_options(parser: Parser) -> None:
     """The options of both verbs; what is not given comes from ``--config`` or has its default."""
     parser.option("scene [SCENE...]", "addresses or patterns, as --scenes takes them")
     parser.option("--scenes SCENE...", "addresses or patterns (default: 'rooms/*')")
@@ -74,8 +74,7 @@ def call_run(arguments: argparse.Namespace) -> int:
     su3d-bench run --scenes 'rooms/*' --limit 5 --set opensu3d.top_m=10 --dry-run
     """
     plan = plan_of(arguments)
-    for note in plan.notes:
-        remark(note, quiet=arguments.quiet)
+    remark(*plan.notes, quiet=arguments.quiet)
     return show_plan(plan, arguments) if arguments.dry_run else carry_out(plan, arguments)
 
 
@@ -104,8 +103,9 @@ def carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
     from su3d_bench.runs.scenes import cache_root
     from su3d_bench.store.caches import why_large, why_slow
 
-    for line in filter(None, (why_slow(), why_large(cache_root()))):
-        remark(f"su3d-bench: {line}", quiet=arguments.quiet)
+    remark(
+        *(f"su3d-bench: {line}" for line in filter(None, (why_slow(), why_large(cache_root())))), quiet=arguments.quiet
+    )
     with progress(len(plan.jobs), is_quiet=arguments.quiet) as report:
         result = run_plan(plan, report)
     _answer_result(result, arguments)
@@ -125,8 +125,7 @@ def _answer_result(result: RunResult, arguments: argparse.Namespace) -> None:
     found = {"found": [asdict(found) for found in result.found]} if result.found else {}
     if not answer_json(arguments, result.metrics | found):
         answer_document(formatted(run_tables(result.metrics, result.found), arguments))
-    for line in result.remarks:
-        remark(line, quiet=arguments.quiet)
+    remark(*result.remarks, quiet=arguments.quiet)
     plan = result.plan
     place = plan.place.name if plan.place.url is None else f"{plan.place.url} (its small files: {plan.folder.path})"
     remark(f"run folder: {place}", quiet=arguments.quiet)
@@ -146,13 +145,13 @@ def _say_what_is_next(result: RunResult) -> None:
         remark(f"{'     ' if n else 'next:'} {command}")
 
 
-def show_plan(plan: Plan, arguments: argparse.Namespace) -> int:
+def show_plan(plan: Plan, arguments: argparse.Namespace) -> None:
     from su3d_bench.runs.advice import estimate
 
     rows = estimate(plan)
     jobs = [asdict(row) for row in rows]
     if answer_json(arguments, {"folder": str(plan.folder.path), "n_workers": plan.n_workers, "jobs": jobs}):
-        return EXIT_DONE
+        return
     for row in rows:
         state = "done already" if row.is_done else f"{counted(row.n_updates, 'update')}, about {row.seconds:.0f} s"
         state = row.remark or state
@@ -164,7 +163,6 @@ def show_plan(plan: Plan, arguments: argparse.Namespace) -> int:
     )
     for job in plan.jobs[:1]:
         answer(f"protocols: {', '.join(job.protocols) or 'none'}; profile {job.profile}")
-    return EXIT_DONE
 
 
 def call_ablate(arguments: argparse.Namespace) -> int:
@@ -181,8 +179,7 @@ def call_ablate(arguments: argparse.Namespace) -> int:
     swept = [arguments.method + row.method.removeprefix(own_name) for row in rows]
     arguments.methods = list(dict.fromkeys([*swept, *arguments.beside]))
     plan = plan_of(arguments)
-    for note in plan.notes:
-        remark(note, quiet=arguments.quiet)
+    remark(*plan.notes, quiet=arguments.quiet)
     if arguments.dry_run:
         return show_plan(plan, arguments)
     code = carry_out(plan, arguments)

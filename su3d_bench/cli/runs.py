@@ -22,7 +22,7 @@ from su3d_bench.cli.options import (
     count,
 )
 from su3d_bench.cli.output import answer, answer_either, answer_json, answer_tables, remark
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, StoreError, counted, suggest
+from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, counted, suggest
 
 if TYPE_CHECKING:
     from su3d_bench.core.maps import Instances
@@ -52,7 +52,7 @@ def _add_list(verbs: Verbs) -> None:
     parser.shared("--format")
 
 
-def call_list(arguments: argparse.Namespace) -> int:
+def call_list(arguments: argparse.Namespace) -> None:
     """List the runs below a folder: when they were written, how far they came, their first numbers.
 
     su3d-bench runs list
@@ -69,7 +69,6 @@ def call_list(arguments: argparse.Namespace) -> int:
         remark(f"no run in {arguments.folder}; su3d-bench run rooms/living0 makes one", quiet=arguments.quiet)
     if entries or arguments.json:
         answer_tables(arguments, [asdict(entry) for entry in entries], [runs_table(entries)])
-    return EXIT_DONE
 
 
 def _add_show(verbs: Verbs) -> None:
@@ -77,7 +76,7 @@ def _add_show(verbs: Verbs) -> None:
     parser.shared("run")
 
 
-def call_show(arguments: argparse.Namespace) -> int:
+def call_show(arguments: argparse.Namespace) -> None:
     """Show what a run was asked for, how far it came, and the command that takes it up again.
 
     su3d-bench runs show runs/demo
@@ -112,7 +111,6 @@ def call_show(arguments: argparse.Namespace) -> int:
         f"take it up again: {again}",
     ]
     answer_either(arguments, value, *lines)
-    return EXIT_DONE
 
 
 def _add_remove(verbs: Verbs) -> None:
@@ -121,7 +119,7 @@ def _add_remove(verbs: Verbs) -> None:
     parser.option("--yes", "do not ask; needed where nobody sits at a terminal")
 
 
-def call_remove(arguments: argparse.Namespace) -> int:
+def call_remove(arguments: argparse.Namespace) -> None:
     """Remove run folders, once it is known that they hold nothing but a run; asks before it does.
 
     su3d-bench runs remove runs/demo
@@ -137,12 +135,11 @@ def call_remove(arguments: argparse.Namespace) -> int:
         lines.append(f"{entry.name}: {entry.state}, {size_bytes(folder.path) / 1e6:.1f} MB, {what}")
     if not arguments.yes and not _is_agreed(lines):
         answer_either(arguments, {"removed": []}, "nothing was removed")
-        return EXIT_DONE
+        return
     for folder in folders:
         folder.remove()
     removed = [str(path) for path in dict.fromkeys(arguments.runs)]
     answer_either(arguments, {"removed": removed}, *(f"removed {line}" for line in lines))
-    return EXIT_DONE
 
 
 def _is_agreed(lines: list[str]) -> bool:
@@ -151,8 +148,7 @@ def _is_agreed(lines: list[str]) -> bool:
 
     if not sys.stdin.isatty():
         raise ConfigError("runs remove: nobody is there to be asked; add --yes to remove without a question")
-    for line in lines:
-        remark(line)
+    remark(*lines)
     remark("remove for good? y or n")
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 
@@ -185,7 +181,7 @@ def _add_refine(verbs: Verbs) -> None:
     add_language_options(parser)
 
 
-def call_refine(arguments: argparse.Namespace) -> int:
+def call_refine(arguments: argparse.Namespace) -> None:
     """Give each instance of a run's maps one name out of the names of its best views (label n'), and leave out what is
     large background under it.
 
@@ -199,7 +195,8 @@ def call_refine(arguments: argparse.Namespace) -> int:
     maps = {scene: _map(job) for scene, job in jobs.items()}
     tops = {scene: top_names(instances, arguments.top_m) for scene, instances in maps.items()}
     if arguments.dry_run:
-        return _estimate(tops, arguments)
+        _estimate(tops, arguments)
+        return
     refined, model = _refine(tops, arguments)
     made: dict[str, NameRecords] = {}
     for scene, job in jobs.items():
@@ -209,7 +206,6 @@ def call_refine(arguments: argparse.Namespace) -> int:
         made[scene] = records
         remark(f"{scene}: {path}", quiet=arguments.quiet)
     _answer(made, arguments)
-    return EXIT_DONE
 
 
 def _filter(arguments: argparse.Namespace) -> FilterConfig:
@@ -266,7 +262,7 @@ def _map(job: JobFolder) -> Instances:
     return prediction
 
 
-def _estimate(tops: dict[str, list[TopNames]], arguments: argparse.Namespace) -> int:
+def _estimate(tops: dict[str, list[TopNames]], arguments: argparse.Namespace) -> None:
     from su3d_bench.questions.refining import ModelRefiner
     from su3d_bench.store.run_folder import RunFolder
 

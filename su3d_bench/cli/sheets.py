@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from su3d_bench.cli import sheets_make
 from su3d_bench.cli.options import Verbs, add_group, add_verb
 from su3d_bench.cli.output import answer_either, answer_json, answer_tables, remark, remark_unseen, written
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, counted
+from su3d_bench.core.errors import ConfigError, DataError, counted
 
 if TYPE_CHECKING:
     from su3d_bench.sheets.scores import Scores
@@ -46,7 +46,7 @@ def _add_score(verbs: Verbs) -> None:
     parser.shared("--format")
 
 
-def call_score(arguments: argparse.Namespace) -> int:
+def call_score(arguments: argparse.Namespace) -> None:
     """Check the answers of all annotators and add them up: accuracies, tests, agreement, people beside the truth.
 
     su3d-bench sheets score ann.csv bob.xlsx --key key/key.json --out scores
@@ -92,7 +92,6 @@ def call_score(arguments: argparse.Namespace) -> int:
         path = written(arguments.disputed, disputed_csv(key, scores.second_looks))
         remark(f"written: {path}", quiet=arguments.quiet)
     answer_tables(arguments, content, [*sheet_tables(content), Prose((_looks_line(scores),))])
-    return EXIT_DONE
 
 
 def _sheet_file(arguments: argparse.Namespace, key_file: Path, sheet_id: str) -> Path:
@@ -118,8 +117,7 @@ def _refuse(faults: Sequence[str], arguments: argparse.Namespace) -> None:
     if arguments.json:
         answer_json(arguments, {"faults": list(faults)})
     else:
-        for fault in faults[:SHOWN_FAULTS]:
-            remark(fault)
+        remark(*faults[:SHOWN_FAULTS])
         if len(faults) > SHOWN_FAULTS:
             remark(f"... and {len(faults) - SHOWN_FAULTS} more")
     n = len(faults)
@@ -175,7 +173,7 @@ def _add_pictures(verbs: Verbs) -> None:
     parser.shared("--device")
 
 
-def call_pictures(arguments: argparse.Namespace) -> int:
+def call_pictures(arguments: argparse.Namespace) -> None:
     """Draw a figure of a run for print: similarity to texts, labels n and n', or answers with their objects.
 
     su3d-bench sheets pictures runs/my-run --queries 'plant on shelf' 'place to sit' --out heat.pdf
@@ -215,4 +213,3 @@ def call_pictures(arguments: argparse.Namespace) -> int:
     draw_grid(arguments.out, columns, rows, scale)
     value = {"picture": str(arguments.out), "columns": columns, "rows": [row.title for row in rows]}
     answer_either(arguments, value, str(arguments.out))
-    return EXIT_DONE

@@ -18,7 +18,7 @@ from su3d_bench.cli.options import (
     given_language_option,
 )
 from su3d_bench.cli.output import answer, answer_json, remark
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, counted
+from su3d_bench.core.errors import ConfigError, counted
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -80,7 +80,7 @@ def add_parser(verbs: Verbs) -> None:
     add_language_options(parser)
 
 
-def call(arguments: argparse.Namespace) -> int:
+def call(arguments: argparse.Namespace) -> None:
     """Make sheets on which people judge a run, or questions: an offline page, a workbook and a table with pictures.
 
     su3d-bench sheets make runs/my-run --kind retrieval annotation reasoning --annotators 3 --out sheets
@@ -101,7 +101,8 @@ def call(arguments: argparse.Namespace) -> int:
         source = RunSource(read_run(arguments.run), arguments.methods, arguments.scenes)
         sources: dict[SheetKind, RunSource] = {kind: _judgeable(source, kind, arguments.quiet) for kind in of_run}
         if arguments.dry_run:
-            return _estimate(sources["reasoning"], left_out, arguments)
+            _estimate(sources["reasoning"], left_out, arguments)
+            return
         drafts, made_by = _drafts(sources, left_out, arguments)
         origins = {kind: _origin(kind, mine, made_by[kind]) for kind, mine in sources.items()}
         drawn = _drawn(source, source.run.name, drafts, arguments)
@@ -112,13 +113,12 @@ def call(arguments: argparse.Namespace) -> int:
         drawn |= _drawn(truth, truth.run or QUESTIONS, of_truth, arguments)
     written_sets = _write({kind: origins[kind] for kind in kinds}, drafts, drawn, arguments)
     if answer_json(arguments, {"sets": written_sets}):
-        return EXIT_DONE
+        return
     for sheet in written_sets:
         answer(f"{sheet['sheet_id']}: {counted(sheet['n_items'], 'item')}, {counted(sheet['n_questions'], 'question')}")
         for path in sheet["files"]:
             answer(path)
         remark(f"key, which annotators must not see: {sheet['key']}", quiet=arguments.quiet)
-    return EXIT_DONE
 
 
 def _check(arguments: argparse.Namespace) -> None:
@@ -239,7 +239,7 @@ def _ask_map(source: RunSource, encoder: Encoder | None, arguments: argparse.Nam
     return by_language_model(client, config).ask, config.text_model
 
 
-def _estimate(source: RunSource, left_out: Collection[str], arguments: argparse.Namespace) -> int:
+def _estimate(source: RunSource, left_out: Collection[str], arguments: argparse.Namespace) -> None:
     """Tell what asking the language model would cost at the most."""
     from su3d_bench.sheets.drafts import reasoning_drafts, requests_into
 
