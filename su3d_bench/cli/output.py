@@ -6,7 +6,7 @@ import argparse
 import math
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -210,6 +210,26 @@ def _above(bars: Progress) -> AbstractContextManager[None]:
         bars.console.print(Text(text.removesuffix("\n")), soft_wrap=True)
 
     return sys.stderr.through(show) if isinstance(sys.stderr, Door) else nullcontext()
+
+
+@contextmanager
+def overall_progress(what: str, *, is_quiet: bool) -> Iterator[tuple[Callable[[int], None], Report]]:
+    """One bar over the steps of all units, with the time left: a function that takes their number, and a ``Report``."""
+    n_done: dict[str, int] = {}
+    with drawn_bars(is_quiet=is_quiet, tells_time_left=True) as bars:
+        if bars is None:
+            yield lambda n_steps: None, lambda event: None
+            return
+        task = bars.add_task(what, total=None, remark="")
+
+        def begin(n_steps: int) -> None:
+            bars.update(task, total=n_steps)
+
+        def report(event: Event) -> None:
+            n_done[event.unit] = event.done
+            bars.update(task, completed=sum(n_done.values()), description=f"{event.unit}: {event.label}")
+
+        yield begin, report
 
 
 class _Board:

@@ -5,35 +5,19 @@ from __future__ import annotations
 import argparse
 import os
 import shlex
-import time
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
+from su3d_bench.cli import output
 from su3d_bench.cli.options import Verbs, add_verb, count
-from su3d_bench.cli.output import answer_either, drawn_bars, progress, remark, written
+from su3d_bench.cli.output import answer_either, remark
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable
-
-if TYPE_CHECKING:
-    from su3d_bench.analysis.page.contents import Amount
-    from su3d_bench.runs.executors import Event
-
 
 MEGABYTE = 10**6
 
 
 def add_pages(verbs: Verbs) -> None:
-    _add_html(verbs)
-    _add_rerun(verbs)
-
-
-def add_archives(verbs: Verbs) -> None:
-    _add_bundle(verbs)
-    _add_verify(verbs)
-
-
-def _add_html(verbs: Verbs) -> None:
     parser = add_verb(verbs, "html", call_html, takes_up=True)
     parser.shared("runs")
     parser.option("--out FILE", "the page (default: page.html)", default=Path("page.html"))
@@ -44,6 +28,22 @@ def _add_html(verbs: Verbs) -> None:
     parser.option("--no-gallery", "leave out the single errors and their photos")
     parser.option("--most-megabytes MB", "maps are thinned for it (default: 30)", type=float, default=30.0)
     parser.shared("--jobs")
+    parser = add_verb(verbs, "rerun", call_rerun)
+    parser.shared("run", "--scenes", "--methods")
+    parser.option(
+        "--stride N", "every Nth of the frames that the methods were given (default: at most 60 of a scene)", type=count
+    )
+    parser.option("--out FILE", "the .rrd file, read by rerun's viewer", required=True)
+
+
+def add_archives(verbs: Verbs) -> None:
+    parser = add_verb(verbs, "bundle", call_bundle)
+    parser.shared("runs")
+    parser.option("--out FILE", "the archive (default: the first run's name.zip)")
+    parser.option("--trained-on TEXT", "the data of your weights, for a registry", default="")
+    parser = add_verb(verbs, "verify", call_verify)
+    parser.option("files FILE...", "LaTeX by report tables, or around it; or bundle.zip of reproduce")
+    parser.option("--root DIR", "where the runs' folders are (default: here, then beside the file)")
 
 
 def call_html(arguments: argparse.Namespace) -> None:
@@ -67,72 +67,21 @@ def call_html(arguments: argparse.Namespace) -> None:
         jobs=arguments.jobs or 0,
     )
     arguments.takes_up = all(os.access(run, os.W_OK) for run in arguments.runs)  # else nothing is kept
-    with drawn_bars(is_quiet=arguments.quiet, tells_time_left=True) as bars:
-        progress = _Progress(bars, is_quiet=arguments.quiet)
-        contents = page_contents(arguments.runs, wishes, begin=progress.begin, report=progress.report)
+    with output.overall_progress("page", is_quiet=arguments.quiet) as (begin, report):
+        contents = page_contents(arguments.runs, wishes, begin=begin, report=report)
     title = arguments.title or ", ".join(dict.fromkeys(run.resolve().name for run in arguments.runs))
     maps = contents.maps
     page = page_html(
         printable(title, 200),
-        {
-            **contents.numbers,
-            "maps": [page_map.listed() for page_map in maps],
-            "gallery": told_of(contents.galleries),
-        },
+        contents.numbers | {"maps": [one.listed() for one in maps], "gallery": told_of(contents.galleries)},
         [scene.listed() for scene in contents.scenes],
         [page_map.content for page_map in maps],
         [gallery.to_json() for gallery in contents.galleries],
     )
-    written(arguments.out, page)
+    output.written(arguments.out, page)
     n_bytes = len(page.encode())
-    about = {
-        "page": str(arguments.out), "n_bytes": n_bytes, "n_maps": len(maps), "most_points": contents.most_points,
-    }  # fmt: skip
-    answer_either(arguments, about, f"{arguments.out}: {n_bytes / MEGABYTE:.1f} MB, {counted(len(maps), 'map')}")
-
-
-class _Progress:
-    """What of the page is made: a bar with the time that is left, or a line a scene where stderr is no terminal."""
-
-    def __init__(self, bars: Any, *, is_quiet: bool) -> None:
-        self._bars = bars
-        self._is_quiet = is_quiet
-        self._done: dict[str, int] = {}
-        self._n_scenes_done = 0
-
-    def begin(self, amount: Amount) -> None:
-        self._amount, self._since = amount, time.monotonic()
-        if amount.n_kept:
-            self._say(f"{counted(amount.n_kept, 'scene')} as made before")
-        if self._bars is not None and amount.n_steps:
-            self._task = self._bars.add_task("page", total=amount.n_steps, remark="")
-
-    def report(self, event: Event) -> None:
-        from su3d_bench.runs.executors import SCENE_DONE
-
-        self._done[event.unit] = event.done
-        n_done, is_scene = sum(self._done.values()), event.label == SCENE_DONE
-        self._n_scenes_done += is_scene
-        doing = "done" if is_scene else event.label
-        if self._bars is not None:
-            self._bars.update(self._task, completed=n_done, description=f"{printable(event.unit, 60)}: {doing}")
-        elif is_scene:
-            left_s = (time.monotonic() - self._since) * (self._amount.n_steps / max(1, n_done) - 1)
-            left = f", about {left_s:.0f} s left" if n_done < self._amount.n_steps else ""
-            self._say(f"{printable(event.unit, 120)}: {self._n_scenes_done} of {self._amount.n_scenes} scenes{left}")
-
-    def _say(self, text: str) -> None:
-        remark(text, quiet=self._is_quiet)
-
-
-def _add_rerun(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "rerun", call_rerun)
-    parser.shared("run")
-    parser.shared("--scenes", "--methods")
-    parser.option(
-        "--stride N", "every Nth of the frames that the methods were given (default: at most 60 of a scene)", type=count
-    )
-    parser.option("--out FILE", "the .rrd file, read by rerun's viewer", required=True)
+    value = {"page": str(arguments.out), "n_bytes": n_bytes, "n_maps": len(maps), "most_points": contents.most_points}
+    answer_either(arguments, value, f"{arguments.out}: {n_bytes / MEGABYTE:.1f} MB, {counted(len(maps), 'map')}")
 
 
 def call_rerun(arguments: argparse.Namespace) -> None:
@@ -148,7 +97,6 @@ def call_rerun(arguments: argparse.Namespace) -> None:
     from su3d_bench.runs.executors import Event
     from su3d_bench.runs.finished import read_run
     from su3d_bench.sheets.sources import chosen_of
-    from su3d_bench.store.run_folder import refuse_records
 
     if arguments.out.suffix != ".rrd" or arguments.out.is_dir():
         raise ConfigError(f"--out {printable(str(arguments.out), 200)}: expected a file name that ends in .rrd")
@@ -156,17 +104,13 @@ def call_rerun(arguments: argparse.Namespace) -> None:
     scenes = chosen_of(run, "scene", arguments.scenes, run.scenes)
     methods = chosen_of(run, "method", arguments.methods, run.methods)
     sdk = rerun_sdk()
-    refuse_records(arguments.out)
     spaces = Spaces(())
     timelines = [SceneTimeline(run, scene, methods, arguments.stride or 0, spaces) for scene in scenes]
     make_folder(arguments.out.parent)
-    with progress(len(timelines), is_quiet=arguments.quiet) as report, replacing(arguments.out) as stream:
-
-        def tell(scene: str, done: int, total: int) -> None:
-            report(Event(scene, "frames", done, total))
-
+    with output.progress(len(timelines), is_quiet=arguments.quiet) as report, replacing(arguments.out) as stream:
         for one in timelines:
-            one.write(Recording(sdk, one.scene, methods, stream), partial(tell, one.scene))
+            tell = partial(lambda scene, done, total: report(Event(scene, "frames", done, total)), one.scene)
+            one.write(Recording(sdk, one.scene, methods, stream), tell)
         refuse_nothing(timelines, run.name)
     for one in timelines:
         remark(*(f"{printable(one.scene, 120)}: {line}" for line in one.remarks), quiet=arguments.quiet)
@@ -177,19 +121,8 @@ def call_rerun(arguments: argparse.Namespace) -> None:
         "n_maps": n_maps, "scenes": list(scenes), "methods": list(methods),
     }  # fmt: skip
     shown = f"{counted(len(scenes), 'scene')}, {counted(n_maps, 'map')}, {counted(n_frames, 'frame')}"
-    answer_either(
-        arguments,
-        about,
-        f"{arguments.out}: {n_bytes / MEGABYTE:.1f} MB, {shown}",
-        f"look at it: rerun {shlex.quote(str(arguments.out))} (version {sdk.__version__}; others may not read it)",
-    )
-
-
-def _add_bundle(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "bundle", call_bundle)
-    parser.shared("runs")
-    parser.option("--out FILE", "the archive (default: the first run's name.zip)")
-    parser.option("--trained-on TEXT", "the data of your weights, for a registry", default="")
+    how = f"look at it: rerun {shlex.quote(str(arguments.out))} (version {sdk.__version__}; others may not read it)"
+    answer_either(arguments, about, f"{arguments.out}: {n_bytes / MEGABYTE:.1f} MB, {shown}", how)
 
 
 def call_bundle(arguments: argparse.Namespace) -> None:
@@ -217,22 +150,13 @@ def call_bundle(arguments: argparse.Namespace) -> None:
     remark(f"next: su3d-bench report verify {place}", quiet=arguments.quiet)
 
 
-BUNDLE = ".zip"
-
-
-def _add_verify(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "verify", call_verify)
-    parser.option("files FILE...", "LaTeX by report tables, or around it; or bundle.zip of reproduce")
-    parser.option("--root DIR", "where the runs' folders are (default: here, then beside the file)")
-
-
 def call_verify(arguments: argparse.Namespace) -> int:
     """Recompute the cells of LaTeX tables from their runs, or score a bundle anew; exit code 1 where one differs.
 
     su3d-bench report verify paper.tex
     su3d-bench report verify reproduced/opensu3d/bundle.zip --json
     """
-    bundles = [file for file in arguments.files if file.suffix.lower() == BUNDLE]
+    bundles = [file for file in arguments.files if file.suffix.lower() == ".zip"]
     if bundles and len(bundles) < len(arguments.files):
         raise ConfigError("report verify: bundles and LaTeX are verified apart; name the one or the other")
     return _verify_bundles(bundles, arguments) if bundles else _verify_papers(arguments)
@@ -248,10 +172,9 @@ def _verify_bundles(bundles: list[Path], arguments: argparse.Namespace) -> int:
     for one in found:
         lines += [f"{one.bundle}: {fault}" for fault in one.faults]
         how = "to the last bit" if one.is_to_the_bit else "integers the same, values within 1e-9"
-        said = f"differs: {counted(len(one.faults), 'fault')}" if one.faults else f"holds, {how}"
-        counts = (counted(one.n_files, "file"), counted(one.n_scores, "score"), counted(one.n_cells, "cell"))
-        looked_at = "{}, {} made anew, {}".format(*counts)
-        lines.append(f"{one.bundle}: {looked_at}; {said}")
+        verdict = f"differs: {counted(len(one.faults), 'fault')}" if one.faults else f"holds, {how}"
+        n_files, n_scores = counted(one.n_files, "file"), counted(one.n_scores, "score")
+        lines.append(f"{one.bundle}: {n_files}, {n_scores} made anew, {counted(one.n_cells, 'cell')}; {verdict}")
     answer_either(arguments, {"bundles": [asdict(one) for one in found]}, *lines)
     return EXIT_CHECK_FAILED if any(one.faults for one in found) else EXIT_DONE
 
