@@ -6,16 +6,14 @@ import argparse
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from su3d_bench.cli.options import Verbs, add_verb
 from su3d_bench.cli.output import answer_tables, remark
 from su3d_bench.core.errors import ConfigError
 
-if TYPE_CHECKING:
-    from su3d_bench.evaluation.result import Request
-
 SCHEMA = 1  # of the JSON file of several methods
+OF_A_REQUEST = ("dataset", "ground_truth", "truth_values", "format", "text_features", "confidences", "queries")
 
 
 def add_parser(verbs: Verbs) -> None:
@@ -62,17 +60,16 @@ def call(arguments: argparse.Namespace) -> None:
     su3d-bench evaluate --name mine=predA theirs=predB --dataset replica --out runs/both
     """
     from su3d_bench.evaluation.as_run import evaluate_methods
-    from su3d_bench.evaluation.evaluate import evaluate, said_of
+    from su3d_bench.evaluation.evaluate import said_of
+    from su3d_bench.evaluation.result import Request
     from su3d_bench.reports.tables.run import evaluation_tables, side_by_side_tables
     from su3d_bench.store.records import plain
 
-    requests = {method: _request(paths, arguments) for method, paths in _named(arguments).items()}
-    was_there = False
-    if len(requests) == 1 and arguments.out is None:
-        results = {method: evaluate(request) for method, request in requests.items()}
-    else:
-        run = evaluate_methods(requests, arguments.out)
-        results, was_there = dict(run.evaluations), run.was_there
+    chosen: dict[str, Any] = {name: getattr(arguments, name) for name in OF_A_REQUEST}
+    chosen |= {"protocols": tuple(arguments.protocols), "scenes": tuple(arguments.scenes)}
+    requests = {method: Request(tuple(paths), **chosen) for method, paths in _named(arguments).items()}
+    run = evaluate_methods(requests, arguments.out)
+    results = run.evaluations
     documents = {method: result.to_json() for method, result in results.items()}
     if len(results) == 1:
         (document,) = documents.values()
@@ -84,24 +81,7 @@ def call(arguments: argparse.Namespace) -> None:
     for method, result in results.items():
         remark(*(f"{method}: {line}" if len(results) > 1 else line for line in said_of(result)), quiet=arguments.quiet)
     if arguments.out is not None:
-        _say_next(arguments.out, list(results), was_there=was_there, is_quiet=arguments.quiet)
-
-
-def _request(paths: Sequence[Path], arguments: argparse.Namespace) -> Request:
-    from su3d_bench.evaluation.result import Request
-
-    return Request(
-        tuple(paths),
-        dataset=arguments.dataset,
-        ground_truth=arguments.ground_truth,
-        truth_values=arguments.truth_values,
-        protocols=tuple(arguments.protocols),
-        scenes=tuple(arguments.scenes),
-        format=arguments.format,
-        text_features=arguments.text_features,
-        confidences=arguments.confidences,
-        queries=arguments.queries,
-    )
+        _say_next(arguments.out, list(results), was_there=run.was_there, is_quiet=arguments.quiet)
 
 
 def _named(arguments: argparse.Namespace) -> dict[str, list[Path]]:
@@ -132,7 +112,10 @@ def _say_next(out: Path, methods: Sequence[str], *, was_there: bool, is_quiet: b
     pair = f"{run}:{method} " + (f"{run}:{shlex.quote(methods[1])}" if len(methods) > 1 else "OTHER_RUN")
     whose = f" --method {method}" if len(methods) > 1 else ""
     state = " (held this evaluation already, and is as it was)" if was_there else ""
-    remark(f"run folder: {out}{state}", quiet=is_quiet)
-    remark(f"next: su3d-bench compare {pair}", quiet=is_quiet)
-    remark(f"      su3d-bench report attribution {run}{whose}", quiet=is_quiet)
-    remark(f"      su3d-bench report tables {run} --format latex", quiet=is_quiet)
+    remark(
+        f"run folder: {out}{state}",
+        f"next: su3d-bench compare {pair}",
+        f"      su3d-bench report attribution {run}{whose}",
+        f"      su3d-bench report tables {run} --format latex",
+        quiet=is_quiet,
+    )

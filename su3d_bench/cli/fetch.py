@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -17,7 +18,7 @@ from su3d_bench.core.errors import ConfigError, suggest
 if TYPE_CHECKING:
     from su3d_bench.fetching.bringing import Brought, Planned
     from su3d_bench.fetching.download import Patience, Watch
-    from su3d_bench.fetching.sources import Source, Sources
+    from su3d_bench.fetching.sources import Source
 
 MB = 1_000_000
 
@@ -45,26 +46,12 @@ def _add_fetch_options(parser: Parser, *, has_servers: bool = True) -> None:
         )
 
 
-def sources_of(arguments: argparse.Namespace) -> Sources:
-    """The table as the flags of ``arguments`` change it."""
-    from su3d_bench.fetching.sources import load_sources
-
-    return load_sources(getattr(arguments, "sources", None), getattr(arguments, "mirror", ()))
-
-
 def patience_of(arguments: argparse.Namespace) -> Patience:
     from su3d_bench.fetching.download import Patience
 
     if not 0 <= arguments.retries <= 1000:
         raise ConfigError(f"--retries {arguments.retries}: expected 0 to 1000")
     return Patience(n_retries=arguments.retries)
-
-
-def size_text(n_bytes: int | None) -> str:
-    """A size in words: in MB below ten GB."""
-    if n_bytes is None:
-        return "size not stated"
-    return f"{n_bytes / MB:,.0f} MB" if n_bytes < 10_000 * MB else f"{n_bytes / MB / 1000:,.1f} GB"
 
 
 def fetch_planned(arguments: argparse.Namespace, planned: Sequence[Planned]) -> None:
@@ -90,47 +77,44 @@ def answer_brought(arguments: argparse.Namespace, here: Sequence[tuple[str, Path
     rows: list[dict[str, Any]] = [{"name": name, "folder": str(folder), "files": []} for name, folder in here]
     lines = [f"{name}: was there already: {folder}" for name, folder in here]
     for entry in brought:
-        rows.append(
-            {
-                "name": entry.source.name,
-                "folder": str(entry.place),
-                "files": [asdict(file) for file in entry.files],
-                "remarks": list(entry.remarks),
-            }
-        )
+        row = {"name": entry.source.name, "folder": str(entry.place), "files": [asdict(file) for file in entry.files]}
+        rows.append(row | {"remarks": list(entry.remarks)})
         lines.append(f"{entry.source.name}: {entry.place}")
-        lines += [f"  {file.sha256}  {file.name}{_agreement(file.held_against)}" for file in entry.files]
+        for file in entry.files:
+            sums = (
+                f"agrees with: {', '.join(file.held_against)}"
+                if file.held_against
+                else "no checksum is stated; recorded"
+            )
+            lines.append(f"  {file.sha256}  {file.name}  ({sums})")
         remark(*(f"{entry.source.name}: {text}" for text in entry.remarks), quiet=arguments.quiet)
     answer_either(arguments, rows, *lines)
-
-
-def _agreement(held_against: Sequence[str]) -> str:
-    return f"  (agrees with: {', '.join(held_against)})" if held_against else "  (no checksum is stated; recorded)"
 
 
 def plan_row(source: Source, here: Path | None) -> dict[str, Any]:
     """A source as ``--dry-run --json`` gives it: every fact with where it was read."""
     from su3d_bench.fetching.download import hub_addresses
 
-    row = source.model_dump(mode="json", exclude_none=True)
-    row["n_bytes"] = source.n_bytes
-    row["is_exact"] = source.is_exact
-    row["addresses"] = [file.address for file in source.files] if source.hub is None else hub_addresses(source)
-    row["here"] = None if here is None else str(here)
-    return row
+    return source.model_dump(mode="json", exclude_none=True) | {
+        "n_bytes": source.n_bytes,
+        "is_exact": source.is_exact,
+        "addresses": [file.address for file in source.files] if source.hub is None else hub_addresses(source),
+        "here": None if here is None else str(here),
+    }
 
 
 def plan_lines(source: Source, here: Path | None) -> list[str]:
     """A source in words: size, licence, every address."""
-    row = plan_row(source, here)
-    about = "" if source.is_exact or source.n_bytes is None else "about "
-    state = f"was there already: {here}" if here is not None else "to be fetched"
-    lines = [
+    from su3d_bench.store.caches import size_text
+
+    about = "" if source.is_exact else "about "
+    size = "size not stated" if source.n_bytes is None else f"{about}{size_text(source.n_bytes)}"
+    return [
         f"{source.name}: {source.what}",
-        f"  {about}{size_text(source.n_bytes)}, {state}",
+        f"  {size}, {f'was there already: {here}' if here is not None else 'to be fetched'}",
         f"  licence {source.licence.name}: {source.licence.address}",
+        *(f"  {address}" for address in plan_row(source, here)["addresses"]),
     ]
-    return lines + [f"  {address}" for address in row["addresses"]]
 
 
 def accept(arguments: argparse.Namespace, sources: Sequence[Source]) -> None:
@@ -149,15 +133,11 @@ def accept(arguments: argparse.Namespace, sources: Sequence[Source]) -> None:
         if not (sys.stdin.isatty() and sys.stderr.isatty()):
             raise ConfigError(
                 f"fetch: the licence '{name}' ({address}) of {names} was not accepted; read it, then add --accept "
-                f"{those[0].name if len(those) == 1 else _quoted(name)}"
+                f"{those[0].name if len(those) == 1 else shlex.quote(name)}"
             )
         remark(f"{names}: under '{name}', {address}; do you accept it? [y/N]")
         if sys.stdin.readline().strip().lower() not in ("y", "yes"):
             raise ConfigError(f"fetch: the licence '{name}' of {names} was not accepted; nothing of it was fetched")
-
-
-def _quoted(name: str) -> str:
-    return f"'{name}'" if " " in name else name
 
 
 def _known_terms(arguments: argparse.Namespace, sources: Sequence[Source]) -> None:
@@ -204,10 +184,12 @@ def call_models(arguments: argparse.Namespace) -> None:
     su3d-bench models fetch sam-vit-h --dry-run
     """
     from su3d_bench.fetching.bringing import plan_models
+    from su3d_bench.fetching.sources import load_sources
     from su3d_bench.perception.models.files import models_folder
 
     root = models_folder(perception_config(arguments).models.folder)
-    return fetch_planned(arguments, plan_models(sources_of(arguments), arguments.names, arguments.profile, root))
+    sources = load_sources(arguments.sources, arguments.mirror)
+    fetch_planned(arguments, plan_models(sources, arguments.names, arguments.profile, root))
 
 
 def add_data(verbs: Verbs) -> None:
@@ -217,15 +199,16 @@ def add_data(verbs: Verbs) -> None:
     su3d-bench datasets fetch scannet --dry-run
     """
     actions = add_group(verbs, "fetch", add_data)
-    _add_replica(actions)
-    _add_scannet(actions)
-
-
-def _add_replica(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "replica", call_replica, takes_up=True)
+    parser = add_verb(actions, "replica", call_replica, takes_up=True)
     parser.option("parts [PART...]", "frames, meshes (default: both)")
     parser.option("--keep-archives", "keep what was unpacked, in .fetched")
     _add_fetch_options(parser)
+    parser = add_verb(actions, "scannet", call_scannet, takes_up=True)
+    parser.option("scans [SCAN...]", "scene0000_00, paper, train, val or test (default: paper)")
+    given = parser.add_mutually_exclusive_group()
+    parser.option("--script FILE", "your official download script", given)
+    parser.option("--from URL", "your own link, in which v1/scans and v2/scans lie", given, dest="address")
+    _add_fetch_options(parser, has_servers=False)
 
 
 def call_replica(arguments: argparse.Namespace) -> None:
@@ -235,20 +218,11 @@ def call_replica(arguments: argparse.Namespace) -> None:
     su3d-bench datasets fetch replica frames --accept replica
     """
     from su3d_bench.fetching.bringing import plan_replica
+    from su3d_bench.fetching.sources import load_sources
     from su3d_bench.runs.scenes import data_root
 
-    return fetch_planned(arguments, plan_replica(sources_of(arguments), arguments.parts, data_root()))
-
-
-def _add_scannet(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "scannet", call_scannet, takes_up=True)
-    parser.option("scans [SCAN...]", "scene0000_00, paper, train, val or test (default: paper)")
-    given = parser.add_mutually_exclusive_group()
-    given.add_argument("--script", type=Path, metavar="FILE", help="your official download script")
-    given.add_argument(
-        "--from", dest="address", metavar="URL", help="your own link, in which v1/scans and v2/scans lie"
-    )
-    _add_fetch_options(parser, has_servers=False)
+    sources = load_sources(arguments.sources, arguments.mirror)
+    fetch_planned(arguments, plan_replica(sources, arguments.parts, data_root()))
 
 
 def call_scannet(arguments: argparse.Namespace) -> None:
@@ -275,9 +249,7 @@ def call_scannet(arguments: argparse.Namespace) -> None:
         return
     if arguments.script is None and arguments.address is None:
         raise how_to_sign(source)
-    for name in arguments.accept:
-        if name.lower() not in (source.name, source.licence.name.lower()):
-            raise ConfigError(f"--accept '{name}': is nothing that is asked for; known: {source.name}")
+    _known_terms(arguments, [source])
     accept(arguments, [source])
     with watching(arguments) as watch:
         if arguments.script is not None:

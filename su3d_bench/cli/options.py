@@ -48,10 +48,13 @@ class Parser(argparse.ArgumentParser):
                 name = action.dest
             self.error(f"unknown {name} '{value}'{suggest(str(value), map(str, action.choices))}")
 
-    def option(self, form: str, text: str, **more: Any) -> None:
-        """Add the option or argument that ``form`` writes as help shows it; ``more`` as ``add_argument`` takes it."""
+    def option(self, form: str, text: str, group: Any = None, **more: Any) -> None:
+        """Add the option or argument that ``form`` writes as help shows it; ``more`` as ``add_argument`` takes it.
+
+        ``group``: of options that exclude each other.
+        """
         name, settings = option(form, text, **more)
-        self.add_argument(name, **settings)
+        (group or self).add_argument(name, **settings)
 
     def shared(self, *names: str, **changes: Any) -> None:
         """Add options of ``SHARED``; ``changes`` are for a verb in which they cannot be the same."""
