@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import textwrap
-from collections.abc import Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -81,6 +80,7 @@ def call_show(arguments: argparse.Namespace) -> None:
     """
     from su3d_bench.core import registry
     from su3d_bench.core.config import flatten, write_toml
+    from su3d_bench.core.interfaces import HasPresets
     from su3d_bench.reports.tables.paper import figures_of
     from su3d_bench.runs.catalogue import about_method
 
@@ -88,29 +88,24 @@ def call_show(arguments: argparse.Namespace) -> None:
     defaults = method.Config().model_dump(mode="json")
     row = about_method(method.name, method)
     figures = figures_of(method=method.name)
-    presets = {name: dict(settings) for name, settings in _presets_of(method).items()}
+    presets = (
+        {name: dict(settings) for name, settings in method.presets.items()} if isinstance(method, HasPresets) else {}
+    )
     published = [figure.model_dump(mode="json", exclude_none=True) for figure in figures]
     if answer_json(arguments, {**row, "settings": defaults, "presets": presets, "published": published}):
         return
-    leaves = [(("method", method.name, *path), value, _remark(method, path)) for path, value in flatten(defaults)]
+    remarks = {name: field.description or "default" for name, field in method.Config.model_fields.items()}
+    leaves = [(("method", method.name, *path), value, remarks[path[0]]) for path, value in flatten(defaults)]
     answer(*(f"# {line}" for line in _lines(row)))
     answer_document("\n" + write_toml(leaves) if leaves else f"# {one_line(method.name)} has no settings")
     if presets:
         answer("", "# presets, each a method of its own name")
-        answer(*(f"# {method.name}@{name}: {_assigned(settings)}" for name, settings in presets.items()))
+        for name, settings in presets.items():
+            assigned = ", ".join(f"{key} = {json.dumps(value)}" for key, value in settings.items())
+            answer(f"# {method.name}@{name}: {assigned}")
     if figures:
         answer("", "# as reported, each in its own set-up; no two need be comparable")
         answer(*(f"# {line}" for figure in figures for line in _figure_lines(figure)))
-
-
-def _presets_of(method: Any) -> Mapping[str, Mapping[str, Any]]:
-    from su3d_bench.core.interfaces import HasPresets
-
-    return method.presets if isinstance(method, HasPresets) else {}
-
-
-def _assigned(settings: Mapping[str, Any]) -> str:
-    return ", ".join(f"{key} = {json.dumps(value)}" for key, value in settings.items())
 
 
 def _figure_lines(figure: Figure) -> list[str]:
@@ -119,8 +114,3 @@ def _figure_lines(figure: Figure) -> list[str]:
     note = f"; {figure.note}" if figure.note else ""
     text = f"{values}{row}: {figure.source}: {figure.setup}{note}; {figure.system.words}"
     return textwrap.wrap(text, WIDTH, subsequent_indent="    ")
-
-
-def _remark(method: Any, path: tuple[str, ...]) -> str:
-    field = method.Config.model_fields[path[0]]
-    return field.description or "default"

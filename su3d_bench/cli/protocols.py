@@ -41,7 +41,11 @@ def add_parser(verbs: Verbs) -> None:
     )
     parser.option("--out PNG", "with --prediction: draw the steps to this file")
     parser.shared("--jobs", "--format")
-    _add_texts(actions)
+    parser = add_verb(actions, "texts", call_texts)
+    parser.option("--protocol P", "whose texts; a name, or a .toml file", required=True)
+    parser.option("--encoder E", "what encodes them, a name of su3d-bench models list (default: the protocol's)")
+    parser.shared("--queries", "--device", "--set")
+    parser.option("--out FILE", "where names and features go", required=True)
     add_new(actions, "protocol")
 
 
@@ -82,17 +86,14 @@ def call_show(arguments: argparse.Namespace) -> None:
         raise ConfigError("protocols show: --queries belongs to --names")
     stated = original_of(arguments.name)
     value = rules.model_dump(mode="json") | {"digest": rules.digest, "labels_taken": labels_taken(rules)}
-    lines = [*_rules_lines(rules, rules_files(arguments.name)), *_original_lines(stated)]
+    facts = {"original": "not said"} if stated is None else stated.facts
+    lines = [*_rules_lines(rules, rules_files(arguments.name)), ""]
+    lines += [f"{name:<28} {text}" for name, text in facts.items()]
     answer_either(arguments, value | {"original": _plain(stated)}, *lines)
 
 
 def _plain(stated: Stated | None) -> dict[str, Any] | None:
     return None if stated is None else stated.original.model_dump(mode="json") | {"of": stated.base}
-
-
-def _original_lines(stated: Stated | None) -> list[str]:
-    facts = {"original": "not said"} if stated is None else stated.facts
-    return ["", *(f"{name:<28} {text}" for name, text in facts.items())]
 
 
 def call_diff(arguments: argparse.Namespace) -> None:
@@ -147,8 +148,7 @@ def _rules_lines(rules: ProtocolRules, files: Sequence[Path]) -> list[str]:
         lines.append(f"{key:<28} {'none' if value is None else toml_value(value)}")
         lines += [f"    {remark}" for remark in remarks.pop(key, [])]
     lines += [f"    {remark}" for key in remarks if key != "classes" for remark in remarks[key]]
-    lines.append(f"{'labels taken':<28} {labels_taken(rules)}")
-    lines.append(f"{'digest':<28} {rules.digest}")
+    lines += [f"{'labels taken':<28} {labels_taken(rules)}", f"{'digest':<28} {rules.digest}"]
     if rules.classes:
         lines += ["", f"{len(rules.scored)} of {len(rules.classes)} classes are scored (id, name, group):"]
         lines += [f"    {remark}" for remark in remarks.get("classes", [])]
@@ -158,17 +158,7 @@ def _rules_lines(rules: ProtocolRules, files: Sequence[Path]) -> list[str]:
     return lines
 
 
-SUFFIX = ".npz"
 FORMS_OF_EVALUATE = (".toml", ".csv")  # of queries, with the objects that they speak of
-
-
-def _add_texts(verbs: Verbs) -> None:
-    parser = add_verb(verbs, "texts", call_texts)
-    parser.option("--protocol P", "whose texts; a name, or a .toml file", required=True)
-    parser.option("--encoder E", "what encodes them, a name of su3d-bench models list (default: the protocol's)")
-    parser.shared("--queries")
-    parser.shared("--device", "--set")
-    parser.option("--out FILE", "where names and features go", required=True)
 
 
 def call_texts(arguments: argparse.Namespace) -> None:
@@ -181,37 +171,22 @@ def call_texts(arguments: argparse.Namespace) -> None:
     from su3d_bench.evaluation.texts import distinct_texts, named_texts, text_arrays
     from su3d_bench.metrics.protocols.loading import load_protocol
     from su3d_bench.perception.models.loading import load_encoder
-    from su3d_bench.store.run_folder import refuse_records
 
     out: Path = arguments.out
-    if out.suffix != SUFFIX:
-        raise ConfigError(f"protocols texts: --out {shown(out)}: give a file that ends in {SUFFIX}")
+    if out.suffix != ".npz":
+        raise ConfigError(f"protocols texts: --out {shown(out)}: give a file that ends in .npz")
     rules = load_protocol(arguments.protocol)
     named = named_texts(rules, arguments.queries)
     name = _encoder_name(arguments.encoder, rules.name, rules.encoder)
-    refuse_records(out)
-    models = perception_config(arguments).models.model_copy(update={"encoder": name})
-    encoder = load_encoder(models)
+    encoder = load_encoder(perception_config(arguments).models.model_copy(update={"encoder": name}))
     texts = distinct_texts(named)
     arrays = text_arrays(texts, encoder)
     make_folder(out.parent)
     write_npz(out, arrays)
-    n_dimensions = int(arrays["features"].shape[1])
-    value = {
-        "file": str(out),
-        "protocol": rules.name,
-        "encoder": encoder.name,
-        "encoder_digest": encoder.digest,
-        "n_names": len(named),
-        "n_texts": len(texts),
-        "n_dimensions": n_dimensions,
-    }
-    answer_either(
-        arguments,
-        value,
-        f"{out}: {len(texts)} texts for {len(named)} names of {rules.name}, {n_dimensions} dimensions, encoder "
-        f"'{encoder.name}'",
-    )
+    numbers = {"n_names": len(named), "n_texts": len(texts), "n_dimensions": int(arrays["features"].shape[1])}
+    names = {"file": str(out), "protocol": rules.name, "encoder": encoder.name, "encoder_digest": encoder.digest}
+    line = "{file}: {n_texts} texts for {n_names} names of {protocol}, {n_dimensions} dimensions, encoder '{encoder}'"
+    answer_either(arguments, names | numbers, line.format(**names, **numbers))
     words = ["--protocols", arguments.protocol, "--text-features", str(out)]
     if arguments.queries is not None and arguments.queries.suffix.lower() in FORMS_OF_EVALUATE:
         words += ["--queries", str(arguments.queries)]
@@ -225,16 +200,13 @@ def _encoder_name(said: str | None, protocol: str, of_protocol: str | None) -> s
     from su3d_bench.perception.models.config import EMBEDDED
 
     known = [EMBEDDED, *(entry.name for entry in MODELS.values() if entry.kind == "encoder")]
-    asked = of_protocol if said is None else said
+    asked = said or of_protocol
     if asked is None:
         listed = ", ".join(known)
         raise ConfigError(f"protocols texts: protocol '{protocol}' names no encoder; name one with --encoder: {listed}")
-    if asked in known:
-        return asked
-    if asked == EmbeddedEncoder.name:
-        return EMBEDDED
+    if asked in (*known, EmbeddedEncoder.name):
+        return asked if asked in known else EMBEDDED
     if (entry := encoder_known_as(asked)) is not None:
         return entry.name
     whose = "" if said is not None else f" of protocol '{protocol}'"
-    hint = suggest(asked, known) or f"; known: {', '.join(known)}"
-    raise ConfigError(f"protocols texts: unknown encoder '{asked}'{whose}{hint}")
+    raise ConfigError(f"protocols texts: unknown encoder '{asked}'{whose}{suggest(asked, known)}")

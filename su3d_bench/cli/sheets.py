@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from su3d_bench.cli import sheets_make
+from su3d_bench.cli import output, sheets_make
 from su3d_bench.cli.options import Verbs, add_group, add_verb
-from su3d_bench.cli.output import answer_either, answer_json, answer_tables, remark, remark_unseen, written
+from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import ConfigError, DataError, counted
 
 if TYPE_CHECKING:
@@ -89,9 +89,9 @@ def call_score(arguments: argparse.Namespace) -> None:
         _write(arguments.out, scores, sheet_file.parent)
         remark(f"written: {arguments.out}", quiet=arguments.quiet)
     if arguments.disputed is not None:
-        path = written(arguments.disputed, disputed_csv(key, scores.second_looks))
+        path = output.written(arguments.disputed, disputed_csv(key, scores.second_looks))
         remark(f"written: {path}", quiet=arguments.quiet)
-    answer_tables(arguments, content, [*sheet_tables(content), Prose((_looks_line(scores),))])
+    output.answer_tables(arguments, content, [*sheet_tables(content), Prose((_looks_line(scores),))])
 
 
 def _sheet_file(arguments: argparse.Namespace, key_file: Path, sheet_id: str) -> Path:
@@ -115,7 +115,7 @@ def _sheet_file(arguments: argparse.Namespace, key_file: Path, sheet_id: str) ->
 def _refuse(faults: Sequence[str], arguments: argparse.Namespace) -> None:
     """Tell all faults, then raise."""
     if arguments.json:
-        answer_json(arguments, {"faults": list(faults)})
+        output.answer_json(arguments, {"faults": list(faults)})
     else:
         remark(*faults[:SHOWN_FAULTS])
         if len(faults) > SHOWN_FAULTS:
@@ -207,9 +207,9 @@ def call_pictures(arguments: argparse.Namespace) -> None:
     else:
         encoder = run.encoder(arguments.device or "cpu")
         for text in texts:
-            remark_unseen(encoder, text, quiet=arguments.quiet)
+            output.remark_unseen(encoder, text, quiet=arguments.quiet)
         rows = figures.similarity(texts, encoder, arguments.colours)
         scale = scale_stops(arguments.colours)
     draw_grid(arguments.out, columns, rows, scale)
     value = {"picture": str(arguments.out), "columns": columns, "rows": [row.title for row in rows]}
-    answer_either(arguments, value, str(arguments.out))
+    output.answer_either(arguments, value, str(arguments.out))

@@ -8,16 +8,9 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from su3d_bench.cli.options import (
-    Verbs,
-    add_language_options,
-    add_verb,
-    answer_estimate,
-    chat_client,
-    count,
-    given_language_option,
-)
-from su3d_bench.cli.output import answer, answer_json, remark
+from su3d_bench.cli import options, output
+from su3d_bench.cli.options import Verbs, add_verb, count
+from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import ConfigError, counted
 
 if TYPE_CHECKING:
@@ -77,7 +70,7 @@ def add_parser(verbs: Verbs) -> None:
         choices=("built-in", "llm"),
         default="built-in",
     )
-    add_language_options(parser)
+    options.add_language_options(parser)
 
 
 def call(arguments: argparse.Namespace) -> None:
@@ -112,12 +105,14 @@ def call(arguments: argparse.Namespace) -> None:
         drafts |= of_truth
         drawn |= _drawn(truth, truth.run or QUESTIONS, of_truth, arguments)
     written_sets = _write({kind: origins[kind] for kind in kinds}, drafts, drawn, arguments)
-    if answer_json(arguments, {"sets": written_sets}):
+    if output.answer_json(arguments, {"sets": written_sets}):
         return
     for sheet in written_sets:
-        answer(f"{sheet['sheet_id']}: {counted(sheet['n_items'], 'item')}, {counted(sheet['n_questions'], 'question')}")
+        output.answer(
+            f"{sheet['sheet_id']}: {counted(sheet['n_items'], 'item')}, {counted(sheet['n_questions'], 'question')}"
+        )
         for path in sheet["files"]:
-            answer(path)
+            output.answer(path)
         remark(f"key, which annotators must not see: {sheet['key']}", quiet=arguments.quiet)
 
 
@@ -138,7 +133,7 @@ def _check(arguments: argparse.Namespace) -> None:
         raise ConfigError("--methods: no method has a part in sheets of kind questions; leave it out")
     if arguments.solver == "llm" and "reasoning" not in arguments.kind:
         raise ConfigError("--solver llm: answers questions of reasoning sheets; add --kind reasoning")
-    if arguments.solver != "llm" and (given := given_language_option(arguments)):
+    if arguments.solver != "llm" and (given := options.given_language_option(arguments)):
         raise ConfigError(f"{given}: is for --solver llm alone; the built-in solver asks nobody")
 
 
@@ -235,7 +230,7 @@ def _ask_map(source: RunSource, encoder: Encoder | None, arguments: argparse.Nam
 
     if arguments.solver != "llm":
         return built_in(encoder), BUILT_IN
-    client, config = chat_client(arguments, source.run.folder)
+    client, config = options.chat_client(arguments, source.run.folder)
     return by_language_model(client, config).ask, config.text_model
 
 
@@ -243,13 +238,13 @@ def _estimate(source: RunSource, left_out: Collection[str], arguments: argparse.
     """Tell what asking the language model would cost at the most."""
     from su3d_bench.sheets.drafts import reasoning_drafts, requests_into
 
-    client, config = chat_client(arguments, source.run.folder)
+    client, config = options.chat_client(arguments, source.run.folder)
     given = _given(source, arguments)
     requests: list[ChatRequest] = []
     for scene in source.scenes:
         n_most = arguments.per_kind or PER_KIND["reasoning"]
         reasoning_drafts(source, scene, given, n_most, requests_into(requests, client, config), left_out)
-    return answer_estimate(arguments, client, requests)
+    return options.answer_estimate(arguments, client, requests)
 
 
 def _given(source: RunSource, arguments: argparse.Namespace) -> Sequence[Question] | None:
@@ -272,12 +267,11 @@ def _drawn(
     source: PictureSource, name: str, drafts: Mapping[SheetKind, Sequence[Draft]], arguments: argparse.Namespace
 ) -> dict[SheetKind, list[bytes]]:
     """The pictures of all drafts."""
-    from su3d_bench.cli.output import progress
     from su3d_bench.runs.executors import Event
     from su3d_bench.sheets.drawing import draw_all
 
     flat = [draft for of_kind in drafts.values() for draft in of_kind]
-    with progress(1, is_quiet=arguments.quiet, last_step="writing") as report:
+    with output.progress(1, is_quiet=arguments.quiet, last_step="writing") as report:
         pictures = draw_all(
             source,
             flat,
