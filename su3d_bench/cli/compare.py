@@ -52,7 +52,7 @@ def call_compare(arguments: argparse.Namespace) -> None:
 
 
 def call_check(arguments: argparse.Namespace) -> int:
-    """Hold a run against a reference and fail where a number got worse; or learn a reference from runs.
+    """Compare a run with a reference and fail where a number got worse; or learn a reference from runs.
 
     su3d-bench check --learn runs/a runs/b runs/c --out reference.json
     su3d-bench check runs/mine --against reference.json --markdown comment.md --junit check.xml

@@ -16,10 +16,8 @@ from su3d_bench.core.errors import ConfigError, counted
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
-    from su3d_bench.core.interfaces import Encoder
     from su3d_bench.perception.language.chat import ChatRequest
     from su3d_bench.questions.model import Question
-    from su3d_bench.questions.solver import AskMap
     from su3d_bench.sheets.drafts import Draft
     from su3d_bench.sheets.drawing import PictureSource
     from su3d_bench.sheets.items import SheetKind
@@ -81,7 +79,7 @@ def call(arguments: argparse.Namespace) -> None:
     """
     from su3d_bench.questions.query_files import read_left_out
     from su3d_bench.runs.finished import read_run
-    from su3d_bench.sheets.sources import RunSource
+    from su3d_bench.sheets.sources import RunSource, truth_of_addresses, truth_of_run
 
     _check(arguments)
     left_out = frozenset[str]() if arguments.leave_out is None else read_left_out(arguments.leave_out)
@@ -100,7 +98,11 @@ def call(arguments: argparse.Namespace) -> None:
         origins = {kind: _origin(kind, mine, made_by[kind]) for kind, mine in sources.items()}
         drawn = _drawn(source, source.run.name, drafts, arguments)
     if QUESTIONS in kinds:
-        truth = _truth(arguments)
+        truth = (
+            truth_of_addresses(arguments.scenes)
+            if arguments.run is None
+            else truth_of_run(arguments.run, arguments.scenes)
+        )
         of_truth, origins[QUESTIONS] = _questions(truth, left_out, arguments)
         drafts |= of_truth
         drawn |= _drawn(truth, truth.run or QUESTIONS, of_truth, arguments)
@@ -108,11 +110,8 @@ def call(arguments: argparse.Namespace) -> None:
     if output.answer_json(arguments, {"sets": written_sets}):
         return
     for sheet in written_sets:
-        output.answer(
-            f"{sheet['sheet_id']}: {counted(sheet['n_items'], 'item')}, {counted(sheet['n_questions'], 'question')}"
-        )
-        for path in sheet["files"]:
-            output.answer(path)
+        n_items, n_questions = counted(sheet["n_items"], "item"), counted(sheet["n_questions"], "question")
+        output.answer(f"{sheet['sheet_id']}: {n_items}, {n_questions}", *sheet["files"])
         remark(f"key, which annotators must not see: {sheet['key']}", quiet=arguments.quiet)
 
 
@@ -123,14 +122,13 @@ def _check(arguments: argparse.Namespace) -> None:
         raise ConfigError(
             "RUN: name the folder of a run; only --kind questions can do without, and needs --scenes then"
         )
-    if kinds == {"annotation"} and arguments.questions != "generated":
-        raise ConfigError("--questions: annotation sheets ask about labels and masks; leave it out")
-    if kinds == {"annotation"} and arguments.leave_out is not None:
-        raise ConfigError("--leave-out: annotation sheets ask about labels and masks; leave it out")
-    if kinds == {QUESTIONS} and arguments.questions != "generated":
-        raise ConfigError("--questions: sheets of kind questions judge those made from the ground truth; leave it out")
-    if kinds == {QUESTIONS} and arguments.methods:
-        raise ConfigError("--methods: no method has a part in sheets of kind questions; leave it out")
+    has_questions = arguments.questions != "generated"
+    if kinds == {"annotation"} and (has_questions or arguments.leave_out is not None):
+        raise ConfigError("--questions, --leave-out: annotation sheets ask about labels and masks; leave it out")
+    if kinds == {QUESTIONS} and (has_questions or arguments.methods):
+        raise ConfigError(
+            "--questions, --methods: sheets of kind questions judge those made from the ground truth; leave it out"
+        )
     if arguments.solver == "llm" and "reasoning" not in arguments.kind:
         raise ConfigError("--solver llm: answers questions of reasoning sheets; add --kind reasoning")
     if arguments.solver != "llm" and (given := options.given_language_option(arguments)):
@@ -159,14 +157,6 @@ def _judgeable(source: RunSource, kind: SheetKind, is_quiet: bool) -> RunSource:
     return source.of_methods(kept)
 
 
-def _truth(arguments: argparse.Namespace) -> TruthSource:
-    from su3d_bench.sheets.sources import truth_of_addresses, truth_of_run
-
-    if arguments.run is None:
-        return truth_of_addresses(arguments.scenes)
-    return truth_of_run(arguments.run, arguments.scenes)
-
-
 def _questions(
     truth: TruthSource, left_out: Collection[str], arguments: argparse.Namespace
 ) -> tuple[dict[SheetKind, list[Draft]], Origin]:
@@ -192,6 +182,7 @@ def _drafts(
     import numpy as np
 
     from su3d_bench.metrics.questions.score import relative_remark
+    from su3d_bench.questions import solver
     from su3d_bench.sheets.drafts import annotation_drafts, questions_of, reasoning_drafts, retrieval_drafts
     from su3d_bench.sheets.sets import check_split
 
@@ -201,7 +192,10 @@ def _drafts(
     drafts_of: dict[SheetKind, list[Draft]] = {kind: [] for kind in sources}
     needs_encoder = "retrieval" in sources or ("reasoning" in sources and arguments.solver != "llm")
     encoder = source.run.encoder(arguments.device or "cpu") if needs_encoder else None
-    ask, answered_by = _ask_map(source, encoder, arguments) if "reasoning" in sources else (None, "")
+    ask, answered_by = solver.built_in(encoder), solver.BUILT_IN
+    if arguments.solver == "llm":
+        client, config = options.chat_client(arguments, source.run.folder)
+        ask, answered_by = solver.by_language_model(client, config).ask, config.text_model
     labelled_by: dict[str, None] = {}
     for scene in source.scenes:  # all kinds of one scene together, for they share its truth
         for kind, mine in sources.items():
@@ -211,7 +205,6 @@ def _drafts(
                 found = (mine.refined(scene, method) for method in mine.methods)
                 labelled_by |= dict.fromkeys(refined.source for refined in found if refined is not None)
             elif kind == "reasoning":
-                assert ask is not None
                 drafts_of[kind] += reasoning_drafts(mine, scene, given, n_most, ask, left_out)
             else:
                 assert encoder is not None
@@ -222,16 +215,6 @@ def _drafts(
         check_split(len(drafts), arguments.annotators, arguments.overlap)
     said = (relative_remark(encoder) or "") if "retrieval" in sources else ""
     return drafts_of, {"retrieval": said, "reasoning": answered_by, "annotation": " and ".join(labelled_by)}
-
-
-def _ask_map(source: RunSource, encoder: Encoder | None, arguments: argparse.Namespace) -> tuple[AskMap, str]:
-    """Who answers the questions of reasoning sheets, and how the key calls them."""
-    from su3d_bench.questions.solver import BUILT_IN, built_in, by_language_model
-
-    if arguments.solver != "llm":
-        return built_in(encoder), BUILT_IN
-    client, config = options.chat_client(arguments, source.run.folder)
-    return by_language_model(client, config).ask, config.text_model
 
 
 def _estimate(source: RunSource, left_out: Collection[str], arguments: argparse.Namespace) -> None:
