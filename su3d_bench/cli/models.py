@@ -105,7 +105,7 @@ def call_check(arguments: argparse.Namespace) -> int:
         for state in states
         for files in state.files
     ]
-    absent = {"form": None, "folder": None, "sha256": {}}
+    absent: dict[str, Any] = {"form": None, "folder": None, "sha256": {}}
     rows += [
         {"name": state.entry.name, **absent, "problems": [state.missing]}
         for state in states

@@ -73,7 +73,7 @@ def call_html(arguments: argparse.Namespace) -> None:
     maps = contents.maps
     page = page_html(
         printable(title, 200),
-        contents.numbers | {"maps": [one.listed() for one in maps], "gallery": told_of(contents.galleries)},
+        {**contents.numbers, "maps": [one.listed() for one in maps], "gallery": told_of(contents.galleries)},
         [scene.listed() for scene in contents.scenes],
         [page_map.content for page_map in maps],
         [gallery.to_json() for gallery in contents.galleries],
