@@ -23,42 +23,21 @@ if TYPE_CHECKING:
 TEXT, WHOLE, NUMBER, TRUTH, WHOLE_OR_NONE = "string", "int64", "float64", "bool", "Int64"
 # What the columns hold, by table.
 METRICS = {
-    "method": TEXT,
-    "protocol": TEXT,
-    "metric": TEXT,
+    **dict.fromkeys(("method", "protocol", "metric"), TEXT),
     "is_headline": TRUTH,
-    "value": NUMBER,
-    "low": NUMBER,
-    "high": NUMBER,
-    "ceiling": NUMBER,
+    **dict.fromkeys(("value", "low", "high", "ceiling"), NUMBER),
     "n_scenes": WHOLE,
 }
-OF_SCENES = {"method": TEXT, "protocol": TEXT, "scene": TEXT, "metric": TEXT, "value": NUMBER}
-OF_CLASSES = {"method": TEXT, "protocol": TEXT, "class_name": TEXT, "metric": TEXT, "value": NUMBER}
+OF_SCENES = {**dict.fromkeys(("method", "protocol", "scene", "metric"), TEXT), "value": NUMBER}
+OF_CLASSES = {**dict.fromkeys(("method", "protocol", "class_name", "metric"), TEXT), "value": NUMBER}
 UPDATES = {"method": TEXT, "scene": TEXT, "update": WHOLE, "frame": WHOLE_OR_NONE}  # all others are numbers
 ERRORS = {
-    "method": TEXT,
-    "protocol": TEXT,
-    "metric": TEXT,
-    "value": NUMBER,
-    "part": TEXT,
-    "kind": TEXT,
-    "n": WHOLE_OR_NONE,
-    "gain": NUMBER,
+    **dict.fromkeys(("method", "protocol", "metric"), TEXT),
+    **{"value": NUMBER, "part": TEXT, "kind": TEXT, "n": WHOLE_OR_NONE, "gain": NUMBER},
 }
 DIFFERENCES = {
-    "protocol": TEXT,
-    "left": TEXT,
-    "right": TEXT,
-    "class_name": TEXT,
-    "metric": TEXT,
-    "value_left": NUMBER,
-    "value_right": NUMBER,
-    "difference": NUMBER,
-    "low": NUMBER,
-    "high": NUMBER,
-    "p": NUMBER,
-    "p_of_all": NUMBER,
+    **dict.fromkeys(("protocol", "left", "right", "class_name", "metric"), TEXT),
+    **dict.fromkeys(("value_left", "value_right", "difference", "low", "high", "p", "p_of_all"), NUMBER),
     "n_scenes": WHOLE,
 }
 _OF_KIND = {"text": TEXT, "whole number": WHOLE, "number": NUMBER, "yes or no": TRUTH}
@@ -78,17 +57,17 @@ def metrics_frame(metrics: MetricsRecord) -> pandas.DataFrame:
             low, high = numbers.intervals.get(metric) or (None, None)
             where = (result.method, result.protocol, metric, metric in result.headline)
             rows.append((*where, value, low, high, ceiling.get(metric), len(numbers.scenes)))
-    return _frame(METRICS, rows)
+    return frame(METRICS, rows)
 
 
 def scenes_frame(metrics: MetricsRecord) -> pandas.DataFrame:
     """A row a method, protocol, scene and metric."""
-    return _frame(OF_SCENES, _inner_rows(metrics, "per_scene"))
+    return frame(OF_SCENES, _inner_rows(metrics, "per_scene"))
 
 
 def classes_frame(metrics: MetricsRecord) -> pandas.DataFrame:
     """A row a method, protocol, class and metric; of the classes that have a value."""
-    return _frame(OF_CLASSES, _inner_rows(metrics, "per_class"))
+    return frame(OF_CLASSES, _inner_rows(metrics, "per_class"))
 
 
 def _inner_rows(metrics: MetricsRecord, name: str) -> list[tuple[Any, ...]]:
@@ -117,7 +96,7 @@ def updates_frame(times: Iterable[UpdateTimes]) -> pandas.DataFrame:
 
 def samples_frame(samples: Sequence[Sample]) -> pandas.DataFrame:
     """A row a sample; ``report samples --columns`` says what each column holds."""
-    return _frame(SAMPLES, [astuple(sample) for sample in samples])
+    return frame(SAMPLES, [astuple(sample) for sample in samples])
 
 
 def errors_frame(attributions: Iterable[RunAttribution]) -> pandas.DataFrame:
@@ -133,7 +112,7 @@ def errors_frame(attributions: Iterable[RunAttribution]) -> pandas.DataFrame:
                 rows.append((*where, "rest", "", None, of_protocol.rest[metric]))
                 for stage, values in of_protocol.stages.items():
                     rows.append((*where, "stage", stage, None, values[metric] - value))
-    return _frame(ERRORS, rows)
+    return frame(ERRORS, rows)
 
 
 def differences_frame(comparison: Mapping[str, Any]) -> pandas.DataFrame:
@@ -148,15 +127,11 @@ def differences_frame(comparison: Mapping[str, Any]) -> pandas.DataFrame:
             where = (protocol["protocol"], protocol["left"], protocol["right"], name, metric)
             numbers = (value["left"], value["right"], value["difference"], low, high, value["p"], value["p_of_all"])
             rows.append((*where, *numbers, len(protocol["scenes"])))
-    return _frame(DIFFERENCES, rows)
+    return frame(DIFFERENCES, rows)
 
 
-def listed_frame(columns: Mapping[str, str], rows: Sequence[Sequence[Any]]) -> pandas.DataFrame:
-    """What there is, a row each."""
-    return _frame(columns, rows)
-
-
-def _frame(columns: Mapping[str, str], rows: Sequence[Sequence[Any]]) -> pandas.DataFrame:
+def frame(columns: Mapping[str, str], rows: Sequence[Sequence[Any]]) -> pandas.DataFrame:
+    """A table of these columns, whose texts are made printable."""
     import pandas
 
     texts = [place for place, kind in enumerate(columns.values()) if kind == TEXT]

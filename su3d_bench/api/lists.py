@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from su3d_bench.api.frames import TEXT, TRUTH, WHOLE, listed_frame
+from su3d_bench.api.frames import TEXT, TRUTH, WHOLE, frame
 from su3d_bench.api.results import Names, several
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ def list_datasets(names: Names = ()) -> pandas.DataFrame:
         if not one["scenes"]:
             rows.append((one["name"], "", one["error"] or "has no scene", one["summary"], False))
     columns = {"dataset": TEXT, "scene": TEXT, "state": TEXT, "summary": TEXT, "is_here": TRUTH}
-    return listed_frame(columns, rows)
+    return frame(columns, rows)
 
 
 def list_methods() -> pandas.DataFrame:
@@ -46,7 +46,7 @@ def list_methods() -> pandas.DataFrame:
 
     columns = dict.fromkeys(("name", "summary", "paper", "source", "licence", "status", "needs"), TEXT)
     rows = [[", ".join(one[key]) if key == "needs" else one[key] or "" for key in columns] for one in known_methods()]
-    return listed_frame(columns, rows)
+    return frame(columns, rows)
 
 
 def list_protocols() -> pandas.DataFrame:
@@ -70,4 +70,4 @@ def list_protocols() -> pandas.DataFrame:
         lists = (", ".join(one.datasets), ", ".join(one.headline))
         original = stated.facts["original"] if stated is not None else ""
         rows.append((one.name, one.summary, one.kind, *lists, one.label_space or "", original, one.version))
-    return listed_frame({**columns, "version": WHOLE}, rows)
+    return frame({**columns, "version": WHOLE}, rows)

@@ -4,96 +4,59 @@ from __future__ import annotations
 
 import argparse
 import os
-from pathlib import Path
-from typing import TYPE_CHECKING
 
-from su3d_bench.cli.options import Verbs, add_options, add_out, add_verb
-from su3d_bench.cli.output import (
-    answer_commands,
-    answer_document,
-    answer_either,
-    answer_json,
-    answer_tables,
-    remark,
-    written,
-)
+from su3d_bench.cli import output
+from su3d_bench.cli.options import Verbs, add_verb
+from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
-
-if TYPE_CHECKING:
-    from su3d_bench.reports.gate import Verdict
 
 
 def add_parser(verbs: Verbs) -> None:
-    _add_compare(verbs)
-    _add_check(verbs)
-
-
-def _add_compare(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "compare",
-        "Compare two runs over their common scenes: exact test, and differences with interval.",
-        (
-            "su3d-bench compare runs/before runs/after --per-class",
-            "su3d-bench compare runs/old-0,runs/old-1 runs/new-0,runs/new-1 --protocols rooms-instance --json",
-        ),
-        call_compare,
+    parser = add_verb(verbs, "compare", call_compare)
+    parser.option("left A", "the folder of a run, or FOLDER:METHOD; FOLDER,FOLDER: several seeds")
+    parser.option("right B", "the run that is held against it; differences are B - A")
+    parser.option("--method METHOD", "compare this method alone (default: all of the same name)")
+    parser.shared("--protocols")
+    parser.option("--per-class", "each class too")
+    parser.shared("--format")
+    parser = add_verb(verbs, "check", call_check)
+    parser.option("runs [RUN...]", "the run to check")
+    parser.option("--against FILE", "the reference")
+    parser.option("--learn RUN...", "repeats of one run to learn from")
+    parser.option("--out FILE", "where --learn writes the reference")
+    parser.option("--cost-limit TIMES", "how many times as long a method may take (with --learn)", type=float)
+    parser.option(
+        "--across-machines POINTS",
+        "by how many points headline values may differ on another machine (with --learn; default: 2)",
+        type=float,
     )
-    parser.add_argument("left", metavar="A", help="the folder of a run, or FOLDER:METHOD; FOLDER,FOLDER: several seeds")
-    parser.add_argument("right", metavar="B", help="the run that is held against it; differences are B - A")
-    parser.add_argument("--method", help="compare this method alone (default: all of the same name)")
-    add_options(parser, "--protocols")
-    parser.add_argument("--per-class", action="store_true", help="each class too")
-    add_options(parser, "--format")
+    parser.option("--markdown FILE", "write the table for a pull request")
+    parser.option("--junit FILE", "write JUnit XML")
+    parser.option(
+        "--github", "print GitHub annotations (default: in its workflows)", action=argparse.BooleanOptionalAction
+    )
 
 
-def call_compare(arguments: argparse.Namespace) -> int:
+def call_compare(arguments: argparse.Namespace) -> None:
+    """Compare two runs over their common scenes: exact test, and differences with interval.
+
+    su3d-bench compare runs/before runs/after --per-class
+    su3d-bench compare runs/old-0,runs/old-1 runs/new-0,runs/new-1 --protocols rooms-instance --json
+    """
     from su3d_bench.analysis.comparison import compare
     from su3d_bench.reports.tables.comparison import comparison_tables
 
-    comparison = compare(
-        arguments.left,
-        arguments.right,
-        method=arguments.method,
-        protocols=arguments.protocols,
-        per_class=arguments.per_class,
-    ).to_json()
-    answer_tables(arguments, comparison, comparison_tables(comparison))
-    return EXIT_DONE
-
-
-def _add_check(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "check",
-        "Hold a run against a reference and fail where a number got worse; or learn a reference from runs.",
-        (
-            "su3d-bench check --learn runs/a runs/b runs/c --out reference.json",
-            "su3d-bench check runs/mine --against reference.json --markdown comment.md --junit check.xml",
-        ),
-        call_check,
-    )
-    parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="the run to check")
-    parser.add_argument("--against", type=Path, metavar="FILE", help="the reference")
-    parser.add_argument("--learn", nargs="+", type=Path, metavar="RUN", help="repeats of one run to learn from")
-    add_out(parser, "FILE", "where --learn writes the reference")
-    parser.add_argument(
-        "--cost-limit", type=float, metavar="TIMES", help="how many times as long a method may take (with --learn)"
-    )
-    parser.add_argument(
-        "--across-machines",
-        type=float,
-        metavar="POINTS",
-        help="by how many points headline values may differ on another machine (with --learn; default: 2)",
-    )
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the table for a pull request")
-    parser.add_argument("--junit", type=Path, metavar="FILE", help="write JUnit XML")
-    parser.add_argument(
-        "--github", action=argparse.BooleanOptionalAction, help="print GitHub annotations (default: in its workflows)"
-    )
+    chosen = {name: getattr(arguments, name) for name in ("method", "protocols", "per_class")}
+    comparison = compare(arguments.left, arguments.right, **chosen).to_json()
+    output.answer_tables(arguments, comparison, comparison_tables(comparison))
 
 
 def call_check(arguments: argparse.Namespace) -> int:
+    """Compare a run with a reference and fail where a number got worse; or learn a reference from runs.
+
+    su3d-bench check --learn runs/a runs/b runs/c --out reference.json
+    su3d-bench check runs/mine --against reference.json --markdown comment.md --junit check.xml
+    """
     if arguments.learn:
         return _learn(arguments)
     if len(arguments.runs) != 1 or arguments.against is None:
@@ -120,14 +83,14 @@ def _learn(arguments: argparse.Namespace) -> int:
         )
     runs = [read_run(path) for path in arguments.learn]
     reference = learn(runs, across, cost_limit)
-    written(arguments.out, json_text(reference.model_dump(mode="json", exclude_defaults=True)))
+    output.written(arguments.out, json_text(reference.model_dump(mode="json", exclude_defaults=True)))
     n_exact = sum(metric.tolerance == 0 for each in reference.results for metric in each.metrics.values())
     n_values = sum(len(each.metrics) for each in reference.results)
     about = {"reference": str(arguments.out), "n_runs": reference.n_runs, "n_values": n_values, "n_exact": n_exact}
     line = (
         f"{arguments.out}: {n_values} headline values from {counted(reference.n_runs, 'run')}, {n_exact} of them exact"
     )
-    answer_either(arguments, about, line)
+    output.answer_either(arguments, about, line)
     if reference.n_runs == 1:
         remark("one run shows no spread: every value must be met exactly; learn from several where runs vary")
     for method in runs[0].methods:
@@ -141,25 +104,18 @@ def _check(arguments: argparse.Namespace) -> int:
 
     from su3d_bench.analysis.gate import check, read_reference
     from su3d_bench.core.printing import terminal_width
-    from su3d_bench.reports.gate import github_lines, plain_parts
+    from su3d_bench.reports.gate import github_lines, junit_xml, markdown, plain_parts
     from su3d_bench.reports.tables.formats import plain
     from su3d_bench.runs.finished import read_run
 
     verdict = check(read_run(arguments.runs[0]), read_reference(arguments.against))
-    _write(verdict, arguments)
-    if not answer_json(arguments, {"passed": verdict.is_passed, **asdict(verdict)}):
-        answer_document(plain(plain_parts(verdict), terminal_width()))
-        in_workflow = os.environ.get("GITHUB_ACTIONS") == "true"
-        if in_workflow if arguments.github is None else arguments.github:
-            answer_commands(github_lines(verdict))
-    for line in verdict.remarks:
-        remark(line, quiet=arguments.quiet)
-    return EXIT_DONE if verdict.is_passed else EXIT_CHECK_FAILED
-
-
-def _write(verdict: Verdict, arguments: argparse.Namespace) -> None:
-    from su3d_bench.reports.gate import junit_xml, markdown
-
     for path, text in ((arguments.markdown, markdown), (arguments.junit, junit_xml)):
         if path is not None:
-            written(path, text(verdict))
+            output.written(path, text(verdict))
+    if not output.answer_json(arguments, {"passed": verdict.is_passed, **asdict(verdict)}):
+        output.answer_document(plain(plain_parts(verdict), terminal_width()))
+        in_workflow = os.environ.get("GITHUB_ACTIONS") == "true"
+        if in_workflow if arguments.github is None else arguments.github:
+            output.answer_commands(github_lines(verdict))
+    remark(*verdict.remarks, quiet=arguments.quiet)
+    return EXIT_DONE if verdict.is_passed else EXIT_CHECK_FAILED

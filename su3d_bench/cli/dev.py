@@ -10,7 +10,7 @@ from typing import Any
 
 from su3d_bench.cli import doctor
 from su3d_bench.cli.new import REGISTRY, add_new
-from su3d_bench.cli.options import Verbs, add_group, add_options, add_out, add_verb
+from su3d_bench.cli.options import Verbs, add_group, add_verb
 from su3d_bench.cli.output import answer, answer_either, answer_json, remark, show
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable, shown
 
@@ -21,66 +21,43 @@ MOST_REFUSED = 20  # lines
 
 
 def add_parser(verbs: Verbs) -> None:
-    actions = add_group(
-        verbs,
-        "dev",
-        "Look after the program: its cache, this machine, completion in a shell, registries of results.",
-        ("su3d-bench dev doctor", "su3d-bench dev cache list"),
-    )
+    """Look after the program: its cache, this machine, completion in a shell, registries of results.
+
+    su3d-bench dev doctor
+    su3d-bench dev cache list
+    """
+    actions = add_group(verbs, "dev", add_parser)
     _add_cache(actions)
-    add_verb(
-        actions,
-        "doctor",
-        "Look at libraries, GPU, data, models, folders and cores; exit code 1 where the main job cannot run.",
-        ("su3d-bench dev doctor", "su3d-bench dev doctor --json"),
-        doctor.call,
-        uses_all_cores=True,  # computes nothing, and shows the settings of threads
-    )
-    parser = add_verb(
-        actions,
-        "completion",
-        "Print a script that completes verbs, options and choices in a shell.",
-        ('eval "$(su3d-bench dev completion bash)"', "su3d-bench dev completion fish | source"),
-        call_completion,
-    )
-    parser.add_argument("shell", choices=SHELLS, help="bash, zsh or fish")
+    add_verb(actions, "doctor", doctor.call, uses_all_cores=True)  # computes nothing, and shows the settings of threads
+    parser = add_verb(actions, "completion", call_completion)
+    parser.option("shell", "bash, zsh or fish", choices=SHELLS)
     _add_registry(actions)
 
 
 def _add_cache(verbs: Verbs) -> None:
-    actions = add_group(
-        verbs,
-        "cache",
-        "List what is kept in $SU3D_CACHE to be quick, and remove it.",
-        ("su3d-bench dev cache list", "su3d-bench dev cache clear perception --older-than 30"),
-        lists=True,
-    )
-    add_verb(
-        actions,
-        "list",
-        "List what is kept by kind: how many files, how large, how old.",
-        ("su3d-bench dev cache list", "su3d-bench dev cache list --json"),
-        call_cache_list,
-    )
-    parser = add_verb(
-        actions,
-        "clear",
-        "Remove what is kept, of some kinds or all; nothing but files of the cache's own form, never through links.",
-        ("su3d-bench dev cache clear all --dry-run", "su3d-bench dev cache clear perception --older-than 30"),
-        call_cache_clear,
-    )
-    parser.add_argument(
-        "kinds",
-        nargs="+",
+    """List what is kept in $SU3D_CACHE to be quick, and remove it.
+
+    su3d-bench dev cache list
+    su3d-bench dev cache clear perception --older-than 30
+    """
+    actions = add_group(verbs, "cache", _add_cache, lists=True)
+    add_verb(actions, "list", call_cache_list)
+    parser = add_verb(actions, "clear", call_cache_clear)
+    parser.option(
+        "kinds KIND...",
+        f"{', '.join(KIND_NAMES)}, or all (which leaves replies: they may have cost money)",
         choices=(*KIND_NAMES, "all"),
-        metavar="KIND",
-        help=f"{', '.join(KIND_NAMES)}, or all (which leaves replies: they may have cost money)",
     )
-    parser.add_argument("--older-than", type=float, default=0.0, metavar="DAYS", help="only what is older (default: 0)")
-    add_options(parser, "--dry-run")
+    parser.option("--older-than DAYS", "only what is older (default: 0)", type=float, default=0.0)
+    parser.shared("--dry-run")
 
 
-def call_cache_list(arguments: argparse.Namespace) -> int:
+def call_cache_list(arguments: argparse.Namespace) -> None:
+    """List what is kept by kind: how many files, how large, how old.
+
+    su3d-bench dev cache list
+    su3d-bench dev cache list --json
+    """
     from su3d_bench.runs.scenes import cache_root
     from su3d_bench.store.caches import KINDS, cache_entries, size_text
 
@@ -100,7 +77,6 @@ def call_cache_list(arguments: argparse.Namespace) -> int:
         lines.append(f"  {row['kind']:<13}  {size_text(row['n_bytes']):>9}  {n_files:>13}  {old}")
         lines.append(f"  {'':<13}  {KINDS[row['kind']].what}")
     answer_either(arguments, {"folder": str(root), "n_bytes": n_bytes, "kinds": rows}, *lines)
-    return EXIT_DONE
 
 
 def _ago(written: float) -> str:
@@ -108,7 +84,12 @@ def _ago(written: float) -> str:
     return counted(round(seconds / DAY_S), "day") if seconds >= DAY_S else counted(round(seconds / 3600), "hour")
 
 
-def call_cache_clear(arguments: argparse.Namespace) -> int:
+def call_cache_clear(arguments: argparse.Namespace) -> None:
+    """Remove what is kept, of some kinds or all; nothing but files of the cache's own form, never through links.
+
+    su3d-bench dev cache clear all --dry-run
+    su3d-bench dev cache clear perception --older-than 30
+    """
     from su3d_bench.runs.scenes import cache_root
     from su3d_bench.store.caches import KINDS, cache_entries, clear_cache, size_text
 
@@ -132,62 +113,45 @@ def call_cache_clear(arguments: argparse.Namespace) -> int:
     if "all" in wanted and "replies" not in wanted and any(cache_entries(root, KINDS["replies"])):
         text = "replies of language models stay; su3d-bench dev cache clear replies removes them"
         remark(text, quiet=arguments.quiet)
-    return EXIT_DONE
 
 
-def call_completion(arguments: argparse.Namespace) -> int:
+def call_completion(arguments: argparse.Namespace) -> None:
+    """Print a script that completes verbs, options and choices in a shell.
+
+    eval "$(su3d-bench dev completion bash)"
+    su3d-bench dev completion fish | source
+    """
     from argcomplete.shell_integration import shellcode
 
     script = shellcode(["su3d-bench"], shell=arguments.shell)
     answer_either(arguments, {"shell": arguments.shell, "script": script}, *script.splitlines())
-    return EXIT_DONE
 
 
 def _add_registry(verbs: Verbs) -> None:
-    actions = add_group(
-        verbs,
-        "registry",
-        "Keep a registry of results: take bundles in after scoring them again, and make a site of their rankings.",
-        (
-            "su3d-bench dev registry add reproduced/rooms/bundle.zip --to my-registry",
-            "su3d-bench dev registry build my-registry --out site",
-        ),
-    )
-    parser = add_verb(
-        actions,
-        "add",
-        "Score bundles again and take them into a registry; exit code 1 where one is refused, with its reasons.",
-        (
-            "su3d-bench dev registry add bundle.zip --to my-registry --name opensu3d-rooms",
-            "su3d-bench dev registry add bundles/mine.zip",
-        ),
-        call_registry_add,
-    )
-    parser.add_argument(
-        "bundles", nargs="+", type=Path, metavar="BUNDLE", help="archives of report bundle or reproduce"
-    )
-    parser.add_argument(
-        "--to", type=Path, default=Path(), metavar="DIR", help="the registry's folder (default: where you are)"
-    )
-    parser.add_argument("--name", help="of the bundle in the registry (default: its file's, or its recipe and digest)")
-    parser = add_verb(
-        actions,
-        "build",
-        "Make a static site of a registry's bundles; exit code 1 where something in it can stand in no ranking.",
-        (
-            "su3d-bench dev registry build my-registry --out site",
-            'su3d-bench dev registry build . --out site --title "Maps of rooms" --bundles-at https://example.org/bundles',
-        ),
-        call_registry_build,
-    )
-    parser.add_argument("folder", type=Path, metavar="DIR", help="a registry, or any folder of bundles")
-    add_out(parser, "DIR", "where the site goes (default: site)", default=Path("site"))
-    parser.add_argument("--title", metavar="TEXT", help="of the first page (default: Registry of results)")
-    parser.add_argument("--bundles-at", metavar="URL", help="link the bundles there (default: named, not linked)")
+    """Keep a registry of results: take bundles in after scoring them again, and make a site of their rankings.
+
+    su3d-bench dev registry add reproduced/rooms/bundle.zip --to my-registry
+    su3d-bench dev registry build my-registry --out site
+    """
+    actions = add_group(verbs, "registry", _add_registry)
+    parser = add_verb(actions, "add", call_registry_add)
+    parser.option("bundles BUNDLE...", "archives of report bundle or reproduce")
+    parser.option("--to DIR", "the registry's folder (default: where you are)", default=Path())
+    parser.option("--name NAME", "of the bundle in the registry (default: its file's, or its recipe and digest)")
+    parser = add_verb(actions, "build", call_registry_build)
+    parser.option("folder DIR", "a registry, or any folder of bundles")
+    parser.option("--out DIR", "where the site goes (default: site)", default=Path("site"))
+    parser.option("--title TEXT", "of the first page (default: Registry of results)")
+    parser.option("--bundles-at URL", "link the bundles there (default: named, not linked)")
     add_new(actions, REGISTRY)
 
 
 def call_registry_add(arguments: argparse.Namespace) -> int:
+    """Score bundles again and take them into a registry; exit code 1 where one is refused, with its reasons.
+
+    su3d-bench dev registry add bundle.zip --to my-registry --name opensu3d-rooms
+    su3d-bench dev registry add bundles/mine.zip
+    """
     from dataclasses import asdict
 
     from su3d_bench.reproducing.registry import add_bundle, lines_of
@@ -205,6 +169,11 @@ def call_registry_add(arguments: argparse.Namespace) -> int:
 
 
 def call_registry_build(arguments: argparse.Namespace) -> int:
+    """Make a static site of a registry's bundles; exit code 1 where something in it can stand in no ranking.
+
+    su3d-bench dev registry build my-registry --out site
+    su3d-bench dev registry build . --out site --title "Maps of rooms" --bundles-at https://example.org/bundles
+    """
     from su3d_bench.reproducing.registry import read_registry
     from su3d_bench.reproducing.registry_site import TITLE, write_site
 
@@ -212,8 +181,7 @@ def call_registry_build(arguments: argparse.Namespace) -> int:
     title = TITLE if arguments.title is None else printable(arguments.title, 120)
     pages = write_site(registry, arguments.out, title, arguments.bundles_at)
     refused = [f"left out: {one.run}, {one.what}: {one.reason}" for one in registry.refused]
-    for line in refused[:MOST_REFUSED]:
-        remark(line)
+    remark(*refused[:MOST_REFUSED])
     if len(refused) > MOST_REFUSED:
         remark(f"left out: {len(refused) - MOST_REFUSED} more")
     counts = f"{counted(len(registry.rows), 'row')} of {counted(registry.n_bundles, 'bundle')} in "

@@ -47,6 +47,11 @@ class Check:
 
 
 def call(arguments: argparse.Namespace) -> int:
+    """Look at libraries, GPU, data, models, folders and cores; exit code 1 where the main job cannot run.
+
+    su3d-bench dev doctor
+    su3d-bench dev doctor --json
+    """
     checks = examine()
     missing = [check for check in checks if check.state == "missing"]
     width = max(len(check.what) for check in checks)

@@ -6,91 +6,70 @@ import argparse
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
-from su3d_bench.cli.options import Verbs, add_options, add_out, add_verb
+from su3d_bench.cli.options import Verbs, add_verb
 from su3d_bench.cli.output import answer_tables, remark
-from su3d_bench.core.errors import EXIT_DONE, ConfigError
-
-if TYPE_CHECKING:
-    from su3d_bench.evaluation.result import Request
+from su3d_bench.core.errors import ConfigError
 
 SCHEMA = 1  # of the JSON file of several methods
+OF_A_REQUEST = ("dataset", "ground_truth", "truth_values", "format", "text_features", "confidences", "queries")
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "evaluate",
-        "Score predictions made elsewhere, under every protocol that fits; the format is recognised.",
-        (
-            "su3d-bench evaluate pred/ --ground-truth gt/ --protocols scannet-instance --out runs/mine",
-            "su3d-bench evaluate --name mine=predA theirs=predB --dataset replica --out runs/both",
-        ),
-        call,
-    )
-    parser.add_argument(
-        "predictions",
-        nargs="*",
-        type=Path,
-        metavar="PREDICTIONS",
-        help="a folder of predictions, a run folder, or files",
-    )
-    parser.add_argument(
-        "--name",
-        nargs="+",
+    parser = add_verb(verbs, "evaluate", call)
+    parser.option("predictions [PREDICTIONS...]", "a folder of predictions, a run folder, or files", type=Path)
+    parser.option(
+        "--name METHOD=PREDICTIONS...",
+        "several methods side by side; METHOD alone names PREDICTIONS (default: as the folder of --out)",
         action="extend",
         default=[],
-        metavar="METHOD=PREDICTIONS",
-        help="several methods side by side; METHOD alone names PREDICTIONS (default: as the folder of --out)",
     )
-    add_out(
-        parser,
-        "DIR",
-        "write a run folder there, which compare, attribute, report, check, sheets, query and export take",
+    parser.option(
+        "--out DIR", "write a run folder there, which compare, attribute, report, check, sheets, query and export take"
     )
-    parser.add_argument(
-        "--dataset", metavar="NAME", help="whose ground truth, below $SU3D_DATA: replica, scannet, rooms"
-    )
-    parser.add_argument(
-        "--ground-truth",
-        type=Path,
-        metavar="DIR",
-        help="ground truth as text instead, <scene>.txt with label * 1000 + instance a vertex, or label ids; or "
+    parser.option("--dataset NAME", "whose ground truth, below $SU3D_DATA: replica, scannet, rooms")
+    parser.option(
+        "--ground-truth DIR",
+        "ground truth as text instead, <scene>.txt with label * 1000 + instance a vertex, or label ids; or "
         "OpenLex3D's release",
     )
-    parser.add_argument(
+    parser.option(
         "--truth-values",
-        choices=("classes", "instances", "numbers"),
-        help="what that text holds, where its values do not tell: class ids, label * 1000 + instance, or numbers of "
+        "what that text holds, where its values do not tell: class ids, label * 1000 + instance, or numbers of "
         "objects alone (0 for none), as in the OpenSUN3D challenge",
+        choices=("classes", "instances", "numbers"),
     )
-    add_options(parser, "--protocols", "--scenes")
-    parser.add_argument("--format", metavar="FORMAT", help="of the predictions, where it cannot be recognised")
-    add_options(parser, "--text-features")
-    parser.add_argument(
+    parser.shared("--protocols", "--scenes")
+    parser.option("--format FORMAT", "of the predictions, where it cannot be recognised")
+    parser.shared("--text-features")
+    parser.option(
         "--confidences",
+        "where a protocol has 1 for every mask: its rule, or the files' (default: file for ScanNet's text)",
         choices=("protocol", "file"),
-        help="where a protocol has 1 for every mask: its rule, or the files' (default: file for ScanNet's text)",
     )
-    add_options(parser, "--queries")
-    parser.add_argument("--per-class", action="store_true", help="print the table of every class too")
-    add_options(parser, "--table-format")
+    parser.shared("--queries")
+    parser.option("--per-class", "print the table of every class too")
+    parser.shared("--table-format")
 
 
-def call(arguments: argparse.Namespace) -> int:
+def call(arguments: argparse.Namespace) -> None:
+    """Score predictions made elsewhere, under every protocol that fits; the format is recognised.
+
+    su3d-bench evaluate pred/ --ground-truth gt/ --protocols scannet-instance --out runs/mine
+    su3d-bench evaluate --name mine=predA theirs=predB --dataset replica --out runs/both
+    """
     from su3d_bench.evaluation.as_run import evaluate_methods
-    from su3d_bench.evaluation.evaluate import evaluate, said_of
+    from su3d_bench.evaluation.evaluate import said_of
+    from su3d_bench.evaluation.result import Request
     from su3d_bench.reports.tables.run import evaluation_tables, side_by_side_tables
     from su3d_bench.store.records import plain
 
-    requests = {method: _request(paths, arguments) for method, paths in _named(arguments).items()}
-    was_there = False
-    if len(requests) == 1 and arguments.out is None:
-        results = {method: evaluate(request) for method, request in requests.items()}
-    else:
-        run = evaluate_methods(requests, arguments.out)
-        results, was_there = dict(run.evaluations), run.was_there
+    chosen: dict[str, Any] = {name: getattr(arguments, name) for name in OF_A_REQUEST}
+    chosen |= {"protocols": tuple(arguments.protocols), "scenes": tuple(arguments.scenes)}
+    requests = {method: Request(tuple(paths), **chosen) for method, paths in _named(arguments).items()}
+    run = evaluate_methods(requests, arguments.out)
+    results = run.evaluations
     documents = {method: result.to_json() for method, result in results.items()}
     if len(results) == 1:
         (document,) = documents.values()
@@ -100,28 +79,9 @@ def call(arguments: argparse.Namespace) -> int:
         tables = side_by_side_tables(plain(run.metrics), documents, per_class=arguments.per_class)
     answer_tables(arguments, document, tables)
     for method, result in results.items():
-        for line in said_of(result):
-            remark(f"{method}: {line}" if len(results) > 1 else line, quiet=arguments.quiet)
+        remark(*(f"{method}: {line}" if len(results) > 1 else line for line in said_of(result)), quiet=arguments.quiet)
     if arguments.out is not None:
-        _say_next(arguments.out, list(results), was_there=was_there, is_quiet=arguments.quiet)
-    return EXIT_DONE
-
-
-def _request(paths: Sequence[Path], arguments: argparse.Namespace) -> Request:
-    from su3d_bench.evaluation.result import Request
-
-    return Request(
-        tuple(paths),
-        dataset=arguments.dataset,
-        ground_truth=arguments.ground_truth,
-        truth_values=arguments.truth_values,
-        protocols=tuple(arguments.protocols),
-        scenes=tuple(arguments.scenes),
-        format=arguments.format,
-        text_features=arguments.text_features,
-        confidences=arguments.confidences,
-        queries=arguments.queries,
-    )
+        _say_next(arguments.out, list(results), was_there=run.was_there, is_quiet=arguments.quiet)
 
 
 def _named(arguments: argparse.Namespace) -> dict[str, list[Path]]:
@@ -152,7 +112,10 @@ def _say_next(out: Path, methods: Sequence[str], *, was_there: bool, is_quiet: b
     pair = f"{run}:{method} " + (f"{run}:{shlex.quote(methods[1])}" if len(methods) > 1 else "OTHER_RUN")
     whose = f" --method {method}" if len(methods) > 1 else ""
     state = " (held this evaluation already, and is as it was)" if was_there else ""
-    remark(f"run folder: {out}{state}", quiet=is_quiet)
-    remark(f"next: su3d-bench compare {pair}", quiet=is_quiet)
-    remark(f"      su3d-bench report attribution {run}{whose}", quiet=is_quiet)
-    remark(f"      su3d-bench report tables {run} --format latex", quiet=is_quiet)
+    remark(
+        f"run folder: {out}{state}",
+        f"next: su3d-bench compare {pair}",
+        f"      su3d-bench report attribution {run}{whose}",
+        f"      su3d-bench report tables {run} --format latex",
+        quiet=is_quiet,
+    )

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.options import Verbs, add_options, add_out, add_verb
+from su3d_bench.cli.options import Verbs, add_verb
 from su3d_bench.cli.output import answer, answer_json, remark
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, counted, printable, suggest
+from su3d_bench.core.errors import ConfigError, PredictionError, counted, printable, suggest
 
 if TYPE_CHECKING:
+    from su3d_bench.core.config import RunConfig
     from su3d_bench.core.interfaces import Encoder
     from su3d_bench.metrics.protocols.model import ProtocolRules
     from su3d_bench.predictions.base import Content, Reader
@@ -24,34 +24,25 @@ QUERY_RULES = "opensun3d-queries"
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "export",
-        "Write predictions, our own or another program's, as the files that another evaluator takes.",
-        (
-            "su3d-bench runs export runs/my-run --to openlex3d --method opensu3d --out exported/opensu3d",
-            "su3d-bench runs export results/open3dis --to scannet --scenes 'replica/*' --out exported/open3dis",
-        ),
-        call,
-    )
-    parser.add_argument("path", type=Path, metavar="RUN_OR_PREDICTION", help="a run folder, or files of predictions")
-    parser.add_argument(
+    parser = add_verb(verbs, "export", call)
+    parser.option("path RUN_OR_PREDICTION", "a run folder, or files of predictions", type=Path)
+    parser.option(
         "--to",
-        required=True,
-        choices=TARGETS,
-        help="openlex3d: a cloud, the object of each point and features; scannet: lists of masks with class and score; "
+        "openlex3d: a cloud, the object of each point and features; scannet: lists of masks with class and score; "
         "scannetpp: such lists with run-length masks, or with a --protocol of kind top-k the classes of every vertex; "
         "opensun3d: the masks that answer the query of each scene of arkitscenes, with confidences",
+        required=True,
+        choices=TARGETS,
     )
-    add_out(parser, "DIR", "a new folder for the files", required=True)
-    parser.add_argument("--method", help="whose maps of a run (default: the only one that it was asked for)")
-    add_options(parser, "--scenes")
-    parser.add_argument("--format", help="the format of the prediction (default: found from its files)")
-    parser.add_argument(
-        "--protocol",
-        help="for scannet and scannetpp: whose classes and ground truth (default: the dataset's only one of instances)",
+    parser.option("--out DIR", "a new folder for the files", required=True)
+    parser.option("--method METHOD", "whose maps of a run (default: the only one that it was asked for)")
+    parser.shared("--scenes")
+    parser.option("--format FORMAT", "the format of the prediction (default: found from its files)")
+    parser.option(
+        "--protocol PROTOCOL",
+        "for scannet and scannetpp: whose classes and ground truth (default: the dataset's only one of instances)",
     )
-    add_options(parser, "--text-features")
+    parser.shared("--text-features")
 
 
 @dataclass(frozen=True)
@@ -68,54 +59,56 @@ class Source:
     run: Path | None = None
 
 
-def call(arguments: argparse.Namespace) -> int:
+def call(arguments: argparse.Namespace) -> None:
+    """Write predictions, our own or another program's, as the files that another evaluator takes.
+
+    su3d-bench runs export runs/my-run --to openlex3d --method opensu3d --out exported/opensu3d
+    su3d-bench runs export results/open3dis --to scannet --scenes 'replica/*' --out exported/open3dis
+    """
     from su3d_bench.predictions.export import whole_folder, write_openlex
 
     is_openlex = arguments.to == "openlex3d"
-    for flag, value in {"--protocol": arguments.protocol, "--text-features": arguments.text_features}.items():
-        is_unused = is_openlex or (arguments.to == "opensun3d" and flag == "--protocol")
-        if value is not None and is_unused:
-            others = "scannet or scannetpp" if flag == "--protocol" else "scannet, scannetpp or opensun3d"
-            raise ConfigError(f"{flag} {value}: belongs to --to {others}; leave it out")
+    for flag, value, users in (
+        ("--protocol", arguments.protocol, TARGETS[1:3]),
+        ("--text-features", arguments.text_features, TARGETS[1:]),
+    ):
+        if value is not None and arguments.to not in users:
+            raise ConfigError(f"{flag} {value}: belongs to --to {' or '.join(users)}; leave it out")
     sources = chosen(sources_of(arguments.path, arguments.format, arguments.method), arguments.scenes, arguments.path)
     names = _names([source.address for source in sources], is_flat=not is_openlex)
     rows = []
     with whole_folder(arguments.out) as folder:
         for source, name in zip(sources, names, strict=True):
             prediction = source.reader.read(source.path, source.scene)
-            with _named(source):
+            try:
                 if is_openlex:
                     remarks = write_openlex(prediction.content, folder / name)
                 elif arguments.to == "opensun3d":
                     remarks = _write_answer(prediction.content, source, arguments, name, folder)
                 else:
                     remarks = _write_for_classes(prediction.content, source, arguments, name, folder)
+            except PredictionError as error:
+                raise PredictionError(f"{printable(source.address, 120)}: {error}") from error
             remarks = (*_partial_remark(source.run), *prediction.remarks, *remarks)
             rows.append({"scene": source.address, "remarks": list(remarks)})
     if answer_json(arguments, {"to": arguments.to, "folder": str(arguments.out), "scenes": rows}):
-        return EXIT_DONE
+        return
     for row in rows:
         for line in row["remarks"]:
             remark(printable(f"{row['scene']}: {line}"), quiet=arguments.quiet)
     answer(f"{counted(len(rows), 'scene')} for {arguments.to}: {arguments.out}")
-    return EXIT_DONE
 
 
 def _partial_remark(run: Path | None) -> tuple[str, ...]:
     """That a map is of the first frames only, where its run was limited."""
-    from su3d_bench.core.config import RunConfig, read_file, resolve
-
-    limit = 0 if run is None else resolve(read_file(run / "run.toml"), (), RunConfig).limit
+    limit = 0 if run is None else _config_of(run).limit
     return (f"partial: the map is of the first {limit} updates of the scene",) if limit else ()
 
 
-@contextmanager
-def _named(source: Source) -> Iterator[None]:
-    """Errors of the block begin with the scene."""
-    try:
-        yield
-    except PredictionError as error:
-        raise PredictionError(f"{printable(source.address, 120)}: {error}") from error
+def _config_of(run: Path) -> RunConfig:
+    from su3d_bench.core.config import RunConfig, read_file, resolve
+
+    return resolve(read_file(run / "run.toml"), (), RunConfig)
 
 
 def sources_of(path: Path, format: str | None, method: str | None) -> list[Source]:
@@ -143,11 +136,10 @@ def sources_of(path: Path, format: str | None, method: str | None) -> list[Sourc
 
 def _only_method(maps: Mapping[str, Sequence[Path]]) -> str | None:
     """The one method that a run was asked for; the ceiling that comes with it is not meant."""
-    from su3d_bench.core.config import RunConfig, read_file, resolve
     from su3d_bench.core.registry import CEILING_METHOD
 
     run = _run_of(next(iter(maps.values()))[0])
-    is_single = run is not None and len(resolve(read_file(run / "run.toml"), (), RunConfig).methods) == 1
+    is_single = run is not None and len(_config_of(run).methods) == 1
     names = [name for name in maps if name != CEILING_METHOD] if is_single and len(maps) > 1 else list(maps)
     return names[0] if len(names) == 1 else None
 
@@ -182,8 +174,7 @@ def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> li
             if fnmatch.fnmatchcase(source.scene, tail if lacks_dataset else pattern):
                 matching.append(replace(source, address=f"{dataset}/{source.scene}") if lacks_dataset else source)
         if not matching:
-            known = [source.scene for source in sources]
-            hint = suggest(pattern, known, "it has")
+            hint = suggest(pattern, [source.scene for source in sources], "it has")
             raise ConfigError(printable(f"no scene of {path} matches '{pattern}'{hint}"))
         matches.update({source.address: source for source in matching})
     return list(matches.values())
@@ -213,23 +204,23 @@ def _write_for_classes(
     from su3d_bench.predictions.base import VertexMasks
 
     is_scannetpp = arguments.to == "scannetpp"
+
+    def write(masks: Any, rules: ProtocolRules | None) -> tuple[str, ...]:
+        if is_scannetpp:
+            return export.write_scannetpp(masks, rules, name, folder)
+        return export.write_scannet(masks, name, folder)
+
     if isinstance(content, VertexMasks) and not export.needs_truth(content, "line" if is_scannetpp else "id"):
         masks = export.masks_as_they_are(content)
-        if is_scannetpp:
-            return export.write_scannetpp(masks, None, name, folder)
-        return export.write_scannet(masks, name, folder)
-    if "/" not in source.address:
-        raise PredictionError(f"which dataset it is of is not known; name it, such as --scenes replica/{source.scene}")
-    dataset, scene = _scene_of(source, is_quiet=arguments.quiet)
+        return write(masks, None)
+    dataset, scene = _scene_of(source, "replica", is_quiet=arguments.quiet)
     rules = _rules(arguments.protocol, dataset, source.run, is_ranked=is_scannetpp)
     encoder = _encoder(content, source, rules, arguments.text_features)
     truth = dataset.ground_truth(scene, rules.ground_truth)
     if not rules.names_masks:
         return export.write_scannetpp_labels(content, rules, truth, encoder, name, folder)
     masks = export.masks_on_truth(content, rules, truth, encoder)
-    if is_scannetpp:
-        return export.write_scannetpp(masks, rules, name, folder)
-    return export.write_scannet(masks, name, folder)
+    return write(masks, rules)
 
 
 def _write_answer(
@@ -243,31 +234,27 @@ def _write_answer(
 
     if isinstance(content, VertexMasks) and export.is_answer(content):
         return export.write_opensun3d(export.answer_as_it_is(content), name, folder)
-    if "/" not in source.address:
-        raise PredictionError(
-            f"which dataset it is of is not known; name it, such as --scenes arkitscenes/{source.scene}"
-        )
-    dataset, scene = _scene_of(source, is_quiet=arguments.quiet)
+    dataset, scene = _scene_of(source, "arkitscenes", is_quiet=arguments.quiet)
     if not isinstance(dataset, AsksText) or not isinstance(dataset, HasSurface):
         raise PredictionError("its dataset asks for nothing in its scenes; --to opensun3d takes scenes of arkitscenes")
     rules = load_protocol(QUERY_RULES)
     encoder = _encoder(content, source, rules, arguments.text_features)
     asked = dataset.asked_text(scene)
     vertices = dataset.surface(scene).vertices
-    answer = export.answer_to(asked, content, rules, vertices, encoder)
-    return export.write_opensun3d(answer, name, folder)
+    return export.write_opensun3d(export.answer_to(asked, content, rules, vertices, encoder), name, folder)
 
 
-def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:
+def _scene_of(source: Source, usual: str, *, is_quiet: bool) -> tuple[Any, str]:
     """The dataset and the scene of a prediction, with the options and the data of the run that it lies in."""
     from su3d_bench.cli.scenes import chosen_scenes
     from su3d_bench.runs.finished import data_of_map
 
+    if "/" not in source.address:
+        raise PredictionError(f"which dataset it is of is not known; name it, such as --scenes {usual}/{source.scene}")
     if source.run is None:
         return chosen_scenes([source.address], [], is_quiet=is_quiet)[0]
-    return data_of_map(source.run, source.address, source.path).dataset(source.address), source.address.partition("/")[
-        2
-    ]
+    data = data_of_map(source.run, source.address, source.path)
+    return data.dataset(source.address), source.address.partition("/")[2]
 
 
 def _rules(name: str | None, dataset: Any, run: Path | None, *, is_ranked: bool) -> ProtocolRules:
@@ -276,34 +263,25 @@ def _rules(name: str | None, dataset: Any, run: Path | None, *, is_ranked: bool)
     Those of kind top-k fit only where classes are ranked (``is_ranked``).
     """
     from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
-    from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for
+    from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names, protocols_for
+    from su3d_bench.runs.finished import read_run
 
-    fitting = {rules.name: rules for rules in map(load_protocol, protocols_for(dataset.name)) if _has_masks(rules)}
+    def has_masks(rules: ProtocolRules) -> bool:
+        return rules.names_masks and rules.confidence is not None
+
+    fitting = {rules.name: rules for rules in map(load_protocol, protocols_for(dataset.name)) if has_masks(rules)}
     if name is None:
         if len({(rules.ground_truth, rules.classes) for rules in fitting.values()}) != 1:
             known = ", ".join(fitting) or "none fits by itself"
             raise ConfigError(f"{dataset.name}: whose classes? name a protocol with --protocol ({known})")
         return next(iter(fitting.values()))
-    rules = _of_run(name, run) or load_protocol(name)
+    is_own = run is not None and not name.endswith(".toml") and name not in protocol_names()
+    finished = read_run(run) if run is not None and is_own else None
+    rules = finished.rules(name) if finished is not None and name in finished.protocols else load_protocol(name)
     reason = why_not_truth(rules, TruthFacts.of_dataset(dataset))
-    if reason is not None or not (_has_masks(rules) or (is_ranked and rules.kind == "top-k")):
+    if reason is not None or not (has_masks(rules) or (is_ranked and rules.kind == "top-k")):
         raise ConfigError(f"--protocol {name}: {reason or 'has no classes of instances'}")
     return rules
-
-
-def _of_run(name: str, run: Path | None) -> ProtocolRules | None:
-    """Somebody's own rules that ``run`` was scored by; None where it has none of that name."""
-    from su3d_bench.metrics.protocols.loading import protocol_names
-    from su3d_bench.runs.finished import read_run
-
-    if run is None or name in protocol_names() or name.endswith(".toml"):
-        return None
-    finished = read_run(run)
-    return finished.rules(name) if name in finished.protocols else None
-
-
-def _has_masks(rules: ProtocolRules) -> bool:
-    return rules.names_masks and rules.confidence is not None
 
 
 def _encoder(content: Content, source: Source, rules: ProtocolRules, texts: Path | None) -> Encoder | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -10,54 +11,39 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.options import Verbs, add_group, add_options, add_verb, perception_config
+from su3d_bench.cli.options import Parser, Verbs, add_group, add_verb, perception_config
 from su3d_bench.cli.output import answer_either, drawn_bars, remark
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, suggest
+from su3d_bench.core.errors import ConfigError, suggest
 
 if TYPE_CHECKING:
     from su3d_bench.fetching.bringing import Brought, Planned
     from su3d_bench.fetching.download import Patience, Watch
-    from su3d_bench.fetching.sources import Source, Sources
+    from su3d_bench.fetching.sources import Source
 
 MB = 1_000_000
 
 
-def _add_fetch_options(parser: argparse.ArgumentParser, *, has_servers: bool = True) -> None:
+def _add_fetch_options(parser: Parser, *, has_servers: bool = True) -> None:
     """``--accept``, ``--dry-run``, ``--retries``; where servers are in the table, ``--mirror`` and ``--sources``."""
-    parser.add_argument(
-        "--accept",
-        nargs="+",
+    parser.option(
+        "--accept NAME...",
+        "accept the licence of what has this name, or the licence itself, such as MIT (default: you are asked)",
         action="extend",
         default=[],
-        metavar="NAME",
-        help="accept the licence of what has this name, or the licence itself, such as MIT (default: you are asked)",
     )
-    add_options(parser, "--dry-run")
-    parser.add_argument(
-        "--retries", type=int, default=3, metavar="N", help="how often a broken download is taken up again (default: 3)"
-    )
+    parser.shared("--dry-run")
+    parser.option("--retries N", "how often a broken download is taken up again (default: 3)", type=int, default=3)
     if has_servers:
-        parser.add_argument(
-            "--mirror",
-            nargs="+",
+        parser.option(
+            "--mirror NAME=URL...",
+            "take its files from this folder of another server; for a repository of the hub, another endpoint",
             action="extend",
             default=[],
-            metavar="NAME=URL",
-            help="take its files from this folder of another server; for a repository of the hub, another endpoint",
         )
-        parser.add_argument(
-            "--sources",
-            type=Path,
-            metavar="FILE",
-            help="a TOML file of your own in the form of the program's table, whose entries take the place of its own",
+        parser.option(
+            "--sources FILE",
+            "a TOML file of your own in the form of the program's table, whose entries take the place of its own",
         )
-
-
-def sources_of(arguments: argparse.Namespace) -> Sources:
-    """The table as the flags of ``arguments`` change it."""
-    from su3d_bench.fetching.sources import load_sources
-
-    return load_sources(getattr(arguments, "sources", None), getattr(arguments, "mirror", ()))
 
 
 def patience_of(arguments: argparse.Namespace) -> Patience:
@@ -68,14 +54,7 @@ def patience_of(arguments: argparse.Namespace) -> Patience:
     return Patience(n_retries=arguments.retries)
 
 
-def size_text(n_bytes: int | None) -> str:
-    """A size in words: in MB below ten GB."""
-    if n_bytes is None:
-        return "size not stated"
-    return f"{n_bytes / MB:,.0f} MB" if n_bytes < 10_000 * MB else f"{n_bytes / MB / 1000:,.1f} GB"
-
-
-def fetch_planned(arguments: argparse.Namespace, planned: Sequence[Planned]) -> int:
+def fetch_planned(arguments: argparse.Namespace, planned: Sequence[Planned]) -> None:
     """Show, ask, bring what is missing, and answer; with ``--dry-run`` only show."""
     from su3d_bench.fetching.bringing import fetch
 
@@ -83,7 +62,7 @@ def fetch_planned(arguments: argparse.Namespace, planned: Sequence[Planned]) -> 
     if arguments.dry_run:
         lines = [line for entry in planned for line in plan_lines(entry.source, entry.here)]
         answer_either(arguments, [plan_row(entry.source, entry.here) for entry in planned], *lines)
-        return EXIT_DONE
+        return
     patience = patience_of(arguments)
     missing = [entry for entry in planned if entry.here is None]
     accept(arguments, [entry.source for entry in missing])
@@ -91,7 +70,6 @@ def fetch_planned(arguments: argparse.Namespace, planned: Sequence[Planned]) -> 
     with watching(arguments) as watch:
         brought = [fetch(entry, watch, patience, keep_archives=keep) for entry in missing]
     answer_brought(arguments, [(entry.source.name, entry.here) for entry in planned if entry.here], brought)
-    return EXIT_DONE
 
 
 def answer_brought(arguments: argparse.Namespace, here: Sequence[tuple[str, Path]], brought: Sequence[Brought]) -> None:
@@ -99,48 +77,44 @@ def answer_brought(arguments: argparse.Namespace, here: Sequence[tuple[str, Path
     rows: list[dict[str, Any]] = [{"name": name, "folder": str(folder), "files": []} for name, folder in here]
     lines = [f"{name}: was there already: {folder}" for name, folder in here]
     for entry in brought:
-        rows.append(
-            {
-                "name": entry.source.name,
-                "folder": str(entry.place),
-                "files": [asdict(file) for file in entry.files],
-                "remarks": list(entry.remarks),
-            }
-        )
+        row = {"name": entry.source.name, "folder": str(entry.place), "files": [asdict(file) for file in entry.files]}
+        rows.append(row | {"remarks": list(entry.remarks)})
         lines.append(f"{entry.source.name}: {entry.place}")
-        lines += [f"  {file.sha256}  {file.name}{_agreement(file.held_against)}" for file in entry.files]
-        for text in entry.remarks:
-            remark(f"{entry.source.name}: {text}", quiet=arguments.quiet)
+        for file in entry.files:
+            sums = (
+                f"agrees with: {', '.join(file.held_against)}"
+                if file.held_against
+                else "no checksum is stated; recorded"
+            )
+            lines.append(f"  {file.sha256}  {file.name}  ({sums})")
+        remark(*(f"{entry.source.name}: {text}" for text in entry.remarks), quiet=arguments.quiet)
     answer_either(arguments, rows, *lines)
-
-
-def _agreement(held_against: Sequence[str]) -> str:
-    return f"  (agrees with: {', '.join(held_against)})" if held_against else "  (no checksum is stated; recorded)"
 
 
 def plan_row(source: Source, here: Path | None) -> dict[str, Any]:
     """A source as ``--dry-run --json`` gives it: every fact with where it was read."""
     from su3d_bench.fetching.download import hub_addresses
 
-    row = source.model_dump(mode="json", exclude_none=True)
-    row["n_bytes"] = source.n_bytes
-    row["is_exact"] = source.is_exact
-    row["addresses"] = [file.address for file in source.files] if source.hub is None else hub_addresses(source)
-    row["here"] = None if here is None else str(here)
-    return row
+    return source.model_dump(mode="json", exclude_none=True) | {
+        "n_bytes": source.n_bytes,
+        "is_exact": source.is_exact,
+        "addresses": [file.address for file in source.files] if source.hub is None else hub_addresses(source),
+        "here": None if here is None else str(here),
+    }
 
 
 def plan_lines(source: Source, here: Path | None) -> list[str]:
     """A source in words: size, licence, every address."""
-    row = plan_row(source, here)
-    about = "" if source.is_exact or source.n_bytes is None else "about "
-    state = f"was there already: {here}" if here is not None else "to be fetched"
-    lines = [
+    from su3d_bench.store.caches import size_text
+
+    about = "" if source.is_exact else "about "
+    size = "size not stated" if source.n_bytes is None else f"{about}{size_text(source.n_bytes)}"
+    return [
         f"{source.name}: {source.what}",
-        f"  {about}{size_text(source.n_bytes)}, {state}",
+        f"  {size}, {f'was there already: {here}' if here is not None else 'to be fetched'}",
         f"  licence {source.licence.name}: {source.licence.address}",
+        *(f"  {address}" for address in plan_row(source, here)["addresses"]),
     ]
-    return lines + [f"  {address}" for address in row["addresses"]]
 
 
 def accept(arguments: argparse.Namespace, sources: Sequence[Source]) -> None:
@@ -159,15 +133,11 @@ def accept(arguments: argparse.Namespace, sources: Sequence[Source]) -> None:
         if not (sys.stdin.isatty() and sys.stderr.isatty()):
             raise ConfigError(
                 f"fetch: the licence '{name}' ({address}) of {names} was not accepted; read it, then add --accept "
-                f"{those[0].name if len(those) == 1 else _quoted(name)}"
+                f"{those[0].name if len(those) == 1 else shlex.quote(name)}"
             )
         remark(f"{names}: under '{name}', {address}; do you accept it? [y/N]")
         if sys.stdin.readline().strip().lower() not in ("y", "yes"):
             raise ConfigError(f"fetch: the licence '{name}' of {names} was not accepted; nothing of it was fetched")
-
-
-def _quoted(name: str) -> str:
-    return f"'{name}'" if " " in name else name
 
 
 def _known_terms(arguments: argparse.Namespace, sources: Sequence[Source]) -> None:
@@ -200,88 +170,67 @@ def watching(arguments: argparse.Namespace) -> Iterator[Watch]:
 
 
 def add_models(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "fetch",
-        "Fetch foundation models into $SU3D_MODELS: from the Hugging Face hub, or where their authors publish them.",
-        (
-            "su3d-bench models fetch --for paper --accept MIT Apache-2.0",
-            "su3d-bench models fetch sam-vit-h --dry-run",
-        ),
-        call_models,
-        takes_up=True,
-    )
-    parser.add_argument("names", nargs="*", metavar="MODEL", help="short names, as models list has them")
-    parser.add_argument("--for", dest="profile", metavar="PROFILE", help="every model that this profile loads: paper")
+    parser = add_verb(verbs, "fetch", call_models, takes_up=True)
+    parser.option("names [MODEL...]", "short names, as models list has them")
+    parser.option("--for PROFILE", "every model that this profile loads: paper", dest="profile")
     _add_fetch_options(parser)
-    add_options(parser, "--set")
+    parser.shared("--set")
 
 
-def call_models(arguments: argparse.Namespace) -> int:
+def call_models(arguments: argparse.Namespace) -> None:
+    """Fetch foundation models into $SU3D_MODELS: from the Hugging Face hub, or where their authors publish them.
+
+    su3d-bench models fetch --for paper --accept MIT Apache-2.0
+    su3d-bench models fetch sam-vit-h --dry-run
+    """
     from su3d_bench.fetching.bringing import plan_models
+    from su3d_bench.fetching.sources import load_sources
     from su3d_bench.perception.models.files import models_folder
 
     root = models_folder(perception_config(arguments).models.folder)
-    return fetch_planned(arguments, plan_models(sources_of(arguments), arguments.names, arguments.profile, root))
+    sources = load_sources(arguments.sources, arguments.mirror)
+    fetch_planned(arguments, plan_models(sources, arguments.names, arguments.profile, root))
 
 
 def add_data(verbs: Verbs) -> None:
-    """``datasets fetch`` with a sub-verb for each dataset that can be fetched."""
-    actions = add_group(
-        verbs,
-        "fetch",
-        "Fetch published data: shown first, resumed, checked, unpacked where it is looked for.",
-        ("su3d-bench datasets fetch replica --dry-run", "su3d-bench datasets fetch scannet --dry-run"),
-    )
-    _add_replica(actions)
-    _add_scannet(actions)
+    """Fetch published data: shown first, resumed, checked, unpacked where it is looked for.
 
-
-def _add_replica(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "replica",
-        "Fetch Replica into $SU3D_DATA: NICE-SLAM's RGB-D frames, and the annotated meshes of the release.",
-        ("su3d-bench datasets fetch replica --dry-run", "su3d-bench datasets fetch replica frames --accept replica"),
-        call_replica,
-        takes_up=True,
-    )
-    parser.add_argument("parts", nargs="*", metavar="PART", help="frames, meshes (default: both)")
-    parser.add_argument("--keep-archives", action="store_true", help="keep what was unpacked, in .fetched")
+    su3d-bench datasets fetch replica --dry-run
+    su3d-bench datasets fetch scannet --dry-run
+    """
+    actions = add_group(verbs, "fetch", add_data)
+    parser = add_verb(actions, "replica", call_replica, takes_up=True)
+    parser.option("parts [PART...]", "frames, meshes (default: both)")
+    parser.option("--keep-archives", "keep what was unpacked, in .fetched")
     _add_fetch_options(parser)
-
-
-def call_replica(arguments: argparse.Namespace) -> int:
-    from su3d_bench.fetching.bringing import plan_replica
-    from su3d_bench.runs.scenes import data_root
-
-    return fetch_planned(arguments, plan_replica(sources_of(arguments), arguments.parts, data_root()))
-
-
-def _add_scannet(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "scannet",
-        "Fetch scans of ScanNet into $SU3D_DATA by your own official script or link, or say how to sign its terms.",
-        (
-            "su3d-bench datasets fetch scannet --script download-scannet.py",
-            "su3d-bench datasets fetch scannet val --from https://example.org/scannet --accept scannet",
-        ),
-        call_scannet,
-        takes_up=True,
-    )
-    parser.add_argument(
-        "scans", nargs="*", metavar="SCAN", help="scene0000_00, paper, train, val or test (default: paper)"
-    )
+    parser = add_verb(actions, "scannet", call_scannet, takes_up=True)
+    parser.option("scans [SCAN...]", "scene0000_00, paper, train, val or test (default: paper)")
     given = parser.add_mutually_exclusive_group()
-    given.add_argument("--script", type=Path, metavar="FILE", help="your official download script")
-    given.add_argument(
-        "--from", dest="address", metavar="URL", help="your own link, in which v1/scans and v2/scans lie"
-    )
+    parser.option("--script FILE", "your official download script", given)
+    parser.option("--from URL", "your own link, in which v1/scans and v2/scans lie", given, dest="address")
     _add_fetch_options(parser, has_servers=False)
 
 
-def call_scannet(arguments: argparse.Namespace) -> int:
+def call_replica(arguments: argparse.Namespace) -> None:
+    """Fetch Replica into $SU3D_DATA: NICE-SLAM's RGB-D frames, and the annotated meshes of the release.
+
+    su3d-bench datasets fetch replica --dry-run
+    su3d-bench datasets fetch replica frames --accept replica
+    """
+    from su3d_bench.fetching.bringing import plan_replica
+    from su3d_bench.fetching.sources import load_sources
+    from su3d_bench.runs.scenes import data_root
+
+    sources = load_sources(arguments.sources, arguments.mirror)
+    fetch_planned(arguments, plan_replica(sources, arguments.parts, data_root()))
+
+
+def call_scannet(arguments: argparse.Namespace) -> None:
+    """Fetch scans of ScanNet into $SU3D_DATA by your own official script or link, or say how to sign its terms.
+
+    su3d-bench datasets fetch scannet --script download-scannet.py
+    su3d-bench datasets fetch scannet val --from https://example.org/scannet --accept scannet
+    """
     from su3d_bench.fetching.scannet import fetch_by_script, fetch_from, how_to_sign, plan_scans
     from su3d_bench.fetching.sources import built_in
     from su3d_bench.runs.scenes import data_root
@@ -294,15 +243,13 @@ def call_scannet(arguments: argparse.Namespace) -> int:
         row = plan_row(source, here) | {"missing": missing, "label_table": scans.label_table}
         counts = f"  {scans.n_files} files of {scans.n_asked} scans are missing below {root}"
         answer_either(arguments, [row], *plan_lines(source, here), counts, *(f"  {name}" for name in missing))
-        return EXIT_DONE
+        return
     if scans.is_here:
         answer_brought(arguments, [(source.name, root)], [])
-        return EXIT_DONE
+        return
     if arguments.script is None and arguments.address is None:
         raise how_to_sign(source)
-    for name in arguments.accept:
-        if name.lower() not in (source.name, source.licence.name.lower()):
-            raise ConfigError(f"--accept '{name}': is nothing that is asked for; known: {source.name}")
+    _known_terms(arguments, [source])
     accept(arguments, [source])
     with watching(arguments) as watch:
         if arguments.script is not None:
@@ -310,4 +257,3 @@ def call_scannet(arguments: argparse.Namespace) -> int:
         else:
             brought = fetch_from(source, scans, arguments.address, watch, patience_of(arguments))
     answer_brought(arguments, [], [brought])
-    return EXIT_DONE

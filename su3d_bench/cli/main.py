@@ -4,42 +4,30 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
+from textwrap import wrap
 
 from su3d_bench.cli.options import Parser
 from su3d_bench.cli.output import remark
-from su3d_bench.core.errors import (
-    EXIT_DONE,
-    EXIT_INTERNAL,
-    EXIT_WRONG_INPUT,
-    Su3dError,
-    error_line,
-    own_line,
-    printable,
-)
+from su3d_bench.core import errors
+from su3d_bench.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_WRONG_INPUT, Su3dError, printable
 from su3d_bench.core.printing import doors
 from su3d_bench.core.system.endings import Ended, ending_in_order
 from su3d_bench.core.version import __version__
 
-# The modules of this folder with ``add_parser(verbs)``, and their verbs, in the order of the help.
-MODULES = {
-    "run": ("run", "ablate"),
-    "evaluate": ("evaluate",),
-    "reproduce": ("reproduce",),
-    "compare": ("compare", "check"),
-    "report": ("report",),
-    "runs": ("runs",),
-    "query": ("query",),
-    "sheets": ("sheets",),
-    "datasets": ("datasets",),
-    "models": ("models",),
-    "methods": ("methods",),
-    "protocols": ("protocols",),
-    "dev": ("dev",),
+# The verbs as the help lists them; each is in the module of this folder that bears its name or stands beside it.
+GROUPS = {
+    "run and score": ("run", "ablate", "evaluate", "reproduce"),
+    "compare and report": ("compare", "check", "report", "runs"),
+    "questions and people": ("query", "sheets"),
+    "data, models and rules": ("datasets", "models", "methods", "protocols"),
+    "maintain": ("dev",),
 }
+MODULE_OF = {"ablate": "run", "check": "compare"}
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 DESCRIPTION = "Evaluate and benchmark open-vocabulary, instance-level 3D scene understanding from RGB-D."
 EPILOG = """examples:
@@ -48,17 +36,28 @@ EPILOG = """examples:
 """
 
 
+class Help(argparse.RawDescriptionHelpFormatter):
+    """The verbs in groups, each with what its help begins with."""
+
+    def _format_action(self, action: argparse.Action) -> str:
+        if not isinstance(action, argparse._SubParsersAction):
+            return super()._format_action(action)
+        about = {one.dest: re.split("[:;]", str(one.help))[0] for one in action._choices_actions}
+        lines = []
+        for group, verbs in GROUPS.items():
+            lines.append(f"  {group}:")
+            for verb in verbs:
+                lines += wrap(f"{verb:<10} {about[verb]}", 79, initial_indent=" " * 4, subsequent_indent=" " * 15)
+        return "\n".join([*lines, ""])
+
+
 def build_parser(verb: str | None = None) -> Parser:
     """The parser of all verbs, or of ``verb`` alone where it is one; nothing heavy is imported for it."""
-    parser = Parser(
-        prog="su3d-bench",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = Parser(prog="su3d-bench", description=DESCRIPTION, epilog=EPILOG, formatter_class=Help)
     parser.add_argument("--version", action="version", version=f"su3d-bench {__version__}")
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
-    for name in [name for name, own in MODULES.items() if verb in own] or MODULES:
+    known = [one for group in GROUPS.values() for one in group]
+    for name in dict.fromkeys(MODULE_OF.get(one, one) for one in ([verb] if verb in known else known)):
         import_module(f"su3d_bench.cli.{name}").add_parser(verbs)
     return parser
 
@@ -113,8 +112,8 @@ def _exit_code(words: Sequence[str]) -> int:
         if not arguments.uses_all_cores:
             limit_threads()  # before numerical libraries are loaded
         with ending_in_order():
-            code: int = arguments.call(arguments)
-        return code
+            code: int | None = arguments.call(arguments)
+        return EXIT_DONE if code is None else code
     except KeyboardInterrupt as end:
         how = f"ended by {end}" if isinstance(end, Ended) else "interrupted"
         again = "takes it up again" if getattr(arguments, "takes_up", False) else "begins anew"
@@ -131,8 +130,8 @@ def _exit_code(words: Sequence[str]) -> int:
         if isinstance(error, Su3dError):
             remark(f"su3d-bench: {error}")
             return error.exit_code
-        if own_line(error):  # the mistake is in somebody's own method or dataset
-            remark(f"su3d-bench: {error_line(error)}")
+        if errors.own_line(error):  # the mistake is in somebody's own method or dataset
+            remark(f"su3d-bench: {errors.error_line(error)}")
             return EXIT_WRONG_INPUT
         text = printable(f"{type(error).__name__}: {error}")
         hint = "" if is_debug else "; run again with --debug for the traceback"

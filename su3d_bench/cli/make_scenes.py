@@ -5,17 +5,16 @@ from __future__ import annotations
 import argparse
 import os
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, NoReturn
 
-from su3d_bench.cli.output import answer_either, drawn_bars, remark
+from su3d_bench.cli.output import answer_either, overall_progress, remark
 from su3d_bench.core import registry
 from su3d_bench.core.config import read_assignments
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, nearest
+from su3d_bench.core.errors import ConfigError, DataError, nearest
 from su3d_bench.core.files.atomic import make_folder
 from su3d_bench.datasets.layouts import LAYOUTS
 from su3d_bench.datasets.writing import SceneTarget, finish_scene, plan_scenes, write_frames
@@ -47,7 +46,7 @@ class Unit:
         return 1 if self.indices is None else len(self.indices)
 
 
-def make(arguments: argparse.Namespace) -> int:
+def make(arguments: argparse.Namespace) -> None:
     """Make what was asked for and print, scene by scene, whether it was made or was there already."""
     part = dataset_part(arguments.dataset, arguments.set)
     scenes = _scenes(part, arguments.scenes)
@@ -70,7 +69,6 @@ def make(arguments: argparse.Namespace) -> int:
     lines = [f"{row['scene']:<16} {row['status']:<17} {row['address']}" for row in rows]
     answer_either(arguments, {"out": str(out), "layout": arguments.layout, "scenes": rows}, *lines)
     remark(f"to use them: SU3D_DATA={out} su3d-bench run --scenes '{reader}/*'", quiet=arguments.quiet)
-    return EXIT_DONE
 
 
 def dataset_part(name: str, assignments: Sequence[str]) -> Part:
@@ -123,7 +121,8 @@ def make_files(part: Part, scenes: Sequence[str], out: Path, arguments: argparse
 
 def _run(units: Sequence[Unit], arguments: argparse.Namespace, done: Callable[[Unit], None]) -> None:
     n_workers = min(arguments.jobs or os.cpu_count() or 1, len(units))
-    with _progress(units, is_quiet=arguments.quiet) as report:
+    with overall_progress("making", is_quiet=arguments.quiet) as (begin, report):
+        begin(sum(unit.n_steps for unit in units))
         if n_workers > 1:
             outcomes = run_processes(_work, units, report, jobs=n_workers, lost=_lost)
         else:
@@ -134,7 +133,7 @@ def _run(units: Sequence[Unit], arguments: argparse.Namespace, done: Callable[[U
 
 def _work(unit: Unit, report: Report) -> Unit:
     dataset = _dataset(unit.dataset, unit.root)
-    label = _label(unit)
+    name = f"{unit.scene}, {'truth' if unit.indices is None else f'frames from {unit.indices.start}'}"
     if unit.target is None:
         dataset.scan(unit.scene)
     elif unit.indices is None:
@@ -143,10 +142,10 @@ def _work(unit: Unit, report: Report) -> Unit:
         layout, n = LAYOUTS[unit.layout], unit.n_steps
 
         def count(n_done: int) -> None:
-            report(Event(unit.scene, label, n_done, n))
+            report(Event(name, "making", n_done, n))
 
         write_frames(layout, dataset, unit.target, unit.indices, count)
-    report(Event(unit.scene, label, unit.n_steps, unit.n_steps))
+    report(Event(name, "made", unit.n_steps, unit.n_steps))
     return unit
 
 
@@ -158,24 +157,3 @@ def _dataset(part: Part, root: Path) -> Any:
 
 def _lost(unit: Unit, cause: str) -> NoReturn:
     raise DataError(f"{unit.dataset.name}/{unit.scene}: {cause}")
-
-
-def _label(unit: Unit) -> str:
-    return "truth" if unit.indices is None else f"frames from {unit.indices.start}"
-
-
-@contextmanager
-def _progress(units: Sequence[Unit], *, is_quiet: bool) -> Iterator[Report]:
-    """A ``Report`` that moves one bar over all steps; it draws nothing where stderr is no terminal."""
-    n_done: dict[tuple[str, str], int] = {}
-    with drawn_bars(is_quiet=is_quiet, tells_time_left=True) as bars:
-        if bars is None:
-            yield lambda event: None
-            return
-        task = bars.add_task("making", total=sum(unit.n_steps for unit in units), remark="")
-
-        def report(event: Event) -> None:
-            n_done[event.unit, event.label] = event.done
-            bars.update(task, completed=sum(n_done.values()), description=f"{event.unit}, {event.label}")
-
-        yield report

@@ -5,14 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import textwrap
-from collections.abc import Mapping
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.new import add_new
 from su3d_bench.cli.options import Verbs, add_group, add_verb
 from su3d_bench.cli.output import answer, answer_document, answer_either, answer_json
-from su3d_bench.core.errors import EXIT_DONE, counted
+from su3d_bench.core.errors import counted
 from su3d_bench.core.printing import one_line
 
 if TYPE_CHECKING:
@@ -22,48 +21,38 @@ WIDTH = 118
 
 
 def add_parser(verbs: Verbs) -> None:
-    actions = add_group(
-        verbs,
-        "methods",
-        "List the methods that can be run, show the settings of one, try one on two frames, or write one of your own.",
-        ("su3d-bench methods list", "su3d-bench methods show opensu3d"),
-        lists=True,
-    )
-    add_verb(
-        actions,
-        "list",
-        "List the methods that can be run: where they come from, their licence, what they need.",
-        ("su3d-bench methods list", "su3d-bench methods list --json"),
-        call_list,
-    )
-    parser = add_verb(
-        actions,
-        "show",
-        "Show the settings of a method, its presets and what papers report of it.",
-        ("su3d-bench methods show opensu3d", "su3d-bench methods show my_method.py:MyMethod"),
-        call_show,
-    )
-    parser.add_argument("name", metavar="METHOD", help="its name, or file.py:Class")
-    parser = add_verb(
-        actions,
-        "check",
-        "Try a method on two frames of a room, and name what is wrong with what it gives.",
-        ("su3d-bench methods check oracle", "su3d-bench methods check my_method.py:MyMethod"),
-        call_check,
-    )
-    parser.add_argument("name", metavar="METHOD", help="its name, or file.py:Class")
+    """List the methods that can be run, show the settings of one, try one on two frames, or write one of your own.
+
+    su3d-bench methods list
+    su3d-bench methods show opensu3d
+    """
+    actions = add_group(verbs, "methods", add_parser, lists=True)
+    add_verb(actions, "list", call_list)
+    parser = add_verb(actions, "show", call_show)
+    parser.option("name METHOD", "its name, or file.py:Class")
+    parser = add_verb(actions, "check", call_check)
+    parser.option("name METHOD", "its name, or file.py:Class")
     add_new(actions, "method")
 
 
-def call_list(arguments: argparse.Namespace) -> int:
+def call_list(arguments: argparse.Namespace) -> None:
+    """List the methods that can be run: where they come from, their licence, what they need.
+
+    su3d-bench methods list
+    su3d-bench methods list --json
+    """
     from su3d_bench.runs.catalogue import known_methods
 
     rows = known_methods()
     answer_either(arguments, rows, *[line for row in rows for line in ("", *_lines(row))][1:])
-    return EXIT_DONE
 
 
-def call_check(arguments: argparse.Namespace) -> int:
+def call_check(arguments: argparse.Namespace) -> None:
+    """Try a method on two frames of a room, and name what is wrong with what it gives.
+
+    su3d-bench methods check oracle
+    su3d-bench methods check my_method.py:MyMethod
+    """
     from su3d_bench.runs.trial import try_method
 
     trial = try_method(arguments.name)
@@ -72,7 +61,6 @@ def call_check(arguments: argparse.Namespace) -> int:
     features = "with features" if trial.has_features else "without features"
     text = f"{trial.method}: two frames of {trial.scene} gave {made}, {features}: nothing found wrong"
     answer_either(arguments, asdict(trial), text)
-    return EXIT_DONE
 
 
 def _lines(row: dict[str, Any]) -> list[str]:
@@ -84,9 +72,15 @@ def _lines(row: dict[str, Any]) -> list[str]:
     return lines
 
 
-def call_show(arguments: argparse.Namespace) -> int:
+def call_show(arguments: argparse.Namespace) -> None:
+    """Show the settings of a method, its presets and what papers report of it.
+
+    su3d-bench methods show opensu3d
+    su3d-bench methods show my_method.py:MyMethod
+    """
     from su3d_bench.core import registry
     from su3d_bench.core.config import flatten, write_toml
+    from su3d_bench.core.interfaces import HasPresets
     from su3d_bench.reports.tables.paper import figures_of
     from su3d_bench.runs.catalogue import about_method
 
@@ -94,30 +88,24 @@ def call_show(arguments: argparse.Namespace) -> int:
     defaults = method.Config().model_dump(mode="json")
     row = about_method(method.name, method)
     figures = figures_of(method=method.name)
-    presets = {name: dict(settings) for name, settings in _presets_of(method).items()}
+    presets = (
+        {name: dict(settings) for name, settings in method.presets.items()} if isinstance(method, HasPresets) else {}
+    )
     published = [figure.model_dump(mode="json", exclude_none=True) for figure in figures]
     if answer_json(arguments, {**row, "settings": defaults, "presets": presets, "published": published}):
-        return EXIT_DONE
-    leaves = [(("method", method.name, *path), value, _remark(method, path)) for path, value in flatten(defaults)]
+        return
+    remarks = {name: field.description or "default" for name, field in method.Config.model_fields.items()}
+    leaves = [(("method", method.name, *path), value, remarks[path[0]]) for path, value in flatten(defaults)]
     answer(*(f"# {line}" for line in _lines(row)))
     answer_document("\n" + write_toml(leaves) if leaves else f"# {one_line(method.name)} has no settings")
     if presets:
         answer("", "# presets, each a method of its own name")
-        answer(*(f"# {method.name}@{name}: {_assigned(settings)}" for name, settings in presets.items()))
+        for name, settings in presets.items():
+            assigned = ", ".join(f"{key} = {json.dumps(value)}" for key, value in settings.items())
+            answer(f"# {method.name}@{name}: {assigned}")
     if figures:
         answer("", "# as reported, each in its own set-up; no two need be comparable")
         answer(*(f"# {line}" for figure in figures for line in _figure_lines(figure)))
-    return EXIT_DONE
-
-
-def _presets_of(method: Any) -> Mapping[str, Mapping[str, Any]]:
-    from su3d_bench.core.interfaces import HasPresets
-
-    return method.presets if isinstance(method, HasPresets) else {}
-
-
-def _assigned(settings: Mapping[str, Any]) -> str:
-    return ", ".join(f"{key} = {json.dumps(value)}" for key, value in settings.items())
 
 
 def _figure_lines(figure: Figure) -> list[str]:
@@ -126,8 +114,3 @@ def _figure_lines(figure: Figure) -> list[str]:
     note = f"; {figure.note}" if figure.note else ""
     text = f"{values}{row}: {figure.source}: {figure.setup}{note}; {figure.system.words}"
     return textwrap.wrap(text, WIDTH, subsequent_indent="    ")
-
-
-def _remark(method: Any, path: tuple[str, ...]) -> str:
-    field = method.Config.model_fields[path[0]]
-    return field.description or "default"

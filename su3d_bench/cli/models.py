@@ -8,74 +8,52 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli import fetch
-from su3d_bench.cli.options import Verbs, add_group, add_options, add_verb, perception_config
-from su3d_bench.cli.output import answer, answer_either, answer_json, remark
+from su3d_bench.cli.options import Verbs, add_group, add_verb, perception_config
+from su3d_bench.cli.output import answer_either, remark
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
-    from su3d_bench.perception.models.files import ModelFiles
-    from su3d_bench.perception.models.loading import ModelState, WarmUp
+    from su3d_bench.perception.models.loading import ModelState
 
 
 def add_parser(verbs: Verbs) -> None:
-    actions = add_group(
-        verbs,
-        "models",
-        "List the foundation models, fetch them, check their files, or run them once.",
-        ("su3d-bench models list", "su3d-bench models fetch --for paper --dry-run"),
-        lists=True,
-    )
-    listing = add_verb(
-        actions,
-        "list",
-        "List every model: size, licence, which profile loads it, and where it lies or that it is missing.",
-        ("su3d-bench models list", "su3d-bench models list --json"),
-        call_list,
-    )
-    add_options(listing, "--set")
-    checking = add_verb(
-        actions,
-        "check",
-        "Tell the SHA-256 of every file of models, as run records carry them, and name all that is wrong.",
-        ("su3d-bench models check", "su3d-bench models check clip-vit-h-14 sam-vit-h --json"),
-        call_check,
-    )
-    checking.add_argument("names", nargs="*", metavar="MODEL", help="short names (default: every model that is here)")
-    add_options(checking, "--set")
-    _add_warm(actions)
+    """List the foundation models, fetch them, check their files, or run them once.
+
+    su3d-bench models list
+    su3d-bench models fetch --for paper --dry-run
+    """
+    actions = add_group(verbs, "models", add_parser, lists=True)
+    listing = add_verb(actions, "list", call_list)
+    listing.shared("--set")
+    checking = add_verb(actions, "check", call_check)
+    checking.option("names [MODEL...]", "short names (default: every model that is here)")
+    checking.shared("--set")
+    parser = add_verb(actions, "warm", call_warm)
+    parser.option("name [ENCODER]", "an encoder alone (default: the profile's models)")
+    parser.option("--profile PROFILE", "whose models (default: paper)")
+    parser.shared("--device", "--set")
     fetch.add_models(actions)
 
 
-def _add_warm(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "warm",
-        "Load the models of a profile, or one encoder, run them on a made frame, and tell time and memory.",
-        ("su3d-bench models warm --profile paper --device cuda", "su3d-bench models warm clip-vit-b-32"),
-        call_warm,
-    )
-    parser.add_argument("name", nargs="?", metavar="ENCODER", help="an encoder alone (default: the profile's models)")
-    parser.add_argument("--profile", help="whose models (default: paper)")
-    add_options(parser, "--device", "--set")
+def call_list(arguments: argparse.Namespace) -> None:
+    """List every model: size, licence, which profile loads it, and where it lies or that it is missing.
 
-
-def call_list(arguments: argparse.Namespace) -> int:
+    su3d-bench models list
+    su3d-bench models list --json
+    """
     states = _states(arguments, ())
-    if answer_json(arguments, [_state_row(state) for state in states]):
-        return EXIT_DONE
     width = max(len(state.entry.name) for state in states)
+    lines = []
     for state in states:
         entry = state.entry
         place = f"found: {state.files[0].folder}" if state.files else "missing"
         size = f"{entry.forms[0].size_mb / 1000:.1f} GB"
         profiles = f" (profile {', '.join(state.profiles)})" if state.profiles else ""
-        answer(f"{entry.name:<{width}}  {entry.kind:<9}  {size:>6}  {entry.licence:<10}  {place}{profiles}")
-    if missing := [state for state in states if not state.files]:
-        remark(
-            f"{len(missing)} missing; su3d-bench models check {missing[0].entry.name} says what to fetch",
-            quiet=arguments.quiet,
-        )
-    return EXIT_DONE
+        lines.append(f"{entry.name:<{width}}  {entry.kind:<9}  {size:>6}  {entry.licence:<10}  {place}{profiles}")
+    answer_either(arguments, [_state_row(state) for state in states], *lines)
+    if missing := [state.entry.name for state in states if not state.files]:
+        text = f"{len(missing)} missing; su3d-bench models check {missing[0]} says what to fetch"
+        remark(text, quiet=arguments.quiet or arguments.json)
 
 
 def _states(arguments: argparse.Namespace, names: tuple[str, ...]) -> list[ModelState]:
@@ -107,30 +85,36 @@ def _state_row(state: ModelState) -> dict[str, Any]:
 
 
 def call_check(arguments: argparse.Namespace) -> int:
+    """Tell the SHA-256 of every file of models, as run records carry them, and name all that is wrong.
+
+    su3d-bench models check
+    su3d-bench models check clip-vit-h-14 sam-vit-h --json
+    """
+    from su3d_bench.perception.models.loading import problems_of
+
     names = tuple(dict.fromkeys(arguments.names))
     states = _states(arguments, names)
-    rows = [_checked(files) for state in states for files in state.files]
-    rows += [_absent(state) for state in states if names and not state.files]
+    rows: list[dict[str, Any]] = [
+        {
+            "name": files.entry.name,
+            "form": files.form.form,
+            "folder": str(files.folder),
+            "sha256": files.digests(),
+            "problems": problems_of(files),
+        }
+        for state in states
+        for files in state.files
+    ]
+    absent: dict[str, Any] = {"form": None, "folder": None, "sha256": {}}
+    rows += [
+        {"name": state.entry.name, **absent, "problems": [state.missing]}
+        for state in states
+        if names and not state.files
+    ]
     if not rows:
         raise ConfigError("models check: none of the models is here; su3d-bench models list names them all")
     answer_either(arguments, rows, *(line for row in rows for line in _check_lines(row)))
     return EXIT_CHECK_FAILED if any(row["problems"] for row in rows) else EXIT_DONE
-
-
-def _checked(files: ModelFiles) -> dict[str, Any]:
-    from su3d_bench.perception.models.loading import problems_of
-
-    return {
-        "name": files.entry.name,
-        "form": files.form.form,
-        "folder": str(files.folder),
-        "sha256": files.digests(),
-        "problems": problems_of(files),
-    }
-
-
-def _absent(state: ModelState) -> dict[str, Any]:
-    return {"name": state.entry.name, "form": None, "folder": None, "sha256": {}, "problems": [state.missing]}
 
 
 def _check_lines(row: dict[str, Any]) -> list[str]:
@@ -141,28 +125,29 @@ def _check_lines(row: dict[str, Any]) -> list[str]:
     return [f"{row['name']} ({row['form']}): {row['folder']}: {state}", *digests, *(f"  {p}" for p in row["problems"])]
 
 
-def call_warm(arguments: argparse.Namespace) -> int:
-    result = _warm(arguments)
+def call_warm(arguments: argparse.Namespace) -> None:
+    """Load the models of a profile, or one encoder, run them on a made frame, and tell time and memory.
+
+    su3d-bench models warm --profile paper --device cuda
+    su3d-bench models warm clip-vit-b-32
+    """
+    from su3d_bench.core.system.devices import device_for
+    from su3d_bench.perception.models.loading import load_encoder, warm_encoder, warm_perception, warm_scene
+    from su3d_bench.perception.profiles import build_perception
+
+    config = perception_config(arguments)
+    device = device_for(config.models.device, 0)
+    if arguments.name is None:
+        config = config.model_copy(update={"cache": False})  # what is measured must be computed
+        profile = arguments.profile or "paper"
+        perception = build_perception(profile, config, scene=warm_scene(), cache_root=Path(), mesh=None)
+        result = warm_perception(perception, device)
+    elif arguments.profile is not None:
+        raise ConfigError("models warm: give an encoder or --profile, not both")
+    else:
+        models = config.models.model_copy(update={"encoder": arguments.name})
+        result = warm_encoder(load_encoder(models), device)
     lines = [f"{result.what}: loaded and first run {result.load_s:.1f} s, next run {result.run_s:.3f} s"]
     lines += [f"  {name:<10} {ms:>10.1f} ms" for name, ms in result.stages_ms.items()]
     lines.append(f"memory: {result.memory_mb:.0f} MB at most ({result.memory_of}); digest {result.digest[:12]}")
     answer_either(arguments, asdict(result), *lines)
-    return EXIT_DONE
-
-
-def _warm(arguments: argparse.Namespace) -> WarmUp:
-    from su3d_bench.core.system.devices import device_for
-    from su3d_bench.perception.models.loading import load_encoder, warm_encoder, warm_perception, warm_scene
-
-    config = perception_config(arguments)
-    if arguments.name is not None:
-        if arguments.profile is not None:
-            raise ConfigError("models warm: give an encoder or --profile, not both")
-        models = config.models.model_copy(update={"encoder": arguments.name})
-        return warm_encoder(load_encoder(models), device_for(models.device, 0))
-    from su3d_bench.perception.profiles import build_perception
-
-    config = config.model_copy(update={"cache": False})  # what is measured must be computed
-    profile = arguments.profile or "paper"
-    perception = build_perception(profile, config, scene=warm_scene(), cache_root=Path(), mesh=None)
-    return warm_perception(perception, device_for(config.models.device, 0))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from su3d_bench.cli.options import Verbs, add_verb
 from su3d_bench.cli.output import answer_either
-from su3d_bench.core.errors import EXIT_DONE, ConfigError
+from su3d_bench.core.errors import ConfigError
 
 SUFFIX = {"method": ".py", "dataset": ".py", "protocol": ".toml"}
 REGISTRY = "registry"
@@ -35,27 +35,27 @@ def add_new(verbs: Verbs, what: str) -> None:
     """The sub-verb ``new`` of methods, datasets, protocols and registries."""
     group = {REGISTRY: "dev registry"}.get(what, f"{what}s")
     place = "my-registry" if what == REGISTRY else f"my_{what}{SUFFIX[what]}"
-    parser = add_verb(
-        verbs,
-        "new",
-        f"Write a {what} of your own that works as it is, to begin from.",
-        (f"su3d-bench {group} new {place}", f"su3d-bench {group} new {place} --json"),
-        call,
-    )
+    about = f"""Write a {what} of your own that works as it is, to begin from.
+
+    su3d-bench {group} new {place}
+    su3d-bench {group} new {place} --json
+    """
+    parser = add_verb(verbs, "new", call, about)
     parser.set_defaults(what=what)
     if what == REGISTRY:
-        parser.add_argument("file", type=Path, metavar="DIR", help="the folder to write")
+        parser.option("file DIR", "the folder to write")
     else:
-        parser.add_argument("file", type=Path, metavar="FILE", help="to write; its name becomes the name in it")
+        parser.option("file FILE", "to write; its name becomes the name in it")
 
 
-def call(arguments: argparse.Namespace) -> int:
+def call(arguments: argparse.Namespace) -> None:
     from su3d_bench.cli.output import written
     from su3d_bench.core.system.files import file_text
 
     what, file = arguments.what, arguments.file
     if what == REGISTRY:
-        return _new_registry(file, arguments)
+        _new_registry(file, arguments)
+        return
     if file.suffix != SUFFIX[what]:
         raise ConfigError(f"{what}s new: {file} must end in {SUFFIX[what]}, such as my_{what}{SUFFIX[what]}")
     words = re.findall(r"[A-Za-z0-9]+", file.stem)
@@ -71,10 +71,9 @@ def call(arguments: argparse.Namespace) -> int:
     commands = [f"su3d-bench {command.format(at=at)}" for command in NEXT[what]]
     lines = (f"{file}; then:", *(f"  {command}" for command in commands))
     answer_either(arguments, {"file": str(file), "next": commands}, *lines)
-    return EXIT_DONE
 
 
-def _new_registry(folder: Path, arguments: argparse.Namespace) -> int:
+def _new_registry(folder: Path, arguments: argparse.Namespace) -> None:
     """A repository whose CI scores the bundles of pull requests anew and publishes the site."""
     import os
     import shlex
@@ -100,4 +99,3 @@ def _new_registry(folder: Path, arguments: argparse.Namespace) -> int:
     commands = [f"su3d-bench {command.format(at=shlex.quote(str(folder)))}" for command in NEXT[REGISTRY]]
     lines = (f"{folder}: a repository for git; then:", *(f"  {command}" for command in commands))
     answer_either(arguments, {"file": str(folder), "next": commands}, *lines)
-    return EXIT_DONE

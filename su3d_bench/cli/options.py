@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, nearest, suggest
+from su3d_bench.core.errors import ConfigError, nearest, suggest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 Verbs = Any  # argparse._SubParsersAction of a parser's verbs
+Call = Callable[[argparse.Namespace], int | None]  # what a verb does; its exit code, none for done
+PATHS = ("FILE", "DIR", "RUN", "PNG", "BUNDLE")
 TABLE_FORMATS = ("text", "markdown", "latex", "csv", "html")
 LANGUAGE = ("perception", "language")
 
@@ -46,6 +48,19 @@ class Parser(argparse.ArgumentParser):
                 name = action.dest
             self.error(f"unknown {name} '{value}'{suggest(str(value), map(str, action.choices))}")
 
+    def option(self, form: str, text: str, group: Any = None, **more: Any) -> None:
+        """Add the option or argument that ``form`` writes as help shows it; ``more`` as ``add_argument`` takes it.
+
+        ``group``: of options that exclude each other.
+        """
+        name, settings = option(form, text, **more)
+        (group or self).add_argument(name, **settings)
+
+    def shared(self, *names: str, **changes: Any) -> None:
+        """Add options of ``SHARED``; ``changes`` are for a verb in which they cannot be the same."""
+        for name in names:
+            self.add_argument(name, **SHARED[name] | changes)
+
 
 class JsonFlag(argparse.Action):
     """``--json``: ``json`` is true where the answer is printed as JSON, ``json_file`` is where it is written."""
@@ -61,41 +76,66 @@ class JsonFlag(argparse.Action):
         namespace.json, namespace.json_file = values is None, values and Path(values)
 
 
+def option(form: str, text: str, **more: Any) -> tuple[str, dict[str, Any]]:
+    """The name of an option or argument and what ``add_argument`` takes of it, from the form that help shows.
+
+    ``--out FILE`` takes a value, ``RUN...`` one or more, ``[RUN...]`` none or more, ``[DIR]`` none or one. What is
+    called FILE, DIR, RUN, PNG or BUNDLE is a path; an option without a value is a switch.
+
+    >>> option("--scenes SCENE...", "these alone")
+    ('--scenes', {'help': 'these alone', 'metavar': 'SCENE', 'nargs': '+'})
+    >>> option("--per-class", "each class too")
+    ('--per-class', {'help': 'each class too', 'action': 'store_true'})
+    """
+    name, _, value = form.partition(" ")
+    is_optional = value.startswith("[")
+    several = value[1:-1] if is_optional else value
+    metavar = several.removesuffix("...")
+    settings: dict[str, Any] = {"help": text}
+    if metavar:
+        settings["metavar"] = metavar
+    if is_optional or several != metavar:
+        settings["nargs"] = "?" if several == metavar else "*" if is_optional else "+"
+    if metavar in PATHS:
+        settings["type"] = Path
+    if name.startswith("--") and not value and not {"action", "choices", "nargs"} & more.keys():
+        settings["action"] = "store_true"
+    return name, settings | more
+
+
 def add_verb(
-    verbs: Verbs,
-    name: str,
-    summary: str,
-    examples: tuple[str, str],
-    call: Callable[[argparse.Namespace], int],
-    *,
-    uses_all_cores: bool = False,
-    takes_up: bool = False,
-) -> argparse.ArgumentParser:
-    """A verb's parser: help that ends with two examples, ``--json``, ``--quiet`` and ``--debug``.
+    verbs: Verbs, name: str, call: Call, about: str = "", *, uses_all_cores: bool = False, takes_up: bool = False
+) -> Parser:
+    """A verb's parser, whose help is the docstring of ``call`` or ``about``; with ``--json``, ``--quiet``, ``--debug``.
 
     Numerical libraries use one thread unless the verb ``uses_all_cores``. One that ``takes_up`` resumes what was
     interrupted; others start again.
     """
-    parser = _parser(verbs, name, summary, examples)
+    parser = _parser(verbs, name, about or call.__doc__)
     parser.set_defaults(call=call, uses_all_cores=uses_all_cores, takes_up=takes_up, json_file=None)
     parser.add_argument("--json", action=JsonFlag, help="print the answer as JSON; with a file, write it there")
-    parser.add_argument("--quiet", action="store_true", help="no progress and no remarks on stderr")
-    parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+    parser.option("--quiet", "no progress and no remarks on stderr")
+    parser.option("--debug", "show the traceback of an error")
     return parser
 
 
-def add_group(verbs: Verbs, name: str, summary: str, examples: tuple[str, str], *, lists: bool = False) -> Verbs:
-    """The sub-verbs of a verb such as ``datasets``, which given alone does its ``list`` if it ``lists``."""
-    parser = _parser(verbs, name, summary, examples)
-    return parser.add_subparsers(dest="action", metavar="VERB", required=not lists)
+def add_group(verbs: Verbs, name: str, add: Callable[[Verbs], None], *, lists: bool = False) -> Verbs:
+    """The sub-verbs of a verb such as ``datasets``, whose help is the docstring of ``add``, the function that adds it.
+
+    Given alone it does its ``list`` if it ``lists``.
+    """
+    return _parser(verbs, name, add.__doc__).add_subparsers(dest="action", metavar="VERB", required=not lists)
 
 
-def _parser(verbs: Verbs, name: str, summary: str, examples: tuple[str, str]) -> argparse.ArgumentParser:
-    parser: argparse.ArgumentParser = verbs.add_parser(
+def _parser(verbs: Verbs, name: str, about: str | None) -> Parser:
+    """A parser whose help is ``about``: a summary, an empty line, and examples, a line each."""
+    summary, _, examples = (about or "").strip().partition("\n\n")
+    summary = " ".join(summary.split())
+    parser: Parser = verbs.add_parser(
         name,
         help=summary[:1].lower() + summary[1:].rstrip("."),
         description=summary,
-        epilog="examples:\n" + "\n".join(f"  {example}" for example in examples),
+        epilog="\n  ".join(["examples:", *map(str.strip, examples.splitlines())]),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     return parser
@@ -131,102 +171,66 @@ def positive(text: str) -> float:
 
 
 # The options that several verbs have, each with its one help text.
-SHARED: dict[str, dict[str, Any]] = {
-    "--jobs": {"type": count, "metavar": "N", "help": "processes side by side (default: the CPU cores)"},
-    "--device": {"metavar": "DEVICE", "help": "of models: cpu, cuda (all GPUs, by job) or cuda:1 (default: cpu)"},
-    "--methods": {"nargs": "+", "default": [], "metavar": "METHOD", "help": "these alone (default: all)"},
-    "--scenes": {"nargs": "+", "default": [], "metavar": "SCENE", "help": "these alone, or patterns (default: all)"},
-    "--protocols": {
-        "nargs": "+",
-        "action": "extend",
-        "default": [],
-        "metavar": "PROTOCOL",
-        "help": "these alone (default: all that fit)",
-    },
-    "--set": {
-        "nargs": "+",
-        "action": "extend",
-        "default": [],
-        "metavar": "KEY=VALUE",
-        "help": "settings, such as opensu3d.top_m=10, rooms.n_frames=40 or perception.models.folder=/data/models",
-    },
-    "--config": {"type": Path, "metavar": "FILE", "help": "a TOML file of settings, such as the run.toml of a run"},
-    "--run": {"type": Path, "metavar": "DIR", "help": "run folder (default: the latest in runs/ with the scene)"},
-    "--method": {"default": "opensu3d", "metavar": "METHOD", "help": "whose maps (default: opensu3d)"},
-    "--format": {
-        "dest": "table_format",
-        "choices": TABLE_FORMATS,
-        "help": "of tables (default: text where they are printed, markdown in a file)",
-    },
-    "--seed": {"type": index, "default": 0, "metavar": "N", "help": "of everything random (default: 0)"},
-    "--limit": {"type": int, "metavar": "N", "help": "only the first N updates of each scene; marks it partial"},
-    "--profile": {
-        "metavar": "PROFILE",
-        "help": "who supplies perception: auto, embedded, oracle, stored, paper (default: auto; of a recipe its own)",
-    },
-    "--solver": {
-        "choices": ("built-in", "llm"),
-        "help": "who answers questions: built-in (geometry alone, the default), or llm, a language model",
-    },
-    "--leave-out": {
-        "type": Path,
-        "metavar": "FILE",
-        "help": "without the questions that a CSV file lists by their id",
-    },
-    "--text-features": {
-        "type": Path,
-        "metavar": "FILE",
-        "help": "features of class names, for predictions that have features: .npz with names and features",
-    },
-    "--queries": {
-        "type": Path,
-        "metavar": "FILE",
-        "help": "texts and their objects, for protocols without classes: .toml or .csv with scene, text and "
-        "objects, files of ScanRefer, Nr3D or OpenLex3D, or .txt with one text per line",
-    },
-    "--executor": {
-        "metavar": "WHERE",
-        "help": "inline, processes, ray or slurm (default: processes, inline for one job)",
-    },
-    "--ray-address": {
-        "metavar": "ADDRESS",
-        "help": "of a Ray cluster, or local to start one here (default: RAY_ADDRESS, or the one that runs here)",
-    },
-    "--gpus-per-job": {"type": float, "metavar": "N", "help": "that ray or slurm gives a scene, such as 0.5"},
-    "--retries": {"type": int, "metavar": "N", "help": "of a scene whose machine was lost (default: 2)"},
-    "--slurm": {
-        "nargs": "+",
-        "metavar": "KEY=VALUE",
-        "help": "submitit's, such as slurm_partition=gpu timeout_min=60",
-    },
-    "--offline": {
-        "action": argparse.BooleanOptionalAction,
-        "help": "use stored replies of language models, ask nobody",
-    },
-    "--dry-run": {"action": "store_true", "help": "say what would be done and what it takes, and do nothing"},
-}
+SHARED: dict[str, dict[str, Any]] = dict(
+    [
+        option("run RUN", "the folder of a run"),
+        option("runs RUN...", "folders of finished runs"),
+        option("--jobs N", "processes side by side (default: the CPU cores)", type=count),
+        option("--device DEVICE", "of models: cpu, cuda (all GPUs, by job) or cuda:1 (default: cpu)"),
+        option("--methods METHOD...", "these alone (default: all)", default=[]),
+        option("--scenes SCENE...", "these alone, or patterns (default: all)", default=[]),
+        option("--protocols PROTOCOL...", "these alone (default: all that fit)", action="extend", default=[]),
+        option(
+            "--set KEY=VALUE...",
+            "settings, such as opensu3d.top_m=10, rooms.n_frames=40 or perception.models.folder=/data/models",
+            action="extend",
+            default=[],
+        ),
+        option("--config FILE", "a TOML file of settings, such as the run.toml of a run"),
+        option("--run DIR", "run folder (default: the latest in runs/ with the scene)"),
+        option("--method METHOD", "whose maps (default: opensu3d)", default="opensu3d"),
+        option(
+            "--format",
+            "of tables (default: text where they are printed, markdown in a file)",
+            dest="table_format",
+            choices=TABLE_FORMATS,
+        ),
+        option("--seed N", "of everything random (default: 0)", type=index, default=0),
+        option("--limit N", "only the first N updates of each scene; marks it partial", type=int),
+        option(
+            "--profile PROFILE",
+            "who supplies perception: auto, embedded, oracle, stored, paper (default: auto; of a recipe its own)",
+        ),
+        option(
+            "--solver",
+            "who answers questions: built-in (geometry alone, the default), or llm, a language model",
+            choices=("built-in", "llm"),
+        ),
+        option("--leave-out FILE", "without the questions that a CSV file lists by their id"),
+        option(
+            "--text-features FILE",
+            "features of class names, for predictions that have features: .npz with names and features",
+        ),
+        option(
+            "--queries FILE",
+            "texts and their objects, for protocols without classes: .toml or .csv with scene, text and objects, files "
+            "of ScanRefer, Nr3D or OpenLex3D, or .txt with one text per line",
+        ),
+        option("--executor WHERE", "inline, processes, ray or slurm (default: processes, inline for one job)"),
+        option(
+            "--ray-address ADDRESS",
+            "of a Ray cluster, or local to start one here (default: RAY_ADDRESS, or the one that runs here)",
+        ),
+        option("--gpus-per-job N", "that ray or slurm gives a scene, such as 0.5", type=float),
+        option("--retries N", "of a scene whose machine was lost (default: 2)", type=int),
+        option("--slurm KEY=VALUE...", "submitit's, such as slurm_partition=gpu timeout_min=60"),
+        option("--offline", "use stored replies of language models, ask nobody", action=argparse.BooleanOptionalAction),
+        option("--dry-run", "say what would be done and what it takes, and do nothing"),
+    ]
+)
 SHARED["--table-format"] = SHARED["--format"]  # where --format is of what is read
 # Where scenes run; docs/running/clusters.md has more on them.
 EXECUTOR = ("--executor", "--ray-address", "--gpus-per-job", "--retries", "--slurm")
-
-
-def add_options(parser: argparse.ArgumentParser, *names: str, **changes: Any) -> None:
-    """Options of ``SHARED``; ``changes`` are for a verb in which they cannot be the same, such as ``required``."""
-    for name in names:
-        parser.add_argument(name, **{**SHARED[name], **changes})
-
-
-def add_runs(parser: argparse.ArgumentParser, nargs: str | None = "+") -> None:
-    """Folders of finished runs: ``runs``, or ``run`` without ``nargs``."""
-    if nargs is None:
-        parser.add_argument("run", type=Path, metavar="RUN", help="the folder of a run")
-    else:
-        parser.add_argument("runs", nargs=nargs, type=Path, metavar="RUN", help="folders of finished runs")
-
-
-def add_out(parser: argparse.ArgumentParser, metavar: str, what: str, **more: Any) -> None:
-    """``--out``: where the verb writes, a FILE or a DIR."""
-    parser.add_argument("--out", type=Path, metavar=metavar, help=what, **more)
 
 
 def open_map(arguments: argparse.Namespace, verb: str, text: str) -> tuple[RunFolder, JobFolder, Prediction]:
@@ -254,17 +258,13 @@ def perception_config(arguments: argparse.Namespace) -> PerceptionConfig:
     return resolve(settings, ("perception",), PerceptionConfig)
 
 
-def add_language_options(parser: argparse.ArgumentParser, default: str = "the paper's gpt-4-1106-preview") -> None:
+def add_language_options(parser: Parser, default: str = "the paper's gpt-4-1106-preview") -> None:
     """The options of verbs that ask a language model: which, where, at what price."""
-    parser.add_argument("--model", metavar="NAME", help=f"language model (default: {default})")
-    parser.add_argument(
-        "--base-url", metavar="URL", help="OpenAI-compatible server (default: $OPENAI_BASE_URL, else OpenAI's)"
-    )
-    add_options(parser, "--config", "--set", "--dry-run")
-    parser.add_argument("--offline", action="store_true", help=SHARED["--offline"]["help"])
-    parser.add_argument(
-        "--ask-failed-again", action="store_true", help="ask again what an earlier command failed to get"
-    )
+    parser.option("--model NAME", f"language model (default: {default})")
+    parser.option("--base-url URL", "OpenAI-compatible server (default: $OPENAI_BASE_URL, else OpenAI's)")
+    parser.shared("--config", "--set", "--dry-run")
+    parser.option("--offline", SHARED["--offline"]["help"])
+    parser.option("--ask-failed-again", "ask again what an earlier command failed to get")
 
 
 def given_language_option(arguments: argparse.Namespace) -> str | None:
@@ -299,7 +299,7 @@ def chat_client(
     return ChatClient(config, store, offline=arguments.offline, ask_failed_again=arguments.ask_failed_again), config
 
 
-def answer_estimate(arguments: argparse.Namespace, client: ChatClient | None, requests: Sequence[ChatRequest]) -> int:
+def answer_estimate(arguments: argparse.Namespace, client: ChatClient | None, requests: Sequence[ChatRequest]) -> None:
     """Print what asking a language model all ``requests`` would cost, nothing without a client; the exit code."""
     from su3d_bench.cli.output import answer_either
     from su3d_bench.perception.language.client import Estimate
@@ -310,4 +310,3 @@ def answer_estimate(arguments: argparse.Namespace, client: ChatClient | None, re
     else:
         estimate = client.estimate(requests)
         answer_either(arguments, estimate.to_json(), estimate.line())
-    return EXIT_DONE

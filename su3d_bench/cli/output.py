@@ -6,7 +6,7 @@ import argparse
 import math
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -138,10 +138,10 @@ def _few_digits(text: str) -> str:
     return digest_bytes(text.encode("utf-8", "surrogatepass"))[:8]
 
 
-def remark(text: str, *, quiet: bool = False) -> None:
-    """Print a remark to stderr."""
-    if not quiet:
-        print(one_line(text), file=sys.stderr)
+def remark(*lines: str, quiet: bool = False) -> None:
+    """Print remarks to stderr, a line each."""
+    for line in () if quiet else lines:
+        print(one_line(line), file=sys.stderr)
 
 
 def remark_unseen(encoder: object, text: str, *, quiet: bool) -> None:
@@ -210,6 +210,26 @@ def _above(bars: Progress) -> AbstractContextManager[None]:
         bars.console.print(Text(text.removesuffix("\n")), soft_wrap=True)
 
     return sys.stderr.through(show) if isinstance(sys.stderr, Door) else nullcontext()
+
+
+@contextmanager
+def overall_progress(what: str, *, is_quiet: bool) -> Iterator[tuple[Callable[[int], None], Report]]:
+    """One bar over the steps of all units, with the time left: a function that takes their number, and a ``Report``."""
+    n_done: dict[str, int] = {}
+    with drawn_bars(is_quiet=is_quiet, tells_time_left=True) as bars:
+        if bars is None:
+            yield lambda n_steps: None, lambda event: None
+            return
+        task = bars.add_task(what, total=None, remark="")
+
+        def begin(n_steps: int) -> None:
+            bars.update(task, total=n_steps)
+
+        def report(event: Event) -> None:
+            n_done[event.unit] = event.done
+            bars.update(task, completed=sum(n_done.values()), description=f"{event.unit}: {event.label}")
+
+        yield begin, report
 
 
 class _Board:

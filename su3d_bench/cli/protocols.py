@@ -11,9 +11,9 @@ from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.new import add_new
-from su3d_bench.cli.options import Verbs, add_group, add_options, add_out, add_verb, perception_config
+from su3d_bench.cli.options import Verbs, add_group, add_verb, perception_config
 from su3d_bench.cli.output import answer_either, answer_tables, progress, remark, show
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, shown, suggest
+from su3d_bench.core.errors import ConfigError, shown, suggest
 
 if TYPE_CHECKING:
     from su3d_bench.metrics.protocols.loading import Stated
@@ -21,54 +21,40 @@ if TYPE_CHECKING:
 
 
 def add_parser(verbs: Verbs) -> None:
-    actions = add_group(
-        verbs,
-        "protocols",
-        "List the protocols, show the rules of one, compare the rules of two, or write one of your own.",
-        ("su3d-bench protocols show rooms-semantic", "su3d-bench protocols diff rooms-semantic replica-mesh-ex6"),
-        lists=True,
+    """List the protocols, show the rules of one, compare the rules of two, or write one of your own.
+
+    su3d-bench protocols show rooms-semantic
+    su3d-bench protocols diff rooms-semantic replica-mesh-ex6
+    """
+    actions = add_group(verbs, "protocols", add_parser, lists=True)
+    add_verb(actions, "list", call_list)
+    parser = add_verb(actions, "show", call_show)
+    parser.option("name PROTOCOL", "its name, or a .toml file of the same form")
+    parser.option("--names", "the texts, one a line, to encode elsewhere")
+    parser.shared("--queries")
+    parser = add_verb(actions, "diff", call_diff)
+    parser.option("name A", "a protocol's name, or a .toml file of the same form")
+    parser.option("other B", "the protocol that it is compared with")
+    parser.option(
+        "--prediction RUN[:METHOD]",
+        "score it under every choice of the rules, and split the difference of its numbers among them",
     )
-    add_verb(
-        actions,
-        "list",
-        "List the protocols and whose evaluations they repeat.",
-        ("su3d-bench protocols list", "su3d-bench protocols list --json"),
-        call_list,
-    )
-    parser = add_verb(
-        actions,
-        "show",
-        "Print every rule of a protocol with its source, or the texts that features are compared with.",
-        ("su3d-bench protocols show rooms-semantic", "su3d-bench protocols show rooms-semantic --names"),
-        call_show,
-    )
-    parser.add_argument("name", metavar="PROTOCOL", help="its name, or a .toml file of the same form")
-    parser.add_argument("--names", action="store_true", help="the texts, one a line, to encode elsewhere")
-    add_options(parser, "--queries")
-    parser = add_verb(
-        actions,
-        "diff",
-        "Print the rules in which two protocols differ, and with --prediction what each does to the numbers.",
-        (
-            "su3d-bench protocols diff rooms-semantic replica-mesh-ex6",
-            "su3d-bench protocols diff rooms-semantic replica-mesh-ex6 --prediction runs/demo --out steps.png",
-        ),
-        call_diff,
-    )
-    parser.add_argument("name", metavar="A", help="a protocol's name, or a .toml file of the same form")
-    parser.add_argument("other", metavar="B", help="the protocol that it is compared with")
-    parser.add_argument(
-        "--prediction",
-        metavar="RUN[:METHOD]",
-        help="score it under every choice of the rules, and split the difference of its numbers among them",
-    )
-    add_out(parser, "PNG", "with --prediction: draw the steps to this file")
-    add_options(parser, "--jobs", "--format")
-    _add_texts(actions)
+    parser.option("--out PNG", "with --prediction: draw the steps to this file")
+    parser.shared("--jobs", "--format")
+    parser = add_verb(actions, "texts", call_texts)
+    parser.option("--protocol P", "whose texts; a name, or a .toml file", required=True)
+    parser.option("--encoder E", "what encodes them, a name of su3d-bench models list (default: the protocol's)")
+    parser.shared("--queries", "--device", "--set")
+    parser.option("--out FILE", "where names and features go", required=True)
     add_new(actions, "protocol")
 
 
-def call_list(arguments: argparse.Namespace) -> int:
+def call_list(arguments: argparse.Namespace) -> None:
+    """List the protocols and whose evaluations they repeat.
+
+    su3d-bench protocols list
+    su3d-bench protocols list --json
+    """
     from su3d_bench.metrics.protocols.loading import load_protocol, original_of, protocol_names
 
     rows = [(load_protocol(name), original_of(name)) for name in protocol_names()]
@@ -81,35 +67,41 @@ def call_list(arguments: argparse.Namespace) -> int:
         if stated is not None:
             lines += [f"    {line}" for line in wrap(stated.in_short, 116, break_on_hyphens=False)]
     answer_either(arguments, values, *lines)
-    return EXIT_DONE
 
 
-def call_show(arguments: argparse.Namespace) -> int:
+def call_show(arguments: argparse.Namespace) -> None:
+    """Print every rule of a protocol with its source, or the texts that features are compared with.
+
+    su3d-bench protocols show rooms-semantic
+    su3d-bench protocols show rooms-semantic --names
+    """
     from su3d_bench.metrics.fitness import labels_taken
     from su3d_bench.metrics.protocols.loading import load_protocol, original_of, rules_files
 
     rules = load_protocol(arguments.name)
     if arguments.names:
-        return _answer_names(arguments, rules)
+        _answer_names(arguments, rules)
+        return
     if arguments.queries is not None:
         raise ConfigError("protocols show: --queries belongs to --names")
     stated = original_of(arguments.name)
     value = rules.model_dump(mode="json") | {"digest": rules.digest, "labels_taken": labels_taken(rules)}
-    lines = [*_rules_lines(rules, rules_files(arguments.name)), *_original_lines(stated)]
+    facts = {"original": "not said"} if stated is None else stated.facts
+    lines = [*_rules_lines(rules, rules_files(arguments.name)), ""]
+    lines += [f"{name:<28} {text}" for name, text in facts.items()]
     answer_either(arguments, value | {"original": _plain(stated)}, *lines)
-    return EXIT_DONE
 
 
 def _plain(stated: Stated | None) -> dict[str, Any] | None:
     return None if stated is None else stated.original.model_dump(mode="json") | {"of": stated.base}
 
 
-def _original_lines(stated: Stated | None) -> list[str]:
-    facts = {"original": "not said"} if stated is None else stated.facts
-    return ["", *(f"{name:<28} {text}" for name, text in facts.items())]
+def call_diff(arguments: argparse.Namespace) -> None:
+    """Print the rules in which two protocols differ, and with --prediction what each does to the numbers.
 
-
-def call_diff(arguments: argparse.Namespace) -> int:
+    su3d-bench protocols diff rooms-semantic replica-mesh-ex6
+    su3d-bench protocols diff rooms-semantic replica-mesh-ex6 --prediction runs/demo --out steps.png
+    """
     from su3d_bench.analysis.rules_walk import Walker, rules_apart
     from su3d_bench.metrics.protocols.loading import load_protocol
     from su3d_bench.reports.tables.comparison import rules_tables
@@ -131,17 +123,15 @@ def call_diff(arguments: argparse.Namespace) -> int:
         show()  # the plot takes longer than the answer
         draw_walk(value, arguments.out)
         remark(f"plot: {arguments.out}", quiet=arguments.quiet)
-    return EXIT_DONE
 
 
-def _answer_names(arguments: argparse.Namespace, rules: ProtocolRules) -> int:
+def _answer_names(arguments: argparse.Namespace, rules: ProtocolRules) -> None:
     from su3d_bench.evaluation.texts import distinct_texts, named_texts
 
     named = named_texts(rules, arguments.queries)
     names = [{"name": name, "texts": list(texts)} for name, texts in named.items()]
     value = {"protocol": rules.name, "encoder": rules.encoder, "names": names}
     answer_either(arguments, value, *distinct_texts(named))
-    return EXIT_DONE
 
 
 def _rules_lines(rules: ProtocolRules, files: Sequence[Path]) -> list[str]:
@@ -158,8 +148,7 @@ def _rules_lines(rules: ProtocolRules, files: Sequence[Path]) -> list[str]:
         lines.append(f"{key:<28} {'none' if value is None else toml_value(value)}")
         lines += [f"    {remark}" for remark in remarks.pop(key, [])]
     lines += [f"    {remark}" for key in remarks if key != "classes" for remark in remarks[key]]
-    lines.append(f"{'labels taken':<28} {labels_taken(rules)}")
-    lines.append(f"{'digest':<28} {rules.digest}")
+    lines += [f"{'labels taken':<28} {labels_taken(rules)}", f"{'digest':<28} {rules.digest}"]
     if rules.classes:
         lines += ["", f"{len(rules.scored)} of {len(rules.classes)} classes are scored (id, name, group):"]
         lines += [f"    {remark}" for remark in remarks.get("classes", [])]
@@ -169,71 +158,39 @@ def _rules_lines(rules: ProtocolRules, files: Sequence[Path]) -> list[str]:
     return lines
 
 
-SUFFIX = ".npz"
 FORMS_OF_EVALUATE = (".toml", ".csv")  # of queries, with the objects that they speak of
 
 
-def _add_texts(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "texts",
-        "Encode every text of a protocol: its classes under its prompts, or queries, for evaluate --text-features.",
-        (
-            "su3d-bench protocols texts --protocol rooms-semantic --encoder embedded --out texts.npz",
-            "su3d-bench protocols texts --protocol replica-openmask3d --encoder clip-vit-l-14-336 --out texts.npz",
-        ),
-        call_texts,
-    )
-    parser.add_argument("--protocol", required=True, metavar="P", help="whose texts; a name, or a .toml file")
-    parser.add_argument(
-        "--encoder", metavar="E", help="what encodes them, a name of su3d-bench models list (default: the protocol's)"
-    )
-    add_options(parser, "--queries")
-    add_options(parser, "--device", "--set")
-    add_out(parser, "FILE", "where names and features go", required=True)
+def call_texts(arguments: argparse.Namespace) -> None:
+    """Encode every text of a protocol: its classes under its prompts, or queries, for evaluate --text-features.
 
-
-def call_texts(arguments: argparse.Namespace) -> int:
+    su3d-bench protocols texts --protocol rooms-semantic --encoder embedded --out texts.npz
+    su3d-bench protocols texts --protocol replica-openmask3d --encoder clip-vit-l-14-336 --out texts.npz
+    """
     from su3d_bench.core.files.atomic import make_folder, write_npz
     from su3d_bench.evaluation.texts import distinct_texts, named_texts, text_arrays
     from su3d_bench.metrics.protocols.loading import load_protocol
     from su3d_bench.perception.models.loading import load_encoder
-    from su3d_bench.store.run_folder import refuse_records
 
     out: Path = arguments.out
-    if out.suffix != SUFFIX:
-        raise ConfigError(f"protocols texts: --out {shown(out)}: give a file that ends in {SUFFIX}")
+    if out.suffix != ".npz":
+        raise ConfigError(f"protocols texts: --out {shown(out)}: give a file that ends in .npz")
     rules = load_protocol(arguments.protocol)
     named = named_texts(rules, arguments.queries)
     name = _encoder_name(arguments.encoder, rules.name, rules.encoder)
-    refuse_records(out)
-    models = perception_config(arguments).models.model_copy(update={"encoder": name})
-    encoder = load_encoder(models)
+    encoder = load_encoder(perception_config(arguments).models.model_copy(update={"encoder": name}))
     texts = distinct_texts(named)
     arrays = text_arrays(texts, encoder)
     make_folder(out.parent)
     write_npz(out, arrays)
-    n_dimensions = int(arrays["features"].shape[1])
-    value = {
-        "file": str(out),
-        "protocol": rules.name,
-        "encoder": encoder.name,
-        "encoder_digest": encoder.digest,
-        "n_names": len(named),
-        "n_texts": len(texts),
-        "n_dimensions": n_dimensions,
-    }
-    answer_either(
-        arguments,
-        value,
-        f"{out}: {len(texts)} texts for {len(named)} names of {rules.name}, {n_dimensions} dimensions, encoder "
-        f"'{encoder.name}'",
-    )
+    numbers = {"n_names": len(named), "n_texts": len(texts), "n_dimensions": int(arrays["features"].shape[1])}
+    names = {"file": str(out), "protocol": rules.name, "encoder": encoder.name, "encoder_digest": encoder.digest}
+    line = "{file}: {n_texts} texts for {n_names} names of {protocol}, {n_dimensions} dimensions, encoder '{encoder}'"
+    answer_either(arguments, names | numbers, line.format(**names, **numbers))
     words = ["--protocols", arguments.protocol, "--text-features", str(out)]
     if arguments.queries is not None and arguments.queries.suffix.lower() in FORMS_OF_EVALUATE:
         words += ["--queries", str(arguments.queries)]
     remark(f"use: su3d-bench evaluate PREDICTIONS {shlex.join(words)}", quiet=arguments.quiet)
-    return EXIT_DONE
 
 
 def _encoder_name(said: str | None, protocol: str, of_protocol: str | None) -> str:
@@ -243,16 +200,13 @@ def _encoder_name(said: str | None, protocol: str, of_protocol: str | None) -> s
     from su3d_bench.perception.models.config import EMBEDDED
 
     known = [EMBEDDED, *(entry.name for entry in MODELS.values() if entry.kind == "encoder")]
-    asked = of_protocol if said is None else said
+    asked = said or of_protocol
     if asked is None:
         listed = ", ".join(known)
         raise ConfigError(f"protocols texts: protocol '{protocol}' names no encoder; name one with --encoder: {listed}")
-    if asked in known:
-        return asked
-    if asked == EmbeddedEncoder.name:
-        return EMBEDDED
+    if asked in (*known, EmbeddedEncoder.name):
+        return asked if asked in known else EMBEDDED
     if (entry := encoder_known_as(asked)) is not None:
         return entry.name
     whose = "" if said is not None else f" of protocol '{protocol}'"
-    hint = suggest(asked, known) or f"; known: {', '.join(known)}"
-    raise ConfigError(f"protocols texts: unknown encoder '{asked}'{whose}{hint}")
+    raise ConfigError(f"protocols texts: unknown encoder '{asked}'{whose}{suggest(asked, known)}")

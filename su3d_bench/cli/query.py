@@ -6,155 +6,112 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli import questions
-from su3d_bench.cli.options import (
-    Verbs,
-    add_group,
-    add_language_options,
-    add_options,
-    add_out,
-    add_verb,
-    answer_estimate,
-    chat_client,
-    count,
-    open_map,
-)
-from su3d_bench.cli.output import answer, answer_json, file_name_of, remark, remark_unseen, show
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, StoreError
+from su3d_bench.cli import options, output, questions
+from su3d_bench.cli.options import Verbs, add_group, add_verb, count
+from su3d_bench.cli.output import remark
+from su3d_bench.core.errors import ConfigError, PredictionError, StoreError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from su3d_bench.core.maps import Instances
     from su3d_bench.metrics.questions.score import RefinedNames
-    from su3d_bench.questions.model import Answer, Ranking
+    from su3d_bench.questions.model import Answer
     from su3d_bench.questions.scene_map import SceneMap
     from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 
 def add_parser(verbs: Verbs) -> None:
-    actions = add_group(
-        verbs,
-        "query",
-        "Ask the map of a scene for a text or a question, and make, show, audit or score sets of questions.",
-        ('su3d-bench query text rooms/living0 "plant on shelf"', "su3d-bench query show paper"),
+    """Ask the map of a scene for a text or a question, and make, show, audit or score sets of questions.
+
+    su3d-bench query text rooms/living0 "plant on shelf"
+    su3d-bench query show paper
+    """
+    actions = add_group(verbs, "query", add_parser)
+    parser = add_verb(actions, "text", call_text)
+    parser.option("scene", "the scene's address, such as rooms/living0")
+    parser.option("text", "what to look for")
+    parser.shared("--run", "--method")
+    parser.option("--top N", "how many instances to list (default: 10)", type=count, default=10)
+    parser.shared("--device")
+    parser.option("--out FILE", "where the picture goes (default: beside the map)")
+    parser = add_verb(actions, "ask", call_ask)
+    parser.option("scene", "the scene's address, such as rooms/living0")
+    parser.option("question", "the question, in English")
+    parser.shared("--run", "--method")
+    parser.option(
+        "--solver", "who answers: geometry alone, or a language model", choices=("built-in", "llm"), default="built-in"
     )
-    _add_text(actions)
-    _add_ask(actions)
+    parser.option(
+        "--names",
+        "the map's labels n, or n' of su3d-bench runs refine (default: n' where it is there)",
+        choices=("auto", "label", "refined"),
+        default="auto",
+    )
+    parser.option(
+        "--eye",
+        "where one stands for left and right, in metres (default: the middle of the map)",
+        nargs=3,
+        type=float,
+        metavar=("X", "Y", "Z"),
+    )
+    parser.option("--out FILE", "where the picture goes (default: beside the map)")
+    options.add_language_options(parser)
     questions.add_parser(actions)
 
 
-def _add_text(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "text",
-        "Rank the instances of a scene's map by their similarity to a text and draw the heat map.",
-        (
-            'su3d-bench query text rooms/living0 "plant on shelf"',
-            'su3d-bench query text rooms/living0 "place to sit" --top 3 --method opensu3d --json',
-        ),
-        call_text,
-    )
-    parser.add_argument("scene", help="the scene's address, such as rooms/living0")
-    parser.add_argument("text", help="what to look for")
-    add_options(parser, "--run", "--method")
-    parser.add_argument("--top", type=count, default=10, metavar="N", help="how many instances to list (default: 10)")
-    add_options(parser, "--device")
-    add_out(parser, "FILE", "where the picture goes (default: beside the map)")
+def call_text(arguments: argparse.Namespace) -> None:
+    """Rank the instances of a scene's map by their similarity to a text and draw the heat map.
 
-
-def call_text(arguments: argparse.Namespace) -> int:
+    su3d-bench query text rooms/living0 "plant on shelf"
+    su3d-bench query text rooms/living0 "place to sit" --top 3 --method opensu3d --json
+    """
     from su3d_bench.core.maps import DenseFeatures, Instances
     from su3d_bench.questions.model import rank
+    from su3d_bench.reports.pictures.maps import draw_heat_map
     from su3d_bench.runs.finished import encoder_of
 
     if not arguments.text.strip():
         raise ConfigError('the text is empty; say what to look for: su3d-bench query text rooms/living0 "a plant"')
-    run, job, prediction = open_map(arguments, "text", arguments.text)
+    run, job, prediction = options.open_map(arguments, "text", arguments.text)
     if not isinstance(prediction, Instances):
         what = "one feature a point and no instances" if isinstance(prediction, DenseFeatures) else "no instances"
         raise PredictionError(f"{job.prediction}: has {what}, so there is nothing to rank; choose another --method")
     encoder = encoder_of(run, arguments.device or "cpu")
     ranking = rank(prediction, arguments.text, encoder)
-    rows = _rows(prediction, ranking, arguments.top)
-    picture = arguments.out or job.picture(f"query-{file_name_of(arguments.text, 'text')}.png")
-    remark_unseen(encoder, arguments.text, quiet=arguments.quiet)
+    rows: list[dict[str, Any]] = [
+        {
+            "rank": place,
+            "id": int(prediction.ids[k]) if len(prediction.ids) else int(k),
+            "name": prediction.names[k],
+            "similarity": float(ranking.similarity[k]),
+            "centroid": [float(value) for value in prediction.centroids[k]],
+        }
+        for place, k in enumerate(ranking.order[: arguments.top], start=1)
+    ]
+    picture = arguments.out or job.picture(f"query-{output.file_name_of(arguments.text, 'text')}.png")
+    output.remark_unseen(encoder, arguments.text, quiet=arguments.quiet)
     if not arguments.json:
         wide = max([4, *(len(str(row["id"])) for row in rows)])
-        answer(f"{'rank':>4}  {'id':>{wide}}  {'similarity':>10}  {'centroid (m)':<22}  name")
+        output.answer(f"{'rank':>4}  {'id':>{wide}}  {'similarity':>10}  {'centroid (m)':<22}  name")
         for row in rows:
-            x, y, z = row["centroid"]
-            place = f"{x:7.2f}{y:7.2f}{z:7.2f}"
-            answer(f"{row['rank']:>4}  {row['id']:>{wide}}  {row['similarity']:>10.3f}  {place:<22}  {row['name']}")
-        show()  # the picture takes longer than the answer
-    _draw_text(prediction, ranking, rows, picture, f'{arguments.scene}: "{arguments.text}"')
-    value = {"scene": arguments.scene, "text": arguments.text, "picture": str(picture), "ranking": rows}
-    if not answer_json(arguments, value):
-        remark(f"heat map: {picture}", quiet=arguments.quiet)
-    return 0
-
-
-def _draw_text(instances: Instances, ranking: Ranking, rows: list[dict[str, Any]], picture: Path, title: str) -> None:
-    from su3d_bench.reports.pictures.maps import draw_heat_map
-
+            place = "".join(f"{value:7.2f}" for value in row["centroid"])
+            scored = f"{row['rank']:>4}  {row['id']:>{wide}}  {row['similarity']:>10.3f}"
+            output.answer(f"{scored}  {place:<22}  {row['name']}")
+        output.show()  # the picture takes longer than the answer
     lines = [f"{row['rank']}. {row['name']}  {row['similarity']:.3f}" for row in rows]
-    draw_heat_map(instances, ranking.similarity, picture, title, lines)
+    draw_heat_map(prediction, ranking.similarity, picture, f'{arguments.scene}: "{arguments.text}"', lines)
+    value = {"scene": arguments.scene, "text": arguments.text, "picture": str(picture), "ranking": rows}
+    if not output.answer_json(arguments, value):
+        remark(f"heat map: {picture}", quiet=arguments.quiet)
 
 
-def _rows(instances: Instances, ranking: Ranking, top: int) -> list[dict[str, Any]]:
-    rows = []
-    for place, k in enumerate(ranking.order[:top], start=1):
-        rows.append(
-            {
-                "rank": place,
-                "id": int(instances.ids[k]) if len(instances.ids) else int(k),
-                "name": instances.names[k],
-                "similarity": float(ranking.similarity[k]),
-                "centroid": [float(value) for value in instances.centroids[k]],
-            }
-        )
-    return rows
+def call_ask(arguments: argparse.Namespace) -> None:
+    """Answer a question about a scene from its map: by geometry, or by a language model.
 
-
-SOLVERS = ("built-in", "llm")
-NAMES = ("auto", "label", "refined")
-
-
-def _add_ask(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "ask",
-        "Answer a question about a scene from its map: by geometry, or by a language model.",
-        (
-            'su3d-bench query ask rooms/living0 "Which lamp is closer to the sofa?"',
-            'su3d-bench query ask rooms/living0 "I am feeling cold, what should I do?" --solver llm --dry-run',
-        ),
-        call_ask,
-    )
-    parser.add_argument("scene", help="the scene's address, such as rooms/living0")
-    parser.add_argument("question", help="the question, in English")
-    add_options(parser, "--run", "--method")
-    parser.add_argument(
-        "--solver", choices=SOLVERS, default="built-in", help="who answers: geometry alone, or a language model"
-    )
-    parser.add_argument(
-        "--names",
-        choices=NAMES,
-        default="auto",
-        help="the map's labels n, or n' of su3d-bench runs refine (default: n' where it is there)",
-    )
-    parser.add_argument(
-        "--eye",
-        nargs=3,
-        type=float,
-        metavar=("X", "Y", "Z"),
-        help="where one stands for left and right, in metres (default: the middle of the map)",
-    )
-    add_out(parser, "FILE", "where the picture goes (default: beside the map)")
-    add_language_options(parser)
-
-
-def call_ask(arguments: argparse.Namespace) -> int:
+    su3d-bench query ask rooms/living0 "Which lamp is closer to the sofa?"
+    su3d-bench query ask rooms/living0 "I am feeling cold, what should I do?" --solver llm --dry-run
+    """
     from su3d_bench.core.maps import Instances
     from su3d_bench.questions.scene_map import map_of
 
@@ -162,25 +119,24 @@ def call_ask(arguments: argparse.Namespace) -> int:
         raise ConfigError(
             'the question is empty; ask such as: su3d-bench query ask rooms/living0 "How many lamps are there?"'
         )
-    run, job, instances = open_map(arguments, "ask", arguments.question)
+    run, job, instances = options.open_map(arguments, "ask", arguments.question)
     if not isinstance(instances, Instances):
         raise PredictionError(f"{job.prediction}: holds no instances, so there is nothing to ask about")
     refined, note = _refined(job, arguments.names)
     scene = map_of(instances, refined)
     if arguments.dry_run:
-        return _estimate(scene, run, arguments)
+        _estimate(scene, run, arguments)
+        return
     reply = _solve(scene, run, arguments)
     if not arguments.json:
-        answer(reply.text)
-        for line in (*reply.notes, f"names: {note}"):
-            remark(line, quiet=arguments.quiet)
-        show()  # the picture takes longer than the answer
+        output.answer(reply.text)
+        remark(*reply.notes, f"names: {note}", quiet=arguments.quiet)
+        output.show()  # the picture takes longer than the answer
     picture = _draw_ask(instances, scene, reply, job, arguments)
     value = {"scene": arguments.scene, "question": arguments.question} | reply.to_json()
-    is_json = answer_json(arguments, value | {"names": note, "picture": None if picture is None else str(picture)})
-    if picture is not None and not is_json:
+    value |= {"names": note, "picture": None if picture is None else str(picture)}
+    if not output.answer_json(arguments, value) and picture is not None:
         remark(f"picture: {picture}", quiet=arguments.quiet)
-    return EXIT_DONE
 
 
 def _refined(job: JobFolder, wanted: str) -> tuple[RefinedNames | None, str]:
@@ -197,13 +153,14 @@ def _refined(job: JobFolder, wanted: str) -> tuple[RefinedNames | None, str]:
     return records.refined, f"labels n' by {records.model or 'vote'}{without}"
 
 
-def _estimate(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> int:
+def _estimate(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> None:
     from su3d_bench.questions.solver import LanguageSolver
 
     if arguments.solver != "llm":
-        return answer_estimate(arguments, None, ())
-    client, config = chat_client(arguments, run)
-    return answer_estimate(arguments, client, [LanguageSolver(scene, client, config).request(arguments.question)])
+        return options.answer_estimate(arguments, None, ())
+    client, config = options.chat_client(arguments, run)
+    request = LanguageSolver(scene, client, config).request(arguments.question)
+    return options.answer_estimate(arguments, client, [request])
 
 
 def _solve(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> Answer:
@@ -214,7 +171,7 @@ def _solve(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> An
     from su3d_bench.questions.solver import LanguageSolver, Solver
 
     if arguments.solver == "llm":
-        return LanguageSolver(scene, *chat_client(arguments, run)).answer(arguments.question)
+        return LanguageSolver(scene, *options.chat_client(arguments, run)).answer(arguments.question)
     eye = None if arguments.eye is None else np.array(arguments.eye, np.float64)
     if eye is not None and not np.isfinite(eye).all():
         raise ConfigError(f"--eye {arguments.eye}: expected three finite numbers of metres")
@@ -228,7 +185,7 @@ def _solve(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> An
     reply = Solver(scene, eye, nearest_name).answer(arguments.question)
     asked = arguments.question.split()
     for noun in unnamed or asked[: len(asked) == 1]:  # of one word there is no question, only a noun
-        remark_unseen(encoder, noun, quiet=arguments.quiet)
+        output.remark_unseen(encoder, noun, quiet=arguments.quiet)
     return reply
 
 
@@ -242,7 +199,7 @@ def _draw_ask(
         if arguments.out is not None:
             remark(f"{arguments.out}: not drawn, for the answer names no object", quiet=arguments.quiet)
         return None
-    picture: Path = arguments.out or job.picture(f"ask-{file_name_of(arguments.question, 'question')}.png")
+    picture: Path = arguments.out or job.picture(f"ask-{output.file_name_of(arguments.question, 'question')}.png")
     rows = [tuple(scene.by_id(object_id).row for object_id in ids) for ids in (reply.object_ids, reply.reference_ids)]
     names = [""] * len(instances)
     for thing in scene.objects:

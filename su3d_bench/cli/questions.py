@@ -5,158 +5,84 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.options import (
-    Verbs,
-    add_language_options,
-    add_options,
-    add_out,
-    add_verb,
-    answer_estimate,
-    chat_client,
-    count,
-    given_language_option,
-)
-from su3d_bench.cli.output import answer, answer_either, answer_json, answer_tables, remark
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, counted
+from su3d_bench.cli import options, output
+from su3d_bench.cli.options import Verbs, add_verb, count
+from su3d_bench.cli.output import remark
+from su3d_bench.core.errors import ConfigError, DataError, counted, printable
 
 if TYPE_CHECKING:
     from su3d_bench.questions.model import Question
 
-PAPER = "paper"
 SOURCES = ("auto", "generated")
 FORMS = ("own", "beacon3d-grounding", "beacon3d-qa")
 JUDGE_MODEL = "gpt-4o-2024-08-06"  # Beacon3D's
-
+FIELDS = ("id", "scene", "kind", "text", "answers", "reply", "source")  # of a question, as --json shows them
 N_SHOWN = 20
 MOST_CHARACTERS = 80
 
 
 def add_parser(verbs: Verbs) -> None:
-    _add_make(verbs)
-    _add_show(verbs)
-    _add_audit(verbs)
-    _add_score(verbs)
-
-
-def _add_make(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "make",
-        "Make a set of questions with known answers from the ground truth of scenes.",
-        (
-            "su3d-bench query make --scenes 'rooms/*' --per-kind 40 --leave-out disputed.csv --out queries.toml",
-            "su3d-bench query make --scenes 'rooms/*' --form beacon3d-qa --out metadata_qa.json",
-        ),
-        _make,
+    scenes = "--scenes SCENE...", "addresses or patterns, such as 'rooms/*'"
+    parser = add_verb(verbs, "make", _make)
+    parser.option(*scenes, required=True)
+    parser.option("--out FILE", "a .toml or .csv file; .json in a form of Beacon3D", required=True)
+    parser.option(
+        "--per-kind N", "at most N questions of each kind and scene, or objects of a scene (default: all)", type=count
     )
-    _add_scenes(parser, required=True)
-    add_out(parser, "FILE", "a .toml or .csv file; .json in a form of Beacon3D", required=True)
-    parser.add_argument(
-        "--per-kind",
-        type=count,
-        metavar="N",
-        help="at most N questions of each kind and scene, or objects of a scene (default: all)",
-    )
-    parser.add_argument(
+    parser.option(
         "--source",
+        "auto: what the dataset itself knows, else generated from classes and boxes (default: auto)",
         default=SOURCES[0],
         choices=SOURCES,
-        help="auto: what the dataset itself knows, else generated from classes and boxes (default: auto)",
     )
-    add_options(parser, "--leave-out")
-    parser.add_argument(
+    parser.shared("--leave-out")
+    parser.option(
         "--form",
+        "own sets of queries, or Beacon3D's metadata_*.json of grounding or of answers in words (default: own)",
         default=FORMS[0],
         choices=FORMS,
-        help="own sets of queries, or Beacon3D's metadata_*.json of grounding or of answers in words (default: own)",
     )
+    parser = add_verb(verbs, "show", _show)
+    parser.option("file FILE", "a set (.toml, .csv, ScanRefer, Nr3D, SQA3D, Beacon3D), or 'paper'", type=str)
+    parser = add_verb(verbs, "audit", _audit)
+    parser.option(*scenes)
+    parser.option("--out DIR", "where page, pictures and table go")
+    parser.option("--n N", "so many questions (default: 200)", type=count, default=200)
+    parser.shared("--seed")
+    parser.option("--kinds KIND...", "these alone, such as retrieval, property, 'what on'", default=[])
+    parser.option("--score FILE", "add up the verdicts in this audit.csv instead")
+    parser.shared("--format")
+    parser = add_verb(verbs, "score", _score)
+    parser.option("file FILE", "a metadata_*.json of Beacon3D")
+    parser.option("--answers FILE", "JSON with what a system answered, in Beacon3D's order", required=True)
+    parser.option("--judge", "let a language model score the answers that match no right one")
+    options.add_language_options(parser, JUDGE_MODEL)
+    parser.shared("--format")
 
 
-def _add_show(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "show",
-        "Show a set of questions: how many of each kind, and the first of them.",
-        ("su3d-bench query show queries.toml", "su3d-bench query show paper --json"),
-        _show,
-    )
-    parser.add_argument(
-        "file", metavar="FILE", help="a set (.toml, .csv, ScanRefer, Nr3D, SQA3D, Beacon3D), or 'paper'"
-    )
+def _make(arguments: argparse.Namespace) -> None:
+    """Make a set of questions with known answers from the ground truth of scenes.
 
-
-def _add_audit(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "audit",
-        "Draw a sample of the questions of scenes with pictures for people, or add up what they said of them.",
-        (
-            "su3d-bench query audit --scenes 'rooms/*' --n 200 --out audit",
-            "su3d-bench query audit --score audit/audit.csv",
-        ),
-        _audit,
-    )
-    _add_scenes(parser)
-    add_out(parser, "DIR", "where page, pictures and table go")
-    parser.add_argument("--n", type=count, default=200, metavar="N", help="so many questions (default: 200)")
-    add_options(parser, "--seed")
-    parser.add_argument(
-        "--kinds", nargs="+", default=[], metavar="KIND", help="these alone, such as retrieval, property, 'what on'"
-    )
-    parser.add_argument("--per-page", type=count, default=12, metavar="N", help="questions of a sheet (default: 12)")
-    parser.add_argument("--score", type=Path, metavar="FILE", help="add up the verdicts in this audit.csv instead")
-    add_options(parser, "--format")
-
-
-def _add_score(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "score",
-        "Score answers to the questions of a metadata_*.json of Beacon3D.",
-        (
-            "su3d-bench query score metadata_qa.json --answers answers.json",
-            "su3d-bench query score metadata_qa.json --answers answers.json --judge --dry-run",
-        ),
-        _score_answers,
-    )
-    parser.add_argument("file", type=Path, metavar="FILE", help="a metadata_*.json of Beacon3D")
-    parser.add_argument(
-        "--answers",
-        type=Path,
-        required=True,
-        metavar="FILE",
-        help="JSON with what a system answered, in Beacon3D's order",
-    )
-    parser.add_argument(
-        "--judge", action="store_true", help="let a language model score the answers that match no right one"
-    )
-    add_language_options(parser, JUDGE_MODEL)
-    add_options(parser, "--format")
-
-
-def _add_scenes(parser: argparse.ArgumentParser, *, required: bool = False) -> None:
-    parser.add_argument(
-        "--scenes", nargs="+", required=required, metavar="SCENE", help="addresses or patterns, such as 'rooms/*'"
-    )
-
-
-def _make(arguments: argparse.Namespace) -> int:
+    su3d-bench query make --scenes 'rooms/*' --per-kind 40 --leave-out disputed.csv --out queries.toml
+    su3d-bench query make --scenes 'rooms/*' --form beacon3d-qa --out metadata_qa.json
+    """
     from su3d_bench.questions.question_files import check_form, write_questions
 
     if arguments.form != FORMS[0]:
-        return _make_beacon3d(arguments)
+        _make_beacon3d(arguments)
+        return
     check_form(arguments.out)
     made = _made(arguments)
     write_questions(arguments.out, made)
     remark(f"{counted(len(made), 'question')}: {arguments.out}", quiet=arguments.quiet)
-    answer_either(arguments, *_counts(made))
-    return EXIT_DONE
+    output.answer_either(arguments, *_counts(made))
 
 
-def _make_beacon3d(arguments: argparse.Namespace) -> int:
+def _make_beacon3d(arguments: argparse.Namespace) -> None:
     """Write one of Beacon3D's metadata files over objects of the scenes."""
     from su3d_bench.cli.scenes import chosen_scenes
     from su3d_bench.core.files.atomic import write_json
@@ -173,13 +99,11 @@ def _make_beacon3d(arguments: argparse.Namespace) -> int:
             raise ConfigError(f"query make: two datasets have a scene '{scene}', and the form has scenes by name")
         objects[scene] = scene_objects(dataset, scene, fullest_truth(dataset, scene), MIN_VERTICES)
         remark(f"{dataset.name}/{scene}: {counted(len(objects[scene]), 'object')}", quiet=arguments.quiet)
-    files = made_files(objects, arguments.per_kind)
-    content = files[FORMS.index(arguments.form) - 1]
+    content = made_files(objects, arguments.per_kind)[FORMS.index(arguments.form) - 1]
     write_json(arguments.out, content)
     n = sum(len(of_class) for of_scene in content.values() for of_class in of_scene.values())
     line = f"{counted(n, 'object')} on {counted(len(content), 'scene')}: {arguments.out}"
-    answer_either(arguments, {"n_objects": n, "n_scenes": len(content), "out": str(arguments.out)}, line)
-    return EXIT_DONE
+    output.answer_either(arguments, {"n_objects": n, "n_scenes": len(content), "out": str(arguments.out)}, line)
 
 
 def _made(arguments: argparse.Namespace) -> list[Question]:
@@ -200,40 +124,29 @@ def _made(arguments: argparse.Namespace) -> list[Question]:
     return made
 
 
-def _show(arguments: argparse.Namespace) -> int:
+def _show(arguments: argparse.Namespace) -> None:
+    """Show a set of questions: how many of each kind, and the first of them.
+
+    su3d-bench query show queries.toml
+    su3d-bench query show paper --json
+    """
     from su3d_bench.questions.question_files import paper_queries, read_questions
 
     questions: Sequence[Question]
-    questions = paper_queries() if arguments.file == PAPER else read_questions(Path(arguments.file), "")
-    if answer_json(arguments, [_row(question) for question in questions]):
-        return EXIT_DONE
-    answer(_counts(questions)[1])
-    for question in questions[:N_SHOWN]:
-        answer("  ".join(str(value) for value in _printable_row(question)))
+    questions = paper_queries() if arguments.file == "paper" else read_questions(Path(arguments.file), "")
+    lines = [_counts(questions)[1], *map(_line, questions[:N_SHOWN])]
     if len(questions) > N_SHOWN:
-        answer(f"... and {len(questions) - N_SHOWN} more; --json shows all")
-    return EXIT_DONE
+        lines.append(f"... and {len(questions) - N_SHOWN} more; --json shows all")
+    value = [{name: getattr(question, name) for name in FIELDS} for question in questions]
+    output.answer_either(arguments, value, *lines)
 
 
-def _row(question: Question) -> dict[str, Any]:
-    return {
-        "id": question.id,
-        "scene": question.scene,
-        "kind": question.kind,
-        "text": question.text,
-        "answers": None if question.answers is None else list(question.answers),
-        "reply": question.reply,
-        "source": question.source,
-    }
-
-
-def _printable_row(question: Question) -> tuple[str, ...]:
-    from su3d_bench.core.errors import printable
-
+def _line(question: Question) -> str:
     ids = " ".join(map(str, question.answers or ()))
     reply = f'"{printable(question.reply, MOST_CHARACTERS)}"' if question.reply else ""
     known = " ".join(part for part in (ids, reply) if part) or "unknown"
-    return printable(question.scene, 60), question.kind, printable(question.text, MOST_CHARACTERS), f"-> {known}"
+    text = printable(question.text, MOST_CHARACTERS)
+    return f"{printable(question.scene, 60)}  {question.kind}  {text}  -> {known}"
 
 
 def _counts(questions: Sequence[Question]) -> tuple[dict[str, Any], str]:
@@ -241,8 +154,7 @@ def _counts(questions: Sequence[Question]) -> tuple[dict[str, Any], str]:
     counts = Counter(question.kind for question in questions)
     n_known = sum(question.is_known for question in questions)
     kinds = ", ".join(f"{n} {kind}" for kind, n in counts.items())
-    n_scenes = len({question.scene for question in questions})
-    on = counted(n_scenes, "scene")
+    on = counted(len({question.scene for question in questions}), "scene")
     text = f"{counted(len(questions), 'question')} on {on} ({kinds}); {n_known} with known answers"
     if n_replies := sum(bool(question.reply) for question in questions):
         text += f", {n_replies} with one in words"
@@ -250,13 +162,20 @@ def _counts(questions: Sequence[Question]) -> tuple[dict[str, Any], str]:
     return content, text
 
 
-def _audit(arguments: argparse.Namespace) -> int:
+def _audit(arguments: argparse.Namespace) -> None:
+    """Draw a sample of the questions of scenes with pictures for people, or add up what they said of them.
+
+    su3d-bench query audit --scenes 'rooms/*' --n 200 --out audit
+    su3d-bench query audit --score audit/audit.csv
+    """
     from su3d_bench.cli.scenes import chosen_scenes
     from su3d_bench.questions.audit import audited_questions, n_of_each, of_kinds, sample
-    from su3d_bench.sheets.audit import make_audit
+    from su3d_bench.sheets.audit import audit_json, audit_table, make_audit, read_verdicts
 
     if arguments.score is not None:
-        return _score(arguments)
+        verdicts = read_verdicts(arguments.score)
+        output.answer_tables(arguments, audit_json(verdicts), [audit_table(verdicts)])
+        return
     if not arguments.scenes or arguments.out is None:
         raise ConfigError("query audit: needs --scenes and --out DIR, or --score DIR/audit.csv")
     scenes = chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet)
@@ -271,10 +190,7 @@ def _audit(arguments: argparse.Namespace) -> int:
         raise DataError("query audit: nothing can be asked of these scenes")
     places = {f"{dataset.name}/{scene}": dataset for dataset, scene in scenes}
     page = make_audit(
-        drawn,
-        places.__getitem__,
-        arguments.out,
-        progress=lambda scene: remark(f"{scene}: drawn", quiet=arguments.quiet),
+        drawn, places.__getitem__, arguments.out, lambda scene: remark(f"{scene}: drawn", quiet=arguments.quiet)
     )
     counts = dict(sorted(Counter(question.kind for question in drawn).items()))
     kinds = ", ".join(f"{n} {kind}" for kind, n in counts.items())
@@ -283,35 +199,28 @@ def _audit(arguments: argparse.Namespace) -> int:
         f"look at {page}, write right, arguable or wrong into audit.csv, then: "
         f"su3d-bench query audit --score {arguments.out}/audit.csv",
     )
-    answer_either(arguments, {"n": len(drawn), "kinds": counts, "page": str(page)}, *lines)
-    return EXIT_DONE
+    output.answer_either(arguments, {"n": len(drawn), "kinds": counts, "page": str(page)}, *lines)
 
 
-def _score(arguments: argparse.Namespace) -> int:
-    from su3d_bench.sheets.audit import audit_json, audit_table, read_verdicts
+def _score(arguments: argparse.Namespace) -> None:
+    """Score answers to the questions of a metadata_*.json of Beacon3D.
 
-    verdicts = read_verdicts(arguments.score)
-    answer_tables(arguments, audit_json(verdicts), [audit_table(verdicts)])
-    return EXIT_DONE
+    su3d-bench query score metadata_qa.json --answers answers.json
+    su3d-bench query score metadata_qa.json --answers answers.json --judge --dry-run
+    """
+    from su3d_bench.questions import beacon3d
+    from su3d_bench.store.run_folder import RunFolder
 
-
-def _score_answers(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.beacon3d import answered_file, answered_json, answered_table, answers_to_questions
-
-    asked = arguments.file
-    if not arguments.judge:
-        if flag := given_language_option(arguments):
-            raise ConfigError(f"query score: {flag} belongs to --judge")
-        answered = answered_file(asked, arguments.answers)
-    else:
-        from su3d_bench.questions.beacon3d import judge_requests, judged
-        from su3d_bench.store.run_folder import RunFolder
-
+    judge = None
+    if arguments.judge:
         folder = RunFolder(arguments.answers.with_name(f"{arguments.answers.stem}.judged"))
-        client, config = chat_client(arguments, folder, JUDGE_MODEL)
+        client, config = options.chat_client(arguments, folder, JUDGE_MODEL)
         if arguments.dry_run:
-            requests = judge_requests(answers_to_questions(asked, arguments.answers), config)
-            return answer_estimate(arguments, client, list(requests.values()))
-        answered = answered_file(asked, arguments.answers, lambda replies: judged(replies, client, config))
-    answer_tables(arguments, answered_json(answered), [answered_table(answered)])
-    return EXIT_DONE
+            asked = beacon3d.answers_to_questions(arguments.file, arguments.answers)
+            options.answer_estimate(arguments, client, list(beacon3d.judge_requests(asked, config).values()))
+            return
+        judge = partial(beacon3d.judged, model=client, config=config)
+    elif flag := options.given_language_option(arguments):
+        raise ConfigError(f"query score: {flag} belongs to --judge")
+    answered = beacon3d.answered_file(arguments.file, arguments.answers, judge)
+    output.answer_tables(arguments, beacon3d.answered_json(answered), [beacon3d.answered_table(answered)])

@@ -5,64 +5,53 @@ from __future__ import annotations
 import argparse
 import os
 import shlex
-import time
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.options import Verbs, add_options, add_out, add_runs, add_verb, count
-from su3d_bench.cli.output import answer_either, drawn_bars, progress, remark, written
+from su3d_bench.cli import output
+from su3d_bench.cli.options import Verbs, add_verb, count
+from su3d_bench.cli.output import answer_either, remark
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable
-
-if TYPE_CHECKING:
-    from su3d_bench.analysis.page.contents import Amount
-    from su3d_bench.runs.executors import Event
-
 
 MEGABYTE = 10**6
 
 
 def add_pages(verbs: Verbs) -> None:
-    _add_html(verbs)
-    _add_rerun(verbs)
+    parser = add_verb(verbs, "html", call_html, takes_up=True)
+    parser.shared("runs")
+    parser.option("--out FILE", "the page (default: page.html)", default=Path("page.html"))
+    parser.option("--title TEXT", "of the page (default: the folders of the runs)")
+    parser.option("--queries TEXT...", "texts to which instances are compared (default: eight)")
+    parser.option("--no-maps", "leave the maps out")
+    parser.option("--no-errors", "leave out what errors cost, and their gallery (quicker)")
+    parser.option("--no-gallery", "leave out the single errors and their photos")
+    parser.option("--most-megabytes MB", "maps are thinned for it (default: 30)", type=float, default=30.0)
+    parser.shared("--jobs")
+    parser = add_verb(verbs, "rerun", call_rerun)
+    parser.shared("run", "--scenes", "--methods")
+    parser.option(
+        "--stride N", "every Nth of the frames that the methods were given (default: at most 60 of a scene)", type=count
+    )
+    parser.option("--out FILE", "the .rrd file, read by rerun's viewer", required=True)
 
 
 def add_archives(verbs: Verbs) -> None:
-    _add_bundle(verbs)
-    _add_verify(verbs)
+    parser = add_verb(verbs, "bundle", call_bundle)
+    parser.shared("runs")
+    parser.option("--out FILE", "the archive (default: the first run's name.zip)")
+    parser.option("--trained-on TEXT", "the data of your weights, for a registry", default="")
+    parser = add_verb(verbs, "verify", call_verify)
+    parser.option("files FILE...", "LaTeX by report tables, or around it; or bundle.zip of reproduce")
+    parser.option("--root DIR", "where the runs' folders are (default: here, then beside the file)")
 
 
-def _add_html(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "html",
-        "Make one page that needs no network: numbers, errors, times, comparisons and the maps in 3D.",
-        (
-            "su3d-bench report html runs/my-run --out page.html",
-            'su3d-bench report html runs/a runs/b --queries "a place to sit" "a plant" --no-errors',
-        ),
-        call_html,
-        takes_up=True,
-    )
-    add_runs(parser)
-    add_out(parser, "FILE", "the page (default: page.html)", default=Path("page.html"))
-    parser.add_argument("--title", metavar="TEXT", help="of the page (default: the folders of the runs)")
-    parser.add_argument(
-        "--queries", nargs="+", metavar="TEXT", help="texts to which instances are compared (default: eight)"
-    )
-    parser.add_argument("--no-maps", action="store_true", help="leave the maps out")
-    parser.add_argument(
-        "--no-errors", action="store_true", help="leave out what errors cost, and their gallery (quicker)"
-    )
-    parser.add_argument("--no-gallery", action="store_true", help="leave out the single errors and their photos")
-    parser.add_argument(
-        "--most-megabytes", type=float, default=30.0, metavar="MB", help="maps are thinned for it (default: 30)"
-    )
-    add_options(parser, "--jobs")
+def call_html(arguments: argparse.Namespace) -> None:
+    """Make one page that needs no network: numbers, errors, times, comparisons and the maps in 3D.
 
-
-def call_html(arguments: argparse.Namespace) -> int:
+    su3d-bench report html runs/my-run --out page.html
+    su3d-bench report html runs/a runs/b --queries "a place to sit" "a plant" --no-errors
+    """
     from su3d_bench.analysis.page.contents import QUERIES, Wishes, page_contents
     from su3d_bench.analysis.page.gallery import told_of
     from su3d_bench.reports.page.page import page_html
@@ -78,88 +67,29 @@ def call_html(arguments: argparse.Namespace) -> int:
         jobs=arguments.jobs or 0,
     )
     arguments.takes_up = all(os.access(run, os.W_OK) for run in arguments.runs)  # else nothing is kept
-    with drawn_bars(is_quiet=arguments.quiet, tells_time_left=True) as bars:
-        progress = _Progress(bars, is_quiet=arguments.quiet)
-        contents = page_contents(arguments.runs, wishes, begin=progress.begin, report=progress.report)
+    with output.overall_progress("page", is_quiet=arguments.quiet) as (begin, report):
+        contents = page_contents(arguments.runs, wishes, begin=begin, report=report)
     title = arguments.title or ", ".join(dict.fromkeys(run.resolve().name for run in arguments.runs))
     maps = contents.maps
     page = page_html(
         printable(title, 200),
-        {
-            **contents.numbers,
-            "maps": [page_map.listed() for page_map in maps],
-            "gallery": told_of(contents.galleries),
-        },
+        {**contents.numbers, "maps": [one.listed() for one in maps], "gallery": told_of(contents.galleries)},
         [scene.listed() for scene in contents.scenes],
         [page_map.content for page_map in maps],
         [gallery.to_json() for gallery in contents.galleries],
     )
-    written(arguments.out, page)
+    output.written(arguments.out, page)
     n_bytes = len(page.encode())
-    about = {
-        "page": str(arguments.out), "n_bytes": n_bytes, "n_maps": len(maps), "most_points": contents.most_points,
-    }  # fmt: skip
-    answer_either(arguments, about, f"{arguments.out}: {n_bytes / MEGABYTE:.1f} MB, {counted(len(maps), 'map')}")
-    return EXIT_DONE
+    value = {"page": str(arguments.out), "n_bytes": n_bytes, "n_maps": len(maps), "most_points": contents.most_points}
+    answer_either(arguments, value, f"{arguments.out}: {n_bytes / MEGABYTE:.1f} MB, {counted(len(maps), 'map')}")
 
 
-class _Progress:
-    """What of the page is made: a bar with the time that is left, or a line a scene where stderr is no terminal."""
+def call_rerun(arguments: argparse.Namespace) -> None:
+    """Write frames, masks, maps and truth of a run on one timeline, for rerun's viewer.
 
-    def __init__(self, bars: Any, *, is_quiet: bool) -> None:
-        self._bars = bars
-        self._is_quiet = is_quiet
-        self._done: dict[str, int] = {}
-        self._n_scenes_done = 0
-
-    def begin(self, amount: Amount) -> None:
-        self._amount, self._since = amount, time.monotonic()
-        if amount.n_kept:
-            self._say(f"{counted(amount.n_kept, 'scene')} as made before")
-        if self._bars is not None and amount.n_steps:
-            self._task = self._bars.add_task("page", total=amount.n_steps, remark="")
-
-    def report(self, event: Event) -> None:
-        from su3d_bench.runs.executors import SCENE_DONE
-
-        self._done[event.unit] = event.done
-        n_done, is_scene = sum(self._done.values()), event.label == SCENE_DONE
-        self._n_scenes_done += is_scene
-        doing = "done" if is_scene else event.label
-        if self._bars is not None:
-            self._bars.update(self._task, completed=n_done, description=f"{printable(event.unit, 60)}: {doing}")
-        elif is_scene:
-            left_s = (time.monotonic() - self._since) * (self._amount.n_steps / max(1, n_done) - 1)
-            left = f", about {left_s:.0f} s left" if n_done < self._amount.n_steps else ""
-            self._say(f"{printable(event.unit, 120)}: {self._n_scenes_done} of {self._amount.n_scenes} scenes{left}")
-
-    def _say(self, text: str) -> None:
-        remark(text, quiet=self._is_quiet)
-
-
-def _add_rerun(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "rerun",
-        "Write frames, masks, maps and truth of a run on one timeline, for rerun's viewer.",
-        (
-            "su3d-bench report rerun runs/my-run --out my-run.rrd",
-            "su3d-bench report rerun runs/my-run --scenes rooms/office0 --methods opensu3d --stride 2 --out office.rrd",
-        ),
-        call_rerun,
-    )
-    add_runs(parser, None)
-    add_options(parser, "--scenes", "--methods")
-    parser.add_argument(
-        "--stride",
-        type=count,
-        metavar="N",
-        help="every Nth of the frames that the methods were given (default: at most 60 of a scene)",
-    )
-    add_out(parser, "FILE", "the .rrd file, read by rerun's viewer", required=True)
-
-
-def call_rerun(arguments: argparse.Namespace) -> int:
+    su3d-bench report rerun runs/my-run --out my-run.rrd
+    su3d-bench report rerun runs/my-run --scenes rooms/office0 --methods opensu3d --stride 2 --out office.rrd
+    """
     from su3d_bench.analysis.page.maps import Spaces
     from su3d_bench.analysis.timeline import SceneTimeline, refuse_nothing
     from su3d_bench.core.files.atomic import make_folder, replacing
@@ -167,7 +97,6 @@ def call_rerun(arguments: argparse.Namespace) -> int:
     from su3d_bench.runs.executors import Event
     from su3d_bench.runs.finished import read_run
     from su3d_bench.sheets.sources import chosen_of
-    from su3d_bench.store.run_folder import refuse_records
 
     if arguments.out.suffix != ".rrd" or arguments.out.is_dir():
         raise ConfigError(f"--out {printable(str(arguments.out), 200)}: expected a file name that ends in .rrd")
@@ -175,21 +104,16 @@ def call_rerun(arguments: argparse.Namespace) -> int:
     scenes = chosen_of(run, "scene", arguments.scenes, run.scenes)
     methods = chosen_of(run, "method", arguments.methods, run.methods)
     sdk = rerun_sdk()
-    refuse_records(arguments.out)
     spaces = Spaces(())
     timelines = [SceneTimeline(run, scene, methods, arguments.stride or 0, spaces) for scene in scenes]
     make_folder(arguments.out.parent)
-    with progress(len(timelines), is_quiet=arguments.quiet) as report, replacing(arguments.out) as stream:
-
-        def tell(scene: str, done: int, total: int) -> None:
-            report(Event(scene, "frames", done, total))
-
+    with output.progress(len(timelines), is_quiet=arguments.quiet) as report, replacing(arguments.out) as stream:
         for one in timelines:
-            one.write(Recording(sdk, one.scene, methods, stream), partial(tell, one.scene))
+            tell = partial(lambda scene, done, total: report(Event(scene, "frames", done, total)), one.scene)
+            one.write(Recording(sdk, one.scene, methods, stream), tell)
         refuse_nothing(timelines, run.name)
     for one in timelines:
-        for line in one.remarks:
-            remark(f"{printable(one.scene, 120)}: {line}", quiet=arguments.quiet)
+        remark(*(f"{printable(one.scene, 120)}: {line}" for line in one.remarks), quiet=arguments.quiet)
     n_bytes, n_frames = arguments.out.stat().st_size, sum(one.n_frames for one in timelines)
     n_maps = sum(one.n_maps for one in timelines)
     about = {
@@ -197,32 +121,16 @@ def call_rerun(arguments: argparse.Namespace) -> int:
         "n_maps": n_maps, "scenes": list(scenes), "methods": list(methods),
     }  # fmt: skip
     shown = f"{counted(len(scenes), 'scene')}, {counted(n_maps, 'map')}, {counted(n_frames, 'frame')}"
-    answer_either(
-        arguments,
-        about,
-        f"{arguments.out}: {n_bytes / MEGABYTE:.1f} MB, {shown}",
-        f"look at it: rerun {shlex.quote(str(arguments.out))} (version {sdk.__version__}; others may not read it)",
-    )
-    return EXIT_DONE
+    how = f"look at it: rerun {shlex.quote(str(arguments.out))} (version {sdk.__version__}; others may not read it)"
+    answer_either(arguments, about, f"{arguments.out}: {n_bytes / MEGABYTE:.1f} MB, {shown}", how)
 
 
-def _add_bundle(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "bundle",
-        "Pack finished runs into one archive that report verify scores anew and a registry takes in.",
-        (
-            "su3d-bench report bundle runs/my-run --out my-run.zip",
-            "su3d-bench report bundle runs/mine --trained-on 'ScanNet v2, training scenes' --out mine.zip",
-        ),
-        call_bundle,
-    )
-    add_runs(parser)
-    add_out(parser, "FILE", "the archive (default: the first run's name.zip)")
-    parser.add_argument("--trained-on", metavar="TEXT", default="", help="the data of your weights, for a registry")
+def call_bundle(arguments: argparse.Namespace) -> None:
+    """Pack finished runs into one archive that report verify scores anew and a registry takes in.
 
-
-def call_bundle(arguments: argparse.Namespace) -> int:
+    su3d-bench report bundle runs/my-run --out my-run.zip
+    su3d-bench report bundle runs/mine --trained-on 'ScanNet v2, training scenes' --out mine.zip
+    """
     from su3d_bench.core.digests import digest_file
     from su3d_bench.reproducing.bundle import bundle_runs, is_bundle, refuse_own_code, refuse_own_truth
     from su3d_bench.runs.finished import read_run
@@ -240,34 +148,15 @@ def call_bundle(arguments: argparse.Namespace) -> int:
     line = f"{place}: {counted(len(arguments.runs), 'run')}, {n_bytes / 1e6:.1f} MB, SHA-256 {value['sha256']}"
     answer_either(arguments, value, line)
     remark(f"next: su3d-bench report verify {place}", quiet=arguments.quiet)
-    return EXIT_DONE
-
-
-BUNDLE = ".zip"
-
-
-def _add_verify(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "verify",
-        "Recompute the cells of LaTeX tables from their runs, or score a bundle anew; exit code 1 where one differs.",
-        ("su3d-bench report verify paper.tex", "su3d-bench report verify reproduced/opensu3d/bundle.zip --json"),
-        call_verify,
-    )
-    parser.add_argument(
-        "files",
-        nargs="+",
-        type=Path,
-        metavar="FILE",
-        help="LaTeX by report tables, or around it; or bundle.zip of reproduce",
-    )
-    parser.add_argument(
-        "--root", type=Path, metavar="DIR", help="where the runs' folders are (default: here, then beside the file)"
-    )
 
 
 def call_verify(arguments: argparse.Namespace) -> int:
-    bundles = [file for file in arguments.files if file.suffix.lower() == BUNDLE]
+    """Recompute the cells of LaTeX tables from their runs, or score a bundle anew; exit code 1 where one differs.
+
+    su3d-bench report verify paper.tex
+    su3d-bench report verify reproduced/opensu3d/bundle.zip --json
+    """
+    bundles = [file for file in arguments.files if file.suffix.lower() == ".zip"]
     if bundles and len(bundles) < len(arguments.files):
         raise ConfigError("report verify: bundles and LaTeX are verified apart; name the one or the other")
     return _verify_bundles(bundles, arguments) if bundles else _verify_papers(arguments)
@@ -283,10 +172,9 @@ def _verify_bundles(bundles: list[Path], arguments: argparse.Namespace) -> int:
     for one in found:
         lines += [f"{one.bundle}: {fault}" for fault in one.faults]
         how = "to the last bit" if one.is_to_the_bit else "integers the same, values within 1e-9"
-        said = f"differs: {counted(len(one.faults), 'fault')}" if one.faults else f"holds, {how}"
-        counts = (counted(one.n_files, "file"), counted(one.n_scores, "score"), counted(one.n_cells, "cell"))
-        looked_at = "{}, {} made anew, {}".format(*counts)
-        lines.append(f"{one.bundle}: {looked_at}; {said}")
+        verdict = f"differs: {counted(len(one.faults), 'fault')}" if one.faults else f"holds, {how}"
+        n_files, n_scores = counted(one.n_files, "file"), counted(one.n_scores, "score")
+        lines.append(f"{one.bundle}: {n_files}, {n_scores} made anew, {counted(one.n_cells, 'cell')}; {verdict}")
     answer_either(arguments, {"bundles": [asdict(one) for one in found]}, *lines)
     return EXIT_CHECK_FAILED if any(one.faults for one in found) else EXIT_DONE
 

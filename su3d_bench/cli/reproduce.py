@@ -9,67 +9,45 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from su3d_bench.cli.options import EXECUTOR, Verbs, add_options, add_out, add_verb
-from su3d_bench.cli.output import answer, answer_document, answer_json, formatted, remark, show, written
+from su3d_bench.cli import output
+from su3d_bench.cli.options import EXECUTOR, Verbs, add_verb
+from su3d_bench.cli.output import remark
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, RunIncomplete, counted, printable
 
 if TYPE_CHECKING:
-    from su3d_bench.reproducing.preflight import Preflight
     from su3d_bench.reproducing.recipe import Asked, AskedRun, Experiment, Recipe
 
-VARIABLES = ("SU3D_DATA",)  # where a rehearsal's own data lie
 OF_A_RUN = ("jobs", "limit", "solver", "offline", "executor", "ray_address", "gpus_per_job", "retries", "slurm")
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "reproduce",
-        "Do a paper's experiments again: what is missing, the runs, its tables beside the printed ones, one archive.",
-        (
-            "su3d-bench reproduce opensu3d --table II III --dry-run",
-            "su3d-bench reproduce opensu3d --table I II III IV V reasoning --rehearse",
-        ),
-        call,
-        takes_up=True,
-    )
-    parser.add_argument(
-        "recipe", metavar="RECIPE", nargs="?", help="its name, or a file of your own (default: list them)"
-    )
-    parser.add_argument("--table", nargs="+", default=[], metavar="NAME", help="these experiments alone (default: all)")
-    add_out(parser, "DIR", "where all goes (default: reproduced/<recipe>)")
-    add_options(parser, "--dry-run")
-    parser.add_argument(
-        "--rehearse", action="store_true", help="the same on rooms made in the same layouts, with embedded perception"
-    )
-    parser.add_argument("--rooms", nargs="+", metavar="ROOM", help="of a rehearsal (default: the recipe's)")
-    parser.add_argument(
-        "--room-settings", nargs="+", metavar="KEY=VALUE", help="options of the rooms, such as n_frames=80 width=160"
-    )
-    parser.add_argument(
-        "--predictions",
-        nargs="+",
+    parser = add_verb(verbs, "reproduce", call, takes_up=True)
+    parser.option("recipe [RECIPE]", "its name, or a file of your own (default: list them)")
+    parser.option("--table NAME...", "these experiments alone (default: all)", default=[])
+    parser.option("--out DIR", "where all goes (default: reproduced/<recipe>)")
+    parser.shared("--dry-run")
+    parser.option("--rehearse", "the same on rooms made in the same layouts, with embedded perception")
+    parser.option("--rooms ROOM...", "of a rehearsal (default: the recipe's)")
+    parser.option("--room-settings KEY=VALUE...", "options of the rooms, such as n_frames=80 width=160")
+    parser.option("--predictions METHOD=DIR...", "of methods that are none here, as evaluate takes", default=[])
+    parser.option(
+        "--text-features METHOD=FILE...",
+        "what the encoder of its predictions makes of texts, as evaluate --text-features",
         default=[],
-        metavar="METHOD=DIR",
-        help="of methods that are none here, as evaluate takes",
     )
-    parser.add_argument(
-        "--text-features",
-        nargs="+",
-        default=[],
-        metavar="METHOD=FILE",
-        help="what the encoder of its predictions makes of texts, as evaluate --text-features",
-    )
-    add_options(parser, "--profile")
-    parser.add_argument("--encoder", help="of all runs, such as embedded (default: the recipe's)")
-    add_options(parser, "--device", "--jobs", "--limit", "--solver", "--offline", *EXECUTOR, "--set")
-    parser.add_argument(
-        "--bundle", type=Path, metavar="FILE", help="the archive (default: bundle.zip in the folder of --out)"
-    )
-    add_options(parser, "--format")
+    parser.shared("--profile")
+    parser.option("--encoder ENCODER", "of all runs, such as embedded (default: the recipe's)")
+    parser.shared("--device", "--jobs", "--limit", "--solver", "--offline", *EXECUTOR, "--set")
+    parser.option("--bundle FILE", "the archive (default: bundle.zip in the folder of --out)")
+    parser.shared("--format")
 
 
 def call(arguments: argparse.Namespace) -> int:
+    """Do a paper's experiments again: what is missing, the runs, its tables beside the printed ones, one archive.
+
+    su3d-bench reproduce opensu3d --table II III --dry-run
+    su3d-bench reproduce opensu3d --table I II III IV V reasoning --rehearse
+    """
     from su3d_bench.reproducing.recipe import load_recipe
 
     if arguments.recipe is None:
@@ -111,8 +89,7 @@ def _list_recipes(arguments: argparse.Namespace) -> int:
     value = [
         {"name": one.name, "title": one.title, "tables": [each.name for each in one.experiments]} for one in recipes
     ]
-    if not answer_json(arguments, value):
-        answer(*(f"{one['name']:<14} {', '.join(one['tables'])}" for one in value))
+    output.answer_either(arguments, value, *(f"{one['name']:<14} {', '.join(one['tables'])}" for one in value))
     return EXIT_DONE
 
 
@@ -126,16 +103,16 @@ def _asked(arguments: argparse.Namespace) -> Asked:
 def _reproduce(
     recipe: Recipe, experiments: Sequence[Experiment], asked: Asked, out: Path, arguments: argparse.Namespace
 ) -> int:
-    from su3d_bench.reproducing.preflight import preflight
+    from su3d_bench.reproducing.preflight import preflight, preflight_tables, summary
     from su3d_bench.reproducing.recipe import asked_runs, evaluate_predictions, named_predictions
 
     runs = asked_runs(recipe, experiments, asked)
     named = named_predictions(experiments, arguments.predictions, arguments.text_features)
     known = preflight(runs)
     if arguments.dry_run:
-        _show(known, arguments)
+        output.answer_tables(arguments, known.to_json(), preflight_tables(known))
         return EXIT_CHECK_FAILED if known.missing else EXIT_DONE
-    _say(known, arguments)
+    remark(*summary(known), quiet=arguments.quiet)
     if known.missing:
         first = known.missing[0]
         more = f" and {len(known.missing) - 1} more" if len(known.missing) > 1 else ""
@@ -153,30 +130,14 @@ def _reproduce(
     return EXIT_DONE
 
 
-def _show(known: Preflight, arguments: argparse.Namespace) -> None:
-    from su3d_bench.reproducing.preflight import preflight_tables
-
-    if not answer_json(arguments, known.to_json()):
-        answer_document(formatted(preflight_tables(known), arguments))
-
-
-def _say(known: Preflight, arguments: argparse.Namespace) -> None:
-    from su3d_bench.reproducing.preflight import summary
-
-    for line in summary(known):
-        remark(line, quiet=arguments.quiet)
-
-
 def _carry_out(run: AskedRun, out: Path, arguments: argparse.Namespace) -> list[str]:
     """Lines of what failed."""
-    from su3d_bench.cli.output import progress
     from su3d_bench.reproducing.recipe import carry_out, plan_of
 
     plan = plan_of(run, out)
-    with progress(len(plan.jobs), is_quiet=arguments.quiet) as report:
+    with output.progress(len(plan.jobs), is_quiet=arguments.quiet) as report:
         result = carry_out(run, plan, report)
-    for line in result.remarks:
-        remark(line, quiet=arguments.quiet)
+    remark(*result.remarks, quiet=arguments.quiet)
     remark(f"run folder: {plan.folder.path}", quiet=arguments.quiet)
     return [line for _, _, line in result.failures]
 
@@ -194,16 +155,17 @@ def _answer(
     cells = compared_all(experiments, results)
     tables = result_tables(experiments, cells, results)
     value = compared_json(recipe, cells)
-    written(out / "tables.md", formatted(tables, argparse.Namespace(table_format="markdown"), is_file=True))
+    output.written(
+        out / "tables.md", output.formatted(tables, argparse.Namespace(table_format="markdown"), is_file=True)
+    )
     write_json(out / "compared.json", value)
-    if not answer_json(arguments, value):
-        answer_document(formatted(tables, arguments))
-        show()
+    if not output.answer_json(arguments, value):
+        output.answer_document(output.formatted(tables, arguments))
+        output.show()
     for picture in draw_queries(experiments, results, out / "pictures", arguments.device or "cpu"):
         remark(f"picture: {picture}", quiet=arguments.quiet)
     bundle = arguments.bundle or out / "bundle.zip"
     write_bundle(bundle, recipe.name, recipe_bytes(arguments.recipe), folders, out)
     remark(f"bundle: {bundle}", quiet=arguments.quiet)
-    names = [name for name in VARIABLES if arguments.rehearse and name in os.environ]
-    where = "".join(f"{name}={shlex.quote(os.environ[name])} " for name in names)
+    where = f"SU3D_DATA={shlex.quote(os.environ['SU3D_DATA'])} " if arguments.rehearse else ""
     remark(f"next: {where}su3d-bench report verify {shlex.quote(str(bundle))}", quiet=arguments.quiet)

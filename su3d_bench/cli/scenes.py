@@ -139,7 +139,7 @@ def _truth_text(variant: TruthVariant) -> str:
     )
 
 
-def show(arguments: argparse.Namespace) -> int:
+def show(arguments: argparse.Namespace) -> None:
     """Draw the scene and print its counts and where the picture is."""
     scenes = chosen_scenes([arguments.scene], arguments.set, is_quiet=arguments.quiet)
     if len(scenes) > 1:
@@ -164,11 +164,10 @@ def show(arguments: argparse.Namespace) -> int:
         "no_ground_truth": look.no_truth or None,
     }
     if answer_json(arguments, printable_json(table)):
-        return EXIT_DONE
+        return
     answer(f"{printable(name)}: {facts_line(look)}")
     if look.up is not None:
         answer(f"up: {printable(up_text(look.up))}")
     if look.no_truth:
         answer(printable(look.no_truth))
     answer(f"picture: {printable(str(path))}")
-    return EXIT_DONE

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from su3d_bench.cli import sheets_make
-from su3d_bench.cli.options import Verbs, add_group, add_options, add_out, add_runs, add_verb
-from su3d_bench.cli.output import answer_either, answer_json, answer_tables, remark, remark_unseen, written
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, counted
+from su3d_bench.cli import output, sheets_make
+from su3d_bench.cli.options import Verbs, add_group, add_verb
+from su3d_bench.cli.output import remark
+from su3d_bench.core.errors import ConfigError, DataError, counted
 
 if TYPE_CHECKING:
     from su3d_bench.sheets.scores import Scores
@@ -19,56 +19,39 @@ SHOWN_FAULTS = 200  # lines; the number of all is told
 
 
 def add_parser(verbs: Verbs) -> None:
-    actions = add_group(
-        verbs,
-        "sheets",
-        "Make sheets for people to judge a run, score their answers, and draw figures.",
-        (
-            "su3d-bench sheets make runs/my-run --kind retrieval --out sheets",
-            "su3d-bench sheets score ann.csv bob.xlsx --key key/key.json",
-        ),
-    )
+    """Make sheets for people to judge a run, score their answers, and draw figures.
+
+    su3d-bench sheets make runs/my-run --kind retrieval --out sheets
+    su3d-bench sheets score ann.csv bob.xlsx --key key/key.json
+    """
+    actions = add_group(verbs, "sheets", add_parser)
     sheets_make.add_parser(actions)
     _add_score(actions)
     _add_pictures(actions)
 
 
 def _add_score(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "score",
-        "Check the answers of all annotators and add them up: accuracies, tests, agreement, people beside the truth.",
-        (
-            "su3d-bench sheets score ann.csv bob.xlsx --key key/key.json --out scores",
-            "su3d-bench sheets score ann.csv bob.csv --key key --disputed disputed.csv",
-        ),
-        call_score,
+    parser = add_verb(verbs, "score", call_score)
+    parser.option(
+        "files [FILE...]", "answers: .csv or .xlsx, in any mixture (default: none, what the ground truth alone says)"
     )
-    parser.add_argument(
-        "files",
-        nargs="*",
-        type=Path,
-        metavar="FILE",
-        help="answers: .csv or .xlsx, in any mixture (default: none, what the ground truth alone says)",
+    parser.option("--key FILE", "key.json of the set, or its folder", required=True)
+    parser.option(
+        "--sheet FILE", "sheet.json of the set, or its folder (default: looked for around the key and the answers)"
     )
-    parser.add_argument("--key", type=Path, required=True, metavar="FILE", help="key.json of the set, or its folder")
-    parser.add_argument(
-        "--sheet",
-        type=Path,
-        metavar="FILE",
-        help="sheet.json of the set, or its folder (default: looked for around the key and the answers)",
+    parser.option("--out DIR", "write scores.json, tables and a list of what to look at again there")
+    parser.option(
+        "--disputed FILE", "sheets of questions: write those that not everybody calls right there, for --leave-out"
     )
-    add_out(parser, "DIR", "write scores.json, tables and a list of what to look at again there")
-    parser.add_argument(
-        "--disputed",
-        type=Path,
-        metavar="FILE",
-        help="sheets of questions: write those that not everybody calls right there, for --leave-out",
-    )
-    add_options(parser, "--format")
+    parser.shared("--format")
 
 
-def call_score(arguments: argparse.Namespace) -> int:
+def call_score(arguments: argparse.Namespace) -> None:
+    """Check the answers of all annotators and add them up: accuracies, tests, agreement, people beside the truth.
+
+    su3d-bench sheets score ann.csv bob.xlsx --key key/key.json --out scores
+    su3d-bench sheets score ann.csv bob.csv --key key --disputed disputed.csv
+    """
     from dataclasses import asdict
 
     from su3d_bench.formats.tables.table import Prose
@@ -106,10 +89,9 @@ def call_score(arguments: argparse.Namespace) -> int:
         _write(arguments.out, scores, sheet_file.parent)
         remark(f"written: {arguments.out}", quiet=arguments.quiet)
     if arguments.disputed is not None:
-        path = written(arguments.disputed, disputed_csv(key, scores.second_looks))
+        path = output.written(arguments.disputed, disputed_csv(key, scores.second_looks))
         remark(f"written: {path}", quiet=arguments.quiet)
-    answer_tables(arguments, content, [*sheet_tables(content), Prose((_looks_line(scores),))])
-    return EXIT_DONE
+    output.answer_tables(arguments, content, [*sheet_tables(content), Prose((_looks_line(scores),))])
 
 
 def _sheet_file(arguments: argparse.Namespace, key_file: Path, sheet_id: str) -> Path:
@@ -133,10 +115,9 @@ def _sheet_file(arguments: argparse.Namespace, key_file: Path, sheet_id: str) ->
 def _refuse(faults: Sequence[str], arguments: argparse.Namespace) -> None:
     """Tell all faults, then raise."""
     if arguments.json:
-        answer_json(arguments, {"faults": list(faults)})
+        output.answer_json(arguments, {"faults": list(faults)})
     else:
-        for fault in faults[:SHOWN_FAULTS]:
-            remark(fault)
+        remark(*faults[:SHOWN_FAULTS])
         if len(faults) > SHOWN_FAULTS:
             remark(f"... and {len(faults) - SHOWN_FAULTS} more")
     n = len(faults)
@@ -177,31 +158,27 @@ FIGURES = ("comparison", "schemes", "teaser")  # as questions/files/files.py has
 
 
 def _add_pictures(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "pictures",
-        "Draw a figure of a run for print: similarity to texts, labels n and n', or answers with their objects.",
-        (
-            "su3d-bench sheets pictures runs/my-run --queries 'plant on shelf' 'place to sit' --out heat.pdf",
-            "su3d-bench sheets pictures runs/my-run --figure schemes --scenes replica/room0 --out schemes.pdf",
-        ),
-        call_pictures,
+    parser = add_verb(verbs, "pictures", call_pictures)
+    parser.shared("run")
+    parser.option("--out FILE", "a .pdf, .png or .svg file", required=True)
+    parser.option("--what", "what is drawn (default: similarity)", choices=SUBJECTS, default="similarity")
+    parser.option("--queries TEXT...", "texts, or questions to be answered", default=[])
+    parser.option(
+        "--figure", "the texts of the paper's figure, or of its page's teaser, before --queries", choices=FIGURES
     )
-    add_runs(parser, None)
-    add_out(parser, "FILE", "a .pdf, .png or .svg file", required=True)
-    parser.add_argument("--what", choices=SUBJECTS, default="similarity", help="what is drawn (default: similarity)")
-    parser.add_argument("--queries", nargs="+", default=[], metavar="TEXT", help="texts, or questions to be answered")
-    parser.add_argument(
-        "--figure", choices=FIGURES, help="the texts of the paper's figure, or of its page's teaser, before --queries"
-    )
-    add_options(parser, "--scenes", "--methods")
-    parser.add_argument("--photo", action="store_true", help="a first column with the colours that the frames saw")
-    parser.add_argument("--view", choices=("corner", "above"), default="corner", help="from where (default: a corner)")
-    parser.add_argument("--colours", choices=("paper", "cividis"), default="paper", help="of similarity")
-    add_options(parser, "--device")
+    parser.shared("--scenes", "--methods")
+    parser.option("--photo", "a first column with the colours that the frames saw")
+    parser.option("--view", "from where (default: a corner)", choices=("corner", "above"), default="corner")
+    parser.option("--colours", "of similarity", choices=("paper", "cividis"), default="paper")
+    parser.shared("--device")
 
 
-def call_pictures(arguments: argparse.Namespace) -> int:
+def call_pictures(arguments: argparse.Namespace) -> None:
+    """Draw a figure of a run for print: similarity to texts, labels n and n', or answers with their objects.
+
+    su3d-bench sheets pictures runs/my-run --queries 'plant on shelf' 'place to sit' --out heat.pdf
+    su3d-bench sheets pictures runs/my-run --figure schemes --scenes replica/room0 --out schemes.pdf
+    """
     from su3d_bench.questions.question_files import figure_texts
     from su3d_bench.reports.pictures.canvas import scale_stops
     from su3d_bench.reports.pictures.figures import draw_grid
@@ -230,10 +207,9 @@ def call_pictures(arguments: argparse.Namespace) -> int:
     else:
         encoder = run.encoder(arguments.device or "cpu")
         for text in texts:
-            remark_unseen(encoder, text, quiet=arguments.quiet)
+            output.remark_unseen(encoder, text, quiet=arguments.quiet)
         rows = figures.similarity(texts, encoder, arguments.colours)
         scale = scale_stops(arguments.colours)
     draw_grid(arguments.out, columns, rows, scale)
     value = {"picture": str(arguments.out), "columns": columns, "rows": [row.title for row in rows]}
-    answer_either(arguments, value, str(arguments.out))
-    return EXIT_DONE
+    output.answer_either(arguments, value, str(arguments.out))

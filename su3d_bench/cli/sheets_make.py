@@ -8,27 +8,16 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from su3d_bench.cli.options import (
-    Verbs,
-    add_language_options,
-    add_options,
-    add_out,
-    add_verb,
-    answer_estimate,
-    chat_client,
-    count,
-    given_language_option,
-)
-from su3d_bench.cli.output import answer, answer_json, remark
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, counted
+from su3d_bench.cli import options, output
+from su3d_bench.cli.options import Verbs, add_verb, count
+from su3d_bench.cli.output import remark
+from su3d_bench.core.errors import ConfigError, counted
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
-    from su3d_bench.core.interfaces import Encoder
     from su3d_bench.perception.language.chat import ChatRequest
     from su3d_bench.questions.model import Question
-    from su3d_bench.questions.solver import AskMap
     from su3d_bench.sheets.drafts import Draft
     from su3d_bench.sheets.drawing import PictureSource
     from su3d_bench.sheets.items import SheetKind
@@ -44,68 +33,53 @@ PER_KIND = {"retrieval": 5, "annotation": 30, "reasoning": 1, QUESTIONS: 2}
 
 
 def add_parser(verbs: Verbs) -> None:
-    parser = add_verb(
-        verbs,
-        "make",
-        "Make sheets on which people judge a run, or questions: an offline page, a workbook and a table with pictures.",
-        (
-            "su3d-bench sheets make runs/my-run --kind retrieval annotation reasoning --annotators 3 --out sheets",
-            "su3d-bench sheets make --kind questions --scenes 'rooms/*' --annotators 2 --overlap 1 --out sheets",
-        ),
-        call,
+    parser = add_verb(verbs, "make", call)
+    parser.option(
+        "run [RUN]", "the folder of a run; variants stand side by side in it (--kind questions can do with --scenes)"
     )
-    parser.add_argument(
-        "run",
-        nargs="?",
-        type=Path,
-        metavar="RUN",
-        help="the folder of a run; variants stand side by side in it (--kind questions can do with --scenes)",
-    )
-    parser.add_argument(
-        "--kind", nargs="+", choices=KINDS, required=True, help="what is judged; several give a folder each in DIR"
-    )
-    add_out(parser, "DIR", "where the sheets go", required=True)
-    parser.add_argument("--key", type=Path, metavar="DIR", help="where the key goes (default: DIR-key)")
-    parser.add_argument(
-        "--questions",
+    parser.option("--kind ...", "what is judged; several give a folder each in DIR", choices=KINDS, required=True)
+    parser.option("--out DIR", "where the sheets go", required=True)
+    parser.option("--key DIR", "where the key goes (default: DIR-key)")
+    parser.option(
+        "--questions FILE",
+        "a file of questions, 'paper' for those of its page, or 'generated' from the ground truth (default)",
         default="generated",
-        metavar="FILE",
-        help="a file of questions, 'paper' for those of its page, or 'generated' from the ground truth (default)",
+        type=str,
     )
-    add_options(parser, "--methods")
-    parser.add_argument(
-        "--scenes",
-        nargs="+",
+    parser.shared("--methods")
+    parser.option(
+        "--scenes S...",
+        "these alone (default: all of the run); without RUN addresses or patterns such as 'rooms/*'",
         default=[],
-        metavar="S",
-        help="these alone (default: all of the run); without RUN addresses or patterns such as 'rooms/*'",
     )
-    add_options(parser, "--leave-out")
-    parser.add_argument(
-        "--per-kind",
-        type=count,
-        metavar="N",
-        help="most items of a scene: questions of a kind (default: 5), instances (30), questions of a template (1); "
+    parser.shared("--leave-out")
+    parser.option(
+        "--per-kind N",
+        "most items of a scene: questions of a kind (default: 5), instances (30), questions of a template (1); "
         "in sheets of questions 2 of each kind and template",
+        type=count,
     )
-    parser.add_argument("--annotators", type=int, default=1, metavar="N", help="people who share the work")
-    parser.add_argument(
-        "--overlap", type=float, default=0.25, metavar="SHARE", help="of all items that everybody gets (default: 0.25)"
-    )
-    add_options(parser, "--seed", "--jobs", "--device")
-    parser.add_argument(
+    parser.option("--annotators N", "people who share the work", type=int, default=1)
+    parser.option("--overlap SHARE", "of all items that everybody gets (default: 0.25)", type=float, default=0.25)
+    parser.shared("--seed", "--jobs", "--device")
+    parser.option(
         "--solver",
+        "who answers in reasoning sheets: geometry alone (default), or a language model, as in query ask",
         choices=("built-in", "llm"),
         default="built-in",
-        help="who answers in reasoning sheets: geometry alone (default), or a language model, as in query ask",
     )
-    add_language_options(parser)
+    options.add_language_options(parser)
 
 
-def call(arguments: argparse.Namespace) -> int:
+def call(arguments: argparse.Namespace) -> None:
+    """Make sheets on which people judge a run, or questions: an offline page, a workbook and a table with pictures.
+
+    su3d-bench sheets make runs/my-run --kind retrieval annotation reasoning --annotators 3 --out sheets
+    su3d-bench sheets make --kind questions --scenes 'rooms/*' --annotators 2 --overlap 1 --out sheets
+    """
     from su3d_bench.questions.query_files import read_left_out
     from su3d_bench.runs.finished import read_run
-    from su3d_bench.sheets.sources import RunSource
+    from su3d_bench.sheets.sources import RunSource, truth_of_addresses, truth_of_run
 
     _check(arguments)
     left_out = frozenset[str]() if arguments.leave_out is None else read_left_out(arguments.leave_out)
@@ -118,24 +92,27 @@ def call(arguments: argparse.Namespace) -> int:
         source = RunSource(read_run(arguments.run), arguments.methods, arguments.scenes)
         sources: dict[SheetKind, RunSource] = {kind: _judgeable(source, kind, arguments.quiet) for kind in of_run}
         if arguments.dry_run:
-            return _estimate(sources["reasoning"], left_out, arguments)
+            _estimate(sources["reasoning"], left_out, arguments)
+            return
         drafts, made_by = _drafts(sources, left_out, arguments)
         origins = {kind: _origin(kind, mine, made_by[kind]) for kind, mine in sources.items()}
         drawn = _drawn(source, source.run.name, drafts, arguments)
     if QUESTIONS in kinds:
-        truth = _truth(arguments)
+        truth = (
+            truth_of_addresses(arguments.scenes)
+            if arguments.run is None
+            else truth_of_run(arguments.run, arguments.scenes)
+        )
         of_truth, origins[QUESTIONS] = _questions(truth, left_out, arguments)
         drafts |= of_truth
         drawn |= _drawn(truth, truth.run or QUESTIONS, of_truth, arguments)
     written_sets = _write({kind: origins[kind] for kind in kinds}, drafts, drawn, arguments)
-    if answer_json(arguments, {"sets": written_sets}):
-        return EXIT_DONE
+    if output.answer_json(arguments, {"sets": written_sets}):
+        return
     for sheet in written_sets:
-        answer(f"{sheet['sheet_id']}: {counted(sheet['n_items'], 'item')}, {counted(sheet['n_questions'], 'question')}")
-        for path in sheet["files"]:
-            answer(path)
+        n_items, n_questions = counted(sheet["n_items"], "item"), counted(sheet["n_questions"], "question")
+        output.answer(f"{sheet['sheet_id']}: {n_items}, {n_questions}", *sheet["files"])
         remark(f"key, which annotators must not see: {sheet['key']}", quiet=arguments.quiet)
-    return EXIT_DONE
 
 
 def _check(arguments: argparse.Namespace) -> None:
@@ -145,17 +122,16 @@ def _check(arguments: argparse.Namespace) -> None:
         raise ConfigError(
             "RUN: name the folder of a run; only --kind questions can do without, and needs --scenes then"
         )
-    if kinds == {"annotation"} and arguments.questions != "generated":
-        raise ConfigError("--questions: annotation sheets ask about labels and masks; leave it out")
-    if kinds == {"annotation"} and arguments.leave_out is not None:
-        raise ConfigError("--leave-out: annotation sheets ask about labels and masks; leave it out")
-    if kinds == {QUESTIONS} and arguments.questions != "generated":
-        raise ConfigError("--questions: sheets of kind questions judge those made from the ground truth; leave it out")
-    if kinds == {QUESTIONS} and arguments.methods:
-        raise ConfigError("--methods: no method has a part in sheets of kind questions; leave it out")
+    has_questions = arguments.questions != "generated"
+    if kinds == {"annotation"} and (has_questions or arguments.leave_out is not None):
+        raise ConfigError("--questions, --leave-out: annotation sheets ask about labels and masks; leave it out")
+    if kinds == {QUESTIONS} and (has_questions or arguments.methods):
+        raise ConfigError(
+            "--questions, --methods: sheets of kind questions judge those made from the ground truth; leave it out"
+        )
     if arguments.solver == "llm" and "reasoning" not in arguments.kind:
         raise ConfigError("--solver llm: answers questions of reasoning sheets; add --kind reasoning")
-    if arguments.solver != "llm" and (given := given_language_option(arguments)):
+    if arguments.solver != "llm" and (given := options.given_language_option(arguments)):
         raise ConfigError(f"{given}: is for --solver llm alone; the built-in solver asks nobody")
 
 
@@ -179,14 +155,6 @@ def _judgeable(source: RunSource, kind: SheetKind, is_quiet: bool) -> RunSource:
     left_out = [method for method in source.methods if method not in kept]
     remark(f"{kind}: left out {', '.join(left_out)}, which {lacks}", quiet=is_quiet)
     return source.of_methods(kept)
-
-
-def _truth(arguments: argparse.Namespace) -> TruthSource:
-    from su3d_bench.sheets.sources import truth_of_addresses, truth_of_run
-
-    if arguments.run is None:
-        return truth_of_addresses(arguments.scenes)
-    return truth_of_run(arguments.run, arguments.scenes)
 
 
 def _questions(
@@ -214,6 +182,7 @@ def _drafts(
     import numpy as np
 
     from su3d_bench.metrics.questions.score import relative_remark
+    from su3d_bench.questions import solver
     from su3d_bench.sheets.drafts import annotation_drafts, questions_of, reasoning_drafts, retrieval_drafts
     from su3d_bench.sheets.sets import check_split
 
@@ -223,7 +192,10 @@ def _drafts(
     drafts_of: dict[SheetKind, list[Draft]] = {kind: [] for kind in sources}
     needs_encoder = "retrieval" in sources or ("reasoning" in sources and arguments.solver != "llm")
     encoder = source.run.encoder(arguments.device or "cpu") if needs_encoder else None
-    ask, answered_by = _ask_map(source, encoder, arguments) if "reasoning" in sources else (None, "")
+    ask, answered_by = solver.built_in(encoder), solver.BUILT_IN
+    if arguments.solver == "llm":
+        client, config = options.chat_client(arguments, source.run.folder)
+        ask, answered_by = solver.by_language_model(client, config).ask, config.text_model
     labelled_by: dict[str, None] = {}
     for scene in source.scenes:  # all kinds of one scene together, for they share its truth
         for kind, mine in sources.items():
@@ -233,7 +205,6 @@ def _drafts(
                 found = (mine.refined(scene, method) for method in mine.methods)
                 labelled_by |= dict.fromkeys(refined.source for refined in found if refined is not None)
             elif kind == "reasoning":
-                assert ask is not None
                 drafts_of[kind] += reasoning_drafts(mine, scene, given, n_most, ask, left_out)
             else:
                 assert encoder is not None
@@ -246,27 +217,17 @@ def _drafts(
     return drafts_of, {"retrieval": said, "reasoning": answered_by, "annotation": " and ".join(labelled_by)}
 
 
-def _ask_map(source: RunSource, encoder: Encoder | None, arguments: argparse.Namespace) -> tuple[AskMap, str]:
-    """Who answers the questions of reasoning sheets, and how the key calls them."""
-    from su3d_bench.questions.solver import BUILT_IN, built_in, by_language_model
-
-    if arguments.solver != "llm":
-        return built_in(encoder), BUILT_IN
-    client, config = chat_client(arguments, source.run.folder)
-    return by_language_model(client, config).ask, config.text_model
-
-
-def _estimate(source: RunSource, left_out: Collection[str], arguments: argparse.Namespace) -> int:
+def _estimate(source: RunSource, left_out: Collection[str], arguments: argparse.Namespace) -> None:
     """Tell what asking the language model would cost at the most."""
     from su3d_bench.sheets.drafts import reasoning_drafts, requests_into
 
-    client, config = chat_client(arguments, source.run.folder)
+    client, config = options.chat_client(arguments, source.run.folder)
     given = _given(source, arguments)
     requests: list[ChatRequest] = []
     for scene in source.scenes:
         n_most = arguments.per_kind or PER_KIND["reasoning"]
         reasoning_drafts(source, scene, given, n_most, requests_into(requests, client, config), left_out)
-    return answer_estimate(arguments, client, requests)
+    return options.answer_estimate(arguments, client, requests)
 
 
 def _given(source: RunSource, arguments: argparse.Namespace) -> Sequence[Question] | None:
@@ -289,12 +250,11 @@ def _drawn(
     source: PictureSource, name: str, drafts: Mapping[SheetKind, Sequence[Draft]], arguments: argparse.Namespace
 ) -> dict[SheetKind, list[bytes]]:
     """The pictures of all drafts."""
-    from su3d_bench.cli.output import progress
     from su3d_bench.runs.executors import Event
     from su3d_bench.sheets.drawing import draw_all
 
     flat = [draft for of_kind in drafts.values() for draft in of_kind]
-    with progress(1, is_quiet=arguments.quiet, last_step="writing") as report:
+    with output.progress(1, is_quiet=arguments.quiet, last_step="writing") as report:
         pictures = draw_all(
             source,
             flat,

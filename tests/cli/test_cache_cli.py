@@ -102,19 +102,15 @@ def test_a_link_is_never_followed(cache: Path, tmp_path: Path, capsys: pytest.Ca
 def test_only_what_is_old_goes(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
     old = FrameCache(cache).path(content_key("old"))
     assert old is not None
-    write_bytes_at(old, time.time() - 40 * 86400)
+    old.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(old, b"x")
+    os.utime(old, (time.time() - 40 * 86400,) * 2)
     assert main(["dev", "cache", "clear", "perception", "--older-than", "30"]) == 0
     assert capsys.readouterr().out == "perception: 1 file, 0.0 MB removed\n"
     assert not old.exists()
     assert held(capsys)["perception"] == 1
     assert main(["dev", "cache", "clear", "perception", "--older-than", "-1"]) == 2
     assert "--older-than -1: expected a number of days" in capsys.readouterr().err
-
-
-def write_bytes_at(path: Path, written: float) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(path, b"x")
-    os.utime(path, (written, written))
 
 
 def test_what_a_run_holds_stays(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from fuzz_words import verbs
 from painted import colour_perception
 from places import SCENES
 
 from su3d_bench.cli.main import build_parser, main
-from su3d_bench.cli.output import file_name_of, file_name_of_scene
-from su3d_bench.core.errors import EXIT_INTERNAL
+from su3d_bench.cli.output import answer_either, file_name_of, file_name_of_scene
+from su3d_bench.core.errors import EXIT_INTERNAL, ConfigError
 from su3d_bench.reports.pictures import maps
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
@@ -23,6 +24,7 @@ from su3d_bench.runs import scene as scene_run
 PAINTED = f"{SCENES}/painted.py:Painted"
 COLLECTOR = f"{SCENES}/painted.py:Collector"
 RUN = ["run", "--scenes", f"{PAINTED}/*", "--methods", COLLECTOR, "--protocols", "rooms-semantic", "--no-pictures"]
+TYPED = shlex.join(RUN)
 HEAVY = (
     "torch", "open3d", "open3d.cpu.pybind", "numba", "sklearn", "pandas", "matplotlib", "onnxruntime", "cv2", "scipy",
     "transformers", "openai", "openpyxl", "psutil", "su3d_bench.predictions.formats", "su3d_bench.runs.plan",
@@ -36,16 +38,6 @@ def _elsewhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(scene_run, "build_perception", colour_perception)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
-
-
-def verbs() -> dict[str, argparse.ArgumentParser]:
-    actions = build_parser()._actions
-    return next(dict(action.choices) for action in actions if isinstance(action, argparse._SubParsersAction))
-
-
-def examples(parser: argparse.ArgumentParser) -> list[str]:
-    assert parser.epilog is not None
-    return [line.strip() for line in parser.epilog.splitlines() if line.strip().startswith("su3d-bench ")]
 
 
 @pytest.mark.parametrize(
@@ -71,13 +63,6 @@ def test_answers_that_need_nothing_load_nothing_heavy(words: list[str], unneeded
     assert done.stdout.splitlines()[-1].split() == ["loaded:", "0"], done.stderr
 
 
-@pytest.mark.parametrize("verb", ["run", "evaluate", "query", "datasets", "methods", "protocols", "runs", "report"])
-def test_the_examples_of_every_verb_parse(verb: str) -> None:
-    for example in examples(verbs()[verb]):
-        arguments = build_parser().parse_args(shlex.split(example)[1:])
-        assert arguments.verb == verb
-
-
 def test_a_protocol_shows_every_rule(capsys: pytest.CaptureFixture[str]) -> None:
     from su3d_bench.metrics.protocols.loading import load_protocol
 
@@ -94,82 +79,43 @@ def test_a_protocol_shows_every_rule(capsys: pytest.CaptureFixture[str]) -> None
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["rum"], "unknown verb 'rum'; did you mean 'run'? known: run, ablate, "),
-        ([], "the following arguments are required: VERB; see su3d-bench --help"),
+        ("rum", "unknown verb 'rum'; did you mean 'run'? known: run, ablate, "),
+        ("", "the following arguments are required: VERB; see su3d-bench --help"),
+        ("run --scene-s x", "run: unknown argument '--scene-s'; did you mean '--scenes'?; see su3d-bench run --help"),
+        ("run --jobs x", "run: argument --jobs: x: expected an integer of 1 or more; see"),
+        ("run --scenes replcia/*", "no scene matches 'replcia/*'; did you mean 'replica/*'?"),
+        ("run --scenes nothing", "no scene matches 'nothing'; known datasets: rooms, replica"),
+        (f"{TYPED} --methods opensu3", "unknown method 'opensu3'; did you mean 'opensu3d'?"),
+        (f"{TYPED} --methods {SCENES}/none.py:X", f"method '{SCENES}/none.py:X': there is no file {SCENES}/none.py"),
+        (f"{TYPED} --profile orcale", "unknown profile 'orcale'; did you mean 'oracle'?"),
         (
-            ["run", "--scene-s", "x"],
-            "run: unknown argument '--scene-s'; did you mean '--scenes'?; see su3d-bench run --help",
-        ),
-        (["run", "--jobs", "x"], "run: argument --jobs: x: expected an integer of 1 or more; see"),
-        (["run", "--scenes", "replcia/*"], "no scene matches 'replcia/*'; did you mean 'replica/*'?"),
-        (["run", "--scenes", f"{PAINTED}/e"], f"no scene matches '{PAINTED}/e'; did you mean '{PAINTED}/d'?"),
-        (["run", "--scenes", "nothing"], "no scene matches 'nothing'; known datasets: rooms, replica"),
-        ([*RUN, "--methods", "opensu3"], "unknown method 'opensu3'; did you mean 'opensu3d'?"),
-        ([*RUN, "--methods", f"{SCENES}/painted.py:Colector"], f"method '{SCENES}/painted.py:Colector': "),
-        ([*RUN, "--methods", f"{SCENES}/none.py:X"], f"method '{SCENES}/none.py:X': there is no file {SCENES}/none.py"),
-        ([*RUN, "--profile", "orcale"], "unknown profile 'orcale'; did you mean 'oracle'?"),
-        ([*RUN, "--protocols", "room-semantic"], "unknown protocol 'room-semantic'; did you mean 'rooms-semantic'?"),
-        (
-            [*RUN, "--protocols", "scannet-instance"],
+            f"{TYPED} --protocols scannet-instance",
             "protocol 'scannet-instance' fits no scene of this run: it scores the labels of 'scannet', painted has "
             "those of 'replica'",
         ),
-        ([*RUN, "--set", "colector.drop=1"], "--set colector.drop=1: 'colector' is no method or dataset of this run"),
-        ([*RUN, "--set", "collector.dorp=1"], "--set collector.dorp: unknown key 'dorp'; did you mean 'drop'?"),
-        ([*RUN, "--set", "collector.drop=x"], "--set collector.drop: collector.drop = 'x': input should be a valid"),
-        ([*RUN, "--stride", "-1"], "--stride: stride = -1: input should be greater than or equal to 0"),
-        ([*RUN, "--config", "none.toml"], "none.toml: cannot read the configuration: No such file or directory"),
-        (["protocols", "shwo"], "protocols: unknown action 'shwo'; did you mean 'show'? known: list, show, "),
+        (f"{TYPED} --set colector.drop=1", "--set colector.drop=1: 'colector' is no method or dataset of this run"),
+        (f"{TYPED} --set collector.dorp=1", "--set collector.dorp: unknown key 'dorp'; did you mean 'drop'?"),
+        (f"{TYPED} --config none.toml", "none.toml: cannot read the configuration: No such file or directory"),
+        ("protocols shwo", "protocols: unknown action 'shwo'; did you mean 'show'? known: list, show, "),
+        ("report runs/demo", "report: unknown action 'runs/demo'; known: tables, timing, html, "),
+        ("report tables r --table VI", "report tables: unknown --table 'VI'; did you mean 'V'? known: I, "),
         (
-            ["protocols", "show", "rooms-semantics"],
-            "unknown protocol 'rooms-semantics'; did you mean 'rooms-semantic'?",
-        ),
-        (
-            ["report", "runs/demo"],
-            "report: unknown action 'runs/demo'; known: tables, timing, html, ",
-        ),
-        (
-            ["report", "tables", "r", "--table", "VI"],
-            "report tables: unknown --table 'VI'; did you mean 'V'? known: I, ",
-        ),
-        (
-            ["report", "tables", "r", "--format", "docx"],
-            "report tables: unknown --format 'docx'; known: text, markdown, latex, csv, html; see ",
-        ),
-        ([*RUN, "--solver", "me"], "run: unknown --solver 'me'; known: built-in, llm; see "),
-        (["methods", "show", "orcle"], "unknown method 'orcle'; did you mean 'oracle'?"),
-        (
-            ["query", "text", f"{PAINTED}/a", "x"],
+            f"query text {PAINTED}/a x",
             f"no run in runs/ holds {PAINTED}/a by opensu3d; make one: su3d-bench run {PAINTED}/a --methods opensu3d",
         ),
-        (["query", "text", "rooms/living0", "  "], "the text is empty; say what to look for"),
-        (["query", "text", "rooms/living0", "x", "--top", "0"], "query text: argument --top: 0: expected an integer"),
-        (
-            ["query", "text", "rooms/living0", "x", "--run", "r"],
-            "r: holds no run; name the folder of one: su3d-bench runs list",
-        ),
-        (
-            ["query", "text", "a plant", "rooms/living0"],
-            "'a plant' is no scene: the scene comes first, then the text;",
-        ),
-        (
-            ["query", "ask", "A plant?", "rooms/living0"],
-            "'A plant?' is no scene: the scene comes first, then the text;",
-        ),
-        (["run", "living0"], "no scene matches 'living0'; did you mean 'rooms/living0'?"),
-        (["run", "--scenes", "livng0"], "no scene matches 'livng0'; did you mean 'rooms/living0'?"),
-        (["ablate", "livi*", "--vary", "m=1"], "no scene matches 'livi*'; did you mean 'rooms/livi*'?"),
-        (["run", "rooms"], "'rooms' is a dataset; name its scenes, such as 'rooms/*'"),
-        (["run", "--methods", "oracle", "rooms/living0"], "--methods rooms/living0: is a scene; write it before the"),
-        (["run", "--extend"], "--extend: say which run with --out, such as --out runs/demo"),
-        (["run", "--replace"], "--replace: say which run with --out, such as --out runs/demo"),
-        ([*RUN, "--extend", "--out", "none"], "--extend: none holds no run.toml of a run; leave --extend out to begin"),
+        ("query text rooms/living0 '  '", "the text is empty; say what to look for"),
+        ("query text rooms/living0 x --run r", "r: holds no run; name the folder of one: su3d-bench runs list"),
+        ("query text 'a plant' rooms/living0", "'a plant' is no scene: the scene comes first, then the text;"),
+        ("run living0", "no scene matches 'living0'; did you mean 'rooms/living0'?"),
+        ("run rooms", "'rooms' is a dataset; name its scenes, such as 'rooms/*'"),
+        ("run --methods oracle rooms/living0", "--methods rooms/living0: is a scene; write it before the"),
+        ("run --extend", "--extend: say which run with --out, such as --out runs/demo"),
+        ("run --replace", "--replace: say which run with --out, such as --out runs/demo"),
+        (f"{TYPED} --extend --out none", "--extend: none holds no run.toml of a run; leave --extend out to begin"),
     ],
 )
-def test_wrong_input_is_one_line_and_exit_code_2(
-    words: list[str], line: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert main(words) == 2
+def test_wrong_input_is_one_line_and_exit_code_2(words: str, line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(shlex.split(words)) == 2
     answer = capsys.readouterr()
     assert answer.out == ""
     assert answer.err.startswith(f"su3d-bench: {line}")
@@ -199,14 +145,6 @@ def test_an_internal_error_is_one_line_and_exit_code_4(
     assert main(["methods"]) == EXIT_INTERNAL
     line = "su3d-bench: internal error: KeyError: 'method'; run again with --debug for the traceback\n"
     assert capsys.readouterr().err == line
-
-
-def test_a_closed_pipe_is_no_error() -> None:
-    python = shlex.quote(sys.executable)
-    command = f"{python} -m su3d_bench protocols show scannet200-instance | head -1; echo ${{PIPESTATUS[0]}}"
-    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
-    assert done.stdout.splitlines()[-1] == "0"
-    assert done.stderr == ""
 
 
 def test_scenes_may_be_expanded_by_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -307,3 +245,64 @@ def test_a_map_without_features_cannot_be_queried(
     capsys.readouterr()
     assert main(["query", "text", "painted/a", "sofa", "--method", "oracle"]) == 2
     assert "query: this map has no features to compare a text with" in capsys.readouterr().err
+
+
+# what options of several verbs do
+
+
+def test_every_verb_has_json_quiet_debug_and_two_examples() -> None:
+    for words, parser in verbs():
+        flags = {name for action in parser._actions for name in action.option_strings}
+        assert {"--json", "--quiet", "--debug"} <= flags, words
+        assert not {"--workers", "--threads", "--output"} & flags, words
+        assert len((parser.epilog or "").splitlines()) == 3, words
+
+
+@pytest.mark.parametrize(
+    ("words", "is_printed", "file"),
+    [
+        (["compare", "a", "b"], False, None),
+        (["compare", "a", "b", "--json"], True, None),
+        (["compare", "a", "b", "--json", "new.json"], False, "new.json"),
+        (["compare", "a", "b", "--json=new.json", "--per-class"], False, "new.json"),
+    ],
+)
+def test_json_is_a_switch_or_names_a_file(words: list[str], is_printed: bool, file: str | None) -> None:
+    arguments = build_parser().parse_args(words)
+    assert (arguments.json, arguments.json_file) == (is_printed, None if file is None else Path(file))
+
+
+def test_json_takes_no_other_file_for_its_own() -> None:
+    with pytest.raises(ConfigError, match=r"report verify: --json paper\.tex: a file for JSON ends in \.json"):
+        build_parser().parse_args(["report", "verify", "--json", "paper.tex"])
+
+
+def test_json_in_a_file_stands_beside_the_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "answers" / "rules.json"
+    assert main(["protocols", "show", "rooms-semantic", "--json", str(file)]) == 0
+    assert not capsys.readouterr().out.startswith("{")
+    assert main(["protocols", "show", "rooms-semantic", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == json.loads(file.read_text())
+
+
+@pytest.mark.parametrize("name", ["run.json", "metrics.json", "run.toml", "scenes/rooms.living0/opensu3d/done.json"])
+def test_files_of_a_run_are_never_replaced_by_an_answer(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    file = Path("runs/demo", name)
+    file.parent.mkdir(parents=True)
+    Path("runs/demo/run.toml").write_text("seed = 0\n")
+    file.write_text("{}")
+    for words in (
+        ["query", "text", "rooms/living0", "plant", "--out", str(file)],
+        ["report", "tables", "runs/demo", "--out", str(file)],
+        ["check", "--learn", "runs/demo", "--out", str(file)],
+        *([["protocols", "list", "--json", str(file)]] if file.suffix == ".json" else []),
+    ):
+        assert main(words) == 2
+        assert "is a file of the run itself" in capsys.readouterr().err
+        assert file.read_text() == "{}"
+
+
+def test_a_number_that_is_none_is_null_in_json(capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = argparse.Namespace(json=True, json_file=None)
+    answer_either(arguments, {"x": [float("nan"), (float("inf"), 1.5)]}, "words")
+    assert json.loads(capsys.readouterr().out, parse_constant=pytest.fail) == {"x": [None, [None, 1.5]]}

@@ -1,10 +1,13 @@
-"""The pages that speak of verbs and variables say what parser and code say."""
+"""Pages, tutorials and the action for GitHub say what parser and code say."""
 
 from __future__ import annotations
 
 import re
+import runpy
 import shlex
+import subprocess
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fuzz_words import verbs
@@ -27,14 +30,6 @@ def test_the_page_of_verbs_is_what_the_parser_says() -> None:
 
 def test_what_is_said_beside_the_help_is_of_verbs_that_exist() -> None:
     assert set(MORE) <= {" ".join(words) for words, _ in verbs()}
-
-
-def test_links_of_the_page_lead_somewhere() -> None:
-    text = PAGE.read_text()
-    headings = {heading.replace(" ", "-") for heading in re.findall(r"^## (.*)$", text, re.MULTILINE)}
-    for target in re.findall(r"\]\(([^)]+)\)", text):
-        place, _, heading = target.partition("#")
-        assert (PAGE.parent / place).exists() if place else heading in headings, target
 
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -77,3 +72,79 @@ def test_a_page_has_one_heading_pictures_with_words_and_links_that_lead_somewher
     assert "![](" not in text
     for target in LINK.findall(text):
         assert (file.parent / target).is_file(), target
+
+
+# the tutorials, which .ci/tutorials.py types
+
+PROGRAM = runpy.run_path(str(ROOT / ".ci" / "tutorials.py"))
+TUTORIALS: dict[str, Path] = PROGRAM["PAGES"]
+
+
+def steps(name: str) -> list[tuple[str, str]]:
+    found: list[tuple[str, str]] = PROGRAM["steps_of"](TUTORIALS[name].read_text(encoding="utf-8"))
+    return found
+
+
+def not_printed(shown: str, printed: str) -> Any:
+    return PROGRAM["not_printed"](shown, printed)
+
+
+@pytest.mark.parametrize("name", TUTORIALS)
+def test_a_tutorial_has_no_block_that_is_shown_and_compared_with_nothing(name: str) -> None:
+    text = TUTORIALS[name].read_text(encoding="utf-8")
+    assert text.count("```text\n") == sum(bool(shown) for _, shown in steps(name))
+
+
+@pytest.mark.parametrize("name", TUTORIALS)
+def test_what_a_tutorial_shows_passes_under_other_numbers_and_not_under_other_words(name: str) -> None:
+    for _, shown in steps(name):
+        assert not_printed(shown, shown.replace("5", "6").replace("1", "2")) == []
+        telling = [line for line in shown.splitlines() if any(letter.isalpha() for letter in line)]
+        assert len(not_printed(shown, "something else\n")) >= len(telling)
+
+
+def test_a_line_with_another_word_or_column_was_not_printed() -> None:
+    assert not_printed("| method | AP |\n3 scenes", "| method | AP | AP50 |\n3 rooms") == [
+        "| method | AP |",
+        "3 scenes",
+    ]
+
+
+# the action for GitHub
+
+ACTION = ROOT / "action.yml"
+PINNED = re.compile(r"actions/(setup-python@v5|cache@v4|upload-artifact@v4)")
+
+
+@pytest.fixture(scope="module")
+def action() -> Any:
+    yaml = pytest.importorskip("yaml", reason="PyYAML comes with transformers and ray")
+    return yaml.safe_load(ACTION.read_text())
+
+
+def test_each_step_runs_in_bash_or_uses_an_action_of_a_known_version(action: Any) -> None:
+    for step in action["runs"]["steps"]:
+        assert ("run" in step) != ("uses" in step)
+        assert step.get("shell") == "bash" if "run" in step else PINNED.fullmatch(step["uses"])
+
+
+def test_scripts_are_whole_and_no_input_is_text_of_one(action: Any) -> None:
+    scripts = [step["run"] for step in action["runs"]["steps"] if "run" in step]
+    assert scripts and not [script for script in scripts if "${{" in script]
+    for script in scripts:
+        subprocess.run(["bash", "-n"], input=script, text=True, check=True)
+
+
+def test_every_input_is_of_use_and_documented_where_it_is_new(action: Any) -> None:
+    steps = str(action["runs"]["steps"])
+    assert all(f"inputs.{name}" in steps for name in action["inputs"])
+    page = (ROOT / "docs" / "running" / "ci-gate.md").read_text()
+    assert all(f"`{name}" in page for name in ("cache", "artifact", "table", "artifact-url"))
+
+
+def test_every_command_is_one_that_the_parser_takes(action: Any) -> None:
+    text = "\n".join(step.get("run", "") for step in action["runs"]["steps"]).replace("\\\n", " ")
+    commands = re.findall(r"su3d-bench (.*?)(?: \|\| .*)?$", text, re.MULTILINE)
+    assert len(commands) == 4
+    for command in commands:
+        build_parser().parse_args(shlex.split(command))

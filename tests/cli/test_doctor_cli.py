@@ -82,9 +82,3 @@ def test_a_shell_completes_verbs_and_choices(line: str, words: set[str], tmp_pat
     subprocess.run([sys.executable, "-m", "su3d_bench"], env=os.environ | environment, check=True)
     assert words <= {word.strip() for word in found.read_text().split("\n")}
     assert not {"run", "evaluate"} & {word.strip() for word in found.read_text().split("\n")}
-
-
-def test_the_script_for_a_shell_names_the_program(capsys: pytest.CaptureFixture[str]) -> None:
-    for shell in ("bash", "zsh", "fish"):
-        assert main(["dev", "completion", shell]) == 0
-        assert "su3d-bench" in capsys.readouterr().out

@@ -52,9 +52,8 @@ def error_of(capsys: pytest.CaptureFixture[str], *words: str) -> str:
 
 def test_a_run_is_exported_for_openlex3d(run_folder: str, capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
-    assert (
-        main(["runs", "export", run_folder, "--to", "openlex3d", "--method", "collector", "--out", "x/collector"]) == 0
-    )
+    words = ["runs", "export", run_folder, "--to", "openlex3d", "--method", "collector"]
+    assert main([*words, "--out", "x/collector"]) == 0
     assert capsys.readouterr().out == "2 scenes for openlex3d: x/collector\n"
     for scene in ("a", "b"):
         own = READERS["su3d-bench"].read(Path(f"r/scenes/painted.{scene}/collector/prediction.npz"), f"painted/{scene}")
@@ -160,10 +159,8 @@ def test_features_outside_of_a_run_are_not_named(run_folder: str, capsys: pytest
     names = [entry.name for entry in RULES.classes]
     np.savez("texts.npz", names=np.array(names), features=colour_perception().encoder.encode_texts(names))
     assert main(["runs", "export", *words, "--text-features", "texts.npz", "--out", "by-texts"]) == 0
-    assert (
-        main(["runs", "export", "r", *words[1:5], "--method", "collector", "--scenes", "painted/a", "--out", "by-run"])
-        == 0
-    )
+    of_run = ["runs", "export", "r", *words[1:5], "--method", "collector", "--scenes", "painted/a"]
+    assert main([*of_run, "--out", "by-run"]) == 0
     assert Path("by-texts/a.txt").read_text() == Path("by-run/a.txt").read_text() != ""
     Path("a.npz").write_bytes(Path("r/scenes/painted.a/oracle/prediction.npz").read_bytes())
     assert main(["runs", "export", *words, "--out", "named"]) == 0

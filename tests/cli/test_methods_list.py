@@ -13,14 +13,8 @@ from su3d_bench.reports.tables.paper import figures_of
 from su3d_bench.runs.plan import make_plan
 
 SYSTEMS = (
-    "opensu3d",
-    "conceptfusion",
-    "conceptfusion-sam",
-    "conceptgraphs",
-    "conceptgraphs-detector",
-    "openmask3d",
-    "openmask3d-segment3d",
-    "sam3d",
+    *("opensu3d", "conceptfusion", "conceptfusion-sam", "conceptgraphs", "conceptgraphs-detector"),
+    *("openmask3d", "openmask3d-segment3d", "sam3d"),
 )
 
 

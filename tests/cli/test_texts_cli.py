@@ -103,12 +103,9 @@ def test_queries_are_encoded_from_every_form_in_which_they_come(
 REFUSED = [
     (["--protocol", "rooms-semantic"], "protocol 'rooms-semantic' names no encoder; name one with --encoder: embedded"),
     (["--protocol", "rooms-semantic", "--encoder", "embeded"], "unknown encoder 'embeded'; did you mean 'embedded'?"),
-    (["--protocol", "rooms-semantic", "--encoder", "x"], "unknown encoder 'x'; known: embedded, clip-vit-h-14"),
     (["--protocol", "class-agnostic-open3dis"], "compares no features with texts; there is nothing to encode"),
-    (["--protocol", "rooms-reasoning"], "compares no features with texts; there is nothing to encode"),
     (["--protocol", "rooms-semantic", "--queries", "q.txt"], "has classes of its own as texts; leave --queries out"),
     (["--protocol", "query-ap", "--queries", "q.txt", "--encoder", "embedded"], "q.txt: is not there"),
-    (["--protocol", "rooms-semantc"], "did you mean 'rooms-semantic'?"),
     (["--protocol", "rooms-semantic", "--encoder", "embedded", "--out", "texts.txt"], "give a file that ends in .npz"),
 ]  # fmt: skip
 

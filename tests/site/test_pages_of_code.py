@@ -3,33 +3,27 @@
 from __future__ import annotations
 
 import doctest
-import importlib.util
 import re
+import runpy
 from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pages_of_code
 import pytest
 import site_hooks
+import site_text
 import yaml
 from pages_of_code import API, METHODS, PROTOCOLS, protocol_page, told_of
 from places import ROOT
 from site_hooks import filled
-from site_text import ROOT_PAGES
+from site_text import ROOT_PAGES, for_site, heading, plain, prose, with_examples
 
 import su3d_bench
 from su3d_bench.core import registry
 from su3d_bench.core.config import flatten
-from su3d_bench.metrics.protocols.loading import (
-    load_protocol,
-    not_comparable_with,
-    protocol_names,
-    remarks_of,
-    rules_files,
-)
+from su3d_bench.metrics.protocols import loading
 from su3d_bench.reports.tables.paper import figures_of
 
 TAGS = {"p", "div", "table", "thead", "tbody", "tr", "th", "td", "code", "a", "details", "summary", "pre"}
@@ -46,15 +40,15 @@ def words(page: str) -> str:
 
 
 def test_every_protocol_has_a_page_with_every_rule_source_and_class(pages: dict[str, str]) -> None:
-    for name in protocol_names():
-        rules, text = load_protocol(name), pages[f"{PROTOCOLS}/{name}.md"]
+    for name in loading.protocol_names():
+        rules, text = loading.load_protocol(name), pages[f"{PROTOCOLS}/{name}.md"]
         shown = words(text)
         for path, value in flatten(rules.model_dump(mode="json", exclude={"classes", "not_comparable_with"})):
             assert ".".join(path) in shown or path == ("summary",)
             assert not isinstance(value, str) or value in shown, (name, path)
-        for remark in (line for lines in remarks_of(rules_files(name)).values() for line in lines):
+        for remark in (line for lines in loading.remarks_of(loading.rules_files(name)).values() for line in lines):
             assert " ".join(remark.replace("`", "").split()) in shown.replace("`", ""), (name, remark)
-        for other in not_comparable_with(rules):
+        for other in loading.not_comparable_with(rules):
             assert f'href="./{other}.html"' in text
         for entry in rules.classes:
             group = f"<td>{entry.group}</td>\n" if entry.group else ""
@@ -88,7 +82,7 @@ def test_nothing_in_a_protocol_file_acts_on_its_page(tmp_path: Path) -> None:
     text = re.sub(r"ignore = \[.*?\]", "ignore = []", text)
     file = tmp_path / "own.toml"
     file.write_text(f"# {hostile}\n\n{text}")
-    page = protocol_page(load_protocol(str(file)), [file])
+    page = protocol_page(loading.load_protocol(str(file)), [file])
     assert set(_Tags(page).found) <= TAGS
     assert page.count("alert(1)") >= 6
     assert {name for _, attributes in _Tags(page).attributes for name, _ in attributes} <= {"href", "class"}
@@ -112,13 +106,6 @@ def test_every_page_has_one_place_in_the_navigation(pages: dict[str, str]) -> No
     there |= set(ROOT_PAGES.values())
     placed = site_hooks._leaves(filled(_settings()["nav"], there))
     assert sorted(placed) == sorted(there)
-    assert sorted(site_hooks._leaves(filled(_settings()["nav"], there | {"tutorials/new.md", "new.md"}))) == sorted(
-        there | {"tutorials/new.md", "new.md"}
-    )
-
-
-def test_the_examples_of_the_hooks_hold() -> None:
-    assert doctest.testmod(site_hooks).failed == 0
 
 
 def _settings() -> dict[str, Any]:
@@ -139,14 +126,6 @@ def test_the_site_asks_for_nothing_that_is_elsewhere() -> None:
     assert all((ROOT / "docs" / name).is_file() for name in [*settings["extra"]["polyfills"], *settings["extra_css"]])
 
 
-def _check() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("check_of_the_site", ROOT / ".ci/site.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def test_the_check_of_a_site_finds_dead_links_and_what_is_loaded_from_elsewhere(tmp_path: Path) -> None:
     (tmp_path / "a.css").write_text("b { background: url( 'https://example.org/x.png') }")
     (tmp_path / "b.html").write_text('<h1 id="there">b</h1>')
@@ -155,7 +134,11 @@ def test_the_check_of_a_site_finds_dead_links_and_what_is_loaded_from_elsewhere(
         '<a href="gone.html">2</a><a href="#no">3</a><script src="//example.org/x.js"></script><img src="gone.png">'
         '<link href="https://example.org/x.css"><style>@import "x"</style><img src="data:image/png;base64,">'
     )
-    found = [line for line in _check().faults_of(tmp_path) if not line.startswith("reference/")]
+    found = [
+        line
+        for line in runpy.run_path(str(ROOT / ".ci/site.py"))["faults_of"](tmp_path)
+        if not line.startswith("reference/")
+    ]
     assert found == [
         "index.html: b.html#gone: the page has no such place",
         "index.html: gone.html is not there",
@@ -168,8 +151,62 @@ def test_the_check_of_a_site_finds_dead_links_and_what_is_loaded_from_elsewhere(
     ]
 
 
-def test_the_check_of_a_site_misses_pages_and_names(tmp_path: Path) -> None:
-    (tmp_path / "index.html").write_text("")
-    found = set(_check().faults_of(tmp_path))
-    assert {"reference/protocols/rooms-instance.html is missing", "reference/methods/oracle.html is missing"} <= found
-    assert {f"reference/api.html lacks {name}" for name in su3d_bench.__all__} <= found
+# texts on their way into the site
+
+HERE = {"su3d_bench/core/types.py", "action.yml", "benchmarks/README.md"}
+
+
+def as_site(text: str, page: str = "docs/running/gpu.md", repository: str | None = None) -> str:
+    return for_site(text, page, HERE.__contains__, repository)
+
+
+def test_the_examples_of_hooks_and_texts_hold() -> None:
+    assert doctest.testmod(site_hooks).failed == doctest.testmod(site_text).failed == 0
+
+
+@pytest.mark.parametrize(
+    ("page", "link", "there"),
+    [
+        ("docs/running/gpu.md", "[a](clusters.md#x)", "[a](clusters.md#x)"),
+        ("docs/running/gpu.md", "[a](../../README.md)", f"[a](../{ROOT_PAGES['README.md']})"),
+        ("docs/running/gpu.md", "[a](../../CONTRIBUTING.md#rules)", "[a](../contributing.md#rules)"),
+        (
+            "README.md",
+            "[`a`](docs/running/gpu.md) ![p](docs/pictures/p.png)",
+            "[`a`](running/gpu.md) ![p](pictures/p.png)",
+        ),
+        ("README.md", "[a](https://example.org/x)", "[a](https://example.org/x)"),
+        ("README.md", "[a](#licence)", "[a](#licence)"),
+    ],
+)
+def test_links_lead_to_pages_of_the_site(page: str, link: str, there: str) -> None:
+    assert as_site(f"See {link}.", page) == f"See {there}."
+
+
+def test_a_link_out_of_the_docs_is_a_path_where_no_code_host_is_known() -> None:
+    text = "[core/types.py](../../su3d_bench/core/types.py), [`action.yml`](../../action.yml)"
+    text += ", [the gate](../../action.yml)"
+    assert as_site(text) == "`su3d_bench/core/types.py`, `action.yml`, the gate (`action.yml`)"
+    assert as_site("[the gate](../../action.yml#L3)", repository="https://example.org/a/b") == (
+        "[the gate](https://example.org/a/b/blob/main/action.yml#L3)"
+    )
+
+
+@pytest.mark.parametrize("link", ["[a](../../gone.py)", "[a](../../../outside.md)"])
+def test_a_link_to_what_is_not_there_stays_for_the_build_to_refuse(link: str) -> None:
+    assert as_site(link) == link
+    assert as_site(link, repository="https://example.org/a/b") == link
+
+
+def test_no_text_acts_on_the_page() -> None:
+    hostile = '</p><script>alert(1)</script>\n\n# x `<b>` ![y](z) https://a.b/"><script> \x1b[31m\u202e'
+    for shown in (plain(hostile), prose(hostile), heading(hostile)):
+        assert "<script" not in shown and "<b>" not in shown and "\n" not in shown
+        assert "\x1b" not in shown and "\u202e" not in shown
+    assert "![y]" not in heading(hostile)
+
+
+def test_an_example_is_a_block_of_code_and_the_rest_of_the_text_as_it_was() -> None:
+    text = "One.\n\n    Two:\n    >>> f(\n    ...     1)\n    2\n    >>> 3\n    3\n\n    ``a`` > b.\n    "
+    assert with_examples(text) == "One.\n\nTwo:\n\n```pycon\n>>> f(\n...     1)\n2\n>>> 3\n3\n```\n\n``a`` > b."
+    assert with_examples("No example, a > b.") == "No example, a > b."

@@ -298,15 +298,6 @@ class Wishes:
 
 
 @dataclass(frozen=True)
-class Amount:
-    """What of a page must be made: ``n_steps`` of ``n_scenes``, while ``n_kept`` scenes were made before."""
-
-    n_scenes: int
-    n_steps: int
-    n_kept: int
-
-
-@dataclass(frozen=True)
 class Contents:
     """Plain ``numbers``, the ``scenes`` with their maps, none of more than ``most_points``, and their ``galleries``."""
 
@@ -350,12 +341,12 @@ def page_contents(
     folders: Sequence[Path],
     wishes: Wishes,
     *,
-    begin: Callable[[Amount], None] = lambda amount: None,
+    begin: Callable[[int], None] = lambda n_steps: None,
     report: Report = lambda event: None,
 ) -> Contents:
     """The contents of the page of the runs in ``folders``.
 
-    ``begin`` is told once what there is to make, ``report`` of every step. Raises a ``StoreError`` where a folder holds
+    ``begin`` is told once how many steps there are, ``report`` of each. Raises a ``StoreError`` where a folder holds
     no finished run; what cannot be had of one is a reason on the page.
     """
     folders = tuple(dict.fromkeys(folders))
@@ -368,7 +359,7 @@ def page_contents(
     wanted = _wanted(runs, maps, told, [wishes.queries, most_points, most_photos, wishes.with_gallery])
     made = {one.scene: kept for one in wanted if (kept := load_scene(one.place, one.scene, runs)) is not None}
     asked = [one for one in wanted if one.scene not in made]
-    begin(Amount(len(asked), sum(one.n_steps for one in asked), len(made)))
+    begin(sum(one.n_steps for one in asked))
     batch = Batch(folders, wishes.queries, most_points, most_photos, wishes.with_gallery, tuple(asked))
     made |= {one.scene: one for one in _all_made(batch, wishes.jobs, report)}
     made = {one.scene: made[one.scene] for one in wanted}
