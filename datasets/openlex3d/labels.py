@@ -8,18 +8,18 @@ base data. Source: openlex3d at commit 3dbad2b.
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Literal, TypeVar
 
 import numpy as np
+from pydantic import AfterValidator, Field, Strict
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing, printable
 from su3d_bench.core.types import Float32Array
 from su3d_bench.formats.arrays import parsed_json, read_text
+from su3d_bench.formats.json_models import FileModel, checked_json
 from su3d_bench.formats.pcd import read_pcd_points
 from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels
 from su3d_bench.metrics.open_vocabulary.score import TextQuery
@@ -27,11 +27,18 @@ from su3d_bench.metrics.open_vocabulary.score import TextQuery
 PROMPTS_NAME = "prompt_list.txt"
 CATEGORIES_NAME = "gt_categories.json"
 VISIBLE_NAME = "gt_visible_cloud.pcd"
-MOST_ID = 2**31 - 1
+MAX_ID = 2**31 - 1
+Content = TypeVar("Content")
 
 Level = Literal["l0", "l1", "all"]
 LEVELS: tuple[Level, ...] = ("l0", "l1", "all")  # synonyms, what depicts them, both
 QUERY_LEVEL: Level = "l0"  # the level that the release evaluates unless another is asked for
+
+
+def _whole_characters(text: str) -> str:
+    """JSON can write halves of characters, which no encoder takes."""
+    text.encode("utf-8")
+    return text
 
 
 def queries_name(level: Level) -> str:
@@ -99,38 +106,60 @@ def read_prompts(path: Path, where: str) -> tuple[str, ...]:
     return prompts
 
 
+ObjectIds = list[Annotated[int, Strict(False), Field(ge=-MAX_ID, le=MAX_ID)]]
+Text = Annotated[str, AfterValidator(_whole_characters)]
+
+
+class Attributes(FileModel):
+    synonyms: list[Text]
+    depictions: list[Text]
+    vis_sim: list[Text]
+    clutter: ObjectIds | None = None
+
+
+class Labels(FileModel):
+    image_attributes: Attributes
+
+
+class Sample(FileModel):
+    object_id: Annotated[int, Field(ge=-MAX_ID, le=MAX_ID)]
+    labels: Labels
+
+
+class Samples(FileModel):
+    samples: list[Sample]
+
+
+class Categories(FileModel):
+    """``gt_categories.json``."""
+
+    dataset: Samples
+
+
 def read_categories(path: Path, where: str) -> dict[int, ObjectLabels]:
     """Object id -> labels, from ``dataset.samples`` of a ``gt_categories.json``."""
-    content = parsed_json(_read_text(path, where), where)
-    samples = _entry(_entry(content, "dataset", dict, where), "samples", list, where)
     labels_of: dict[int, ObjectLabels] = {}
-    for number, sample in enumerate(samples):
-        at = f"{where}: sample {number}"
-        object_id = _whole_number(_entry(sample, "object_id", int, at), at)
-        attributes = _entry(_entry(sample, "labels", dict, at), "image_attributes", dict, at)
-        labels = ObjectLabels(
-            _texts(attributes, "synonyms", at),
-            _texts(attributes, "depictions", at),
-            _texts(attributes, "vis_sim", at),
-            _ids(attributes.get("clutter") or [], f"{at}: 'clutter'"),
-        )
-        if labels_of.setdefault(object_id, labels) != labels:
-            raise DataError(f"{at}: object {object_id} stands there twice with other labels; keep one of them")
+    for sample in _read_json(path, where, Categories).dataset.samples:
+        found = sample.labels.image_attributes
+        tiers = tuple(found.synonyms), tuple(found.depictions), tuple(found.vis_sim)
+        labels = ObjectLabels(*tiers, tuple(found.clutter or ()))
+        if labels_of.setdefault(sample.object_id, labels) != labels:
+            raise DataError(f"{where}: object {sample.object_id} stands there twice with other labels; keep one")
     return labels_of
 
 
 def read_queries(path: Path, where: str) -> tuple[TextQuery, ...]:
     """The queries of all levels of the file, in its order: level -> text -> object ids."""
-    queries = []
-    for level, of_level in _table(parsed_json(_read_text(path, where), where), where).items():
-        at = f"{where}: '{printable(level, 40)}'"
-        for text, ids in _table(of_level, at).items():
-            beside = f"{at}: query '{printable(text, 60)}'"
-            objects = _ids(ids, beside)
-            if len(set(objects)) != len(objects):
-                raise DataError(f"{beside}: an object stands there twice; name each once")
-            queries.append(TextQuery(_sound(text, beside), objects))
-    return tuple(queries)
+    levels = _read_json(path, where, dict[str, dict[Text, ObjectIds]])
+    queries = tuple(TextQuery(text, tuple(ids)) for level in levels.values() for text, ids in level.items())
+    for query in queries:
+        if len(set(query.object_ids)) != len(query.object_ids):
+            raise DataError(f"{where}: query '{printable(query.text, 60)}': an object stands there twice")
+    return queries
+
+
+def _read_json(path: Path, where: str, kind: type[Content]) -> Content:
+    return checked_json(parsed_json(_read_text(path, where), where), where, kind)
 
 
 def _read_text(path: Path, where: str) -> str:
@@ -141,63 +170,3 @@ def _read_text(path: Path, where: str) -> str:
 
 def _missing(path: Path, where: str) -> GroundTruthMissing:
     return GroundTruthMissing(f"{where}: is not there; expected {printable(str(path), 200)}")
-
-
-def _table(value: Any, where: str) -> Mapping[str, Any]:
-    if not isinstance(value, dict):
-        raise DataError(f"{where}: is {_kind(value)}; expected an object")
-    return value
-
-
-_NAMES: dict[type, str] = {dict: "an object", list: "a list", int: "a whole number", str: "a text"}
-
-
-def _entry(value: Any, key: str, kind: type, where: str) -> Any:
-    """``value[key]``, which must be of ``kind``."""
-    table = _table(value, where)
-    if key not in table:
-        raise DataError(f"{where}: has no '{key}'; expected the file of the release")
-    if not isinstance(table[key], kind) or isinstance(table[key], bool):
-        raise DataError(f"{where}: '{key}' is {_kind(table[key])}; expected {_NAMES[kind]}")
-    return table[key]
-
-
-def _texts(attributes: Mapping[str, Any], tier: str, where: str) -> tuple[str, ...]:
-    words = _entry(attributes, tier, list, where)
-    for word in words:
-        if not isinstance(word, str):
-            raise DataError(f"{where}: '{tier}' holds {_kind(word)}; expected texts")
-    return tuple(_sound(word, f"{where}: '{tier}'") for word in words)
-
-
-def _sound(text: str, where: str) -> str:
-    """A text of whole characters: JSON can write halves of them, which no encoder takes."""
-    try:
-        text.encode("utf-8")
-    except UnicodeEncodeError as error:
-        raise DataError(f"{where}: '{printable(text, 60)}' holds half a character; copy the file again") from error
-    return text
-
-
-def _ids(values: Any, where: str) -> tuple[int, ...]:
-    """Object ids; the release writes some of them as texts."""
-    if not isinstance(values, list):
-        raise DataError(f"{where}: is {_kind(values)}; expected a list of object ids")
-    return tuple(_whole_number(value, where) for value in values)
-
-
-def _whole_number(value: Any, where: str) -> int:
-    if isinstance(value, str) and value.isascii() and value.isdecimal() and len(value) <= 10:
-        value = int(value)
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise DataError(f"{where}: an object id is {_kind(value)}; expected a whole number")
-    if not -MOST_ID <= value <= MOST_ID:
-        raise DataError(f"{where}: an object id is outside -{MOST_ID} to {MOST_ID}")
-    return value
-
-
-def _kind(value: Any) -> str:
-    """What stands in a file, for messages: the value where it is short, else its kind."""
-    if isinstance(value, dict | list):
-        return f"{_NAMES[type(value)]} of {len(value)}"
-    return printable(json.dumps(value), 40)

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from su3d_bench.core.digests import digest_file, digest_json
 from su3d_bench.core.errors import DataError, GroundTruthMissing, PredictionError, converted
@@ -26,7 +27,8 @@ from su3d_bench.datasets.recordings.meshes import vertex_positions
 from su3d_bench.datasets.replica.folders import find_original_scene, original_name
 from su3d_bench.datasets.replica.truth import MESH_NAME, AnnotatedMesh, read_annotated_mesh
 from su3d_bench.datasets.scannetpp.truth import BASES as SCANNETPP_BASES
-from su3d_bench.formats.arrays import MOST_POINTS, checked_points, kind_of, parsed_json, read_text
+from su3d_bench.formats.arrays import MOST_POINTS, checked_points, kind_of
+from su3d_bench.formats.json_models import FileModel, read_json
 from su3d_bench.formats.ply import read_ply
 from su3d_bench.formats.torch_files import read_torch
 from su3d_bench.metrics.matching.nearest import nearest
@@ -44,7 +46,7 @@ HM3D_BASES = (
 )  # fmt: skip
 HM3D_URL = "http://aisdatasets.cs.uni-freiburg.de/openlex3d/hm3d"
 SCENE_INFO, OBJECTS_FOLDER = "scene_info.json", "objects"
-MOST_OBJECTS = 2**16  # the original keeps ids in 16 bits
+MAX_OBJECTS = 2**16  # the original keeps ids in 16 bits
 
 
 @dataclass(frozen=True)
@@ -145,15 +147,26 @@ def _of_hm3d(data_root: Path, scene: str) -> LabelledPoints:
     return read_object_clouds(folders[0], f"hm3d/{scene}")
 
 
+class CloudObject(FileModel):
+    id: Annotated[int, Field(ge=0, lt=MAX_OBJECTS)]
+
+
+class SceneInfo(FileModel):
+    objects: Annotated[list[CloudObject], Field(min_length=1)]
+
+
 def read_object_clouds(folder: Path, where: str) -> LabelledPoints:
     """The cloud of every object that ``scene_info.json`` names, one object after another."""
-    ids = _object_ids(folder / SCENE_INFO, f"{where}: {SCENE_INFO}")
+    advice = "unpack the release again"
+    ids = [one.id for one in read_json(folder / SCENE_INFO, f"{where}: {SCENE_INFO}", SceneInfo, advice).objects]
+    if len(set(ids)) != len(ids):
+        raise DataError(f"{where}: {SCENE_INFO}: an object stands there twice; {advice}")
     clouds: list[Float32Array] = []
     n_points = 0
     for one in ids:
         path, beside = folder / OBJECTS_FOLDER / f"{one}.ply", f"{where}: {OBJECTS_FOLDER}/{one}.ply"
         if not path.is_file():
-            raise DataError(f"{beside}: is not there, and {SCENE_INFO} names object {one}; unpack the release again")
+            raise DataError(f"{beside}: is not there, and {SCENE_INFO} names object {one}; {advice}")
         clouds.append(vertex_positions(read_ply(path, beside), beside))
         n_points += len(clouds[-1])
         if n_points > MOST_POINTS:
@@ -163,24 +176,6 @@ def read_object_clouds(folder: Path, where: str) -> LabelledPoints:
         np.repeat(np.array(ids, np.int64), [len(cloud) for cloud in clouds]),
         f"the clouds in {OBJECTS_FOLDER}",
     )
-
-
-def _object_ids(path: Path, where: str) -> list[int]:
-    content = parsed_json(read_text(path, where), where)
-    objects = content.get("objects") if isinstance(content, dict) else None
-    if not isinstance(objects, list) or not objects:
-        raise DataError(f"{where}: has no list 'objects' with entries; unpack the release again")
-    ids: dict[int, None] = {}
-    for number, entry in enumerate(objects):
-        one = entry.get("id") if isinstance(entry, dict) else None
-        if isinstance(one, bool) or not isinstance(one, int) or not 0 <= one < MOST_OBJECTS:
-            raise DataError(
-                f"{where}: object {number} has no 'id' from 0 to {MOST_OBJECTS - 1}; unpack the release again"
-            )
-        if one in ids:
-            raise DataError(f"{where}: object {one} stands there twice; unpack the release again")
-        ids[one] = None
-    return list(ids)
 
 
 DATASETS = ("replica", "scannetpp", "hm3d")  # as the release calls them, and below the data root their own data

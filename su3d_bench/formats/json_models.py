@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -28,15 +27,10 @@ class FileModel(BaseModel):
     model_config = ConfigDict(frozen=True, strict=True)
 
 
-@cache
-def _adapter(kind: Any) -> TypeAdapter[Any]:
-    return TypeAdapter(kind)
-
-
 def checked_json(content: Any, where: str, kind: type[Content], advice: str = "copy the file again") -> Content:
     """``content`` as a ``kind``; a ``DataError`` names the first place that does not fit."""
     try:
-        value: Content = _adapter(kind).validate_python(content)
+        value: Content = TypeAdapter(kind).validate_python(content)
     except ValidationError as error:
         fault = error.errors(include_url=False)[0]
         place = printable(".".join(map(str, fault["loc"])), 120)
