@@ -366,7 +366,7 @@ def every_kth(known: set[int]) -> range:
     return range(0, max(known) + 1, math.gcd(*known) or 1)
 
 
-def check_complete(kinds: Mapping[str, NumberedNames], expected: range, where: str) -> None:
+def check_complete(kinds: Mapping[str, NumberedNames], expected: range, where: str, advice: str = EXPORT_AGAIN) -> None:
     """Raise ``DataError`` unless each kind of file is there for exactly the ``expected`` frames.
 
     The keys are what the name of a missing file would be, with {} in place of its number.
@@ -375,12 +375,12 @@ def check_complete(kinds: Mapping[str, NumberedNames], expected: range, where: s
     n_missing = sum(len(expected) - len(known) for known in there.values())
     if n_missing:
         first = next(name.format(n) for name, known in there.items() for n in expected if n not in known)
-        raise DataError(f"{where}: {first} is missing{_more(n_missing)}; {EXPORT_AGAIN}")
+        raise DataError(f"{where}: {first} is missing{_more(n_missing)}; {advice}")
     extra = [name for files in kinds.values() for number, name in files.items() if number not in expected]
     if extra:
         raise DataError(
             f"{where}: the recording has {len(expected)} frames, but there is also {extra[0][:60]}{_more(len(extra))}; "
-            f"{EXPORT_AGAIN}"
+            f"{advice}"
         )
 
 

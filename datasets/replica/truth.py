@@ -15,18 +15,18 @@ from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from su3d_bench.core.errors import DataError, reading
 from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import Float32Array, GroundTruth, InstanceMesh, Int32Array, Int64Array
 from su3d_bench.datasets.recordings.meshes import check_finite, face_corners, fans, scalar_column, vertex_positions
 from su3d_bench.datasets.replica.folders import FUSED_CLOUD, replica_label_set
-from su3d_bench.formats.arrays import parsed_json
 from su3d_bench.formats.hdf5 import largest_column, read_rows
-from su3d_bench.formats.images import read_bytes
+from su3d_bench.formats.json_models import FileModel, read_json
 from su3d_bench.formats.ply import MAX_HEADER_BYTES, ListColumn, read_header, read_ply
 from su3d_bench.formats.poses import moved, read_first_pose
 
@@ -52,7 +52,7 @@ class AnnotatedMesh:
 
 def read_annotated_mesh(folder: Path, where: str) -> AnnotatedMesh:
     """The mesh of the scene in ``folder``; ``where`` begins each message. Void objects are counted in a warning."""
-    class_of_object = read_object_classes(folder / INFO_NAME, where)
+    class_of_object = read_info(folder / INFO_NAME, where).class_of_object
     vertices, corners, objects = _read_mesh(folder / MESH_NAME, f"{where}: {MESH_NAME}")
     known = {number: class_id for number, class_id in class_of_object.items() if class_id in replica_label_set().ids}
     ids, face_rows = np.unique(objects, return_inverse=True)
@@ -64,62 +64,45 @@ def read_annotated_mesh(folder: Path, where: str) -> AnnotatedMesh:
     )
 
 
-def read_object_classes(path: Path, where: str) -> dict[int, int]:
-    """Object id -> class id as ``info_semantic.json`` has it, undefined classes included."""
-    objects = read_objects(path, where)
-    where = f"{where}: {INFO_NAME}"
-    class_of_object: dict[int, int] = {}
-    for row in objects:
-        object_id, class_id = whole_number(row, "id", where), whole_number(row, "class_id", where)
-        if not 0 <= object_id <= MAX_OBJECT_ID:
-            raise DataError(f"{where}: an object has the id {object_id}; expected 0 to {MAX_OBJECT_ID}")
-        if class_of_object.setdefault(object_id, class_id) != class_id:
+class InfoClass(FileModel):
+    id: int
+    name: str
+
+
+class InfoObject(FileModel):
+    id: Annotated[int, Field(ge=0, le=MAX_OBJECT_ID)]
+    class_id: int
+    oriented_bbox: Any = None
+
+
+class Info(FileModel):
+    """``info_semantic.json``; ``class_of_object`` has undefined classes too."""
+
+    classes: list[InfoClass]
+    objects: list[InfoObject]
+
+    @property
+    def class_of_object(self) -> dict[int, int]:
+        return {row.id: row.class_id for row in self.objects}
+
+
+def read_info(path: Path, where: str) -> Info:
+    """The table of the scene's objects. Its own classes must be Replica's: with others every label would be wrong."""
+    where, labels = f"{where}: {INFO_NAME}", replica_label_set()
+    info = read_json(path, where, Info)
+    for row in info.classes:
+        if row.id in labels.ids and row.name.replace("_", "-").lower() != labels.name_of(row.id):
             raise DataError(
-                f"{where}: object {object_id} stands there twice, as class {class_of_object[object_id]} and as class "
-                f"{class_id}"
+                f"{where}: class {row.id} is {row.name[:40]!a}, in Replica it is '{labels.name_of(row.id)}'; this file "
+                "has other classes"
             )
-    return class_of_object
-
-
-def read_objects(path: Path, where: str) -> list[dict[str, Any]]:
-    """The rows of ``objects`` of an ``info_semantic.json`` whose classes are Replica's."""
-    where = f"{where}: {INFO_NAME}"
-    content = parsed_json(read_bytes(path, where), where)
-    objects = _list_of_tables(content, "objects", where)
-    _check_class_names(_list_of_tables(content, "classes", where), where)
-    return objects
-
-
-def _list_of_tables(content: Any, key: str, where: str) -> list[dict[str, Any]]:
-    rows = content.get(key) if isinstance(content, dict) else None
-    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise DataError(f"{where}: has no list '{key}' of objects; expected the file of the original release")
-    return rows
-
-
-def whole_number(row: dict[str, Any], key: str, where: str) -> int:
-    value = row.get(key)
-    if isinstance(value, bool) or not isinstance(value, int):
-        owner = shown(row.get("id")).strip("'")
-        raise DataError(f"{where}: object {owner}: '{key}' is {shown(value)}, not a whole number")
-    return value
-
-
-def shown(value: Any) -> str:
-    """A value of a JSON file as a message may show it: short, on one line, in quotes; a list or table by its type."""
-    return ascii((str(value) if value is None or isinstance(value, str | int | float) else type(value).__name__)[:40])
-
-
-def _check_class_names(classes: list[dict[str, Any]], where: str) -> None:
-    """The file's own class table must be Replica's: with another one every label would be wrong."""
-    labels = replica_label_set()
-    for row in classes:
-        class_id = row.get("id")
-        if class_id in labels.ids and str(row.get("name")).replace("_", "-").lower() != labels.name_of(class_id):
+    class_of_object = info.class_of_object
+    for one in info.objects:
+        if (class_id := class_of_object[one.id]) != one.class_id:
             raise DataError(
-                f"{where}: class {class_id} is {shown(row.get('name'))}, in Replica it is "
-                f"'{labels.name_of(class_id)}'; this file has other classes"
+                f"{where}: object {one.id} stands there twice, as class {one.class_id} and as class {class_id}"
             )
+    return info
 
 
 def _say_what_is_void(ids: Int64Array, n_faces: Int64Array, class_of_object: Mapping[int, int], where: str) -> None:
