@@ -19,12 +19,12 @@ from pydantic import Field, model_validator
 from su3d_bench.core.errors import DataError, PredictionError, converted, printable
 from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.core.types import Float32Array, Floor, GroundTruth, LabelSet, Places, Room
-from su3d_bench.datasets.hm3dsem.frames import INFO_NAME, OBJECTS
 from su3d_bench.formats.arrays import MOST_POINTS, checked_points, read_text
 from su3d_bench.formats.json_models import FileModel, Lengths, Metres, Point, WholeNumber, read_json
 from su3d_bench.formats.ply import read_ply
 from su3d_bench.metrics.protocols.loading import CLASS_TABLES
 
+INFO_NAME, OBJECTS = "scene_info.json", "objects"
 LABEL_SPACE, VARIANT = "hm3dsem", "hovsg-objects"
 MAX_OBJECTS = 100_000
 HEADER = "HM3D Semantic Annotations"
@@ -157,11 +157,12 @@ def read_annotation(path: Path, where: str) -> dict[int, tuple[str, str, int]]:
     return rows
 
 
-def annotation_problem(info: WalkInfo, annotation: Mapping[int, tuple[str, str, int]], where: str) -> str | None:
-    """A line where an object of the walk is not that of the scene's annotation."""
+def check_annotation(info: WalkInfo, annotation: Mapping[int, tuple[str, str, int]], where: str) -> None:
+    """A ``DataError`` where an object of the walk is not that of the scene's annotation."""
     for one in info.objects:
         own = one.hex, one.category, one.region_id
         if annotation.get(one.id) != own:
             found = printable(f"colour, category and region are {own} and {annotation.get(one.id)}", 120)
-            return f"{where}: {INFO_NAME}: object {one.id} is not that of the scene's .semantic.txt ({found}); {AGAIN}"
-    return None
+            raise DataError(
+                f"{where}: {INFO_NAME}: object {one.id} is not that of the scene's .semantic.txt ({found}); {AGAIN}"
+            )

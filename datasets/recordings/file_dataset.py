@@ -17,9 +17,9 @@ from pydantic import BaseModel, ConfigDict
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError, GroundTruthMissing, ScenesMissing, suggest
 from su3d_bench.core.system.files import file_text
-from su3d_bench.core.types import GroundTruth, ImageDomain, InstanceMesh, SceneInfo
+from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo
 from su3d_bench.datasets.openlex3d import release as openlex3d
-from su3d_bench.datasets.recordings.recorded_frames import reading
+from su3d_bench.datasets.recordings.recorded_frames import RecordedFrames, Recording, reading
 
 logger = logging.getLogger(__name__)
 MARKER = "rooms.json"  # in a folder of scenes: those that `datasets make` rendered
@@ -235,6 +235,29 @@ class FileDataset(ABC, Generic[OptionsT]):
             hint = suggest(scene, list(self.tree.folder_of), f"{self.tree.places[0]} has")
             raise DataError(f"{self.name}: no scene '{scene}'{hint}")
         return self.tree.folder_of[scene]
+
+
+class RecordedDataset(FileDataset[OptionsT]):
+    """A dataset whose frames have one size and are read from one colour and one depth file each."""
+
+    @abstractmethod
+    def recording(self, scene: str) -> Recording: ...
+
+    def n_frames(self, scene: str, stride: int) -> int:
+        return len(self.frames(scene, stride))
+
+    def frames(self, scene: str, stride: int) -> Sequence[Frame]:
+        return RecordedFrames(self.recording(scene), stride)
+
+    def recording_files(self, scene: str) -> Sequence[Path]:
+        return (*self.recording(scene).files, *self.recording(scene).images())
+
+    def recording_key(self, scene: str) -> str:
+        return self.recording(scene).digest()
+
+    def problems(self, scene: str) -> Iterator[str]:
+        """What is missing of the recording, a line for each kind; the frames go on without it."""
+        yield from self.recording(scene).missing
 
 
 def sizes_and_ends(files: Sequence[Path], n_ends: int, digest: Callable[[Path], Any] = digest_file) -> str:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -154,10 +154,10 @@ class Recording:
     def images(self) -> list[Path]:
         return [self.folder.path / name for frame in self.frames for name in (frame.colour, frame.depth)]
 
-    def digest(self, words: Iterable[object]) -> str:
-        """A key of ``words``, the content of ``files``, all images' names and sizes, and the content of the first and
+    def digest(self) -> str:
+        """A key of the content of ``files``, all images' names and sizes, and the content of the first and
         the last frame: an image in the middle that was changed and kept its size goes unseen."""
-        total = hashlib.sha256(" ".join(str(word) for word in words).encode())
+        total = hashlib.sha256()
         images = self.images()
         with reading(self.where):
             for path in (*self.files, *images[:2], *images[-2:]):

@@ -66,7 +66,8 @@ class Replica(FileDataset[NoOptions]):
             words = str(error).partition(": ")[2]
             original = folders.find_original_scene(self.root, scene)
             if original is not None and (original / truth.INFO_NAME).exists():
-                words = f"{len(self.object_boxes(scene))} boxes of objects, no mesh ({original / truth.MESH_NAME} is missing)"
+                mesh = original / truth.MESH_NAME
+                words = f"{len(self.object_boxes(scene))} boxes of objects, no mesh ({mesh} is missing)"
         released = []
         for variant, files in self._released_truths(scene).items():
             missing = [path.name for path in files if not path.exists()]
@@ -143,8 +144,8 @@ class Replica(FileDataset[NoOptions]):
         original = folders.find_original_scene(self.root, scene)
         if original is None or not (original / truth.INFO_NAME).exists():
             raise GroundTruthMissing(
-                f"{self.where(scene)}: no boxes of objects; expected {folders.original_name(scene)}/{truth.INFO_NAME} of the "
-                f"original release in {self.root / 'replica_v1'}: {folders.FETCH_MESHES}"
+                f"{self.where(scene)}: no boxes of objects; expected {folders.original_name(scene)}/{truth.INFO_NAME} "
+                f"of the original release in {self.root / 'replica_v1'}: {folders.FETCH_MESHES}"
             )
         return original / truth.INFO_NAME
 
@@ -191,9 +192,8 @@ class Replica(FileDataset[NoOptions]):
     def _released_truths(self, scene: str) -> dict[str, tuple[Path, ...]]:
         """Variant -> its files, of what others than Replica's makers released; none where nothing of it is here."""
         sequence = folders.find_semantic_sequence(self.root, scene)
-        clouds = (
-            () if sequence is None else (*truth.cloud_files(sequence), self.folder(scene) / folders.REFERENCE_CLOUD)
-        )
+        reference = self.folder(scene) / folders.REFERENCE_CLOUD
+        clouds = () if sequence is None else (*truth.cloud_files(sequence), reference)
         labels = {variant: self._label_file(scene, variant) for variant in ("openmask3d", "ovo-51")}
         graphs = scene_graphs.find_graph_folder(self.root)
         of_graph = () if graphs is None else tuple(graphs / name for name in scene_graphs.FILES)
@@ -230,14 +230,15 @@ class Replica(FileDataset[NoOptions]):
         where, sequence = self.where(scene), folders.find_semantic_sequence(self.root, scene)
         reference = self.folder(scene) / folders.REFERENCE_CLOUD
         if sequence is None:
+            expected = f"{folders.original_name(scene)}/Sequence_1/{folders.FUSED_CLOUD}"
             raise GroundTruthMissing(
-                f"{where}: no ground truth 'conceptgraphs'; expected {folders.original_name(scene)}/Sequence_1/{folders.FUSED_CLOUD} "
-                f"of its authors ({folders.CLOUDS_URL}) in {self.root / folders.SEMANTIC_FOLDERS[0]}; replica-mesh-ex6 needs none of it"
+                f"{where}: no ground truth 'conceptgraphs'; expected {expected} of its authors ({folders.CLOUDS_URL}) "
+                f"in {self.root / folders.SEMANTIC_FOLDERS[0]}; replica-mesh-ex6 needs none of it"
             )
         if not reference.exists():
             raise GroundTruthMissing(
-                f"{where}: no ground truth 'conceptgraphs'; the points to be scored, {folders.REFERENCE_CLOUD}, are missing in "
-                f"{reference.parents[2]}; make them with run_slam_rgb.py of ConceptGraphs (stride 5, 480x640)"
+                f"{where}: no ground truth 'conceptgraphs'; the points to be scored, {folders.REFERENCE_CLOUD}, are "
+                f"missing in {reference.parents[2]}; make them with ConceptGraphs' run_slam_rgb.py (stride 5, 480x640)"
             )
         return truth.conceptgraphs_truth(sequence, reference, where)
 
@@ -259,8 +260,8 @@ class Replica(FileDataset[NoOptions]):
         original, where = folders.find_original_scene(self.root, scene), self.where(scene)
         if original is None:
             raise GroundTruthMissing(
-                f"{where}: no ground truth; expected {folders.original_name(scene)}/{truth.MESH_NAME} of the original release "
-                f"in {self.root / 'replica_v1'}: {folders.FETCH_MESHES}"
+                f"{where}: no ground truth; expected {folders.original_name(scene)}/{truth.MESH_NAME} of the original "
+                f"release in {self.root / 'replica_v1'}: {folders.FETCH_MESHES}"
             )
         for name in (truth.MESH_NAME, truth.INFO_NAME):
             if not (original / name).exists():

@@ -7,7 +7,6 @@ A scene is ``rgbd/<scene>/rgbd.toml`` below the data root, or a TOML file or a f
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -21,11 +20,10 @@ from su3d_bench.core.geometry import turn_to_z
 from su3d_bench.core.types import (
     Float32Array,
     Float64Array,
-    Frame,
     Surface,
     WorldUp,
 )
-from su3d_bench.datasets.recordings.file_dataset import FileDataset, SceneTree, keeps_last
+from su3d_bench.datasets.recordings.file_dataset import RecordedDataset, SceneTree, keeps_last
 from su3d_bench.datasets.recordings.meshes import read_surface
 from su3d_bench.datasets.recordings.pose_convention import ROTATED, Finding, guess_up
 from su3d_bench.datasets.recordings.recorded_frames import (
@@ -69,7 +67,7 @@ class RgbdOptions(BaseModel):
         return [value] if isinstance(value, str) else value
 
 
-class Rgbd(FileDataset[RgbdOptions]):
+class Rgbd(RecordedDataset[RgbdOptions]):
     """Any folder of colour, depth and pose files that an rgbd.toml describes; unscored, without ground truth.
 
     ``folder_of`` is the description of each scene: those of the option ``files`` in its order, then those below the
@@ -99,12 +97,6 @@ class Rgbd(FileDataset[RgbdOptions]):
             path_of[name] = path
         return SceneTree(self.root, (*self.options.files, place), path_of, frozenset())
 
-    def n_frames(self, scene: str, stride: int) -> int:
-        return len(self.frames(scene, stride))
-
-    def frames(self, scene: str, stride: int) -> Sequence[Frame]:
-        return RecordedFrames(self.recording(scene), stride)
-
     def is_reading_checked(self, scene: str) -> bool:
         """Whether the description lets depth be held against the poses."""
         return self._open(scene)[0].check_convention
@@ -121,16 +113,6 @@ class Rgbd(FileDataset[RgbdOptions]):
             f"with {' and '.join(changes)}; set that in {self.folder(scene).name}, or check_convention = false "
             "to read the files as they are described"
         )
-
-    def recording_files(self, scene: str) -> Sequence[Path]:
-        return (*self.recording(scene).files, *self.recording(scene).images())
-
-    def recording_key(self, scene: str) -> str:
-        return self.recording(scene).digest(())
-
-    def problems(self, scene: str) -> Iterator[str]:
-        """Frames that lack an image or a usable pose, one line for all; the others go on without them."""
-        yield from self.recording(scene).missing
 
     def surface(self, scene: str) -> Surface:
         """The mesh that the description names."""

@@ -18,7 +18,7 @@ from su3d_bench.core.geometry import are_rigid, turn_to_z
 from su3d_bench.core.system.files import parse_toml
 from su3d_bench.core.types import Float64Array, UpAxis
 from su3d_bench.datasets.recordings.recorded_frames import Folder, numbers, pinhole, square
-from su3d_bench.datasets.tum.timed_poses import quaternion_poses, rows_of, seconds, unit_quaternion
+from su3d_bench.datasets.tum.dataset import quaternion_poses, rows_of, seconds, unit_quaternion
 from su3d_bench.formats.arrays import parsed_json, read_text
 
 FILE_NAME = "rgbd.toml"
