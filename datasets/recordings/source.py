@@ -19,7 +19,7 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.geometry import are_rigid
-from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
+from su3d_bench.core.types import Float32Array, Float64Array, Int64Array, UInt8Array
 from su3d_bench.datasets.recordings.recorded_frames import square
 from su3d_bench.formats.arrays import read_text
 from su3d_bench.formats.images import (
@@ -77,20 +77,14 @@ class RgbdSource(Protocol):
     ``where`` (``<dataset>/<scene>``) begins each message; a fault in any file is a ``DataError``.
     """
 
-    @property
-    def where(self) -> str: ...
-
-    @property
-    def camera(self) -> SensorPair: ...
+    where: str
+    camera: SensorPair
+    numbers: Int64Array  # of the records at full rate; exports that left frames out keep their numbers
 
     def __len__(self) -> int: ...
 
-    def pose(self, i: int) -> Float64Array:
-        """Camera-to-world matrix (4, 4) as stored, of the depth camera; not finite where tracking was lost."""
-        ...
-
     def poses(self) -> Float64Array:
-        """All poses (n, 4, 4)."""
+        """Camera-to-world matrices (n, 4, 4) as stored, of the depth camera; not finite where tracking was lost."""
         ...
 
     def timestamp_s(self, i: int) -> float:
@@ -103,10 +97,6 @@ class RgbdSource(Protocol):
 
     def depth(self, i: int) -> UInt16Array:
         """Values (H, W) as stored, 0 where invalid, in the depth size of ``camera``."""
-        ...
-
-    def frame_number(self, i: int) -> int:
-        """The number of record ``i`` at full rate; exports that left frames out keep their numbers."""
         ...
 
     def files(self) -> Sequence[Path]:
@@ -273,7 +263,7 @@ class FrameFiles:
     pose: str
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class ExportedFrames:
     """An export as an ``RgbdSource``; each file is read when it is asked for.
 
@@ -294,15 +284,15 @@ class ExportedFrames:
     def pose(self, i: int) -> Float64Array:
         return read_matrix(self.folder, self.frames[i].pose, self.where)
 
-    def poses(self) -> Float64Array:
-        return self._poses.copy()
-
     @cached_property
-    def _poses(self) -> Float64Array:
+    def numbers(self) -> Int64Array:
+        return np.array([frame.number for frame in self.frames], np.int64)
+
+    def poses(self) -> Float64Array:
         return np.array([self.pose(i) for i in range(len(self))]).reshape(-1, 4, 4)
 
     def timestamp_s(self, i: int) -> float:
-        return self.frame_number(i) / FRAMES_PER_SECOND
+        return int(self.numbers[i]) / FRAMES_PER_SECOND
 
     def colour(self, i: int) -> UInt8Array:
         where, content = self._read(self.frames[i].colour)
@@ -311,9 +301,6 @@ class ExportedFrames:
     def depth(self, i: int) -> UInt16Array:
         where, content = self._read(self.frames[i].depth)
         return sized(decode_depth, content, self.camera.depth_size, where, self.size_reason)
-
-    def frame_number(self, i: int) -> int:
-        return self.frames[i].number
 
     def files(self) -> Sequence[Path]:
         images = (name for frame in self.frames for name in (frame.colour, frame.depth, frame.pose))

@@ -38,7 +38,7 @@ from su3d_bench.datasets.recordings.source import (
     read_matrix,
     read_size,
 )
-from su3d_bench.datasets.scannet.sens import MAX_HEADER_BYTES, SensSource, header_bytes, parse_header
+from su3d_bench.datasets.scannet.sens import MAX_HEADER_BYTES, SensFile, header_bytes, parse_header
 from su3d_bench.formats.arrays import read_text
 from su3d_bench.formats.images import Size
 
@@ -80,7 +80,7 @@ def find_source(folder: Path, scene: str, where: str, kind: SourceKind = "auto")
     with reading(where):
         form, place = _find(folder, scene, kind) or (None, folder)
     if form == "sens":
-        return SensSource(place, where)
+        return SensFile(place, where)
     if form is not None:
         return open_python_export(place, where) if form == "python" else open_cpp_export(place, where)
     looked_for = {
@@ -280,7 +280,7 @@ def describe_recording(folder: Path, scene: str, where: str, kind: SourceKind) -
 def digest_recording(source: RgbdSource, poses: Float64Array) -> str:
     """A key of a recording's cameras, poses and time stamps, of the sizes of all images, and of the first and last."""
     total = hashlib.sha256()
-    if isinstance(source, SensSource):
+    if isinstance(source, SensFile):
         total.update(header_bytes(source.header, len(source)) + source.records().tobytes())
         for i in (0, len(source) - 1):
             total.update(digest_bytes(source.colour_bytes(i) + source.depth_bytes(i)).encode())
@@ -338,11 +338,10 @@ def read_walk(source: RgbdSource) -> Walk:
 def classify_poses(source: RgbdSource) -> tuple[Walk, BoolArray]:
     """The records as ``read_walk`` has them, and which of them (n,) have a pose that is neither lost nor right."""
     poses = source.poses()
-    numbers = np.array([source.frame_number(i) for i in range(len(poses))], np.int64)
     is_finite = np.isfinite(poses).all(axis=(1, 2))
     is_rigid = np.zeros(len(poses), bool)
     is_rigid[is_finite] = are_rigid(poses[is_finite])
-    return Walk(numbers, poses, is_rigid), is_finite & ~is_rigid & (poses[:, 0, 0] != 0)
+    return Walk(source.numbers, poses, is_rigid), is_finite & ~is_rigid & (poses[:, 0, 0] != 0)
 
 
 def faulty_pose(where: str, number: int) -> str:

@@ -241,7 +241,7 @@ class ScannetLayout(Layout):
             pieces = [target.partial / name for index in range(n_frames) for name in self.frame_names(index)]
             header = sens_header(dataset.intrinsics, size_of(file_bytes(pieces[0])[sens.FRAME_RECORD.itemsize :]))
             records = (file_bytes(piece) for piece in pieces)
-            sens.write_sens(target.partial / target.frames, header, records, np.zeros(0, sens.MOTION_RECORD))
+            sens.write_sens(target.partial / target.frames, header, records)
         if (target.partial / PIECES).exists():
             shutil.rmtree(target.partial / PIECES)
 
