@@ -11,12 +11,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated
+
+from pydantic import FailFast, Field
 
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.types import LabelSet
-from su3d_bench.formats.arrays import parsed_json
-from su3d_bench.formats.images import read_bytes
+from su3d_bench.formats.json_models import FileModel, WholeNumber, read_json
 from su3d_bench.metrics.protocols.loading import load_protocol
 
 # By its protocol, whose label space and ground truth bear the same name: what records call the aspect.
@@ -67,22 +68,37 @@ def attribute_id(variant: str, words: str) -> int | None:
     return min(found)[1] if found else None
 
 
+Words = Annotated[str, Field(max_length=MOST_CHARACTERS)]
+
+
+class Record(FileModel):
+    """The words on an object; an aspect may be absent."""
+
+    scene_id: Annotated[Words, Field(min_length=1)]
+    object_id: WholeNumber
+    affordance: Words | None = None
+    property: Words | None = None
+    type: Words | None = None
+    manner: Words | None = None
+    synonyms: Words | None = None
+    requirement: Words | None = None
+    element: Words | None = None
+    material: Words | None = None
+
+
+Records = Annotated[list[Record], Field(min_length=1, max_length=MOST_RECORDS), FailFast()]
+
+
 def read_attributes(path: Path) -> Mapping[str, Attributes]:
     """The words of every object of each scan, by its id there; a ``DataError`` where the file is damaged."""
     where = f"openscan: {path.name}"
-    content = parsed_json(read_bytes(path, where), where)
-    if not isinstance(content, list) or not 1 <= len(content) <= MOST_RECORDS:
-        raise DataError(f"{where}: holds no list of 1 to {MOST_RECORDS} records; download it again, see {PAGE}")
     scenes: dict[str, dict[int, Mapping[str, str]]] = {}
-    for number, record in enumerate(content, 1):
-        at = f"{where}: record {number}"
-        if not isinstance(record, dict):
-            raise DataError(f"{at} is no table; expected scene_id, object_id and the aspects")
-        scene, object_id = _text(record, "scene_id", at), _object_id(record, at)
-        objects = scenes.setdefault(scene, {})
-        if object_id in objects:
-            raise DataError(f"{at}: object {object_id} of {printable(scene, 40)} has a record already")
-        objects[object_id] = {key: _text(record, key, at) for key in KEYS.values()}
+    for number, record in enumerate(read_json(path, where, Records, f"download it again, see {PAGE}"), 1):
+        objects = scenes.setdefault(record.scene_id, {})
+        if record.object_id in objects:
+            scan = printable(record.scene_id, 40)
+            raise DataError(f"{where}: record {number}: object {record.object_id} of {scan} has a record already")
+        objects[record.object_id] = {key: getattr(record, key) or "" for key in KEYS.values()}
     return scenes
 
 
@@ -98,20 +114,3 @@ def attribute_ids(attributes: Attributes, variant: str, where: str) -> dict[int,
             )
         ids[object_id] = known or 0
     return ids
-
-
-def _text(record: Mapping[str, Any], key: str, at: str) -> str:
-    """The words under ``key``; an aspect may be absent, a scan may not."""
-    value = record.get(key, None if key == "scene_id" else "")
-    if value is None and key != "scene_id":
-        return ""
-    if not isinstance(value, str) or len(value) > MOST_CHARACTERS or (key == "scene_id" and not value):
-        raise DataError(f"{at}: '{key}' must be a few words; found {printable(repr(value), 40)}")
-    return value
-
-
-def _object_id(record: Mapping[str, Any], at: str) -> int:
-    text = str(record.get("object_id"))
-    if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise DataError(f"{at}: 'object_id' must be a whole number; found {printable(text, 40)}")
-    return int(text)

@@ -22,5 +22,7 @@ def write_replica(folder: Path, frames: Sequence[Frame], n: int) -> ReplicaFrame
         cv2.imwrite(str(folder / colour_name(i)), frame.rgb[:, :, ::-1])
         cv2.imwrite(str(folder / depth_name(i)), np.round(frame.depth_m * SCALE).astype(np.uint16))
     height, width = frames[0].depth_m.shape
+    (fx, _, cx), (_, fy, cy) = frames[0].intrinsics[:2].tolist()
+    camera = Camera(w=width, h=height, fx=fx, fy=fy, cx=cx, cy=cy, scale=SCALE)
     poses = np.array([frames[i % len(frames)].camera_to_world for i in range(n)])
-    return ReplicaFrames(folder, "replica/bench", Camera(width, height, frames[0].intrinsics, SCALE), poses, range(n))
+    return ReplicaFrames(folder, "replica/bench", camera, poses, range(n))

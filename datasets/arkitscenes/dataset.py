@@ -14,24 +14,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.core.errors import FramesMissing, GroundTruthMissing
 from su3d_bench.core.types import Frame, GroundTruth, Surface
-from su3d_bench.datasets.arkitscenes.challenge import (
-    BASES,
-    LABEL_SPACE,
-    SCENE_NAMES,
-    VARIANT,
-    Challenge,
-    ChallengeQuery,
-    answered,
-    find_challenge,
-)
-from su3d_bench.datasets.arkitscenes.frames import (
-    MOST_CONFIDENCE,
-    TRAJECTORY_NAME,
-    Images,
-    PhoneFrames,
-    PhoneRecording,
-    open_recording,
-)
+from su3d_bench.datasets.arkitscenes import challenge as challenge_files
+from su3d_bench.datasets.arkitscenes import frames
+from su3d_bench.datasets.arkitscenes.frames import PhoneRecording
 from su3d_bench.datasets.recordings import meshes
 from su3d_bench.datasets.recordings.file_dataset import FileDataset, faults_of, keeps_last, sizes_and_ends
 from su3d_bench.datasets.recordings.recorded_frames import reading
@@ -60,9 +45,11 @@ class ArkitScenesOptions(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    images: Images = "lowres"
+    images: frames.Images = "lowres"
     width: int = Field(default=640, ge=16, le=4096)  # ScanNet's depth camera; images of low resolution have 256
-    least_confidence: int = Field(default=0, ge=0, le=MOST_CONFIDENCE)  # the challenge's loader reads no confidence
+    least_confidence: int = Field(
+        default=0, ge=0, le=frames.MOST_CONFIDENCE
+    )  # the challenge's loader reads no confidence
     challenge: Path | None = None
 
 
@@ -75,26 +62,28 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
 
     name = "arkitscenes"
     reader_version = 2
-    scene_names = SCENE_NAMES
-    places_of_scenes = tuple(f"{base}/{name}" if base else name for base in BASES for name in SETS)
+    scene_names = challenge_files.SCENE_NAMES
+    places_of_scenes = tuple(f"{base}/{name}" if base else name for base in challenge_files.BASES for name in SETS)
     how_to_get = (
         f"/{DEVELOPMENT}, in raw/Training or where else https://github.com/apple/ARKitScenes and the OpenSUN3D "
-        f"challenge download them (a scene is a folder such as 42445173 with {TRAJECTORY_NAME}); set SU3D_DATA to "
-        "where they are"
+        f"challenge download them (a scene is a folder such as 42445173 with {frames.TRAJECTORY_NAME}); set SU3D_DATA "
+        "to where they are"
     )
-    label_space = LABEL_SPACE
-    variants = (VARIANT,)
+    label_space = challenge_files.LABEL_SPACE
+    variants = (challenge_files.VARIANT,)
     no_mesh = "the challenge annotates what answers its query and nothing else"
     Options = ArkitScenesOptions
 
     def is_scene(self, folder: Path) -> bool:
-        names = (TRAJECTORY_NAME, f"{folder.name}_frames", mesh_name(folder.name))
-        return re.fullmatch(SCENE_NAMES, folder.name) is not None and any((folder / one).exists() for one in names)
+        names = (frames.TRAJECTORY_NAME, f"{folder.name}_frames", mesh_name(folder.name))
+        return re.fullmatch(challenge_files.SCENE_NAMES, folder.name) is not None and any(
+            (folder / one).exists() for one in names
+        )
 
     @cached_property
-    def challenge(self) -> Challenge:
+    def challenge(self) -> challenge_files.Challenge:
         """The challenge's lists and truths, as far as they are here."""
-        return find_challenge(self.root, self.options.challenge)
+        return challenge_files.find_challenge(self.root, self.options.challenge)
 
     def groups(self) -> Mapping[str, Sequence[str]]:
         """The challenge's development scenes, and its test scenes where their list is here."""
@@ -118,7 +107,7 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
 
     def frames(self, scene: str, stride: int) -> Sequence[Frame]:
         """Every ``stride``-th of the frames that have all of their files and a pose, in the order of their times."""
-        return PhoneFrames(self.recording(scene), stride, self.options.width, self.options.least_confidence)
+        return frames.PhoneFrames(self.recording(scene), stride, self.options.width, self.options.least_confidence)
 
     def recording_files(self, scene: str) -> Sequence[Path]:
         return self.recording(scene).files()
@@ -141,9 +130,11 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
         """What the scene is searched for; ``GroundTruthMissing`` where no list has its query."""
         return self.challenge.query(scene)
 
-    def queries(self, scene: str) -> Sequence[ChallengeQuery]:
+    def queries(self, scene: str) -> Sequence[challenge_files.ChallengeQuery]:
         """The scene's query with the numbers of the objects that answer it; ``GroundTruthMissing`` without either."""
-        return (answered(self.ground_truth(scene, VARIANT), self.challenge.query(scene)),)
+        return (
+            challenge_files.answered(self.ground_truth(scene, challenge_files.VARIANT), self.challenge.query(scene)),
+        )
 
     def mesh_file(self, scene: str) -> Path:
         """The mesh that the phone made, which may be missing."""
@@ -161,7 +152,7 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
         yield from faults_of(
             [
                 lambda: self.surface(scene),
-                lambda: self.ground_truth(scene, VARIANT),
+                lambda: self.ground_truth(scene, challenge_files.VARIANT),
                 lambda: self.challenge.query(scene),
             ]
         )
@@ -171,4 +162,4 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
         deeper = self.folder(scene) / f"{scene}_frames"
         folder = deeper if deeper.is_dir() else self.folder(scene)
         options = self.options
-        return open_recording(folder, scene, options.images, options.least_confidence, self.where(scene))
+        return frames.open_recording(folder, scene, options.images, options.least_confidence, self.where(scene))

@@ -1,6 +1,9 @@
 """Walks through HM3DSem as HOV-SG generates and evaluates them: floors, rooms and objects of whole buildings.
 
-The world stays that of Habitat, whose y points up: predictions of HOV-SG lie in it.
+A walk has ``rgb/``, ``depth/`` and ``pose/`` with a file for each frame. Depth is 16 bits in mm. A pose is one line of
+16 numbers, the camera in Habitat's axes (x right, y up, z back); frames have the camera in OpenCV's axes, as HOV-SG's
+loader has them. There is no camera file: images are 90 degrees wide, and the principal point is half the size
+(hovsg/dataloader/hm3dsem.py). The world stays that of Habitat, whose y points up: predictions of HOV-SG lie in it.
 """
 
 from __future__ import annotations
@@ -9,36 +12,43 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from su3d_bench.core.errors import DataError, GroundTruthMissing, counted
-from su3d_bench.core.types import Frame, GroundTruth, WorldUp
-from su3d_bench.datasets.hm3dsem.frames import (
-    EVALUATED,
-    GROUPS,
-    INFO_NAME,
-    LABELS_OF,
-    OBJECTS,
-    PLACES,
-    POSE,
-    SCENE_NAMES,
-    WALKS_URL,
-    annotation_file,
-    open_walk,
-)
-from su3d_bench.datasets.hm3dsem.truth import (
-    AGAIN,
-    LABEL_SPACE,
-    VARIANT,
-    annotation_problem,
-    read_annotation,
-    read_info,
-    read_truth,
-)
+from su3d_bench.core.geometry import are_rigid
+from su3d_bench.core.types import Float64Array, GroundTruth, WorldUp
+from su3d_bench.datasets.hm3dsem import truth
 from su3d_bench.datasets.openlex3d import release as openlex3d
-from su3d_bench.datasets.recordings.file_dataset import FileDataset, NoOptions, faults_of, keeps_last
-from su3d_bench.datasets.recordings.recorded_frames import RecordedFrames, Recording, reading
+from su3d_bench.datasets.recordings import recorded_frames
+from su3d_bench.datasets.recordings.file_dataset import NoOptions, RecordedDataset, faults_of, keeps_last
+from su3d_bench.datasets.recordings.recorded_frames import RecordedFrame, Recording
+from su3d_bench.datasets.recordings.source import by_number, check_complete, list_folder, read_matrix, read_size
+
+WALKS_FOLDER, SPLIT = "hm3dsem_walks", "val"
+SPLITS = (SPLIT, "train", "minival")
+PLACES = tuple(f"{base}{split}" for base in (f"{WALKS_FOLDER}/", "hm3dsem/", "HM3DSem/", "") for split in SPLITS)
+RELEASE_PLACES = tuple(f"{base}/{split}" for base in ("hm3d", "HM3D", "hm3dsem", "HM3DSem") for split in SPLITS)
+SCENE_NAMES = r"\d{5}-[A-Za-z0-9]{11}"
+COLOUR, DEPTH, POSE = "rgb", "depth", "pose"
+LABELS_OF = "hm3d"  # as OpenLex3D calls the dataset
+WALKS_URL = "https://github.com/hovsg/HOV-SG#habitat-matterport-3d-semantics"
+# The scenes that HOV-SG evaluates by its README, and those that its generator has poses for.
+EVALUATED = (
+    "00824-Dd4bFSTQ8gi", "00829-QaLdnwvtxbs", "00843-DYehNKdT76V", "00861-GLAQ4DNUx5U",
+    "00862-LT9Jq6dN3Ea", "00873-bxsVRursffK", "00877-4ok3usBNeis", "00890-6s7QHgap2fW",
+)  # fmt: skip
+GROUPS: Mapping[str, tuple[str, ...]] = {
+    "hovsg": EVALUATED,
+    "walks": tuple(sorted((*EVALUATED, "00847-bCPU9suPUw9", "00849-a8BtkwhxdRV"))),
+}
+UNITS_PER_METRE = 1000.0  # habitat_utils.py: save_obs
+FRAMES_PER_SECOND = 30.0  # ours: walks have no times
+TO_HABITAT = np.diag([1.0, -1.0, -1.0, 1.0])  # from a camera in OpenCV's axes to one in Habitat's, and back
+DEPTH_M_OF_VALUE = recorded_frames.depth_m_of_values(UNITS_PER_METRE)
+ENDINGS = {COLOUR: "png", DEPTH: "png", POSE: "txt"}
 
 
-class Hm3dSem(FileDataset[NoOptions]):
+class Hm3dSem(RecordedDataset[NoOptions]):
     """HOV-SG's walks through HM3DSem, with the truth that its tools create; read below the data root."""
 
     name = "hm3dsem"
@@ -49,15 +59,15 @@ class Hm3dSem(FileDataset[NoOptions]):
         f"/{PLACES[0]} (a walk is a folder such as {EVALUATED[0]} with pose/, rgb/ and depth/); generate them with "
         f"HOV-SG's tools ({WALKS_URL})"
     )
-    label_space = LABEL_SPACE
-    variants = (VARIANT,)
+    label_space = truth.LABEL_SPACE
+    variants = (truth.VARIANT,)
     further_truths = openlex3d.FURTHER_TRUTHS
     labels_of = LABELS_OF
     no_mesh = "that of HM3D keeps its objects in a texture, which is not read"
     Options = NoOptions
 
     def is_scene(self, folder: Path) -> bool:
-        is_walk = (folder / POSE).is_dir() or (folder / INFO_NAME).is_file()
+        is_walk = (folder / POSE).is_dir() or (folder / truth.INFO_NAME).is_file()
         return is_walk and re.fullmatch(SCENE_NAMES, folder.name) is not None
 
     def groups(self) -> Mapping[str, Sequence[str]]:
@@ -67,31 +77,19 @@ class Hm3dSem(FileDataset[NoOptions]):
     def status(self, scene: str) -> str:
         """A word on the walk from a quick look: frames, and ground truth."""
         folder = self.folder(scene)
-        with reading(self.where(scene)):
+        with recorded_frames.reading(self.where(scene)):
             n = sum(1 for _ in (folder / POSE).glob("*.txt")) if (folder / POSE).is_dir() else 0
-        truth = "ground truth" if (folder / INFO_NAME).is_file() else f"no ground truth ({INFO_NAME} is missing)"
-        return f"{counted(n, 'frame')}, {truth}"
-
-    def n_frames(self, scene: str, stride: int) -> int:
-        return len(self.frames(scene, stride))
-
-    def frames(self, scene: str, stride: int) -> Sequence[Frame]:
-        return RecordedFrames(self.recording(scene), stride)
-
-    def recording_files(self, scene: str) -> Sequence[Path]:
-        return (*self.recording(scene).files, *self.recording(scene).images())
-
-    def recording_key(self, scene: str) -> str:
-        return self.recording(scene).digest(())
+        missing = "" if (folder / truth.INFO_NAME).is_file() else f"no ground truth ({truth.INFO_NAME} is missing)"
+        return f"{counted(n, 'frame')}, {missing or 'ground truth'}"
 
     def small_files(self, scene: str) -> tuple[Path, ...]:
         folder = self.folder(scene)
-        if not (folder / INFO_NAME).is_file():
+        if not (folder / truth.INFO_NAME).is_file():
             return ()
         annotation = annotation_file(self.root, folder)
-        clouds = sorted((folder / OBJECTS).glob("*.ply"))
+        clouds = sorted((folder / truth.OBJECTS).glob("*.ply"))
         labels = openlex3d.label_files(self.root, LABELS_OF, scene)
-        return (folder / INFO_NAME, *clouds, *(() if annotation is None else (annotation,)), *labels)
+        return (folder / truth.INFO_NAME, *clouds, *(() if annotation is None else (annotation,)), *labels)
 
     def up(self, scene: str) -> WorldUp:
         """Y, as Habitat has it."""
@@ -100,19 +98,15 @@ class Hm3dSem(FileDataset[NoOptions]):
 
     def problems(self, scene: str) -> Iterator[str]:
         """What is wrong with poses, truth and annotation, a line each; images are left to the frames."""
-        yield from faults_of([lambda: self.recording(scene)])
-        faults = list(faults_of([lambda: self.annotated(scene)]))
-        yield from faults
-        annotation = annotation_file(self.root, self.folder(scene))
-        if faults or annotation is None or not (self.folder(scene) / INFO_NAME).is_file():
-            return
-        yield from faults_of([lambda: self._check_annotation(annotation, scene)])
+        yield from faults_of([lambda: self.recording(scene), lambda: self._check_annotation(scene)])
 
-    def _check_annotation(self, annotation: Path, scene: str) -> None:
-        info = read_info(self.folder(scene) / INFO_NAME, self.where(scene))
-        line = annotation_problem(info, read_annotation(annotation, self.where(scene)), self.where(scene))
-        if line is not None:
-            raise DataError(line)
+    def _check_annotation(self, scene: str) -> None:
+        self.annotated(scene)
+        folder, where = self.folder(scene), self.where(scene)
+        annotation = annotation_file(self.root, folder)
+        if annotation is not None:
+            info = truth.read_info(folder / truth.INFO_NAME, where)
+            truth.check_annotation(info, truth.read_annotation(annotation, where), where)
 
     def own_truth(self, scene: str, variant: str) -> GroundTruth:
         return self.annotated(scene)
@@ -123,8 +117,57 @@ class Hm3dSem(FileDataset[NoOptions]):
 
     @keeps_last
     def annotated(self, scene: str) -> GroundTruth:
-        if not (self.folder(scene) / INFO_NAME).is_file():
+        if not (self.folder(scene) / truth.INFO_NAME).is_file():
             raise GroundTruthMissing(
-                f"{self.where(scene)}: no ground truth, {INFO_NAME} is missing in {self.folder(scene)}; {AGAIN}"
+                f"{self.where(scene)}: no ground truth, {truth.INFO_NAME} is missing in {self.folder(scene)}; "
+                f"{truth.AGAIN}"
             )
-        return read_truth(self.folder(scene), self.where(scene))
+        return truth.read_truth(self.folder(scene), self.where(scene))
+
+
+def annotation_file(root: Path, walk: Path) -> Path | None:
+    """The ``.semantic.txt`` of a walk's scene, beside the walk or in the release; None where it is not there."""
+    name = f"{walk.name.partition('-')[2]}.semantic.txt"
+    folders = [walk, *(root / place / walk.name for place in RELEASE_PLACES)]
+    return next((folder / name for folder in folders if (folder / name).is_file()), None)
+
+
+def open_walk(path: Path, where: str) -> Recording:
+    """The frames of the walk in ``path``; a fault in what is read of it is a ``DataError``."""
+    files = {
+        kind: by_number(list_folder(path, kind, where), rf"[\w-]{{1,80}}[_-](\d{{6,9}})\.{ending}", f"{where}: {kind}/")
+        for kind, ending in ENDINGS.items()
+    }
+    numbers = sorted(set().union(*files.values()))
+    if not numbers:
+        raise DataError(f"{where}: {POSE}/, {COLOUR}/ and {DEPTH}/ hold no frame; generate the walk again")
+    check_complete(
+        {f"{kind}/..._{{:06d}}.{ending}": files[kind] for kind, ending in ENDINGS.items()},
+        range(numbers[0], numbers[-1] + 1),
+        where,
+    )
+    poses = read_poses(path, [f"{POSE}/{files[POSE][number]}" for number in numbers], where)
+    frames = tuple(
+        RecordedFrame(n, n / FRAMES_PER_SECOND, f"{COLOUR}/{files[COLOUR][n]}", f"{DEPTH}/{files[DEPTH][n]}", pose)
+        for n, pose in zip(numbers, poses, strict=True)
+    )
+    width, height = read_size(path, frames[0].colour, where)
+    return Recording(
+        where,
+        recorded_frames.Folder(path),
+        frames,
+        recorded_frames.pinhole(width / 2, width / 2, width / 2, height / 2, where),
+        DEPTH_M_OF_VALUE,
+        tuple(path / POSE / files[POSE][number] for number in numbers),
+        image_size=(width, height),
+    )
+
+
+def read_poses(path: Path, names: Sequence[str], where: str) -> Float64Array:
+    """Camera-to-world poses (n, 4, 4) of cameras in OpenCV's axes, in the world of the files."""
+    poses = np.array([read_matrix(path, name, where) for name in names]).reshape(-1, 4, 4)
+    is_sound = np.isfinite(poses).all(axis=(1, 2))
+    is_sound[is_sound] = are_rigid(poses[is_sound])
+    if not is_sound.all():
+        raise DataError(f"{where}: {names[int(np.argmin(is_sound))]}: is no rigid pose; generate the walk again")
+    return poses @ TO_HABITAT

@@ -9,25 +9,24 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field, model_validator
 
 from su3d_bench.core.errors import DataError, PredictionError, converted, printable
 from su3d_bench.core.system.files import file_text, parse_toml
-from su3d_bench.core.types import Float32Array, Float64Array, Floor, GroundTruth, LabelSet, Places, Room
-from su3d_bench.datasets.hm3dsem.frames import INFO_NAME, OBJECTS
-from su3d_bench.formats.arrays import MOST_POINTS, checked_points, parsed_json, read_text
-from su3d_bench.formats.images import read_bytes
+from su3d_bench.core.types import Float32Array, Floor, GroundTruth, LabelSet, Places, Room
+from su3d_bench.formats.arrays import MOST_POINTS, checked_points, read_text
+from su3d_bench.formats.json_models import FileModel, Lengths, Metres, Point, WholeNumber, read_json
 from su3d_bench.formats.ply import read_ply
 from su3d_bench.metrics.protocols.loading import CLASS_TABLES
 
+INFO_NAME, OBJECTS = "scene_info.json", "objects"
 LABEL_SPACE, VARIANT = "hm3dsem", "hovsg-objects"
-MOST_OBJECTS, MOST_ID = 100_000, 10**9
-MOST_M = 1e6  # no wall of a building is as far
+MAX_OBJECTS = 100_000
 HEADER = "HM3D Semantic Annotations"
 AGAIN = "create the ground truth again with HOV-SG's tool"
 
@@ -39,24 +38,47 @@ def label_set() -> LabelSet:
     return LabelSet(LABEL_SPACE, tuple(int(row[0]) for row in rows), tuple(str(row[1]) for row in rows))
 
 
-@dataclass(frozen=True)
-class WalkObject:
-    """An object of ``scene_info.json``; ``box``: centre and sides (2, 3) m."""
+class Level(FileModel):
+    id: WholeNumber
+    lower: Metres
+    upper: Metres
 
-    id: int
+
+class Region(FileModel):
+    """A room; people name it with ``category``, HOV-SG's tools by a vote of its objects."""
+
+    floor_id: WholeNumber
+    bev_region_points: Annotated[list[Point], Field(min_length=1)]
+    min_height: Metres
+    max_height: Metres
+    mean_height: Metres
+    category: str | None = None
+    voted_category: str | None = None
+
+
+class WalkObject(FileModel):
+    id: WholeNumber
     category: str
-    colour: str
-    region: int
-    box: Float64Array
+    hex: str
+    region_id: WholeNumber
+    obb_center: Point
+    obb_dims: Lengths
 
 
-@dataclass(frozen=True)
-class WalkInfo:
+class WalkInfo(FileModel):
     """What ``scene_info.json`` holds, in its order."""
 
-    objects: tuple[WalkObject, ...]
-    floors: tuple[Floor, ...]
-    rooms: tuple[Room, ...]
+    levels: list[Level]
+    regions: list[Region]
+    objects: Annotated[list[WalkObject], Field(min_length=1, max_length=MAX_OBJECTS)]
+
+    @model_validator(mode="after")
+    def _check_ids(self) -> WalkInfo:
+        if len({one.id for one in self.objects}) != len(self.objects):
+            raise ValueError("an object stands there twice")
+        if not {room.floor_id for room in self.regions} <= {level.id for level in self.levels}:
+            raise ValueError("a 'floor_id' names no level")
+        return self
 
 
 def read_truth(folder: Path, where: str) -> GroundTruth:
@@ -71,7 +93,6 @@ def read_truth(folder: Path, where: str) -> GroundTruth:
         raise DataError(f"{where}: {OBJECTS}/ has {sum(sizes)} points; {AGAIN}")
     labels = label_set()
     id_of = dict(zip(labels.names, labels.ids, strict=True))
-    boxes = {number: one.box for number, one in enumerate(info.objects, 1)}
     return GroundTruth(
         np.concatenate([np.zeros((0, 3), np.float32), *clouds]),
         np.repeat(np.array([id_of.get(one.category, 0) for one in info.objects], np.int32), sizes),
@@ -79,98 +100,25 @@ def read_truth(folder: Path, where: str) -> GroundTruth:
         labels,
         VARIANT,
         f"{INFO_NAME} and the clouds in {OBJECTS}/",
-        places=Places(info.floors, info.rooms, boxes),
+        places=places_of(info),
     )
 
 
 def read_info(path: Path, where: str) -> WalkInfo:
     """What ``scene_info.json`` says; ``where`` begins each message."""
-    where = f"{where}: {path.name}"
-    content = parsed_json(read_bytes(path, where, AGAIN), where)
-    tables = {key: _rows(content, key, where) for key in ("levels", "regions", "objects")}
-    floors = {}
-    for place, row in tables["levels"]:
-        floors[_whole(row, "id", place)] = Floor(_number(row, "lower", place), _number(row, "upper", place))
-    rooms = tuple(_room(row, place, floors) for place, row in tables["regions"])
-    objects = tuple(_object(row, place) for place, row in tables["objects"])
-    ids = [one.id for one in objects]
-    if len(set(ids)) != len(ids):
-        twice = next(number for number in ids if ids.count(number) > 1)
-        raise DataError(f"{where}: object {twice} stands there twice; {AGAIN}")
-    if not objects:
-        raise DataError(f"{where}: has no object; {AGAIN}")
-    return WalkInfo(objects, tuple(floors.values()), rooms)
+    return read_json(path, f"{where}: {path.name}", WalkInfo, AGAIN)
 
 
-def _room(row: Mapping[str, Any], place: str, floors: Mapping[int, Floor]) -> Room:
-    if _whole(row, "floor_id", place) not in floors:
-        raise DataError(f"{place}: 'floor_id' names no level; {AGAIN}")
-    points = _numbers(row, "bev_region_points", place)
-    if points.ndim != 2 or points.shape[1:] != (3,) or not len(points):
-        raise DataError(
-            f"{place}: 'bev_region_points' has the shape {points.shape}; expected rows of three, one at least"
-        )
-    lowest, highest, mean = (_number(row, f"{which}_height", place) for which in ("min", "max", "mean"))
-    category = row.get("category") or row.get("voted_category") or ""
-    if not isinstance(category, str):
-        raise DataError(f"{place}: 'category' is {_shown(category)}; expected a text")
-    return Room(points, lowest, highest, mean, category)
-
-
-def _object(row: Mapping[str, Any], place: str) -> WalkObject:
-    for key in ("category", "hex"):
-        if not isinstance(row.get(key), str):
-            raise DataError(f"{place}: '{key}' is {_shown(row.get(key))}; expected a text")
-    centre, sides = _numbers(row, "obb_center", place), _numbers(row, "obb_dims", place)
-    if centre.shape != (3,) or sides.shape != (3,) or (sides < 0).any():
-        raise DataError(f"{place}: 'obb_center' and 'obb_dims' are no centre and sides of a box; {AGAIN}")
-    return WalkObject(
-        _whole(row, "id", place),
-        row["category"],
-        row["hex"],
-        _whole(row, "region_id", place),
-        np.stack([centre, sides]),
-    )
-
-
-def _rows(content: Any, key: str, where: str) -> list[tuple[str, dict[str, Any]]]:
-    """The rows of a list of tables, each with what messages call it."""
-    rows = content.get(key) if isinstance(content, dict) else None
-    if not isinstance(rows, list) or len(rows) > MOST_OBJECTS:
-        raise DataError(f"{where}: has no list '{key}' of at most {MOST_OBJECTS}; {AGAIN}")
-    wrong = next((number for number, row in enumerate(rows) if not isinstance(row, dict)), None)
-    if wrong is not None:
-        raise DataError(f"{where}: {key}[{wrong}] is {_shown(rows[wrong])}; expected an object")
-    return [(f"{where}: {key}[{number}]", row) for number, row in enumerate(rows)]
-
-
-def _whole(row: Mapping[str, Any], key: str, where: str) -> int:
-    value = row.get(key)
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MOST_ID:
-        raise DataError(f"{where}: '{key}' is {_shown(value)}; expected a whole number from 0")
-    return value
-
-
-def _number(row: Mapping[str, Any], key: str, where: str) -> float:
-    value = row.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not -MOST_M <= value <= MOST_M:
-        raise DataError(f"{where}: '{key}' is {_shown(value)}; expected metres")
-    return float(value)
-
-
-def _numbers(row: Mapping[str, Any], key: str, where: str) -> Float64Array:
-    """The list, or list of lists, of numbers under ``key``."""
-    try:
-        values = np.array(row.get(key))
-    except (ValueError, TypeError, RecursionError):
-        values = np.array(None)
-    if values.dtype.kind not in "if" or not (np.abs(values) <= MOST_M).all():
-        raise DataError(f"{where}: '{key}' is no list of metres; {AGAIN}")
-    return values.astype(np.float64)
-
-
-def _shown(value: Any) -> str:
-    return printable(str(value), 40)
+def places_of(info: WalkInfo) -> Places:
+    """The floors, the rooms, and the boxes of the objects, counted from 1."""
+    floors = {level.id: Floor(level.lower, level.upper) for level in info.levels}
+    rooms = (
+        Room(np.array(one.bev_region_points, np.float64), one.min_height, one.max_height, one.mean_height,
+             one.category or one.voted_category or "")
+        for one in info.regions
+    )  # fmt: skip
+    boxes = {number: np.array([one.obb_center, one.obb_dims]) for number, one in enumerate(info.objects, 1)}
+    return Places(tuple(floors.values()), tuple(rooms), boxes)
 
 
 def read_cloud(path: Path, where: str) -> Float32Array:
@@ -204,18 +152,17 @@ def read_annotation(path: Path, where: str) -> dict[int, tuple[str, str, int]]:
             row = int(key), (colour, category, int(region))
         except (ValueError, StopIteration, csv.Error):
             raise DataError(f'{where}:{number}: is {line[:60]!a}; expected id,colour,"category",region') from None
-        if rows.setdefault(row[0], row[1]) != row[1] or len(rows) > MOST_OBJECTS:
+        if rows.setdefault(row[0], row[1]) != row[1] or len(rows) > MAX_OBJECTS:
             raise DataError(f"{where}:{number}: object {row[0]} stands there twice; copy the file again")
     return rows
 
 
-def annotation_problem(info: WalkInfo, annotation: Mapping[int, tuple[str, str, int]], where: str) -> str | None:
-    """A line where an object of the walk is not that of the scene's annotation."""
+def check_annotation(info: WalkInfo, annotation: Mapping[int, tuple[str, str, int]], where: str) -> None:
+    """A ``DataError`` where an object of the walk is not that of the scene's annotation."""
     for one in info.objects:
-        own = one.colour, one.category, one.region
+        own = one.hex, one.category, one.region_id
         if annotation.get(one.id) != own:
-            return (
-                f"{where}: {INFO_NAME}: object {one.id} is not that of the scene's .semantic.txt (colour, category and "
-                f"region are {_shown(own)} and {_shown(annotation.get(one.id))}); {AGAIN}"
+            found = printable(f"colour, category and region are {own} and {annotation.get(one.id)}", 120)
+            raise DataError(
+                f"{where}: {INFO_NAME}: object {one.id} is not that of the scene's .semantic.txt ({found}); {AGAIN}"
             )
-    return None

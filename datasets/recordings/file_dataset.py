@@ -17,12 +17,13 @@ from pydantic import BaseModel, ConfigDict
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError, GroundTruthMissing, ScenesMissing, suggest
 from su3d_bench.core.system.files import file_text
-from su3d_bench.core.types import GroundTruth, ImageDomain, InstanceMesh, SceneInfo
+from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo
 from su3d_bench.datasets.openlex3d import release as openlex3d
-from su3d_bench.datasets.recordings.recorded_frames import reading
+from su3d_bench.datasets.recordings.recorded_frames import RecordedFrames, Recording, reading
 
 logger = logging.getLogger(__name__)
 MARKER = "rooms.json"  # in a folder of scenes: those that `datasets make` rendered
+MAX_LINES = 20  # on faults of one kind
 DatasetT = TypeVar("DatasetT")
 OptionsT = TypeVar("OptionsT", bound=BaseModel)
 Answer = TypeVar("Answer")
@@ -68,17 +69,20 @@ def folders_in(root: Path, names: Iterable[str]) -> Iterator[tuple[Path, list[Pa
 
 @dataclass(frozen=True)
 class SceneTree:
-    """``places``: the folders with scenes; ``folder_of`` each; ``made``: those that ``datasets make`` rendered."""
+    """``places``: the folders with scenes; ``folders`` of each, the first place first; ``made``: those that
+    ``datasets make`` rendered."""
 
     root: Path
     places: tuple[Path, ...]
-    folder_of: Mapping[str, Path]
-    made: frozenset[str]
+    folders: Mapping[str, tuple[Path, ...]]
+    made: frozenset[str] = frozenset()
 
 
-def find_scenes(root: Path, names: Iterable[str], is_scene: Callable[[Path], bool]) -> SceneTree:
-    """The scenes in folders of these names below ``root``, each in the first; none is no error here."""
-    folder_of: dict[str, Path] = {}
+def find_scenes(
+    root: Path, names: Iterable[str], is_scene: Callable[[Path], bool], first: Sequence[str] = ()
+) -> SceneTree:
+    """The scenes in folders of these names below ``root``, those of ``first`` before all others; none is no error."""
+    folders: dict[str, tuple[Path, ...]] = {}
     places, made = [], set[str]()
     for place, children in folders_in(root, names):
         scenes = [child for child in children if is_scene(child)]
@@ -87,8 +91,9 @@ def find_scenes(root: Path, names: Iterable[str], is_scene: Callable[[Path], boo
             places.append(place)
             made |= {scene.name for scene in scenes if scene.name in rooms}
         for scene in scenes:
-            folder_of.setdefault(scene.name, scene)
-    return SceneTree(root, tuple(places), dict(sorted(folder_of.items())), frozenset(made))
+            folders[scene.name] = (*folders.get(scene.name, ()), scene)
+    order = dict.fromkeys([scene for scene in first if scene in folders] + sorted(folders))
+    return SceneTree(root, tuple(places), {scene: folders[scene] for scene in order}, frozenset(made))
 
 
 def keeps_last(method: Callable[[DatasetT, str], Answer]) -> Callable[[DatasetT, str], Answer]:
@@ -117,6 +122,14 @@ def faults_of(questions: Iterable[Callable[[], object]]) -> Iterator[str]:
             if str(error) not in seen:
                 yield str(error)
             seen.add(str(error))
+
+
+def shortened(lines: Iterable[str], where: str) -> Iterator[str]:
+    """The first lines on faults of one kind, and how many more there are."""
+    found = list(lines)
+    yield from found[:MAX_LINES]
+    if len(found) > MAX_LINES:
+        yield f"{where}: {len(found) - MAX_LINES} more faults of this kind"
 
 
 class FileDataset(ABC, Generic[OptionsT]):
@@ -160,12 +173,12 @@ class FileDataset(ABC, Generic[OptionsT]):
     def tree(self) -> SceneTree:
         """Where the scenes are; a ``ScenesMissing`` that says how to get data where there are none."""
         tree = self.find_tree()
-        if not tree.folder_of:
+        if not tree.folders:
             raise ScenesMissing(f"{self.name}: no scene in {self.root}{self.how_to_get}")
         return tree
 
     def scenes(self) -> Sequence[str]:
-        return tuple(self.tree.folder_of)
+        return tuple(self.tree.folders)
 
     def places(self) -> Sequence[Path]:
         """Where scenes are, or else would be looked for first."""
@@ -231,10 +244,33 @@ class FileDataset(ABC, Generic[OptionsT]):
 
     def folder(self, scene: str) -> Path:
         """The folder of a scene; a ``DataError`` where there is none."""
-        if scene not in self.tree.folder_of:
-            hint = suggest(scene, list(self.tree.folder_of), f"{self.tree.places[0]} has")
+        if scene not in self.tree.folders:
+            hint = suggest(scene, list(self.tree.folders), f"{self.tree.places[0]} has")
             raise DataError(f"{self.name}: no scene '{scene}'{hint}")
-        return self.tree.folder_of[scene]
+        return self.tree.folders[scene][0]
+
+
+class RecordedDataset(FileDataset[OptionsT]):
+    """A dataset whose frames have one size and are read from one colour and one depth file each."""
+
+    @abstractmethod
+    def recording(self, scene: str) -> Recording: ...
+
+    def n_frames(self, scene: str, stride: int) -> int:
+        return len(self.frames(scene, stride))
+
+    def frames(self, scene: str, stride: int) -> Sequence[Frame]:
+        return RecordedFrames(self.recording(scene), stride)
+
+    def recording_files(self, scene: str) -> Sequence[Path]:
+        return (*self.recording(scene).files, *self.recording(scene).images())
+
+    def recording_key(self, scene: str) -> str:
+        return self.recording(scene).digest()
+
+    def problems(self, scene: str) -> Iterator[str]:
+        """What is missing of the recording, a line for each kind; the frames go on without it."""
+        yield from self.recording(scene).missing
 
 
 def sizes_and_ends(files: Sequence[Path], n_ends: int, digest: Callable[[Path], Any] = digest_file) -> str:

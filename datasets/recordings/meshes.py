@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ from su3d_bench.core.types import Float32Array, Int32Array, Int64Array, Surface
 from su3d_bench.formats.ply import ListColumn, PlyElement, PlyFile, read_ply
 
 CORNER_NAMES = ("vertex_indices", "vertex_index")
-MAX_SEGMENT_ID = 2**32 - 1  # the published tools keep them in 32 bits
 
 
 def face_corners(face: PlyElement, n_vertices: int, where: str) -> ListColumn:
@@ -67,26 +65,6 @@ def fans(corners: ListColumn) -> tuple[Int32Array, Int64Array]:
     step = np.arange(len(first)) - np.repeat(np.cumsum(n_triangles) - n_triangles, n_triangles)
     rows = np.stack([first, first + step + 1, first + step + 2], axis=1)
     return corners.values[rows].astype(np.int32), np.repeat(np.arange(len(n_triangles)), n_triangles)
-
-
-def segment_ids(values: Any, where: str) -> Int64Array:
-    """Ids of segments in a JSON list, as numbers or as text; ``where`` names the list."""
-    if not isinstance(values, list):
-        raise DataError(f"{where}: is no list; copy the file again")
-    numbers = [whole_number(value) for value in values]
-    wrong = next((row for row, number in enumerate(numbers) if number is None or number > MAX_SEGMENT_ID), None)
-    if wrong is not None:
-        raise DataError(
-            f"{where}[{wrong}] is {ascii(values[wrong])[:40]}; expected a segment id, 0 to {MAX_SEGMENT_ID}"
-        )
-    return np.array(numbers, np.int64)
-
-
-def whole_number(value: Any) -> int | None:
-    """The value of a number or of one written as text; None where it is neither or below 0."""
-    if isinstance(value, str):
-        return int(value) if re.fullmatch(r"[0-9]{1,18}", value) else None
-    return value if isinstance(value, int) and not isinstance(value, bool) and value >= 0 else None
 
 
 def check_one_mesh(n_segments: int, n_vertices: int, names: tuple[str, str], where: str) -> None:

@@ -6,18 +6,20 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from threading import Lock
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, UInt8Array
-from su3d_bench.formats.images import UInt16Array, decode_colour, decode_depth, read_bytes
+from su3d_bench.formats.images import Size, UInt16Array, decode_colour, decode_depth, read_bytes
 
 MAX_NAME_LENGTH = 255  # of one part of a path, in every file system of today
 N_DEPTH_VALUES = 1 << 16
@@ -148,16 +150,16 @@ class Recording:
     intrinsics: Float64Array
     metres: Float32Array
     files: tuple[Path, ...]
-    image_size: tuple[int, int] | None = None
+    image_size: Size | None = None
     missing: tuple[str, ...] = ()
 
     def images(self) -> list[Path]:
         return [self.folder.path / name for frame in self.frames for name in (frame.colour, frame.depth)]
 
-    def digest(self, words: Iterable[object]) -> str:
-        """A key of ``words``, the content of ``files``, all images' names and sizes, and the content of the first and
+    def digest(self) -> str:
+        """A key of the content of ``files``, all images' names and sizes, and the content of the first and
         the last frame: an image in the middle that was changed and kept its size goes unseen."""
-        total = hashlib.sha256(" ".join(str(word) for word in words).encode())
+        total = hashlib.sha256()
         images = self.images()
         with reading(self.where):
             for path in (*self.files, *images[:2], *images[-2:]):
@@ -224,9 +226,30 @@ class RecordedFrames(Sequence[Frame]):
         return where, read_bytes(self._recording.folder.path / name, where, self.advice)
 
 
-def left_out(where: str, names: Sequence[str], what: str, n_used: int) -> str:
-    """The line that says what was left out: how many and the first."""
-    return f"{where}: {len(names)} {what} (the first: {names[0][:80]}); left out, {n_used} frames are used"
+def colour_at(colour: UInt8Array, size: Size) -> UInt8Array:
+    """The image averaged to the width and height ``size``."""
+    import cv2
+
+    is_same = colour.shape[1::-1] == size
+    return colour if is_same else np.asarray(cv2.resize(colour, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def nearest_at(image: NDArray[Any], size: Size) -> NDArray[Any]:
+    """The image at the width and height ``size``, each pixel the nearest one of the original."""
+    import cv2
+
+    is_same = image.shape[1::-1] == size
+    return image if is_same else np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST_EXACT), image.dtype)
+
+
+def left_out(where: str, names: Sequence[str], what: str, n_used: int) -> list[str]:
+    """The line, if any, that says how many were left out and the first; logged where frames are used without them."""
+    if not names:
+        return []
+    line = f"{where}: {len(names)} {what} (the first: {names[0][:80]}); left out, {n_used} frames are used"
+    if n_used:
+        logger.warning("%s", line)
+    return [line]
 
 
 def pinhole(fx: float, fy: float, cx: float, cy: float, where: str) -> Float64Array:

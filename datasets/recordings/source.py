@@ -19,19 +19,10 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.geometry import are_rigid
-from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
+from su3d_bench.core.types import Float32Array, Float64Array, Int64Array, UInt8Array
 from su3d_bench.datasets.recordings.recorded_frames import square
+from su3d_bench.formats import images
 from su3d_bench.formats.arrays import read_text
-from su3d_bench.formats.images import (
-    MAX_PIXELS,
-    Size,
-    UInt16Array,
-    decode_colour,
-    decode_depth,
-    image_size,
-    read_bytes,
-    sized,
-)
 
 
 @dataclass(frozen=True)
@@ -43,8 +34,8 @@ class SensorPair:
     ``where`` begins the message of what does not fit.
     """
 
-    colour_size: Size
-    depth_size: Size
+    colour_size: images.Size
+    depth_size: images.Size
     colour_intrinsics: Float64Array
     depth_intrinsics: Float64Array
     colour_extrinsic: Float64Array
@@ -54,8 +45,8 @@ class SensorPair:
 
     def __post_init__(self, where: str) -> None:
         for name, (width, height) in (("colour", self.colour_size), ("depth", self.depth_size)):
-            if width < 1 or height < 1 or width * height > MAX_PIXELS:
-                raise DataError(f"{where}: {name} images of {width}x{height}; expected 1 to {MAX_PIXELS} pixels")
+            if width < 1 or height < 1 or width * height > images.MAX_PIXELS:
+                raise DataError(f"{where}: {name} images of {width}x{height}; expected 1 to {images.MAX_PIXELS} pixels")
         for name, matrix in (("colour", self.colour_intrinsics), ("depth", self.depth_intrinsics)):
             assert matrix.shape == (3, 3), matrix.shape
             if not np.isfinite(matrix).all() or not (matrix[0, 0] > 0 and matrix[1, 1] > 0):
@@ -77,20 +68,14 @@ class RgbdSource(Protocol):
     ``where`` (``<dataset>/<scene>``) begins each message; a fault in any file is a ``DataError``.
     """
 
-    @property
-    def where(self) -> str: ...
-
-    @property
-    def camera(self) -> SensorPair: ...
+    where: str
+    camera: SensorPair
+    numbers: Int64Array  # of the records at full rate; exports that left frames out keep their numbers
 
     def __len__(self) -> int: ...
 
-    def pose(self, i: int) -> Float64Array:
-        """Camera-to-world matrix (4, 4) as stored, of the depth camera; not finite where tracking was lost."""
-        ...
-
     def poses(self) -> Float64Array:
-        """All poses (n, 4, 4)."""
+        """Camera-to-world matrices (n, 4, 4) as stored, of the depth camera; not finite where tracking was lost."""
         ...
 
     def timestamp_s(self, i: int) -> float:
@@ -101,12 +86,8 @@ class RgbdSource(Protocol):
         """Image (H, W, 3) RGB in the colour size of ``camera``."""
         ...
 
-    def depth(self, i: int) -> UInt16Array:
+    def depth(self, i: int) -> images.UInt16Array:
         """Values (H, W) as stored, 0 where invalid, in the depth size of ``camera``."""
-        ...
-
-    def frame_number(self, i: int) -> int:
-        """The number of record ``i`` at full rate; exports that left frames out keep their numbers."""
         ...
 
     def files(self) -> Sequence[Path]:
@@ -273,7 +254,7 @@ class FrameFiles:
     pose: str
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class ExportedFrames:
     """An export as an ``RgbdSource``; each file is read when it is asked for.
 
@@ -288,6 +269,9 @@ class ExportedFrames:
     camera_files: Sequence[str]
     size_reason: str
 
+    def __post_init__(self) -> None:
+        self.numbers: Int64Array = np.array([frame.number for frame in self.frames], np.int64)
+
     def __len__(self) -> int:
         return len(self.frames)
 
@@ -295,25 +279,18 @@ class ExportedFrames:
         return read_matrix(self.folder, self.frames[i].pose, self.where)
 
     def poses(self) -> Float64Array:
-        return self._poses.copy()
-
-    @cached_property
-    def _poses(self) -> Float64Array:
         return np.array([self.pose(i) for i in range(len(self))]).reshape(-1, 4, 4)
 
     def timestamp_s(self, i: int) -> float:
-        return self.frame_number(i) / FRAMES_PER_SECOND
+        return int(self.numbers[i]) / FRAMES_PER_SECOND
 
     def colour(self, i: int) -> UInt8Array:
         where, content = self._read(self.frames[i].colour)
-        return sized(decode_colour, content, self.camera.colour_size, where, self.size_reason)
+        return images.sized(images.decode_colour, content, self.camera.colour_size, where, self.size_reason)
 
-    def depth(self, i: int) -> UInt16Array:
+    def depth(self, i: int) -> images.UInt16Array:
         where, content = self._read(self.frames[i].depth)
-        return sized(decode_depth, content, self.camera.depth_size, where, self.size_reason)
-
-    def frame_number(self, i: int) -> int:
-        return self.frames[i].number
+        return images.sized(images.decode_depth, content, self.camera.depth_size, where, self.size_reason)
 
     def files(self) -> Sequence[Path]:
         images = (name for frame in self.frames for name in (frame.colour, frame.depth, frame.pose))
@@ -321,7 +298,7 @@ class ExportedFrames:
 
     def _read(self, name: str) -> tuple[str, bytes]:
         where = f"{self.where}: {name}"
-        return where, read_bytes(self.folder / name, where, EXPORT_AGAIN)
+        return where, images.read_bytes(self.folder / name, where, EXPORT_AGAIN)
 
 
 def read_matrix(folder: Path, name: str, where: str, sides: Sequence[int] = (4,)) -> Float64Array:
@@ -330,9 +307,9 @@ def read_matrix(folder: Path, name: str, where: str, sides: Sequence[int] = (4,)
     return square(read_text(folder / name, where, EXPORT_AGAIN).split(), where, sides)
 
 
-def read_size(folder: Path, name: str, where: str) -> Size:
+def read_size(folder: Path, name: str, where: str) -> images.Size:
     """Width and height of an image file by its header."""
-    size = image_size(read_bytes(folder / name, f"{where}: {name}", EXPORT_AGAIN))
+    size = images.image_size(images.read_bytes(folder / name, f"{where}: {name}", EXPORT_AGAIN))
     if size is None:
         raise DataError(f"{where}: {name}: not a readable image; {EXPORT_AGAIN}")
     return size
@@ -366,7 +343,7 @@ def every_kth(known: set[int]) -> range:
     return range(0, max(known) + 1, math.gcd(*known) or 1)
 
 
-def check_complete(kinds: Mapping[str, NumberedNames], expected: range, where: str) -> None:
+def check_complete(kinds: Mapping[str, NumberedNames], expected: range, where: str, advice: str = EXPORT_AGAIN) -> None:
     """Raise ``DataError`` unless each kind of file is there for exactly the ``expected`` frames.
 
     The keys are what the name of a missing file would be, with {} in place of its number.
@@ -375,12 +352,12 @@ def check_complete(kinds: Mapping[str, NumberedNames], expected: range, where: s
     n_missing = sum(len(expected) - len(known) for known in there.values())
     if n_missing:
         first = next(name.format(n) for name, known in there.items() for n in expected if n not in known)
-        raise DataError(f"{where}: {first} is missing{_more(n_missing)}; {EXPORT_AGAIN}")
+        raise DataError(f"{where}: {first} is missing{_more(n_missing)}; {advice}")
     extra = [name for files in kinds.values() for number, name in files.items() if number not in expected]
     if extra:
         raise DataError(
             f"{where}: the recording has {len(expected)} frames, but there is also {extra[0][:60]}{_more(len(extra))}; "
-            f"{EXPORT_AGAIN}"
+            f"{advice}"
         )
 
 

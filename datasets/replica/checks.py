@@ -9,16 +9,17 @@ import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.geometry import rotations_of
 from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import Float64Array, GroundTruth, ObjectBoxes, OrientedBox
-from su3d_bench.datasets.recordings.file_dataset import faults_of
+from su3d_bench.datasets.recordings.file_dataset import faults_of, shortened
 from su3d_bench.datasets.recordings.recorded_frames import reading
 from su3d_bench.datasets.replica.folders import replica_label_set
 from su3d_bench.datasets.replica.frames import (
@@ -26,81 +27,65 @@ from su3d_bench.datasets.replica.frames import (
     read_camera,
     trajectory_lines,
 )
-from su3d_bench.datasets.replica.truth import (
-    INFO_NAME,
-    MESH_NAME,
-    AnnotatedMesh,
-    read_annotated_mesh,
-    read_object_classes,
-    read_objects,
-    shown,
-    whole_number,
-)
+from su3d_bench.datasets.replica.truth import INFO_NAME, MESH_NAME, AnnotatedMesh, Info, read_annotated_mesh, read_info
 from su3d_bench.formats.images import PNG_SIGNATURE
+from su3d_bench.formats.json_models import FileModel, Lengths, Metres, Point, checked_json
 from su3d_bench.formats.poses import poses_of_lines
 
 SLACK_M = 0.05
 SPACING_M = 0.05  # of the points on the sides of boxes
 LEAST_ALONG = 6  # points along one edge: the sides of the smallest thing then have 216, enough to count as an object
 MOST_POINTS = 2_000_000
-MOST_OBJECTS = 10_000  # the release has at most some hundreds in a scene
+MAX_OBJECTS = 10_000  # the release has at most some hundreds in a scene
 UNIT_TOLERANCE = 1e-2  # the release writes unit quaternions in single precision
-MOST_M = 1e6  # no box of a room is as far or as large; float64 stays exact to a nanometre
 
 
-def read_boxes(path: Path, where: str) -> dict[int, OrientedBox]:
+class BoxSize(FileModel):
+    center: Point
+    sizes: Lengths
+
+
+class BoxOrientation(FileModel):
+    rotation: Annotated[list[Metres], Field(min_length=4, max_length=4)]  # x y z w
+    translation: Point
+
+
+class ObjectBox(FileModel):
+    """The ``oriented_bbox`` of an object."""
+
+    abb: BoxSize
+    orientation: BoxOrientation
+
+
+def boxes_of(info: Info, where: str) -> dict[int, OrientedBox]:
     """Object id -> its box in the world; objects without ``oriented_bbox`` are left out."""
-    boxes: dict[int, OrientedBox] = {}
-    for row in read_objects(path, where):
-        object_id = whole_number(row, "id", f"{where}: {INFO_NAME}")
-        if row.get("oriented_bbox") is not None:
-            boxes[object_id] = _box(row["oriented_bbox"], f"{where}: {INFO_NAME}: object {object_id}")
-    return boxes
+    return {
+        row.id: _box(row.oriented_bbox, f"{where}: {INFO_NAME}: object {row.id}")
+        for row in info.objects
+        if row.oriented_bbox is not None
+    }
 
 
 def _box(content: Any, where: str) -> OrientedBox:
-    try:
-        abb, orientation = content["abb"], content["orientation"]
-        lists = abb["center"], abb["sizes"], orientation["rotation"], orientation["translation"]
-    except (KeyError, TypeError, IndexError) as error:
-        raise DataError(
-            f"{where}: 'oriented_bbox' is incomplete; expected abb (center, sizes) and orientation (rotation, "
-            "translation)"
-        ) from error
-    names = ("center", "sizes", "rotation", "translation")
-    centre, sizes, quaternion, translation = (
-        _numbers(values, 4 if name == "rotation" else 3, f"{where}: '{name}'")
-        for name, values in zip(names, lists, strict=True)
-    )
+    found = checked_json(content, where, ObjectBox)
+    quaternion = np.array(found.orientation.rotation)
     length = float(np.linalg.norm(quaternion))
     if not abs(length - 1) < UNIT_TOLERANCE:
         raise DataError(f"{where}: 'rotation' has the length {length:g}; expected a unit quaternion x y z w")
-    if (sizes < 0).any():
-        raise DataError(f"{where}: 'sizes' are {sizes.tolist()}; expected 0 m or more")
     rotation = rotations_of((quaternion / length)[None])[0]
-    return OrientedBox(rotation @ centre + translation, sizes, rotation)
-
-
-def _numbers(values: Any, n: int, where: str) -> Float64Array:
-    numbers = values if isinstance(values, list) else []
-    if len(numbers) != n or any(isinstance(value, bool) or not isinstance(value, int | float) for value in numbers):
-        raise DataError(f"{where} is {shown(values)} of length {len(numbers)}; expected {n} numbers")
-    # an integer in JSON may have any length; comparing it does not overflow
-    unfit = next((value for value in numbers if not -MOST_M <= value <= MOST_M), None)
-    if unfit is not None:
-        raise DataError(f"{where} holds {shown(unfit)}; expected numbers within {MOST_M:g} m")
-    return np.array([float(value) for value in numbers])
+    centre = rotation @ np.array(found.abb.center) + np.array(found.orientation.translation)
+    return OrientedBox(centre, np.array(found.abb.sizes), rotation)
 
 
 def object_boxes_of(path: Path, where: str) -> ObjectBoxes:
     """The boxes of the objects that have a class, at least one, by instance id: that of the object, plus 1."""
-    classes, labels = read_object_classes(path, where), replica_label_set()
-    found = read_boxes(path, where)
+    info, labels = read_info(path, where), replica_label_set()
+    classes, found = info.class_of_object, boxes_of(info, where)
     boxes = {number + 1: found[number] for number in sorted(found) if classes[number] in labels.ids}
     if not boxes:
         raise GroundTruthMissing(f"{where}: no ground truth 'boxes'; no object of a class has a box in {INFO_NAME}")
-    if len(boxes) > MOST_OBJECTS:
-        raise DataError(f"{where}: {INFO_NAME}: {len(boxes)} objects have a box; expected at most {MOST_OBJECTS}")
+    if len(boxes) > MAX_OBJECTS:
+        raise DataError(f"{where}: {INFO_NAME}: {len(boxes)} objects have a box; expected at most {MAX_OBJECTS}")
     return ObjectBoxes(boxes, {instance: classes[instance - 1] for instance in boxes}, labels)
 
 
@@ -157,7 +142,6 @@ def objects_outside_boxes(mesh: AnnotatedMesh, boxes: Mapping[int, OrientedBox])
     return outside
 
 
-MOST_LINES = 20  # of one kind of fault; the rest is counted
 PNG_HEAD_BYTES = 64  # signature, and the chunk with the size
 PNG_TAIL_BYTES = 1024  # the end of the pixels, and what little writers put behind it
 
@@ -167,24 +151,9 @@ def render_problems(tree: Path, scene: str, where: str) -> Iterator[str]:
     lines: list[str] = []
     yield from faults_of([lambda: read_camera(tree / "cam_params.json", where),
                           lambda: lines.extend(trajectory_lines(tree / scene / "traj.txt", where))])  # fmt: skip
-    yield from _shortened(_pose_problems(lines, where), f"{where}: traj.txt")
+    reads = [partial(poses_of_lines, [line], f"{where}: traj.txt", number) for number, line in enumerate(lines, 1)]
+    yield from shortened(faults_of(reads), f"{where}: traj.txt")
     yield from faults_of([lambda: check_frames_complete(tree / scene, len(lines), where)])
-
-
-def _shortened(problems: Iterator[str], where: str) -> Iterator[str]:
-    n_more = 0
-    for n, line in enumerate(problems):
-        if n < MOST_LINES:
-            yield line
-        else:
-            n_more += 1
-    if n_more:
-        yield f"{where}: {n_more} more faults of this kind"
-
-
-def _pose_problems(lines: list[str], where: str) -> Iterator[str]:
-    for number, line in enumerate(lines, 1):
-        yield from faults_of([partial(poses_of_lines, [line], f"{where}: traj.txt", number)])
 
 
 def original_problems(original: Path | None, where: str) -> Iterator[str]:
@@ -195,7 +164,7 @@ def original_problems(original: Path | None, where: str) -> Iterator[str]:
         yield f"{where}: {INFO_NAME} is missing in {original}; copy it there"
         return
     try:
-        boxes = read_boxes(original / INFO_NAME, where)
+        boxes = boxes_of(read_info(original / INFO_NAME, where), where)
         if not (original / MESH_NAME).exists():
             return
         outside = objects_outside_boxes(read_annotated_mesh(original, where), boxes)
@@ -207,7 +176,7 @@ def original_problems(original: Path | None, where: str) -> Iterator[str]:
         f"{SLACK_M} m; the boxes are of another mesh"
         for object_id, beyond_m in outside.items()
     )
-    yield from _shortened(lines, f"{where}: {INFO_NAME}")
+    yield from shortened(lines, f"{where}: {INFO_NAME}")
 
 
 def digest_of(files: Sequence[Path], images: Sequence[Path], where: str) -> str:

@@ -13,59 +13,7 @@ from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh,
 from su3d_bench.datasets.openlex3d import release as openlex3d
 from su3d_bench.datasets.recordings.file_dataset import FileDataset, NoOptions, keeps_last, read_marker
 from su3d_bench.datasets.recordings.meshes import read_surface
-from su3d_bench.datasets.replica.checks import (
-    box_truth,
-    digest_of,
-    object_boxes_of,
-    original_problems,
-    read_boxes,
-    render_problems,
-)
-from su3d_bench.datasets.replica.folders import (
-    CLOUDS_URL,
-    FETCH_FRAMES,
-    FETCH_MESHES,
-    FUSED_CLOUD,
-    HOW_TO_GET_LABELS,
-    INSTANCE_FOLDERS,
-    REFERENCE_CLOUD,
-    RENDER_FOLDERS,
-    SEMANTIC_FOLDERS,
-    SEMANTIC_LABEL_FOLDERS,
-    RenderTree,
-    find_label_file,
-    find_original_scene,
-    find_render_tree,
-    find_semantic_sequence,
-    no_render_tree,
-    original_name,
-    unrendered_scenes,
-)
-from su3d_bench.datasets.replica.frames import (
-    ReplicaFrames,
-    check_frames_complete,
-    colour_name,
-    depth_name,
-    read_camera,
-    read_trajectory,
-)
-from su3d_bench.datasets.replica.scene_graphs import FILES as GRAPH_FILES
-from su3d_bench.datasets.replica.scene_graphs import VARIANT as SCENE_GRAPH
-from su3d_bench.datasets.replica.scene_graphs import find_graph_folder, graph_truth
-from su3d_bench.datasets.replica.truth import (
-    INFO_NAME,
-    MESH_NAME,
-    AnnotatedMesh,
-    LabelledMesh,
-    class_file_truth,
-    cloud_files,
-    conceptgraphs_truth,
-    corner_truth,
-    instance_file_truth,
-    read_annotated_mesh,
-    triangle_mesh,
-    vertex_truth,
-)
+from su3d_bench.datasets.replica import checks, folders, frames, scene_graphs, truth
 
 
 class Replica(FileDataset[NoOptions]):
@@ -77,61 +25,62 @@ class Replica(FileDataset[NoOptions]):
     scene_names = r"(room_?[0-2]|office_?[0-4])"  # those of made rooms are among them
     label_space = "replica"
     variants = (
-        "mesh-vertices", "face-corners", "conceptgraphs", "openmask3d", "ovo-51", "boxes", SCENE_GRAPH
+        "mesh-vertices", "face-corners", "conceptgraphs", "openmask3d", "ovo-51", "boxes", scene_graphs.VARIANT
     )  # fmt: skip
     further_truths = openlex3d.FURTHER_TRUTHS
     labels_of = "replica"
     Options = NoOptions
 
     @cached_property
-    def rendered(self) -> RenderTree:
+    def rendered(self) -> folders.RenderTree:
         """The render tree, without scenes where there is none."""
-        return find_render_tree(self.root) or RenderTree(self.root / RENDER_FOLDERS[0], ())
+        return folders.find_render_tree(self.root) or folders.RenderTree(self.root / folders.RENDER_FOLDERS[0], ())
 
     def scenes(self) -> Sequence[str]:
         """The official scenes that are here, in their order, then every other scene of the render tree.
 
         Without a render tree those of the original release, which can be looked at; beside one they are named singly.
         """
-        scenes = self.rendered.scenes or unrendered_scenes(self.root)
+        scenes = self.rendered.scenes or folders.unrendered_scenes(self.root)
         if not scenes:
-            raise no_render_tree(self.root)
+            raise folders.no_render_tree(self.root)
         return scenes
 
     def places(self) -> Sequence[Path]:
         """Where the render tree is, or else would be looked for, in that order."""
-        tree = find_render_tree(self.root)
-        return [tree.folder] if tree is not None else [self.root / name for name in RENDER_FOLDERS]
+        tree = folders.find_render_tree(self.root)
+        return [tree.folder] if tree is not None else [self.root / name for name in folders.RENDER_FOLDERS]
 
     def status(self, scene: str) -> str:
         """A word on the scene from a quick look: poses and ground truth; ``info`` checks every file's presence."""
-        frames = "no frames"
+        n_frames = "no frames"
         if self._is_rendered(scene):
             try:
                 n_poses = file_bytes(self.folder(scene) / "traj.txt").rstrip().count(b"\n") + 1
             except OSError:
                 return "traj.txt is missing"
-            frames = counted(n_poses, "frame")
+            n_frames = counted(n_poses, "frame")
         try:
-            truth = f"ground truth in {self._original(scene)}"
+            words = f"ground truth in {self._original(scene)}"
         except GroundTruthMissing as error:
-            truth = str(error).partition(": ")[2]
-            original = find_original_scene(self.root, scene)
-            if original is not None and (original / INFO_NAME).exists():
-                truth = f"{len(self.object_boxes(scene))} boxes of objects, no mesh ({original / MESH_NAME} is missing)"
+            words = str(error).partition(": ")[2]
+            original = folders.find_original_scene(self.root, scene)
+            if original is not None and (original / truth.INFO_NAME).exists():
+                mesh = original / truth.MESH_NAME
+                words = f"{len(self.object_boxes(scene))} boxes of objects, no mesh ({mesh} is missing)"
         released = []
         for variant, files in self._released_truths(scene).items():
             missing = [path.name for path in files if not path.exists()]
             released += [f"{variant} without its {missing[0]}" if missing else variant] if files else []
-        return f"{frames}, {truth}" + (f"; also {', '.join(released)}" if released else "")
+        return f"{n_frames}, {words}" + (f"; also {', '.join(released)}" if released else "")
 
     def n_frames(self, scene: str, stride: int) -> int:
         """Cheap, with a check that the scene's frames are complete."""
         folder = self.folder(scene)
         if not self._is_rendered(scene):
             return 0
-        n_poses = len(read_trajectory(folder / "traj.txt", self.where(scene)))
-        check_frames_complete(folder, n_poses, self.where(scene))
+        n_poses = len(frames.read_trajectory(folder / "traj.txt", self.where(scene)))
+        frames.check_frames_complete(folder, n_poses, self.where(scene))
         return len(range(0, n_poses, stride))
 
     def image_domain(self, scene: str) -> ImageDomain:
@@ -142,66 +91,66 @@ class Replica(FileDataset[NoOptions]):
         if not self._is_rendered(scene):
             raise FramesMissing(
                 f"{where}: no frames; expected traj.txt and results/ of NICE-SLAM's render in {folder}: "
-                f"{FETCH_FRAMES}; what is here can be looked at: su3d-bench datasets show {where}"
+                f"{folders.FETCH_FRAMES}; what is here can be looked at: su3d-bench datasets show {where}"
             )
-        camera = read_camera(self.rendered.folder / "cam_params.json", where)
-        poses = read_trajectory(folder / "traj.txt", where)
-        check_frames_complete(folder, len(poses), where)
-        return ReplicaFrames(folder, where, camera, poses, range(0, len(poses), stride))
+        camera = frames.read_camera(self.rendered.folder / "cam_params.json", where)
+        poses = frames.read_trajectory(folder / "traj.txt", where)
+        frames.check_frames_complete(folder, len(poses), where)
+        return frames.ReplicaFrames(folder, where, camera, poses, range(0, len(poses), stride))
 
     def recording_files(self, scene: str) -> Sequence[Path]:
         folder = self.folder(scene)
         if not self._is_rendered(scene):
             return ()
-        n_poses = len(read_trajectory(folder / "traj.txt", self.where(scene)))
-        images = [folder / name(index) for index in range(n_poses) for name in (colour_name, depth_name)]
+        n_poses = len(frames.read_trajectory(folder / "traj.txt", self.where(scene)))
+        images = [folder / name(index) for index in range(n_poses) for name in (frames.colour_name, frames.depth_name)]
         return (self.rendered.folder / "cam_params.json", folder / "traj.txt", *images)
 
     def recording_key(self, scene: str) -> str:
         """A key of the content of every file; ``image_key`` says what it cannot see in an image."""
         folder = self.folder(scene)
         files = (self.rendered.folder / "cam_params.json", folder / "traj.txt") if self._is_rendered(scene) else ()
-        return digest_of(files, sorted(folder.glob("results/*")), self.where(scene))
+        return checks.digest_of(files, sorted(folder.glob("results/*")), self.where(scene))
 
     def problems(self, scene: str) -> Iterator[str]:
         """What is wrong with the scene's files, one line each; what has no entry is no fault but void."""
         self.folder(scene)
         if self._is_rendered(scene):
-            yield from render_problems(self.rendered.folder, scene, self.where(scene))
-        yield from original_problems(find_original_scene(self.root, scene), self.where(scene))
+            yield from checks.render_problems(self.rendered.folder, scene, self.where(scene))
+        yield from checks.original_problems(folders.find_original_scene(self.root, scene), self.where(scene))
 
     def own_truth(self, scene: str, variant: str) -> GroundTruth:
         match variant:
             case "mesh-vertices":
-                return vertex_truth(self._annotated_mesh(scene))
+                return truth.vertex_truth(self._annotated_mesh(scene))
             case "face-corners":
-                return corner_truth(self._annotated_mesh(scene))
+                return truth.corner_truth(self._annotated_mesh(scene))
             case "conceptgraphs":
                 return self._cloud_truth(scene)
             case "openmask3d" | "ovo-51":
                 return self._label_file_truth(scene, variant)
             case "replicassg":
-                return graph_truth(self.root, scene, self._annotated_mesh(scene), self.where(scene))
+                return scene_graphs.graph_truth(self.root, scene, self._annotated_mesh(scene), self.where(scene))
             case "boxes":
-                return box_truth(object_boxes_of(self._info(scene), self.where(scene)))
+                return checks.box_truth(checks.object_boxes_of(self._info(scene), self.where(scene)))
         raise AssertionError(variant)
 
     def object_boxes(self, scene: str) -> Mapping[int, OrientedBox]:
         """Object id of the original release -> its box in the world, from ``info_semantic.json`` alone."""
-        return read_boxes(self._info(scene), self.where(scene))
+        return checks.boxes_of(truth.read_info(self._info(scene), self.where(scene)), self.where(scene))
 
     def _info(self, scene: str) -> Path:
         self.folder(scene)
-        original = find_original_scene(self.root, scene)
-        if original is None or not (original / INFO_NAME).exists():
+        original = folders.find_original_scene(self.root, scene)
+        if original is None or not (original / truth.INFO_NAME).exists():
             raise GroundTruthMissing(
-                f"{self.where(scene)}: no boxes of objects; expected {original_name(scene)}/{INFO_NAME} of the "
-                f"original release in {self.root / 'replica_v1'}: {FETCH_MESHES}"
+                f"{self.where(scene)}: no boxes of objects; expected {folders.original_name(scene)}/{truth.INFO_NAME} "
+                f"of the original release in {self.root / 'replica_v1'}: {folders.FETCH_MESHES}"
             )
-        return original / INFO_NAME
+        return original / truth.INFO_NAME
 
     def instance_mesh(self, scene: str) -> InstanceMesh:
-        return triangle_mesh(self._annotated_mesh(scene))
+        return truth.triangle_mesh(self._annotated_mesh(scene))
 
     def surface(self, scene: str) -> Surface:
         """The mesh beside the render, whose vertices label files for OpenMask3D and OVO describe."""
@@ -223,96 +172,96 @@ class Replica(FileDataset[NoOptions]):
         return self.rendered.folder / scene
 
     def _is_annotated(self, scene: str) -> bool:
-        original = find_original_scene(self.root, scene) if re.fullmatch(r"\w[\w-]*", scene, re.ASCII) else None
-        return original is not None and any((original / name).is_file() for name in (MESH_NAME, INFO_NAME))
+        original = folders.find_original_scene(self.root, scene) if re.fullmatch(r"\w[\w-]*", scene, re.ASCII) else None
+        return original is not None and any((original / name).is_file() for name in (truth.MESH_NAME, truth.INFO_NAME))
 
     def _is_rendered(self, scene: str) -> bool:
         return scene in self.rendered.scenes
 
     def small_files(self, scene: str) -> tuple[Path, ...]:
         """The render's mesh and every file of ground truth that is here, of whatever variant."""
-        original = find_original_scene(self.root, scene)
-        names = (MESH_NAME, INFO_NAME)
+        original = folders.find_original_scene(self.root, scene)
+        names = (truth.MESH_NAME, truth.INFO_NAME)
         paths = [self._render_mesh(scene)] + ([] if original is None else [original / name for name in names])
         released = self._released_truths(scene)
         paths += [path for files in released.values() for path in files]
         if released["openmask3d"] or released["ovo-51"]:
-            paths += [mesh.path for mesh in self._labelled_meshes(scene)]
+            paths += self._labelled_meshes(scene).values()
         return tuple(path for path in dict.fromkeys(paths) if path.exists())
 
     def _released_truths(self, scene: str) -> dict[str, tuple[Path, ...]]:
         """Variant -> its files, of what others than Replica's makers released; none where nothing of it is here."""
-        sequence = find_semantic_sequence(self.root, scene)
-        clouds = () if sequence is None else (*cloud_files(sequence), self.folder(scene) / REFERENCE_CLOUD)
+        sequence = folders.find_semantic_sequence(self.root, scene)
+        reference = self.folder(scene) / folders.REFERENCE_CLOUD
+        clouds = () if sequence is None else (*truth.cloud_files(sequence), reference)
         labels = {variant: self._label_file(scene, variant) for variant in ("openmask3d", "ovo-51")}
-        graphs = find_graph_folder(self.root)
-        of_graph = () if graphs is None else tuple(graphs / name for name in GRAPH_FILES)
+        graphs = scene_graphs.find_graph_folder(self.root)
+        of_graph = () if graphs is None else tuple(graphs / name for name in scene_graphs.FILES)
         lex = openlex3d.label_files(self.root, self.name, scene)
-        return {"conceptgraphs": clouds, SCENE_GRAPH: of_graph, "openlex3d": lex} | {
+        return {"conceptgraphs": clouds, scene_graphs.VARIANT: of_graph, "openlex3d": lex} | {
             variant: () if path is None else (path,) for variant, path in labels.items()
         }
 
     def _label_file(self, scene: str, variant: str) -> Path | None:
         if variant == "openmask3d":
-            return find_label_file(self.root, scene, INSTANCE_FOLDERS, "instance_labels_")
-        return find_label_file(self.root, scene, SEMANTIC_LABEL_FOLDERS, "semantic_labels_")
+            return folders.find_label_file(self.root, scene, folders.INSTANCE_FOLDERS, "instance_labels_")
+        return folders.find_label_file(self.root, scene, folders.SEMANTIC_LABEL_FOLDERS, "semantic_labels_")
 
-    def _labelled_meshes(self, scene: str) -> list[LabelledMesh]:
+    def _labelled_meshes(self, scene: str) -> dict[str, Path]:
         """The meshes whose vertices a label file may describe, that of the render first, as the authors used it."""
-        original, render = find_original_scene(self.root, scene), self._render_mesh(scene)
-        meshes = [LabelledMesh(render, render.name)]
-        if original is not None:
-            meshes.append(LabelledMesh(original / MESH_NAME, MESH_NAME))
-        return [mesh for mesh in meshes if mesh.path.exists()]
+        original, render = folders.find_original_scene(self.root, scene), self._render_mesh(scene)
+        meshes = {render.name: render} | ({} if original is None else {truth.MESH_NAME: original / truth.MESH_NAME})
+        return {name: path for name, path in meshes.items() if path.exists()}
 
     def _label_file_truth(self, scene: str, variant: str) -> GroundTruth:
         path, where = self._label_file(scene, variant), self.where(scene)
         if path is None:
-            folder = INSTANCE_FOLDERS[0] if variant == "openmask3d" else SEMANTIC_LABEL_FOLDERS[0]
+            folder = folders.INSTANCE_FOLDERS[0] if variant == "openmask3d" else folders.SEMANTIC_LABEL_FOLDERS[0]
             raise GroundTruthMissing(
                 f"{where}: no ground truth '{variant}'; expected {folder}/{scene}.txt, one label a vertex, in "
-                f"{self.rendered.folder}; {HOW_TO_GET_LABELS[variant]}"
+                f"{self.rendered.folder}; {folders.HOW_TO_GET_LABELS[variant]}"
             )
-        make = instance_file_truth if variant == "openmask3d" else class_file_truth
+        make = truth.instance_file_truth if variant == "openmask3d" else truth.class_file_truth
         return make(path, self._labelled_meshes(scene), where)
 
     def _cloud_truth(self, scene: str) -> GroundTruth:
-        where, sequence = self.where(scene), find_semantic_sequence(self.root, scene)
-        reference = self.folder(scene) / REFERENCE_CLOUD
+        where, sequence = self.where(scene), folders.find_semantic_sequence(self.root, scene)
+        reference = self.folder(scene) / folders.REFERENCE_CLOUD
         if sequence is None:
+            expected = f"{folders.original_name(scene)}/Sequence_1/{folders.FUSED_CLOUD}"
             raise GroundTruthMissing(
-                f"{where}: no ground truth 'conceptgraphs'; expected {original_name(scene)}/Sequence_1/{FUSED_CLOUD} "
-                f"of its authors ({CLOUDS_URL}) in {self.root / SEMANTIC_FOLDERS[0]}; replica-mesh-ex6 needs none of it"
+                f"{where}: no ground truth 'conceptgraphs'; expected {expected} of its authors ({folders.CLOUDS_URL}) "
+                f"in {self.root / folders.SEMANTIC_FOLDERS[0]}; replica-mesh-ex6 needs none of it"
             )
         if not reference.exists():
             raise GroundTruthMissing(
-                f"{where}: no ground truth 'conceptgraphs'; the points to be scored, {REFERENCE_CLOUD}, are missing in "
-                f"{reference.parents[2]}; make them with run_slam_rgb.py of ConceptGraphs (stride 5, 480x640)"
+                f"{where}: no ground truth 'conceptgraphs'; the points to be scored, {folders.REFERENCE_CLOUD}, are "
+                f"missing in {reference.parents[2]}; make them with ConceptGraphs' run_slam_rgb.py (stride 5, 480x640)"
             )
-        return conceptgraphs_truth(sequence, reference, where)
+        return truth.conceptgraphs_truth(sequence, reference, where)
 
     @keeps_last
-    def _annotated_mesh(self, scene: str) -> AnnotatedMesh:
+    def _annotated_mesh(self, scene: str) -> truth.AnnotatedMesh:
         self.folder(scene)
-        return read_annotated_mesh(self._original(scene), self.where(scene))
+        return truth.read_annotated_mesh(self._original(scene), self.where(scene))
 
     def _instead(self, scene: str) -> str:
         """A clause on what scores the scene without its mesh; empty where nothing does."""
         try:
-            object_boxes_of(self._info(scene), self.where(scene))
+            checks.object_boxes_of(self._info(scene), self.where(scene))
         except DataError:
             return ""
         return "; the protocol replica-boxes scores it by the boxes of its objects"
 
     def _original(self, scene: str) -> Path:
         """The scene's folder in the original release, with both files of the truth."""
-        original, where = find_original_scene(self.root, scene), self.where(scene)
+        original, where = folders.find_original_scene(self.root, scene), self.where(scene)
         if original is None:
             raise GroundTruthMissing(
-                f"{where}: no ground truth; expected {original_name(scene)}/{MESH_NAME} of the original release "
-                f"in {self.root / 'replica_v1'}: {FETCH_MESHES}"
+                f"{where}: no ground truth; expected {folders.original_name(scene)}/{truth.MESH_NAME} of the original "
+                f"release in {self.root / 'replica_v1'}: {folders.FETCH_MESHES}"
             )
-        for name in (MESH_NAME, INFO_NAME):
+        for name in (truth.MESH_NAME, truth.INFO_NAME):
             if not (original / name).exists():
                 reason = f"{original / name} is missing{self._instead(scene)}"
                 raise GroundTruthMissing(f"{where}: no ground truth; {reason}")

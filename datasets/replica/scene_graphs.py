@@ -9,16 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
+from pydantic import Field, Strict
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.types import GroundTruth, LabelSet, TrueGraph
 from su3d_bench.datasets.replica.folders import LABEL_SPACE, ORIGINAL_FOLDERS, original_name
-from su3d_bench.datasets.replica.truth import MAX_OBJECT_ID, MESH_NAME, AnnotatedMesh, shown
+from su3d_bench.datasets.replica.truth import MAX_OBJECT_ID, MESH_NAME, AnnotatedMesh
 from su3d_bench.formats.arrays import parsed_json
 from su3d_bench.formats.images import read_bytes
+from su3d_bench.formats.json_models import FileModel, WholeNumber, checked_json
 
 VARIANT = "replicassg"
 OBJECTS, RELATIONS, CLASSES = "objects.json", "relationships.json", "replica_to_visual_genome.json"
@@ -26,8 +28,8 @@ FILES = (OBJECTS, RELATIONS, CLASSES)
 UNKNOWN = "unknown"  # a label that means none of the listed classes
 FOLDER_NAMES = ("ReplicaSSG", "ReplicaSSG/files", "replicassg")
 URL = "https://github.com/Howardkhh/ReplicaSSG"
-MOST_BYTES = 64 << 20  # the released ones have 0.3 MB
-MOST_OBJECTS = 100_000
+MAX_BYTES = 64 << 20  # the released ones have 0.3 MB
+Content = TypeVar("Content")
 
 
 def find_graph_folder(root: Path) -> Path | None:
@@ -70,64 +72,55 @@ def graph_truth(root: Path, scene: str, mesh: AnnotatedMesh, where: str) -> Grou
     )
 
 
+class ClassLists(FileModel):
+    listed: Annotated[list[str], Field(min_length=1)] = Field(alias="VisualGenome_list")
+    meant: dict[str, Any] = Field(alias="Replica2VisualGenome")
+
+
+class GraphObject(FileModel):
+    id: WholeNumber
+    label: str
+
+
+class Scans(FileModel):
+    scans: list[dict[str, Any]]
+
+
 def _classes(path: Path, where: str) -> tuple[tuple[str, ...], Mapping[str, int]]:
     """The listed classes, and the id of that which each label of Replica means; labels of none of them are left out."""
-    content = _content(path, where)
-    listed, meant = content.get("VisualGenome_list"), content.get("Replica2VisualGenome")
-    if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed) or not listed:
-        raise DataError(f"{where}: has no list 'VisualGenome_list' of names")
-    if not isinstance(meant, dict) or len(set(listed)) != len(listed):
-        raise DataError(f"{where}: needs a table 'Replica2VisualGenome' and every class once")
-    place = {name: number for number, name in enumerate(listed, 1)}
-    return tuple(listed), {
-        label: place[name] for label, name in meant.items() if isinstance(name, str) and name in place
+    content = _read(path, where, ClassLists)
+    place = {name: number for number, name in enumerate(content.listed, 1)}
+    if len(place) != len(content.listed):
+        raise DataError(f"{where}: needs every class of 'VisualGenome_list' once")
+    return tuple(place), {
+        label: place[name] for label, name in content.meant.items() if isinstance(name, str) and name in place
     }
 
 
 def _objects(path: Path, scan: str, class_of_label: Mapping[str, int], where: str) -> dict[int, int]:
     """Instance id -> class id of the objects of a scan that have one."""
     answer: dict[int, int] = {}
-    for row in _rows(path, scan, "objects", where):
-        number, label = (
-            row.get("id") if isinstance(row, dict) else None,
-            row.get("label") if isinstance(row, dict) else 0,
-        )
-        word = str(number)
-        if not isinstance(label, str) or not (word.isascii() and word.isdigit() and len(word) < 10):
-            raise DataError(f"{where}: {scan}: an object is {shown(row)}; expected an id and a label")
-        if label in class_of_label and answer.setdefault(int(word) + 1, class_of_label[label]) != class_of_label[label]:
-            raise DataError(f"{where}: {scan}: object {word} stands there twice, with two classes")
+    for row in _rows(path, scan, "objects", list[GraphObject], where):
+        class_id = class_of_label.get(row.label)
+        if class_id is not None and answer.setdefault(row.id + 1, class_id) != class_id:
+            raise DataError(f"{where}: {scan}: object {row.id} stands there twice, with two classes")
     return answer
 
 
 def _relations(path: Path, scan: str, where: str) -> tuple[tuple[int, str, int], ...]:
     """Subject, predicate and object of each relation of a scan; the file has both objects before the predicate."""
-    answer = []
-    for row in _rows(path, scan, "relationships", where):
-        is_row = isinstance(row, list) and len(row) == 4 and isinstance(row[3], str)
-        if not is_row or not all(type(row[k]) is int and 0 <= row[k] < MAX_OBJECT_ID for k in (0, 1)):
-            raise DataError(f"{where}: {scan}: a relation is {ascii(row)[:60]}; expected subject, object, number, name")
-        answer.append((row[0] + 1, row[3], row[1] + 1))
-    return tuple(answer)
+    kind = list[Annotated[tuple[WholeNumber, WholeNumber, Any, str], Strict(False)]]
+    rows = _rows(path, scan, "relationships", kind, where)
+    return tuple((subject + 1, predicate, other + 1) for subject, other, _, predicate in rows)
 
 
-def _rows(path: Path, scan: str, key: str, where: str) -> list[Any]:
-    scans = _content(path, where).get("scans")
-    if not isinstance(scans, list):
-        raise DataError(f"{where}: has no list 'scans'")
-    mine = [one for one in scans if isinstance(one, dict) and one.get("scan") == scan]
-    if len(mine) != 1 or not isinstance(mine[0].get(key), list):
-        raise DataError(f"{where}: has {len(mine)} entries of {scan} with a list '{key}'; expected one")
-    rows: list[Any] = mine[0][key]
-    if len(rows) > MOST_OBJECTS:
-        raise DataError(f"{where}: {scan} has {len(rows)} {key}; expected at most {MOST_OBJECTS}")
-    return rows
+def _rows(path: Path, scan: str, key: str, kind: type[Content], where: str) -> Content:
+    """The list under ``key`` of the one entry of a scan; those of other scans are not looked at."""
+    mine = [one for one in _read(path, where, Scans).scans if one.get("scan") == scan]
+    if len(mine) != 1:
+        raise DataError(f"{where}: has {len(mine)} entries of {scan}; expected one")
+    return checked_json(mine[0].get(key), f"{where}: {scan}: {key}", kind)
 
 
-def _content(path: Path, where: str) -> dict[str, Any]:
-    if path.is_file() and path.stat().st_size > MOST_BYTES:
-        raise DataError(f"{where}: has more than {MOST_BYTES >> 20} MiB; copy the released file")
-    content = parsed_json(read_bytes(path, where), where)
-    if not isinstance(content, dict):
-        raise DataError(f"{where}: holds {type(content).__name__}; expected the file of ReplicaSSG ({URL})")
-    return content
+def _read(path: Path, where: str, kind: type[Content]) -> Content:
+    return checked_json(parsed_json(read_bytes(path, where, most=MAX_BYTES), where), where, kind)

@@ -12,21 +12,21 @@ from __future__ import annotations
 import logging
 import re
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import Field
 
 from su3d_bench.core.errors import DataError, reading
 from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import Float32Array, GroundTruth, InstanceMesh, Int32Array, Int64Array
 from su3d_bench.datasets.recordings.meshes import check_finite, face_corners, fans, scalar_column, vertex_positions
 from su3d_bench.datasets.replica.folders import FUSED_CLOUD, replica_label_set
-from su3d_bench.formats.arrays import parsed_json
 from su3d_bench.formats.hdf5 import largest_column, read_rows
-from su3d_bench.formats.images import read_bytes
+from su3d_bench.formats.json_models import FileModel, read_json
 from su3d_bench.formats.ply import MAX_HEADER_BYTES, ListColumn, read_header, read_ply
 from su3d_bench.formats.poses import moved, read_first_pose
 
@@ -52,7 +52,7 @@ class AnnotatedMesh:
 
 def read_annotated_mesh(folder: Path, where: str) -> AnnotatedMesh:
     """The mesh of the scene in ``folder``; ``where`` begins each message. Void objects are counted in a warning."""
-    class_of_object = read_object_classes(folder / INFO_NAME, where)
+    class_of_object = read_info(folder / INFO_NAME, where).class_of_object
     vertices, corners, objects = _read_mesh(folder / MESH_NAME, f"{where}: {MESH_NAME}")
     known = {number: class_id for number, class_id in class_of_object.items() if class_id in replica_label_set().ids}
     ids, face_rows = np.unique(objects, return_inverse=True)
@@ -64,62 +64,45 @@ def read_annotated_mesh(folder: Path, where: str) -> AnnotatedMesh:
     )
 
 
-def read_object_classes(path: Path, where: str) -> dict[int, int]:
-    """Object id -> class id as ``info_semantic.json`` has it, undefined classes included."""
-    objects = read_objects(path, where)
-    where = f"{where}: {INFO_NAME}"
-    class_of_object: dict[int, int] = {}
-    for row in objects:
-        object_id, class_id = whole_number(row, "id", where), whole_number(row, "class_id", where)
-        if not 0 <= object_id <= MAX_OBJECT_ID:
-            raise DataError(f"{where}: an object has the id {object_id}; expected 0 to {MAX_OBJECT_ID}")
-        if class_of_object.setdefault(object_id, class_id) != class_id:
+class InfoClass(FileModel):
+    id: int
+    name: str
+
+
+class InfoObject(FileModel):
+    id: Annotated[int, Field(ge=0, le=MAX_OBJECT_ID)]
+    class_id: int
+    oriented_bbox: Any = None
+
+
+class Info(FileModel):
+    """``info_semantic.json``; ``class_of_object`` has undefined classes too."""
+
+    classes: list[InfoClass]
+    objects: list[InfoObject]
+
+    @property
+    def class_of_object(self) -> dict[int, int]:
+        return {row.id: row.class_id for row in self.objects}
+
+
+def read_info(path: Path, where: str) -> Info:
+    """The table of the scene's objects. Its own classes must be Replica's: with others every label would be wrong."""
+    where, labels = f"{where}: {INFO_NAME}", replica_label_set()
+    info = read_json(path, where, Info)
+    for row in info.classes:
+        if row.id in labels.ids and row.name.replace("_", "-").lower() != labels.name_of(row.id):
             raise DataError(
-                f"{where}: object {object_id} stands there twice, as class {class_of_object[object_id]} and as class "
-                f"{class_id}"
+                f"{where}: class {row.id} is {row.name[:40]!a}, in Replica it is '{labels.name_of(row.id)}'; this file "
+                "has other classes"
             )
-    return class_of_object
-
-
-def read_objects(path: Path, where: str) -> list[dict[str, Any]]:
-    """The rows of ``objects`` of an ``info_semantic.json`` whose classes are Replica's."""
-    where = f"{where}: {INFO_NAME}"
-    content = parsed_json(read_bytes(path, where), where)
-    objects = _list_of_tables(content, "objects", where)
-    _check_class_names(_list_of_tables(content, "classes", where), where)
-    return objects
-
-
-def _list_of_tables(content: Any, key: str, where: str) -> list[dict[str, Any]]:
-    rows = content.get(key) if isinstance(content, dict) else None
-    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise DataError(f"{where}: has no list '{key}' of objects; expected the file of the original release")
-    return rows
-
-
-def whole_number(row: dict[str, Any], key: str, where: str) -> int:
-    value = row.get(key)
-    if isinstance(value, bool) or not isinstance(value, int):
-        owner = shown(row.get("id")).strip("'")
-        raise DataError(f"{where}: object {owner}: '{key}' is {shown(value)}, not a whole number")
-    return value
-
-
-def shown(value: Any) -> str:
-    """A value of a JSON file as a message may show it: short, on one line, in quotes; a list or table by its type."""
-    return ascii((str(value) if value is None or isinstance(value, str | int | float) else type(value).__name__)[:40])
-
-
-def _check_class_names(classes: list[dict[str, Any]], where: str) -> None:
-    """The file's own class table must be Replica's: with another one every label would be wrong."""
-    labels = replica_label_set()
-    for row in classes:
-        class_id = row.get("id")
-        if class_id in labels.ids and str(row.get("name")).replace("_", "-").lower() != labels.name_of(class_id):
+    class_of_object = info.class_of_object
+    for one in info.objects:
+        if (class_id := class_of_object[one.id]) != one.class_id:
             raise DataError(
-                f"{where}: class {class_id} is {shown(row.get('name'))}, in Replica it is "
-                f"'{labels.name_of(class_id)}'; this file has other classes"
+                f"{where}: object {one.id} stands there twice, as class {one.class_id} and as class {class_id}"
             )
+    return info
 
 
 def _say_what_is_void(ids: Int64Array, n_faces: Int64Array, class_of_object: Mapping[int, int], where: str) -> None:
@@ -226,22 +209,14 @@ OVO_CLASSES = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class LabelledMesh:
-    """A mesh whose vertices a label file may describe; ``name`` is what messages call it."""
-
-    path: Path
-    name: str
-
-
-def instance_file_truth(path: Path, meshes: Sequence[LabelledMesh], where: str) -> GroundTruth:
+def instance_file_truth(path: Path, meshes: Mapping[str, Path], where: str) -> GroundTruth:
     """Instances of a ``class id * 1000 + instance`` file on the vertices of the first of ``meshes`` that has as many.
 
     Values below 1000 and those of the undefined class 256 are void. Each other value is an instance, one ending in
     000 too, as ScanNet's evaluation has it; instances are numbered from 1 in the order of their values, because two
     classes may use the same number.
     """
-    values, mesh = _labels_of_mesh(path, meshes, where)
+    values, name = _labels_of_mesh(path, meshes, where)
     distinct, inverse = np.unique(values, return_inverse=True)
     label = distinct // INSTANCES_PER_CLASS
     if label[0] < 0:
@@ -262,22 +237,22 @@ def instance_file_truth(path: Path, meshes: Sequence[LabelledMesh], where: str) 
             f"{INSTANCES_PER_CLASS - 1}"
         )
     return GroundTruth(
-        _vertices(mesh, where),
+        _vertices(meshes[name], f"{where}: {name}"),
         np.where(is_void, 0, label).astype(np.int32)[inverse],
         number.astype(np.int32)[inverse],
         replica_label_set(),
         "openmask3d",
-        f"{path.parent.name}/{path.name}, class id * {INSTANCES_PER_CLASS} + instance of each vertex of {mesh.name}",
+        f"{path.parent.name}/{path.name}, class id * {INSTANCES_PER_CLASS} + instance of each vertex of {name}",
     )
 
 
-def class_file_truth(path: Path, meshes: Sequence[LabelledMesh], where: str) -> GroundTruth:
+def class_file_truth(path: Path, meshes: Mapping[str, Path], where: str) -> GroundTruth:
     """Classes of a file of Replica's ids on the vertices of the first of ``meshes`` that has as many; no instances.
 
     Any number that is none of the 51 and does not stand for 'no class' is refused: it would mean another numbering,
     such as 0 to 50 in the order of OpenNeRF's evaluation, and every label would be wrong.
     """
-    values, mesh = _labels_of_mesh(path, meshes, where)
+    values, name = _labels_of_mesh(path, meshes, where)
     foreign = np.setdiff1d(values, (*OVO_CLASSES, *CLASSLESS))
     if len(foreign):
         raise DataError(
@@ -285,41 +260,43 @@ def class_file_truth(path: Path, meshes: Sequence[LabelledMesh], where: str) -> 
             "evaluation; a file numbered 0 to 50 must be brought back to Replica's ids first"
         )
     return GroundTruth(
-        _vertices(mesh, where),
+        _vertices(meshes[name], f"{where}: {name}"),
         np.where(np.isin(values, OVO_CLASSES), values, 0).astype(np.int32),
         np.zeros(len(values), np.int32),
         replica_label_set(),
         "ovo-51",
-        f"{path.parent.name}/{path.name}, the class of each vertex of {mesh.name}",
+        f"{path.parent.name}/{path.name}, the class of each vertex of {name}",
     )
 
 
-def _labels_of_mesh(path: Path, meshes: Sequence[LabelledMesh], where: str) -> tuple[Int32Array, LabelledMesh]:
-    """The labels, and the mesh that has as many vertices; a ``DataError`` that names all counts where none has."""
-    n_vertices = [_n_vertices(mesh, where) for mesh in meshes]
+def _labels_of_mesh(path: Path, meshes: Mapping[str, Path], where: str) -> tuple[Int32Array, str]:
+    """The labels, and the name of the mesh that has as many vertices; a ``DataError`` with all counts where none has.
+
+    ``meshes``: those that the file may describe by what messages call them.
+    """
+    n_vertices = {name: _n_vertices(mesh, f"{where}: {name}") for name, mesh in meshes.items()}
     if not n_vertices:
         raise DataError(
             f"{where}: {path.name}: labels the vertices of a mesh, but neither the mesh of the render nor that of the "
             "original release is here; copy one of them"
         )
-    values, n_lines = read_whole_numbers(path, max(n_vertices), f"{where}: {path.name}")
-    for mesh, n in zip(meshes, n_vertices, strict=True):
-        if 0 < n == n_lines:
-            return values, mesh
-    counts = " and ".join(f"{mesh.name} {n}" for mesh, n in zip(meshes, n_vertices, strict=True))
-    raise DataError(f"{where}: {path.name}: has {n_lines} labels, {counts} vertices; expected one label a vertex")
+    values, n_lines = read_whole_numbers(path, max(n_vertices.values()), f"{where}: {path.name}")
+    name = next((name for name, n in n_vertices.items() if 0 < n == n_lines), None)
+    if name is None:
+        counts = " and ".join(f"{name} {n}" for name, n in n_vertices.items())
+        raise DataError(f"{where}: {path.name}: has {n_lines} labels, {counts} vertices; expected one label a vertex")
+    return values, name
 
 
-def _n_vertices(mesh: LabelledMesh, where: str) -> int:
+def _n_vertices(mesh: Path, where: str) -> int:
     """As the header says it; ``_vertices`` reads and checks the chosen mesh."""
-    where = f"{where}: {mesh.name}"
-    with reading(where, DataError), opened(mesh.path) as file:
+    with reading(where, DataError), opened(mesh) as file:
         header = read_header(file.read(MAX_HEADER_BYTES), where)
     return next((element.n_rows for element in header.elements if element.name == "vertex"), 0)
 
 
-def _vertices(mesh: LabelledMesh, where: str) -> Float32Array:
-    return vertex_positions(read_ply(mesh.path, f"{where}: {mesh.name}"), f"{where}: {mesh.name}")
+def _vertices(mesh: Path, where: str) -> Float32Array:
+    return vertex_positions(read_ply(mesh, where), where)
 
 
 def read_whole_numbers(path: Path, at_most: int, where: str) -> tuple[Int32Array, int]:

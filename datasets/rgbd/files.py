@@ -12,20 +12,18 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from su3d_bench.core.config import Setting, Settings, flatten, resolve
+from su3d_bench.core.config import Setting, Settings, flatten, key_lines, resolve
 from su3d_bench.core.errors import ConfigError, DataError, suggest
 from su3d_bench.core.geometry import are_rigid, turn_to_z
 from su3d_bench.core.system.files import parse_toml
 from su3d_bench.core.types import Float64Array, UpAxis
 from su3d_bench.datasets.recordings.recorded_frames import Folder, numbers, pinhole, square
-from su3d_bench.datasets.tum.timed_poses import quaternion_poses, rows_of, seconds, unit_quaternion
+from su3d_bench.datasets.tum.dataset import quaternion_poses, rows_of, seconds, unit_quaternion
 from su3d_bench.formats.arrays import parsed_json, read_text
 
 FILE_NAME = "rgbd.toml"
 INDEX = "{index}"
 MAX_DESCRIPTION_BYTES = 1 << 14  # some twenty lines are in use; deeply nested keys take quadratic time
-MAX_MESSAGE_LENGTH = 480
-ASSIGNMENT = re.compile(r"""\s*["']?([\w-]+)["']?\s*=""")
 Number = Annotated[float, Field(allow_inf_nan=False)]
 DepthValue = Annotated[int, Field(ge=0, le=65535)]
 
@@ -99,7 +97,7 @@ def read_description(path: Path, where: str) -> RgbdDescription:
         raise DataError(f"{where} has {len(text)} characters; expected a description of a few lines")
     try:
         table = parse_toml(text)
-        lines = _lines_of(text)
+        lines = {key[0]: line for key, line in reversed(key_lines(text).items())}
         _check_keys(table, lines, where)
         leaves = flatten(table)
         settings = Settings(
@@ -107,20 +105,11 @@ def read_description(path: Path, where: str) -> RgbdDescription:
         )
         return resolve(settings, ("rgbd",), RgbdDescription)
     except tomllib.TOMLDecodeError as error:
-        raise DataError(_one_line(f"{where}: not valid TOML: {error}")) from error
+        raise DataError(f"{where}: not valid TOML: {error}") from error
     except ConfigError as error:
         # A rule on several keys has no line of its own.
         place, of_whole, rule = str(error).partition(" rgbd = '...':")
-        raise DataError(_one_line(f"{where}:{rule}" if of_whole else f"{where}{place}")) from error
-
-
-def _lines_of(text: str) -> dict[str, int]:
-    """The line on which each key stands first."""
-    line_of: dict[str, int] = {}
-    for number, line in enumerate(text.split("\n"), start=1):
-        if match := ASSIGNMENT.match(line):
-            line_of.setdefault(match[1], number)
-    return line_of
+        raise DataError(f"{where}:{rule}" if of_whole else f"{where}{place}") from error
 
 
 def _check_keys(table: dict[str, Any], lines: dict[str, int], where: str) -> None:
@@ -129,15 +118,10 @@ def _check_keys(table: dict[str, Any], lines: dict[str, int], where: str) -> Non
     for key in table:
         if key not in fields:
             hint = suggest(key[:40], fields)
-            raise DataError(_one_line(f"{where}:{lines.get(key, 1)}: unknown key '{key[:40]}'{hint}"))
+            raise DataError(f"{where}:{lines.get(key, 1)}: unknown key '{key[:40]}'{hint}")
     for key, field in fields.items():
         if field.is_required() and key not in table:
             raise DataError(f"{where}: the key '{key}' is missing; needed: colour, depth, depth_unit_m, and more")
-
-
-def _one_line(message: str) -> str:
-    line = "".join(character if character.isprintable() else " " for character in message)
-    return line if len(line) <= MAX_MESSAGE_LENGTH else f"{line[:MAX_MESSAGE_LENGTH]}..."
 
 
 MAX_NUMBER = 2**31 - 1  # maps keep the numbers of frames in 32 bits; time stamps in names do not fit

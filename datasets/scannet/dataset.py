@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -13,99 +13,42 @@ from pydantic import BaseModel, ConfigDict
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.types import Float64Array, Frame, GroundTruth, InstanceMesh, Surface
 from su3d_bench.datasets import openscan
-from su3d_bench.datasets.recordings.file_dataset import FileDataset, keeps_last
+from su3d_bench.datasets.recordings.file_dataset import FileDataset, SceneTree, faults_of, keeps_last, shortened
 from su3d_bench.datasets.recordings.source import Grid, RgbdSource, make_registration
-from su3d_bench.datasets.scannet.folders import (
-    OVO_SCENES,
-    PAPER_SCENES,
-    SPLITS,
-    ScanFolders,
-    find_scans,
-    split_scenes,
-)
-from su3d_bench.datasets.scannet.recordings import (
-    ScannetFrames,
-    SourceKind,
-    Walk,
-    classify_poses,
-    describe_recording,
-    digest_recording,
-    faulty_pose,
-    find_source,
-    folder_of_recording,
-    read_walk,
-)
-from su3d_bench.datasets.scannet.truth import (
-    FIRST_TABLE_NAME,
-    TABLE_NAME,
-    AnnotatedScan,
-    LabelTable,
-    aggregation_name,
-    aligned,
-    instance_mesh,
-    labels_name,
-    mesh_name,
-    meta_name,
-    moved,
-    nyu40_label_set,
-    nyu40_truth,
-    read_annotated_scan,
-    read_axis_alignment,
-    read_label_table,
-    read_objects,
-    read_segments,
-    read_surface,
-    scannet200_truth,
-    segments_name,
-    truth_names,
-)
+from su3d_bench.datasets.scannet import folders, recordings, truth
 from su3d_bench.formats.ply import read_ply
-
-MOST_POSES = 20  # named one by one; the rest is counted
 
 
 def recording_problems(open_source: Callable[[], RgbdSource], grid: Grid, where: str) -> Iterator[str]:
     """Faults of the recording's index, its cameras and its poses."""
     try:
         source = open_source()
-        walk, is_faulty = classify_poses(source)
+        walk, is_faulty = recordings.classify_poses(source)
     except DataError as error:
         yield str(error)
         return
     numbers = walk.numbers[np.flatnonzero(is_faulty)]
-    yield from (faulty_pose(where, int(number)) for number in numbers[:MOST_POSES])
-    if len(numbers) > MOST_POSES:
-        yield f"{where}: {len(numbers) - MOST_POSES} more poses are not rigid motions"
-    if len(numbers) == 0:
-        yield from _fault(read_walk, source)
-    yield from _fault(make_registration, source.camera, grid, where)
+    yield from shortened((recordings.faulty_pose(where, int(number)) for number in numbers), where)
+    reads = [] if len(numbers) else [partial(recordings.read_walk, source)]
+    yield from faults_of([*reads, partial(make_registration, source.camera, grid, where)])
 
 
 def annotation_problems(files: Mapping[str, Path], scan: str, where: str) -> Iterator[str]:
     """Faults of the files that there are (by their names), each alone and, where all of the truth is, together."""
     readers: dict[str, Callable[[Path], object]] = {
-        TABLE_NAME: lambda path: read_label_table(path, where),
-        FIRST_TABLE_NAME: lambda path: read_label_table(path, where),
+        truth.TABLE_NAME: lambda path: truth.read_label_table(path, where),
+        truth.FIRST_TABLE_NAME: lambda path: truth.read_label_table(path, where),
         openscan.RAW_NAME: openscan.read_attributes,
-        meta_name(scan): lambda path: read_axis_alignment(path, where),
-        segments_name(scan): lambda path: read_segments(path, scan, where),
-        aggregation_name(scan): lambda path: read_objects(path, scan, where),
-        mesh_name(scan): lambda path: read_ply(path, f"{where}: {path.name}"),
-        labels_name(scan): lambda path: read_ply(path, f"{where}: {path.name}"),
+        truth.meta_name(scan): lambda path: truth.read_axis_alignment(path, where),
+        truth.segments_name(scan): lambda path: truth.read_segments(path, scan, where),
+        truth.aggregation_name(scan): lambda path: truth.read_objects(path, scan, where),
+        truth.mesh_name(scan): lambda path: read_ply(path, f"{where}: {path.name}"),
+        truth.labels_name(scan): lambda path: read_ply(path, f"{where}: {path.name}"),
     }
-    faults = [line for name, read in readers.items() if name in files for line in _fault(read, files[name])]
-    yield from faults
-    if set(truth_names(scan)) <= set(files):
-        yield from (line for line in _fault(read_annotated_scan, files, scan, where) if line not in faults)
-
-
-def _fault(read: Callable[..., object], *arguments: object) -> list[str]:
-    """The line that ``read`` fails with; none where it does not."""
-    try:
-        read(*arguments)
-    except DataError as error:
-        return [str(error)]
-    return []
+    reads: list[Callable[[], object]] = [partial(read, files[name]) for name, read in readers.items() if name in files]
+    if set(truth.truth_names(scan)) <= set(files):
+        reads.append(partial(truth.read_annotated_scan, files, scan, where))
+    yield from faults_of(reads)
 
 
 class ScannetOptions(BaseModel):
@@ -114,7 +57,7 @@ class ScannetOptions(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    source: SourceKind = "auto"
+    source: recordings.SourceKind = "auto"
     grid: Grid = "depth"
     axis_align: bool = False
 
@@ -138,27 +81,24 @@ class ScanNet(FileDataset[ScannetOptions]):
     further_truths = openscan.FURTHER_TRUTHS
     Options = ScannetOptions
 
-    def find_tree(self) -> ScanFolders:
-        return find_scans(self.root)
-
-    @property
-    def scans(self) -> ScanFolders:
-        """The tree of scenes, with all folders of each."""
-        assert isinstance(self.tree, ScanFolders)
-        return self.tree
+    def find_tree(self) -> SceneTree:
+        return folders.find_scans(self.root)
 
     def groups(self) -> Mapping[str, Sequence[str]]:
         """The official splits, and the five scenes of the paper and of OVO, by name; whether they are here or not."""
-        return {split: split_scenes(split) for split in SPLITS} | {"paper": PAPER_SCENES, "ovo": OVO_SCENES}
+        return {split: folders.split_scenes(split) for split in folders.SPLITS} | {
+            "paper": folders.PAPER_SCENES,
+            "ovo": folders.OVO_SCENES,
+        }
 
     def status(self, scene: str) -> str:
         """A word on the scene from a quick look: frames, those without a pose among them, and ground truth."""
-        frames = describe_recording(self.folder(scene), scene, self.where(scene), self.options.source)
+        frames = recordings.describe_recording(self.folder(scene), scene, self.where(scene), self.options.source)
         try:
             self._truth_files(scene)
         except GroundTruthMissing as error:
             return f"{frames}, {str(error).partition(': ')[2]}"
-        table = "" if self.scans.find_label_table() else f", no ScanNet200: {TABLE_NAME} is missing"
+        table = "" if folders.find_table(self.tree) else f", no ScanNet200: {truth.TABLE_NAME} is missing"
         return f"{frames}, ground truth{table}"
 
     def n_frames(self, scene: str, stride: int) -> int:
@@ -170,14 +110,14 @@ class ScanNet(FileDataset[ScannetOptions]):
         source, walk = self._open(scene)
         registration = make_registration(source.camera, self.options.grid, self.where(scene))
         self.warn_once(scene, walk.say_what_is_lost(self.where(scene)))
-        return ScannetFrames(source, registration, walk, walk.every(stride), self._motion(scene))
+        return recordings.ScannetFrames(source, registration, walk, walk.every(stride), self._motion(scene))
 
     def recording_files(self, scene: str) -> Sequence[Path]:
         return self._open(scene)[0].files()
 
     def recording_key(self, scene: str) -> str:
         source, walk = self._open(scene)
-        return digest_recording(source, walk.poses)
+        return recordings.digest_recording(source, walk.poses)
 
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:
         attributes = variant in self.further_truths
@@ -186,14 +126,14 @@ class ScanNet(FileDataset[ScannetOptions]):
     def own_truth(self, scene: str, variant: str) -> GroundTruth:
         scan = self._annotated_scan(scene)
         if variant == "nyu40-vertices":
-            return nyu40_truth(scan, self._label_tables)
-        table = next((table for table in self._label_tables if table.name == TABLE_NAME), None)
+            return truth.nyu40_truth(scan, self._label_tables)
+        table = next((table for table in self._label_tables if table.name == truth.TABLE_NAME), None)
         if table is None:
             raise GroundTruthMissing(
-                f"{self.where(scene)}: no ground truth '{variant}'; {TABLE_NAME} of the release is missing, put it "
-                f"into {self.scans.table_folders()[0]}"
+                f"{self.where(scene)}: no ground truth '{variant}'; {truth.TABLE_NAME} of the release is missing, put "
+                f"it into {folders.table_folders(self.tree)[0]}"
             )
-        return scannet200_truth(scan, table)
+        return truth.scannet200_truth(scan, table)
 
     def _attribute_truth(self, scene: str, variant: str) -> GroundTruth:
         """OpenScan's attributes of the annotated objects; void where an object has none."""
@@ -201,7 +141,7 @@ class ScanNet(FileDataset[ScannetOptions]):
         if path is None:
             raise GroundTruthMissing(
                 f"{where}: no ground truth '{variant}'; {openscan.RAW_NAME} is missing, get it by {openscan.PAGE} and "
-                f"put it into {self.scans.table_folders()[0]}"
+                f"put it into {folders.table_folders(self.tree)[0]}"
             )
         attributes = self._attributes.get(scene)
         if attributes is None:
@@ -219,42 +159,44 @@ class ScanNet(FileDataset[ScannetOptions]):
 
     @property
     def _openscan(self) -> Path | None:
-        return self.scans.find_label_table(openscan.RAW_NAME)
+        return folders.find_table(self.tree, openscan.RAW_NAME)
 
     def instance_mesh(self, scene: str) -> InstanceMesh:
-        return instance_mesh(self._annotated_scan(scene), self._label_tables)
+        return truth.instance_mesh(self._annotated_scan(scene), self._label_tables)
 
     def surface(self, scene: str) -> Surface:
         """The decimated mesh, with the published segments where they are here; scans without truth have both."""
         self.folder(scene)
-        mesh = self.scans.find_file(scene, mesh_name(scene))
+        mesh = folders.find_file(self.tree, scene, truth.mesh_name(scene))
         if mesh is None:
             raise DataError(
-                f"{self.where(scene)}: no mesh; {mesh_name(scene)} is missing, copy it into "
-                f"{self.scans.folders[scene][0]}"
+                f"{self.where(scene)}: no mesh; {truth.mesh_name(scene)} is missing, copy it into "
+                f"{self.tree.folders[scene][0]}"
             )
-        surface = read_surface(mesh, self.scans.find_file(scene, segments_name(scene)), scene, self.where(scene))
+        surface = truth.read_surface(
+            mesh, folders.find_file(self.tree, scene, truth.segments_name(scene)), scene, self.where(scene)
+        )
         motion = self._motion(scene)
-        return surface if motion is None else replace(surface, vertices=moved(surface.vertices, motion))
+        return surface if motion is None else replace(surface, vertices=truth.moved(surface.vertices, motion))
 
     def problems(self, scene: str) -> Iterator[str]:
         """Every fault of the scene's files, one line each; the readers stop at the first."""
         where, folder = self.where(scene), self.folder(scene)
         yield from recording_problems(
-            lambda: find_source(folder, scene, where, self.options.source), self.options.grid, where
+            lambda: recordings.find_source(folder, scene, where, self.options.source), self.options.grid, where
         )
         yield from annotation_problems({path.name: path for path in self.small_files(scene)}, scene, where)
 
     def folder(self, scene: str) -> Path:
         """The folder of the scan with its recording."""
         super().folder(scene)
-        return folder_of_recording(self.scans.folders[scene], scene, self.options.source)
+        return recordings.folder_of_recording(self.tree.folders[scene], scene, self.options.source)
 
     @keeps_last
-    def _open(self, scene: str) -> tuple[RgbdSource, Walk]:
+    def _open(self, scene: str) -> tuple[RgbdSource, recordings.Walk]:
         """The recording of ``scene`` and its poses."""
-        source = find_source(self.folder(scene), scene, self.where(scene), self.options.source)
-        return source, read_walk(source)
+        source = recordings.find_source(self.folder(scene), scene, self.where(scene), self.options.source)
+        return source, recordings.read_walk(source)
 
     def _motion(self, scene: str) -> Float64Array | None:
         """What is applied to the world; None for nothing."""
@@ -265,46 +207,51 @@ class ScanNet(FileDataset[ScannetOptions]):
         return np.eye(4) if self.options.axis_align else self._alignment(scene)
 
     def _alignment(self, scene: str) -> Float64Array:
-        path = self.scans.find_file(scene, meta_name(scene))
+        path = folders.find_file(self.tree, scene, truth.meta_name(scene))
         if path is None:
             raise DataError(
-                f"{self.where(scene)}: {meta_name(scene)} is missing; what lies along the walls needs it, copy it "
-                f"into {self.scans.folders[scene][0]}"
+                f"{self.where(scene)}: {truth.meta_name(scene)} is missing; what lies along the walls needs it, copy "
+                f"it into {self.tree.folders[scene][0]}"
             )
-        return read_axis_alignment(path, self.where(scene))
+        return truth.read_axis_alignment(path, self.where(scene))
 
     def nyu40_class(self, category: str) -> str | None:
         """The class of NYU40 that the table of the release gives a raw category; None where it has none."""
-        table = next((table for table in self._label_tables if table.name == TABLE_NAME), None)
+        table = next((table for table in self._label_tables if table.name == truth.TABLE_NAME), None)
         if table is None:
             raise DataError(
-                f"{self.name}: {TABLE_NAME} of the release is missing, by which names of objects have classes; put it "
-                f"into {self.scans.table_folders()[0]}"
+                f"{self.name}: {truth.TABLE_NAME} of the release is missing, by which names of objects have classes; "
+                f"put it into {folders.table_folders(self.tree)[0]}"
             )
         class_id = table.nyu40_of.get(category)
-        return None if class_id is None else nyu40_label_set().name_of(class_id)
+        return None if class_id is None else truth.nyu40_label_set().name_of(class_id)
 
     @cached_property
-    def _label_tables(self) -> Sequence[LabelTable]:
-        return [read_label_table(path, self.name) for path in self.scans.label_tables()]
+    def _label_tables(self) -> Sequence[truth.LabelTable]:
+        return [truth.read_label_table(path, self.name) for path in folders.label_tables(self.tree)]
 
     def small_files(self, scene: str) -> tuple[Path, ...]:
-        paths = [self.scans.find_file(scene, name) for name in (meta_name(scene), *truth_names(scene))]
-        return tuple(path for path in (*paths, *self.scans.label_tables(), self._openscan) if path is not None)
+        paths = [
+            folders.find_file(self.tree, scene, name) for name in (truth.meta_name(scene), *truth.truth_names(scene))
+        ]
+        return tuple(path for path in (*paths, *folders.label_tables(self.tree), self._openscan) if path is not None)
 
     def _truth_files(self, scene: str) -> dict[str, Path]:
         """The path of each file of the truth."""
         self.folder(scene)
-        path_of = {name: self.scans.find_file(scene, name) for name in truth_names(scene)}
+        path_of = {name: folders.find_file(self.tree, scene, name) for name in truth.truth_names(scene)}
         missing = [name for name, path in path_of.items() if path is None]
         if missing:
-            reason = f"; expected in {self.scans.folders[scene][0]}"
-            if scene in split_scenes("test"):
+            reason = f"; expected in {self.tree.folders[scene][0]}"
+            if scene in folders.split_scenes("test"):
                 reason = "; the benchmark keeps that of its test scans to itself"
             raise GroundTruthMissing(f"{self.where(scene)}: no ground truth, {missing[0]} is missing{reason}")
         return {name: path for name, path in path_of.items() if path is not None}
 
     @keeps_last
-    def _annotated_scan(self, scene: str) -> AnnotatedScan:
-        scan, motion = read_annotated_scan(self._truth_files(scene), scene, self.where(scene)), self._motion(scene)
-        return scan if motion is None else aligned(scan, motion)
+    def _annotated_scan(self, scene: str) -> truth.AnnotatedScan:
+        scan, motion = (
+            truth.read_annotated_scan(self._truth_files(scene), scene, self.where(scene)),
+            self._motion(scene),
+        )
+        return scan if motion is None else truth.aligned(scan, motion)

@@ -21,9 +21,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field, Strict, StringConstraints
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.geometry import are_rigid
@@ -38,17 +39,9 @@ from su3d_bench.core.types import (
     LabelSet,
     Surface,
 )
-from su3d_bench.datasets.recordings.meshes import (
-    check_one_mesh,
-    face_corners,
-    majority,
-    segment_ids,
-    vertex_positions,
-    whole_number,
-    with_segments,
-)
-from su3d_bench.formats.arrays import parsed_json, read_text
-from su3d_bench.formats.images import read_bytes
+from su3d_bench.datasets.recordings import meshes
+from su3d_bench.formats.arrays import read_text
+from su3d_bench.formats.json_models import FileModel, SegmentIds, read_json
 from su3d_bench.formats.ply import ListColumn, read_ply
 
 PREFIX = "scannet."  # before scene ids and file names of the second release, not of the first
@@ -56,13 +49,33 @@ PREFIX = "scannet."  # before scene ids and file names of the second release, no
 MAX_OBJECT_ID = 998
 
 
-@dataclass(frozen=True)
-class AnnotatedObject:
+class AnnotatedObject(FileModel):
     """One object: its number in the scan, the raw category, and the ids of its segments."""
 
-    id: int
-    category: str
-    segments: Int64Array
+    id: Annotated[int, Strict(False), Field(ge=0, le=MAX_OBJECT_ID)]
+    category: Annotated[str, StringConstraints(strip_whitespace=True)] = Field(alias="label")
+    segments: SegmentIds
+
+
+class ScanFile(FileModel):
+    """A file that says of itself to which scan it belongs; Segmentator names it after the mesh file."""
+
+    sceneId: str  # noqa: N815 - as in the file
+
+    def check_scan(self, scan: str, where: str) -> None:
+        if self.sceneId.removeprefix(PREFIX) not in (scan, f"{scan}_vh_clean_2"):
+            raise DataError(
+                f"{where}: 'sceneId' is {ascii(self.sceneId)[:80]}, not '{scan}'; this file belongs to another scan"
+            )
+
+
+class Segmentation(ScanFile):
+    segIndices: SegmentIds  # noqa: N815 - as in the file
+
+
+class Aggregation(ScanFile):
+    segmentsFile: str  # noqa: N815 - as in the file
+    segGroups: list[AnnotatedObject]  # noqa: N815 - as in the file
 
 
 def segments_name(scan: str) -> str:
@@ -75,32 +88,26 @@ def aggregation_name(scan: str) -> str:
 
 def read_segments(path: Path, scan: str, where: str) -> Int64Array:
     """The segment id of every vertex, in the order of the mesh; ``where`` begins each message."""
-    where = f"{where}: {path.name}"
-    return segment_ids(_read_table(path, scan, where).get("segIndices"), f"{where}: 'segIndices'")
+    content = read_json(path, f"{where}: {path.name}", Segmentation)
+    content.check_scan(scan, f"{where}: {path.name}")
+    return np.array(content.segIndices, np.int64)
 
 
 def read_objects(path: Path, scan: str, where: str) -> list[AnnotatedObject]:
     """The objects in the order of the file, which must refer to the segments of the decimated mesh."""
     where = f"{where}: {path.name}"
-    content = _read_table(path, scan, where)
-    segments_file = content.get("segmentsFile")
-    if not isinstance(segments_file, str) or segments_file.removeprefix(PREFIX) != segments_name(scan):
+    content = read_json(path, where, Aggregation)
+    content.check_scan(scan, where)
+    if content.segmentsFile.removeprefix(PREFIX) != segments_name(scan):
         raise DataError(
-            f"{where}: 'segmentsFile' is {_clip(segments_file)}, but {segments_name(scan)} is read; take the "
-            "aggregation that belongs to it"
+            f"{where}: 'segmentsFile' is {ascii(content.segmentsFile)[:80]}, but {segments_name(scan)} is read; take "
+            "the aggregation that belongs to it"
         )
-    groups = content.get("segGroups")
-    if not isinstance(groups, list):
-        raise DataError(f"{where}: has no list 'segGroups'; copy the file again")
-    objects = [_read_object(group, f"{where}: group {row}") for row, group in enumerate(groups)]
     category_of: dict[int, str] = {}
-    for entry in objects:
+    for entry in content.segGroups:
         if category_of.setdefault(entry.id, entry.category) != entry.category:
-            raise DataError(
-                f"{where}: object {entry.id} stands there twice, as {_clip(category_of[entry.id])} and as "
-                f"{_clip(entry.category)}"
-            )
-    return objects
+            raise DataError(f"{where}: object {entry.id} stands there twice, with two categories; copy the file again")
+    return content.segGroups
 
 
 def object_of_vertex(segments: Int64Array, objects: Sequence[AnnotatedObject]) -> Int64Array:
@@ -108,41 +115,8 @@ def object_of_vertex(segments: Int64Array, objects: Sequence[AnnotatedObject]) -
     ids, segment_rows = np.unique(segments, return_inverse=True)
     owner = np.full(len(ids), -1, np.int64)
     for row, entry in enumerate(objects):
-        owner[np.isin(ids, entry.segments)] = row
+        owner[np.isin(ids, np.array(entry.segments, np.int64))] = row
     return owner[segment_rows.reshape(-1)] if len(ids) else np.zeros(0, np.int64)
-
-
-def _read_table(path: Path, scan: str, where: str) -> dict[str, Any]:
-    """The JSON object in a file that says of itself that it belongs to ``scan``."""
-    content = parsed_json(read_bytes(path, where), where)
-    if not isinstance(content, dict):
-        raise DataError(f"{where}: is no JSON object; copy the file again")
-    scene = content.get("sceneId")
-    # Segmentator names the scene after the mesh file when a user runs it.
-    belongs = isinstance(scene, str) and scene.removeprefix(PREFIX) in (scan, f"{scan}_vh_clean_2")
-    if not belongs:
-        raise DataError(f"{where}: 'sceneId' is {_clip(scene)}, not '{scan}'; this file belongs to another scan")
-    return content
-
-
-def _read_object(group: Any, where: str) -> AnnotatedObject:
-    if not isinstance(group, dict):
-        raise DataError(f"{where} is no JSON object; copy the file again")
-    number = whole_number(group.get("id"))
-    if number is None or number > MAX_OBJECT_ID:
-        raise DataError(
-            f"{where}: 'id' is {_clip(group.get('id'))}; expected 0 to {MAX_OBJECT_ID}, since ground truth is "
-            "label * 1000 + id + 1"
-        )
-    category = group.get("label")
-    if not isinstance(category, str):
-        raise DataError(f"{where}: 'label' is {_clip(category)}; expected a category")
-    return AnnotatedObject(number, category.strip(), segment_ids(group.get("segments"), f"{where}: 'segments'"))
-
-
-def _clip(value: Any) -> str:
-    """The value as it may stand in a message."""
-    return ascii(value)[:80]
 
 
 LABEL_SPACE = "scannet"
@@ -277,7 +251,7 @@ def read_annotated_scan(files: Mapping[str, Path], scan: str, where: str) -> Ann
     segments = read_segments(files[segments_name(scan)], scan, where)
     objects = read_objects(files[aggregation_name(scan)], scan, where)
     vertices, triangles = _mesh(files[mesh_name(scan)], f"{where}: {mesh_name(scan)}")
-    check_one_mesh(len(segments), len(vertices), (segments_name(scan), mesh_name(scan)), where)
+    meshes.check_one_mesh(len(segments), len(vertices), (segments_name(scan), mesh_name(scan)), where)
     labels = _labels(files[labels_name(scan)], vertices, f"{where}: {labels_name(scan)}", mesh_name(scan))
     return AnnotatedScan(where, vertices, triangles, labels, objects, object_of_vertex(segments, objects))
 
@@ -288,8 +262,8 @@ def read_surface(mesh: Path, segments: Path | None, scan: str, where: str) -> Su
     if segments is None:
         return Surface(vertices, triangles)
     ids = read_segments(segments, scan, where)
-    check_one_mesh(len(ids), len(vertices), (segments_name(scan), mesh_name(scan)), where)
-    return with_segments(Surface(vertices, triangles), ids)
+    meshes.check_one_mesh(len(ids), len(vertices), (segments_name(scan), mesh_name(scan)), where)
+    return meshes.with_segments(Surface(vertices, triangles), ids)
 
 
 def moved(vertices: Float32Array, motion: Float64Array) -> Float32Array:
@@ -305,7 +279,7 @@ def aligned(scan: AnnotatedScan, motion: Float64Array) -> AnnotatedScan:
 def _labels(path: Path, vertices: Float32Array, where: str, mesh: str) -> Int64Array:
     """The labels of a mesh that must be the one of ``vertices``, vertex by vertex."""
     file = read_ply(path, where)
-    labelled = vertex_positions(file, where)
+    labelled = meshes.vertex_positions(file, where)
     if len(labelled) != len(vertices):
         raise DataError(f"{where}: has {len(labelled)} vertices, {mesh} has {len(vertices)}; they belong to two meshes")
     is_elsewhere = np.abs(labelled.astype(np.float64) - vertices).max(axis=1) > SAME_PLACE_M
@@ -328,10 +302,10 @@ def _labels(path: Path, vertices: Float32Array, where: str, mesh: str) -> Int64A
 def _mesh(path: Path, where: str) -> tuple[Float32Array, Int32Array]:
     """Vertices (V, 3) and rows of three of them; none where the file has no faces."""
     file = read_ply(path, where)
-    vertices, element = vertex_positions(file, where), file.element("face")
+    vertices, element = meshes.vertex_positions(file, where), file.element("face")
     if element is None or element.n_rows == 0:
         return vertices, np.zeros((0, 3), np.int32)
-    corners = face_corners(element, len(vertices), where)
+    corners = meshes.face_corners(element, len(vertices), where)
     if (corners.lengths != 3).any():
         raise DataError(f"{where}: faces are no triangles of 'vertex_indices'; expected the mesh of the release")
     return vertices, corners.values.reshape(-1, 3).astype(np.int32)
@@ -414,7 +388,7 @@ def instance_mesh(scan: AnnotatedScan, tables: Sequence[LabelTable]) -> Instance
     return InstanceMesh(
         scan.vertices,
         scan.triangles,
-        majority(instance, scan.triangles),
+        meshes.majority(instance, scan.triangles),
         {int(instance_id): int(class_id) for instance_id, class_id in zip(ids, classes, strict=True) if class_id > 0},
         nyu40_label_set(),
     )

@@ -18,23 +18,7 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.files.atomic import make_folder, write_text
 from su3d_bench.core.system.files import file_bytes, file_text, parse_toml
 from su3d_bench.core.types import Float64Array, Frame, Int64Array, UInt8Array
-from su3d_bench.datasets.scannet.sens import (
-    FRAME_RECORD,
-    MICROSECONDS,
-    MOTION_RECORD,
-    SensFrame,
-    SensHeader,
-    write_sens,
-)
-from su3d_bench.datasets.scannet.truth import (
-    TABLE_NAME,
-    aggregation_name,
-    labels_name,
-    mesh_name,
-    meta_name,
-    segments_name,
-    truth_names,
-)
+from su3d_bench.datasets.scannet import sens, truth
 from su3d_bench.datasets.writing import Layout, SceneTarget, write_shared_text
 from su3d_bench.formats.images import JPEG_QUALITY, depth_in_units, image_size, jpeg_bytes, list_column, triangles_of
 from su3d_bench.formats.ply import Column, PlyElement, write_ply
@@ -124,11 +108,13 @@ def write_scan_truth(dataset: Rooms, scene: str, scan: str, folder: Path) -> lis
     labels = nyu40_of[owner]
     faces = triangles_of(surface.faces)
     face_element = PlyElement("face", len(faces), {"vertex_indices": list_column(faces)})
-    write_ply(folder / mesh_name(scan), [_vertices(surface, surface.colours, {}), face_element])
+    write_ply(folder / truth.mesh_name(scan), [_vertices(surface, surface.colours, {}), face_element])
     label_colours = np.array(nyu40_colours(), np.uint8)[labels]
-    write_ply(folder / labels_name(scan), [_vertices(surface, label_colours, {"label": labels}), face_element])
+    write_ply(folder / truth.labels_name(scan), [_vertices(surface, label_colours, {"label": labels}), face_element])
     params = {"minCosine": str(MIN_COSINE)}
-    _write_json(folder / segments_name(scan), {"params": params, "sceneId": scan, "segIndices": segments.tolist()})
+    _write_json(
+        folder / truth.segments_name(scan), {"params": params, "sceneId": scan, "segIndices": segments.tolist()}
+    )
     seen = [known for known in objects if (owner == known.id).any()]
     groups = [
         {"id": annotation_id(known), "objectId": annotation_id(known),
@@ -136,8 +122,10 @@ def write_scan_truth(dataset: Rooms, scene: str, scan: str, folder: Path) -> lis
         for known in seen
     ]  # fmt: skip
     aggregation = {"sceneId": f"scannet.{scan}", "appId": "su3d-bench", "segGroups": groups}
-    _write_json(folder / aggregation_name(scan), aggregation | {"segmentsFile": f"scannet.{segments_name(scan)}"})
-    write_text(folder / meta_name(scan), _facts_of(dataset, scene))
+    _write_json(
+        folder / truth.aggregation_name(scan), aggregation | {"segmentsFile": f"scannet.{truth.segments_name(scan)}"}
+    )
+    write_text(folder / truth.meta_name(scan), _facts_of(dataset, scene))
     return seen
 
 
@@ -230,11 +218,11 @@ class ScannetLayout(Layout):
     def target(self, scene: str, key: str, out: Path) -> SceneTarget:
         scan = scan_name(scene)
         folder = out / SCANS_FOLDER / scan
-        truth = tuple(folder / name for name in (*truth_names(scan), meta_name(scan)))
-        return SceneTarget(scene, key, folder, f"{scan}.sens", truth)
+        names = *truth.truth_names(scan), truth.meta_name(scan)
+        return SceneTarget(scene, key, folder, f"{scan}.sens", tuple(folder / name for name in names))
 
     def write_shared(self, dataset: Rooms, scene: str, out: Path) -> None:
-        write_shared_text(out / TABLE_NAME, label_table_text(), "is another label table than that of the rooms")
+        write_shared_text(out / truth.TABLE_NAME, label_table_text(), "is another label table than that of the rooms")
 
     def write_truth(self, dataset: Rooms, target: SceneTarget) -> None:
         write_scan_truth(dataset, target.scene, target.folder.name, target.partial)
@@ -243,17 +231,17 @@ class ScannetLayout(Layout):
         return (f"{PIECES}/{index:06d}.record",)
 
     def frame_files(self, frame: Frame) -> Sequence[bytes]:
-        time = round(frame.timestamp_s * MICROSECONDS)
+        time = round(frame.timestamp_s * sens.MICROSECONDS)
         depth = zlib.compress(depth_in_units(frame.depth_m, DEPTH_SHIFT).astype("<u2").tobytes())
-        return (SensFrame(frame.camera_to_world, time, time, jpeg_bytes(frame.rgb), depth).stored,)
+        return (sens.SensFrame(frame.camera_to_world, time, time, jpeg_bytes(frame.rgb), depth).stored,)
 
     def join(self, dataset: Rooms, target: SceneTarget) -> None:
         if not target.has_frames:
             n_frames = len(dataset.frames(target.scene, 1))
             pieces = [target.partial / name for index in range(n_frames) for name in self.frame_names(index)]
-            header = sens_header(dataset.intrinsics, size_of(file_bytes(pieces[0])[FRAME_RECORD.itemsize :]))
+            header = sens_header(dataset.intrinsics, size_of(file_bytes(pieces[0])[sens.FRAME_RECORD.itemsize :]))
             records = (file_bytes(piece) for piece in pieces)
-            write_sens(target.partial / target.frames, header, records, np.zeros(0, MOTION_RECORD))
+            sens.write_sens(target.partial / target.frames, header, records)
         if (target.partial / PIECES).exists():
             shutil.rmtree(target.partial / PIECES)
 
@@ -272,10 +260,10 @@ def intrinsics_4x4(intrinsics: Float64Array) -> Float64Array:
     return matrix.astype(np.float32).astype(np.float64)
 
 
-def sens_header(intrinsics: Float64Array, size: tuple[int, int]) -> SensHeader:
+def sens_header(intrinsics: Float64Array, size: tuple[int, int]) -> sens.SensHeader:
     """The header of a recording whose two cameras are one."""
     camera, (width, height) = intrinsics_4x4(intrinsics), size
-    return SensHeader(
+    return sens.SensHeader(
         sensor_name=SENSOR_NAME,
         intrinsic_colour=camera,
         extrinsic_colour=np.eye(4),

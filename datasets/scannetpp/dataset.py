@@ -20,30 +20,8 @@ from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, Surface
 from su3d_bench.datasets.openlex3d import release as openlex3d
 from su3d_bench.datasets.recordings.file_dataset import FileDataset, faults_of, keeps_last, sizes_and_ends
 from su3d_bench.datasets.recordings.recorded_frames import reading
-from su3d_bench.datasets.scannetpp.frames import (
-    IphoneFrames,
-    IphoneRecording,
-    PoseSource,
-    describe_recording,
-    open_recording,
-)
-from su3d_bench.datasets.scannetpp.truth import (
-    BASES,
-    BENCHMARK_FOLDER,
-    LABEL_SPACE,
-    LIST_NAMES,
-    MASK_NAME,
-    MESH_NAME,
-    SEGMENTS_NAME,
-    TRUTH_NAMES,
-    VARIANT,
-    AnnotatedScan,
-    instance_mesh,
-    read_annotated_scan,
-    read_benchmark_classes,
-    read_surface,
-    vertex_truth,
-)
+from su3d_bench.datasets.scannetpp import frames, truth
+from su3d_bench.datasets.scannetpp.frames import IphoneRecording
 from su3d_bench.formats.arrays import read_text
 
 SCENE_NAMES = r"[0-9a-f]{10}"
@@ -59,7 +37,7 @@ class ScannetppOptions(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    poses: PoseSource = "auto"
+    poses: frames.PoseSource = "auto"
     width: int = Field(default=640, ge=16, le=4096)  # ScanNet's depth camera
 
 
@@ -73,13 +51,13 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
     name = "scannetpp"
     reader_version = 2
     scene_names = SCENE_NAMES
-    places_of_scenes = tuple(f"{base}/data" if base else "data" for base in BASES)
+    places_of_scenes = tuple(f"{base}/data" if base else "data" for base in truth.BASES)
     how_to_get = (
         "/data or in scannetpp/data (a scene is a folder such as 036bce3393 with iphone/ and scans/); ask for the data "
         "at https://kaldir.vc.in.tum.de/scannetpp/ and set SU3D_DATA to where it is"
     )
-    label_space = LABEL_SPACE
-    variants = (VARIANT,)
+    label_space = truth.LABEL_SPACE
+    variants = (truth.VARIANT,)
     further_truths = openlex3d.FURTHER_TRUTHS
     labels_of = "scannetpp"
     Options = ScannetppOptions
@@ -109,7 +87,7 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
     def status(self, scene: str) -> str:
         """A word on the scene from a quick look: frames, and ground truth."""
         with reading(self.where(scene)):
-            words = describe_recording(self.folder(scene) / IPHONE, self.options.poses)
+            words = frames.describe_recording(self.folder(scene) / IPHONE, self.options.poses)
         try:
             self._truth_files(scene)
             self._benchmark_folder(scene)
@@ -125,14 +103,14 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
         those that have none once."""
         recording = self.recording(scene)
         self.warn_once(scene, recording.say_what_is_lost())
-        return IphoneFrames(recording, recording.every(stride), self.options.width)
+        return frames.IphoneFrames(recording, recording.every(stride), self.options.width)
 
     def recording_files(self, scene: str) -> Sequence[Path]:
         return self.recording(scene).files()
 
     def files(self, scene: str) -> Sequence[Path]:
         # A list of masked vertices may be empty: it is listed where it is not, because an empty file is else a fault.
-        return [path for path in super().files(scene) if path.name != MASK_NAME or path.stat().st_size]
+        return [path for path in super().files(scene) if path.name != truth.MASK_NAME or path.stat().st_size]
 
     def recording_key(self, scene: str) -> str:
         recording = self.recording(scene)
@@ -143,23 +121,23 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
             return poses + sizes_and_ends(recording.files()[len(posed.files) :], 1, _digest_of)
 
     def small_files(self, scene: str) -> tuple[Path, ...]:
-        paths = [self.folder(scene) / SCANS / name for name in TRUTH_NAMES]
+        paths = [self.folder(scene) / SCANS / name for name in truth.TRUTH_NAMES]
         lists = self._find_benchmark_folder(scene)
-        paths += [] if lists is None else [lists / name for name in LIST_NAMES]
+        paths += [] if lists is None else [lists / name for name in truth.LIST_NAMES]
         paths += openlex3d.label_files(self.root, self.name, scene)
         return tuple(path for path in paths if path.is_file())
 
     def own_truth(self, scene: str, variant: str) -> GroundTruth:
-        return vertex_truth(self.annotated_scan(scene))
+        return truth.vertex_truth(self.annotated_scan(scene))
 
     def instance_mesh(self, scene: str) -> InstanceMesh:
-        return instance_mesh(self.annotated_scan(scene))
+        return truth.instance_mesh(self.annotated_scan(scene))
 
     def surface(self, scene: str) -> Surface:
         """The mesh, with the published segments where they are here; scenes without truth have both."""
         folder = self.folder(scene) / SCANS
-        segments = folder / SEGMENTS_NAME
-        return read_surface(folder / MESH_NAME, segments if segments.is_file() else None, self.where(scene))
+        segments = folder / truth.SEGMENTS_NAME
+        return truth.read_surface(folder / truth.MESH_NAME, segments if segments.is_file() else None, self.where(scene))
 
     def problems(self, scene: str) -> Iterator[str]:
         """What is wrong with the recording's poses and with the truth, a line each; images are left to the frames."""
@@ -170,41 +148,43 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
     @keeps_last
     def recording(self, scene: str) -> IphoneRecording:
         with reading(self.where(scene)):
-            return open_recording(self.folder(scene) / IPHONE, self.where(scene), self.options.poses)
+            return frames.open_recording(self.folder(scene) / IPHONE, self.where(scene), self.options.poses)
 
     def _truth_files(self, scene: str) -> dict[str, Path]:
         """The path of each file of the truth."""
         folder = self.folder(scene) / SCANS
-        missing = [name for name in TRUTH_NAMES if not (folder / name).is_file()]
+        missing = [name for name in truth.TRUTH_NAMES if not (folder / name).is_file()]
         if missing:
             reason = f"expected in {folder}"
-            if missing[0] == MASK_NAME:
+            if missing[0] == truth.MASK_NAME:
                 reason += "; without it, vertices would be scored that the benchmark leaves out"
-            elif missing[0] != MESH_NAME:
+            elif missing[0] != truth.MESH_NAME:
                 reason += "; the benchmark keeps the annotation of its test scenes to itself"
             raise GroundTruthMissing(f"{self.where(scene)}: no ground truth, {missing[0]} is missing; {reason}")
-        return {name: folder / name for name in TRUTH_NAMES}
+        return {name: folder / name for name in truth.TRUTH_NAMES}
 
     def _find_benchmark_folder(self, scene: str) -> Path | None:
         """Where the lists of the benchmark lie, beside the scene first; None where none has all of them."""
         near = self.folder(scene).parent.parent
-        places = [release / BENCHMARK_FOLDER for release in (near, *self.releases)]
-        return next((place for place in places if all((place / name).is_file() for name in LIST_NAMES)), None)
+        places = [release / truth.BENCHMARK_FOLDER for release in (near, *self.releases)]
+        return next((place for place in places if all((place / name).is_file() for name in truth.LIST_NAMES)), None)
 
     def _benchmark_folder(self, scene: str) -> Path:
         lists = self._find_benchmark_folder(scene)
         if lists is None:
-            place = self.folder(scene).parent.parent / BENCHMARK_FOLDER
+            place = self.folder(scene).parent.parent / truth.BENCHMARK_FOLDER
             raise GroundTruthMissing(
-                f"{self.where(scene)}: no ground truth, the benchmark's lists {', '.join(LIST_NAMES)} are missing; "
-                f"they come with the data, put them into {place}"
+                f"{self.where(scene)}: no ground truth, the benchmark's lists {', '.join(truth.LIST_NAMES)} are "
+                f"missing; they come with the data, put them into {place}"
             )
         return lists
 
     @keeps_last
-    def annotated_scan(self, scene: str) -> AnnotatedScan:
+    def annotated_scan(self, scene: str) -> truth.AnnotatedScan:
         files, where = self._truth_files(scene), self.where(scene)
-        return read_annotated_scan(files, read_benchmark_classes(self._benchmark_folder(scene), where), where)
+        return truth.read_annotated_scan(
+            files, truth.read_benchmark_classes(self._benchmark_folder(scene), where), where
+        )
 
 
 def read_split(path: Path) -> tuple[str, ...]:

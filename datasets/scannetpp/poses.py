@@ -18,17 +18,19 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.geometry import are_rigid
+from su3d_bench.core.geometry import are_rigid, rotations_of
 from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.datasets.recordings.recorded_frames import numbers, pinhole, reading
-from su3d_bench.formats.arrays import parsed_json, read_text
-from su3d_bench.formats.images import MAX_PIXELS, Size, read_bytes
+from su3d_bench.formats.arrays import read_text
+from su3d_bench.formats.images import MAX_PIXELS, Size
+from su3d_bench.formats.json_models import FileModel, read_json
 
 COLMAP, CAMERAS_NAME, IMAGES_NAME = "colmap", "cameras.txt", "images.txt"
 TRACKING_NAME = "pose_intrinsic_imu.json"
@@ -46,6 +48,8 @@ N_PARAMETERS = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL":
 MOST_DISTORTION = 10.0  # an iPhone has 0.2
 MOST_LINE_BYTES = 16 << 20  # of the points of one image, which are some thousands
 HEAD_BYTES = 4096
+Row3 = Annotated[list[float], Field(min_length=3, max_length=3)]
+Row4 = Annotated[list[float], Field(min_length=4, max_length=4)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,42 +159,31 @@ def _inverse_pose(values: Sequence[float], where: str) -> Float64Array:
     if not all(math.isfinite(value) and abs(value) < 1e9 for value in values) or abs(length - 1) > 1e-2:
         raise DataError(f"{where}: expected a unit quaternion qw qx qy qz and a shift in metres; copy the file again")
     w, x, y, z = (value / length for value in values[:4])
-    to_camera = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    to_camera = rotations_of(np.array([[x, y, z, w]]))[0]
     pose = np.eye(4)
     pose[:3, :3] = to_camera.T
     pose[:3, 3] = -to_camera.T @ np.array(values[4:7])
     return pose
 
 
+class TrackedFrame(FileModel):
+    """What is read of a frame; numbers of a pose are not finite where tracking was lost."""
+
+    aligned_pose: Annotated[list[Row4], Field(min_length=4, max_length=4)]
+    intrinsic: Annotated[list[Row3], Field(min_length=3, max_length=3)]
+
+
 def read_tracking(path: Path, where: str, size: Size) -> PosedFrames:
     """Every frame of the video, whose images have that ``size``, with its ``aligned_pose``."""
     where = f"{where}: {path.name}"
-    content = parsed_json(read_bytes(path, where), where)
-    if not isinstance(content, dict) or not content:
-        raise DataError(f"{where}: is no JSON object with a key a frame; copy the file again")
-    entry_of: dict[int, Any] = {}
-    for name, entry in content.items():
-        number = frame_number(name, where)
-        if not isinstance(entry, dict) or number in entry_of:
-            raise DataError(f"{where}: frame {number} stands there twice or is no JSON object; copy the file again")
-        entry_of[number] = entry
+    entries = read_json(path, where, dict[str, TrackedFrame])
+    entry_of = {frame_number(name, where): entry for name, entry in entries.items()}
+    if not entry_of or len(entry_of) != len(entries):
+        raise DataError(f"{where}: has no frame, or one twice; copy the file again")
     order = sorted(entry_of)
-    poses = np.array(
-        [_matrix(entry_of[n].get("aligned_pose"), 4, f"{where}: frame {n}: 'aligned_pose'") for n in order]
-    )
-    cameras = [_matrix(entry_of[n].get("intrinsic"), 3, f"{where}: frame {n}: 'intrinsic'") for n in order]
-    intrinsics = np.array(
-        [
-            pinhole(k[0, 0], k[1, 1], k[0, 2], k[1, 2], f"{where}: frame {n}: 'intrinsic'")
-            for n, k in zip(order, cameras, strict=True)
-        ]
-    )
+    poses = np.array([entry_of[n].aligned_pose for n in order], np.float64)
+    cameras = [(entry_of[n].intrinsic, f"{where}: frame {n}: 'intrinsic'") for n in order]
+    intrinsics = np.array([pinhole(k[0][0], k[1][1], k[0][2], k[1][2], place) for k, place in cameras])
     is_elsewhere = np.abs(intrinsics[:, :2, 2] / np.array(size) - 0.5).max(axis=1) > OFF_CENTRE
     if is_elsewhere.any():
         row = int(is_elsewhere.argmax())
@@ -199,26 +192,11 @@ def read_tracking(path: Path, where: str, size: Size) -> PosedFrames:
             f"{intrinsics[row, 1, 2]:g}), the images have {size[0]}x{size[1]}; it belongs to images of another size"
         )
     is_finite = np.isfinite(poses).all(axis=(1, 2))
-    is_faulty = is_finite.copy()
-    is_faulty[is_finite] = ~are_rigid(poses[is_finite])
-    if is_faulty.any():
-        raise DataError(
-            f"{where}: frame {order[int(is_faulty.argmax())]}: 'aligned_pose' is not a rigid motion; copy the file "
-            "again"
-        )
+    faulty = [
+        n for n, pose in zip(order, poses, strict=True) if np.isfinite(pose).all() and not are_rigid(pose[None])[0]
+    ]
+    if faulty:
+        raise DataError(f"{where}: frame {faulty[0]}: 'aligned_pose' is not a rigid motion; copy the file again")
     if not is_finite.any():
         raise DataError(f"{where}: none of the {len(order)} frames has a pose; leave the scene out")
     return PosedFrames(np.array(order, np.int64), poses, intrinsics, size, np.zeros(4), (path,))
-
-
-def _matrix(value: Any, side: int, where: str) -> Float64Array:
-    """A square matrix as nested lists; its numbers may be not finite."""
-    rows = value if isinstance(value, list) and len(value) == side else []
-    is_matrix = all(isinstance(row, list) and len(row) == side for row in rows) and bool(rows)
-    entries = [entry for row in rows for entry in row] if is_matrix else []
-    if not entries or not all(isinstance(entry, int | float) and not isinstance(entry, bool) for entry in entries):
-        raise DataError(f"{where} is no matrix of {side}x{side} numbers; copy the file again")
-    try:
-        return np.array([float(entry) for entry in entries]).reshape(side, side)
-    except OverflowError:
-        raise DataError(f"{where} holds a number beyond all measure; copy the file again") from None

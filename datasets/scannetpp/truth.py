@@ -20,7 +20,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -28,8 +27,8 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, GroundTruth, InstanceMesh, Int32Array, Int64Array, LabelSet, Surface
 from su3d_bench.datasets.recordings import meshes
 from su3d_bench.datasets.recordings.recorded_frames import numbers
-from su3d_bench.formats.arrays import parsed_json, read_text
-from su3d_bench.formats.images import read_bytes
+from su3d_bench.formats.arrays import read_text
+from su3d_bench.formats.json_models import FileModel, SegmentIds, read_json
 
 MESH_NAME = "mesh_aligned_0.05.ply"
 MASK_NAME = "mesh_aligned_0.05_mask.txt"
@@ -37,36 +36,24 @@ SEGMENTS_NAME, OBJECTS_NAME = "segments.json", "segments_anno.json"
 MAX_VERTEX = re.compile(r"[0-9]{1,10}")
 
 
-@dataclass(frozen=True)
-class AnnotatedObject:
+class AnnotatedObject(FileModel):
     """One object: the word that the annotator typed, and the ids of its segments."""
 
-    word: str
-    segments: Int64Array
+    label: str
+    segments: SegmentIds
+
+
+class Segmentation(FileModel):
+    segIndices: SegmentIds  # noqa: N815 - as in the file
+
+
+class Annotation(FileModel):
+    segGroups: list[AnnotatedObject]  # noqa: N815 - as in the file
 
 
 def read_segments(path: Path, where: str) -> Int64Array:
     """The segment id of every vertex, in the order of the mesh; ``where`` begins each message."""
-    where = f"{where}: {path.name}"
-    return meshes.segment_ids(_read_table(path, where).get("segIndices"), f"{where}: 'segIndices'")
-
-
-def read_objects(path: Path, where: str) -> list[AnnotatedObject]:
-    """The objects in the order of the file."""
-    where = f"{where}: {path.name}"
-    groups = _read_table(path, where).get("segGroups")
-    if not isinstance(groups, list):
-        raise DataError(f"{where}: has no list 'segGroups'; copy the file again")
-    return [_read_object(group, f"{where}: group {row}") for row, group in enumerate(groups)]
-
-
-def _read_object(group: Any, where: str) -> AnnotatedObject:
-    if not isinstance(group, dict):
-        raise DataError(f"{where} is no JSON object; copy the file again")
-    word = group.get("label")
-    if not isinstance(word, str):
-        raise DataError(f"{where}: 'label' is {ascii(word)[:40]}; expected a word")
-    return AnnotatedObject(word, meshes.segment_ids(group.get("segments"), f"{where}: 'segments'"))
+    return np.array(read_json(path, f"{where}: {path.name}", Segmentation).segIndices, np.int64)
 
 
 def vertices_of_segments(segments: Int64Array) -> _Members:
@@ -105,13 +92,6 @@ def read_mask(path: Path, n_vertices: int, where: str) -> BoolArray:
         raise DataError(f"{where}: {wrong[:20]!a} is no vertex of {MESH_NAME}, which has {n_vertices} (from 0)")
     is_masked[[int(word) for word in words]] = True
     return is_masked
-
-
-def _read_table(path: Path, where: str) -> dict[str, Any]:
-    content = parsed_json(read_bytes(path, where), where)
-    if not isinstance(content, dict):
-        raise DataError(f"{where}: is no JSON object; copy the file again")
-    return content
 
 
 BASES = ("", "scannetpp", "ScanNetPP", "ScanNet++", "scannetpp_v2", "scannetpp_v1", "scannetpp/v2", "scannetpp/v1")
@@ -234,11 +214,11 @@ class AnnotatedScan:
 def read_annotated_scan(files: Mapping[str, Path], classes: BenchmarkClasses, where: str) -> AnnotatedScan:
     """The mesh with its annotation; ``files`` has the path of each of ``TRUTH_NAMES``."""
     segments = read_segments(files[SEGMENTS_NAME], where)
-    objects = read_objects(files[OBJECTS_NAME], where)
+    objects = read_json(files[OBJECTS_NAME], f"{where}: {OBJECTS_NAME}", Annotation).segGroups
     surface = read_surface(files[MESH_NAME], None, where)
     n = len(surface.vertices)
     meshes.check_one_mesh(len(segments), n, (SEGMENTS_NAME, MESH_NAME), where)
-    class_of = {number: classes.id_of[one.word] for number, one in enumerate(objects, 1) if one.word in classes.id_of}
+    class_of = {number: classes.id_of[one.label] for number, one in enumerate(objects, 1) if one.label in classes.id_of}
     if any(number > MAX_OBJECTS and class_of[number] in classes.with_instances for number in class_of):
         raise DataError(
             f"{where}: {OBJECTS_NAME} has {len(objects)} objects; ground truth is class * 1000 + object, which cannot "
@@ -249,7 +229,7 @@ def read_annotated_scan(files: Mapping[str, Path], classes: BenchmarkClasses, wh
     size = np.full((n, MOST_CLASSES_OF_A_VERTEX), np.inf)
     n_laid = np.zeros(n, np.int64)
     for number, class_id in class_of.items():
-        vertices = members.of(objects[number - 1].segments)
+        vertices = members.of(np.array(objects[number - 1].segments, np.int64))
         vertices = vertices[n_laid[vertices] < MOST_CLASSES_OF_A_VERTEX]
         at = vertices, n_laid[vertices]
         every_class[at], every_object[at], size[at] = class_id, number, len(vertices)

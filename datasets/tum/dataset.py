@@ -14,9 +14,8 @@ There is no ground truth of objects.
 
 from __future__ import annotations
 
-import logging
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -24,24 +23,14 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.types import Float64Array, Frame
-from su3d_bench.datasets.recordings.file_dataset import FileDataset, keeps_last
-from su3d_bench.datasets.recordings.recorded_frames import (
-    Folder,
-    RecordedFrame,
-    RecordedFrames,
-    Recording,
-    depth_m_of_values,
-    left_out,
-    numbers,
-    pinhole,
-)
-from su3d_bench.datasets.tum.timed_poses import pose_at, read_trajectory, rows_of, seconds
+from su3d_bench.core.geometry import rotations_of
+from su3d_bench.core.types import Float64Array
+from su3d_bench.datasets.recordings import recorded_frames
+from su3d_bench.datasets.recordings.file_dataset import RecordedDataset, keeps_last
 from su3d_bench.formats.arrays import read_text
 
-logger = logging.getLogger(__name__)
 UNITS_PER_METRE = 5000.0  # the benchmark's page "file formats"
-DEPTH_M_OF_VALUE = depth_m_of_values(UNITS_PER_METRE)
+DEPTH_M_OF_VALUE = recorded_frames.depth_m_of_values(UNITS_PER_METRE)
 MAX_CANDIDATES = 2_000_000  # pairs of images near in time; a recording has about two an image
 # fx fy cx cy of the colour cameras: the benchmark's page "file formats", section "intrinsic camera calibration".
 CAMERAS = {
@@ -69,7 +58,7 @@ class TumOptions(BaseModel):
     intrinsics: tuple[float, float, float, float] | None = None
 
 
-class Tum(FileDataset[TumOptions]):
+class Tum(RecordedDataset[TumOptions]):
     """Sequences in the layout of the TUM RGB-D benchmark; unscored, because they have no ground truth of objects."""
 
     name = "tum"
@@ -86,29 +75,13 @@ class Tum(FileDataset[TumOptions]):
     def is_scene(self, folder: Path) -> bool:
         return not folder.name.startswith(".") and all((folder / name).is_file() for name in ("rgb.txt", "depth.txt"))
 
-    def n_frames(self, scene: str, stride: int) -> int:
-        return len(self.frames(scene, stride))
-
-    def frames(self, scene: str, stride: int) -> Sequence[Frame]:
-        return RecordedFrames(self.recording(scene), stride)
-
-    def recording_files(self, scene: str) -> Sequence[Path]:
-        return (*self.recording(scene).files, *self.recording(scene).images())
-
-    def recording_key(self, scene: str) -> str:
-        return self.recording(scene).digest(())
-
-    def problems(self, scene: str) -> Iterator[str]:
-        """What the lists name and is not there, a line in all; the frames go on without it."""
-        yield from self.recording(scene).missing
-
     @keeps_last
-    def recording(self, scene: str) -> Recording:
+    def recording(self, scene: str) -> recorded_frames.Recording:
         return self._open(self.folder(scene), self.where(scene))
 
-    def _open(self, path: Path, where: str) -> Recording:
+    def _open(self, path: Path, where: str) -> recorded_frames.Recording:
         """The frames whose images and pose are there; what is missing is said once, as a warning."""
-        folder, limit_s = Folder(path), self.options.max_difference_s
+        folder, limit_s = recorded_frames.Folder(path), self.options.max_difference_s
         has_pairs = (path / "associate.txt").exists()
         pairs = read_pairs(path, where) if has_pairs else associate(path, where, limit_s)
         lists = ("associate.txt",) if has_pairs else ("rgb.txt", "depth.txt")
@@ -126,31 +99,31 @@ class Tum(FileDataset[TumOptions]):
             if pose is None:
                 unposed.append(colour)
             else:
-                frames.append(RecordedFrame(index, colour_s, colour, depth, pose))
+                frames.append(recorded_frames.RecordedFrame(index, colour_s, colour, depth, pose))
         no_pose = f"colour images have no pose within {limit_s:g} s in groundtruth.txt"
-        remarks = [left_out(named, missing, "images named there are missing", len(frames))] if missing else []
-        remarks += [left_out(where, unposed, no_pose, len(frames))] if unposed else []
+        remarks = recorded_frames.left_out(named, missing, "images named there are missing", len(frames))
+        remarks += recorded_frames.left_out(where, unposed, no_pose, len(frames))
         if not frames:
             raise DataError(remarks[0] if remarks else f"{named}: no two images within {limit_s:g} s")
-        for line in remarks:
-            logger.warning("%s", line)
         camera = ("camera.txt",) if (path / "camera.txt").exists() else ()
         files = tuple(path / name for name in (*lists, *camera, "groundtruth.txt"))
         intrinsics = self._intrinsics(path, where)
-        return Recording(where, folder, tuple(frames), intrinsics, DEPTH_M_OF_VALUE, files, missing=tuple(remarks))
+        return recorded_frames.Recording(
+            where, folder, tuple(frames), intrinsics, DEPTH_M_OF_VALUE, files, missing=tuple(remarks)
+        )
 
     def _intrinsics(self, path: Path, where: str) -> Float64Array:
         if self.options.intrinsics is not None:
-            return pinhole(*self.options.intrinsics, where=f"{where}: option intrinsics")
+            return recorded_frames.pinhole(*self.options.intrinsics, where=f"{where}: option intrinsics")
         if (path / "camera.txt").exists():
             where = f"{where}: camera.txt"
             words = read_text(path / "camera.txt", where).split()
             if len(words) != 4:
                 raise DataError(f"{where}: has {len(words)} values; expected one line fx fy cx cy")
-            fx, fy, cx, cy = numbers(words, where)
-            return pinhole(fx, fy, cx, cy, where)
+            fx, fy, cx, cy = recorded_frames.numbers(words, where)
+            return recorded_frames.pinhole(fx, fy, cx, cy, where)
         camera = re.search(r"(?:freiburg|fr)([123])", path.name)
-        return pinhole(*CAMERAS[camera[1] if camera else ""], where=where)
+        return recorded_frames.pinhole(*CAMERAS[camera[1] if camera else ""], where=where)
 
 
 def read_pairs(folder: Path, where: str) -> list[tuple[Stamped, Stamped]]:
@@ -185,3 +158,74 @@ def associate(folder: Path, where: str, max_difference_s: float) -> list[tuple[S
             partner[i] = j
             taken.add(j)
     return [(colours[i], depths[j]) for i, j in sorted(partner.items())]
+
+
+def rows_of(path: Path, where: str, n_words: int, form: str) -> list[tuple[int, list[str]]]:
+    """(line number, words) of every line that is no comment; commas and tabs part words, as in associate.py."""
+    rows = []
+    for number, line in enumerate(read_text(path, where).replace(",", " ").split("\n"), start=1):
+        words = line.split()
+        if words and not words[0].startswith("#"):
+            if len(words) != n_words:
+                raise DataError(f"{where} line {number}: has {len(words)} values; expected {form}")
+            rows.append((number, words))
+    if not rows:
+        raise DataError(f"{where}: has no lines; expected {form}")
+    return rows
+
+
+def seconds(word: str, where: str) -> float:
+    (time_s,) = recorded_frames.numbers([word], where)
+    if not abs(time_s) < 1e12:
+        raise DataError(f"{where}: the time is {time_s:g}; expected seconds")
+    return time_s
+
+
+def read_trajectory(path: Path, where: str) -> tuple[Float64Array, Float64Array]:
+    """Times (n,) s ascending and rows (n, 7) tx ty tz qx qy qz qw with unit quaternions."""
+    rows = {}
+    for number, words in rows_of(path, where, 8, "'time tx ty tz qx qy qz qw'"):
+        place = f"{where} line {number}"
+        tx, ty, tz, *quaternion = recorded_frames.numbers(words[1:], place)
+        if not max(abs(tx), abs(ty), abs(tz)) < 1e6:
+            raise DataError(f"{place}: the camera is at {tx:g} {ty:g} {tz:g}; expected metres")
+        rows[seconds(words[0], place)] = [tx, ty, tz, *unit_quaternion(quaternion, place)]
+    times_s = sorted(rows)
+    return np.array(times_s), np.array([rows[time] for time in times_s])
+
+
+def pose_at(
+    time_s: float, times_s: Float64Array, rows: Float64Array, max_difference_s: float, *, interpolate: bool
+) -> Float64Array | None:
+    """Camera-to-world pose (4, 4) at ``time_s``; None where no row is within ``max_difference_s``."""
+    after = int(np.searchsorted(times_s, time_s))
+    near = [k for k in (after - 1, after) if 0 <= k < len(times_s) and abs(times_s[k] - time_s) <= max_difference_s]
+    if not near:
+        return None
+    if len(near) == 1 or not interpolate:
+        row = rows[min(near, key=lambda k: abs(times_s[k] - time_s))]
+        return np.asarray(quaternion_poses(row[None, :3], row[None, 3:])[0])
+    before, behind = rows[near[0]], rows[near[1]]
+    part = (time_s - times_s[near[0]]) / (times_s[near[1]] - times_s[near[0]])
+    sign = 1.0 if before[3:] @ behind[3:] >= 0 else -1.0  # a quaternion and its negative are one rotation
+    angle = np.arccos(min(1.0, abs(float(before[3:] @ behind[3:]))))
+    # Below 1e-6 rad the sines are too small to divide by, and the straight line is as good.
+    weights = (1 - part, part) if angle < 1e-6 else np.sin([(1 - part) * angle, part * angle]) / np.sin(angle)
+    quaternion = weights[0] * before[3:] + sign * weights[1] * behind[3:]
+    translation = (1 - part) * before[:3] + part * behind[:3]
+    return np.asarray(quaternion_poses(translation[None], quaternion[None] / np.linalg.norm(quaternion))[0])
+
+
+def quaternion_poses(translations: Float64Array, quaternions: Float64Array) -> Float64Array:
+    """Poses (n, 4, 4) of translations (n, 3) and unit quaternions (n, 4) in the order x y z w."""
+    poses = np.tile(np.eye(4), (len(quaternions), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = rotations_of(quaternions), translations
+    return poses
+
+
+def unit_quaternion(values: Sequence[float], where: str) -> list[float]:
+    """The quaternion at length 1; one without a direction is a ``DataError``."""
+    length = float(np.linalg.norm(values))
+    if not (np.isfinite(length) and length > 1e-6):
+        raise DataError(f"{where}: the quaternion has the length {length:g}; expected 1")
+    return [value / length for value in values]
