@@ -253,30 +253,27 @@ class Plan:
 
     def finish_lights(self) -> None:
         """A light under each hanging lamp, or under the ceiling's middle where none hangs, and above floor lamps."""
-        hanging = [p for p in self.placed if p.item.class_name == "lamp" and self.mount[p.id] == "ceiling"]
+        lamps = [p for p in self.placed if p.item.class_name == "lamp"]
+        hanging = [p for p in lamps if self.mount[p.id] == "ceiling"]
         for lamp in hanging:
-            x, y, z = lamp.position
-            self.lights.append(Light((float(x), float(y), float(z) - 0.14), (1.5, 1.44, 1.32), 0.22))
+            x, y, z = lamp.position.tolist()
+            self.lights.append(Light((x, y, z - 0.14), (1.5, 1.44, 1.32), 0.22))
         if not hanging:
             self.lights.append(Light((self.width / 2, self.depth / 2, self.height - 0.2), (1.5, 1.46, 1.38), 0.35))
-        standing = [p for p in self.placed if p.item.class_name == "lamp" and p.item.size[2] > 1.2][:1]
-        for lamp in standing:
-            x, y, _ = lamp.position
-            top = float(lamp.position[2] + lamp.item.size[2])
-            self.lights.append(Light((float(x), float(y), top + 0.12), (0.5, 0.42, 0.3), 0.08))
+        for lamp in [p for p in lamps if p.item.size[2] > 1.2][:1]:
+            x, y, z = lamp.position.tolist()
+            self.lights.append(Light((x, y, z + float(lamp.item.size[2]) + 0.12), (0.5, 0.42, 0.3), 0.08))
 
 
-def _face(width: float, height: float, material: Material, name: str, colour: str, made_of: str) -> Item:
-    """A single upright rectangle that faces -y, x from 0 to ``width``."""
-    quads = np.array([[[0, 0, 0], [width, 0, 0], [width, 0, height], [0, 0, height]]], np.float64)
-    shape = Shape(quads, np.broadcast_to(np.array([0.0, -1.0, 0.0]), (1, 4, 3)).copy())
-    return Item(name, colour, made_of, "medium", (Part(shape, material),), (), np.array([width, 0.0, height]))
-
-
-def _level(width: float, depth: float, up: float, material: Material, name: str, colour: str, made_of: str) -> Item:
-    quads = np.array([[[0, 0, 0], [width, 0, 0], [width, depth, 0], [0, depth, 0]]], np.float64)
-    shape = Shape(quads, np.broadcast_to(np.array([0.0, 0.0, up]), (1, 4, 3)).copy())
-    return Item(name, colour, made_of, "medium", (Part(shape, material),), (), np.array([width, depth, 0.0]))
+def _rectangle(
+    side: tuple[float, float, float], normal: tuple[float, float, float], material: Material, name: str, colour: str,
+    made_of: str,
+) -> Item:  # fmt: skip
+    """A single rectangle along x and ``side``, which is 0 in one of y and z, with a corner at the origin."""
+    x, y, z = side
+    quads = np.array([[[0, 0, 0], [x, 0, 0], [x, y, z], [0, y, z]]], np.float64)
+    shape = Shape(quads, np.broadcast_to(np.array(normal), (1, 4, 3)).copy())
+    return Item(name, colour, made_of, "medium", (Part(shape, material),), (), np.array(side))
 
 
 def add_shell(plan: Plan, tiled: bool) -> None:
@@ -291,9 +288,10 @@ def add_shell(plan: Plan, tiled: bool) -> None:
         ground = Material(Texture.TILES, base, shade(base, 0.6), float(rng.uniform(0.28, 0.42)), 0.25, seed=seed)
     else:
         ground = Material(Texture.PLANKS, base, shade(base, 0.55), 0.035, 0.15, seed=seed)
-    plan.add(_level(plan.width, plan.depth, 1.0, ground, "floor", floor_colour, made_of), 0, 0, 0, 0, "room")
+    level = (plan.width, plan.depth, 0.0)
+    plan.add(_rectangle(level, (0.0, 0.0, 1.0), ground, "floor", floor_colour, made_of), 0, 0, 0, 0, "room")
     lid = Material(Texture.PLAIN, tone("white"), shade(tone("white"), 0.95))
-    plan.add(_level(plan.width, plan.depth, -1.0, lid, "ceiling", "white", "stone"), 0, 0, plan.height, 0, "room")
+    plan.add(_rectangle(level, (0.0, 0.0, -1.0), lid, "ceiling", "white", "stone"), 0, 0, plan.height, 0, "room")
     colour = str(rng.choice(["white", "white", "beige", "grey", "yellow", "green", "blue", "pink"]))
     rgb = mix(tone(colour, rng), tone("white"), 0.0 if colour in ("white", "grey") else 0.55)
     style = 2 if tiled else int(rng.choice([0, 0, 1, 3]))
@@ -304,7 +302,8 @@ def add_shell(plan: Plan, tiled: bool) -> None:
     corners = ((0.0, plan.depth), (plan.width, plan.depth), (plan.width, 0.0), (0.0, 0.0))
     for wall in range(4):
         material = accent if wall == accent_wall else paint
-        face = _face(plan.wall_length(wall), plan.height, material, "wall", colour, "stone")
+        side = (plan.wall_length(wall), 0.0, plan.height)
+        face = _rectangle(side, (0.0, -1.0, 0.0), material, "wall", colour, "stone")
         plan.add(face, *corners[wall], 0.0, WALL_YAW[wall], "room")
 
 

@@ -7,28 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.datasets.rooms.groups import (
-    SMALL_DECOR,
-    bath_shelf,
-    bedding,
-    cushioned_bench,
-    cushions,
-    desk_place,
-    dining_table,
-    filled_basket,
-    floor_things,
-    hang_ceiling_lamp,
-    long_walls,
-    plant_on_stand,
-    seating,
-    some,
-    stock,
-    stocked_cabinet,
-    stocked_shelf,
-    stocked_wall_shelf,
-    television,
-    wall_things,
-)
+from su3d_bench.datasets.rooms import groups
 from su3d_bench.datasets.rooms.objects.items import Item, Part, Spot
 from su3d_bench.datasets.rooms.plan import GAP_M, Plan, add_openings, add_shell
 from su3d_bench.datasets.rooms.rendering.mesh import Placed
@@ -120,17 +99,17 @@ def beside_on(plan: Plan, top: Placed, anchor: Placed, item: Item) -> None:
 
 
 def living(plan: Plan) -> None:
-    sofa = seating(plan)
-    television(plan, sofa)
-    stocked_shelf(plan, n=7)
-    stocked_cabinet(plan, SMALL_DECOR, 3)
+    sofa = groups.seating(plan)
+    groups.television(plan, sofa)
+    groups.stocked_shelf(plan, n=7)
+    groups.stocked_cabinet(plan, groups.SMALL_DECOR, 3)
     plan.against_wall(plan.new("lamp", "floor_lamp"), corner=True)
-    plant_on_stand(plan)
-    filled_basket(plan, "blanket")
+    groups.plant_on_stand(plan)
+    groups.filled_basket(plan, "blanket")
     plan.somewhere(plan.new(str(plan.rng.choice(["beanbag", "stool"]))))
-    cushioned_bench(plan)
-    floor_things(plan, some(plan, 3, "backpack", "exercise-ball", "box", "indoor-plant", "umbrella"))
-    wall_things(plan, 2)
+    groups.cushioned_bench(plan)
+    groups.floor_things(plan, groups.some(plan, 3, "backpack", "exercise-ball", "box", "indoor-plant", "umbrella"))
+    groups.wall_things(plan, 2)
 
 
 def bedroom(plan: Plan) -> None:
@@ -142,24 +121,24 @@ def bedroom(plan: Plan) -> None:
             plan.facing(plan.new("rug"), bed, -0.9, turn=0.0)
         for _ in range(2):
             stand = plan.beside(plan.new("nightstand"), bed, 0.07)
-            more = some(plan, 1, ("book", "book_stack"), "cup", "tissue-paper", "candle")
-            stock(plan, stand, [("lamp", "table_lamp"), *more])
-        bedding(plan, bed)
+            more = groups.some(plan, 1, ("book", "book_stack"), "cup", "tissue-paper", "candle")
+            groups.stock(plan, stand, [("lamp", "table_lamp"), *more])
+        groups.bedding(plan, bed)
         plan.on(plan.new("cushion", "flat_cushion"), bed, "seat", turn=20.0)
         plan.hang_above(plan.new("picture"), bed, 1.35)
     wardrobe = plan.against_wall(plan.new("wardrobe"))
-    stocked_cabinet(plan, SMALL_DECOR, 4)
+    groups.stocked_cabinet(plan, groups.SMALL_DECOR, 4)
     if wardrobe is None or plan.rng.random() < 0.5:
-        stocked_shelf(plan, n=6)
+        groups.stocked_shelf(plan, n=6)
     else:
-        desk_place(plan, laptop=True)
-    filled_basket(plan, "blanket")
-    plant_on_stand(plan)
+        groups.desk_place(plan, laptop=True)
+    groups.filled_basket(plan, "blanket")
+    groups.plant_on_stand(plan)
     plan.somewhere(plan.new(str(plan.rng.choice(["stool", "beanbag", "beanbag"]))))
     if plan.rng.random() < 0.5:
-        cushioned_bench(plan)
-    floor_things(plan, some(plan, 3, "backpack", "box", "exercise-ball", "umbrella"))
-    wall_things(plan, 2)
+        groups.cushioned_bench(plan)
+    groups.floor_things(plan, groups.some(plan, 3, "backpack", "box", "exercise-ball", "umbrella"))
+    groups.wall_things(plan, 2)
 
 
 def kitchen(plan: Plan) -> None:
@@ -167,35 +146,35 @@ def kitchen(plan: Plan) -> None:
     fridge = plan.against_wall(plan.new("refrigerator"), gap=0.02)
     if fridge:
         plan.on(plan.new("box"), fridge, turn=6.0)
-    dining_table(plan, 3)
+    groups.dining_table(plan, 3)
     pool = "bowl", "vase", "chopping-board", "bottle", "pot", "indoor-plant", "knife-block", "paper-towel"
-    stocked_cabinet(plan, pool, 5)
+    groups.stocked_cabinet(plan, pool, 5)
     plan.against_wall(plan.new("bin"), gap=0.04)
-    stocked_wall_shelf(plan, ["cup", "bottle", "bowl", "indoor-plant"], turn=3.0)
-    floor_things(plan, ["stool", "mat", "box", "umbrella"])
-    wall_things(plan, 1)
+    groups.stocked_wall_shelf(plan, ["cup", "bottle", "bowl", "indoor-plant"], turn=3.0)
+    groups.floor_things(plan, ["stool", "mat", "box", "umbrella"])
+    groups.wall_things(plan, 1)
 
 
 def office(plan: Plan) -> None:
     for laptop in (False, bool(plan.rng.random() < 0.4)):
-        desk_place(plan, laptop)
-    stocked_shelf(plan, [("book", "books"), "box"], 7)
-    stocked_cabinet(plan, [*SMALL_DECOR, "box", "paper-towel"], 3)
+        groups.desk_place(plan, laptop)
+    groups.stocked_shelf(plan, [("book", "books"), "box"], 7)
+    groups.stocked_cabinet(plan, [*groups.SMALL_DECOR, "box", "paper-towel"], 3)
     if plan.rng.random() < 0.6:
         sofa = plan.against_wall(plan.new("sofa"))
         if sofa:
-            cushions(plan, sofa, 2)
+            groups.cushions(plan, sofa, 2)
     else:
-        cushioned_bench(plan)
+        groups.cushioned_bench(plan)
     plan.against_wall(plan.new("lamp", "floor_lamp"), corner=True)
-    stocked_wall_shelf(plan, [("book", "books"), "sculpture", "indoor-plant"])
-    plant_on_stand(plan)
-    floor_things(plan, some(plan, 3, "backpack", "umbrella", "box", "exercise-ball", "basket"))
-    wall_things(plan, 2, n_plugs=3)
+    groups.stocked_wall_shelf(plan, [("book", "books"), "sculpture", "indoor-plant"])
+    groups.plant_on_stand(plan)
+    groups.floor_things(plan, groups.some(plan, 3, "backpack", "umbrella", "box", "exercise-ball", "basket"))
+    groups.wall_things(plan, 2, n_plugs=3)
 
 
 def bathroom(plan: Plan) -> None:
-    tub = plan.against_wall(plan.new("bathtub"), long_walls(plan), 0.02, corner=True)
+    tub = plan.against_wall(plan.new("bathtub"), groups.long_walls(plan), 0.02, corner=True)
     sink_item = plan.new("sink", "pedestal_sink")
     sink = plan.against_wall(sink_item, gap=0.5) or plan.against_wall(sink_item, gap=0.1)
     if sink:
@@ -208,32 +187,32 @@ def bathroom(plan: Plan) -> None:
         plan.beside(plan.new("bin"), toilet, 0.12)
     if tub:
         plan.facing(plan.new("mat"), tub, 0.05, turn=0.0)
-    bath_shelf(plan)
+    groups.bath_shelf(plan)
     folded = "towel", "folded_towel"
-    stocked_cabinet(plan, ["candle", "bottle", "tissue-paper", "indoor-plant", "cup"], 3, [folded])
-    stocked_wall_shelf(plan, ["bottle", "cup", "candle", folded], 1.4)
-    filled_basket(plan, "towel")
-    floor_things(plan, ["stool"])
+    groups.stocked_cabinet(plan, ["candle", "bottle", "tissue-paper", "indoor-plant", "cup"], 3, [folded])
+    groups.stocked_wall_shelf(plan, ["bottle", "cup", "candle", folded], 1.4)
+    groups.filled_basket(plan, "towel")
+    groups.floor_things(plan, ["stool"])
     plan.hang_somewhere(plan.new("towel", "towel_rail"), 0.95)
-    wall_things(plan, 1, clock=False, n_plugs=1)
+    groups.wall_things(plan, 1, clock=False, n_plugs=1)
 
 
 def studio(plan: Plan) -> None:
     """One room to live, sleep and work in."""
     bed = plan.against_wall(plan.new("bed"), gap=0.2, corner=True)
     if bed:
-        bedding(plan, bed)
+        groups.bedding(plan, bed)
         stand = plan.beside(plan.new("nightstand"), bed, 0.07)
-        stock(plan, stand, [("lamp", "table_lamp"), "cup"])
-    sofa = seating(plan)
-    television(plan, sofa)
-    desk_place(plan, laptop=bool(plan.rng.random() < 0.5))
+        groups.stock(plan, stand, [("lamp", "table_lamp"), "cup"])
+    sofa = groups.seating(plan)
+    groups.television(plan, sofa)
+    groups.desk_place(plan, laptop=bool(plan.rng.random() < 0.5))
     plan.against_wall(plan.new("wardrobe"))
-    stocked_shelf(plan, n=6)
+    groups.stocked_shelf(plan, n=6)
     plan.against_wall(plan.new("refrigerator"))
-    stocked_cabinet(plan, (), 0, ["microwave", "pot", "paper-towel", "bottle"])
-    floor_things(plan, some(plan, 3, "backpack", "umbrella", "box", "exercise-ball", "basket", "stool"))
-    wall_things(plan, 2)
+    groups.stocked_cabinet(plan, (), 0, ["microwave", "pot", "paper-towel", "bottle"])
+    groups.floor_things(plan, groups.some(plan, 3, "backpack", "umbrella", "box", "exercise-ball", "basket", "stool"))
+    groups.wall_things(plan, 2)
 
 
 @dataclass(frozen=True)
@@ -266,7 +245,9 @@ def furnish(kind: str, rng: np.random.Generator) -> Plan:
     add_openings(plan, int(rng.integers(rules.windows[0], rules.windows[1] + 1)), cover)
     n_lamps = 2 if kind == "studio" else 1
     for k in range(n_lamps):
-        hang_ceiling_lamp(plan, plan.width * (k + 1) / (n_lamps + 1), plan.depth * float(rng.uniform(0.45, 0.55)))
+        groups.hang_ceiling_lamp(
+            plan, plan.width * (k + 1) / (n_lamps + 1), plan.depth * float(rng.uniform(0.45, 0.55))
+        )
     rules.furnish(plan)
     plan.finish_lights()
     return plan
