@@ -77,7 +77,7 @@ def test_damaged_arrays_and_images_are_read_or_refused(tmp_path: Path) -> None:
     check(stored, stored.read_bytes(), lambda: read_stored(stored, still_life(40), CountingEncoder()), named="frame 40")
     image = write_image(tmp_path / "labels")
     source = images(tmp_path / "labels")
-    check(image, image.read_bytes(), lambda: source.regions(still_life(40)))
+    check(image, image.read_bytes(), lambda: source.frame(still_life(40)))
 
 
 def check(path: Path, whole: bytes, read: Callable[[], object], named: str = "") -> None:

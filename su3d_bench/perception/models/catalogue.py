@@ -72,24 +72,21 @@ class ModelEntry:
         raise ConfigError(f"model '{self.name}': does not come in the form '{name}'; known: {known}")
 
 
-def _entry(name: str, row: Mapping[str, Any], table: Mapping[str, Any]) -> ModelEntry:
-    forms = tuple(_form(name, form, table["files"]) for form in row["forms"])
-    return ModelEntry(**{**row, "name": name, "forms": forms, "trained_on": table["trained_on"][row["trained_on"]]})
+def _entry(name: str, row: Mapping[str, Any]) -> ModelEntry:
+    forms = tuple(_form(name, form) for form in row["forms"])
+    return ModelEntry(**{**row, "name": name, "forms": forms, "trained_on": _TABLE["trained_on"][row["trained_on"]]})
 
 
-def _form(name: str, row: Mapping[str, Any], files: Mapping[str, list[str]]) -> ModelForm:
+def _form(name: str, row: Mapping[str, Any]) -> ModelForm:
     hub = f"https://huggingface.co/{row.get('repository')}"
     source = f"python tools/export_onnx.py {name} --out DIR" if row["form"] == "onnx" else hub
-    listed = row["files"] if isinstance(row["files"], list) else files[row["files"]]
+    listed = row["files"] if isinstance(row["files"], list) else _TABLE["files"][row["files"]]
     return ModelForm(**{"source": source, **row, "files": tuple(listed)})
 
 
-def _read_models() -> Mapping[str, ModelEntry]:
-    table = parse_toml(file_text(Path(__file__).with_name("catalogue.toml")))
-    return MappingProxyType({name: _entry(name, row, table) for name, row in table["models"].items()})
-
-
-MODELS = _read_models()
+_TABLE = parse_toml(file_text(Path(__file__).with_name("catalogue.toml")))
+MODELS: Mapping[str, ModelEntry] = MappingProxyType({name: _entry(name, row) for name, row in _TABLE["models"].items()})
+SETTINGS: tuple[str, ...] = tuple(_TABLE["settings"])
 # What a profile loads unasked; profiles that are not named load no model of this table.
 PROFILE_MODELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {"paper": ("clip-vit-h-14", "sam-vit-h", "grounding-dino", "ram-plus")}
