@@ -58,10 +58,11 @@ class Plan:
         self.lights: list[Light] = []
         self._used: dict[str, set[str]] = {}
 
-    def new(self, class_name: str, model: str | None = None, colour: str | None = None) -> Item:
-        """An item in a colour that its class does not have in this room yet, as far as there are such."""
+    def new(self, want: str, colour: str | None = None) -> Item:
+        """An item of a class, or of a class/model, in a colour that the class does not have in this room yet."""
+        class_name, _, model = want.partition("/")
         used = self._used.setdefault(class_name, set())
-        item = make(class_name, self.rng, model, colour, frozenset(used))
+        item = make(class_name, self.rng, model or None, colour, frozenset(used))
         used.add(item.colour)
         return item
 
