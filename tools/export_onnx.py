@@ -33,7 +33,7 @@ from su3d_bench.core.system.devices import CPU
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import BoolArray, Float32Array, Int64Array
 from su3d_bench.perception.models.catalogue import ONNX_MANIFEST, model_entry
-from su3d_bench.perception.models.encoders import towers
+from su3d_bench.perception.models.encoders import encoder as towers
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec, unit_rows
 from su3d_bench.perception.models.encoders.texts import read_tokeniser
 from su3d_bench.perception.models.files import ModelFiles, bounded, locate, read_weights

@@ -109,11 +109,8 @@ def stood_up(item: Item) -> Item:
 
 def plant_on_stand(plan: Plan) -> None:
     stand = plan.somewhere(plan.new("plant-stand"))
-    if stand is None:
-        return
-    for _ in range(8):
-        if plan.on(plan.new("indoor-plant"), stand, where="centre", turn=90.0):
-            return
+    if stand:
+        any(plan.on(plan.new("indoor-plant"), stand, where="centre", turn=90.0) for _ in range(8))
 
 
 def seating(plan: Plan) -> Placed | None:

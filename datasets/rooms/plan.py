@@ -162,13 +162,9 @@ class Plan:
         return self.try_at_wall(item, wall, along, item.size[1] / 2 + GAP_M, z, gap, mount="wall")
 
     def hang_somewhere(self, item: Item, z: float, walls: Sequence[int] = (0, 1, 2, 3)) -> Placed | None:
-        for wall in self.shuffled(walls) * 10:
-            half = item.size[0] / 2 + 0.05
-            along = float(self.rng.uniform(half, self.wall_length(wall) - half))
-            placed = self.hang(item, wall, along, z)
-            if placed:
-                return placed
-        return None
+        half = item.size[0] / 2 + 0.05
+        places = ((wall, self.rng.uniform(half, self.wall_length(wall) - half)) for wall in self.shuffled(walls) * 10)
+        return next(filter(None, (self.hang(item, wall, float(along), z) for wall, along in places)), None)
 
     def wall_of(self, placed: Placed) -> tuple[int, float]:
         """The wall behind an item, and its place along that wall."""
@@ -182,12 +178,9 @@ class Plan:
     def beside(self, item: Item, anchor: Placed, gap: float = 0.06, back: bool = True) -> Placed | None:
         """To the left or right of an item, backs aligned."""
         y = (anchor.item.size[1] - item.size[1]) / 2 if back else 0.0
-        for side in self.shuffled((-1, 1)):
-            x = side * (anchor.item.size[0] / 2 + gap + item.size[0] / 2)
-            placed = self.try_by(item, anchor, x, y, anchor.yaw)
-            if placed:
-                return placed
-        return None
+        x = anchor.item.size[0] / 2 + gap + item.size[0] / 2
+        sides = (self.try_by(item, anchor, side * x, y, anchor.yaw) for side in self.shuffled((-1, 1)))
+        return next(filter(None, sides), None)
 
     def facing(self, item: Item, anchor: Placed, distance: float, shift: float = 0.0, turn: float = 180.0,
                jitter: float = 0.0) -> Placed | None:  # fmt: skip

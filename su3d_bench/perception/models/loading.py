@@ -21,7 +21,7 @@ from su3d_bench.core.types import Frame, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.models.catalogue import PROFILE_MODELS, FormName, ModelEntry, model_entry
 from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, PaperConfig, Runtime
-from su3d_bench.perception.models.encoders import towers
+from su3d_bench.perception.models.encoders import encoder as encoders
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec, FoundationEncoder, Towers
 from su3d_bench.perception.models.encoders.texts import Tokeniser, read_tokeniser
 from su3d_bench.perception.models.files import PICKLED, ModelFiles, kept, locate, read_settings, read_weights
@@ -90,10 +90,10 @@ def _torch_encoder(
         return {"runtime": config.runtime, "files": files.digests(), "precision": precision, "device": kind}
 
     if config.runtime == "open_clip":
-        spec = towers.open_clip_spec(files, config.transform)
-        tokeniser: Callable[[], Tokeniser] = partial(towers.open_clip_tokeniser, files)
+        spec = encoders.open_clip_spec(files, config.transform)
+        tokeniser: Callable[[], Tokeniser] = partial(encoders.open_clip_tokeniser, files)
     else:
-        spec = towers.transformers_spec(files, config.transform)
+        spec = encoders.transformers_spec(files, config.transform)
         tokeniser = _tokeniser_of(files, spec)
     return FoundationEncoder(files.entry.known_as, spec, load_towers, tokeniser, identity, cache, device)
 
@@ -103,10 +103,10 @@ def _onnx_encoder(
 ) -> FoundationEncoder:
     provider: Provider = config.provider or ("cpu" if config.device == "cpu" else "cuda")
     device_index = 0 if provider == "cpu" else int(device_for(config.device, job_index).partition(":")[2])
-    manifest = towers.EncoderManifest.read(files.weights)
+    manifest = encoders.EncoderManifest.read(files.weights)
     if manifest.name != files.entry.name:
         raise ConfigError(f"{files.folder}: holds '{manifest.name}', not '{files.entry.name}'; correct models.paths")
-    spec = towers.onnx_spec(files, config.transform)
+    spec = encoders.onnx_spec(files, config.transform)
 
     def identity() -> Mapping[str, Any]:
         return {"runtime": "onnx", "files": dict(manifest.files), "provider": provider}
@@ -121,13 +121,13 @@ def _onnx_encoder(
 @lru_cache(maxsize=1)
 def _torch_towers(files: ModelFiles, runtime: Runtime, device: str, precision: str, batch: int) -> Towers:
     if runtime == "open_clip":
-        return towers.OpenClipTowers(towers.load_open_clip(files), device, precision, batch)
-    return towers.TransformersTowers(towers.load_transformers(files), device, precision, batch)
+        return encoders.OpenClipTowers(encoders.load_open_clip(files), device, precision, batch)
+    return encoders.TransformersTowers(encoders.load_transformers(files), device, precision, batch)
 
 
 @lru_cache(maxsize=1)
 def _onnx_towers(files: ModelFiles, provider: Provider, device_index: int, batch: int) -> Towers:
-    return towers.OnnxTowers(files, provider, device_index, batch)
+    return encoders.OnnxTowers(files, provider, device_index, batch)
 
 
 def _tokeniser_of(files: ModelFiles, spec: EncoderSpec) -> Callable[[], Tokeniser]:
@@ -275,7 +275,7 @@ def problems_of(files: ModelFiles) -> list[str]:
             return problems + _problems_of_export(files)
         if files.form.form == "transformers":
             if files.entry.kind == "encoder":
-                towers.transformers_spec(files, "original")
+                encoders.transformers_spec(files, "original")
             else:
                 read_settings(files.folder / "config.json")
         if files.weights.suffix in PICKLED or files.weights.suffix == ".safetensors":
@@ -288,7 +288,7 @@ def problems_of(files: ModelFiles) -> list[str]:
 def _problems_of_export(files: ModelFiles) -> list[str]:
     if files.entry.kind == "tagger":
         return tagging.wrong_tagger(files)
-    kind: type[OnnxManifest] = towers.EncoderManifest if files.entry.kind == "encoder" else SamManifest
+    kind: type[OnnxManifest] = encoders.EncoderManifest if files.entry.kind == "encoder" else SamManifest
     manifest = kind.read(files.weights)
     wrong = wrong_files(manifest, files.folder)
     if manifest.name != files.entry.name:

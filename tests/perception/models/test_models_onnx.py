@@ -14,7 +14,7 @@ from tiny_models import SAM_PX, blocks, noise_images, tiny_sam, write_tiny_clip
 
 from su3d_bench.core.errors import DataError, ModelMissing
 from su3d_bench.perception.models.config import ModelsConfig
-from su3d_bench.perception.models.encoders.towers import EncoderManifest
+from su3d_bench.perception.models.encoders.encoder import EncoderManifest
 from su3d_bench.perception.models.files import locate
 from su3d_bench.perception.models.loading import load_encoder
 from su3d_bench.perception.models.masks.sam import Prompts, Sam, TorchSam, load_onnx_sam
