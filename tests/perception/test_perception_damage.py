@@ -15,8 +15,8 @@ from test_perception_stored_images import images, write_image
 from su3d_bench.perception.models.catalogue import model_entry
 from su3d_bench.perception.models.encoders.encoder import EncoderManifest, transformers_spec
 from su3d_bench.perception.models.files import ModelFiles
+from su3d_bench.perception.models.masks.grounded_sam import read_word_list
 from su3d_bench.perception.models.masks.sam import SamManifest
-from su3d_bench.perception.models.masks.tagging import read_word_list
 from su3d_bench.perception.stored import read_stored
 from su3d_bench.perception.stored_masks import read_names
 

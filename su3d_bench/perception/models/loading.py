@@ -25,8 +25,8 @@ from su3d_bench.perception.models.encoders import encoder as encoders
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec, FoundationEncoder, Towers
 from su3d_bench.perception.models.encoders.texts import Tokeniser, read_tokeniser
 from su3d_bench.perception.models.files import PICKLED, ModelFiles, kept, locate, read_settings, read_weights
-from su3d_bench.perception.models.masks import tagging
-from su3d_bench.perception.models.masks.grounded_sam import Networks
+from su3d_bench.perception.models.masks import grounded_sam
+from su3d_bench.perception.models.masks.grounded_sam import Networks, Tagger
 from su3d_bench.perception.models.masks.grounding_dino import load_grounding_dino
 from su3d_bench.perception.models.masks.sam import Sam, SamManifest, SamNetwork, load_onnx_sam, load_sam
 from su3d_bench.perception.models.onnx import OnnxManifest, Provider, open_session, wrong_files
@@ -209,7 +209,7 @@ def _locate_sam(config: PaperConfig, models: ModelsConfig) -> ModelFiles:
     return _locate(models, config.segmenter, ("onnx",) if config.sam_runtime == "onnx" else _SAM_FORMS)
 
 
-def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, device: str) -> tagging.Tagger:
+def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, device: str) -> Tagger:
     """The tagger that is asked for, or with ``auto`` the first that is here."""
     if config.tagger == "ram" or (config.tagger == "auto" and find_spec("ram") is not None):
         with _passed_over(config.tagger):
@@ -217,18 +217,18 @@ def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, device:
             files = _locate(models, TAGGER, ("original",))
             digests = [text for pair in sorted(files.digests().items()) for text in pair]
             # RAM++'s own code mixes float32 in, so it runs in float32 wherever it runs.
-            load = partial(kept, files, (device,), partial(tagging.load_ram, files, device))
-            return tagging.RamTagger(load, device, content_key(*digests))
+            load = partial(kept, files, (device,), partial(grounded_sam.load_ram, files, device))
+            return grounded_sam.RamTagger(load, device, content_key(*digests))
     if config.tagger in ("ram-onnx", "auto"):
         with _passed_over(config.tagger):
             files = _locate(models, TAGGER, ("onnx",))
-            if wrong := tagging.wrong_tagger(files):
+            if wrong := grounded_sam.wrong_tagger(files):
                 raise DataError(wrong[0])
-            tags = tagging.read_word_list(files.folder / tagging.RAM_TAG_LIST)
-            return tagging.OnnxRamTagger(
+            tags = grounded_sam.read_word_list(files.folder / grounded_sam.RAM_TAG_LIST)
+            return grounded_sam.OnnxRamTagger(
                 partial(open_session, files.weights), tags, content_key(*files.digests().values())
             )
-    return tagging.WordTagger(encoder, tagging.read_word_list(config.words), config.n_tags)
+    return grounded_sam.WordTagger(encoder, grounded_sam.read_word_list(config.words), config.n_tags)
 
 
 def _passed_over(tagger: str) -> AbstractContextManager[None]:
@@ -287,7 +287,7 @@ def problems_of(files: ModelFiles) -> list[str]:
 
 def _problems_of_export(files: ModelFiles) -> list[str]:
     if files.entry.kind == "tagger":
-        return tagging.wrong_tagger(files)
+        return grounded_sam.wrong_tagger(files)
     kind: type[OnnxManifest] = encoders.EncoderManifest if files.entry.kind == "encoder" else SamManifest
     manifest = kind.read(files.weights)
     wrong = wrong_files(manifest, files.folder)

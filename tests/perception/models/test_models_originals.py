@@ -26,10 +26,9 @@ from su3d_bench.perception.models.masks.automatic_masks import (
     point_grid,
     to_last_pixel,
 )
-from su3d_bench.perception.models.masks.grounded_sam import GROUNDED_MASKS, GroundedConfig
+from su3d_bench.perception.models.masks.grounded_sam import GROUNDED_MASKS, RAM_PX, GroundedConfig, ram_pixels
 from su3d_bench.perception.models.masks.grounding_dino import suppress, tag_of, tag_of_first_word
 from su3d_bench.perception.models.masks.sam import Prompts, Sam, as_shares_of_float32, sam_names
-from su3d_bench.perception.models.masks.tagging import RAM_PX, ram_pixels
 
 CASES: dict[str, Any] = json.loads((Path(__file__).parents[2] / "cases/front_end.json").read_text())
 

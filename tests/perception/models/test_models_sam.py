@@ -12,9 +12,8 @@ from tiny_models import SAM_PX, blocks, frame_of, tiny_sam
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float32Array, UInt8Array
-from su3d_bench.perception.models.masks.grounded_sam import Networks, SamRegions
+from su3d_bench.perception.models.masks.grounded_sam import Networks, SamRegions, WordTagger
 from su3d_bench.perception.models.masks.sam import Prompts, Sam, TorchSam, fill_sam
-from su3d_bench.perception.models.masks.tagging import WordTagger
 
 RGB = blocks(40, 60)
 BOXES = np.array([[5, 5, 30, 30], [0, 0, 60, 40], [22.5, 3.25, 41, 39]], np.float32)

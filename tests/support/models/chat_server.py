@@ -31,10 +31,9 @@ class Answered:
     model: str | None = None
 
 
-def error(status: int, message: str = "no", code: str | None = None, **headers: str) -> Answered:
+def error(status: int, message: str = "no", code: str | None = None) -> Answered:
     raw = json.dumps({"error": {"message": message, "code": code, "type": "x"}}).encode()
-    given = {name.replace("_", "-"): value for name, value in headers.items()}
-    return Answered(status=status, raw=raw, headers={"retry-after-ms": "1", **given})
+    return Answered(status=status, raw=raw, headers={"retry-after-ms": "1"})
 
 
 def completion(body: Body, answered: Answered) -> bytes:

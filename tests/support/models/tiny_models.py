@@ -16,7 +16,7 @@ import pytest
 from su3d_bench.core.system.devices import require, require_transformers
 from su3d_bench.core.types import Frame, UInt8Array
 from su3d_bench.perception.models.encoders.images import CLIP_MEAN, CLIP_STD
-from su3d_bench.perception.models.masks.tagging import RAM_MODEL, RAM_PX, RAM_TAG_LIST
+from su3d_bench.perception.models.masks.grounded_sam import RAM_MODEL, RAM_PX, RAM_TAG_LIST
 
 needs_models = pytest.mark.skipif(
     find_spec("torch") is None or find_spec("transformers") is None,
@@ -237,34 +237,28 @@ def write_clip_tokenizer(folder: Path) -> int:
 
 # ---- RAM++ as it is exported
 
-_CELL_PX = 96
-_N_SEEN = 3 * (RAM_PX // _CELL_PX) ** 2  # mean colours of 4 x 4 cells
-_OPSET, _IR_VERSION = 17, 8  # that any ONNX Runtime reads which the project takes
+_N_SEEN = 3 * 4**2  # mean colours of 4 x 4 cells of 96 px
+_RAM_PLUS = """
+<ir_version: 8, opset_import: ["": 17]>
+ram_plus (float[1, 3, {px}, {px}] image) => (float[1, {n}] tag) {{
+    cells = AveragePool <kernel_shape = [96, 96], strides = [96, 96]> (image)
+    seen = Flatten (cells)
+    logits = Gemm (seen, weight, bias)
+    is_there = Greater (logits, zero)
+    tag = Cast <to = 1> (is_there)
+}}
+"""
 
 
 def write_tagger(folder: Path, tags: Sequence[str], seed: int = 0) -> Path:
     """A network that answers ``image`` (1, 3, 384, 384) with ``tag`` (1, T): 1 for some of ``tags``, by colours."""
     onnx = require("onnx", "a stand-in of RAM++")
-    helper, numpy_helper, kinds = onnx.helper, onnx.numpy_helper, onnx.TensorProto
     random = np.random.default_rng(seed)
     weight = (random.normal(size=(_N_SEEN, len(tags))) / _N_SEEN**0.5).astype(np.float32)
     bias = (random.normal(size=len(tags)) * 0.5).astype(np.float32)
-    nodes = [
-        helper.make_node("AveragePool", ["image"], ["cells"], kernel_shape=[_CELL_PX] * 2, strides=[_CELL_PX] * 2),
-        helper.make_node("Flatten", ["cells"], ["seen"]),
-        helper.make_node("Gemm", ["seen", "weight", "bias"], ["logits"]),
-        helper.make_node("Greater", ["logits", "zero"], ["is_there"]),
-        helper.make_node("Cast", ["is_there"], ["tag"], to=kinds.FLOAT),
-    ]
-    constants = {"weight": weight, "bias": bias, "zero": np.zeros(1, np.float32)}
-    graph = helper.make_graph(
-        nodes,
-        "ram_plus",
-        [helper.make_tensor_value_info("image", kinds.FLOAT, [1, 3, RAM_PX, RAM_PX])],
-        [helper.make_tensor_value_info("tag", kinds.FLOAT, [1, len(tags)])],
-        [numpy_helper.from_array(value, name) for name, value in constants.items()],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR_VERSION)
+    model = onnx.parser.parse_model(_RAM_PLUS.format(px=RAM_PX, n=len(tags)))
+    for name, value in {"weight": weight, "bias": bias, "zero": np.zeros(1, np.float32)}.items():
+        model.graph.initializer.append(onnx.numpy_helper.from_array(value, name))
     onnx.checker.check_model(model)
     folder.mkdir(parents=True, exist_ok=True)
     (folder / RAM_MODEL).write_bytes(model.SerializeToString())
