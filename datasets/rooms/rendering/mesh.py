@@ -128,7 +128,7 @@ def _n_cells(quads: Float64Array, edges: Sequence[tuple[int, int]], longest_m: f
     """How many cells (Q,) lie along the longer of two opposite edges, given by their corners."""
     steps = [(quads[:, start] - quads[:, end]) ** 2 for start, end in edges]
     longest = np.max([step[:, 0] + step[:, 1] + step[:, 2] for step in steps], axis=0)
-    return np.maximum(1, np.ceil(np.sqrt(longest) / longest_m - 1e-6)).astype(np.int64)
+    return np.asarray(np.maximum(1, np.ceil(np.sqrt(longest) / longest_m - 1e-6)), np.int64)
 
 
 def _places(counts: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
