@@ -33,10 +33,17 @@ from su3d_bench.core.system.devices import CPU
 from su3d_bench.core.system.files import file_text
 from su3d_bench.core.types import BoolArray, Float32Array, Int64Array
 from su3d_bench.perception.models.catalogue import ONNX_MANIFEST, model_entry
-from su3d_bench.perception.models.encoders import towers
+from su3d_bench.perception.models.encoders import encoder as towers
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec, unit_rows
 from su3d_bench.perception.models.encoders.texts import read_tokeniser
 from su3d_bench.perception.models.files import ModelFiles, bounded, locate, read_weights
+from su3d_bench.perception.models.masks.grounded_sam import (
+    RAM_MODEL,
+    RAM_TAG_LIST,
+    RamManifest,
+    ram_pixels,
+    read_word_list,
+)
 from su3d_bench.perception.models.masks.sam import (
     BOTTOM_RIGHT,
     DECODER_FILE,
@@ -46,7 +53,6 @@ from su3d_bench.perception.models.masks.sam import (
     SamManifest,
     load_sam,
 )
-from su3d_bench.perception.models.masks.tagging import RAM_MODEL, RAM_TAG_LIST, RamManifest, ram_pixels, read_word_list
 from su3d_bench.perception.models.onnx import OnnxManifest, open_session
 
 # 17 has LayerNormalization as one operator; newer ones bring nothing that our towers use.

@@ -20,7 +20,7 @@ import numpy as np
 from su3d_bench.core.system.devices import make_deterministic, precision_for, require_transformers
 from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.datasets.rooms.dataset import Rooms
-from su3d_bench.perception.models.encoders.towers import TransformersTowers
+from su3d_bench.perception.models.encoders.encoder import TransformersTowers
 from su3d_bench.perception.models.masks.automatic_masks import AUTOMATIC_MASKS, AutomaticMasks
 from su3d_bench.perception.models.masks.grounding_dino import BoxConfig, GroundingDino
 from su3d_bench.perception.models.masks.sam import Sam, TorchSam, sam_config

@@ -29,6 +29,7 @@ class RoomClass:
 _TABLE: Mapping[str, Any] = parse_toml(file_text(Path(__file__).with_name("classes.toml")))
 COLOUR_RGB: Mapping[str, tuple[int, int, int]] = {name: tuple(rgb) for name, rgb in _TABLE["colours"].items()}
 COLOURS = tuple(COLOUR_RGB)
+LOOKS: Mapping[str, Mapping[str, Any]] = _TABLE["looks"]
 MATERIALS: tuple[str, ...] = tuple(_TABLE["materials"])
 
 

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -28,19 +27,18 @@ from su3d_bench.core.types import (
     WholeObject,
 )
 from su3d_bench.datasets import openscan
-from su3d_bench.datasets.rooms.rendering.render import LEVELS, add_noise
-
-if TYPE_CHECKING:  # what makes a room is imported where one is made: a list of scenes needs none of it
-    from su3d_bench.datasets.rooms.plan import Plan
-    from su3d_bench.datasets.rooms.rendering.mesh import Patches, RoomMesh
-    from su3d_bench.datasets.rooms.rendering.render import RenderedFrame, Renderer
-    from su3d_bench.datasets.rooms.scan import RoomScan
-    from su3d_bench.datasets.rooms.truth import RoomObject, RoomTruth
+from su3d_bench.datasets.rooms.classes import CLASS_ID
+from su3d_bench.datasets.rooms.plan import Plan
+from su3d_bench.datasets.rooms.recipes import KINDS, furnish
+from su3d_bench.datasets.rooms.rendering.mesh import Patches, RoomMesh, build_mesh, gather_patches
+from su3d_bench.datasets.rooms.rendering.render import LEVELS, RenderedFrame, Renderer, add_noise, camera_intrinsics
+from su3d_bench.datasets.rooms.scan import RoomScan, kept_arrays, kept_scan, scan_room
+from su3d_bench.datasets.rooms.truth import RoomObject, RoomTruth, attribute_of_object, truth_of
+from su3d_bench.datasets.rooms.walk import walk
 
 SOURCES = ("datasets/rooms", "numerics")  # what moves a room: what is kept of one is keyed by it
 GENERATOR_VERSION = 3  # raise it whenever a scene of the same name comes out different
 DEFAULT_SCENES = ("living0", "bedroom0", "kitchen0", "office0", "bathroom0", "studio0", "living1", "office1")
-KIND_NAMES = ("living", "bedroom", "kitchen", "office", "bathroom", "studio")  # the keys of recipes.KINDS
 TRAINING_FROM = 10_000  # numbers from here on are kept for training the embedded encoder; no benchmark uses them
 FRAMES_PER_SECOND = 30.0
 N_STRUCTURE = 6  # floor, ceiling and four walls have the ids 1..6
@@ -63,16 +61,14 @@ class RoomOptions(BaseModel):
 @cache
 def label_set() -> LabelSet:
     """The classes of the rooms, which are Replica's."""
-    from su3d_bench.datasets.rooms.classes import CLASS_ID
-
     return LabelSet("replica", tuple(CLASS_ID.values()), tuple(CLASS_ID))
 
 
 def scene_name_parts(scene: str) -> tuple[str, int]:
     """Kind and number of a scene name; raises ``DataError`` for what is no scene."""
     match = re.fullmatch(r"([a-z]+)(0|[1-9]\d{0,5})", scene)
-    if match is None or match[1] not in KIND_NAMES:
-        hint = nearest(scene, DEFAULT_SCENES) or f"; kinds: {', '.join(KIND_NAMES)}"
+    if match is None or match[1] not in KINDS:
+        hint = nearest(scene, DEFAULT_SCENES) or f"; kinds: {', '.join(KINDS)}"
         raise DataError(f"rooms: no scene '{scene}'; a scene is a kind and a number such as office3{hint}")
     return match[1], int(match[2])
 
@@ -94,44 +90,32 @@ class BuiltRoom:
 
     @cached_property
     def plan(self) -> Plan:
-        from su3d_bench.datasets.rooms.recipes import furnish
-
         return furnish(scene_name_parts(self.scene)[0], _generator("room", self.scene, self.options.seed_offset))
 
     @cached_property
     def truth(self) -> RoomTruth:
-        from su3d_bench.datasets.rooms.truth import truth_of
-
         return truth_of(self.scene, scene_name_parts(self.scene)[0], self.plan)
 
     @cached_property
     def patches(self) -> Patches:
-        from su3d_bench.datasets.rooms.rendering.mesh import gather_patches
-
         return gather_patches(self.plan.placed)
 
     @cached_property
     def mesh(self) -> RoomMesh:
-        from su3d_bench.datasets.rooms.scan import kept_mesh
-
-        return kept_mesh(self._kept_in("mesh"), self._bake)
-
-    def _bake(self) -> RoomMesh:
-        from su3d_bench.datasets.rooms.rendering.mesh import build_mesh
-
         exposure = float(_generator("exposure", self.scene, self.options.seed_offset).uniform(0.58, 0.72))
-        return build_mesh(self.patches, self.plan.lights, exposure)
+        arrays = kept_arrays(
+            self._kept_in("mesh"),
+            RoomMesh.__dataclass_fields__,
+            lambda: vars(build_mesh(self.patches, self.plan.lights, exposure)),
+        )
+        return RoomMesh(**arrays)
 
     @cached_property
     def renderer(self) -> Renderer:
-        from su3d_bench.datasets.rooms.rendering.render import Renderer
-
         return Renderer(self.mesh, self.options.width, self.options.height)
 
     def coarser(self, width: int) -> Renderer:
         """A renderer of the same tree, kept until another width is asked for."""
-        from su3d_bench.datasets.rooms.rendering.render import Renderer
-
         if self._coarser is None or self._coarser.width != width:
             height = max(1, round(self.options.height * width / self.options.width))
             self._coarser = Renderer(self.mesh, width, height, self.renderer)
@@ -139,23 +123,18 @@ class BuiltRoom:
 
     @cached_property
     def trajectory(self) -> Float64Array:
-        from su3d_bench.datasets.rooms.scan import kept_walk
-
-        return kept_walk(self._kept_in("walk"), self._walk)
+        poses: Float64Array = kept_arrays(self._kept_in("walk"), ("poses",), lambda: {"poses": self._walk()})["poses"]
+        return poses
 
     @property
     def scan(self) -> RoomScan:
         """The surface that the walk sees, made anew."""
-        from su3d_bench.datasets.rooms.scan import scan_room
-
         return scan_room(self.patches, self.mesh, self.trajectory, self.options.mesh_spacing_m)
 
     def _kept_in(self, what: str) -> Path | None:
         return None if self.folder is None else self.folder / f"{self.scene}.{what}.npz"
 
     def _walk(self) -> Float64Array:
-        from su3d_bench.datasets.rooms.walk import walk
-
         plan = self.plan
         size = plan.width, plan.depth, plan.height
         rng = _generator("walk", self.scene, self.options.seed_offset)
@@ -180,8 +159,6 @@ class Rooms:
 
     @property
     def intrinsics(self) -> Float64Array:
-        from su3d_bench.datasets.rooms.rendering.render import camera_intrinsics
-
         return camera_intrinsics(self.options.width, self.options.height)
 
     def scenes(self) -> Sequence[str]:
@@ -234,8 +211,6 @@ class Rooms:
 
     def sketch(self, scene: str, index: int, width: int) -> Frame:
         """Frame ``index`` with fewer pixels, free of noise: colours and depths where the thinned rays hit."""
-        from su3d_bench.datasets.rooms.rendering.render import camera_intrinsics
-
         if width >= self.options.width:
             return self.frame(scene, index)
         room = self._room(scene)
@@ -246,8 +221,6 @@ class Rooms:
 
     def scan(self, scene: str) -> RoomScan:
         """The ground-truth surface; made once, then read from the cache."""
-        from su3d_bench.datasets.rooms.scan import kept_scan
-
         path = self.root / "rooms" / self._scan_key(scene) / f"{scene}.npz"
         return kept_scan(path, lambda: self._room(scene).scan)
 
@@ -271,11 +244,6 @@ class Rooms:
         words = package_digest(*SOURCES), self.options.n_frames, self.options.seed_offset, sorted(packages.items())
         return self.root / "rooms" / digest_json(words)[:16]
 
-    def visible_vertices(self, scene: str) -> dict[int, int]:
-        """Scan vertices of each object id; objects that the walk never sees have none."""
-        counts = np.bincount(self.scan(scene).object_of_vertex(), minlength=len(self.objects(scene)) + 1)
-        return {object_id: int(n) for object_id, n in enumerate(counts) if object_id}
-
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:
         """Labelled scan vertices (``mesh-vertices``) or the corners of every face in face order (``face-corners``).
 
@@ -296,8 +264,6 @@ class Rooms:
         return GroundTruth(points, self._class_of_object(scene)[owner], owner, label_set(), variant, source)
 
     def _attribute_truth(self, scene: str, variant: str) -> GroundTruth:
-        from su3d_bench.datasets.rooms.truth import attribute_of_object
-
         scan = self.scan(scene)
         owner = scan.object_of_vertex()
         attributes = attribute_of_object(self.objects(scene), variant)[owner]

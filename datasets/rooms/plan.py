@@ -58,10 +58,11 @@ class Plan:
         self.lights: list[Light] = []
         self._used: dict[str, set[str]] = {}
 
-    def new(self, class_name: str, model: str | None = None, colour: str | None = None) -> Item:
-        """An item in a colour that its class does not have in this room yet, as far as there are such."""
+    def new(self, want: str, colour: str | None = None) -> Item:
+        """An item of a class, or of a class/model, in a colour that the class does not have in this room yet."""
+        class_name, _, model = want.partition("/")
         used = self._used.setdefault(class_name, set())
-        item = make(class_name, self.rng, model, colour, frozenset(used))
+        item = make(class_name, self.rng, model or None, colour, frozenset(used))
         used.add(item.colour)
         return item
 
@@ -161,13 +162,9 @@ class Plan:
         return self.try_at_wall(item, wall, along, item.size[1] / 2 + GAP_M, z, gap, mount="wall")
 
     def hang_somewhere(self, item: Item, z: float, walls: Sequence[int] = (0, 1, 2, 3)) -> Placed | None:
-        for wall in self.shuffled(walls) * 10:
-            half = item.size[0] / 2 + 0.05
-            along = float(self.rng.uniform(half, self.wall_length(wall) - half))
-            placed = self.hang(item, wall, along, z)
-            if placed:
-                return placed
-        return None
+        half = item.size[0] / 2 + 0.05
+        places = ((wall, self.rng.uniform(half, self.wall_length(wall) - half)) for wall in self.shuffled(walls) * 10)
+        return next(filter(None, (self.hang(item, wall, float(along), z) for wall, along in places)), None)
 
     def wall_of(self, placed: Placed) -> tuple[int, float]:
         """The wall behind an item, and its place along that wall."""
@@ -181,12 +178,9 @@ class Plan:
     def beside(self, item: Item, anchor: Placed, gap: float = 0.06, back: bool = True) -> Placed | None:
         """To the left or right of an item, backs aligned."""
         y = (anchor.item.size[1] - item.size[1]) / 2 if back else 0.0
-        for side in self.shuffled((-1, 1)):
-            x = side * (anchor.item.size[0] / 2 + gap + item.size[0] / 2)
-            placed = self.try_by(item, anchor, x, y, anchor.yaw)
-            if placed:
-                return placed
-        return None
+        x = anchor.item.size[0] / 2 + gap + item.size[0] / 2
+        sides = (self.try_by(item, anchor, side * x, y, anchor.yaw) for side in self.shuffled((-1, 1)))
+        return next(filter(None, sides), None)
 
     def facing(self, item: Item, anchor: Placed, distance: float, shift: float = 0.0, turn: float = 180.0,
                jitter: float = 0.0) -> Placed | None:  # fmt: skip
@@ -253,30 +247,27 @@ class Plan:
 
     def finish_lights(self) -> None:
         """A light under each hanging lamp, or under the ceiling's middle where none hangs, and above floor lamps."""
-        hanging = [p for p in self.placed if p.item.class_name == "lamp" and self.mount[p.id] == "ceiling"]
+        lamps = [p for p in self.placed if p.item.class_name == "lamp"]
+        hanging = [p for p in lamps if self.mount[p.id] == "ceiling"]
         for lamp in hanging:
-            x, y, z = lamp.position
-            self.lights.append(Light((float(x), float(y), float(z) - 0.14), (1.5, 1.44, 1.32), 0.22))
+            x, y, z = lamp.position.tolist()
+            self.lights.append(Light((x, y, z - 0.14), (1.5, 1.44, 1.32), 0.22))
         if not hanging:
             self.lights.append(Light((self.width / 2, self.depth / 2, self.height - 0.2), (1.5, 1.46, 1.38), 0.35))
-        standing = [p for p in self.placed if p.item.class_name == "lamp" and p.item.size[2] > 1.2][:1]
-        for lamp in standing:
-            x, y, _ = lamp.position
-            top = float(lamp.position[2] + lamp.item.size[2])
-            self.lights.append(Light((float(x), float(y), top + 0.12), (0.5, 0.42, 0.3), 0.08))
+        for lamp in [p for p in lamps if p.item.size[2] > 1.2][:1]:
+            x, y, z = lamp.position.tolist()
+            self.lights.append(Light((x, y, z + float(lamp.item.size[2]) + 0.12), (0.5, 0.42, 0.3), 0.08))
 
 
-def _face(width: float, height: float, material: Material, name: str, colour: str, made_of: str) -> Item:
-    """A single upright rectangle that faces -y, x from 0 to ``width``."""
-    quads = np.array([[[0, 0, 0], [width, 0, 0], [width, 0, height], [0, 0, height]]], np.float64)
-    shape = Shape(quads, np.broadcast_to(np.array([0.0, -1.0, 0.0]), (1, 4, 3)).copy())
-    return Item(name, colour, made_of, "medium", (Part(shape, material),), (), np.array([width, 0.0, height]))
-
-
-def _level(width: float, depth: float, up: float, material: Material, name: str, colour: str, made_of: str) -> Item:
-    quads = np.array([[[0, 0, 0], [width, 0, 0], [width, depth, 0], [0, depth, 0]]], np.float64)
-    shape = Shape(quads, np.broadcast_to(np.array([0.0, 0.0, up]), (1, 4, 3)).copy())
-    return Item(name, colour, made_of, "medium", (Part(shape, material),), (), np.array([width, depth, 0.0]))
+def _rectangle(
+    side: tuple[float, float, float], normal: tuple[float, float, float], material: Material, name: str, colour: str,
+    made_of: str,
+) -> Item:  # fmt: skip
+    """A single rectangle along x and ``side``, which is 0 in one of y and z, with a corner at the origin."""
+    x, y, z = side
+    quads = np.array([[[0, 0, 0], [x, 0, 0], [x, y, z], [0, y, z]]], np.float64)
+    shape = Shape(quads, np.broadcast_to(np.array(normal), (1, 4, 3)).copy())
+    return Item(name, colour, made_of, "medium", (Part(shape, material),), (), np.array(side))
 
 
 def add_shell(plan: Plan, tiled: bool) -> None:
@@ -291,9 +282,10 @@ def add_shell(plan: Plan, tiled: bool) -> None:
         ground = Material(Texture.TILES, base, shade(base, 0.6), float(rng.uniform(0.28, 0.42)), 0.25, seed=seed)
     else:
         ground = Material(Texture.PLANKS, base, shade(base, 0.55), 0.035, 0.15, seed=seed)
-    plan.add(_level(plan.width, plan.depth, 1.0, ground, "floor", floor_colour, made_of), 0, 0, 0, 0, "room")
+    level = (plan.width, plan.depth, 0.0)
+    plan.add(_rectangle(level, (0.0, 0.0, 1.0), ground, "floor", floor_colour, made_of), 0, 0, 0, 0, "room")
     lid = Material(Texture.PLAIN, tone("white"), shade(tone("white"), 0.95))
-    plan.add(_level(plan.width, plan.depth, -1.0, lid, "ceiling", "white", "stone"), 0, 0, plan.height, 0, "room")
+    plan.add(_rectangle(level, (0.0, 0.0, -1.0), lid, "ceiling", "white", "stone"), 0, 0, plan.height, 0, "room")
     colour = str(rng.choice(["white", "white", "beige", "grey", "yellow", "green", "blue", "pink"]))
     rgb = mix(tone(colour, rng), tone("white"), 0.0 if colour in ("white", "grey") else 0.55)
     style = 2 if tiled else int(rng.choice([0, 0, 1, 3]))
@@ -304,7 +296,8 @@ def add_shell(plan: Plan, tiled: bool) -> None:
     corners = ((0.0, plan.depth), (plan.width, plan.depth), (plan.width, 0.0), (0.0, 0.0))
     for wall in range(4):
         material = accent if wall == accent_wall else paint
-        face = _face(plan.wall_length(wall), plan.height, material, "wall", colour, "stone")
+        side = (plan.wall_length(wall), 0.0, plan.height)
+        face = _rectangle(side, (0.0, -1.0, 0.0), material, "wall", colour, "stone")
         plan.add(face, *corners[wall], 0.0, WALL_YAW[wall], "room")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +42,7 @@ class RoomScan:
 
 def scan_room(patches: Patches, mesh: RoomMesh, poses: Float64Array, spacing_m: float) -> RoomScan:
     """The faces of about ``spacing_m`` that at least one of the poses sees."""
-    grid = cut(patches, np.full(len(patches.corners), spacing_m))
+    grid = cut(patches, spacing_m)
     points = at_rows(patches.corners, grid.rows)
     owner = patches.object_id[grid.quad_of_face]
     seen = _visible(points, grid, owner, mesh, poses)
@@ -112,38 +112,13 @@ def surface_colours(mesh: RoomMesh, points: Float32Array) -> UInt8Array:
 Arrays = dict[str, Any]
 
 
-def kept_mesh(path: Path | None, make: Callable[[], RoomMesh]) -> RoomMesh:
-    """The mesh in ``path``, byte for byte what ``make`` made; made where it is not there, and then kept there."""
-    return RoomMesh(**_kept(path, lambda: _arrays_of(make()), RoomMesh.__dataclass_fields__))
-
-
-def kept_scan(path: Path, make: Callable[[], RoomScan]) -> RoomScan:
-    """The scan in ``path``; made where it is not there, and then kept there, which must be possible."""
-    try:
-        return RoomScan(**_kept(path, lambda: _arrays_of(make()), RoomScan.__dataclass_fields__, forgiven=()))
-    except OSError as error:
-        raise DataError(
-            f"rooms: cannot write the scan to {path} ({error.strerror}); set SU3D_DATA to a folder that can be written"
-        ) from error
-
-
-def _arrays_of(kept: RoomMesh | RoomScan) -> Arrays:
-    return {field.name: getattr(kept, field.name) for field in fields(kept)}
-
-
-def kept_walk(path: Path | None, make: Callable[[], Float64Array]) -> Float64Array:
-    """The poses (n, 4, 4) in ``path``; made where they are not there, and then kept there."""
-    poses: Float64Array = _kept(path, lambda: {"poses": make()}, ("poses",))["poses"]
-    return poses
-
-
-def _kept(
+def kept_arrays(
     path: Path | None,
-    make: Callable[[], Arrays],
     names: Collection[str],
+    make: Callable[[], Arrays],
     forgiven: tuple[type[OSError], ...] = (OSError,),
 ) -> Arrays:
-    """The arrays of these ``names`` in ``path``, whose checksums hold, else those that ``make`` gives.
+    """The arrays of these ``names`` in ``path``, whose checksums hold, else those that ``make`` gives, kept there.
 
     A folder that takes no file only means that the next process makes the arrays again, where that is forgiven.
     """
@@ -157,3 +132,13 @@ def _kept(
     with suppress(*forgiven), filling(path) as stream:
         np.savez(stream, **made)
     return made
+
+
+def kept_scan(path: Path, make: Callable[[], RoomScan]) -> RoomScan:
+    """The scan in ``path``; made where it is not there, and then kept there, which must be possible."""
+    try:
+        return RoomScan(**kept_arrays(path, RoomScan.__dataclass_fields__, lambda: vars(make()), forgiven=()))
+    except OSError as error:
+        raise DataError(
+            f"rooms: cannot write the scan to {path} ({error.strerror}); set SU3D_DATA to a folder that can be written"
+        ) from error

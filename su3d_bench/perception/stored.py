@@ -221,15 +221,12 @@ def _load(path: Path, where: str) -> dict[str, NDArray[Any]]:
 
 
 def _check_keys(arrays: Mapping[str, NDArray[Any]], where: str) -> None:
-    missing = [key for key in _REQUIRED if key not in arrays]
-    unknown = [key for key in arrays if key not in _REQUIRED + _OPTIONAL]
-    partial = [key for key in _FEATURES if key in arrays]
-    if missing:
-        raise DataError(f"{where}: array '{missing[0]}' is missing; needed: {', '.join(_REQUIRED)}")
-    if unknown:
-        raise DataError(f"{where}: unknown array '{unknown[0]}'; known: {', '.join(_REQUIRED + _OPTIONAL)}")
-    if partial and len(partial) < len(_FEATURES):
-        raise DataError(f"{where}: has '{partial[0]}' but not all of {', '.join(_FEATURES)}; give all four or none")
+    n_features = len(set(_FEATURES) & set(arrays))
+    if not {*_REQUIRED} <= set(arrays) <= {*_REQUIRED, *_OPTIONAL} or n_features not in (0, len(_FEATURES)):
+        raise DataError(
+            f"{where}: holds {', '.join(arrays)}; expected {', '.join(_REQUIRED)}, captions or not, and all or none of "
+            f"{', '.join(_FEATURES)}"
+        )
 
 
 def _check_rows(arrays: Mapping[str, NDArray[Any]], where: str) -> int:
@@ -314,15 +311,11 @@ def _features(
             f"{where}: crop_features {crops.shape} and global_feature {whole.shape}; expected {expected} and "
             f"({encoder.dim},)"
         )
-    norms = np.linalg.norm(crops.astype(np.float64), axis=2)
-    bad = np.argwhere(~(np.abs(norms - 1) < 1e-3))
-    if len(bad):
-        k, r = (int(value) for value in bad[0])
-        raise DataError(
-            f"{where}, region {k}: its feature at ratio {float(ratios[r])} has length {norms[k, r]:.4g}, not 1"
-        )
-    if not abs(float(np.linalg.norm(whole.astype(np.float64))) - 1) < 1e-3:
-        raise DataError(f"{where}: global_feature is not of length 1")
+    rows = np.concatenate([crops.reshape(-1, encoder.dim), whole[None]]).astype(np.float64)
+    lengths = np.linalg.norm(rows, axis=1)
+    if not (np.abs(lengths - 1) < 1e-3).all():
+        worst = lengths[np.argmax(np.abs(lengths - 1))]
+        raise DataError(f"{where}: crop_features or global_feature has a row of length {worst:.4g}, not 1")
     of_ratio = {float(ratio): crops[:, column].astype(np.float32) for column, ratio in enumerate(ratios)}
     return of_ratio, whole.astype(np.float32)
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,16 +33,6 @@ MAX_NAMES_BYTES = 1 << 20
 MAX_NAME_LENGTH = 100
 
 
-@dataclass(frozen=True)
-class LabelledRegions:
-    """Regions of one image by ascending value: masks (K, H, W), boxes (K, 4) as in ``Regions``, names where given."""
-
-    values: tuple[int, ...]
-    masks: BoolArray
-    boxes: Float32Array
-    names: tuple[str | None, ...]
-
-
 class LabelImages:
     """The label images of a scene; ``files`` are those that a run reads, the names' file first."""
 
@@ -56,8 +45,8 @@ class LabelImages:
         self._name_of = {} if names is None else read_names(names, self._where)
         self.files = (*(() if names is None else (names,)), *self._images.values())
 
-    def regions(self, frame: Frame) -> LabelledRegions:
-        """What the image of ``frame`` shows; raises ``DataError``."""
+    def frame(self, frame: Frame) -> StoredFrame:
+        """Regions by ascending value, "" for a name that is not given, no score below another; raises ``DataError``."""
         path = self._images.get(frame.index)
         if path is None:
             raise DataError(
@@ -70,15 +59,8 @@ class LabelImages:
         masks = np.empty((len(values), *labels.shape), np.bool_)
         for mask, value in zip(masks, values, strict=True):
             np.equal(labels, value, out=mask)
-        return LabelledRegions(
-            tuple(values), masks, mask_boxes(masks), tuple(self._name_of.get(value) for value in values)
-        )
-
-    def frame(self, frame: Frame) -> StoredFrame:
-        """The same with "" for a name that is not given, and no score below another."""
-        labelled = self.regions(frame)
-        names = tuple(name or "" for name in labelled.names)
-        return StoredFrame(Regions(labelled.masks, labelled.boxes, np.ones(len(names), np.float32), names))
+        names = tuple(self._name_of.get(value, "") for value in values)
+        return StoredFrame(Regions(masks, mask_boxes(masks), np.ones(len(names), np.float32), names))
 
 
 def decode_labels(path: Path, shape: tuple[int, ...], where: str) -> NDArray[Any]:
@@ -130,7 +112,6 @@ def read_names(path: Path, where: str) -> dict[int, str]:
     return names
 
 
-MAX_NAME_LENGTH = 100
 _SKIPPED = ("image_crops",)
 # Who made the features in the files, and of which crops: boxes and 20 px on every side.
 FEATURES_ENCODER, FEATURES_PADDING_PX = "clip-vit-h-14", 20

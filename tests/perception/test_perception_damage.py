@@ -13,10 +13,10 @@ from test_perception_stored import written
 from test_perception_stored_images import images, write_image
 
 from su3d_bench.perception.models.catalogue import model_entry
-from su3d_bench.perception.models.encoders.towers import EncoderManifest, transformers_spec
+from su3d_bench.perception.models.encoders.encoder import EncoderManifest, transformers_spec
 from su3d_bench.perception.models.files import ModelFiles
+from su3d_bench.perception.models.masks.grounded_sam import read_word_list
 from su3d_bench.perception.models.masks.sam import SamManifest
-from su3d_bench.perception.models.masks.tagging import read_word_list
 from su3d_bench.perception.stored import read_stored
 from su3d_bench.perception.stored_masks import read_names
 
@@ -77,7 +77,7 @@ def test_damaged_arrays_and_images_are_read_or_refused(tmp_path: Path) -> None:
     check(stored, stored.read_bytes(), lambda: read_stored(stored, still_life(40), CountingEncoder()), named="frame 40")
     image = write_image(tmp_path / "labels")
     source = images(tmp_path / "labels")
-    check(image, image.read_bytes(), lambda: source.regions(still_life(40)))
+    check(image, image.read_bytes(), lambda: source.frame(still_life(40)))
 
 
 def check(path: Path, whole: bytes, read: Callable[[], object], named: str = "") -> None:

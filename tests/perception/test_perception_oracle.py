@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from perception_fakes import INTRINSICS, CountingEncoder, quad_mesh, still_life
+from perception_fakes import INTRINSICS, CountingEncoder, still_life
 
 from su3d_bench.baselines.oracle import Oracle
 from su3d_bench.core.system.timing import Timer
-from su3d_bench.core.types import Frame, GroundTruth, Int32Array, LabelSet, PerceptionNeeds, SceneInfo
+from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, Int32Array, LabelSet, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.oracle import MeshProjector, OracleConfig, OracleNoise, OracleSegmenter, disturb
 from su3d_bench.perception.profiles import PerceptionConfig, build_perception
 
@@ -17,6 +18,20 @@ SCENE = SceneInfo("rooms", "living0", n_frames=1, stride=1, image_domain="render
 # One pixel is 1 cm at 1 m: the square covers columns 30..69 and rows 20..49 of the image at depth 1.
 SQUARE = ((30 - 80) / 100, (70 - 80) / 100, (20 - 60) / 100, (50 - 60) / 100, 1.0)
 WALL = (-3.0, 3.0, -3.0, 3.0, 2.0)
+
+
+def quad_mesh(*quads: tuple[float, float, float, float, float], instance: Sequence[int]) -> InstanceMesh:
+    """Rectangles (x0, x1, y0, y1, z) that face the camera, two triangles each, as instances of ascending class."""
+    corners = [[(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)] for x0, x1, y0, y1, z in quads]
+    triangles = np.arange(0, 4 * len(quads), 4)[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])
+    known = sorted({i for i in instance if i})
+    return InstanceMesh(
+        np.array(corners, np.float32).reshape(-1, 3),
+        triangles.reshape(-1, 3).astype(np.int32),
+        np.repeat(np.array(instance, np.int32), 2),
+        {key: 20 + rank for rank, key in enumerate(known)},
+        LabelSet("replica", (20, 21, 22, 23), ("chair", "cup", "umbrella", "blinds")),
+    )
 
 
 def flat_frame(depth_m: float = 2.0, index: int = 0) -> Frame:

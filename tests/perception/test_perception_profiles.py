@@ -13,14 +13,9 @@ from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import ImageDomain, PerceptionNeeds, SceneInfo
 from su3d_bench.opensu3d.config import OpenSU3DConfig
-from su3d_bench.perception.cache import crop_images, crop_window, mask_boxes
+from su3d_bench.perception.cache import crop_images, crop_window
 from su3d_bench.perception.detections import is_background, regions_to_keep
-from su3d_bench.perception.embedded.lexicon import (
-    Namer,
-    NamingConfig,
-    colour_word,
-    vocabulary,
-)
+from su3d_bench.perception.embedded.lexicon import Namer, NamingConfig, colour_word, vocabulary
 from su3d_bench.perception.profiles import PerceptionConfig, build_perception, resolve_profile
 
 
@@ -152,10 +147,3 @@ def test_a_crop_holds_the_pixels_of_its_window() -> None:
     rgb = np.arange(6 * 8 * 3, dtype=np.uint8).reshape(6, 8, 3)
     (crop,) = crop_images(rgb, np.array([[2, 1, 6, 5]], np.float32), 0.5)
     assert np.array_equal(crop, rgb[2:4, 3:5])
-
-
-def test_mask_boxes_are_tight_with_exclusive_ends() -> None:
-    masks = np.zeros((2, 6, 8), bool)
-    masks[0, 1:3, 4:7] = True
-    assert mask_boxes(masks).tolist() == [[4, 1, 7, 3], [0, 0, 0, 0]]
-    assert mask_boxes(masks[:0]).shape == (0, 4)

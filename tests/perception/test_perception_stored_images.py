@@ -50,8 +50,8 @@ def perception(folder: Path, cache: Path, names: str | None = None) -> Perceptio
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_each_value_above_zero_is_one_region_by_ascending_value(tmp_path: Path, dtype: Any) -> None:
     write_image(tmp_path, labels(dtype))
-    found = images(tmp_path).regions(still_life(40))
-    assert found.values == (48, 132) and found.names == (None, None)
+    found = images(tmp_path).frame(still_life(40)).regions
+    assert found.names == ("", "")
     np.testing.assert_array_equal(found.masks, [labels() == 48, labels() == 132])
     np.testing.assert_array_equal(found.boxes, [[90, 50, 120, 90], [20, 40, 60, 80]])
 
@@ -84,7 +84,7 @@ def test_named_values_keep_their_name_and_score_and_the_encoder_names_the_others
 def test_what_is_no_label_image_is_said(tmp_path: Path, image: np.ndarray, message: str) -> None:
     write_image(tmp_path, image)
     with pytest.raises(DataError) as caught:
-        images(tmp_path).regions(still_life(40))
+        images(tmp_path).frame(still_life(40))
     assert str(caught.value).startswith("rgbd/desk: frame-0040.segm.png") and message in str(caught.value)
 
 

@@ -7,24 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from su3d_bench.datasets.rooms.objects.items import Assembly
-from su3d_bench.datasets.rooms.objects.materials import (
-    Material,
-    Texture,
-    ceramic,
-    chrome,
-    cloth,
-    light,
-    linear,
-    metal,
-    mix,
-    paint,
-    paper,
-    plain_cloth,
-    plastic,
-    shade,
-    tone,
-    wood,
-)
+from su3d_bench.datasets.rooms.objects.materials import Material, Texture, light, linear, mix, shade, tone
 from su3d_bench.datasets.rooms.objects.shapes import (
     Shape,
     block,
@@ -51,27 +34,27 @@ def _shade(build: Assembly, radius: float, height: float, z: float) -> None:
 
 def table_lamp(build: Assembly) -> None:
     foot, tall = build.size(0.075, 0.1), build.size(0.2, 0.3)
-    body = ceramic(build.other("white", "blue", "green", "brown", "black"))
+    body = build.of("ceramic", build.other("white", "blue", "green", "brown", "black"))
     if build.chance(0.5):
         belly = [(0, 0), (foot * 0.7, 0), (foot, tall * 0.3), (foot * 0.8, tall * 0.6)]
         build.add(body, lathe([*belly, (0.02, tall * 0.85), (0.02, tall), (0, tall)], 20))
     else:
         stand = lathe([(0, 0), (foot, 0), (foot, 0.015), (0.014, 0.025), (0.014, tall), (0, tall)], 20)
-        build.add(metal(tone("black"), build.rng), stand)
-    build.add(chrome(build.rng), cylinder(0.009, 0.12, z=tall - 0.005))
+        build.add(build.of("metal", "black"), stand)
+    build.add("chrome", cylinder(0.009, 0.12, z=tall - 0.005))
     _shade(build, build.size(0.13, 0.17), build.size(0.15, 0.2), tall + 0.02)
 
 
 def floor_lamp(build: Assembly) -> None:
     tall = build.rng.uniform(1.25, 1.45)
-    pole = metal(tone(str(build.rng.choice(["black", "grey", "brown"]))), build.rng)
+    pole = build.of("metal", tone(str(build.rng.choice(["black", "grey", "brown"]))))
     build.add(pole, lathe([(0, 0), (0.15, 0), (0.15, 0.02), (0.03, 0.035), (0, 0.035)], 24))
     build.add(pole, cylinder(0.014, tall - 0.03, z=0.03))
     _shade(build, build.size(0.18, 0.23), build.size(0.23, 0.29), tall - 0.05)
 
 
 def desk_lamp(build: Assembly) -> None:
-    body = metal(build.rgb, build.rng) if build.material == "metal" else plastic(build.rgb)
+    body = build.of("metal") if build.material == "metal" else build.of("plastic")
     build.add(body, lathe([(0, 0), (0.085, 0), (0.085, 0.018), (0.02, 0.028), (0, 0.028)], 20))
     build.add(body, tube([(0, 0, 0.02), (0, 0.1, 0.22), (0, -0.06, 0.4)], 0.011))
     build.add(body, ellipsoid(0.02, 0.02, 0.02).moved(0, 0.1, 0.22))
@@ -85,7 +68,7 @@ def ceiling_lamp(build: Assembly) -> None:
     cord = build.rng.uniform(0.12, 0.25)
     radius, height = build.size(0.2, 0.27), build.size(0.16, 0.22)
     _shade(build, radius, height, 0.0)
-    black = plastic(tone("black"))
+    black = build.of("plastic", "black")
     build.add(black, cylinder(0.008, cord, z=height * 0.5), cylinder(0.05, 0.03, z=height * 0.5 + cord))
     build.add(black, *[block(radius * 0.9, 0.008, 0.006, 0, 0, height * 0.8).turned("z", turn) for turn in (0, 90)])
 
@@ -107,7 +90,7 @@ def indoor_plant(build: Assembly) -> None:
     pot_colour = build.other("white", "orange", "brown", "blue", "grey", "black", "yellow")
     base = pot_height * 0.9
     profile = [(0, 0), (0.72, 0), (0.98, 0.85), (1.06, 0.86), (1.06, 1), (0.93, 1), (0.93, 0.9), (0, 0.9)]
-    build.add(ceramic(pot_colour), lathe([(r * out, pot_height * up) for out, up in profile], 22))
+    build.add(build.of("ceramic", pot_colour), lathe([(r * out, pot_height * up) for out, up in profile], 22))
     soil = Material(Texture.CARPET, linear((62, 42, 28)), linear((30, 20, 14)), 0.01)
     build.add(soil, cylinder(r * 0.92, 0.006, z=base))
     habit = int(build.rng.integers(0, 3))
@@ -132,7 +115,7 @@ def _broad_leaves(build: Assembly, base: float, tall: float, r: float) -> None:
 
 
 def _bush(build: Assembly, base: float, tall: float, r: float) -> None:
-    trunk = wood(tone("brown"), build.rng, 2)
+    trunk = build.of("wooden", "brown", 2)
     build.add(trunk, tube([(0, 0, base), (0.01, 0, base + tall * 0.35), (0, 0.01, base + tall * 0.6)], 0.012, 6))
     for i in range(26):
         turn, rise = 360 * i * 0.381966, build.rng.uniform(0.3, 0.95)
@@ -171,19 +154,19 @@ def vase(build: Assembly) -> None:
             bend = build.rng.uniform(0.02, 0.07)
             top = (0.0, float(bend), h + build.rng.uniform(0.08, 0.18))
             stem = tube([(0, 0, h * 0.3), (0, bend * 0.4, h), top], 0.004, 5).turned("z", 72 * i)
-            build.add(paint(tone("green")), stem)
+            build.add(build.of("paint", "green"), stem)
             bloom = build.other("red", "yellow", "pink", "purple", "white")
-            build.add(paint(bloom), ellipsoid(0.028, 0.028, 0.022).moved(*top).turned("z", 72 * i))
+            build.add(build.of("paint", bloom), ellipsoid(0.028, 0.028, 0.022).moved(*top).turned("z", 72 * i))
 
 
 def picture(build: Assembly) -> None:
     width, height = build.size(0.42, 0.7), build.size(0.38, 0.56)
     bar = build.rng.uniform(0.02, 0.04)
-    frame = wood(build.rgb, build.rng) if build.colour == "brown" else paint(build.rgb, 0.25)
+    frame = build.of("wooden") if build.colour == "brown" else replace(build.of("paint"), gloss=0.25)
     build.add(frame, *[block(bar, 0.026, height, x / 2) for x in both(width - bar)])
     build.add(frame, *[block(width - 2 * bar, 0.026, bar, 0, 0, z) for z in (0.0, height - bar)])
     margin = bar + (0.045 if build.chance(0.5) else 0.0)
-    build.add(paper(tone("white")), block(width - 2 * bar, 0.01, height - 2 * bar, 0, 0.004, bar))
+    build.add(build.of("paper", "white"), block(width - 2 * bar, 0.01, height - 2 * bar, 0, 0.004, bar))
     extent = (-width / 2 + margin, width / 2 - margin, margin, height - margin)
     colours = [
         build.other(str(name))
@@ -200,7 +183,7 @@ def clock(build: Assembly) -> None:
     extent = (-r * 0.88, r * 0.88, r * 0.12, r * 1.88)
     face = Material(Texture.CLOCK_FACE, tone("white"), tone("black"), 1.0, 0.2, extent=extent)
     build.add(face, cylinder(r * 0.87, 0.003).turned("x", 90).moved(0, -0.0245, r))
-    hands = paint(tone("black"))
+    hands = build.of("paint", "black")
     for length, thick in ((r * 0.5, 0.016), (r * 0.72, 0.011)):
         turn = build.rng.uniform(0, 360)
         build.add(hands, block(thick, 0.003, length, 0, 0, -0.02).turned("y", turn).moved(0, -0.031, r))
@@ -209,10 +192,10 @@ def clock(build: Assembly) -> None:
 def candle(build: Assembly) -> None:
     r, h = build.size(0.038, 0.05), build.size(0.12, 0.2)
     dish = lathe([(0, 0), (r * 1.6, 0), (r * 1.75, 0.018), (r * 1.6, 0.018), (r * 1.4, 0.008), (0, 0.008)], 20)
-    build.add(metal(linear((176, 140, 70)), build.rng), dish)
+    build.add(build.of("metal", linear((176, 140, 70))), dish)
     wax = lathe([(0, 0), (r, 0), (r, h), (r * 0.8, h - 0.008), (0, h - 0.012)], 18)
-    build.add(paint(build.rgb, 0.2), wax.moved(z=0.009))
-    build.add(paint(tone("black")), cylinder(0.003, 0.02, z=h - 0.004))
+    build.add(replace(build.of("paint"), gloss=0.2), wax.moved(z=0.009))
+    build.add(build.of("paint", "black"), cylinder(0.003, 0.02, z=h - 0.004))
     flame = Material(Texture.PLAIN, linear((255, 190, 70)), linear((255, 170, 50)), glow=1.0)
     build.add(flame, ellipsoid(0.009, 0.009, 0.02).moved(z=h + 0.03))
 
@@ -220,7 +203,7 @@ def candle(build: Assembly) -> None:
 def sculpture(build: Assembly) -> None:
     h = build.size(0.26, 0.4)
     body = build.main()
-    build.add(paint(tone("black"), 0.3), block(0.13, 0.13, 0.04))
+    build.add(replace(build.of("paint", "black"), gloss=0.3), block(0.13, 0.13, 0.04))
     kind = int(build.rng.integers(0, 3))
     if kind == 0:  # a bust
         outline = [(0, 0), (0.05, 0), (0.045, 0.18), (0.1, 0.3), (0.09, 0.42), (0.032, 0.52), (0.03, 0.6), (0, 0.6)]
@@ -254,18 +237,18 @@ def flat_cushion(build: Assembly) -> None:
 def pillow(build: Assembly) -> None:
     """A wide, flat, pale pillow."""
     width, depth = build.size(0.52, 0.64), build.size(0.34, 0.4)
-    build.add(plain_cloth(build.rgb, build.rng), puff(width, depth, build.rng.uniform(0.14, 0.18)).turned("x", 90))
+    build.add(build.of("plain fabric"), puff(width, depth, build.rng.uniform(0.14, 0.18)).turned("x", 90))
 
 
 def blanket(build: Assembly) -> None:
     """A folded blanket: layers with a rounded fold at the front."""
     width, depth = build.size(0.42, 0.55), build.size(0.32, 0.4)
-    cover = cloth(build.rgb, build.rng, large=True)
+    cover = build.of("large fabric")
     n = int(build.rng.integers(3, 5))
     for i in range(n):
         grow, x = build.rng.uniform(-0.012, 0.012), build.rng.uniform(-0.006, 0.006)
         build.add(cover, soft_block(width + grow, depth + grow, 0.034, x, 0, i * 0.0345, 0.0165))
-    fringe = plain_cloth(shade(build.rgb, 0.6), build.rng)
+    fringe = build.of("plain fabric", shade(build.rgb, 0.6))
     for i in range(int(width / 0.03)):
         x, y, z = -width / 2 + 0.02 + i * 0.03, -depth / 2 - 0.022, (n - 1) * 0.0345 + 0.012
         build.add(fringe, block(0.011, 0.04, 0.006, x, y, z))
@@ -276,8 +259,8 @@ def rolled_blanket(build: Assembly) -> None:
     length, r = build.size(0.44, 0.52), build.size(0.075, 0.085)
     spiral = [(r * 0.2, 0.004), (r * 0.3, -0.004), (r * 0.55, -0.004), (r * 0.65, 0.005), (r * 0.8, 0.005), (r, 0.014)]
     roll = lathe([(0, 0), *spiral, (r, length), (0, length)], 20)
-    build.add(cloth(build.rgb, build.rng, large=True), roll.turned("y", 90))
-    fringe = plain_cloth(shade(build.rgb, 0.6), build.rng)
+    build.add("large fabric", roll.turned("y", 90))
+    fringe = build.of("plain fabric", shade(build.rgb, 0.6))
     for i in range(14):
         strand = block(0.03, 0.008, 0.006, length + 0.016, 0, r * 0.9).turned("x", 360 * i / 14)
         build.add(fringe, strand)
@@ -286,8 +269,8 @@ def rolled_blanket(build: Assembly) -> None:
 def folded_towel(build: Assembly) -> None:
     """A stack of folded towels with a border stripe."""
     width, depth = build.size(0.3, 0.38), build.size(0.2, 0.25)
-    stripe = plain_cloth(mix(build.rgb, (0.9, 0.9, 0.9), 0.6), build.rng)
-    soft = plain_cloth(build.rgb, build.rng)
+    stripe = build.of("plain fabric", mix(build.rgb, (0.9, 0.9, 0.9), 0.6))
+    soft = build.of("plain fabric")
     for i in range(int(build.rng.integers(2, 4))):
         z = i * 0.047
         build.add(soft, soft_block(width, depth, 0.045, float(build.rng.uniform(-0.008, 0.008)), 0, z, 0.021))
@@ -296,12 +279,12 @@ def folded_towel(build: Assembly) -> None:
 
 def rolled_towel(build: Assembly) -> None:
     length, r = build.size(0.34, 0.42), build.size(0.055, 0.07)
-    soft = plain_cloth(build.rgb, build.rng)
+    soft = build.of("plain fabric")
     turns = [(0.2, 0.003), (0.25, 0.003), (0.35, -0.004), (0.55, -0.004), (0.62, 0.004), (0.8, 0.004), (1, 0.012)]
     spiral = [(r * share, x) for share, x in turns]
     build.add(soft, lathe([(0, 0), *spiral, (r, length), (0, length)], 18).turned("y", 90))
     band = lathe([(r, 0), (r + 0.003, 0), (r + 0.003, 0.03), (r, 0.03), (r, 0)], 18).turned("y", 90)
-    build.add(plain_cloth(mix(build.rgb, (0.9, 0.9, 0.9), 0.6), build.rng), band.moved(length * 0.75))
+    build.add(build.of("plain fabric", mix(build.rgb, (0.9, 0.9, 0.9), 0.6)), band.moved(length * 0.75))
 
 
 def rug(build: Assembly) -> None:
@@ -311,7 +294,7 @@ def rug(build: Assembly) -> None:
     seed = int(build.rng.integers(1, 999))
     pile = Material(Texture.RUG, build.rgb, second, scale, 0.0, axis=2, extent=extent, seed=seed)
     build.add(pile, block(width, depth, 0.012))
-    fringe = plain_cloth(tone("beige"), build.rng)
+    fringe = build.of("plain fabric", "beige")
     for x in both(width / 2 + 0.026):
         build.add(fringe, *[block(0.05, 0.012, 0.005, x, y) for y in np.arange(-depth / 2 + 0.02, depth / 2, 0.05)])
 
@@ -320,14 +303,14 @@ def mat(build: Assembly) -> None:
     width, depth = build.size(0.6, 0.75), build.size(0.4, 0.46)
     pile = Material(Texture.CARPET, build.rgb, shade(build.rgb, 0.55), 0.012)
     build.add(pile, soft_block(width, depth, 0.026, 0, 0, 0, 0.012))
-    edge = plain_cloth(mix(build.rgb, (0.85, 0.85, 0.82), 0.6), build.rng)
+    edge = build.of("plain fabric", mix(build.rgb, (0.85, 0.85, 0.82), 0.6))
     build.add(edge, *[block(width * 0.86, 0.03, 0.003, 0, y, 0.0262) for y in both(depth * 0.38)])
 
 
 def backpack(build: Assembly) -> None:
     width, depth, height = build.size(0.29, 0.34), build.size(0.16, 0.19), build.size(0.4, 0.47)
-    cover = plain_cloth(build.rgb, build.rng)
-    trim = plain_cloth(shade(build.rgb, 0.4) if build.colour != "black" else tone("grey"), build.rng)
+    cover = build.of("plain fabric")
+    trim = build.of("plain fabric", shade(build.rgb, 0.4) if build.colour != "black" else tone("grey"))
     build.add(cover, soft_block(width, depth, height, 0, 0, 0, 0.07))
     build.add(trim, soft_block(width * 0.78, 0.07, height * 0.42, 0, -depth / 2 - 0.02, 0.03, 0.03))
     build.add(trim, soft_block(width * 0.9, depth * 0.9, 0.03, 0, -0.02, height * 0.72, 0.012))
@@ -335,7 +318,7 @@ def backpack(build: Assembly) -> None:
     angle = np.linspace(0, np.pi, 7)
     loop = [(0.05 * float(np.cos(a)), depth * 0.2, height - 0.01 + 0.05 * float(np.sin(a))) for a in angle]
     build.add(trim, tube(loop, 0.01, 7))
-    build.add(chrome(build.rng), block(width * 0.66, 0.006, 0.008, 0, -depth / 2 - 0.056, height * 0.36))
+    build.add("chrome", block(width * 0.66, 0.006, 0.008, 0, -depth / 2 - 0.056, height * 0.36))
     strap = (-0.01, 0.9), (0.04, 0.6), (-0.005, 0.12)
     for x in both(width * 0.27):
         build.add(trim, tube([(x, depth / 2 + back, height * up) for back, up in strap], 0.017, 6))
@@ -344,7 +327,7 @@ def backpack(build: Assembly) -> None:
 def umbrella(build: Assembly) -> None:
     """A closed umbrella that stands on its tip: shaft, folded canopy, crook."""
     h = build.size(0.78, 0.9)
-    build.add(metal(tone("grey"), build.rng), cylinder(0.008, h * 0.8))
+    build.add(build.of("metal", "grey"), cylinder(0.008, h * 0.8))
     r = 0.055 * build.scale
     folds = 8
     angle = np.linspace(0, 2 * np.pi, folds * 6 + 1)
@@ -352,9 +335,9 @@ def umbrella(build: Assembly) -> None:
     outline = (0.06, 0.012), (0.15, r * 0.55), (0.45, r), (0.62, r * 0.9), (0.66, 0.014)
     rings = [(ring * rad * np.cos(angle), ring * rad * np.sin(angle), np.full_like(angle, h * z)) for z, rad in outline]
     grid = np.stack([np.stack(each, axis=-1) for each in rings], axis=1)
-    build.add(plain_cloth(build.rgb, build.rng), sheet(grid, 0.004))
+    build.add("plain fabric", sheet(grid, 0.004))
     band = lathe([(r * 0.9, 0), (r * 1.24, 0), (r * 1.24, 0.03), (r * 0.9, 0.03)], 18)
-    build.add(plain_cloth(shade(build.rgb, 0.4), build.rng), band.moved(z=h * 0.42))
+    build.add(build.of("plain fabric", shade(build.rgb, 0.4)), band.moved(z=h * 0.42))
     turn = np.linspace(0, np.pi, 8)
     crook = [(0.04 - 0.04 * float(np.cos(a)), 0.0, h * 0.9 + 0.04 * float(np.sin(a))) for a in turn]
-    build.add(wood(tone("brown"), build.rng, 2), tube([(0, 0, h * 0.66), *crook, (0.08, 0, h * 0.85)], 0.013, 8))
+    build.add(build.of("wooden", "brown", 2), tube([(0, 0, h * 0.66), *crook, (0.08, 0, h * 0.85)], 0.013, 8))

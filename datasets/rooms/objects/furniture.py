@@ -3,18 +3,7 @@
 from __future__ import annotations
 
 from su3d_bench.datasets.rooms.objects.items import Assembly
-from su3d_bench.datasets.rooms.objects.materials import (
-    chrome,
-    cloth,
-    leather,
-    mix,
-    paint,
-    plain_cloth,
-    plastic,
-    shade,
-    tone,
-    wood,
-)
+from su3d_bench.datasets.rooms.objects.materials import mix, shade, tone
 from su3d_bench.datasets.rooms.objects.shapes import Shape, block, both, box, corners, cylinder, lathe, soft_block, tube
 
 
@@ -42,7 +31,7 @@ def chair(build: Assembly) -> None:
     build.add(frame, *_legs(width, depth, seat - 0.04, 0.042, 0.0))
     build.add(build.main(axis=1), soft_block(width, depth, 0.045, 0, 0, seat - 0.04, 0.012))
     if build.chance(0.4):
-        cover = cloth(build.other("red", "blue", "beige", "green"), build.rng)
+        cover = build.of("fabric", build.other("red", "blue", "beige", "green"))
         build.add(cover, soft_block(width * 0.92, depth * 0.9, 0.045, 0, -0.01, seat + 0.005, 0.02))
     y = depth / 2 - 0.021
     build.add(frame, *[block(0.042, 0.042, back + 0.0, x, y, seat) for x in both(width / 2 - 0.021)])
@@ -62,18 +51,18 @@ def _shell_chair(build: Assembly, width: float, depth: float, seat: float, back:
     build.add(shell, soft_block(width, depth, 0.05, 0, 0, seat - 0.03, 0.024))
     rest = soft_block(width * 0.96, 0.04, back, 0, 0, 0, 0.019).turned("x", -9).moved(0, depth / 2 + 0.01, seat)
     build.add(shell, rest)
-    steel = chrome(build.rng)
+    steel = build.of("chrome")
     if build.chance(0.5):  # office chair: column and five-armed foot
         build.add(steel, cylinder(0.03, seat - 0.11, z=0.08))
         for i in range(5):
-            build.add(plastic(tone("black")), box(0.0, 0.27, -0.022, 0.022, 0.05, 0.085).turned("z", 72 * i + 18))
+            build.add(build.of("plastic", "black"), box(0.0, 0.27, -0.022, 0.022, 0.05, 0.085).turned("z", 72 * i + 18))
             wheel = soft_block(0.05, 0.035, 0.05, 0.25, 0, 0, 0.017).turned("z", 72 * i + 18)
-            build.add(plastic(tone("black")), wheel)
+            build.add(build.of("plastic", "black"), wheel)
         if build.chance(0.5):
             for side in (-1, 1):
                 x = side * (width / 2 + 0.01)
                 bar = [(x, 0.08, seat), (x + side * 0.03, 0.08, seat + 0.2), (x + side * 0.03, -0.12, seat + 0.2)]
-                build.add(plastic(tone("black")), tube(bar, 0.016))
+                build.add(build.of("plastic", "black"), tube(bar, 0.016))
         return
     for sx in (-1, 1):
         for sy in (-1, 1):
@@ -85,7 +74,7 @@ def stool(build: Assembly) -> None:
     radius, height = build.size(0.16, 0.2), build.rng.uniform(0.42, 0.62) * build.scale
     seat = lathe([(0, 0), (radius * 0.96, 0), (radius, 0.02), (radius, 0.05), (0, 0.055)])
     build.add(build.main(), seat.moved(z=height - 0.05))
-    legs = chrome(build.rng) if build.material == "metal" else build.main(axis=2)
+    legs = build.of("chrome") if build.material == "metal" else build.main(axis=2)
     reach = radius * 0.95
     for x, y in corners(reach, reach):
         build.add(legs, tube([(x, y, 0), (x * 0.62, y * 0.62, height - 0.048)], 0.017))
@@ -112,27 +101,27 @@ def beanbag(build: Assembly) -> None:
     profile = [(0, 0), (r * 0.8, 0.0), (r * 0.97, 0.07), (r, 0.16), (r * 0.9, h * 0.5), (r * 0.62, h * 0.78),
                (r * 0.3, h * 0.95), (0.05, h), (0, h)]  # fmt: skip
     body = lathe(profile, 24)
-    build.add(plain_cloth(build.rgb, build.rng), body)
-    build.add(plain_cloth(shade(build.rgb, 0.6), build.rng), cylinder(0.03, 0.05, z=h - 0.005))
+    build.add("plain fabric", body)
+    build.add(build.of("plain fabric", shade(build.rgb, 0.6)), cylinder(0.03, 0.05, z=h - 0.005))
 
 
 def sofa(build: Assembly) -> None:
     width, depth = build.size(1.55, 2.0), build.rng.uniform(0.82, 0.92)
     arm, seat, back = build.rng.uniform(0.13, 0.2), 0.42, build.rng.uniform(0.76, 0.86)
-    cover = leather(build.rgb, build.rng) if build.material == "leather" else plain_cloth(build.rgb, build.rng)
+    cover = build.of("leather") if build.material == "leather" else build.of("plain fabric")
     build.add(cover, soft_block(width - 0.02, depth - 0.02, 0.22, 0, 0, 0.08, 0.03))
     arm_top = build.rng.uniform(0.56, 0.64)
     build.add(cover, *[soft_block(arm, depth, arm_top - 0.07, x, 0, 0.07, 0.06) for x in both((width - arm) / 2)])
     build.add(cover, soft_block(width - 2 * arm, 0.2, back - 0.1, 0, depth / 2 - 0.1, 0.1, 0.06))
     n = 3 if width > 1.75 else 2
     inner = (width - 2 * arm) / n
-    soft = cover if build.chance(0.6) else plain_cloth(shade(build.rgb, 0.75), build.rng)
+    soft = cover if build.chance(0.6) else build.of("plain fabric", shade(build.rgb, 0.75))
     for i in range(n):
         x = (i - (n - 1) / 2) * inner
         build.add(soft, soft_block(inner - 0.008, depth - 0.24, 0.14, x, -0.1, seat - 0.13, 0.045))
         rest = soft_block(inner - 0.01, 0.14, back - seat - 0.04, 0, 0, 0, 0.05).turned("x", -8)
         build.add(soft, rest.moved(x, depth / 2 - 0.27, seat + 0.01))
-    build.add(wood(tone("brown"), build.rng, 2), *_legs(width, depth, 0.085, 0.05, 0.05))
+    build.add(build.of("wooden", "brown", 2), *_legs(width, depth, 0.085, 0.05, 0.05))
     build.spot((-width / 2 + arm, width / 2 - arm), (-depth / 2 + 0.06, depth / 2 - 0.34), seat + 0.012, role="seat")
 
 
@@ -146,14 +135,14 @@ def bed(build: Assembly) -> None:
     build.add(build.main(axis=2), *_legs(width, length, 0.16, 0.06, 0.01))
     sheet_rgb = mix(tone("white"), build.other("blue", "beige", "grey", "pink"), 0.15)
     top = 0.53
-    linen = plain_cloth(sheet_rgb, build.rng)
+    linen = build.of("plain fabric", sheet_rgb)
     build.add(linen, soft_block(width - 0.05, length - 0.13, 0.2, 0, -0.01, top - 0.2, 0.05))
     duvet_colour = build.other("blue", "white", "grey", "beige", "green", "purple", "red")
-    duvet = cloth(duvet_colour, build.rng, large=True)
+    duvet = build.of("large fabric", duvet_colour)
     cover = soft_block(width + 0.05, length * 0.62, 0.3, 0, -length * 0.19 + 0.045, top - 0.22, 0.07)
     build.add(duvet, cover)
     fold = soft_block(width + 0.02, 0.18, 0.07, 0, length * 0.12 + 0.05, top + 0.04, 0.03)
-    build.add(plain_cloth(sheet_rgb, build.rng), fold)
+    build.add(build.of("plain fabric", sheet_rgb), fold)
     build.spot(both(width / 2 - 0.06), (length / 2 - 0.56, length / 2 - 0.1), top + 0.003, role="head")
     build.spot(both(width / 2 - 0.08), (-length / 2 + 0.12, length * 0.02), top + 0.082, role="seat")
 
@@ -206,7 +195,7 @@ def desk(build: Assembly) -> None:
     x = side * (width / 2 - 0.23)
     build.add(body, block(0.42, depth - 0.06, height - 0.1, x, 0.01, 0.06))
     front = -depth / 2 + 0.04
-    pull = chrome(build.rng)
+    pull = build.of("chrome")
     drawer = (height - 0.12) / 3
     for i in range(3):
         z = 0.075 + i * drawer
@@ -232,10 +221,10 @@ def _fronts(
             y = -depth / 2 - 0.02
             if knob:
                 side = x if rows > 1 else x + (1 if column < columns / 2 else -1) * (cell / 2 - 0.05)
-                build.add(chrome(build.rng), _knob(side, y, z + tall * (0.5 if rows > 1 else 0.6)))
+                build.add("chrome", _knob(side, y, z + tall * (0.5 if rows > 1 else 0.6)))
             else:
                 side = x + (1 if column < columns / 2 else -1) * (cell / 2 - 0.045)
-                build.add(chrome(build.rng), _handle(side, y, z + tall * 0.4, z + tall * 0.66))
+                build.add("chrome", _handle(side, y, z + tall * 0.4, z + tall * 0.66))
 
 
 def nightstand(build: Assembly) -> None:
@@ -261,7 +250,7 @@ def cabinet(build: Assembly) -> None:
 def base_cabinet(build: Assembly) -> None:
     width, depth, height = build.rng.uniform(0.6, 0.85), 0.58, 0.86
     build.add(build.main(axis=2), block(width, depth, height - 0.1, 0, 0, 0.1))
-    build.add(paint(tone("black")), block(width - 0.01, depth - 0.07, 0.1, 0, 0.03, 0))
+    build.add(build.of("paint", "black"), block(width - 0.01, depth - 0.07, 0.1, 0, 0.03, 0))
     _fronts(build, width, depth, 0.11, 0.66, 2, 1, False)
     _fronts(build, width, depth, 0.66, height - 0.005, 1, 1, True)
     build.spot(both(width / 2), both(depth / 2), height, role="base")
@@ -276,7 +265,7 @@ def wall_cabinet(build: Assembly) -> None:
 def wardrobe(build: Assembly) -> None:
     width, depth, height = build.size(1.05, 1.35), build.rng.uniform(0.54, 0.6), build.rng.uniform(1.92, 2.08)
     build.add(build.main(axis=2), block(width, depth, height - 0.06, 0, 0, 0.06))
-    build.add(paint(tone("black")), block(width - 0.06, depth - 0.05, 0.06, 0, 0.02, 0))
+    build.add(build.of("paint", "black"), block(width - 0.06, depth - 0.05, 0.06, 0, 0.02, 0))
     build.add(build.main(axis=0), block(width + 0.05, depth + 0.05, 0.05, 0, -0.01, height))
     _fronts(build, width, depth, 0.4, height - 0.01, 3 if width > 1.25 else 2, 1, False)
     _fronts(build, width, depth, 0.08, 0.4, 2, 1, True)
@@ -320,7 +309,7 @@ def tv_stand(build: Assembly) -> None:
     for sx in (-1, 1):
         x = sx * width / 3
         build.add(build.main(axis=0), block(width / 3 - 0.04, 0.02, height - 0.145, x, -depth / 2 + 0.012, 0.1))
-        build.add(chrome(build.rng), _knob(x, -depth / 2, height / 2 + 0.03))
+        build.add("chrome", _knob(x, -depth / 2, height / 2 + 0.03))
     build.add(build.main(axis=2), *_legs(width, depth, 0.06, 0.05, 0.05))
     build.spot(both(width / 2 - 0.02), both(depth / 2 - 0.01), height)
     build.spot(both(width / 6 - 0.03), (-depth / 2 + 0.02, depth / 2 - 0.04), 0.095, height - 0.15, "board")

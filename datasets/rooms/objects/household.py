@@ -7,22 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from su3d_bench.datasets.rooms.objects.items import Assembly
-from su3d_bench.datasets.rooms.objects.materials import (
-    Material,
-    Rgb,
-    Texture,
-    ceramic,
-    chrome,
-    linear,
-    metal,
-    mix,
-    paper,
-    plastic,
-    shade,
-    tone,
-    wicker,
-    wood,
-)
+from su3d_bench.datasets.rooms.objects.materials import Material, Rgb, Texture, linear, mix, shade, tone
 from su3d_bench.datasets.rooms.objects.shapes import block, both, cylinder, ellipsoid, lathe, soft_block, tube
 
 
@@ -45,7 +30,9 @@ def _volume(build: Assembly, rgb: Rgb, thick: float, depth: float, tall: float, 
     for side in (x - thick / 2 + 0.0015, x + thick / 2 - 0.0015):
         build.add(label, block(0.003, depth, tall, side))
     build.add(label, block(thick - 0.0062, 0.003, tall, x, -depth / 2 + 0.0015))
-    build.add(paper(linear((232, 224, 204))), block(thick - 0.0064, depth - 0.01, tall - 0.008, x, 0.002, 0.004))
+    build.add(
+        build.of("paper", linear((232, 224, 204))), block(thick - 0.0064, depth - 0.01, tall - 0.008, x, 0.002, 0.004)
+    )
 
 
 def book_stack(build: Assembly) -> None:
@@ -60,7 +47,7 @@ def book_stack(build: Assembly) -> None:
         boards.append(block(width, 0.003, thick - 0.0064, 0, -depth / 2 + 0.0015, z + 0.0032))
         build.add(cover, *[shape.turned("z", turn) for shape in boards])
         pages = block(width - 0.01, depth - 0.008, thick - 0.0066, 0, 0.001, z + 0.0033)
-        build.add(paper(linear((232, 224, 204))), pages.turned("z", turn))
+        build.add(build.of("paper", linear((232, 224, 204))), pages.turned("z", turn))
         z += thick + 0.001
 
 
@@ -70,10 +57,10 @@ def cardboard_box(build: Assembly) -> None:
     side = Material(Texture.CARDBOARD, build.rgb, shade(build.rgb, 0.8), 0.012, 0.02, seed=3)
     if build.chance(0.55):
         build.add(side, block(width, depth, height))
-        tape = plastic(mix(build.rgb, linear((226, 206, 150)), 0.75))
+        tape = build.of("plastic", mix(build.rgb, linear((226, 206, 150)), 0.75))
         build.add(tape, block(width * 1.002, 0.055, 0.002, 0, 0, height + 0.001))
         build.add(tape, *[block(0.002, 0.055, 0.07, x, 0, height - 0.07) for x in both(width / 2 + 0.0015)])
-        build.add(paper(tone("white")), block(0.11, 0.002, 0.075, width * 0.2, -depth / 2 - 0.0015, height * 0.4))
+        build.add(build.of("paper", "white"), block(0.11, 0.002, 0.075, width * 0.2, -depth / 2 - 0.0015, height * 0.4))
         build.spot(both(width / 2 - 0.02), both(depth / 2 - 0.02), height + 0.002, 0.4)
         return
     build.add(side, block(width, depth, 0.006))
@@ -87,9 +74,9 @@ def cardboard_box(build: Assembly) -> None:
 
 def basket(build: Assembly) -> None:
     r, h = build.size(0.21, 0.25), build.size(0.24, 0.32)
-    weave = wicker(build.rgb, build.rng)
+    weave = build.of("wicker")
     build.add(weave, lathe([(0, 0), (r * 0.8, 0), (r, h), (r - 0.018, h), (r * 0.8 - 0.018, 0.016), (0, 0.016)], 28))
-    rim = wicker(shade(build.rgb, 0.75), build.rng)
+    rim = build.of("wicker", shade(build.rgb, 0.75))
     edge = [(0.001, -0.02), (0.012, -0.01), (0.012, 0.008), (-0.02, 0.008), (-0.02, 0.001)]
     build.add(rim, lathe([(r + out, h + up) for out, up in edge], 28))
     angle = np.linspace(0, np.pi, 9)
@@ -108,14 +95,14 @@ def bin_(build: Assembly) -> None:
         lid = lathe([(0, 0), (r + 0.006, 0), (r + 0.006, 0.025), (r * 0.6, 0.07), (0, 0.08)], 24)
         pedal = soft_block(0.09, 0.06, 0.018, 0, -r - 0.02, 0.008, 0.007)
         foot = lathe([(r, 0), (r + 0.006, 0), (r + 0.006, 0.03), (r, 0.03)], 24)
-        build.add(plastic(tone("black")), lid.moved(z=h + 0.001), pedal, foot)
+        build.add(build.of("plastic", "black"), lid.moved(z=h + 0.001), pedal, foot)
         return
     outside = [(0, 0), (r * 0.78, 0), (r, h), (r + 0.01, h), (r + 0.01, h + 0.012)]
     inside = [(r - 0.012, h + 0.012), (r * 0.77 - 0.01, 0.01), (0, 0.01)]
     build.add(body, lathe([*outside, *inside], 24))
-    liner = plastic(mix(build.rgb, tone("black"), 0.6))
+    liner = build.of("plastic", mix(build.rgb, tone("black"), 0.6))
     build.add(liner, lathe([(0, 0), (r * 0.8, 0), (r * 0.8, 0.004), (0, 0.004)], 20).moved(z=h * 0.35))
-    scrap = paper(tone("white"))
+    scrap = build.of("paper", "white")
     for i in range(3):
         ball = ellipsoid(r * 0.33, r * 0.3, r * 0.3).moved(r * 0.38, 0, h * 0.35 + r * 0.3)
         build.add(scrap, ball.turned("z", 120 * i))
@@ -126,28 +113,28 @@ def exercise_ball(build: Assembly) -> None:
     skin = Material(Texture.GORES, build.rgb, shade(build.rgb, 0.7), 0.05, 0.45)
     build.add(skin, ellipsoid(r, r, r))
     valve = cylinder(0.02, 0.012).turned("x", 60)
-    build.add(plastic(tone("white")), valve.moved(0, -r * 0.866 + 0.004, r * 0.5 - 0.002))
+    build.add(build.of("plastic", "white"), valve.moved(0, -r * 0.866 + 0.004, r * 0.5 - 0.002))
 
 
 def pan(build: Assembly) -> None:
     """A shallow, dark frying pan with one long handle."""
     r = build.size(0.115, 0.145)
-    body = metal(build.rgb, build.rng)
+    body = build.of("metal")
     build.add(body, lathe([(0, 0), (r * 0.82, 0), (r, 0.05), (r - 0.006, 0.052), (r * 0.8, 0.008), (0, 0.008)], 26))
-    build.add(metal(linear((44, 44, 47)), build.rng), cylinder(r * 0.78, 0.002, z=0.0082))
-    grip = plastic(tone("black"))
+    build.add(build.of("metal", linear((44, 44, 47))), cylinder(r * 0.78, 0.002, z=0.0082))
+    grip = build.of("plastic", "black")
     build.add(grip, tube([(0, -r + 0.002, 0.042), (0, -r - 0.08, 0.058), (0, -r - 0.2, 0.066)], 0.014, 8))
 
 
 def pot(build: Assembly) -> None:
     """A cooking pot with a lid, its knob and two side handles."""
     r, h = build.size(0.1, 0.125), build.size(0.12, 0.16)
-    body = metal(build.rgb, build.rng) if build.colour == "grey" else ceramic(build.rgb)
+    body = build.of("metal") if build.colour == "grey" else build.of("ceramic")
     build.add(body, lathe([(0, 0), (r * 0.96, 0), (r, 0.012), (r, h), (0, h)], 26))
-    lid = chrome(build.rng) if build.colour == "grey" else ceramic(shade(build.rgb, 0.9))
+    lid = build.of("chrome") if build.colour == "grey" else build.of("ceramic", shade(build.rgb, 0.9))
     cover = lathe([(0, 0), (r + 0.006, 0), (r + 0.006, 0.008), (r * 0.6, 0.028), (0, 0.036)], 26)
     build.add(lid, cover.moved(z=h + 0.0005))
-    black = plastic(tone("black"))
+    black = build.of("plastic", "black")
     knob = lathe([(0, 0), (0.012, 0), (0.012, 0.012), (0.022, 0.024), (0.018, 0.034), (0, 0.036)], 14)
     build.add(black, knob.moved(z=h + 0.035))
     grip = [(r - 0.003, -0.045, h * 0.78), (r + 0.035, -0.035, h * 0.8)]
@@ -158,10 +145,10 @@ def pot(build: Assembly) -> None:
 
 def plate(build: Assembly) -> None:
     r = build.size(0.115, 0.14)
-    body = ceramic(build.rgb)
+    body = build.of("ceramic")
     profile = [(0, 0), (r * 0.55, 0), (r * 0.7, 0.006), (r, 0.02), (r, 0.024), (r * 0.68, 0.011), (0, 0.009)]
     build.add(body, lathe(profile, 28))
-    ring = ceramic(mix(build.rgb, tone("blue") if build.colour == "white" else tone("white"), 0.75))
+    ring = build.of("ceramic", mix(build.rgb, tone("blue") if build.colour == "white" else tone("white"), 0.75))
     build.add(ring, lathe([(r * 0.84, 0.0178), (r * 0.84, 0.0185), (r * 0.93, 0.0222), (r * 0.93, 0.0215)], 28))
 
 
@@ -170,10 +157,10 @@ def bowl(build: Assembly) -> None:
     h = r * build.rng.uniform(0.62, 0.75)
     outer = [(0, 0), (r * 0.45, 0), (r * 0.45, 0.01), (r * 0.78, h * 0.4), (r, h)]
     inner = [(r - 0.008, h), (r * 0.74, h * 0.45), (r * 0.4, 0.022), (0, 0.018)]
-    build.add(ceramic(build.rgb), lathe([*outer, *inner], 26))
+    build.add("ceramic", lathe([*outer, *inner], 26))
     if build.chance(0.4):
         for i in range(4):
-            skin = replace(plastic(build.other("orange", "red", "yellow", "green")), gloss=0.2)
+            skin = replace(build.of("plastic", build.other("orange", "red", "yellow", "green")), gloss=0.2)
             fruit = ellipsoid(r * 0.36, r * 0.36, r * 0.36).moved(r * 0.4, 0, h * 0.78)
             build.add(skin, fruit.turned("z", 90 * i))
 
@@ -181,14 +168,14 @@ def bowl(build: Assembly) -> None:
 def cup(build: Assembly) -> None:
     r, h = build.size(0.042, 0.05), build.size(0.095, 0.115)
     r, h = max(r, 0.04), max(h, 0.09)
-    body = ceramic(build.rgb)
+    body = build.of("ceramic")
     if build.chance(0.35):
         body = replace(body, texture=Texture.STRIPES, b=mix(build.rgb, (0.9, 0.9, 0.9), 0.75), scale=0.04, axis=1)
     build.add(body, lathe([(0, 0), (r * 0.9, 0), (r, h), (r - 0.005, h), (r * 0.88 - 0.004, 0.008), (0, 0.008)], 18))
-    build.add(ceramic(linear((74, 44, 24))), cylinder(r * 0.88, 0.002, z=h * 0.78))
+    build.add(build.of("ceramic", linear((74, 44, 24))), cylinder(r * 0.88, 0.002, z=h * 0.78))
     angle = np.linspace(-np.pi / 2, np.pi / 2, 8)
     ring = [(r * 0.93 + 0.03 * float(np.cos(a)), 0, h * 0.52 + 0.03 * float(np.sin(a))) for a in angle]
-    build.add(ceramic(build.rgb), tube(ring, 0.007, 7))
+    build.add("ceramic", tube(ring, 0.007, 7))
 
 
 def bottle(build: Assembly) -> None:
@@ -198,22 +185,22 @@ def bottle(build: Assembly) -> None:
     label = Material(Texture.LABEL, tone("white"), build.other("red", "blue", "green", "yellow"), h * 0.3, 0.05, seed=5)
     build.add(label, lathe([(r, h * 0.16), (r + 0.0015, h * 0.16), (r + 0.0015, h * 0.46), (r, h * 0.46)], 20))
     cap = build.other("red", "white", "black", "yellow")
-    build.add(plastic(cap), cylinder(r * 0.42, h * 0.07, z=h * 0.94))
+    build.add(build.of("plastic", cap), cylinder(r * 0.42, h * 0.07, z=h * 0.94))
 
 
 def chopping_board(build: Assembly) -> None:
     width, depth = build.size(0.34, 0.42), build.size(0.22, 0.27)
-    build.add(wood(build.rgb, build.rng), soft_block(width, depth, 0.022, 0, 0, 0, 0.009))
-    build.add(wood(build.rgb, build.rng), soft_block(0.1, 0.075, 0.02, width / 2 + 0.04, 0, 0.001, 0.009))
+    build.add("wooden", soft_block(width, depth, 0.022, 0, 0, 0, 0.009))
+    build.add("wooden", soft_block(0.1, 0.075, 0.02, width / 2 + 0.04, 0, 0.001, 0.009))
     for i in range(3):
         slice_ = cylinder(0.026, 0.008).moved(-width * 0.2 + i * 0.06, -depth * 0.1, 0.0225)
-        build.add(plastic(build.other("red", "green", "orange")), slice_)
+        build.add(build.of("plastic", build.other("red", "green", "orange")), slice_)
 
 
 def knife_block(build: Assembly) -> None:
     tall = build.size(0.2, 0.24)
-    build.add(wood(build.rgb, build.rng, 2), block(0.1, 0.13, tall).turned("x", -14))
-    black, steel = plastic(tone("black")), chrome(build.rng)
+    build.add(build.of("wooden", axis=2), block(0.1, 0.13, tall).turned("x", -14))
+    black, steel = build.of("plastic", "black"), build.of("chrome")
     for i in range(5):
         x, y = (i % 3 - 1) * 0.031, -0.03 + (i // 3) * 0.055
         build.add(steel, block(0.016, 0.024, 0.02, x, y, tall + 0.0005).turned("x", -14))
@@ -223,7 +210,7 @@ def knife_block(build: Assembly) -> None:
 def paper_towel(build: Assembly) -> None:
     """A kitchen roll on an upright holder."""
     r, h = build.size(0.058, 0.066), build.rng.uniform(0.21, 0.24)
-    holder = chrome(build.rng) if build.chance(0.5) else wood(tone("brown"), build.rng)
+    holder = build.of("chrome") if build.chance(0.5) else build.of("wooden", "brown")
     build.add(holder, lathe([(0, 0), (0.082, 0), (0.082, 0.014), (0, 0.014)], 22), cylinder(0.011, h + 0.06, z=0.014))
     build.add(holder, ellipsoid(0.02, 0.02, 0.02).moved(z=h + 0.085))
     roll = Material(Texture.DOTS, tone("white"), shade(tone("white"), 0.8), 0.024)
@@ -237,8 +224,8 @@ def tissue_box(build: Assembly) -> None:
     second = mix(build.rgb, (0.9, 0.9, 0.9), 0.7)
     print_ = Material(Texture.DOTS, build.rgb, second, 0.035, 0.05)
     build.add(print_, block(width, depth, tall))
-    build.add(paper(shade(second, 0.5)), block(width * 0.6, depth * 0.4, 0.0015, 0, 0, tall + 0.001))
-    white = paper(tone("white"))
+    build.add(build.of("paper", shade(second, 0.5)), block(width * 0.6, depth * 0.4, 0.0015, 0, 0, tall + 0.001))
+    white = build.of("paper", "white")
     for turn, lean in ((0, 12), (70, -14), (130, 8)):
         tissue = block(0.085, 0.004, 0.075).tapered(0.45).turned("x", lean).turned("z", turn)
         build.add(white, tissue.moved(0, 0, tall + 0.003))

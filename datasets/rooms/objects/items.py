@@ -84,7 +84,12 @@ class Assembly:
 
     def main(self, axis: int = 0) -> Material:
         """The object's own material in its own colour; ``axis`` is the direction of a wood grain."""
-        return of_kind(self.material, self.rgb, self.rng, axis)
+        return self.of(self.material, axis=axis)
+
+    def of(self, kind: str, rgb: Rgb | str | None = None, axis: int = 0) -> Material:
+        """A material in a colour, which may be given by its name; in the object's own where none is given."""
+        colour = tone(rgb) if isinstance(rgb, str) else self.rgb if rgb is None else rgb
+        return of_kind(kind, colour, self.rng, axis)
 
     def other(self, *colours: str) -> Rgb:
         """A tone of one of the colours."""
@@ -97,8 +102,10 @@ class Assembly:
     def chance(self, probability: float) -> bool:
         return bool(self.rng.random() < probability)
 
-    def add(self, material: Material, *shapes: Shape) -> None:
-        self.parts.extend(Part(shape, material) for shape in shapes)
+    def add(self, material: Material | str, *shapes: Shape) -> None:
+        """Parts of one material, or of a kind of material in the object's own colour."""
+        made_of = self.of(material) if isinstance(material, str) else material
+        self.parts.extend(Part(shape, made_of) for shape in shapes)
 
     def spot(self, x: tuple[float, float], y: tuple[float, float], z: float, clearance: float = 10.0,
              role: str = "top") -> None:  # fmt: skip

@@ -8,39 +8,18 @@ from enum import IntEnum
 import numpy as np
 
 from su3d_bench.core.types import Float32Array
-from su3d_bench.datasets.rooms.classes import COLOUR_RGB
+from su3d_bench.datasets.rooms.classes import COLOUR_RGB, LOOKS
 
 Rgb = tuple[float, float, float]  # linear light, 0..1
 
 
-class Texture(IntEnum):
-    """What ``pattern_kernels`` knows how to paint."""
-
-    PLAIN = 0
-    WOOD = 1
-    WEAVE = 2
-    TILES = 3
-    SPECKLE = 4
-    STRIPES = 5
-    CHECKS = 6
-    DOTS = 7
-    BRUSHED = 8
-    PICTURE = 9
-    KEYS = 10
-    SCREEN = 11
-    PLANKS = 12
-    WICKER = 13
-    LEAF = 14
-    CARPET = 15
-    SKY = 16
-    CLOCK_FACE = 17
-    RUG = 18
-    MARBLE = 19
-    CARDBOARD = 20
-    LABEL = 21
-    ZIGZAG = 22
-    GORES = 23
-    WALL = 24
+# What ``pattern_kernels`` knows how to paint.
+Texture = IntEnum(
+    "Texture",
+    "PLAIN WOOD WEAVE TILES SPECKLE STRIPES CHECKS DOTS BRUSHED PICTURE KEYS SCREEN PLANKS WICKER LEAF CARPET SKY "
+    "CLOCK_FACE RUG MARBLE CARDBOARD LABEL ZIGZAG GORES WALL",
+    start=0,
+)
 
 
 @dataclass(frozen=True)
@@ -101,78 +80,34 @@ def _seed(rng: np.random.Generator) -> int:
     return int(rng.integers(1, 4000))
 
 
-def wood(rgb: Rgb, rng: np.random.Generator, axis: int = 0) -> Material:
-    return Material(Texture.WOOD, rgb, shade(rgb, 0.62), scale=rng.uniform(0.02, 0.045), gloss=0.12, axis=axis,
-                    seed=_seed(rng))  # fmt: skip
+def of_kind(kind: str, rgb: Rgb, rng: np.random.Generator, axis: int = 0) -> Material:
+    """The usual look of a kind of material: of ``LOOKS``, or fabric, which may be plain or large in its pattern.
+
+    ``axis`` is the direction of a wood grain.
+    """
+    if kind.endswith("fabric"):
+        return _fabric(kind, rgb, rng)
+    look = LOOKS[kind]
+    texture = Texture.MARBLE if kind == "stone" and rng.random() >= 0.6 else Texture[look["texture"]]
+    rgb = linear(look["colour"]) if "colour" in look else rgb
+    scale = look.get("scale", 0.05)
+    scale = rng.uniform(*scale) if isinstance(scale, list) else scale
+    seed = _seed(rng) if look.get("is_seeded") else 0
+    axis = axis if kind == "wooden" else 0
+    return Material(texture, rgb, shade(rgb, look["second"]), scale, look.get("gloss", 0.05), axis=axis, seed=seed)
 
 
-def paint(rgb: Rgb, gloss: float = 0.08) -> Material:
-    return Material(Texture.PLAIN, rgb, shade(rgb, 0.9), gloss=gloss)
-
-
-def plastic(rgb: Rgb) -> Material:
-    return Material(Texture.PLAIN, rgb, shade(rgb, 0.95), gloss=0.35)
-
-
-def metal(rgb: Rgb, rng: np.random.Generator) -> Material:
-    return Material(Texture.BRUSHED, rgb, shade(rgb, 0.7), scale=0.01, gloss=0.7, seed=_seed(rng))
-
-
-def chrome(rng: np.random.Generator) -> Material:
-    return metal(linear((178, 180, 184)), rng)
-
-
-def ceramic(rgb: Rgb) -> Material:
-    return Material(Texture.PLAIN, rgb, shade(rgb, 0.93), gloss=0.6)
-
-
-def glass(rgb: Rgb) -> Material:
-    return Material(Texture.PLAIN, rgb, shade(rgb, 0.8), gloss=0.9)
-
-
-def stone(rgb: Rgb, rng: np.random.Generator) -> Material:
-    texture = Texture.SPECKLE if rng.random() < 0.6 else Texture.MARBLE
-    return Material(texture, rgb, shade(rgb, 0.55), scale=rng.uniform(0.006, 0.012), gloss=0.3, seed=_seed(rng))
-
-
-def leather(rgb: Rgb, rng: np.random.Generator) -> Material:
-    return Material(Texture.PLAIN, rgb, shade(rgb, 0.7), scale=0.02, gloss=0.3, seed=_seed(rng))
-
-
-def wicker(rgb: Rgb, rng: np.random.Generator) -> Material:
-    return Material(Texture.WICKER, rgb, shade(rgb, 0.35), scale=rng.uniform(0.018, 0.026), seed=_seed(rng))
-
-
-def paper(rgb: Rgb) -> Material:
-    return Material(Texture.PLAIN, rgb, shade(rgb, 0.92), gloss=0.03)
-
-
-def cloth(rgb: Rgb, rng: np.random.Generator, patterned: bool = True, large: bool = False) -> Material:
+def _fabric(kind: str, rgb: Rgb, rng: np.random.Generator) -> Material:
     """Fabric in one colour, or with a second tone in stripes, checks, dots or zigzag."""
     second = mix(rgb, (0.85, 0.83, 0.78), 0.75) if sum(rgb) < 1.2 else shade(rgb, 0.45)
-    size = rng.uniform(0.05, 0.09) if large else rng.uniform(0.025, 0.05)
+    size = rng.uniform(0.05, 0.09) if kind == "large fabric" else rng.uniform(0.025, 0.05)
     plain = Material(Texture.WEAVE, rgb, shade(rgb, 0.72), scale=0.006, gloss=0.0, seed=_seed(rng))
-    if not patterned or rng.random() < 0.45:
+    if kind == "plain fabric" or rng.random() < 0.45:
         return plain
     pattern = Texture(int(rng.choice([Texture.STRIPES, Texture.CHECKS, Texture.DOTS, Texture.ZIGZAG])))
     return replace(plain, texture=pattern, b=second, scale=size, axis=int(rng.integers(0, 2)))
 
 
-def plain_cloth(rgb: Rgb, rng: np.random.Generator) -> Material:
-    return cloth(rgb, rng, patterned=False)
-
-
 def light(rgb: tuple[float, float, float], glow: float = 1.0) -> Material:
     """What sends out light of a colour (sRGB 0..255) itself."""
     return Material(Texture.PLAIN, linear(rgb), linear(rgb), glow=glow)
-
-
-_OF_ONE_LOOK = {"plastic": plastic, "ceramic": ceramic, "glass": glass, "paper": paper}
-_DRAWN = {"metal": metal, "fabric": cloth, "leather": leather, "stone": stone, "wicker": wicker}
-
-
-def of_kind(material: str, rgb: Rgb, rng: np.random.Generator, axis: int = 0) -> Material:
-    """The usual look of a material named as in ``MATERIALS``."""
-    if material == "wooden":
-        return wood(rgb, rng, axis)
-    return _OF_ONE_LOOK[material](rgb) if material in _OF_ONE_LOOK else _DRAWN[material](rgb, rng)

@@ -110,23 +110,39 @@ class Grid:
     quad_of_face: Int32Array
 
 
-def cut(patches: Patches, longest: Float64Array) -> Grid:
-    """Each quad as a grid of cells whose edges are no longer than ``longest`` (Q,) metres."""
-    from su3d_bench.datasets.rooms.rendering.shade_kernels import subdivide
+def cut(patches: Patches, longest_m: float) -> Grid:
+    """Each quad as a grid of cells whose edges are no longer than ``longest_m``."""
+    n_u = _n_cells(patches.corners, ((0, 1), (3, 2)), longest_m)
+    n_v = _n_cells(patches.corners, ((0, 3), (1, 2)), longest_m)
+    n_points, n_faces = (n_u + 1) * (n_v + 1), n_u * n_v
+    quad, at = _places(n_points)
+    rows = np.column_stack([quad, at // (n_v + 1)[quad] / n_u[quad], at % (n_v + 1)[quad] / n_v[quad]])
+    quad, at = _places(n_faces)
+    step = n_v[quad] + 1
+    base = (np.cumsum(n_points) - n_points)[quad] + at // n_v[quad] * step + at % n_v[quad]
+    faces = np.stack([base, base + step, base + step + 1, base + 1], axis=1).astype(np.int32)
+    return Grid(rows, faces, quad.astype(np.int32))
 
-    none = np.empty((0, 3)), np.empty((0, 4), np.int32)
-    n_points, n_faces = subdivide(patches.corners, longest, *none)
-    rows, faces = np.empty((n_points, 3)), np.empty((n_faces, 4), np.int32)
-    subdivide(patches.corners, longest, rows, faces)
-    return Grid(rows, faces, rows[faces[:, 0], 0].astype(np.int32))
+
+def _n_cells(quads: Float64Array, edges: Sequence[tuple[int, int]], longest_m: float) -> NDArray[np.int64]:
+    """How many cells (Q,) lie along the longer of two opposite edges, given by their corners."""
+    steps = [(quads[:, start] - quads[:, end]) ** 2 for start, end in edges]
+    longest = np.max([step[:, 0] + step[:, 1] + step[:, 2] for step in steps], axis=0)
+    return np.asarray(np.maximum(1, np.ceil(np.sqrt(longest) / longest_m - 1e-6)), np.int64)
+
+
+def _places(counts: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The group of each of the things that groups have ``counts`` of, and its place in the group."""
+    group = np.repeat(np.arange(len(counts)), counts)
+    return group, np.arange(len(group)) - (np.cumsum(counts) - counts)[group]
 
 
 def at_rows(values: Float64Array, rows: Float64Array) -> Float64Array:
-    from su3d_bench.datasets.rooms.rendering.shade_kernels import bilinear
-
-    out = np.empty((len(rows), values.shape[2]))
-    bilinear(values, rows, out)
-    return out
+    """Values at (quad, u, v) rows from the values at the quads' four corners."""
+    quad, u, v = rows[:, 0].astype(np.int64), rows[:, 1:2], rows[:, 2:]
+    near = values[quad, 0] * (1 - u) + values[quad, 1] * u
+    far = values[quad, 3] * (1 - u) + values[quad, 2] * u
+    return np.asarray(near * (1 - v) + far * v)
 
 
 def merge_equal(keys: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -141,7 +157,7 @@ def merge_equal(keys: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.i
 
 def build_mesh(patches: Patches, lights: Sequence[Light], exposure: float) -> RoomMesh:
     """The render mesh, its light computed by ray casting against itself."""
-    grid = cut(patches, np.full(len(patches.corners), LIGHT_SPACING_M))
+    grid = cut(patches, LIGHT_SPACING_M)
     points = at_rows(patches.corners, grid.rows)
     normals = at_rows(patches.normals, grid.rows)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)

@@ -1,4 +1,4 @@
-"""Compiled shading: baked light and highlights on textures, one pixel at a time; and the grids of a face.
+"""Compiled shading: baked light and highlights on textures, one pixel at a time; and which faces an image shows.
 
 Imported lazily: numba takes a second to load. The columns of a material row are those of ``Material.row``.
 """
@@ -26,9 +26,7 @@ def shade(t_hit, primitive, uv, rays, origin, triangles, normals, texture, light
         if not t < 1e9:
             depth[i] = 0.0
             instance[i] = 0
-            rgb[i, 0] = 0
-            rgb[i, 1] = 0
-            rgb[i, 2] = 0
+            rgb[i] = 0
             continue
         triangle = primitive[i]
         i0, i1, i2 = triangles[triangle, 0], triangles[triangle, 1], triangles[triangle, 2]
@@ -36,19 +34,9 @@ def shade(t_hit, primitive, uv, rays, origin, triangles, normals, texture, light
         b0 = 1 - b1 - b2
         depth[i] = t
         instance[i] = instance_of_triangle[triangle]
-        x = b0 * texture[i0, 0] + b1 * texture[i1, 0] + b2 * texture[i2, 0]
-        y = b0 * texture[i0, 1] + b1 * texture[i1, 1] + b2 * texture[i2, 1]
-        z = b0 * texture[i0, 2] + b1 * texture[i1, 2] + b2 * texture[i2, 2]
-        e1x, e1y, e1z = (
-            texture[i1, 0] - texture[i0, 0],
-            texture[i1, 1] - texture[i0, 1],
-            texture[i1, 2] - texture[i0, 2],
-        )
-        e2x, e2y, e2z = (
-            texture[i2, 0] - texture[i0, 0],
-            texture[i2, 1] - texture[i0, 1],
-            texture[i2, 2] - texture[i0, 2],
-        )
+        x, y, z = _between(texture, i0, i1, i2, b0, b1, b2)
+        e1x, e1y, e1z = _difference(texture, i1, i0)
+        e2x, e2y, e2z = _difference(texture, i2, i0)
         px, py, pz = abs(e1y * e2z - e1z * e2y), abs(e1z * e2x - e1x * e2z), abs(e1x * e2y - e1y * e2x)
         if pz >= px and pz >= py:
             u, v = x, y
@@ -59,9 +47,7 @@ def shade(t_hit, primitive, uv, rays, origin, triangles, normals, texture, light
         row = materials[material_of_triangle[triangle]]
         kind, scale, gloss, glow, axis, seed = int(row[0]), row[7], row[8], row[9], int(row[10]), row[15]
         r, g, b = surface_colour(kind, x, y, z, u, v, row, scale, axis, seed)
-        lr = b0 * light[i0, 0] + b1 * light[i1, 0] + b2 * light[i2, 0]
-        lg = b0 * light[i0, 1] + b1 * light[i1, 1] + b2 * light[i2, 1]
-        lb = b0 * light[i0, 2] + b1 * light[i1, 2] + b2 * light[i2, 2]
+        lr, lg, lb = _between(light, i0, i1, i2, b0, b1, b2)
         spark = np.float32(0.0)
         if gloss > 0.1:
             spark = _highlight(i, t, b0, b1, b2, i0, i1, i2, normals, rays, origin, lights, gloss)
@@ -69,6 +55,19 @@ def shade(t_hit, primitive, uv, rays, origin, triangles, normals, texture, light
         rgb[i, 0] = _encode(r * (lr + glow) + spark)
         rgb[i, 1] = _encode(g * (lg + glow) + spark)
         rgb[i, 2] = _encode(b * (lb + glow) + spark)
+
+
+@inlined
+def _between(values, i0, i1, i2, b0, b1, b2):  # type: ignore[no-untyped-def]
+    """The three numbers at a point of a triangle from those at its vertices."""
+    x = b0 * values[i0, 0] + b1 * values[i1, 0] + b2 * values[i2, 0]
+    y = b0 * values[i0, 1] + b1 * values[i1, 1] + b2 * values[i2, 1]
+    return x, y, b0 * values[i0, 2] + b1 * values[i1, 2] + b2 * values[i2, 2]
+
+
+@inlined
+def _difference(values, i, j):  # type: ignore[no-untyped-def]
+    return values[i, 0] - values[j, 0], values[i, 1] - values[j, 1], values[i, 2] - values[j, 2]
 
 
 @inlined
@@ -81,9 +80,7 @@ def _encode(value):  # type: ignore[no-untyped-def]
 
 @inlined
 def _highlight(i, t, b0, b1, b2, i0, i1, i2, normals, rays, origin, lights, gloss):  # type: ignore[no-untyped-def]
-    nx = b0 * normals[i0, 0] + b1 * normals[i1, 0] + b2 * normals[i2, 0]
-    ny = b0 * normals[i0, 1] + b1 * normals[i1, 1] + b2 * normals[i2, 1]
-    nz = b0 * normals[i0, 2] + b1 * normals[i1, 2] + b2 * normals[i2, 2]
+    nx, ny, nz = _between(normals, i0, i1, i2, b0, b1, b2)
     dx, dy, dz = rays[i, 0], rays[i, 1], rays[i, 2]
     length = math.sqrt(dx * dx + dy * dy + dz * dz)
     wx, wy, wz = origin[0] + t * dx, origin[1] + t * dy, origin[2] + t * dz
@@ -109,52 +106,6 @@ def aim(directions, pose, rays):  # type: ignore[no-untyped-def]
             rays[i, 3 + k] = (
                 pose[k, 0] * directions[i, 0] + pose[k, 1] * directions[i, 1] + pose[k, 2] * directions[i, 2]
             )
-
-
-@compiled
-def subdivide(quads, longest, points, corner):  # type: ignore[no-untyped-def]
-    """Writes the grid of each quad, side by side, as (quad, u, v) rows of ``points`` and vertex indices ``corner``.
-
-    With empty outputs it only counts; answers (vertices, faces).
-    """
-    n_points, n_faces = 0, 0
-    fill = len(points) > 0
-    for q in range(len(quads)):
-        u_edge, v_edge = 0.0, 0.0
-        for k in range(3):
-            u_edge += (quads[q, 1, k] - quads[q, 0, k]) ** 2
-            v_edge += (quads[q, 3, k] - quads[q, 0, k]) ** 2
-        u_other, v_other = 0.0, 0.0
-        for k in range(3):
-            u_other += (quads[q, 2, k] - quads[q, 3, k]) ** 2
-            v_other += (quads[q, 2, k] - quads[q, 1, k]) ** 2
-        nu = max(1, math.ceil(math.sqrt(max(u_edge, u_other)) / longest[q] - 1e-6))
-        nv = max(1, math.ceil(math.sqrt(max(v_edge, v_other)) / longest[q] - 1e-6))
-        if fill:
-            for i in range(nu + 1):
-                for j in range(nv + 1):
-                    at = n_points + i * (nv + 1) + j
-                    points[at, 0], points[at, 1], points[at, 2] = q, i / nu, j / nv
-            for i in range(nu):
-                for j in range(nv):
-                    base = n_points + i * (nv + 1) + j
-                    at = n_faces + i * nv + j
-                    corner[at, 0], corner[at, 1] = base, base + nv + 1
-                    corner[at, 2], corner[at, 3] = base + nv + 2, base + 1
-        n_points += (nu + 1) * (nv + 1)
-        n_faces += nu * nv
-    return n_points, n_faces
-
-
-@compiled
-def bilinear(quads, points, out):  # type: ignore[no-untyped-def]
-    """Values at (quad, u, v) rows from the values at the quads' four corners."""
-    for i in range(len(points)):
-        q, u, v = int(points[i, 0]), points[i, 1], points[i, 2]
-        for k in range(out.shape[1]):
-            near = quads[q, 0, k] * (1 - u) + quads[q, 1, k] * u
-            far = quads[q, 3, k] * (1 - u) + quads[q, 2, k] * u
-            out[i, k] = near * (1 - v) + far * v
 
 
 NEAREST_M, GRAZING = 0.15, 0.08  # closer, or flatter than this cosine, a depth camera sees nothing

@@ -116,20 +116,11 @@ def token_ids(texts: Sequence[str]) -> Int64Array:
     return np.stack([_text_ids(text) for text in texts])
 
 
+Words = Mapping[str, tuple[str, ...]]
+_TABLE: Mapping[str, Any] = parse_toml(file_text(Path(__file__).with_name("lexicon.toml")))
 # Colour words with the sRGB value that each stands for; chosen to be far apart in CIELAB.
-COLOURS: tuple[tuple[str, tuple[int, int, int]], ...] = (
-    ("black", (25, 25, 25)),
-    ("grey", (128, 128, 128)),
-    ("white", (235, 235, 235)),
-    ("red", (180, 35, 35)),
-    ("orange", (225, 125, 40)),
-    ("yellow", (225, 200, 60)),
-    ("green", (60, 140, 65)),
-    ("blue", (50, 85, 170)),
-    ("purple", (115, 60, 140)),
-    ("pink", (225, 140, 170)),
-    ("brown", (110, 70, 40)),
-    ("beige", (215, 195, 160)),
+COLOURS: tuple[tuple[str, tuple[int, int, int]], ...] = tuple(
+    (name, (red, green, blue)) for name, (red, green, blue) in _TABLE["colour_values"].items()
 )
 
 
@@ -222,10 +213,6 @@ class Namer:
         best = weights.argmax(axis=1) if len(logits) else np.zeros(0, np.intp)
         confidences = 1.0 / weights.sum(axis=1)
         return Names(tuple(self._words.words[index] for index in best), confidences)
-
-
-Words = Mapping[str, tuple[str, ...]]
-_TABLE: Mapping[str, Any] = parse_toml(file_text(Path(__file__).with_name("lexicon.toml")))
 
 
 def _words(section: str) -> Words:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from su3d_bench.core.system.devices import DEVICE, EXPECTED_DEVICE
-from su3d_bench.perception.models.catalogue import MODELS
+from su3d_bench.perception.models.catalogue import MODELS, Kind
 from su3d_bench.perception.models.masks.automatic_masks import AutomaticMaskConfig
 from su3d_bench.perception.models.masks.grounded_sam import GroundedConfig
 from su3d_bench.perception.models.onnx import Provider
@@ -16,6 +16,18 @@ from su3d_bench.perception.models.onnx import Provider
 EMBEDDED = "embedded"
 Precision = Literal["auto", "float32", "float16", "bfloat16"]
 Runtime = Literal["torch", "open_clip", "onnx"]
+
+
+def _one_of(kind: Kind, *more: str) -> AfterValidator:
+    """A check that a name is one of the models of ``kind``, or one of ``more``."""
+    known = [*more, *(entry.name for entry in MODELS.values() if entry.kind == kind)]
+
+    def check(name: str) -> str:
+        if name not in known:
+            raise ValueError(f"is no {kind}; known: {', '.join(known)}")
+        return name
+
+    return AfterValidator(check)
 
 
 class ModelsConfig(BaseModel):
@@ -34,7 +46,7 @@ class ModelsConfig(BaseModel):
     device: str = "cpu"
     precision: Precision = "auto"
     batch: int = Field(default=0, ge=0, le=4096)
-    encoder: str | None = None
+    encoder: Annotated[str, _one_of("encoder", EMBEDDED)] | None = None
     runtime: Runtime = "torch"
     provider: Provider | None = None
     transform: Literal["original", "transformers"] = "original"
@@ -46,14 +58,6 @@ class ModelsConfig(BaseModel):
     def _is_a_device(cls, name: str) -> str:
         if DEVICE.fullmatch(name) is None:
             raise ValueError(EXPECTED_DEVICE)
-        return name
-
-    @field_validator("encoder")
-    @classmethod
-    def _is_known(cls, name: str | None) -> str | None:
-        known = [EMBEDDED, *(entry.name for entry in MODELS.values() if entry.kind == "encoder")]
-        if name is not None and name not in known:
-            raise ValueError(f"is no encoder; known: {', '.join(known)}")
         return name
 
     @field_validator("paths")
@@ -92,19 +96,11 @@ class PaperConfig(BaseModel):
     tagger: TaggerName = "auto"
     words: Path | None = None
     n_tags: int = Field(default=20, ge=1, le=200)
-    segmenter: str = "sam-vit-h"
+    segmenter: Annotated[str, _one_of("segmenter")] = "sam-vit-h"
     sam_runtime: Literal["torch", "onnx"] = "torch"
     grounded: GroundedConfig = GroundedConfig()
     automatic: AutomaticMaskConfig = AutomaticMaskConfig()
     captions: Literal["template", "model"] = "template"
-
-    @field_validator("segmenter")
-    @classmethod
-    def _is_a_segmenter(cls, name: str) -> str:
-        known = [entry.name for entry in MODELS.values() if entry.kind == "segmenter"]
-        if name not in known:
-            raise ValueError(f"is no segmenter; known: {', '.join(known)}")
-        return name
 
     @model_validator(mode="after")
     def _words_are_used(self) -> PaperConfig:

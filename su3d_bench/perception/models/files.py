@@ -13,6 +13,7 @@ import pickle
 import stat
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -20,12 +21,20 @@ from typing import Any, TypeVar, cast
 from pydantic import TypeAdapter, ValidationError
 
 from su3d_bench.core.digests import digest_bytes, digest_file
-from su3d_bench.core.errors import ConfigError, DataError, ModelMissing, PredictionError, StoreError, converted
+from su3d_bench.core.errors import (
+    ConfigError,
+    DataError,
+    ModelMissing,
+    PredictionError,
+    StoreError,
+    converted,
+    printable,
+)
 from su3d_bench.core.files.atomic import make_folder, read_json, write_json
 from su3d_bench.core.system.devices import make_deterministic, require, require_transformers
 from su3d_bench.core.system.files import file_text, regular
 from su3d_bench.formats.torch_files import check_stored
-from su3d_bench.perception.models.catalogue import FormName, ModelEntry, ModelForm, model_entry
+from su3d_bench.perception.models.catalogue import SETTINGS, FormName, ModelEntry, ModelForm, model_entry
 
 DEFAULT_FOLDER = "~/.cache/su3d-bench/models"
 DIGEST_FOLDER = "model-digests"
@@ -33,21 +42,6 @@ Checked = TypeVar("Checked")
 Loaded = TypeVar("Loaded")
 LARGEST_SETTINGS = 2**24  # bytes; a tokenizer.json of 256,000 words has 2**23
 PICKLED = {".bin", ".pt", ".pth", ".ckpt"}
-# Beside the weights, what may move an answer.
-_SETTINGS = (
-    "config.json",
-    "preprocessor_config.json",
-    "processor_config.json",
-    "open_clip_config.json",
-    "tokenizer.json",
-    "tokenizer_config.json",
-    "special_tokens_map.json",
-    "added_tokens.json",
-    "vocab.json",
-    "vocab.txt",
-    "merges.txt",
-    "spiece.model",
-)
 
 
 @dataclass(frozen=True)
@@ -61,7 +55,7 @@ class ModelFiles:
 
     def digests(self) -> dict[str, str]:
         """SHA-256 by file name of the weights and of every file of settings beside them."""
-        names = dict.fromkeys((self.weights.name, *_SETTINGS))
+        names = dict.fromkeys((self.weights.name, *SETTINGS))
         return {name: file_sha256(self.folder / name) for name in names if (self.folder / name).is_file()}
 
     def wrong_digests(self) -> list[str]:
@@ -106,8 +100,8 @@ def locate(
         return _at(entry, wanted, path.expanduser().absolute())
     for form in wanted:
         for candidate in _folders(entry, form, folder):
-            if (weights := _weights(form, candidate)) is not None and not _lacking(form, candidate):
-                return ModelFiles(entry, form, candidate, weights)
+            if (found := _whole(entry, form, candidate)) is not None:
+                return found
     place = models_folder(folder)
     raise ModelMissing(f"model '{entry.name}': not found below {place}; {what_to_fetch(entry, wanted)}")
 
@@ -123,13 +117,10 @@ def _at(entry: ModelEntry, forms: Sequence[ModelForm], path: Path) -> ModelFiles
         raise ConfigError(f"model '{entry.name}': {path} is no file that it is read from; name a folder with {known}")
     if not path.is_dir():
         raise ModelMissing(f"model '{entry.name}': there is no {path}; mend the path, or {what_to_fetch(entry, forms)}")
-    lacking = []
     for form in forms:
-        weights = _weights(form, path)
-        if weights is not None and not _lacking(form, path):
-            return ModelFiles(entry, form, path, weights)
-        lacking.append(_lacking(form, path))
-    nearest = min(lacking, key=len)
+        if (found := _whole(entry, form, path)) is not None:
+            return found
+    nearest = min((_lacking(form, path) for form in forms), key=len)
     raise ModelMissing(f"model '{entry.name}': {path} lacks {', '.join(nearest)}; {what_to_fetch(entry, forms)}")
 
 
@@ -169,8 +160,12 @@ def _names(requirement: str) -> list[str]:
     return [name.strip() for alternative in requirement.split("|") for name in alternative.split("+")]
 
 
-def _weights(form: ModelForm, folder: Path) -> Path | None:
-    return next((folder / name for name in _names(form.files[0]) if (folder / name).is_file()), None)
+def _whole(entry: ModelEntry, form: ModelForm, folder: Path) -> ModelFiles | None:
+    """The files of ``form`` in ``folder``; None where one is missing."""
+    if _lacking(form, folder):
+        return None
+    weights = next(folder / name for name in _names(form.files[0]) if (folder / name).is_file())
+    return ModelFiles(entry, form, folder, weights)
 
 
 def _lacking(form: ModelForm, folder: Path) -> list[str]:
@@ -201,8 +196,10 @@ def file_sha256(path: Path) -> str:
         return digest_file(path)
     key = f"{path.resolve()}\n{status.st_size}\n{status.st_mtime_ns}"
     note = digest_cache() / f"{digest_bytes(key.encode())[:32]}.json"
-    if (known := _noted(note, key)) is not None:
-        return known
+    with suppress(StoreError, KeyError, TypeError):  # a damaged note counts as absent
+        content = read_json(note)
+        if content == _note(key, content["sha256"]):
+            return str(content["sha256"])
     digest = digest_file(path)
     make_folder(note.parent)
     write_json(note, _note(key, digest))
@@ -213,17 +210,6 @@ def digest_cache() -> Path:
     """The folder of noted digests, in the cache of perception."""
     root = Path(os.environ.get("SU3D_CACHE") or "~/.cache/su3d-bench/cache").expanduser()
     return root / DIGEST_FOLDER
-
-
-def _noted(note: Path, key: str) -> str | None:
-    if not note.is_file() or note.stat().st_size > 2**16:
-        return None
-    try:
-        content: Any = read_json(note)
-    except StoreError:  # a damaged note counts as absent
-        return None
-    digest = content.get("sha256") if isinstance(content, dict) else None
-    return digest if isinstance(digest, str) and content == _note(key, digest) else None
 
 
 def _note(key: str, digest: str) -> dict[str, str]:
@@ -312,9 +298,7 @@ def checked(kind: type[Checked], values: Mapping[str, Any], where: object) -> Ch
 
 def bounded(error: object, limit: int = 160) -> str:
     """What ``error`` says, as one printable line of at most ``limit`` characters."""
-    text = "".join(character if character.isprintable() else " " for character in str(error))
-    text = " ".join(text.split())
-    return text if len(text) <= limit else text[: limit - 3] + "..."
+    return printable(str(error), limit)
 
 
 # A worker segments one scene after another; a segmenter, a detector and a tagger stay in memory.

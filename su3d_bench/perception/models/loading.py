@@ -21,23 +21,14 @@ from su3d_bench.core.types import Frame, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.models.catalogue import PROFILE_MODELS, FormName, ModelEntry, model_entry
 from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, PaperConfig, Runtime
-from su3d_bench.perception.models.encoders import towers
+from su3d_bench.perception.models.encoders import encoder as encoders
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec, FoundationEncoder, Towers
 from su3d_bench.perception.models.encoders.texts import Tokeniser, read_tokeniser
 from su3d_bench.perception.models.files import PICKLED, ModelFiles, kept, locate, read_settings, read_weights
-from su3d_bench.perception.models.masks.grounded_sam import Networks
+from su3d_bench.perception.models.masks import grounded_sam
+from su3d_bench.perception.models.masks.grounded_sam import Networks, Tagger
 from su3d_bench.perception.models.masks.grounding_dino import load_grounding_dino
 from su3d_bench.perception.models.masks.sam import Sam, SamManifest, SamNetwork, load_onnx_sam, load_sam
-from su3d_bench.perception.models.masks.tagging import (
-    RAM_TAG_LIST,
-    OnnxRamTagger,
-    RamTagger,
-    Tagger,
-    WordTagger,
-    load_ram,
-    read_word_list,
-    wrong_tagger,
-)
 from su3d_bench.perception.models.onnx import OnnxManifest, Provider, open_session, wrong_files
 
 FORM_OF_RUNTIME: Mapping[Runtime, FormName] = {"torch": "transformers", "open_clip": "open_clip", "onnx": "onnx"}
@@ -99,10 +90,10 @@ def _torch_encoder(
         return {"runtime": config.runtime, "files": files.digests(), "precision": precision, "device": kind}
 
     if config.runtime == "open_clip":
-        spec = towers.open_clip_spec(files, config.transform)
-        tokeniser: Callable[[], Tokeniser] = partial(towers.open_clip_tokeniser, files)
+        spec = encoders.open_clip_spec(files, config.transform)
+        tokeniser: Callable[[], Tokeniser] = partial(encoders.open_clip_tokeniser, files)
     else:
-        spec = towers.transformers_spec(files, config.transform)
+        spec = encoders.transformers_spec(files, config.transform)
         tokeniser = _tokeniser_of(files, spec)
     return FoundationEncoder(files.entry.known_as, spec, load_towers, tokeniser, identity, cache, device)
 
@@ -112,10 +103,10 @@ def _onnx_encoder(
 ) -> FoundationEncoder:
     provider: Provider = config.provider or ("cpu" if config.device == "cpu" else "cuda")
     device_index = 0 if provider == "cpu" else int(device_for(config.device, job_index).partition(":")[2])
-    manifest = towers.EncoderManifest.read(files.weights)
+    manifest = encoders.EncoderManifest.read(files.weights)
     if manifest.name != files.entry.name:
         raise ConfigError(f"{files.folder}: holds '{manifest.name}', not '{files.entry.name}'; correct models.paths")
-    spec = towers.onnx_spec(files, config.transform)
+    spec = encoders.onnx_spec(files, config.transform)
 
     def identity() -> Mapping[str, Any]:
         return {"runtime": "onnx", "files": dict(manifest.files), "provider": provider}
@@ -130,13 +121,13 @@ def _onnx_encoder(
 @lru_cache(maxsize=1)
 def _torch_towers(files: ModelFiles, runtime: Runtime, device: str, precision: str, batch: int) -> Towers:
     if runtime == "open_clip":
-        return towers.OpenClipTowers(towers.load_open_clip(files), device, precision, batch)
-    return towers.TransformersTowers(towers.load_transformers(files), device, precision, batch)
+        return encoders.OpenClipTowers(encoders.load_open_clip(files), device, precision, batch)
+    return encoders.TransformersTowers(encoders.load_transformers(files), device, precision, batch)
 
 
 @lru_cache(maxsize=1)
 def _onnx_towers(files: ModelFiles, provider: Provider, device_index: int, batch: int) -> Towers:
-    return towers.OnnxTowers(files, provider, device_index, batch)
+    return encoders.OnnxTowers(files, provider, device_index, batch)
 
 
 def _tokeniser_of(files: ModelFiles, spec: EncoderSpec) -> Callable[[], Tokeniser]:
@@ -226,16 +217,18 @@ def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, device:
             files = _locate(models, TAGGER, ("original",))
             digests = [text for pair in sorted(files.digests().items()) for text in pair]
             # RAM++'s own code mixes float32 in, so it runs in float32 wherever it runs.
-            load = partial(kept, files, (device,), partial(load_ram, files, device))
-            return RamTagger(load, device, content_key(*digests))
+            load = partial(kept, files, (device,), partial(grounded_sam.load_ram, files, device))
+            return grounded_sam.RamTagger(load, device, content_key(*digests))
     if config.tagger in ("ram-onnx", "auto"):
         with _passed_over(config.tagger):
             files = _locate(models, TAGGER, ("onnx",))
-            if wrong := wrong_tagger(files):
+            if wrong := grounded_sam.wrong_tagger(files):
                 raise DataError(wrong[0])
-            tags = read_word_list(files.folder / RAM_TAG_LIST)
-            return OnnxRamTagger(partial(open_session, files.weights), tags, content_key(*files.digests().values()))
-    return WordTagger(encoder, read_word_list(config.words), config.n_tags)
+            tags = grounded_sam.read_word_list(files.folder / grounded_sam.RAM_TAG_LIST)
+            return grounded_sam.OnnxRamTagger(
+                partial(open_session, files.weights), tags, content_key(*files.digests().values())
+            )
+    return grounded_sam.WordTagger(encoder, grounded_sam.read_word_list(config.words), config.n_tags)
 
 
 def _passed_over(tagger: str) -> AbstractContextManager[None]:
@@ -282,7 +275,7 @@ def problems_of(files: ModelFiles) -> list[str]:
             return problems + _problems_of_export(files)
         if files.form.form == "transformers":
             if files.entry.kind == "encoder":
-                towers.transformers_spec(files, "original")
+                encoders.transformers_spec(files, "original")
             else:
                 read_settings(files.folder / "config.json")
         if files.weights.suffix in PICKLED or files.weights.suffix == ".safetensors":
@@ -294,8 +287,8 @@ def problems_of(files: ModelFiles) -> list[str]:
 
 def _problems_of_export(files: ModelFiles) -> list[str]:
     if files.entry.kind == "tagger":
-        return wrong_tagger(files)
-    kind: type[OnnxManifest] = towers.EncoderManifest if files.entry.kind == "encoder" else SamManifest
+        return grounded_sam.wrong_tagger(files)
+    kind: type[OnnxManifest] = encoders.EncoderManifest if files.entry.kind == "encoder" else SamManifest
     manifest = kind.read(files.weights)
     wrong = wrong_files(manifest, files.folder)
     if manifest.name != files.entry.name:

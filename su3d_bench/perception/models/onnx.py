@@ -106,12 +106,11 @@ def _refusals() -> tuple[type[Exception], ...]:
 
 def _chain(provider: Provider, device_index: int) -> list[Any]:
     on_device = {"device_id": device_index}
-    if provider == "cuda":
-        # the default searches an algorithm by timing, which may differ from run to run
-        return [
-            (PROVIDERS["cuda"], {**on_device, "cudnn_conv_algo_search": "HEURISTIC", "use_tf32": "0"}),
-            PROVIDERS["cpu"],
-        ]
-    if provider == "tensorrt":
-        return [(PROVIDERS["tensorrt"], on_device), (PROVIDERS["cuda"], on_device), PROVIDERS["cpu"]]
-    return [PROVIDERS["cpu"]]
+    # the default searches an algorithm by timing, which may differ from run to run
+    fixed = {**on_device, "cudnn_conv_algo_search": "HEURISTIC", "use_tf32": "0"}
+    chains: dict[Provider, list[Any]] = {
+        "cpu": [],
+        "cuda": [(PROVIDERS["cuda"], fixed)],
+        "tensorrt": [(PROVIDERS["tensorrt"], on_device), (PROVIDERS["cuda"], on_device)],
+    }
+    return [*chains[provider], PROVIDERS["cpu"]]

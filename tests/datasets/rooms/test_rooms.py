@@ -84,9 +84,9 @@ def test_instance_images_agree_with_the_instance_mesh(rooms: Rooms) -> None:
 @pytest.mark.proof
 def test_every_object_is_seen_and_counts_on_the_default_scan_density(tmp_path: Path) -> None:
     dense = Rooms(tmp_path, Rooms.Options(n_frames=400))
-    seen = dense.visible_vertices(SCENE)
-    assert min(seen.values()) > 0
-    assert np.mean([n >= 100 for n in seen.values()]) >= 0.95
+    seen = np.bincount(dense.scan(SCENE).object_of_vertex(), minlength=len(dense.objects(SCENE)) + 1)[1:]
+    assert seen.min() > 0
+    assert np.mean(seen >= 100) >= 0.95
 
 
 def test_the_scan_leaves_out_what_the_walk_cannot_see(rooms: Rooms) -> None:
@@ -114,18 +114,12 @@ def test_scan_normals_are_unit_and_face_the_room(rooms: Rooms) -> None:
     assert (wound > 0).mean() > 0.99
 
 
-@pytest.mark.parametrize("damage", ["flipped byte", "empty"])
-def test_a_damaged_cache_file_is_made_anew(rooms: Rooms, damage: str) -> None:
+def test_a_damaged_cache_file_is_made_anew(rooms: Rooms) -> None:
     good = rooms.scan(SCENE)
     (path,) = rooms.root.glob(f"rooms/*/{SCENE}.npz")
     content = path.read_bytes()
     middle = len(content) // 2
-    damaged = {
-        "cut short": content[:middle],
-        "flipped byte": content[:middle] + bytes([content[middle] ^ 255]) + content[middle + 1 :],
-        "empty": b"",
-    }
-    path.write_bytes(damaged[damage])
+    path.write_bytes(content[:middle] + bytes([content[middle] ^ 255]) + content[middle + 1 :])
     assert _same(rooms.scan(SCENE), good)
     assert path.read_bytes() == content
     assert not list(path.parent.glob(".*"))

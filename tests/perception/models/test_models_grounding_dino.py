@@ -14,7 +14,6 @@ from su3d_bench.perception.models.masks.grounding_dino import (
     CONCEPTGRAPHS_BOXES,
     BoxConfig,
     GroundingDino,
-    is_in_phrase,
     text_prompt,
 )
 
@@ -30,12 +29,6 @@ def tokenizer(tmp_path_factory: pytest.TempPathFactory) -> Any:
 @pytest.fixture(scope="module")
 def detector(tokenizer: Any) -> GroundingDino:
     return GroundingDino(tiny_dino(), tokenizer, *DINO_PX)
-
-
-def test_tokens_above_the_threshold_name_a_box_but_not_the_ends_of_the_text() -> None:
-    probabilities = np.array([[0.9, 0.3, 0.25, 0.26, 0.9, 0.9], [0.9, 0.1, 0.1, 0.1, 0.9, 0.9]], np.float32)
-    chosen = is_in_phrase(probabilities, 0.25, n_tokens=5)
-    assert chosen.tolist() == [[False, True, False, True, False, False], [False] * 6]
 
 
 @pytest.mark.parametrize("size", [(40, 60), (60, 40), (40, 100), (48, 48)])

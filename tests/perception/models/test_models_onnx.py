@@ -14,7 +14,7 @@ from tiny_models import SAM_PX, blocks, noise_images, tiny_sam, write_tiny_clip
 
 from su3d_bench.core.errors import DataError, ModelMissing
 from su3d_bench.perception.models.config import ModelsConfig
-from su3d_bench.perception.models.encoders.towers import EncoderManifest
+from su3d_bench.perception.models.encoders.encoder import EncoderManifest
 from su3d_bench.perception.models.files import locate
 from su3d_bench.perception.models.loading import load_encoder
 from su3d_bench.perception.models.masks.sam import Prompts, Sam, TorchSam, load_onnx_sam
@@ -96,10 +96,7 @@ def test_a_changed_file_is_not_run(folder: Path, tmp_path: Path, name: str, file
     [
         (("format",), "x", "format is 'x'"),
         (("files", "../x.onnx"), "0", "files must be names inside the folder"),
-        (("files",), {}, "files must be names inside the folder"),
         (("spec", "dim"), 10**9, "is no manifest of an exported model"),
-        (("spec", "transform", "size"), 10**9, "is no manifest of an exported model"),
-        (("spec", "surprise"), 1, "is no manifest of an exported model"),
     ],
 )
 def test_a_manifest_without_sense_is_one_line(

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_models import N_TOKENS, blocks, needs_models, write_clip_tokenizer
+from tiny_models import N_TOKENS, blocks, needs_models, tiny_sam, write_clip_tokenizer
 
 from su3d_bench.core.types import BoolArray
 from su3d_bench.perception.cache import mask_boxes
@@ -26,10 +26,9 @@ from su3d_bench.perception.models.masks.automatic_masks import (
     point_grid,
     to_last_pixel,
 )
-from su3d_bench.perception.models.masks.grounded_sam import GROUNDED_MASKS, GroundedConfig
+from su3d_bench.perception.models.masks.grounded_sam import GROUNDED_MASKS, RAM_PX, GroundedConfig, ram_pixels
 from su3d_bench.perception.models.masks.grounding_dino import suppress, tag_of, tag_of_first_word
-from su3d_bench.perception.models.masks.sam import Prompts, Sam, as_shares_of_float32
-from su3d_bench.perception.models.masks.tagging import RAM_PX, ram_pixels
+from su3d_bench.perception.models.masks.sam import Prompts, Sam, as_shares_of_float32, sam_names
 
 CASES: dict[str, Any] = json.loads((Path(__file__).parents[2] / "cases/front_end.json").read_text())
 
@@ -129,6 +128,13 @@ def test_points_of_a_grid_reach_sams_prompts_with_the_originals_bits(case: dict[
     scale = np.array(size_with_longest_side(*size, side)) / size
     rounded = ((point_grid(n_side) * size).astype(np.float32) * scale).astype(np.float32)
     assert (2 * ((rounded + np.float32(0.5)) / np.float32(side)) - 1 != places).any()
+
+
+@needs_models
+@pytest.mark.parametrize(("original", "name"), CASES["sam_names"])
+def test_the_original_checkpoints_names_become_those_of_transformers(original: str, name: str) -> None:
+    assert name in tiny_sam().state_dict()
+    assert name in sam_names({original: 0})
 
 
 def mask_of(rows: str) -> BoolArray:

@@ -73,9 +73,7 @@ def test_a_processor_file_of_either_age_gives_the_transform(tmp_path: Path) -> N
         ({"rescale_factor": 1}, "rescale_factor is 1"),
         ({"size": {"longest_edge": 9}}, "expected a shortest edge"),
         ({"image_std": [0, 1, 1]}, r"std\.0 is 0"),
-        ({"image_mean": [10**400, 1, 1]}, r"mean\.0 is "),
         ({"image_std": [1, float("nan"), 1]}, r"std\.1 is nan"),
-        ({"resample": "cubic"}, "resample is cubic"),
     ],
 )
 def test_a_processor_file_that_asks_for_another_recipe_is_refused(

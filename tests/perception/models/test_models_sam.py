@@ -12,9 +12,8 @@ from tiny_models import SAM_PX, blocks, frame_of, tiny_sam
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float32Array, UInt8Array
-from su3d_bench.perception.models.masks.grounded_sam import Networks, SamRegions
-from su3d_bench.perception.models.masks.sam import Prompts, Sam, TorchSam, fill_sam, sam_names
-from su3d_bench.perception.models.masks.tagging import WordTagger
+from su3d_bench.perception.models.masks.grounded_sam import Networks, SamRegions, WordTagger
+from su3d_bench.perception.models.masks.sam import Prompts, Sam, TorchSam, fill_sam
 
 RGB = blocks(40, 60)
 BOXES = np.array([[5, 5, 30, 30], [0, 0, 60, 40], [22.5, 3.25, 41, 39]], np.float32)
@@ -114,41 +113,6 @@ def test_regions_on_demand_look_at_each_frame_once() -> None:
     empty, score = regions.mask_at(first, np.zeros((0, 2), np.int64))
     assert not empty.any() and empty.shape == (40, 60) and score == 0
     assert regions.encode_regions(first, masks[0][0], np.array([[0, 0, 9, 9]])).shape == (1, 8)
-
-
-ORIGINAL_NAMES = {
-    "vision_encoder.patch_embed.projection.weight": "image_encoder.patch_embed.proj.weight",
-    "vision_encoder.pos_embed": "image_encoder.pos_embed",
-    "vision_encoder.layers.1.layer_norm2.bias": "image_encoder.blocks.1.norm2.bias",
-    "vision_encoder.layers.0.attn.rel_pos_h": "image_encoder.blocks.0.attn.rel_pos_h",
-    "vision_encoder.layers.0.mlp.lin1.weight": "image_encoder.blocks.0.mlp.lin1.weight",
-    "vision_encoder.neck.conv1.weight": "image_encoder.neck.0.weight",
-    "vision_encoder.neck.layer_norm2.bias": "image_encoder.neck.3.bias",
-    "prompt_encoder.shared_embedding.positional_embedding": (
-        "prompt_encoder.pe_layer.positional_encoding_gaussian_matrix"
-    ),
-    "prompt_encoder.point_embed.3.weight": "prompt_encoder.point_embeddings.3.weight",
-    "prompt_encoder.mask_embed.layer_norm2.weight": "prompt_encoder.mask_downscaling.4.weight",
-    "prompt_encoder.mask_embed.conv3.bias": "prompt_encoder.mask_downscaling.6.bias",
-    "mask_decoder.upscale_conv2.weight": "mask_decoder.output_upscaling.3.weight",
-    "mask_decoder.upscale_layer_norm.weight": "mask_decoder.output_upscaling.1.weight",
-    "mask_decoder.transformer.layers.0.layer_norm4.weight": "mask_decoder.transformer.layers.0.norm4.weight",
-    "mask_decoder.transformer.layer_norm_final_attn.weight": "mask_decoder.transformer.norm_final_attn.weight",
-    "mask_decoder.transformer.layers.1.cross_attn_token_to_image.q_proj.weight": (
-        "mask_decoder.transformer.layers.1.cross_attn_token_to_image.q_proj.weight"
-    ),
-    "mask_decoder.iou_prediction_head.proj_in.weight": "mask_decoder.iou_prediction_head.layers.0.weight",
-    "mask_decoder.iou_prediction_head.layers.0.weight": "mask_decoder.iou_prediction_head.layers.1.weight",
-    "mask_decoder.iou_prediction_head.proj_out.weight": "mask_decoder.iou_prediction_head.layers.2.weight",
-    "mask_decoder.output_hypernetworks_mlps.2.layers.0.bias": "mask_decoder.output_hypernetworks_mlps.2.layers.1.bias",
-    "mask_decoder.output_hypernetworks_mlps.3.proj_out.bias": "mask_decoder.output_hypernetworks_mlps.3.layers.2.bias",
-}
-
-
-def test_the_original_checkpoints_names_become_those_of_transformers() -> None:
-    for theirs, original in ORIGINAL_NAMES.items():
-        assert theirs in tiny_sam().state_dict(), theirs
-        assert theirs in sam_names({original: 0}), original
 
 
 def test_a_checkpoint_fills_every_weight_or_is_refused() -> None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
@@ -31,10 +31,9 @@ class Answered:
     model: str | None = None
 
 
-def error(status: int, message: str = "no", code: str | None = None, **headers: str) -> Answered:
+def error(status: int, message: str = "no", code: str | None = None) -> Answered:
     raw = json.dumps({"error": {"message": message, "code": code, "type": "x"}}).encode()
-    given = {name.replace("_", "-"): value for name, value in headers.items()}
-    return Answered(status=status, raw=raw, headers={"retry-after-ms": "1", **given})
+    return Answered(status=status, raw=raw, headers={"retry-after-ms": "1"})
 
 
 def completion(body: Body, answered: Answered) -> bytes:
@@ -99,17 +98,13 @@ class ChatServer:
             answered = self.script.pop(0) if self.script else self.answer(body)
         self.stop.wait(answered.wait_s)
         content = answered.raw if answered.raw is not None else completion(body, answered)
-        try:
+        stated = {"Content-Type": answered.kind, "Content-Length": str(len(content)), **answered.headers}
+        with suppress(OSError):
             handler.send_response(answered.status)
-            handler.send_header("Content-Type", answered.kind)
-            handler.send_header("Content-Length", str(len(content)))
-            for name, value in answered.headers.items():
+            for name, value in stated.items():
                 handler.send_header(name, value)
             handler.end_headers()
             handler.wfile.write(content)
-            handler.wfile.flush()
-        except OSError:
-            pass
 
     def close(self) -> None:
         self.stop.set()
@@ -117,13 +112,8 @@ class ChatServer:
         self._http.server_close()
 
 
-@contextmanager
-def chat_server() -> Iterator[ChatServer]:
-    server = ChatServer()
-    try:
-        yield server
-    finally:
-        server.close()
+def chat_server() -> closing[ChatServer]:
+    return closing(ChatServer())
 
 
 def quick_config(server: ChatServer | None = None, **changes: Any) -> LanguageConfig:

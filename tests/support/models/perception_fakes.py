@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from su3d_bench.core.types import Float32Array, Float64Array, Frame, InstanceMesh, LabelSet, UInt8Array
+from su3d_bench.core.types import Float32Array, Float64Array, Frame, UInt8Array
 
 INTRINSICS: Float64Array = np.array([[100.0, 0, 79.5], [0, 100.0, 59.5], [0, 0, 1]])
 
@@ -45,21 +45,3 @@ def still_life(index: int = 0) -> Frame:
     depth_m[50:90, 90:120] = 2.5
     rgb[10:30, 70:110] = 40, 60, 180
     return Frame(index, index / 30, rgb, depth_m, np.eye(4), INTRINSICS)
-
-
-def quad_mesh(*quads: tuple[float, float, float, float, float], instance: Sequence[int]) -> InstanceMesh:
-    """Rectangles (x0, x1, y0, y1, z) that face the camera, two triangles each, as instances of ascending class."""
-    vertices: list[tuple[float, float, float]] = []
-    triangles: list[tuple[int, int, int]] = []
-    for x0, x1, y0, y1, z in quads:
-        start = len(vertices)
-        vertices += [(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)]
-        triangles += [(start, start + 1, start + 2), (start, start + 2, start + 3)]
-    known = sorted({i for i in instance if i})
-    return InstanceMesh(
-        np.array(vertices, np.float32),
-        np.array(triangles, np.int32),
-        np.repeat(np.array(instance, np.int32), 2),
-        {key: 20 + rank for rank, key in enumerate(known)},
-        LabelSet("replica", (20, 21, 22, 23), ("chair", "cup", "umbrella", "blinds")),
-    )

@@ -16,7 +16,7 @@ import pytest
 from su3d_bench.core.system.devices import require, require_transformers
 from su3d_bench.core.types import Frame, UInt8Array
 from su3d_bench.perception.models.encoders.images import CLIP_MEAN, CLIP_STD
-from su3d_bench.perception.models.masks.tagging import RAM_PX, RAM_TAG_LIST
+from su3d_bench.perception.models.masks.grounded_sam import RAM_MODEL, RAM_PX, RAM_TAG_LIST
 
 needs_models = pytest.mark.skipif(
     find_spec("torch") is None or find_spec("transformers") is None,
@@ -30,7 +30,10 @@ def write_models(root: Path) -> Path:
     """Folders of tiny SAM and GroundingDINO in the hub's form under the names that they are looked for."""
     tiny_sam().save_pretrained(root / "sam-vit-h")
     (root / "sam-vit-h" / "preprocessor_config.json").write_text("{}")
-    write_detector(root / "grounding-dino")
+    detector = root / "grounding-dino"
+    tiny_dino().save_pretrained(detector)
+    (detector / "preprocessor_config.json").write_text("{}")
+    tiny_tokenizer(detector).save_pretrained(detector)
     return root
 
 
@@ -119,8 +122,8 @@ DINO_WORDS = (
 
 
 @cache
-def tiny_dino(n_queries: int = 10, n_tokens: int = 32) -> Any:
-    """``transformers``' GroundingDINO with small towers; texts of at most ``n_tokens`` tokens."""
+def tiny_dino() -> Any:
+    """``transformers``' GroundingDINO with small towers; texts of at most 32 tokens."""
     import torch
 
     transformers = require_transformers("a stand-in of GroundingDINO")
@@ -133,11 +136,11 @@ def tiny_dino(n_queries: int = 10, n_tokens: int = 32) -> Any:
         backbone_config=transformers.SwinConfig(**tower),
         text_config=transformers.BertConfig(
             hidden_size=16, num_hidden_layers=1, num_attention_heads=2, intermediate_size=32, vocab_size=_N_WORDS,
-            max_position_embeddings=max(64, n_tokens),
+            max_position_embeddings=64,
         ),
-        num_queries=n_queries, encoder_layers=1, decoder_layers=2, encoder_ffn_dim=32, decoder_ffn_dim=32, d_model=32,
+        num_queries=10, encoder_layers=1, decoder_layers=2, encoder_ffn_dim=32, decoder_ffn_dim=32, d_model=32,
         encoder_attention_heads=4, decoder_attention_heads=4, encoder_n_points=2, decoder_n_points=2,
-        max_text_len=n_tokens,
+        max_text_len=32,
     )  # fmt: skip
     model = transformers.GroundingDinoForObjectDetection(config)
     with torch.no_grad():
@@ -146,123 +149,69 @@ def tiny_dino(n_queries: int = 10, n_tokens: int = 32) -> Any:
     return model.eval()
 
 
-def write_vocabulary(folder: Path, words: Sequence[str] = DINO_WORDS) -> Path:
-    """``vocab.txt`` of the tiny tokenizer: bert's marks in their places, some words, and nothing else of use."""
-    named = {_FIRST_WORD + k: word for k, word in enumerate(words)} | _MARKS
-    lines = [named.get(k, f"[unused{k}]") for k in range(_N_WORDS)]
+def tiny_tokenizer(folder: Path) -> Any:
+    """A tokenizer over ``vocab.txt`` in ``folder``: bert's marks in their places, and some words."""
+    named = {_FIRST_WORD + k: word for k, word in enumerate(DINO_WORDS)} | _MARKS
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "vocab.txt"
-    path.write_text("\n".join(lines) + "\n")
-    return path
-
-
-def tiny_tokenizer(folder: Path, words: Sequence[str] = DINO_WORDS) -> Any:
-    transformers = require_transformers("a stand-in of GroundingDINO")
-    return transformers.BertTokenizer(vocab=str(write_vocabulary(folder, words)))
-
-
-def write_detector(folder: Path, model: Any = None, words: Sequence[str] = DINO_WORDS) -> Path:
-    """``model`` (``tiny_dino()``) with its tokenizer as the hub's repository has them."""
-    (model or tiny_dino()).save_pretrained(str(folder))
-    (folder / "preprocessor_config.json").write_text("{}")
-    tiny_tokenizer(folder, words).save_pretrained(str(folder))
-    write_vocabulary(folder, words)
-    return folder
+    (folder / "vocab.txt").write_text("".join(f"{named.get(k, f'[unused{k}]')}\n" for k in range(_N_WORDS)))
+    return require_transformers("a stand-in of GroundingDINO").BertTokenizer(vocab=str(folder / "vocab.txt"))
 
 
 # ---- encoders
 
 CLIP_WORDS = (
-    "chair",
-    "table",
-    "lamp",
-    "a",
-    "the",
-    "in",
-    "scene",
-    "red",
-    "cup",
-    "image",
-    "of",
-    "an",
-    "on",
-    "tv",
-    "screen",
-)
+    "chair", "table", "lamp", "a", "the", "in", "scene", "red", "cup", "image", "of", "an", "on", "tv", "screen",
+)  # fmt: skip
 N_TOKENS = 16
 CLIP_PX = 32
 CLIP_DIM = 24
 
 
-def write_tiny_clip(folder: Path, seed: int = 0, weights: str = "model.safetensors", n_tokens: int = N_TOKENS) -> Path:
-    """A CLIP of two layers as transformers saves it; ``weights`` may be ``pytorch_model.bin``, the older form."""
-    import torch
+_LAYERS = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4}
 
-    transformers = require_transformers("a stand-in of CLIP")
-    torch.manual_seed(seed)
+
+def write_tiny_clip(folder: Path, seed: int = 0, n_tokens: int = N_TOKENS) -> Path:
+    """A CLIP of two layers as transformers saves it."""
     n_words = write_clip_tokenizer(folder)
-    layers = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4}
-    config = transformers.CLIPConfig(
-        vision_config={**layers, "image_size": CLIP_PX, "patch_size": 8},
-        text_config={
-            **layers,
-            "vocab_size": n_words,
-            "max_position_embeddings": n_tokens,
-            "bos_token_id": n_words - 2,
-            "eos_token_id": n_words - 1,
-            "pad_token_id": n_words - 1,
-        },
-        projection_dim=CLIP_DIM,
-    )
-    model: Any = transformers.CLIPModel(config)
-    _spread(model)
-    model.save_pretrained(str(folder))
-    if weights != "model.safetensors":
-        torch.save(model.state_dict(), folder / weights)
-        (folder / "model.safetensors").unlink()
-    size = {"shortest_edge": CLIP_PX}
-    crop = {"height": CLIP_PX, "width": CLIP_PX}
-    _write_preprocessor(folder, {"size": size, "crop_size": crop, "do_center_crop": True})
-    return folder
+    ends = {"bos_token_id": n_words - 2, "eos_token_id": n_words - 1, "pad_token_id": n_words - 1}
+    words = {"vocab_size": n_words, "max_position_embeddings": n_tokens, **ends}
+    crop = {"crop_size": {"height": CLIP_PX, "width": CLIP_PX}, "do_center_crop": True}
+    images = {"size": {"shortest_edge": CLIP_PX}, "image_mean": CLIP_MEAN, "image_std": CLIP_STD, **crop}
+    return _write_encoder(folder, seed, "CLIP", words, images, projection_dim=CLIP_DIM)
 
 
 def write_tiny_siglip(folder: Path, seed: int = 0) -> Path:
     """A SigLIP of two layers as transformers saves it, with a ``tokenizer.json`` of whole words."""
-    import torch
-
     tokenizers = require("tokenizers", "a stand-in of SigLIP")
-
-    transformers = require_transformers("a stand-in of SigLIP")
-    torch.manual_seed(seed)
     folder.mkdir(parents=True, exist_ok=True)
-    words = {word: k for k, word in enumerate(["<unk>", "</s>", *CLIP_WORDS])}
-    tokenizer = tokenizers.Tokenizer(tokenizers.models.WordLevel(words, unk_token="<unk>"))
+    known = {word: k for k, word in enumerate(["<unk>", "</s>", *CLIP_WORDS])}
+    tokenizer = tokenizers.Tokenizer(tokenizers.models.WordLevel(known, unk_token="<unk>"))
     tokenizer.pre_tokenizer = tokenizers.pre_tokenizers.Whitespace()
     tokenizer.save(str(folder / "tokenizer.json"))
-    layers = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 2, "num_attention_heads": 4}
-    config = transformers.SiglipConfig(
-        vision_config={**layers, "image_size": CLIP_PX, "patch_size": 8},
-        text_config={**layers, "vocab_size": len(words), "max_position_embeddings": N_TOKENS, "pad_token_id": 1},
-    )
-    model: Any = transformers.SiglipModel(config)
-    _spread(model)
-    model.save_pretrained(str(folder))
-    half = [0.5, 0.5, 0.5]
-    size = {"height": CLIP_PX, "width": CLIP_PX}
-    _write_preprocessor(
-        folder, {"size": size, "image_mean": half, "image_std": half, "image_processor_type": "SiglipImageProcessor"}
-    )
-    return folder
+    words = {"vocab_size": len(known), "max_position_embeddings": N_TOKENS, "pad_token_id": 1}
+    half = {"image_mean": [0.5] * 3, "image_std": [0.5] * 3, "image_processor_type": "SiglipImageProcessor"}
+    return _write_encoder(folder, seed, "Siglip", words, {"size": {"height": CLIP_PX, "width": CLIP_PX}, **half})
 
 
-def _spread(model: Any) -> None:
-    """Larger random weights than a fresh model has, so that different inputs give clearly different features."""
+def _write_encoder(
+    folder: Path, seed: int, kind: str, words: dict[str, Any], images: dict[str, Any], **more: int
+) -> Path:
+    """An encoder with larger random weights than a fresh one has, so that features of different inputs differ."""
     import torch
 
+    transformers = require_transformers("a stand-in of an encoder")
+    torch.manual_seed(seed)
+    config = getattr(transformers, f"{kind}Config")(
+        vision_config={**_LAYERS, "image_size": CLIP_PX, "patch_size": 8}, text_config={**_LAYERS, **words}, **more
+    )
+    model: Any = getattr(transformers, f"{kind}Model")(config)
     with torch.no_grad():
         for parameter in model.parameters():
             if parameter.ndim > 1:
                 parameter.normal_(0.0, 0.2)
+    model.save_pretrained(str(folder))
+    (folder / "preprocessor_config.json").write_text(json.dumps({"resample": 3, "do_resize": True, **images}))
+    return folder
 
 
 def write_clip_tokenizer(folder: Path) -> int:
@@ -286,44 +235,32 @@ def write_clip_tokenizer(folder: Path) -> int:
     return len(vocabulary)
 
 
-def _write_preprocessor(folder: Path, settings: dict[str, object]) -> None:
-    usual = {"image_mean": list(CLIP_MEAN), "image_std": list(CLIP_STD), "resample": 3, "do_resize": True}
-    (folder / "preprocessor_config.json").write_text(json.dumps(usual | settings))
-
-
 # ---- RAM++ as it is exported
 
-RAM_FILE = "ram_plus.onnx"
-_CELL_PX = 96
-_N_SEEN = 3 * (RAM_PX // _CELL_PX) ** 2  # mean colours of 4 x 4 cells
-_OPSET, _IR_VERSION = 17, 8  # that any ONNX Runtime reads which the project takes
+_N_SEEN = 3 * 4**2  # mean colours of 4 x 4 cells of 96 px
+_RAM_PLUS = """
+<ir_version: 8, opset_import: ["": 17]>
+ram_plus (float[1, 3, {px}, {px}] image) => (float[1, {n}] tag) {{
+    cells = AveragePool <kernel_shape = [96, 96], strides = [96, 96]> (image)
+    seen = Flatten (cells)
+    logits = Gemm (seen, weight, bias)
+    is_there = Greater (logits, zero)
+    tag = Cast <to = 1> (is_there)
+}}
+"""
 
 
 def write_tagger(folder: Path, tags: Sequence[str], seed: int = 0) -> Path:
     """A network that answers ``image`` (1, 3, 384, 384) with ``tag`` (1, T): 1 for some of ``tags``, by colours."""
     onnx = require("onnx", "a stand-in of RAM++")
-    helper, numpy_helper, kinds = onnx.helper, onnx.numpy_helper, onnx.TensorProto
     random = np.random.default_rng(seed)
     weight = (random.normal(size=(_N_SEEN, len(tags))) / _N_SEEN**0.5).astype(np.float32)
     bias = (random.normal(size=len(tags)) * 0.5).astype(np.float32)
-    nodes = [
-        helper.make_node("AveragePool", ["image"], ["cells"], kernel_shape=[_CELL_PX] * 2, strides=[_CELL_PX] * 2),
-        helper.make_node("Flatten", ["cells"], ["seen"]),
-        helper.make_node("Gemm", ["seen", "weight", "bias"], ["logits"]),
-        helper.make_node("Greater", ["logits", "zero"], ["is_there"]),
-        helper.make_node("Cast", ["is_there"], ["tag"], to=kinds.FLOAT),
-    ]
-    constants = {"weight": weight, "bias": bias, "zero": np.zeros(1, np.float32)}
-    graph = helper.make_graph(
-        nodes,
-        "ram_plus",
-        [helper.make_tensor_value_info("image", kinds.FLOAT, [1, 3, RAM_PX, RAM_PX])],
-        [helper.make_tensor_value_info("tag", kinds.FLOAT, [1, len(tags)])],
-        [numpy_helper.from_array(value, name) for name, value in constants.items()],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR_VERSION)
+    model = onnx.parser.parse_model(_RAM_PLUS.format(px=RAM_PX, n=len(tags)))
+    for name, value in {"weight": weight, "bias": bias, "zero": np.zeros(1, np.float32)}.items():
+        model.graph.initializer.append(onnx.numpy_helper.from_array(value, name))
     onnx.checker.check_model(model)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / RAM_FILE).write_bytes(model.SerializeToString())
+    (folder / RAM_MODEL).write_bytes(model.SerializeToString())
     (folder / RAM_TAG_LIST).write_text("\n".join(tags) + "\n")
     return folder

@@ -1,23 +1,237 @@
-"""GroundedSAM: tags of the image, boxes of what they name, masks in the boxes; and SAM without any tag."""
+"""GroundedSAM: tags of the image, boxes of what they name, masks in the boxes; and SAM without any tag.
+
+Tags come from RAM++, or are the words of a list that an encoder finds likeliest.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from su3d_bench.core.errors import DataError, ModelMissing
+from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import BoolArray, Frame, Int64Array, Regions
+from su3d_bench.core.system.devices import make_deterministic, require
+from su3d_bench.core.system.files import file_text
+from su3d_bench.core.types import BoolArray, Float32Array, Frame, Int64Array, Regions, UInt8Array
 from su3d_bench.perception.cache import CropsOnDemand, OfLastFrame, content_key, mask_boxes
-from su3d_bench.perception.models.encoders.images import Resample
+from su3d_bench.perception.embedded.lexicon import PromptedWords, listed_words, vocabulary
+from su3d_bench.perception.models.catalogue import ONNX_MANIFEST
+from su3d_bench.perception.models.encoders.images import Resample, normalised, resized
+from su3d_bench.perception.models.files import ModelFiles, bounded, read_weights, what_to_fetch
 from su3d_bench.perception.models.masks.automatic_masks import AutomaticMaskConfig, AutomaticMasks
 from su3d_bench.perception.models.masks.grounding_dino import CONCEPTGRAPHS_BOXES, BoxConfig, GroundingDino
 from su3d_bench.perception.models.masks.sam import Sam
-from su3d_bench.perception.models.masks.tagging import ADDED_TAGS, BACKGROUND_TAGS, STOP_WORDS, Tagger, chosen_tags
+from su3d_bench.perception.models.onnx import OnnxManifest, wrong_files
+
+RAM_PX = 384
+RAM_MODEL, RAM_TAG_LIST = "ram_plus.onnx", "ram_tag_list.txt"
+# Of its tensors: made by the network itself from its window size; the authors' loader drops them too.
+MADE_BY_ITSELF = ("relative_position_index", "attn_mask")
+WORDS_CAVEAT = "tags: RAM++ is not here; the words of a list that the encoder finds likeliest stand in for its tags"
+MAX_WORDS, MAX_WORD_LENGTH = 20_000, 100
+MAX_LIST_BYTES = 1 << 21
+# Words that taggers give and that name no object, as ConceptGraphs sorts them (generate_gsa_results.py, 5c4da70): a tag
+# that contains one of these is left out.
+STOP_WORDS = (
+    "room", "kitchen", "office", "house", "home", "building", "corner", "shadow", "carpet", "photo", "shade", "stall",
+    "space", "aquarium", "apartment", "image", "city", "blue", "skylight", "hallway", "bureau", "modern", "salon",
+    "doorway", "wall lamp", "wood floor",
+)  # fmt: skip
+# Asked for in every image besides its tags.
+ADDED_TAGS = ("other item",)
+# Added with --add_bg_classes.
+BACKGROUND_TAGS = ("wall", "floor", "ceiling")
+
+
+class Tagger(Protocol):
+    """Words for what an image shows; ``caveat`` says what must be said of them.
+
+    ``resample``: how a tagger that takes a small picture of the whole image makes it.
+    """
+
+    name: str
+    digest: str
+    caveat: str | None
+
+    def tags(self, rgb: UInt8Array, resample: Resample = "bilinear") -> tuple[str, ...]: ...
+
+
+class RamTagger:
+    """RAM++ through its published package, ``ram``."""
+
+    name = "ram"
+    caveat: str | None = None
+
+    def __init__(self, load: Callable[[], Any], device: str, digest: str) -> None:
+        self._model = cache(load)
+        self._device = device
+        self.digest = content_key("ram", digest)
+
+    def tags(self, rgb: UInt8Array, resample: Resample = "bilinear") -> tuple[str, ...]:
+        """The tags of ``rgb`` (H, W, 3) in the order of RAM++'s list."""
+        import torch
+
+        pixels = torch.from_numpy(ram_pixels(rgb, resample)[None]).to(self._device)
+        with torch.inference_mode():
+            english, _ = self._model().generate_tag(pixels)
+        return tuple(tag for tag in str(english[0]).split(" | ") if tag)
+
+
+class OnnxRamTagger:
+    """RAM++ exported: ``image`` (1, 3, 384, 384) to ``tag`` (1, T), 1 where it holds, its first answer.
+
+    ``tools/export_onnx.py`` writes it so, and the script of recognize-anything's pull request 204.
+    """
+
+    name = "ram-onnx"
+    caveat: str | None = None
+
+    def __init__(self, load: Callable[[], Any], tag_list: Sequence[str], digest: str) -> None:
+        self._session = cache(load)
+        self._tag_list = tuple(tag_list)
+        self.digest = content_key("ram-onnx", digest, *self._tag_list)
+
+    def tags(self, rgb: UInt8Array, resample: Resample = "bilinear") -> tuple[str, ...]:
+        """The tags of ``rgb`` (H, W, 3) in the order of the list."""
+        session = self._session()
+        is_there = session.run(None, {session.get_inputs()[0].name: ram_pixels(rgb, resample)[None]})[0]
+        if is_there.shape != (1, len(self._tag_list)):
+            raise DataError(
+                f"tagger 'ram-onnx': the model answers {is_there.shape}, {RAM_TAG_LIST} has {len(self._tag_list)} "
+                "tags; both must come from one version of the package"
+            )
+        return tuple(self._tag_list[index] for index in np.flatnonzero(is_there[0] > 0.5))
+
+
+class RamManifest(OnnxManifest):
+    """The manifest of an exported RAM++."""
+
+    FORMAT = "su3d-bench onnx tagger 1"
+    REQUIRES = (RAM_MODEL, RAM_TAG_LIST)
+
+
+def wrong_tagger(files: ModelFiles) -> list[str]:
+    """A line for each fault of an exported RAM++; one without a manifest, as others export it, has none to be found."""
+    path = files.folder / ONNX_MANIFEST
+    return wrong_files(RamManifest.read(path), files.folder) if is_file(path) else []
+
+
+class WordTagger:
+    """The ``n_tags`` words of a list that are likeliest somewhere in the image, the likeliest first.
+
+    A word counts as much as its similarity in the best of six views: the image, its quarters, and its middle.
+    """
+
+    name = "words"
+    caveat: str | None = WORDS_CAVEAT
+
+    def __init__(self, encoder: Encoder, words: Sequence[str], n_tags: int, prompt: str = "{} in a scene") -> None:
+        self._encoder = encoder
+        self._words = PromptedWords(encoder, words, prompt)
+        self._n_tags = n_tags
+        self.digest = content_key("words", encoder.digest, str(n_tags), prompt, *self._words.words)
+
+    def tags(self, rgb: UInt8Array, resample: Resample = "bilinear") -> tuple[str, ...]:
+        """At most ``n_tags`` words for ``rgb`` (H, W, 3), each of whose views the encoder prepares in its own way."""
+        similarity = self._words.similarity(self._encoder.encode_images(_views(rgb)))
+        order = np.argsort(-similarity.max(axis=0), kind="stable")
+        return tuple(self._words.words[index] for index in order[: self._n_tags])
+
+
+def _views(rgb: UInt8Array) -> list[UInt8Array]:
+    height, width = rgb.shape[:2]
+    half_height, half_width = max(height // 2, 1), max(width // 2, 1)
+    below, beside = height - half_height, width - half_width
+    corners = ((0, 0), (0, beside), (below, 0), (below, beside), (below // 2, beside // 2))
+    parts = [np.ascontiguousarray(rgb[top : top + half_height, left : left + half_width]) for top, left in corners]
+    return [rgb, *parts]
+
+
+def ram_pixels(rgb: UInt8Array, resample: Resample = "bilinear") -> Float32Array:
+    """``rgb`` (H, W, 3) as RAM++ takes it, (3, 384, 384): squeezed to a square, whatever its shape.
+
+    Its own transform is bilinear (recognize-anything 7cb804a, ram/transform.py).
+    """
+    return normalised(resized(rgb, RAM_PX, RAM_PX, resample))
+
+
+def chosen_tags(tags: Iterable[str], stop_words: Sequence[str], added: Sequence[str]) -> tuple[str, ...]:
+    """``tags`` once each and ``added``, without those that contain a stop word; ConceptGraphs' order of steps.
+
+    >>> chosen_tags(["bed", "bedroom", "lamp"], ["room"], ["other item"])
+    ('bed', 'lamp', 'other item')
+    """
+    named = dict.fromkeys([*(tag.strip() for tag in tags if tag.strip()), *added])
+    return tuple(tag for tag in named if not any(word in tag.lower() for word in stop_words))
+
+
+def read_word_list(path: Path | None) -> tuple[str, ...]:
+    """The words of a text file, one a line, empty lines and those that begin with # aside; None: our own list."""
+    if path is None:
+        return vocabulary()
+    try:
+        if path.stat().st_size > MAX_LIST_BYTES:
+            raise DataError(f"{path}: has {path.stat().st_size} bytes; expected a list of words, one a line")
+        words = listed_words(file_text(path))
+    except OSError as error:
+        raise DataError(f"{path}: the list of words cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: is no UTF-8 text; expected a list of words, one a line") from error
+    if not 1 <= len(words) <= MAX_WORDS:
+        raise DataError(f"{path}: has {len(words)} words; expected 1 to {MAX_WORDS}")
+    for word in words:
+        if len(word) > MAX_WORD_LENGTH or not word.isprintable():
+            raise DataError(f"{path}: {word[:40]!r} is no word; expected short printable texts")
+    return words
+
+
+def load_ram(files: ModelFiles, device: str) -> Any:
+    """RAM++ of the package ``ram`` with its published weights; raises ``ModelMissing`` where it is not there."""
+    try:
+        models = require("ram.models", "tagger 'ram-plus'")
+    except ModelMissing as error:
+        raise ModelMissing(
+            "tagger 'ram-plus': its package is not installed; export it with tools/export_onnx.py, or "
+            "set perception.paper.tagger to words"
+        ) from error
+    make_deterministic(device)
+    try:
+        # Without a file: the package would read it in full, and weights are read as plain tensors alone.
+        model = models.ram_plus(pretrained="", image_size=RAM_PX, vit="swin_l")
+    except OSError as error:  # the package makes its tokenizer from bert-base-uncased
+        raise ModelMissing(
+            f"tagger 'ram-plus': its package cannot be set up ({bounded(error)}); it needs the tokenizer of "
+            "bert-base-uncased in the Hugging Face cache"
+        ) from error
+    fill_ram(model, read_weights(files.weights), files)
+    return model.eval().to(device)
+
+
+def fill_ram(model: Any, tensors: dict[str, Any], files: ModelFiles) -> None:
+    """Give ``model`` its weights under the names of the authors' own loader; ``DataError`` where some do not fit."""
+    advice = what_to_fetch(files.entry, (files.form,))
+    named = {
+        name.replace("vision_multi", "tagging_head"): tensor
+        for name, tensor in tensors.items()
+        if not any(part in name for part in MADE_BY_ITSELF)
+    }
+    try:
+        missing = model.load_state_dict(named, strict=False).missing_keys
+    except RuntimeError as error:
+        raise DataError(f"{files.weights}: does not fit RAM++ ({bounded(error)}); {advice}") from error
+    if missing := [name for name in missing if not any(part in name for part in MADE_BY_ITSELF)]:
+        raise DataError(f"{files.weights}: lacks {len(missing)} tensors, such as {missing[0][:80]}; {advice}")
+
+
+# ---- named regions
 
 # Moves the digest when what lies between the networks changes.
 FRONT_END_VERSION = "2"

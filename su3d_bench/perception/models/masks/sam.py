@@ -7,8 +7,9 @@ A network that says what it sees is separate from the geometry around it: ``Torc
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Protocol
 
 import numpy as np
@@ -16,6 +17,7 @@ from pydantic import Field
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.system.devices import Batches, require_transformers
+from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
 from su3d_bench.perception.models.encoders.images import normalised_bytes, resized, size_with_longest_side
 from su3d_bench.perception.models.files import ModelFiles, bounded, kept, load_class, on_device, read_weights
@@ -198,36 +200,7 @@ class TorchSam:
 
 # ---- through transformers, from a model folder or an original checkpoint
 
-# Width, layers, heads and layers with global attention of the image towers, from segment_anything/build_sam.py.
-_SAM_TOWERS = {
-    "sam-vit-h": (1280, 32, 16, (7, 15, 23, 31)),
-    "sam-vit-l": (1024, 24, 16, (5, 11, 17, 23)),
-    "sam-vit-b": (768, 12, 12, (2, 5, 8, 11)),
-}
-# The original's names and transformers' for the same tensors, as whole parts of a dotted name.
-_SAM_NAMES = (
-    (r"^image_encoder\.", "vision_encoder."),
-    (r"\.patch_embed\.proj\.", ".patch_embed.projection."),
-    (r"\.blocks\.", ".layers."),
-    (r"\.neck\.0\.", ".neck.conv1."),
-    (r"\.neck\.1\.", ".neck.layer_norm1."),
-    (r"\.neck\.2\.", ".neck.conv2."),
-    (r"\.neck\.3\.", ".neck.layer_norm2."),
-    (r"\.norm(\d|_final_attn)\.", r".layer_norm\1."),
-    (r"\.pe_layer\.positional_encoding_gaussian_matrix$", ".shared_embedding.positional_embedding"),
-    (r"\.point_embeddings\.", ".point_embed."),
-    (r"\.mask_downscaling\.0\.", ".mask_embed.conv1."),
-    (r"\.mask_downscaling\.1\.", ".mask_embed.layer_norm1."),
-    (r"\.mask_downscaling\.3\.", ".mask_embed.conv2."),
-    (r"\.mask_downscaling\.4\.", ".mask_embed.layer_norm2."),
-    (r"\.mask_downscaling\.6\.", ".mask_embed.conv3."),
-    (r"\.output_upscaling\.0\.", ".upscale_conv1."),
-    (r"\.output_upscaling\.1\.", ".upscale_layer_norm."),
-    (r"\.output_upscaling\.3\.", ".upscale_conv2."),
-    (r"(\.output_hypernetworks_mlps\.\d+|\.iou_prediction_head)\.layers\.0\.", r"\1.proj_in."),
-    (r"(\.output_hypernetworks_mlps\.\d+|\.iou_prediction_head)\.layers\.2\.", r"\1.proj_out."),
-    (r"(\.output_hypernetworks_mlps\.\d+|\.iou_prediction_head)\.layers\.1\.", r"\1.layers.0."),
-)
+_CHECKPOINTS: Mapping[str, Any] = parse_toml(file_text(Path(__file__).with_name("sam_checkpoints.toml")))
 _SAM_POSITIONS = "shared_image_embedding.positional_embedding"
 _SAM_NO_WEIGHTS = ("pixel_mean", "pixel_std")  # of the image, which some copies of the checkpoint hold
 
@@ -248,7 +221,7 @@ def sam_names(tensors: dict[str, Any]) -> dict[str, Any]:
     for name, tensor in tensors.items():
         if name in _SAM_NO_WEIGHTS:
             continue
-        for old, new in _SAM_NAMES:
+        for old, new in _CHECKPOINTS["names"]:
             name = re.sub(old, new, name)
         renamed[name] = tensor
     positions = renamed.get("prompt_encoder.shared_embedding.positional_embedding")
@@ -260,14 +233,7 @@ def sam_names(tensors: dict[str, Any]) -> dict[str, Any]:
 def sam_config(name: str) -> Any:
     """``transformers``' configuration of the published SAM called ``name``."""
     transformers = require_transformers(f"segmenter '{name}'")
-    width, n_layers, n_heads, global_layers = _SAM_TOWERS[name]
-    tower = {
-        "hidden_size": width,
-        "num_hidden_layers": n_layers,
-        "num_attention_heads": n_heads,
-        "global_attn_indexes": list(global_layers),
-    }
-    return transformers.SamConfig(vision_config=tower)
+    return transformers.SamConfig(vision_config=dict(_CHECKPOINTS["towers"][name]))
 
 
 def fill_sam(model: Any, tensors: dict[str, Any], where: str) -> Any:
