@@ -285,7 +285,7 @@ def pack_scores(scores: Mapping[str, SceneScore]) -> bytes:
             "warnings": score.warnings,
         }
         arrays[f"{name}/about"] = np.frombuffer(json.dumps(about, sort_keys=True).encode(), np.uint8)
-        arrays |= {f"{name}/{array}": getattr(score.counts, array) for array in score.counts.arrays}
+        arrays |= {f"{name}/{array}": getattr(score.counts, array) for array in score.counts.arrays()}
     # numpy dates every member 1980-01-01, so the bytes say nothing of when they were written
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
@@ -322,7 +322,7 @@ def _unpack_one(name: str, arrays: Mapping[str, NDArray[Any]]) -> SceneScore:
     return SceneScore(
         protocol=about["protocol"],
         version=about["version"],
-        counts=kind.checked({array: arrays[f"{name}/{array}"] for array in kind.arrays}),
+        counts=kind.checked({array: arrays[f"{name}/{array}"] for array in kind.arrays()}),
         n_predictions=about["n_predictions"],
         n_scored=about["n_scored"],
         n_farther=n_farther,

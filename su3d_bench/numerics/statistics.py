@@ -166,6 +166,16 @@ def t_quantile(level: float, n_free: float) -> float:
     return float(ndtri(level) if np.isinf(n_free) else stdtrit(n_free, level))
 
 
+def ratio(part: Float64Array | Int64Array, whole: Float64Array | Int64Array) -> Float64Array:
+    """``part / whole``; NaN of nothing.
+
+    >>> ratio(np.array([1, 0]), np.array([4, 0])).tolist()
+    [0.25, nan]
+    """
+    quotient: Float64Array = np.full(part.shape, np.nan)
+    return np.divide(part, whole, out=quotient, where=whole > 0)
+
+
 def nan_mean(values: Float64Array) -> float:
     """Mean of the values that are not NaN; NaN where there is none.
 
@@ -184,8 +194,7 @@ def row_means(values: Float64Array) -> Float64Array:
     [0.5, nan]
     """
     is_number = ~np.isnan(values)
-    n = is_number.sum(axis=1)
-    return np.where(n > 0, np.where(is_number, values, 0.0).sum(axis=1) / np.maximum(n, 1), np.nan)
+    return ratio(np.where(is_number, values, 0.0).sum(axis=1), is_number.sum(axis=1))
 
 
 @dataclass(frozen=True)

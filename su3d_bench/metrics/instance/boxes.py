@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import permutations
-from typing import ClassVar
 
 import numpy as np
 
@@ -19,11 +18,24 @@ from su3d_bench.metrics.matching.labelling import (
     class_index_of_ids,
     classes_of_prediction,
     encoder_warning,
+    places_among_scored,
     scored_classes,
 )
-from su3d_bench.metrics.metric import Arrays, Counts, Metric, Pooled, SceneScore, Values, present
+from su3d_bench.metrics.matching.nearest import Points
+from su3d_bench.metrics.metric import (
+    ROWS,
+    Counts,
+    Metric,
+    Pooled,
+    SceneScore,
+    Values,
+    axes,
+    class_columns,
+    first_row,
+    present,
+)
 from su3d_bench.metrics.protocols.model import BOX_AXES
-from su3d_bench.numerics.statistics import row_means
+from su3d_bench.numerics.statistics import ratio, row_means
 
 # A cube of half sides 1 in six tetrahedra (6, 4, 3): one for each order in which its axes lead from corner to corner.
 _TETRAHEDRA: Float64Array = np.array(
@@ -40,6 +52,12 @@ def smallest_box(points: Float64Array, rotation: Float64Array) -> OrientedBox:
     along_axes = rotation.T @ points.T  # (3, N): each axis in one piece, which takes a fraction of the time of (N, 3)
     low, high = along_axes.min(axis=1), along_axes.max(axis=1)
     return OrientedBox(rotation @ ((low + high) / 2), high - low, rotation)
+
+
+def box_around(points: Points) -> Float64Array:
+    """The lowest and the highest corner (2, 3) of the smallest box around points (N, 3) along the axes of the world."""
+    known = np.asarray(points, np.float64)
+    return np.stack([known.min(axis=0), known.max(axis=0)])
 
 
 def box_iou(first: OrientedBox, second: OrientedBox) -> float:
@@ -118,23 +136,14 @@ class BoxCounts(Counts):
     """
 
     stored_as = "boxes"
-    arrays: ClassVar[Arrays] = {
-        "class_index": ("i", ("rows",)),
-        "score": ("f", ("rows",)),
-        "is_true": ("b", ("rows", "thresholds")),
-        "n_truth": ("i", ("classes",)),
-        "n_centred": ("i", ("classes",)),
-        "n_located": ("i", ("classes",)),
-        "n_named": ("i", ("classes",)),
-    }
 
-    class_index: Int32Array
-    score: Float64Array
-    is_true: BoolArray
-    n_truth: Int64Array
-    n_centred: Int64Array
-    n_located: Int64Array
-    n_named: Int64Array
+    class_index: Int32Array = field(metadata=axes(ROWS))
+    score: Float64Array = field(metadata=axes(ROWS))
+    is_true: BoolArray = field(metadata=axes(ROWS, "thresholds"))
+    n_truth: Int64Array = field(metadata=axes("classes"))
+    n_centred: Int64Array = field(metadata=axes("classes"))
+    n_located: Int64Array = field(metadata=axes("classes"))
+    n_named: Int64Array = field(metadata=axes("classes"))
 
     def contradiction(self) -> str | None:
         """Rows beyond the classes, scores without an order, more boxes found or named than there are or can be."""
@@ -269,26 +278,18 @@ def _curves(
     return np.where(n_truth > 0, area, np.nan), np.where(n_truth > 0, recall, np.nan)
 
 
-def share_values(counts: Sequence[BoxCounts], weights: Int64Array) -> dict[str, tuple[Int64Array, Int64Array]]:
+def share_values(counts: Sequence[BoxCounts], weights: Int64Array) -> dict[str, tuple[Float64Array, Float64Array]]:
     """The numerator and denominator (R, C) of the shares ``centroid``, ``class`` and precision at each threshold."""
-    drawn = {
-        name: weights @ np.stack([getattr(of_scene, name) for of_scene in counts])
-        for name in ("n_truth", "n_centred", "n_located", "n_named")
-    }
+    drawn = BoxCounts.drawn(counts, weights, "n_truth", "n_centred", "n_located", "n_named")
     n_classes = drawn["n_truth"].shape[1]
 
-    def rows(which: Sequence[BoolArray]) -> Int64Array:
-        each = [
-            np.bincount(of_scene.class_index[chosen], minlength=n_classes)
-            for of_scene, chosen in zip(counts, which, strict=True)
-        ]
-        drawn_rows: Int64Array = weights @ np.stack(each).astype(np.int64)
-        return drawn_rows
+    def rows(of: Callable[[BoxCounts], Int32Array]) -> Float64Array:
+        return weights.astype(np.float64) @ np.stack([np.bincount(of(c), minlength=n_classes) for c in counts])
 
-    n_rows = rows([np.ones(len(of_scene.score), bool) for of_scene in counts])
+    n_rows = rows(lambda c: c.class_index)
     shares = {"centroid": (drawn["n_centred"], drawn["n_truth"]), "class": (drawn["n_named"], drawn["n_located"])}
     for t, place in enumerate(PLACES):
-        shares[f"precision{place}"] = rows([of_scene.is_true[:, t] for of_scene in counts]), n_rows
+        shares[f"precision{place}"] = rows(lambda c, t=t: c.class_index[c.is_true[:, t]]), n_rows
     return shares
 
 
@@ -313,10 +314,8 @@ class BoxMetric(Metric[BoxCounts]):
         boxes = list(truth.boxes.boxes.values())
         ids = np.array([truth.boxes.class_of_instance[instance] for instance in truth.boxes.boxes], np.int64)
         known = class_index_of_ids(rules, ids)
-        is_scored = scored_classes(rules)
-        # of each class its place among the scored ones; -1 for one that is not, and at the end for no class
-        place = np.append(np.where(is_scored, np.cumsum(is_scored) - 1, -1), -1)
-        is_present = present(known, len(rules.classes)) & is_scored
+        place = places_among_scored(rules)
+        is_present = present(known, len(rules.classes)) & scored_classes(rules)
         called = place[classes_of_prediction(rules, prediction, encoder, candidate_classes(rules, is_present))]
         masks, scores = masks_and_scores(prediction)
         scores = np.ones(len(scores)) if rules.confidence == "ones" else scores
@@ -330,43 +329,31 @@ class BoxMetric(Metric[BoxCounts]):
         return self.score(counts, prediction, np.zeros(0), warnings)
 
     def pooled(self, counts: Sequence[BoxCounts]) -> Pooled:
-        of_class = self._of_classes(counts, np.ones((1, len(counts)), np.int64))
-        classes = {
-            entry.name: {name: float(table[0, c]) for name, table in of_class.items()}
-            for c, entry in enumerate(self.rules.scored)
-        }
-        return Pooled(self.combine(counts), classes)
+        tables = self._of_classes(counts, np.ones((1, len(counts)), np.int64))
+        columns = class_columns(self.rules, tables, np.ones(len(self.rules.scored), bool))
+        return Pooled(self.combine(counts), {name: first_row(values) for name, values in columns.items()})
 
     def combine(self, counts: Sequence[BoxCounts]) -> Values:
-        once = np.ones((1, len(counts)), np.int64)
-        return {name: float(value[0]) for name, value in self.resampled(counts, once).items()}
+        return self.values_once(counts)
 
     def resampled(self, counts: Sequence[BoxCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
         values = {name: row_means(table) for name, table in class_values(counts, weights).items()}
         for name, (part, whole) in share_values(counts, weights).items():
-            values[name] = _share(part.sum(axis=1), whole.sum(axis=1))
+            values[name] = ratio(part.sum(axis=1), whole.sum(axis=1))
         return {name: values[name] for name in self.rules.value_names}
 
     def resampled_classes(self, counts: Sequence[BoxCounts], weights: Int64Array) -> dict[str, dict[str, Float64Array]]:
         tables = self._of_classes(counts, weights)
         has_truth = np.any([of_scene.n_truth > 0 for of_scene in counts], axis=0)
-        return {
-            entry.name: {name: tables[name][:, c] for name in self.rules.headline}
-            for c, entry in enumerate(self.rules.scored)
-            if has_truth[c]
-        }
+        return class_columns(self.rules, {name: tables[name] for name in self.rules.headline}, has_truth)
 
     def _of_classes(self, counts: Sequence[BoxCounts], weights: Int64Array) -> dict[str, Float64Array]:
         """Each value (R, C) of each class alone; NaN where a draw has no true box of it."""
+        shares = share_values(counts, weights)
+        has_truth = shares["centroid"][1] > 0
         tables = class_values(counts, weights)
-        shares = {name: _share(*parts) for name, parts in share_values(counts, weights).items()}
-        has_truth = weights @ np.stack([of_scene.n_truth for of_scene in counts]) > 0
-        tables |= {name: np.where(has_truth, table, np.nan) for name, table in shares.items()}
+        tables |= {name: np.where(has_truth, ratio(*parts), np.nan) for name, parts in shares.items()}
         return {name: tables[name] for name in self.rules.value_names}
-
-
-def _share(part: Int64Array, whole: Int64Array) -> Float64Array:
-    return np.where(whole > 0, part / np.maximum(whole, 1), np.nan)
 
 
 def _constant_warning(scores: Float64Array) -> str | None:

@@ -25,7 +25,7 @@ from su3d_bench.metrics.matching.labelling import (
     encoder_warning,
     scored_classes,
 )
-from su3d_bench.metrics.metric import C, Metric, Pooled, SceneScore, Values, n_predictions, present
+from su3d_bench.metrics.metric import C, Metric, Pooled, SceneScore, Values, group_means, n_predictions, present
 from su3d_bench.metrics.protocols.kinds import AP_NAMES
 from su3d_bench.metrics.protocols.model import ProtocolRules, TransferRules
 
@@ -35,6 +35,7 @@ CONSTANT_CONFIDENCE = "every confidence is"
 DUPLICATE_IOU = 0.9  # pairs above it are the same object twice; duplicates can raise AP under constant confidences
 OBJECT = 1  # the one label that all have where the protocol has no classes
 NO_OBJECT = 0
+AP_COLUMNS = {name: name for name in AP_NAMES}
 
 
 class CurveMetric(Metric[InstanceCounts]):
@@ -48,23 +49,13 @@ class CurveMetric(Metric[InstanceCounts]):
 
     def pooled(self, counts: Sequence[InstanceCounts]) -> Pooled:
         curve = instance_ap.combine(counts, self.rules.thresholds)
-        of_class = {name: _named(curve.of_class(index)) for index, name in enumerate(self.rules.curve_names)}
-        return Pooled(_ap_values(curve), of_class, self._groups(curve), self._warnings(counts))
-
-    def _groups(self, curve: InstanceAP) -> dict[str, Values]:
-        """The mean of each group over those of its classes that have a value."""
-        members: dict[str, list[int]] = {}
-        for index, entry in enumerate(() if self.rules.class_agnostic is not None else self.rules.scored):
-            if entry.group:
-                members.setdefault(entry.group, []).append(index)
-        return {name: _named(curve.of_group(indices)) for name, indices in members.items()}
-
-    def _warnings(self, counts: Sequence[InstanceCounts]) -> tuple[str, ...]:
-        whole = instance_ap.concatenate(counts)
-        small = np.flatnonzero((whole.n_truth == 0) & (whole.n_small_truth > 0))
+        classes = {name: _named(curve.of_class(index)) for index, name in enumerate(self.rules.curve_names)}
+        groups = group_means(self.rules, classes, AP_COLUMNS) if self.rules.class_agnostic is None else {}
+        n_truth, n_small_truth = (sum(getattr(c, name) for c in counts) for name in ("n_truth", "n_small_truth"))
+        small = np.flatnonzero((n_truth == 0) & (n_small_truth > 0))
         names = ", ".join(f"'{self.rules.curve_names[index]}'" for index in small)
-        size = self.rules.min_region_size
-        return (f"not scored, because no scene has an instance of {size} points: {names}",) if names else ()
+        warning = f"not scored, because no scene has an instance of {self.rules.min_region_size} points: {names}"
+        return Pooled(_ap_values(curve), classes, groups, (warning,) if names else ())
 
     def combine(self, counts: Sequence[InstanceCounts]) -> Values:
         return _ap_values(instance_ap.combine(counts, self.rules.thresholds))

@@ -21,11 +21,10 @@ from su3d_bench.metrics.matching.labelling import (
     encoder_warning,
     scored_classes,
 )
-from su3d_bench.metrics.metric import Metric, Pooled, SceneScore, Values, present
+from su3d_bench.metrics.metric import Metric, Pooled, SceneScore, Values, group_means, present
 from su3d_bench.metrics.protocols.model import ClassEntry, ProtocolRules
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, SemanticMetrics
-from su3d_bench.numerics.statistics import nan_mean
 
 GROUP_COLUMNS = {"mAcc": "recall", "mIoU": "IoU"}  # what a group of classes is called by, and what it averages
 
@@ -59,7 +58,7 @@ class SemanticMetric(Metric[SemanticCounts]):
         return {"classes": len(self.rules.classes), "columns": len(self.rules.classes) + 1}
 
     def pooled(self, counts: Sequence[SemanticCounts]) -> Pooled:
-        metrics = self._metrics(semantic.concatenate(counts), pooled=True)
+        metrics = self._metrics(SemanticCounts.joined(counts), pooled=True)
         classes = {
             self._entries[index].name: {
                 "recall": float(metrics.recall[row]),
@@ -70,10 +69,10 @@ class SemanticMetric(Metric[SemanticCounts]):
             }
             for row, index in enumerate(metrics.class_index)
         }
-        return Pooled(self._values(metrics), classes, self._groups(classes))
+        return Pooled(self._values(metrics), classes, group_means(self.rules, classes, GROUP_COLUMNS))
 
     def combine_each(self, counts: Sequence[SemanticCounts]) -> list[Values]:
-        return [self._values(self._metrics(semantic.concatenate([of_scene]), pooled=False)) for of_scene in counts]
+        return [self._values(self._metrics(of_scene, pooled=False)) for of_scene in counts]
 
     def resampled(self, counts: Sequence[SemanticCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
         is_scored = scored_classes(self.rules) if self.rules.metric == "hovsg" else None
@@ -110,20 +109,6 @@ class SemanticMetric(Metric[SemanticCounts]):
             "mF1-conceptgraphs": metrics.mean_f1_conceptgraphs,
             "n_classes": len(metrics.class_index),
             **{f"n_IoU>{level:.2f}": n for level, n in zip(semantic.IOU_LEVELS, metrics.n_classes_above, strict=True)},
-        }
-
-    def _groups(self, classes: Mapping[str, Values]) -> dict[str, Values]:
-        """The mean of each group over those of its classes that have a value."""
-        rows: dict[str, list[Values]] = {}
-        for entry in self.rules.scored:
-            if entry.group:
-                rows.setdefault(entry.group, []).append(classes.get(entry.name, {}))
-        return {
-            name: {
-                shown: nan_mean(np.array([row.get(column, np.nan) for row in of_group]))
-                for shown, column in GROUP_COLUMNS.items()
-            }
-            for name, of_group in rows.items()
         }
 
     def _metrics(self, whole: SemanticCounts, *, pooled: bool) -> SemanticMetrics:

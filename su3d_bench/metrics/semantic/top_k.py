@@ -6,8 +6,7 @@ Source: semantic/eval/eval_semantic.py and semantic/utils/confmat.py of scannetp
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -22,11 +21,12 @@ from su3d_bench.metrics.matching.labelling import (
     ranked_classes,
     scored_classes,
 )
-from su3d_bench.metrics.metric import Arrays, Counts, Metric, Pooled, SceneScore, present
+from su3d_bench.metrics.metric import Counts, Metric, Pooled, SceneScore, axes, present
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, SemanticMetrics
 from su3d_bench.metrics.semantic.score import owners_at
+from su3d_bench.numerics.statistics import ratio
 
 ONE_CLASS = "the prediction names one class a point: top {k} is top 1"
 
@@ -40,15 +40,10 @@ class TopKCounts(Counts):
     """
 
     stored_as = "top-k"
-    arrays: ClassVar[Arrays] = {
-        "best": ("i", ("classes", "columns")),
-        "any": ("i", ("classes", "columns")),
-        "is_present": ("b", ("classes",)),
-    }
 
-    best: Int64Array
-    any: Int64Array
-    is_present: BoolArray
+    best: Int64Array = field(metadata=axes("classes", "columns"))
+    any: Int64Array = field(metadata=axes("classes", "columns"))
+    is_present: BoolArray = field(metadata=axes("classes"))
 
     def contradiction(self) -> str | None:
         """Points of a class that the scenes do not contain, other numbers of points, fewer hits among more classes."""
@@ -176,8 +171,7 @@ class TopKMetric(Metric[TopKCounts]):
         answer: dict[str, dict[str, Float64Array]] = {}
         for which, prefix in ((0, ""), (1, f"top-{self._k} ")):
             hit, n_true, n_predicted = semantic.resampled_points([c.each[which] for c in counts], weights)
-            recall = np.where(n_true > 0, hit / np.maximum(n_true, 1), np.nan)
-            iou = np.where(n_true > 0, hit / np.maximum(n_true + n_predicted - hit, 1), np.nan)
+            recall, iou = ratio(hit, n_true), np.where(n_true > 0, ratio(hit, n_true + n_predicted - hit), np.nan)
             for index in np.flatnonzero(scored_classes(self.rules)):
                 if any(c.is_present[index] for c in counts):
                     row = answer.setdefault(self.rules.classes[index].name, {})
@@ -186,11 +180,8 @@ class TopKMetric(Metric[TopKCounts]):
 
     def _metrics(self, counts: Sequence[TopKCounts]) -> tuple[SemanticMetrics, SemanticMetrics]:
         """Of the first class and of the k, over all classes; those that are not scored have no point and no value."""
-        best, any_of_k = zip(*(of_scene.each for of_scene in counts), strict=True)
-        return (
-            semantic.scannet_metrics(semantic.concatenate(best).confusion),
-            semantic.scannet_metrics(semantic.concatenate(any_of_k).confusion),
-        )
+        whole = TopKCounts.joined(counts)
+        return semantic.scannet_metrics(whole.best), semantic.scannet_metrics(whole.any)
 
 
 def _labels(rules: ProtocolRules, truth: GroundTruth) -> Int64Array:

@@ -114,7 +114,7 @@ def test_the_order_of_masks_and_the_numbers_of_objects_change_nothing() -> None:
     one = score_scene(RULES, truth, prediction, None).counts
     for counts in (score_scene(RULES, truth, mixed, None).counts, score_scene(RULES, other, prediction, None).counts):
         assert isinstance(one, PanopticCounts) and isinstance(counts, PanopticCounts)
-        for name in PanopticCounts.arrays:
+        for name in PanopticCounts.arrays():
             np.testing.assert_allclose(getattr(counts, name), getattr(one, name), rtol=1e-15)
 
 
@@ -182,7 +182,7 @@ def test_counts_survive_their_file_and_impossible_ones_are_refused() -> None:
     assert combine(RULES, {"a": kept}).metrics == combine(RULES, {"a": score}).metrics
     counts = score.counts
     assert isinstance(counts, PanopticCounts)
-    arrays = {name: getattr(counts, name) for name in PanopticCounts.arrays}
+    arrays = {name: getattr(counts, name) for name in PanopticCounts.arrays()}
     for iou in (np.full_like(counts.iou, 9.0), np.full_like(counts.iou, np.nan)):
         with pytest.raises(DataError, match="'iou' of class 0"):
             PanopticCounts.checked(arrays | {"iou": iou})

@@ -214,7 +214,7 @@ def test_counts_survive_their_file_and_impossible_ones_are_refused() -> None:
     score = score_scene(RULES, QUESTIONS, PERFECT, ENCODER)
     kept = unpack_scores(pack_scores({RULES.name: score}))[RULES.name]
     assert plain_json(combine(RULES, {"a": kept}).metrics) == plain_json(combine(RULES, {"a": score}).metrics)
-    arrays = {name: getattr(score.counts, name) for name in PresenceCounts.arrays}
+    arrays = {name: getattr(score.counts, name) for name in PresenceCounts.arrays()}
     for name, value, message in (
         ("sampling", np.full(4, 3, np.int64), "counts beyond the 3 samplings"),
         ("similarity", np.full(4, np.nan), "no cosines"),

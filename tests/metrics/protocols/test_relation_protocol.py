@@ -147,7 +147,7 @@ def test_the_first_relation_of_a_pair_counts_and_a_doubtful_one_is_not_true() ->
 def test_counts_that_no_scene_gives_are_refused() -> None:
     one, two = np.ones(2, np.int64), np.full(2, 2, np.int64)
     with pytest.raises(DataError, match="'n_objects_found' has more than 'n_objects'"):
-        RelationCounts.checked(dict(zip(RelationCounts.arrays, (one, two, one, one, one), strict=True)))
+        RelationCounts.checked(dict(zip(RelationCounts.arrays(), (one, two, one, one, one), strict=True)))
     other = RelationCounts(one, one, one, one, one)
     with pytest.raises(DataError, match="was scored with 2 classes"):
         metric_of(RULES).check("a", other)
