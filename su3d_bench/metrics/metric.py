@@ -181,6 +181,30 @@ class Metric(ABC, Generic[C]):
         """
         return {}
 
+    def class_columns(
+        self, tables: Mapping[str, Float64Array], is_kept: BoolArray
+    ) -> dict[str, dict[str, Float64Array]]:
+        """Class -> column -> value (R,) from ``tables`` (R, C) of the scored classes, for those that are kept (C,)."""
+        return {
+            entry.name: {name: table[:, c] for name, table in tables.items()}
+            for c, entry in enumerate(self.rules.scored)
+            if is_kept[c]
+        }
+
+    def group_means(self, classes: Mapping[str, Values], columns: Mapping[str, str]) -> dict[str, Values]:
+        """Of each group the means over its classes that have a value; ``columns``: name of the mean -> of the value."""
+        rows: dict[str, list[Values]] = {}
+        for entry in self.rules.scored:
+            if entry.group:
+                rows.setdefault(entry.group, []).append(classes.get(entry.name, {}))
+        return {
+            group: {
+                name: nan_mean(np.array([row.get(column, np.nan) for row in of_group]))
+                for name, column in columns.items()
+            }
+            for group, of_group in rows.items()
+        }
+
     def combine(self, counts: Sequence[C]) -> Values:
         """The metrics of the scenes together."""
         return self.pooled(counts).values
@@ -232,31 +256,6 @@ def _weighted_mean(values: Float64Array, weights: Int64Array) -> Float64Array:
 def first_row(values: Mapping[str, Float64Array]) -> Values:
     """Of each value (R,) the first."""
     return {name: float(value[0]) for name, value in values.items()}
-
-
-def class_columns(
-    rules: ProtocolRules, tables: Mapping[str, Float64Array], is_kept: BoolArray
-) -> dict[str, dict[str, Float64Array]]:
-    """Class -> column -> value (R,) from ``tables`` (R, C) of the scored classes, for those that are kept (C,)."""
-    return {
-        entry.name: {name: table[:, c] for name, table in tables.items()}
-        for c, entry in enumerate(rules.scored)
-        if is_kept[c]
-    }
-
-
-def group_means(rules: ProtocolRules, classes: Mapping[str, Values], columns: Mapping[str, str]) -> dict[str, Values]:
-    """The mean of each group over those of its classes that have a value; ``columns``: what it is called, of what."""
-    rows: dict[str, list[Values]] = {}
-    for entry in rules.scored:
-        if entry.group:
-            rows.setdefault(entry.group, []).append(classes.get(entry.name, {}))
-    return {
-        group: {
-            name: nan_mean(np.array([row.get(column, np.nan) for row in of_group])) for name, column in columns.items()
-        }
-        for group, of_group in rows.items()
-    }
 
 
 def present(class_index: Int64Array, n_classes: int) -> BoolArray:

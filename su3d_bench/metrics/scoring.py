@@ -29,17 +29,9 @@ from su3d_bench.metrics.metric import MOST_COUNTED, Counts, Metric, SceneScore, 
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.score import CategoriesMetric, QueryMetric, QueryTruth
 from su3d_bench.metrics.protocols.model import Kind, ProtocolRules
+from su3d_bench.metrics.questions import score as questions
 from su3d_bench.metrics.questions.grounding import ChainMetric, GroundingMetric
 from su3d_bench.metrics.questions.presence import PresenceMetric
-from su3d_bench.metrics.questions.score import (
-    AnnotationMetric,
-    AnnotationTruth,
-    PresenceTruth,
-    ReasoningMetric,
-    ReasoningTruth,
-    RetrievalMetric,
-    RetrievalTruth,
-)
 from su3d_bench.metrics.relations import RelationMetric
 from su3d_bench.metrics.semantic.panoptic import PanopticMetric
 from su3d_bench.metrics.semantic.score import SemanticMetric
@@ -58,7 +50,9 @@ __all__ = [
 ]
 
 EVERY_SCENE = "every scene"  # stands before a warning that all scenes share, where else the name of one stands
-QuestionTruth = RetrievalTruth | PresenceTruth | AnnotationTruth | ReasoningTruth
+QuestionTruth = (
+    questions.RetrievalTruth | questions.PresenceTruth | questions.AnnotationTruth | questions.ReasoningTruth
+)
 Truth = GroundTruth | OpenLexTruth | QueryTruth | QuestionTruth
 METRICS: dict[Kind, type[Metric[Any]]] = {
     "semantic": SemanticMetric,
@@ -73,10 +67,10 @@ METRICS: dict[Kind, type[Metric[Any]]] = {
     "relations": RelationMetric,
     "objects": ObjectMetric,
     "places": PlaceMetric,
-    "retrieval": RetrievalMetric,
+    "retrieval": questions.RetrievalMetric,
     "presence": PresenceMetric,
-    "annotation": AnnotationMetric,
-    "reasoning": ReasoningMetric,
+    "annotation": questions.AnnotationMetric,
+    "reasoning": questions.ReasoningMetric,
 }
 _COUNTS: dict[str, type[Counts]] = {metric.counts.stored_as: metric.counts for metric in METRICS.values()}
 

@@ -12,11 +12,10 @@ from functools import cached_property
 from typing import Any, Generic, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
-from su3d_bench.core.types import BoolArray, GroundTruth, Int64Array
+from su3d_bench.core.types import BoolArray, GroundTruth, Int64Array, IntArray
 from su3d_bench.metrics.attribution import masks as corrections
 from su3d_bench.metrics.attribution.masks import CAUSES, LabelledPoints, MaskError, causes_of, find_errors, repaired
 from su3d_bench.metrics.attribution.overlaps import (
@@ -36,8 +35,6 @@ from su3d_bench.metrics.metric import C, Metric, Values
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
 from su3d_bench.metrics.semantic.score import SemanticMetric, call_points, transfer_votes
-
-IntArray = NDArray[np.integer[Any]]
 
 
 @dataclass(frozen=True)

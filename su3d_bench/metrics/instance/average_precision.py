@@ -12,13 +12,11 @@ import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array
+from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array, IntArray
 from su3d_bench.metrics.metric import ROWS, Counts, axes
 from su3d_bench.numerics.statistics import row_means
 
@@ -173,8 +171,6 @@ def _halves(values: Float64Array) -> tuple[Float64Array, Float64Array]:
 THRESHOLDS: tuple[float, ...] = (*(float(t) for t in np.arange(0.5, 0.95, 0.05)), 0.25)
 MIN_REGION_SIZE = 100  # points; the official script's --min_region_size, opt.min_region_sizes
 INSTANCES_PER_CLASS = 1000  # ground truth is label * 1000 + instance
-
-IntArray = NDArray[np.integer[Any]]
 
 
 @dataclass(frozen=True)

@@ -13,27 +13,9 @@ from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Partition
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int32Array, Int64Array, OrientedBox
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE, masks_and_scores
-from su3d_bench.metrics.matching.labelling import (
-    candidate_classes,
-    class_index_of_ids,
-    classes_of_prediction,
-    encoder_warning,
-    places_among_scored,
-    scored_classes,
-)
+from su3d_bench.metrics.matching import labelling
 from su3d_bench.metrics.matching.nearest import Points
-from su3d_bench.metrics.metric import (
-    ROWS,
-    Counts,
-    Metric,
-    Pooled,
-    SceneScore,
-    Values,
-    axes,
-    class_columns,
-    first_row,
-    present,
-)
+from su3d_bench.metrics.metric import ROWS, Counts, Metric, Pooled, SceneScore, Values, axes, first_row, present
 from su3d_bench.metrics.protocols.model import BOX_AXES
 from su3d_bench.numerics.statistics import ratio, row_means
 
@@ -313,10 +295,10 @@ class BoxMetric(Metric[BoxCounts]):
             raise DataError(f"{rules.name}: the truth '{truth.variant}' has no boxes")
         boxes = list(truth.boxes.boxes.values())
         ids = np.array([truth.boxes.class_of_instance[instance] for instance in truth.boxes.boxes], np.int64)
-        known = class_index_of_ids(rules, ids)
-        place = places_among_scored(rules)
-        is_present = present(known, len(rules.classes)) & scored_classes(rules)
-        called = place[classes_of_prediction(rules, prediction, encoder, candidate_classes(rules, is_present))]
+        known = labelling.class_index_of_ids(rules, ids)
+        place = labelling.places_among_scored(rules)
+        is_present = present(known, len(rules.classes))
+        called = place[labelling.classes_of_prediction(rules, prediction, encoder, is_present)]
         masks, scores = masks_and_scores(prediction)
         scores = np.ones(len(scores)) if rules.confidence == "ones" else scores
         kept = np.flatnonzero(masks.sizes >= rules.min_region_size)
@@ -324,13 +306,13 @@ class BoxMetric(Metric[BoxCounts]):
         wanted = np.flatnonzero(place[known] >= 0)
         iou, holds_centroid = _meet(shapes, [boxes[g] for g in wanted], rules.box_axes)
         counts = count_boxes(iou, holds_centroid, place[known[wanted]], called[kept], scores[kept], len(rules.scored))
-        warnings = [encoder_warning(rules, prediction, encoder), _constant_warning(scores[kept])]
+        warnings = [labelling.encoder_warning(rules, prediction, encoder), _constant_warning(scores[kept])]
         # the sides of a box are no surface that a map should have: there is no coverage
         return self.score(counts, prediction, np.zeros(0), warnings)
 
     def pooled(self, counts: Sequence[BoxCounts]) -> Pooled:
         tables = self._of_classes(counts, np.ones((1, len(counts)), np.int64))
-        columns = class_columns(self.rules, tables, np.ones(len(self.rules.scored), bool))
+        columns = self.class_columns(tables, np.ones(len(self.rules.scored), bool))
         return Pooled(self.combine(counts), {name: first_row(values) for name, values in columns.items()})
 
     def combine(self, counts: Sequence[BoxCounts]) -> Values:
@@ -345,7 +327,7 @@ class BoxMetric(Metric[BoxCounts]):
     def resampled_classes(self, counts: Sequence[BoxCounts], weights: Int64Array) -> dict[str, dict[str, Float64Array]]:
         tables = self._of_classes(counts, weights)
         has_truth = np.any([of_scene.n_truth > 0 for of_scene in counts], axis=0)
-        return class_columns(self.rules, {name: tables[name] for name in self.rules.headline}, has_truth)
+        return self.class_columns({name: tables[name] for name in self.rules.headline}, has_truth)
 
     def _of_classes(self, counts: Sequence[BoxCounts], weights: Int64Array) -> dict[str, Float64Array]:
         """Each value (R, C) of each class alone; NaN where a draw has no true box of it."""

@@ -47,12 +47,14 @@ def candidate_classes(rules: ProtocolRules, is_present: BoolArray) -> Int64Array
 
 
 def classes_of_prediction(
-    rules: ProtocolRules, prediction: Prediction, encoder: Encoder | None, candidates: Int64Array
+    rules: ProtocolRules, prediction: Prediction, encoder: Encoder | None, is_present: BoolArray
 ) -> Int64Array:
     """A class index for each instance, row of features or point; -1 where it is none of the protocol's classes.
 
-    Labels that the method itself decided are taken as they are; otherwise features are classified among ``candidates``.
+    Labels that the method itself decided are taken as they are; otherwise features are classified among the candidates
+    of a scene that contains ``is_present`` (C,).
     """
+    candidates = candidate_classes(rules, is_present)
     labels = getattr(prediction, "labels", None)
     if labels is None:
         return _classes_of_features(rules, prediction, encoder, candidates)
@@ -65,16 +67,18 @@ def classes_of_prediction(
 
 
 def ranked_classes(
-    rules: ProtocolRules, prediction: Prediction, encoder: Encoder | None, candidates: Int64Array, k: int
+    rules: ProtocolRules, prediction: Prediction, encoder: Encoder | None, is_present: BoolArray, k: int
 ) -> Int64Array:
     """The ``k`` likeliest classes (K, k) of each instance, row of features or point, the best first, -1 for no more.
 
-    The labels of the method itself, in its order; otherwise the ``candidates`` of highest similarity.
+    The labels of the method itself, in its order; otherwise the candidates of highest similarity of a scene that
+    contains ``is_present`` (C,).
     """
+    candidates = candidate_classes(rules, is_present)
     ranked = np.full((n_predictions(prediction), k), -1, np.int64)
     labels = getattr(prediction, "labels", None)
     if len(ranked):
-        ranked[:, 0] = classes_of_prediction(rules, prediction, encoder, candidates)
+        ranked[:, 0] = classes_of_prediction(rules, prediction, encoder, is_present)
     if labels is not None:
         index_of = {entry.name: index for index, entry in enumerate(rules.classes)}
         for row, further in enumerate(getattr(prediction, "further_labels", None) or ()):

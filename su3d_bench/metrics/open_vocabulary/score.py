@@ -17,16 +17,8 @@ from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.instance.score import CurveMetric, score_of_masks
+from su3d_bench.metrics.matching import labelling
 from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.matching.labelling import (
-    cosines,
-    device_of,
-    encoder_warning,
-    has_every_label,
-    needed_features,
-    similarities,
-    text_features,
-)
 from su3d_bench.metrics.matching.votes import transfer_each_mask
 from su3d_bench.metrics.metric import Metric, Pooled, SceneScore
 from su3d_bench.metrics.open_vocabulary import openlex3d
@@ -182,7 +174,7 @@ class CategoriesMetric(Metric[ObjectCounts]):
         used = np.unique(unit[unit >= 0])
         count = _count_ranks if is_ranking else _count_categories
         counts = count(rules, truth, prediction, encoder, ids, object_row, used, transfer.rows_of(used, unit))
-        warnings = (encoder_warning(rules, prediction, encoder), _shared_points_warning(prediction))
+        warnings = (labelling.encoder_warning(rules, prediction, encoder), _shared_points_warning(prediction))
         return self.score(counts, prediction, distance[scored], warnings)
 
     @property
@@ -246,7 +238,7 @@ def _count_categories(
     labels = getattr(prediction, "labels", None)
     if not len(used):
         vocabulary, top = list[str](), np.zeros((0, 1), np.int64)
-    elif labels is not None and has_every_label(prediction):
+    elif labels is not None and labelling.has_every_label(prediction):
         vocabulary = sorted(set(labels))
         top = np.array([[vocabulary.index(labels[row])] for row in used], np.int64).reshape(-1, 1)
     else:
@@ -292,10 +284,10 @@ def _similarity_blocks(
     rules: ProtocolRules, truth: OpenLexTruth, prediction: Prediction, encoder: Encoder | None, used: Int64Array
 ) -> Iterator[Float64Array]:
     """The cosines (B, P) of the units ``used`` with the prompts, a block of units after another."""
-    features, known = needed_features(rules, prediction, encoder)
-    text = text_features(rules, truth.prompts, features, known)
+    features, known = labelling.needed_features(rules, prediction, encoder)
+    text = labelling.text_features(rules, truth.prompts, features, known)
     for start in range(0, len(used), _BLOCK_UNITS):
-        yield cosines(features[used[start : start + _BLOCK_UNITS]], text, device_of(known))
+        yield labelling.cosines(features[used[start : start + _BLOCK_UNITS]], text, labelling.device_of(known))
         release_pages(features)
 
 
@@ -322,7 +314,7 @@ class QueryMetric(CurveMetric):
         masks = transfer.masks_of(prediction)
         similarity = np.empty((len(masks), len(truth.queries)))
         if len(masks) and truth.queries:
-            similarity = similarities(rules, [query.text for query in truth.queries], prediction, encoder)
+            similarity = labelling.similarities(rules, [query.text for query in truth.queries], prediction, encoder)
         cap_m, voxel_m = rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
         if rules.transfer.candidates == "each-mask":
             assert cap_m is not None
@@ -341,5 +333,5 @@ class QueryMetric(CurveMetric):
         )
         asked_for = np.unique(np.array([each for query in truth.queries for each in query.object_ids], np.int64))
         wanted = np.isin(truth.object_of_point, asked_for[asked_for >= 0])
-        warnings = [encoder_warning(rules, prediction, encoder)]
+        warnings = [labelling.encoder_warning(rules, prediction, encoder)]
         return score_of_masks(self, counts, prediction, truth.points, wanted, warnings)

@@ -13,11 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
+from su3d_bench.core.types import BoolArray, Float64Array, Int64Array, IntArray
 from su3d_bench.metrics.metric import Counts, axes
 from su3d_bench.numerics.statistics import nan_mean, ratio, row_means
-
-IntArray = NDArray[np.integer[Any]]
 
 IOU_LEVELS = (0.15, 0.25, 0.50, 0.75)  # conceptgraph/utils/eval.py counts the classes above these
 

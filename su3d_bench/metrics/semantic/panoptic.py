@@ -18,20 +18,11 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Masks, Partition
-from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array
+from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array, IntArray
 from su3d_bench.metrics.instance.score import masks_and_scores, named_classes, score_of_masks
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import class_index_of_ids, encoder_warning, places_among_scored
-from su3d_bench.metrics.metric import (
-    Counts,
-    Metric,
-    Pooled,
-    SceneScore,
-    axes,
-    class_columns,
-    first_row,
-    group_means,
-)
+from su3d_bench.metrics.metric import Counts, Metric, Pooled, SceneScore, axes, first_row
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.numerics.statistics import ratio
 
@@ -216,11 +207,11 @@ class PanopticMetric(Metric[PanopticCounts]):
 
     def pooled(self, counts: Sequence[PanopticCounts]) -> Pooled:
         table = self._once(counts)
-        columns = class_columns(self.rules, table, np.ones(len(self.rules.scored), bool))
+        columns = self.class_columns(table, np.ones(len(self.rules.scored), bool))
         classes = {name: first_row(values) for name, values in columns.items()}
         n_classes = int((~np.isnan(table["PQ"])).sum())
         values = first_row(means(table, things_of(self.rules), rule_of(self.rules))) | {"n_classes": n_classes}
-        return Pooled(values, classes, group_means(self.rules, classes, {name: name for name in QUALITIES}))
+        return Pooled(values, classes, self.group_means(classes, {name: name for name in QUALITIES}))
 
     def _once(self, counts: Sequence[PanopticCounts]) -> dict[str, Float64Array]:
         """The qualities (1, C) of all scenes, whose IoUs are summed in their order: the last bit tells."""
@@ -237,7 +228,7 @@ class PanopticMetric(Metric[PanopticCounts]):
     ) -> dict[str, dict[str, Float64Array]]:
         table = class_qualities(PanopticCounts.drawn(counts, weights), rule_of(self.rules))
         has_truth = np.sum([of_scene.n_matched + of_scene.n_missed for of_scene in counts], axis=0) > 0
-        return class_columns(self.rules, table, has_truth)
+        return self.class_columns(table, has_truth)
 
 
 def things_of(rules: ProtocolRules) -> BoolArray:
@@ -255,7 +246,7 @@ def told_truth(rules: ProtocolRules, truth: GroundTruth) -> GroundTruth:
     There every labelled point belongs to a segment, and what the annotation gives a class and no instance, as
     ScanNet++'s does with walls, becomes one instance a class.
 
-    >>> from su3d_bench.core.types import LabelSet
+    >>> from su3d_bench.core.types import LabelSet, IntArray
     >>> from su3d_bench.metrics.protocols.loading import load_protocol
     >>> names = LabelSet("replica", (93, 20), ("wall", "chair"))
     >>> ids = np.array([93, 20, 0, 93], np.int32), np.array([0, 5, 0, 0], np.int32)
@@ -274,8 +265,8 @@ def told_truth(rules: ProtocolRules, truth: GroundTruth) -> GroundTruth:
 
 def count_segments(
     rules: ProtocolRules,
-    semantic: NDArray[np.integer[Any]],
-    instance: NDArray[np.integer[Any]],
+    semantic: IntArray,
+    instance: IntArray,
     masks: Masks,
     scores: Float64Array,
     class_ids: Int64Array,
@@ -296,7 +287,7 @@ def count_segments(
     return per_scene(truth, predicted, things_of(rules), rule_of(rules), size)
 
 
-def _scored_index(rules: ProtocolRules, ids: NDArray[np.integer[Any]]) -> Int64Array:
+def _scored_index(rules: ProtocolRules, ids: IntArray) -> Int64Array:
     """The place of each class id among the scored classes, -1 where it is none of them."""
     return places_among_scored(rules)[class_index_of_ids(rules, ids)]
 
