@@ -13,7 +13,6 @@ import pytest
 from places import CASES
 from scored_room import ID, LABELS, OneHotEncoder, instances
 
-from su3d_bench.core.errors import DataError
 from su3d_bench.core.maps import DenseFeatures, Masks
 from su3d_bench.core.types import GroundTruth, LabelSet
 from su3d_bench.evaluation.scoring import map_of, skips_missing_scenes
@@ -21,7 +20,7 @@ from su3d_bench.metrics.fitness import ContentFacts, why_not_content
 from su3d_bench.metrics.instance.score import without_labels
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import ProtocolResult, combine, metric_of, pack_scores, score_scene, unpack_scores
-from su3d_bench.metrics.semantic.top_k import ONE_CLASS, TopKCounts, top_k_confusion
+from su3d_bench.metrics.semantic.top_k import ONE_CLASS, top_k_confusion
 from su3d_bench.predictions.base import VertexLabels
 from su3d_bench.predictions.export import _runs_json
 from su3d_bench.predictions.formats import recognise
@@ -220,15 +219,3 @@ def test_resampling_once_is_the_value_itself() -> None:
 def test_a_point_without_any_label_is_skipped_and_one_without_a_class_is_missed() -> None:
     labels, ranked = np.array([[-1, -1], [-1, 2], [1, 0]]), np.array([[0, 1], [-1, -1], [2, 0]])
     assert top_k_confusion(labels, ranked, 3).tolist() == [[1, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]
-
-
-@pytest.mark.parametrize("name", ["best", "any"])
-def test_counts_that_no_scene_gives_are_refused(name: str) -> None:
-    whole = {"best": np.array([[1, 1, 0], [0, 0, 0]]), "any": np.array([[2, 0, 0], [0, 0, 0]])}
-    arrays = {**whole, "is_present": np.array([True, False])}
-    TopKCounts.checked(arrays)
-    for wrong in (np.array([[0, 0, 0], [2, 0, 0]]), np.array([[3, 0, 0], [0, 0, 0]])):
-        with pytest.raises(DataError, match="score the scene again"):
-            TopKCounts.checked({**arrays, name: wrong})
-    with pytest.raises(DataError, match="fewer hits"):
-        TopKCounts.checked({**arrays, "best": whole["any"], "any": whole["best"]})

@@ -16,10 +16,9 @@ from places import CASES
 from scored_room import ENCODER, ID, instances, noisy, noisy_scores, nothing, room, truth_as_prediction
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import DataError
 from su3d_bench.core.maps import Masks
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, score_scene, unpack_scores
+from su3d_bench.metrics.scoring import combine, metric_of, score_scene
 from su3d_bench.metrics.semantic import panoptic
 from su3d_bench.metrics.semantic.panoptic import PanopticCounts, Rule, Segments, count_segments
 
@@ -174,18 +173,6 @@ def test_groups_of_classes_have_means_of_their_own() -> None:
     none, one_each = np.zeros(200, np.int64), np.ones(200, np.int64)
     whole = metric_of(rules).pooled([PanopticCounts(none, none, one_each, np.zeros(200))])
     assert whole.groups == {name: {"PQ": 0.0, "SQ": 0.0, "RQ": 0.0} for name in ("head", "common", "tail")}
-
-
-def test_counts_survive_their_file_and_impossible_ones_are_refused() -> None:
-    score = noisy_scores(RULES.name, 1)["rooms/0"]
-    kept = unpack_scores(pack_scores({RULES.name: score}))[RULES.name]
-    assert combine(RULES, {"a": kept}).metrics == combine(RULES, {"a": score}).metrics
-    counts = score.counts
-    assert isinstance(counts, PanopticCounts)
-    arrays = {name: getattr(counts, name) for name in PanopticCounts.arrays()}
-    for iou in (np.full_like(counts.iou, 9.0), np.full_like(counts.iou, np.nan)):
-        with pytest.raises(DataError, match="'iou' of class 0"):
-            PanopticCounts.checked(arrays | {"iou": iou})
 
 
 def test_the_splits_are_those_that_are_named() -> None:
