@@ -65,8 +65,7 @@ class GivenTexts:
         rows = [self._row_of.get(text, self._row_of.get(self._class_of.get(text, text), -1)) for text in texts]
         if -1 in rows:
             raise PredictionError(f"{shown(self._given.path)}: has no feature for '{texts[rows.index(-1)]}'")
-        features: Float32Array = self._given.features[rows]
-        return features
+        return self._given.features[rows]
 
 
 def read_text_features(path: Path | None) -> TextFeatures | None:

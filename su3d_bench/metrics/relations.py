@@ -120,8 +120,7 @@ def last_best(scores: Float64Array) -> Int64Array:
     [1]
     """
     n = scores.shape[1]
-    answer: Int64Array = n - 1 - scores[:, ::-1].argmax(axis=1) if len(scores) else np.zeros(0, np.int64)
-    return answer
+    return n - 1 - scores[:, ::-1].argmax(axis=1) if len(scores) else np.zeros(0, np.int64)
 
 
 def boxes_around(points: Points, masks: Masks) -> Float64Array:

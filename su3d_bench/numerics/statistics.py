@@ -64,8 +64,7 @@ def has_part(values: Float64Array, has_value: BoolArray) -> BoolArray:
     another.
     """
     n_with_value = np.bincount(_group_of_scene(len(has_value)), weights=has_value, minlength=len(values) - 1)
-    is_part: BoolArray = (n_with_value > 0) | (values[1:] != values[0])
-    return is_part
+    return np.asarray((n_with_value > 0) | (values[1:] != values[0]))
 
 
 def pseudo_values(values: Float64Array, is_part: BoolArray | None = None) -> Float64Array:
@@ -79,8 +78,7 @@ def pseudo_values(values: Float64Array, is_part: BoolArray | None = None) -> Flo
     """
     whole, left_out = values[0], values[1:]
     kept = left_out if is_part is None else left_out[is_part]
-    pseudo: Float64Array = len(kept) * whole - (len(kept) - 1) * kept
-    return pseudo
+    return np.asarray(len(kept) * whole - (len(kept) - 1) * kept)
 
 
 def jackknife_interval(
@@ -347,8 +345,7 @@ def _slopes_of_blocks(x: Float64Array, y: Float64Array, starts: Int64Array, leng
 
 def _block_sums(values: Float64Array, starts: Int64Array, lengths: Int64Array) -> Float64Array:
     running = np.concatenate([[0.0], np.cumsum(values)])
-    total: Float64Array = (running[starts + lengths] - running[starts]).sum(axis=1)
-    return total
+    return np.asarray((running[starts + lengths] - running[starts]).sum(axis=1))
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import permutations
 
@@ -82,8 +82,7 @@ def _cut(parts: Float64Array, inside: Float64Array) -> Float64Array:
     def crossing(rows: np.ndarray, near: int, far: int) -> Float64Array:
         """Where the edges from the corners ``near`` to the corners ``far`` leave."""
         share = inside[rows, near] / (inside[rows, near] - inside[rows, far])
-        point: Float64Array = parts[rows, near] + share[:, None] * (parts[rows, far] - parts[rows, near])
-        return point
+        return np.asarray(parts[rows, near] + share[:, None] * (parts[rows, far] - parts[rows, near]))
 
     one, two, three = (np.flatnonzero(n_inside == n) for n in (1, 2, 3))
     left.append(np.stack([parts[one, 0], *(crossing(one, 0, far) for far in (1, 2, 3))], axis=1))
@@ -265,13 +264,14 @@ def share_values(counts: Sequence[BoxCounts], weights: Int64Array) -> dict[str, 
     drawn = BoxCounts.drawn(counts, weights, "n_truth", "n_centred", "n_located", "n_named")
     n_classes = drawn["n_truth"].shape[1]
 
-    def rows(of: Callable[[BoxCounts], Int32Array]) -> Float64Array:
-        return weights.astype(np.float64) @ np.stack([np.bincount(of(c), minlength=n_classes) for c in counts])
+    def rows(classes: Sequence[Int32Array]) -> Float64Array:
+        each = [np.bincount(of_scene, minlength=n_classes) for of_scene in classes]
+        return weights.astype(np.float64) @ np.stack(each).astype(np.float64)
 
-    n_rows = rows(lambda c: c.class_index)
+    n_rows = rows([c.class_index for c in counts])
     shares = {"centroid": (drawn["n_centred"], drawn["n_truth"]), "class": (drawn["n_named"], drawn["n_located"])}
     for t, place in enumerate(PLACES):
-        shares[f"precision{place}"] = rows(lambda c, t=t: c.class_index[c.is_true[:, t]]), n_rows
+        shares[f"precision{place}"] = rows([c.class_index[c.is_true[:, t]] for c in counts]), n_rows
     return shares
 
 

@@ -109,8 +109,7 @@ def _classes_of_features(
     if not len(candidates) or not len(features):
         return np.full(len(features), -1, np.int64)
     text = text_features(rules, [rules.classes[index].name for index in candidates], features, encoder)
-    named: Int64Array = candidates[most_similar(features, text, device_of(encoder))]
-    return named
+    return np.asarray(candidates[most_similar(features, text, device_of(encoder))])
 
 
 def text_features(
@@ -131,8 +130,7 @@ def text_features(
     if n_prompts == 1:
         return encoded
     directions = _normalised(np.asarray(encoded, np.float64))
-    mean: Float64Array = directions.reshape(len(names), n_prompts, -1).mean(axis=1)
-    return mean
+    return np.asarray(directions.reshape(len(names), n_prompts, -1).mean(axis=1))
 
 
 @remembered

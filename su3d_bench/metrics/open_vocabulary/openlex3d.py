@@ -247,8 +247,7 @@ class RankedLabels:
 
 
 def _row_mean(values: Float64Array) -> Float64Array:
-    mean: Float64Array = values.mean(axis=1) if values.shape[1] else np.full(len(values), np.nan)
-    return mean
+    return values.mean(axis=1) if values.shape[1] else np.full(len(values), np.nan)
 
 
 def ranked_labels(labels: ObjectLabels, prompts: Sequence[str]) -> RankedLabels:

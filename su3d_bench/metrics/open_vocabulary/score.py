@@ -85,8 +85,7 @@ def confidences(similarity: Float64Array, rule: Literal["similarity", "similarit
         return similarity
     halved = (similarity + 1.0) / 2.0
     low, high = halved.min(axis=0), halved.max(axis=0)
-    stretched: Float64Array = (halved - low) / np.maximum(high - low, _SMALLEST_RANGE)
-    return stretched
+    return np.asarray((halved - low) / np.maximum(high - low, _SMALLEST_RANGE))
 
 
 def per_scene(
@@ -220,8 +219,7 @@ def voxel_means(points: Float32Array, voxel_m: float) -> Float32Array:
     voxel = transfer.row_ids(np.floor(points / np.float32(voxel_m)).astype(np.int64))
     sums = np.zeros((int(voxel.max()) + 1, 3), np.float32)
     np.add.at(sums, voxel, points)
-    means: Float32Array = sums / np.bincount(voxel).astype(np.float32)[:, None]
-    return means
+    return sums / np.bincount(voxel).astype(np.float32)[:, None]
 
 
 def _count_categories(

@@ -84,8 +84,7 @@ class GroundingMetric(ShareMetric):
         texts = [query.text for query in truth.queries]
         first = rows[similarities(self.rules, texts, prediction, encoder, rows).argmax(axis=0)]
         choice = [choose(iou[row]) for row in first.tolist()]
-        answer: BoolArray = is_meant[np.arange(len(choice)), choice]
-        return answer
+        return is_meant[np.arange(len(choice)), choice]
 
 
 def choose(scores: Float64Array) -> int:

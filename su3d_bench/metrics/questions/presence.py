@@ -72,8 +72,7 @@ def _of_sampling(counts: PresenceCounts, place: int) -> PresenceCounts:
 
 def _shares(rows: Sequence[PresenceCounts], weights: Int64Array) -> dict[str, Float64Array]:
     def total(kept: list[BoolArray]) -> Float64Array:
-        whole: Float64Array = (weights @ np.array([int(one.sum()) for one in kept], np.int64)).astype(np.float64)
-        return whole
+        return (weights @ np.array([int(one.sum()) for one in kept], np.int64)).astype(np.float64)
 
     true_yes = total([row.is_there & row.says_yes for row in rows])
     false_yes = total([~row.is_there & row.says_yes for row in rows])
@@ -181,5 +180,4 @@ def relevancies(cosine: Float64Array, canonical: Float64Array, rules: PresenceRu
     [[0.731, 0.269]]
     """
     nearest = canonical.max(axis=1, keepdims=True)
-    answer: Float64Array = 1.0 / (1.0 + np.exp(rules.sharpness * (nearest - cosine)))
-    return answer
+    return np.asarray(1.0 / (1.0 + np.exp(rules.sharpness * (nearest - cosine))))

@@ -280,7 +280,7 @@ def first_instances(
     """The instance (Q,) whose feature is nearest to each text, the first of equals; -1 in an empty map."""
     if not n_predictions(prediction) or not texts:
         return np.full(len(texts), -1, np.int64)
-    return similarities(rules, list(texts), prediction, encoder).argmax(axis=0)
+    return np.asarray(similarities(rules, list(texts), prediction, encoder).argmax(axis=0))
 
 
 def judge_retrieval(main_object: Int64Array, first: Int64Array, questions: Sequence[AskedText]) -> BoolArray:

@@ -215,9 +215,8 @@ class PanopticMetric(Metric[PanopticCounts]):
 
     def _once(self, counts: Sequence[PanopticCounts]) -> dict[str, Float64Array]:
         """The qualities (1, C) of all scenes, whose IoUs are summed in their order: the last bit tells."""
-        whole = PanopticCounts.joined(counts)
-        sums = {name: getattr(whole, name)[None] for name in PanopticCounts.arrays()}
-        return class_qualities(sums, rule_of(self.rules))
+        sums = vars(PanopticCounts.joined(counts))
+        return class_qualities({name: values[None] for name, values in sums.items()}, rule_of(self.rules))
 
     def resampled(self, counts: Sequence[PanopticCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
         rule = rule_of(self.rules)
