@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -122,15 +121,18 @@ def evaluate_methods(requests: Mapping[str, Request], out: Path | None = None) -
     _refuse_other_runs(out)
     place = out.absolute()
     atomic.make_folder(place.parent)
-    with _told_of(out), unfinished_folder(place) as filled:
-        folder = RunFolder(filled)
-        kept = [_Kept(method, request, folder) for method, request in requests.items()]
-        run = _evaluated(kept)
-        record = _write(kept, run, folder)
-        if atomic.is_file(out / "run.json"):
-            _refuse_other_evaluation(out, record, run.metrics)
-            return replace(run, was_there=True)
-        become(filled, place)
+    try:
+        with unfinished_folder(place) as filled:
+            folder = RunFolder(filled)
+            kept = [_Kept(method, request, folder) for method, request in requests.items()]
+            run = _evaluated(kept)
+            record = _write(kept, run, folder)
+            if atomic.is_file(out / "run.json"):
+                _refuse_other_evaluation(out, record, run.metrics)
+                return replace(run, was_there=True)
+            become(filled, place)
+    except OSError as error:
+        raise atomic.write_error(out, error) from error
     return run
 
 
@@ -144,14 +146,6 @@ def check_method_name(name: str) -> None:
 def _evaluated(kept: Sequence[_Kept]) -> EvaluatedRun:
     evaluations = {one.method: evaluate(one.request, one) for one in kept}
     return EvaluatedRun(evaluations, _metrics(kept, evaluations))
-
-
-@contextmanager
-def _told_of(out: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise atomic.write_error(out, error) from error
 
 
 def _refuse_other_runs(out: Path) -> None:

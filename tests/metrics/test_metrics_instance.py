@@ -267,28 +267,19 @@ def test_counts_of_parts_combine_to_the_whole(case: str, data: st.DataObject) ->
 # ---- what is refused
 
 
-def test_a_confidence_that_is_no_number_is_refused() -> None:
-    with pytest.raises(PredictionError, match="instance 1: its confidence is nan"):
-        one_scene(TWO, [FIRST, SECOND], [5, 5], [0.5, float("nan")])
-
-
-def test_an_index_outside_the_scene_is_refused() -> None:
-    with pytest.raises(PredictionError, match=r"instance 1: mask holds index 500, the scene has 500 points \(0..499\)"):
-        one_scene(TWO, [FIRST, np.arange(350, 501)], [5, 5], [0.5, 0.5])
-
-
-def test_a_point_that_stands_twice_in_a_mask_is_refused() -> None:
-    with pytest.raises(PredictionError, match="instance 0: its point indices are not strictly ascending"):
-        one_scene(TWO, [np.repeat(np.arange(100), 2), FIRST], [5, 5], [0.5, 0.5])
-
-
-def test_masks_that_do_not_pair_up_with_labels_are_refused() -> None:
-    with pytest.raises(PredictionError, match="2 labels, 1 masks, 1 scores"):
-        one_scene(TWO, [FIRST], [5, 5], [0.5])
-    with pytest.raises(PredictionError, match="2 labels, 1 masks, 2 scores"):
-        one_scene(TWO, [FIRST], [5, 5], [0.5, 0.5])
-    with pytest.raises(PredictionError, match="2 labels, 2 masks, 1 scores"):
-        one_scene(TWO, [FIRST, SECOND], [5, 5], [0.5])
+@pytest.mark.parametrize(
+    ("masks", "labels", "scores", "message"),
+    [
+        ([FIRST, SECOND], [5, 5], [0.5, float("nan")], "finite numbers"),
+        ([FIRST], [5, 5], [0.5, 0.5], "as many labels"),
+        ([FIRST, SECOND], [5, 5], [0.5], "as many labels"),
+        ([FIRST, np.arange(350, 501)], [5, 5], [0.5, 0.5], "below 500"),
+        ([np.repeat(np.arange(100), 2), FIRST], [5, 5], [0.5, 0.5], "ascending point indices, each once"),
+    ],
+)
+def test_masks_that_do_not_fit_the_scene_are_refused(masks: Any, labels: Any, scores: Any, message: str) -> None:
+    with pytest.raises(PredictionError, match=message):
+        one_scene(TWO, masks, labels, scores)
 
 
 def test_truth_that_the_encoding_cannot_hold_is_refused() -> None:

@@ -247,8 +247,6 @@ def test_dense_features_and_masks_without_features_cannot_be_ranked() -> None:
         score_scene(OPENLEX, truth, instances_with(truth.points, [np.arange(3)], None, ["chair"]), ENCODER)
 
 
-def test_truths_that_do_not_hold_together_are_refused() -> None:
+def test_a_query_names_an_object_once() -> None:
     with pytest.raises(DataError, match="query 'seat': an object stands there twice"):
         TextQuery("seat", (7, 7))
-    with pytest.raises(DataError, match="do not agree"):
-        QueryTruth(np.zeros((3, 3), np.float32), np.zeros(2, np.int64), (), "v", "s")

@@ -290,7 +290,7 @@ def _object_ids(rules: ProtocolRules, truth: GroundTruth) -> Int64Array:
     return np.where(instance > 0, instance, instance.max(initial=0) + 2 + class_index_of_ids(rules, truth.semantic))
 
 
-MendedScene = corrections.Mended | corrections.MendedPoints
+MendedScene = corrections.Mended[InstanceCounts] | corrections.Mended[SemanticCounts]
 Errors = tuple[int, Sequence[SingleError]]
 
 

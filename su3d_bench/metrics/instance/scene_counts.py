@@ -50,7 +50,7 @@ def per_scene(
     >>> counts.n_predictions.tolist(), counts.is_true.tolist()
     ([2, 2], [True, False, True, False, True, False, True, False])
     """
-    _check_predictions(ground_truth, indptr, indices, len(scores) if labels is None else len(labels), scores)
+    _check_predictions(len(ground_truth), indptr, indices, len(scores) if labels is None else len(labels), scores)
     classes = class_overlaps(ground_truth, indptr, indices, labels, class_ids, min_region_size)
     return instance_ap.stacked(
         [one.counts(index, scores, thresholds, forgives_void=forgives_void) for index, one in enumerate(classes)]
@@ -201,37 +201,20 @@ def met_instances(over: BoolArray, takes_part: BoolArray) -> Iterator[tuple[int,
 
 
 def _check_predictions(
-    ground_truth: IntArray,
-    indptr: IntArray,
-    indices: IntArray,
-    n_predictions: int,
-    scores: Float64Array,
+    n_points: int, indptr: IntArray, indices: IntArray, n_predictions: int, scores: Float64Array
 ) -> None:
-    n_points = len(ground_truth)
-    if len(indptr) != n_predictions + 1 or len(scores) != n_predictions:
-        raise PredictionError(
-            f"{n_predictions} labels, {len(indptr) - 1} masks, {len(scores)} scores; they must pair up"
-        )
-    # the original ranks inf above all numbers; here it is taken for an overflow, in which order was lost (README.md)
-    if not np.isfinite(scores).all():
-        bad = int(np.flatnonzero(~np.isfinite(scores))[0])
-        raise PredictionError(f"instance {bad}: its confidence is {scores[bad]}; confidences are finite numbers")
-    if len(indices):
-        starts = np.zeros(len(indices), bool)
-        starts[indptr[:-1][indptr[:-1] < len(indices)]] = True
-        unsorted = np.flatnonzero((np.diff(indices) <= 0) & ~starts[1:])
-        if len(unsorted):
-            owner = int(np.searchsorted(indptr, unsorted[0], side="right") - 1)
-            raise PredictionError(
-                f"instance {owner}: its point indices are not strictly ascending; sort them, each once"
-            )
-        if indices.min() < 0 or indices.max() >= n_points:
-            worst = int(np.flatnonzero((indices < 0) | (indices >= n_points))[0])
-            owner = int(np.searchsorted(indptr, worst, side="right") - 1)
-            raise PredictionError(
-                f"instance {owner}: mask holds index {int(indices[worst])}, the scene has {n_points} points "
-                f"(0..{n_points - 1})"
-            )
+    """A ``PredictionError`` for masks that no reader and no ``Instances.of`` gives.
+
+    The original ranks a confidence of infinity above all numbers; here it is taken for an overflow, in which order was
+    lost (README.md).
+    """
+    if len(indptr) != n_predictions + 1 or len(scores) != n_predictions or not np.isfinite(scores).all():
+        raise PredictionError(f"{n_predictions} masks: need as many labels, and confidences that are finite numbers")
+    rises = np.diff(indices) > 0
+    starts = indptr[1:-1]
+    rises[starts[(starts > 0) & (starts < len(indices))] - 1] = True
+    if not rises.all() or indices.min(initial=0) < 0 or indices.max(initial=-1) >= n_points:
+        raise PredictionError(f"{n_predictions} masks: need ascending point indices, each once, below {n_points}")
 
 
 def segments_of(ground_truth: IntArray) -> tuple[Int64Array, Int64Array, Int64Array]:

@@ -64,14 +64,6 @@ class QueryTruth:
     space: str = SPACE
     alignment: Float64Array | None = None
 
-    def __post_init__(self) -> None:
-        n = len(self.points)
-        if self.points.shape != (n, 3) or self.object_of_point.shape != (n,):
-            raise DataError(
-                f"ground truth '{self.variant}': points {self.points.shape} and objects {self.object_of_point.shape} "
-                "do not agree"
-            )
-
 
 def confidences(similarity: Float64Array, rule: Literal["similarity", "similarity-min-max"]) -> Float64Array:
     """The confidence (K, Q) of each mask for each query: its cosine, or that stretched to 0..1 over the masks.
