@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from made_points import OTHER, VOID, Problem, classes_of, drawn, drawn_in_space, scored
+from made_points import OTHER, VOID, Problem, classes_of, scored
 from original_code import STOPS, Ask, Original, load, of_python_3, recorded, silence, without_gpu
 from places import CASES
 
@@ -25,6 +25,42 @@ SHORT = (",", ":")
 OF_CONCEPTGRAPHS = {
     "mIoU": "miou", "F-mIoU": "fmiou", "mAcc": "recall", "mPrecision": "precision", "mF1-conceptgraphs": "f1score"
 }  # fmt: skip
+
+
+def drawn(seed: int, index: int) -> Problem:
+    """Problem ``index`` on the points themselves: missing classes, void, nothing called, wrong classes."""
+    rng = np.random.default_rng([seed, index])
+    scenes = []
+    for _ in range(rng.integers(1, 4)):
+        there = rng.choice(8, rng.integers(1, 5), replace=False)
+        truth = rng.choice([*there, *there, OTHER, VOID], n := int(rng.integers(1, 18)))
+        guess = rng.choice([*range(OTHER + 1), VOID], n)
+        scenes.append({"truth": truth.tolist(), "called": np.where(rng.random(n) < 0.5, truth, guess).tolist()})
+    return scenes
+
+
+def drawn_in_space(seed: int, index: int) -> Problem:
+    """Problem ``index`` with three clouds: points of the truth, of the prediction and to be scored; some coincide.
+
+    The prediction has classes that are scored and true in the scene alone.
+    """
+    rng = np.random.default_rng([seed, index, 3])
+    scenes = []
+    for _ in range(rng.integers(1, 4)):
+        there = rng.choice(8, rng.integers(1, 5), replace=False)
+        clouds = [rng.integers(0, 1000, (rng.integers(4, 14), 3)) for _ in range(3)]
+        for cloud in clouds:
+            cloud[-1] = clouds[0][rng.integers(len(clouds[0]))]
+        truth = [*there, *rng.choice([*there, OTHER], len(clouds[0]))][: len(clouds[0])]
+        scored = sorted({int(one) for one in truth} - {OTHER})
+        scenes.append(
+            {
+                "truth": [int(one) for one in truth],
+                "called": rng.choice(scored, len(clouds[1])).tolist(),
+                **{key: cloud.tolist() for key, cloud in zip(("places_mm", "own_mm", "seen_mm"), clouds, strict=True)},
+            }
+        )
+    return scenes
 
 
 def scannet(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 import numpy as np
-from made_queries import Problem, drawn, objects_of, scored
+from made_queries import Problem, objects_of, scored
 from original_code import Ask, Original, load, of_python_3, recorded, silence
 from original_instances import SCANNET, emptied
 from places import CASES
@@ -16,6 +16,28 @@ from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.protocols.model import ProtocolRules
 
 ASKED, OTHER = 3, 4  # labels of the two classes; what is not asked for is no void, so that masks on it are wrong
+
+
+def drawn(seed: int, index: int) -> Problem:
+    """Problem ``index``: objects of several queries and of none, equal cosines, masks twice, on nothing."""
+    rng = np.random.default_rng([seed, index])
+    scenes = []
+    for _ in range(rng.integers(1, 3)):
+        ids = [int(one) for one in rng.permutation(rng.integers(2, 7))]
+        objects = [[one if rng.random() < 0.85 else -1, int(rng.integers(1, 12))] for one in ids]
+        starts = np.cumsum([0, *(length for _, length in objects)]).tolist()
+        there = [one for one, _ in objects if one >= 0] or [99]  # an object that no point has
+        queries = [sorted(rng.choice(there, min(len(there), n), replace=False).tolist()) for n in rng.integers(1, 4, 3)]
+        masks: list[list[int]] = []
+        for _ in range(rng.choice([0, 2, 4, 7])):
+            run = int(rng.integers(len(objects)))
+            start = int(rng.integers(max(0, starts[run] - 1), starts[run] + 2))
+            end = int(rng.integers(start + 1, starts[run + 1] + 3))
+            near = [min(start, starts[-1] - 1), min(max(end, start + 1), starts[-1])]
+            masks.append(masks[-1] if masks and rng.random() < 0.15 else near)
+        cosines = np.round(rng.uniform(-1, 1, (len(masks), len(queries))), 1).tolist()
+        scenes.append({"objects": objects, "queries": queries, "masks": masks, "cosines": cosines})
+    return scenes
 
 
 def scannet(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:

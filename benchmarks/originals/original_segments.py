@@ -12,10 +12,11 @@ from made_segments import (
     LEFT_OUT,
     N_SCORED,
     N_THINGS,
+    OTHER,
+    UNLABELLED,
     Problem,
     Scene,
     classes_of,
-    drawn,
     has_left_out,
     our_qualities,
 )
@@ -27,6 +28,34 @@ from su3d_bench.metrics.protocols.model import ProtocolRules
 
 FILE = "panopticapi/evaluation.py"
 OVERALL = ("pq", "sq", "rq")
+
+
+def drawn(seed: int, index: int) -> Problem:
+    """Problem ``index``: crowds, void, points that are left out, masks of no scored class, overlaps of one half."""
+    rng = np.random.default_rng([seed, index, 7])
+    scenes = []
+    for _ in range(rng.integers(1, 4)):
+        sizes = rng.integers(1, 7, rng.integers(2, 8))
+        of_part = rng.choice([0, 0, 1, 2, 3, 3, 4, OTHER, UNLABELLED, LEFT_OUT], len(sizes))
+        is_crowd = rng.random(len(sizes)) < 0.25
+        part = np.repeat(np.arange(len(sizes)), sizes)
+        owner = np.where(
+            rng.random(len(part)) < rng.choice([0.0, 0.3, 0.5]), rng.integers(-1, len(sizes), len(part)), part
+        )
+        there, owner = np.unique(np.append(owner, -1), return_inverse=True)
+        guess = rng.integers(0, OTHER + 1, len(sizes))
+        called = np.where((rng.random(len(sizes)) < 0.7) & (of_part >= 0), of_part, guess)[there[1:]]
+        scenes.append(
+            {
+                "truth": of_part[part].tolist(),
+                "instance": np.where(is_crowd | (of_part < 0) | (of_part >= N_THINGS), 0, np.arange(len(sizes)) + 1)[
+                    part
+                ].tolist(),
+                "owner": (owner[:-1] - 1).tolist(),
+                "called": called.tolist(),
+            }
+        )
+    return scenes
 
 
 def panopticapi(rules: ProtocolRules, checkout: Path, folder: Path) -> Ask:

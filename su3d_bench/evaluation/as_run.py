@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -17,16 +16,7 @@ import numpy as np
 from su3d_bench.core.config import write_toml
 from su3d_bench.core.digests import code_digest, digest_file, digest_json, git_state, package_versions
 from su3d_bench.core.errors import ConfigError, StoreError, printable, shown
-from su3d_bench.core.files.atomic import (
-    is_file,
-    json_text,
-    make_folder,
-    read_json,
-    write_bytes,
-    write_error,
-    write_json,
-    write_text,
-)
+from su3d_bench.core.files import atomic
 from su3d_bench.core.files.locks import become, unfinished_folder
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.registry import CEILING_METHOD
@@ -46,20 +36,7 @@ from su3d_bench.runs.existing import sealed
 from su3d_bench.runs.finished import made_elsewhere
 from su3d_bench.runs.plan import check_folder_name
 from su3d_bench.runs.summary import BY_THE_METHOD, confidences_of
-from su3d_bench.store.records import (
-    GitRecord,
-    MetricsRecord,
-    NumbersRecord,
-    PredictionsRecord,
-    ProtocolRecord,
-    ResultRecord,
-    RunRecord,
-    TruthRecord,
-    UnscoredRecord,
-    plain,
-    read_record,
-    updates_text,
-)
+from su3d_bench.store import records
 from su3d_bench.store.run_folder import RunFolder
 
 OF_FILES = "those of the files"
@@ -72,7 +49,7 @@ class EvaluatedRun:
     """Evaluations by method, and as a run.  ``was_there``: the folder held them already and stayed as it was."""
 
     evaluations: Mapping[str, Evaluation]
-    metrics: MetricsRecord
+    metrics: records.MetricsRecord
     was_there: bool = False
 
 
@@ -115,12 +92,12 @@ class _Kept:
         job = self.folder.job(address, self.method)
         job.prepare()
         write_content(job.prediction, content)
-        write_text(job.updates, updates_text([]))
+        atomic.write_text(job.updates, records.updates_text([]))
 
     @property
-    def record(self) -> PredictionsRecord:
+    def record(self) -> records.PredictionsRecord:
         texts = self.request.text_features
-        return PredictionsRecord(
+        return records.PredictionsRecord(
             method=self.method,
             formats=self.formats,
             paths=tuple(str(path) for path in self.request.predictions),
@@ -143,16 +120,19 @@ def evaluate_methods(requests: Mapping[str, Request], out: Path | None = None) -
         return _evaluated(kept)
     _refuse_other_runs(out)
     place = out.absolute()
-    make_folder(place.parent)
-    with _told_of(out), unfinished_folder(place) as filled:
-        folder = RunFolder(filled)
-        kept = [_Kept(method, request, folder) for method, request in requests.items()]
-        run = _evaluated(kept)
-        record = _write(kept, run, folder)
-        if is_file(out / "run.json"):
-            _refuse_other_evaluation(out, record, run.metrics)
-            return replace(run, was_there=True)
-        become(filled, place)
+    atomic.make_folder(place.parent)
+    try:
+        with unfinished_folder(place) as filled:
+            folder = RunFolder(filled)
+            kept = [_Kept(method, request, folder) for method, request in requests.items()]
+            run = _evaluated(kept)
+            record = _write(kept, run, folder)
+            if atomic.is_file(out / "run.json"):
+                _refuse_other_evaluation(out, record, run.metrics)
+                return replace(run, was_there=True)
+            become(filled, place)
+    except OSError as error:
+        raise atomic.write_error(out, error) from error
     return run
 
 
@@ -168,31 +148,26 @@ def _evaluated(kept: Sequence[_Kept]) -> EvaluatedRun:
     return EvaluatedRun(evaluations, _metrics(kept, evaluations))
 
 
-@contextmanager
-def _told_of(out: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise write_error(out, error) from error
-
-
 def _refuse_other_runs(out: Path) -> None:
     """A ``StoreError`` where ``out`` holds something that no evaluation wrote, before anything is scored."""
     if out.is_symlink() or (out.exists() and not out.is_dir()):
         raise StoreError(f"{shown(out)}: is no folder; choose another with --out")
     RunFolder(out).refuse_other_content()
-    if is_file(out / "run.json") and not read_record(RunRecord, out / "run.json", shown(out)).predictions:
+    if (
+        atomic.is_file(out / "run.json")
+        and not records.read_record(records.RunRecord, out / "run.json", shown(out)).predictions
+    ):
         raise StoreError(
             f"{shown(out)}: holds a run, and no evaluation of predictions made elsewhere; choose another with --out"
         )
 
 
-def _refuse_other_evaluation(out: Path, record: RunRecord, metrics: MetricsRecord) -> None:
+def _refuse_other_evaluation(out: Path, record: records.RunRecord, metrics: records.MetricsRecord) -> None:
     """A ``StoreError`` where ``out`` holds another evaluation than the one of ``record``, which says in what."""
-    there = read_record(RunRecord, out / "run.json", shown(out))
+    there = records.read_record(records.RunRecord, out / "run.json", shown(out))
     pairs = {what: (of(there), of(record)) for what, of in _IDENTITY.items()}
     other = next((what for what, (before, now) in pairs.items() if before != now), None)
-    if other is None and read_json(out / "metrics.json") != json.loads(json_text(plain(metrics))):
+    if other is None and atomic.read_json(out / "metrics.json") != json.loads(atomic.json_text(records.plain(metrics))):
         other = "numbers, though of the same files" if there.code == record.code else "numbers of another version"
     if other is not None:
         raise StoreError(
@@ -200,7 +175,7 @@ def _refuse_other_evaluation(out: Path, record: RunRecord, metrics: MetricsRecor
         )
 
 
-def _without_paths(record: RunRecord) -> list[object]:
+def _without_paths(record: records.RunRecord) -> list[object]:
     """The predictions of a run by what they hold, wherever they lay."""
     return [
         [one.formats, one.confidences, one.texts and one.texts[1]]
@@ -209,7 +184,7 @@ def _without_paths(record: RunRecord) -> list[object]:
     ]
 
 
-_IDENTITY: dict[str, Callable[[RunRecord], object]] = {
+_IDENTITY: dict[str, Callable[[records.RunRecord], object]] = {
     "methods": lambda record: record.methods,
     "scenes": lambda record: record.scenes,
     "ground truth": lambda record: (dict(record.data_digests), _truth_key(record.ground_truth)),
@@ -218,17 +193,17 @@ _IDENTITY: dict[str, Callable[[RunRecord], object]] = {
 }
 
 
-def _truth_key(truth: TruthRecord | None) -> object:
+def _truth_key(truth: records.TruthRecord | None) -> object:
     return truth and (truth.dataset, truth.values, truth.queries)
 
 
 # ---- numbers
 
 
-def _metrics(kept: Sequence[_Kept], evaluations: Mapping[str, Evaluation]) -> MetricsRecord:
+def _metrics(kept: Sequence[_Kept], evaluations: Mapping[str, Evaluation]) -> records.MetricsRecord:
     rules = {protocol.rules.name: protocol.rules for one in evaluations.values() for protocol in one.protocols}
     results = tuple(_result(one, evaluations[one.method], each) for each in rules.values() for one in kept)
-    return MetricsRecord(limit=0, scenes=_scenes(kept, evaluations), results=results)
+    return records.MetricsRecord(limit=0, scenes=_scenes(kept, evaluations), results=results)
 
 
 def _scenes(kept: Sequence[_Kept], evaluations: Mapping[str, Evaluation]) -> tuple[str, ...]:
@@ -239,12 +214,12 @@ def _scenes(kept: Sequence[_Kept], evaluations: Mapping[str, Evaluation]) -> tup
     return tuple(truths.address(scene) for scene in known if scene in scored)
 
 
-def _result(kept: _Kept, evaluation: Evaluation, rules: ProtocolRules) -> ResultRecord:
+def _result(kept: _Kept, evaluation: Evaluation, rules: ProtocolRules) -> records.ResultRecord:
     found = next((one for one in evaluation.protocols if one.rules.name == rules.name), None)
     scenes = kept.truths.scenes
     scores = {} if found is None else found.scores
     encoder, digest = (None, None) if found is None or found.encoder is None else found.encoder
-    return ResultRecord(
+    return records.ResultRecord(
         method=kept.method,
         protocol=rules.name,
         version=rules.version,
@@ -268,11 +243,11 @@ def _addressed(kept: _Kept, scores: Mapping[str, SceneScore]) -> dict[str, Scene
     return {kept.truths.address(scene): score for scene, score in scores.items()}
 
 
-def _numbers(kept: _Kept, found: ProtocolEvaluation) -> NumbersRecord:
+def _numbers(kept: _Kept, found: ProtocolEvaluation) -> records.NumbersRecord:
     numbers = combine(found.rules, _addressed(kept, found.scores)).to_json()
     if found.coverage is None:
         numbers["coverage"] = {}
-    return NumbersRecord(**numbers | {"warnings": tuple(_warning(kept, line) for line in found.warnings)})
+    return records.NumbersRecord(**numbers | {"warnings": tuple(_warning(kept, line) for line in found.warnings)})
 
 
 def _warning(kept: _Kept, line: str) -> str:
@@ -286,14 +261,14 @@ def _warning(kept: _Kept, line: str) -> str:
 def _confidences(kept: _Kept, found: ProtocolEvaluation) -> str | None:
     if kept.confidences == "file" and found.with_ones is not None:
         return AGAINST_THE_RULE
-    said = confidences_of(found.rules, NumbersRecord(**found.result.to_json()))
+    said = confidences_of(found.rules, records.NumbersRecord(**found.result.to_json()))
     return OF_FILES if said == BY_THE_METHOD else said
 
 
 # ---- files
 
 
-def _write(kept: Sequence[_Kept], run: EvaluatedRun, folder: RunFolder) -> RunRecord:
+def _write(kept: Sequence[_Kept], run: EvaluatedRun, folder: RunFolder) -> records.RunRecord:
     """Write everything but the maps, which are there; the record of the run."""
     record = _record(kept, run)
     for one in kept:
@@ -303,13 +278,13 @@ def _write(kept: Sequence[_Kept], run: EvaluatedRun, folder: RunFolder) -> RunRe
             _seal(one, run.evaluations[one.method], address, record, folder)
     record = replace(record, predictions=tuple(one.record for one in kept))
     _write_ceilings(kept, run.evaluations, folder)
-    write_text(folder.path / "run.toml", sealed(write_toml(_settings(kept, record))))
-    write_json(folder.path / "metrics.json", plain(run.metrics))
-    write_json(folder.path / "run.json", plain(record))
+    atomic.write_text(folder.path / "run.toml", sealed(write_toml(_settings(kept, record))))
+    atomic.write_json(folder.path / "metrics.json", records.plain(run.metrics))
+    atomic.write_json(folder.path / "run.json", records.plain(record))
     return record
 
 
-def _seal(kept: _Kept, evaluation: Evaluation, address: str, record: RunRecord, folder: RunFolder) -> None:
+def _seal(kept: _Kept, evaluation: Evaluation, address: str, record: records.RunRecord, folder: RunFolder) -> None:
     job = folder.job(address, kept.method)
     scores = {
         one.rules.name: score
@@ -317,11 +292,11 @@ def _seal(kept: _Kept, evaluation: Evaluation, address: str, record: RunRecord, 
         for scene, score in one.scores.items()
         if kept.truths.address(scene) == address
     }
-    write_bytes(job.counts, pack_scores(scores))
+    atomic.write_bytes(job.counts, pack_scores(scores))
     unscored = {
         each.protocol: each.reason for each in record.unscored if (each.scene, each.method) == (address, kept.method)
     }
-    write_text(job.log, "".join(f"{line}\n" for line in (made_elsewhere(kept.formats), "done")))
+    atomic.write_text(job.log, "".join(f"{line}\n" for line in (made_elsewhere(kept.formats), "done")))
     key = {"data": record.data_digests[address], "method": kept.method, "predictions": digest_json(kept.files[address])}
     job.seal("predict", key, [job.prediction, job.updates])
     job.seal(
@@ -342,10 +317,10 @@ def _write_ceilings(kept: Sequence[_Kept], evaluations: Mapping[str, Evaluation]
     for address, scores in ceilings.items():
         job = folder.job(address, CEILING_METHOD)
         job.prepare()
-        write_bytes(job.counts, pack_scores(scores))
+        atomic.write_bytes(job.counts, pack_scores(scores))
 
 
-def _record(kept: Sequence[_Kept], run: EvaluatedRun) -> RunRecord:
+def _record(kept: Sequence[_Kept], run: EvaluatedRun) -> records.RunRecord:
     git = git_state()
     truths = kept[0].truths
     rules = {found.rules.name: found.rules for one in run.evaluations.values() for found in one.protocols}
@@ -354,11 +329,11 @@ def _record(kept: Sequence[_Kept], run: EvaluatedRun) -> RunRecord:
     ))  # fmt: skip
     scenes = run.metrics.scenes
     digests = {truths.address(scene): truths.digest(scene) for scene in _names(kept) if truths.address(scene) in scenes}
-    return RunRecord(
+    return records.RunRecord(
         status="complete",
         is_partial=False,
         code=code_digest(),
-        git=None if git is None else GitRecord(**git),
+        git=None if git is None else records.GitRecord(**git),
         packages=package_versions(),
         hardware=hardware_line(),
         processor=processor_digest(),
@@ -366,7 +341,7 @@ def _record(kept: Sequence[_Kept], run: EvaluatedRun) -> RunRecord:
         encoder=", ".join(name for name, _ in encoders) or None,
         encoder_digest=", ".join(digest for _, digest in encoders) or None,
         data_digests=digests,
-        protocols=tuple(ProtocolRecord(each.name, each.version, each.digest) for each in rules.values()),
+        protocols=tuple(records.ProtocolRecord(each.name, each.version, each.digest) for each in rules.values()),
         methods=tuple(one.method for one in kept),
         scenes=scenes,
         unscored=tuple(_unscored(kept, run, list(rules))),
@@ -380,7 +355,7 @@ def _names(kept: Sequence[_Kept]) -> list[str]:
     return list(dict.fromkeys(scene for one in kept for scene in one.truths.scenes))
 
 
-def _unscored(kept: Sequence[_Kept], run: EvaluatedRun, protocols: Sequence[str]) -> Iterable[UnscoredRecord]:
+def _unscored(kept: Sequence[_Kept], run: EvaluatedRun, protocols: Sequence[str]) -> Iterable[records.UnscoredRecord]:
     """Why scenes of the run have no score of a method under a protocol."""
     for one in kept:
         evaluation = run.evaluations[one.method]
@@ -390,7 +365,9 @@ def _unscored(kept: Sequence[_Kept], run: EvaluatedRun, protocols: Sequence[str]
             for scene in _names(kept):
                 address = one.truths.address(scene)
                 if address in run.metrics.scenes and scene not in scores:
-                    yield UnscoredRecord(address, one.method, name, _why_not(evaluation, found.get(name), name, scene))
+                    yield records.UnscoredRecord(
+                        address, one.method, name, _why_not(evaluation, found.get(name), name, scene)
+                    )
 
 
 def _why_not(evaluation: Evaluation, found: ProtocolEvaluation | None, protocol: str, scene: str) -> str:
@@ -399,7 +376,7 @@ def _why_not(evaluation: Evaluation, found: ProtocolEvaluation | None, protocol:
     return printable(found.unscored.get(scene, "has no prediction, and is left out as the original evaluator does"))
 
 
-def _settings(kept: Sequence[_Kept], record: RunRecord) -> list[tuple[tuple[str, ...], object, str]]:
+def _settings(kept: Sequence[_Kept], record: records.RunRecord) -> list[tuple[tuple[str, ...], object, str]]:
     """What was asked for, as far as a run has it."""
     request, target = kept[0].request, kept[0].truths.target
     name = record.scenes[0].partition("/")[0]

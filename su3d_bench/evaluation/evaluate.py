@@ -18,28 +18,12 @@ from su3d_bench.core.maps import Instances, Masks
 from su3d_bench.core.system.files import noted
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.datasets.openlex3d.release import OpenLexRelease
+from su3d_bench.evaluation import scoring as scene_scoring
 from su3d_bench.evaluation.result import Evaluation, ProtocolEvaluation, Request, SceneOutcomes, formed, some_names
-from su3d_bench.evaluation.scoring import (
-    facts_of,
-    nothing_like,
-    score_on_objects,
-    score_on_truth,
-    score_on_vertices,
-    skips_missing_scenes,
-    with_confidences_of_files,
-)
 from su3d_bench.evaluation.text_truth import FLAG, TextTruths
 from su3d_bench.evaluation.texts import TextFeatures, encoder_for, read_text_features
 from su3d_bench.evaluation.truth import NOT_MEANT, DatasetTruths, OpenLexTruths, SceneTruths, VertexTruth
-from su3d_bench.metrics.fitness import (
-    ContentFacts,
-    labels_counted,
-    n_feature_dimensions,
-    under_several_labels,
-    why_not_content,
-    why_not_length,
-    why_not_numbers,
-)
+from su3d_bench.metrics import fitness
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
@@ -175,7 +159,7 @@ class Scoring:
 
     def add(self, scene: str, prediction: ScenePrediction, where: str) -> None:
         """Score one scene; at the first that is not empty, protocols that do not fit go out or, when named, raise."""
-        facts = facts_of(prediction.content)
+        facts = scene_scoring.facts_of(prediction.content)
         if any(rules.names_masks for rules in self.rules.values()):
             facts = replace(facts, n_several=_n_under_several_labels(prediction.content))
         why_not = {name: self._score(rules, scene, prediction, facts) for name, rules in self.rules.items()}
@@ -199,10 +183,10 @@ class Scoring:
 
         What stands for the prediction of one that is counted.
         """
-        nothing = nothing_like(self._first)
+        nothing = scene_scoring.nothing_like(self._first)
         for name, rules in self.rules.items():
             kept = self.outcomes[name]
-            if skips_missing_scenes(rules):
+            if scene_scoring.skips_missing_scenes(rules):
                 kept.skipped += scenes
                 continue
             for scene in scenes:
@@ -226,16 +210,18 @@ class Scoring:
             raise PredictionError(f"nothing could be scored: {next(iter(not_scored.values()))}")
         return tuple(protocols), dict(sorted(not_scored.items()))
 
-    def _score(self, rules: ProtocolRules, scene: str, prediction: ScenePrediction, facts: ContentFacts) -> str | None:
+    def _score(
+        self, rules: ProtocolRules, scene: str, prediction: ScenePrediction, facts: fitness.ContentFacts
+    ) -> str | None:
         """The reason why a scene cannot be scored under the protocol; None where it was."""
         has_points, kept = self._truths.has_points, self.outcomes[rules.name]
-        reason = why_not_content(rules, facts, has_points=has_points)
+        reason = fitness.why_not_content(rules, facts, has_points=has_points)
         if reason is None and has_points and not self._is_named and self._first is None:
-            reason = why_not_numbers(rules, facts)
+            reason = fitness.why_not_numbers(rules, facts)
         if reason is not None:
             return reason
         encoder: Encoder | str | None = None
-        if (n_dimensions := n_feature_dimensions(rules, facts)) is not None:
+        if (n_dimensions := fitness.n_feature_dimensions(rules, facts)) is not None:
             encoder = encoder_for(rules, n_dimensions, self._texts, is_own=prediction.format == OwnRuns.name)
         if isinstance(encoder, str):
             return encoder
@@ -244,7 +230,7 @@ class Scoring:
         if facts.n and (rules.n_labels or 0) > 1:
             content = prediction.content
             further = content.further if isinstance(content, VertexLabels) else getattr(content, "further_labels", None)
-            given = labels_counted(rules, by_features=encoder is not None, are_several=further is not None)
+            given = fitness.labels_counted(rules, by_features=encoder is not None, are_several=further is not None)
             if kept.labels not in (None, given):
                 return f"gives {given} of a point, and {kept.labels} in the scenes before; give all alike"
             kept.labels = given
@@ -253,7 +239,7 @@ class Scoring:
         return self._score_content(rules, scene, prediction.content, encoder)
 
     def _score_content(self, rules: ProtocolRules, scene: str, content: Content, encoder: Encoder | None) -> str | None:
-        kept, facts = self.outcomes[rules.name], facts_of(content)
+        kept, facts = self.outcomes[rules.name], scene_scoring.facts_of(content)
         try:
             truth = self._truths.of_scene(rules, scene)
         except GroundTruthMissing as error:
@@ -261,18 +247,18 @@ class Scoring:
                 kept.unscored[scene] = str(error)
                 return None
             return str(error)
-        used = with_confidences_of_files(rules) if self._file_confidences else rules
+        used = scene_scoring.with_confidences_of_files(rules) if self._file_confidences else rules
         if isinstance(truth, VertexTruth):
-            if (reason := why_not_length(facts, len(truth.values))) is not None:
+            if (reason := fitness.why_not_length(facts, len(truth.values))) is not None:
                 raise PredictionError(f"{scene}: {reason}")
-            outcome = score_on_vertices(used, truth, scene, content, encoder)
+            outcome = scene_scoring.score_on_vertices(used, truth, scene, content, encoder)
             kept.warnings += [line for line in truth.doubts if line not in kept.warnings]
         elif isinstance(truth, GroundTruth):
-            if (reason := why_not_length(facts, len(truth.points))) is not None:
+            if (reason := fitness.why_not_length(facts, len(truth.points))) is not None:
                 return reason
-            outcome = score_on_truth(used, truth, scene, content, encoder)
+            outcome = scene_scoring.score_on_truth(used, truth, scene, content, encoder)
         else:
-            outcome = score_on_objects(used, truth, scene, content, encoder)
+            outcome = scene_scoring.score_on_objects(used, truth, scene, content, encoder)
         kept.has_coverage = self._truths.has_points
         kept.add(scene, outcome)
         return None
@@ -283,4 +269,4 @@ def _n_under_several_labels(content: Content) -> int:
     labels = content.class_numbers if isinstance(content, VertexMasks) else getattr(content, "labels", None)
     if labels is None or not isinstance(content, Masks):
         return 0
-    return int(under_several_labels(content, [*labels]).sum())
+    return int(fitness.under_several_labels(content, [*labels]).sum())

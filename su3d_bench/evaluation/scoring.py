@@ -20,15 +20,8 @@ from su3d_bench.metrics.instance.score import (
     named_classes,
     without_labels,
 )
+from su3d_bench.metrics.matching import checks
 from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.matching.checks import (
-    check_cloud,
-    class_warnings,
-    duplicate_warnings,
-    empty_warnings,
-    label_warnings,
-    mask_facts,
-)
 from su3d_bench.metrics.matching.labelling import class_index_of_ids, encoder_warning, scored_classes
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
@@ -96,18 +89,18 @@ def score_on_vertices(
     if isinstance(content, VertexLabels):
         predicted = ids_of(content.class_ids, content.numbering, rules)
         class_ids = predicted if len(predicted) else np.zeros(len(labels), np.int64)
-        warnings = label_warnings(scene, rules, predicted)
+        warnings = checks.label_warnings(scene, rules, predicted)
         score, ceiling = (_semantic_score(rules, labels, called) for called in (class_ids, labels))
         return SceneOutcome(score, ceiling, warnings=tuple(warnings))
     assert isinstance(content, VertexMasks)
     if rules.class_agnostic is not None:
         values = encode_without_classes(rules, labels, values % instance_ap.INSTANCES_PER_CLASS)
     ids, named = _ids_of_masks(rules, content, labels, encoder)
-    facts = mask_facts(content, content.scores, len(values))
+    facts = checks.mask_facts(content, content.scores, len(values))
     warnings = [
-        *empty_warnings(scene, facts, content, content.keys),
-        *duplicate_warnings(scene, facts, content.keys),
-        *class_warnings(scene, rules, content.class_numbers, ids),
+        *checks.empty_warnings(scene, facts, content, content.keys),
+        *checks.duplicate_warnings(scene, facts, content.keys),
+        *checks.class_warnings(scene, rules, content.class_numbers, ids),
         *_melted(scene, rules, truth.values),
         *named,
     ]
@@ -225,17 +218,17 @@ def score_on_truth(
     """The outcome against the truth of a dataset; what has no points of its own stands on those of the truth."""
     prediction = map_of(content, truth.points, rules)
     if isinstance(content, VertexMasks):
-        warnings = class_warnings(scene, rules, content.class_numbers, content.class_ids(rules))
+        warnings = checks.class_warnings(scene, rules, content.class_numbers, content.class_ids(rules))
     elif isinstance(content, VertexLabels):
-        warnings = label_warnings(scene, rules, ids_of(content.class_ids, content.numbering, rules))
+        warnings = checks.label_warnings(scene, rules, ids_of(content.class_ids, content.numbering, rules))
     else:
-        warnings = check_cloud(scene, content.points, truth.points)
+        warnings = checks.check_cloud(scene, content.points, truth.points)
     facts = bound = None
     if not isinstance(prediction, DenseFeatures):
         masks, scores = masks_and_scores(prediction)
         if not isinstance(content, VertexLabels):
-            facts = mask_facts(masks, scores, len(prediction.points))
-            warnings += empty_warnings(scene, facts, masks, getattr(prediction, "names", ()))
+            facts = checks.mask_facts(masks, scores, len(prediction.points))
+            warnings += checks.empty_warnings(scene, facts, masks, getattr(prediction, "names", ()))
         if rules.names_masks and rules.confidences:
             values, moved, scores = without_labels(rules, truth, prediction)
             bound = _instance_counts(rules, values, moved, scores, None)
@@ -272,11 +265,11 @@ def score_on_objects(
     """
     prediction: Prediction = NOTHING if isinstance(content, VertexMasks | VertexLabels) else content
     base = truth.scene if isinstance(truth, QuestionTruth) else truth
-    warnings = check_cloud(scene, prediction.points, base.points)
+    warnings = checks.check_cloud(scene, prediction.points, base.points)
     facts = None
     if isinstance(prediction, Instances):
-        facts = mask_facts(prediction, np.asarray(prediction.scores, np.float64), len(prediction.points))
-        warnings += empty_warnings(scene, facts, prediction, prediction.names)
+        facts = checks.mask_facts(prediction, np.asarray(prediction.scores, np.float64), len(prediction.points))
+        warnings += checks.empty_warnings(scene, facts, prediction, prediction.names)
     if (remark := metric_of(rules).ceiling_remark) is not None:
         warnings.append(remark)
     return SceneOutcome(score_scene(rules, truth, prediction, encoder), facts=facts, warnings=tuple(warnings))

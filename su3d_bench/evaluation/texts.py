@@ -65,8 +65,7 @@ class GivenTexts:
         rows = [self._row_of.get(text, self._row_of.get(self._class_of.get(text, text), -1)) for text in texts]
         if -1 in rows:
             raise PredictionError(f"{shown(self._given.path)}: has no feature for '{texts[rows.index(-1)]}'")
-        features: Float32Array = self._given.features[rows]
-        return features
+        return self._given.features[rows]
 
 
 def read_text_features(path: Path | None) -> TextFeatures | None:
@@ -79,13 +78,11 @@ def read_text_features(path: Path | None) -> TextFeatures | None:
     names, features = arrays.get("names"), arrays.get("features")
     if names is None or features is None:
         raise DataError(f"{where}: has no 'names' and 'features'; expected both, one row of features a name")
-    if names.ndim != 1 or names.dtype.kind != "U" or features.ndim != 2 or features.dtype.kind != "f":
-        raise DataError(f"{where}: names {names.shape} {names.dtype.kind}, features {features.shape}; expected texts "
-                        "(C,) and numbers (C, D)")  # fmt: skip
-    if not 0 < len(names) == len(features) <= MOST_NAMES or not np.isfinite(features).all():
+    are_arrays = names.ndim == 1 and names.dtype.kind == "U" and features.ndim == 2 and features.dtype.kind == "f"
+    if not are_arrays or not 0 < len(names) == len(features) <= MOST_NAMES or not np.isfinite(features).all():
         raise DataError(
-            f"{where}: {len(names)} names and features {features.shape}; expected one finite row of features a name, "
-            f"at most {MOST_NAMES}"
+            f"{where}: names {names.shape} {names.dtype}, features {features.shape} {features.dtype}; expected texts "
+            f"(C,), at most {MOST_NAMES}, and a row of finite numbers (C, D) each"
         )
     texts = tuple(str(name) for name in names)
     if len(set(texts)) < len(texts):

@@ -11,7 +11,6 @@ from hashlib import blake2b
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from su3d_bench.core.maps import Instances, Partition, Prediction
 from su3d_bench.metrics.graphs import NEEDS_PLACES
@@ -22,7 +21,7 @@ from su3d_bench.metrics.questions.score import labels_n
 
 if TYPE_CHECKING:
     from su3d_bench.core.maps import Masks
-    from su3d_bench.core.types import BoolArray
+    from su3d_bench.core.types import BoolArray, IntArray
 
 ONE, SEVERAL = "one label", "the top labels of a mask"
 LEAST_SEVERAL = 0.5  # of the masks; single masks can be there twice by chance
@@ -75,7 +74,6 @@ def under_several_labels(masks: Masks, labels: Sequence[str | int]) -> BoolArray
     >>> under_several_labels(masks, ("chair", "lamp", "stool", "lamp")).tolist()
     [True, False, True, False]
     """
-    import numpy as np
 
     keys = [blake2b(masks.mask(k).tobytes(), digest_size=16).digest() for k in range(len(masks))]
     seen: dict[bytes, set[str | int]] = {}
@@ -137,7 +135,7 @@ class ContentFacts:
     has_labels: bool = False
     has_every_label: bool = False
     has_names: bool = False
-    class_ids: NDArray[np.integer[Any]] | None = None
+    class_ids: IntArray | None = None
     n_points: int | None = None
     n_several: int = 0
     has_places: bool = False

@@ -7,9 +7,9 @@ Source: ``evaluate_objects`` of hovsg/eval/hm3dsem_evaluator.py, hovsg/HOV-SG at
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -17,18 +17,12 @@ from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Partition
 from su3d_bench.core.types import UP, Float64Array, Floor, GroundTruth, Int64Array, Places, Room
+from su3d_bench.metrics.instance.boxes import box_around
 from su3d_bench.metrics.instance.score import score_of_masks
 from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.matching.labelling import (
-    class_index_of_ids,
-    cosines,
-    device_of,
-    encoder_warning,
-    has_every_label,
-    text_features,
-)
+from su3d_bench.metrics.matching.labelling import class_index_of_ids, encoder_warning, has_every_label, similarities
 from su3d_bench.metrics.matching.nearest import row_ids
-from su3d_bench.metrics.metric import Arrays, Counts, Metric, Pooled, SceneScore
+from su3d_bench.metrics.metric import Counts, Metric, SceneScore, axes
 from su3d_bench.metrics.protocols.kinds import OBJECT_RANKS
 from su3d_bench.metrics.protocols.model import ProtocolRules
 
@@ -51,7 +45,7 @@ class Cloud:
     @cached_property
     def corners(self) -> Float64Array:
         """The lowest and the highest corner (2, D); there must be points."""
-        return np.stack([self.points.min(axis=0), self.points.max(axis=0)])
+        return box_around(self.points)
 
     def n_near(self, other: Cloud, radius_m: float) -> int:
         """How many of its points have one of ``other`` nearer than ``radius_m``."""
@@ -148,22 +142,13 @@ def rates(n_found: Float64Array, n_predicted: Float64Array, n_true: Float64Array
     ([[0.5, 0.25]], [[1.0, 0.5]], [[0.5, 0.2]])
     """
     predicted, true = n_predicted[:, None], n_true[:, None]
-    nothing = np.where(true > 0, 0.0, np.nan)
-    return Rates(
-        np.where((predicted > 0) & (true > 0), n_found / np.maximum(predicted, 1), nothing),
-        np.where(true > 0, n_found / np.maximum(true, 1), np.nan),
-        np.where(true > 0, n_found / np.maximum(predicted + true - n_found, 1), np.nan),
-    )
+    wholes = (predicted, true, predicted + true - n_found)
+    return Rates(*(np.where(true > 0, n_found / np.maximum(whole, 1), np.nan) for whole in wholes))
 
 
 def trapezoid(values: Float64Array, places: Float64Array) -> Float64Array:
     """The area (R,) under ``values`` (R, K) at ``places`` (R, K)."""
     return np.asarray(np.trapezoid(values, places, axis=1))
-
-
-def summed(parts: Sequence[Float64Array | Int64Array], weights: Int64Array) -> Float64Array:
-    """The sums (R, ...) of the parts of S scenes, each drawn ``weights`` (R, S) times."""
-    return np.tensordot(weights.astype(np.float64), np.stack(parts).astype(np.float64), axes=1)
 
 
 RADIUS_M = 0.02  # evaluate_objects: points of two objects nearer than this lie together
@@ -181,15 +166,10 @@ class MatchedObjects(Counts):
     """
 
     stored_as = "matched-objects"
-    arrays: ClassVar[Arrays] = {
-        "n_objects": ("i", ("sides",)),
-        "n_found": ("i", ("thresholds",)),
-        "n_ranked": ("i", ("ranks",)),
-    }
 
-    n_objects: Int64Array
-    n_found: Int64Array
-    n_ranked: Int64Array
+    n_objects: Int64Array = field(metadata=axes("sides"))
+    n_found: Int64Array = field(metadata=axes("thresholds"))
+    n_ranked: Int64Array = field(metadata=axes("ranks"))
 
     def contradiction(self) -> str | None:
         """More pairs than objects, or pairs found at a threshold and not at a lower one."""
@@ -241,34 +221,24 @@ class ObjectMetric(Metric[MatchedObjects]):
             return np.zeros(0, np.int64)
         if isinstance(prediction, Instances) and has_every_label(prediction):
             return _ranks_of_labels(self.rules, prediction, rows, category)
-        if prediction.features is None or encoder is None:
-            raise PredictionError(f"{self.rules.name}: needs features and an encoder, or labels, to rank categories by")
         names = [entry.name for entry in self.rules.classes]
-        text = text_features(self.rules, names, prediction.features, encoder)
-        features = np.asarray(prediction.features)[rows]
-        rank = ranks_among(cosines(features, text, device_of(encoder)), category)
-        return np.where(np.asarray(features).any(axis=1), rank, 0)
+        rank = ranks_among(similarities(self.rules, names, prediction, encoder, rows), category)
+        assert prediction.features is not None
+        return np.where(prediction.features[rows].any(axis=1), rank, 0)
 
     @property
     def sizes(self) -> dict[str, int]:
         return {"thresholds": len(THRESHOLDS), "ranks": len(self.rules.classes) + 1, "sides": 2}
 
-    def pooled(self, counts: Sequence[MatchedObjects]) -> Pooled:
-        values = self.resampled(counts, np.ones((1, len(counts)), np.int64))
-        return Pooled({name: float(value[0]) for name, value in values.items()})
-
     def resampled(self, counts: Sequence[MatchedObjects], weights: Int64Array) -> Mapping[str, Float64Array]:
-        n_objects, n_found, n_ranked = (
-            summed([getattr(of_scene, name) for of_scene in counts], weights)
-            for name in ("n_objects", "n_found", "n_ranked")
-        )
+        n_objects, n_found, n_ranked = MatchedObjects.drawn(counts, weights).values()
         n_predicted, n_true = n_objects[:, 0], n_objects[:, 1]
         at = rates(n_found, n_predicted, n_true)
         n_places = len(self.rules.classes)
         n_pairs = n_ranked.sum(axis=1, keepdims=True)
         within = np.concatenate([np.zeros((len(weights), 1)), np.cumsum(n_ranked[:, :-1], axis=1)], axis=1)
-        nothing = np.where(n_true > 0, 0.0, np.nan)[:, None]  # the original divides by the number of pairs
-        share = np.where(n_pairs > 0, within / np.maximum(n_pairs, 1), nothing)
+        # the original divides by the number of pairs
+        share = np.where(n_true[:, None] > 0, within / np.maximum(n_pairs, 1), np.nan)
         ks = np.arange(0, n_places, RANK_STEP)
         area = trapezoid(share[:, ks], np.broadcast_to(ks / n_places, (len(share), len(ks))))
         columns = [area, *(share[:, min(k, n_places)] for k in OBJECT_RANKS)]
@@ -361,21 +331,13 @@ class PlaceCounts(Counts):
     """
 
     stored_as = "places"
-    arrays: ClassVar[Arrays] = {
-        "n_scenes": ("i", ("sides",)),
-        "n_bounds": ("i", ("sides",)),
-        "n_bounds_found": ("i", ("numbers",)),
-        "n_rooms": ("i", ("sides",)),
-        "n_rooms_found": ("i", ("thresholds",)),
-        "room_shares": ("f", ("sides",)),
-    }
 
-    n_scenes: Int64Array
-    n_bounds: Int64Array
-    n_bounds_found: Int64Array
-    n_rooms: Int64Array
-    n_rooms_found: Int64Array
-    room_shares: Float64Array
+    n_scenes: Int64Array = field(metadata=axes("sides"))
+    n_bounds: Int64Array = field(metadata=axes("sides"))
+    n_bounds_found: Int64Array = field(metadata=axes("numbers"))
+    n_rooms: Int64Array = field(metadata=axes("sides"))
+    n_rooms_found: Int64Array = field(metadata=axes("thresholds"))
+    room_shares: Float64Array = field(metadata=axes("sides"))
 
     def contradiction(self) -> str | None:
         """More found than there is."""
@@ -420,14 +382,9 @@ class PlaceMetric(Metric[PlaceCounts]):
     def sizes(self) -> dict[str, int]:
         return {"thresholds": len(THRESHOLDS), "sides": 2, "numbers": 1}
 
-    def pooled(self, counts: Sequence[PlaceCounts]) -> Pooled:
-        values = self.resampled(counts, np.ones((1, len(counts)), np.int64))
-        return Pooled({name: float(value[0]) for name, value in values.items()})
-
     def resampled(self, counts: Sequence[PlaceCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
-        n_scenes, n_bounds, n_bounds_found, n_rooms, n_rooms_found, shares = (
-            summed([getattr(of_scene, name) for of_scene in counts], weights) for name in PlaceCounts.arrays
-        )
+        drawn = PlaceCounts.drawn(counts, weights)
+        n_scenes, n_bounds, n_bounds_found, n_rooms, n_rooms_found, shares = drawn.values()
         floors = rates(n_bounds_found, n_bounds[:, 0], n_bounds[:, 1])
         rooms = rates(n_rooms_found, n_rooms[:, 0], n_rooms[:, 1])
         covered = rates(shares, n_rooms[:, 0], n_rooms[:, 1])

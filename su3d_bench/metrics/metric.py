@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from functools import cache, reduce
 from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
@@ -16,38 +17,66 @@ from su3d_bench.core.maps import Instances, Prediction
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 from su3d_bench.metrics.matching.nearest import n_farther
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.numerics.statistics import nan_mean
+from su3d_bench.numerics.statistics import nan_mean, ratio
 
 MOST_COUNTED = 1 << 53  # numbers beyond it are not whole any more where ratios are formed
 Values = dict[str, float]
-Arrays = Mapping[str, tuple[str, tuple[str, ...]]]
 C = TypeVar("C", bound="Counts")
+ROWS = "rows"  # the axis along which scenes are put one after another; along all others they are summed
+NUMBER_KINDS = {"Int64Array": "i", "Int32Array": "i", "Float64Array": "f", "BoolArray": "b"}
+
+
+def axes(*names: str) -> dict[str, tuple[str, ...]]:
+    """The metadata of an array of counts: its axes, of which those of one name are equally long."""
+    return {"axes": names}
 
 
 @dataclass(frozen=True)
 class Counts:
-    """What scenes add to a protocol's numbers, as arrays.
-
-    ``stored_as`` names the kind in files; ``arrays``: of each array the kind of its numbers and its axes, of which
-    those of one name are equally long.
-    """
+    """What scenes add to a protocol's numbers, as arrays with ``axes``; ``stored_as`` names the kind in files."""
 
     stored_as: ClassVar[str]
-    arrays: ClassVar[Arrays]
+
+    @classmethod
+    @cache
+    def arrays(cls) -> dict[str, tuple[str, tuple[str, ...]]]:
+        """Of each array the kind of its numbers and its axes."""
+        return {array.name: (NUMBER_KINDS[str(array.type)], array.metadata["axes"]) for array in fields(cls)}
+
+    @classmethod
+    def joined(cls, counts: Sequence[Self]) -> Self:
+        """The counts of several scenes as one: rows one after another, numbers summed in order, flags of any scene."""
+        whole: dict[str, NDArray[Any]] = {}
+        for name, (number_kind, names) in cls.arrays().items():
+            parts = [getattr(of_scene, name) for of_scene in counts]
+            if names[0] == ROWS:
+                whole[name] = np.concatenate(parts)
+            else:
+                whole[name] = reduce(np.logical_or if number_kind == "b" else np.add, parts)
+        return cls(**whole)
+
+    @classmethod
+    def drawn(cls, counts: Sequence[Self], weights: Int64Array, *names: str) -> dict[str, Float64Array]:
+        """The arrays ``names``, or all, summed (R, ...) over the scenes drawn ``weights`` (R, S) times."""
+        drawn = weights.astype(np.float64)
+        return {
+            name: drawn @ np.stack([getattr(of_scene, name) for of_scene in counts]).astype(np.float64)
+            for name in names or cls.arrays()
+        }
 
     @classmethod
     def checked(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
         """The counts in ``arrays``; a ``DataError`` names one that no scene gives: of another kind or shape than it
         must be, below 0, or that another one contradicts."""
         sizes: dict[str, int] = {}
-        for name, (number_kind, axes) in cls.arrays.items():
+        for name, (number_kind, names) in cls.arrays().items():
             array = arrays[name]
-            fits = array.dtype.kind == number_kind and array.ndim == len(axes)
-            if not fits or any(sizes.setdefault(axis, n) != n for axis, n in zip(axes, array.shape, strict=True)):
+            fits = array.dtype.kind == number_kind and array.ndim == len(names)
+            if not fits or any(sizes.setdefault(axis, n) != n for axis, n in zip(names, array.shape, strict=True)):
                 raise DataError(f"counts: '{name}' is {array.dtype.name} {array.shape}; score the scene again")
             if number_kind == "i" and array.size and not 0 <= array.min() <= array.max() < MOST_COUNTED:
                 raise DataError(f"counts: '{name}' counts from {array.min()} to {array.max()}; score the scene again")
-        counts = cls(**{name: arrays[name] for name in cls.arrays})
+        counts = cls(**{name: arrays[name] for name in cls.arrays()})
         if (fault := counts.contradiction()) is not None:
             raise DataError(f"counts: {fault}; score the scene again")
         return counts
@@ -61,8 +90,8 @@ class Counts:
         """How long each axis is."""
         return {
             axis: n
-            for name, (_, axes) in self.arrays.items()
-            for axis, n in zip(axes, getattr(self, name).shape, strict=True)
+            for name, (_, names) in self.arrays().items()
+            for axis, n in zip(names, getattr(self, name).shape, strict=True)
         }
 
 
@@ -133,9 +162,13 @@ class Metric(ABC, Generic[C]):
     def sizes(self) -> dict[str, int]:
         """How long the axes of the counts are that the rules fix."""
 
-    @abstractmethod
     def pooled(self, counts: Sequence[C]) -> Pooled:
         """The numbers of the scenes together."""
+        return Pooled(self.values_once(counts))
+
+    def values_once(self, counts: Sequence[C]) -> Values:
+        """The values of ``resampled`` with each scene drawn once."""
+        return first_row(self.resampled(counts, np.ones((1, len(counts)), np.int64)))
 
     @abstractmethod
     def resampled(self, counts: Sequence[C], weights: Int64Array) -> Mapping[str, Float64Array]:
@@ -147,6 +180,30 @@ class Metric(ABC, Generic[C]):
         With weights of ones this is the value over all scenes, with a single one that of a scene alone.
         """
         return {}
+
+    def class_columns(
+        self, tables: Mapping[str, Float64Array], is_kept: BoolArray
+    ) -> dict[str, dict[str, Float64Array]]:
+        """Class -> column -> value (R,) from ``tables`` (R, C) of the scored classes, for those that are kept (C,)."""
+        return {
+            entry.name: {name: table[:, c] for name, table in tables.items()}
+            for c, entry in enumerate(self.rules.scored)
+            if is_kept[c]
+        }
+
+    def group_means(self, classes: Mapping[str, Values], columns: Mapping[str, str]) -> dict[str, Values]:
+        """Of each group the means over its classes that have a value; ``columns``: name of the mean -> of the value."""
+        rows: dict[str, list[Values]] = {}
+        for entry in self.rules.scored:
+            if entry.group:
+                rows.setdefault(entry.group, []).append(classes.get(entry.name, {}))
+        return {
+            group: {
+                name: nan_mean(np.array([row.get(column, np.nan) for row in of_group]))
+                for name, column in columns.items()
+            }
+            for group, of_group in rows.items()
+        }
 
     def combine(self, counts: Sequence[C]) -> Values:
         """The metrics of the scenes together."""
@@ -193,8 +250,12 @@ def scene_mean(rows: Collection[Mapping[str, float]]) -> Values:
 def _weighted_mean(values: Float64Array, weights: Int64Array) -> Float64Array:
     is_number = ~np.isnan(values)
     drawn = weights[:, is_number].astype(np.float64)
-    n = drawn.sum(axis=1)
-    return np.where(n > 0, (drawn * values[is_number]).sum(axis=1) / np.maximum(n, 1), np.nan)
+    return ratio((drawn * values[is_number]).sum(axis=1), drawn.sum(axis=1))
+
+
+def first_row(values: Mapping[str, Float64Array]) -> Values:
+    """Of each value (R,) the first."""
+    return {name: float(value[0]) for name, value in values.items()}
 
 
 def present(class_index: Int64Array, n_classes: int) -> BoolArray:

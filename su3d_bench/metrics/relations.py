@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -13,13 +12,14 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Masks, Partition
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array
+from su3d_bench.metrics.instance.boxes import box_around
 from su3d_bench.metrics.instance.score import named_classes, score_of_masks
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import class_index_of_ids, encoder_warning
-from su3d_bench.metrics.matching.nearest import Points, nearest
-from su3d_bench.metrics.metric import Arrays, Counts, Metric, Pooled, SceneScore, Values
+from su3d_bench.metrics.matching.nearest import Points, nearest, rows_of
+from su3d_bench.metrics.metric import Counts, Metric, Pooled, SceneScore, axes, first_row
 from su3d_bench.numerics.relations import RELATIONS, Relation, Relations
-from su3d_bench.numerics.statistics import nan_mean
+from su3d_bench.numerics.statistics import nan_mean, ratio
 
 NAMES = ("object R@1", "predicate R@1", "relationship R@1", "object mR@1", "predicate mR@1")
 
@@ -30,19 +30,12 @@ class RelationCounts(Counts):
     many objects got their class, relations their predicate, and relations subject, predicate and object right."""
 
     stored_as = "relations"
-    arrays: ClassVar[Arrays] = {
-        "n_objects": ("i", ("classes",)),
-        "n_objects_found": ("i", ("classes",)),
-        "n_relations": ("i", ("predicates",)),
-        "n_predicates_found": ("i", ("predicates",)),
-        "n_triplets_found": ("i", ("predicates",)),
-    }
 
-    n_objects: Int64Array
-    n_objects_found: Int64Array
-    n_relations: Int64Array
-    n_predicates_found: Int64Array
-    n_triplets_found: Int64Array
+    n_objects: Int64Array = field(metadata=axes("classes"))
+    n_objects_found: Int64Array = field(metadata=axes("classes"))
+    n_relations: Int64Array = field(metadata=axes("predicates"))
+    n_predicates_found: Int64Array = field(metadata=axes("predicates"))
+    n_triplets_found: Int64Array = field(metadata=axes("predicates"))
 
     def contradiction(self) -> str | None:
         """More that is found than there is, or triplets without their predicate."""
@@ -57,20 +50,11 @@ class RelationCounts(Counts):
         return None
 
 
-def resampled(counts: Sequence[RelationCounts], weights: Int64Array) -> dict[str, Float64Array]:
-    """Each array of the counts (R, C or P) over the scenes drawn ``weights`` (R, S) times."""
-    drawn = weights.astype(np.float64)
-    return {
-        name: drawn @ np.stack([getattr(of_scene, name) for of_scene in counts]).astype(np.float64)
-        for name in RelationCounts.arrays
-    }
-
-
 def recalls(sums: dict[str, Float64Array]) -> dict[str, Float64Array]:
     """The recalls (R,) of sums of counts (R, C or P); NaN where nothing is true. ``mR`` is the mean over what is true.
 
     >>> one = RelationCounts(*(np.array(n, np.int64) for n in ([2, 1], [2, 0], [4], [2], [1])))
-    >>> {name: value.tolist() for name, value in recalls(resampled([one], np.ones((1, 1), np.int64))).items()}
+    >>> {name: value.tolist() for name, value in recalls(RelationCounts.drawn([one], np.array([[1]]))).items()}
     ... # doctest: +NORMALIZE_WHITESPACE
     {'object R@1': [0.6666666666666666], 'predicate R@1': [0.5], 'relationship R@1': [0.25], 'object mR@1': [0.5],
      'predicate mR@1': [0.5]}
@@ -86,12 +70,6 @@ def recalls(sums: dict[str, Float64Array]) -> dict[str, Float64Array]:
         np.array([nan_mean(row) for row in of_predicate]),
     )
     return dict(zip(NAMES, values, strict=True))
-
-
-def ratio(part: Float64Array, whole: Float64Array) -> Float64Array:
-    """Shares, NaN of nothing."""
-    answer: Float64Array = np.divide(part, whole, out=np.full(part.shape, np.nan), where=whole > 0)
-    return answer
 
 
 OWN_SHARE = 0.5  # of a predicted object's points, to stand for an object: less, and it stands for none
@@ -142,16 +120,14 @@ def last_best(scores: Float64Array) -> Int64Array:
     [1]
     """
     n = scores.shape[1]
-    answer: Int64Array = n - 1 - scores[:, ::-1].argmax(axis=1) if len(scores) else np.zeros(0, np.int64)
-    return answer
+    return n - 1 - scores[:, ::-1].argmax(axis=1) if len(scores) else np.zeros(0, np.int64)
 
 
 def boxes_around(points: Points, masks: Masks) -> Float64Array:
     """The lowest and highest corners (K, 2, 3) of the points of each mask; zeros of an empty one."""
     boxes = np.zeros((len(masks), 2, 3))
     for row in np.flatnonzero(masks.sizes).tolist():
-        members = points[masks.mask(row)]
-        boxes[row] = members.min(axis=0), members.max(axis=0)
+        boxes[row] = box_around(points[masks.mask(row)])
     return boxes
 
 
@@ -197,16 +173,10 @@ class RelationMetric(Metric[RelationCounts]):
         assert rules.transfer.cap_m is not None
         graph = self._graph(truth)
         masks = transfer.masks_of(prediction)
-        row_of_point = _rows_of(graph.ids, truth.instance)
+        row_of_point = rows_of(graph.ids, truth.instance)
         is_object = row_of_point >= 0
-        shared = shared_points(
-            prediction.points,
-            masks,
-            truth.points[is_object],
-            row_of_point[is_object],
-            len(graph.ids),
-            rules.transfer.cap_m,
-        )
+        true_points, owner = truth.points[is_object], row_of_point[is_object]
+        shared = shared_points(prediction.points, masks, true_points, owner, len(graph.ids), rules.transfer.cap_m)
         stands = stand_for(shared, masks.sizes)
         called = class_index_of_ids(rules, named_classes(rules, truth.semantic, prediction, encoder))
         edges, remark = self._edges(prediction, masks, called, stands)
@@ -236,18 +206,13 @@ class RelationMetric(Metric[RelationCounts]):
         objects, classes = np.array([*kept], np.int64), np.array([*kept.values()], np.int64)
         if truth.graph is not None and rules.relations == "annotated":
             row_of = {key: row for row, key in enumerate(kept)}
-            return _Graph(
-                objects,
-                classes,
-                [
-                    (row_of[subject], row_of[other], self._place(predicate))
-                    for subject, predicate, other in truth.graph.relations
-                    if subject in row_of and other in row_of
-                ],
-            )
-        boxes = np.array(
-            [_box(truth.points[truth.instance == key]) for key in kept], np.float64
-        ).reshape(-1, 2, 3)  # fmt: skip
+            relations = [
+                (row_of[subject], row_of[other], self._place(predicate))
+                for subject, predicate, other in truth.graph.relations
+                if subject in row_of and other in row_of
+            ]
+            return _Graph(objects, classes, relations)
+        boxes = np.array([box_around(truth.points[truth.instance == key]) for key in kept]).reshape(-1, 2, 3)
         names = [rules.classes[place].name for place in kept.values()]
         edges = geometric_edges(boxes, names, rules.predicates, sure=True)
         return _Graph(objects, classes, [(*pair, place) for pair, place in edges.items()])
@@ -304,11 +269,11 @@ class RelationMetric(Metric[RelationCounts]):
 
     def pooled(self, counts: Sequence[RelationCounts]) -> Pooled:
         """The recalls, beside each what it is a share of, ``n_<name>``, and those of each class and predicate."""
-        sums = resampled(counts, np.ones((1, len(counts)), np.int64))
-        values: Values = {name: float(value[0]) for name, value in recalls(sums).items()}
+        sums = RelationCounts.drawn(counts, np.ones((1, len(counts)), np.int64))
+        values = first_row(recalls(sums))
         n_objects, n_relations = int(sums["n_objects"].sum()), int(sums["n_relations"].sum())
         values |= dict(zip((f"n_{name}" for name in NAMES[:3]), (n_objects, n_relations, n_relations), strict=True))
-        single = {name: float(value[0]) for name, value in self._single(sums).items()}
+        single = first_row(self._single(sums))
         return Pooled(values, {name: {"R@1": value} for name, value in single.items() if not np.isnan(value)})
 
     def _single(self, sums: Mapping[str, Float64Array]) -> dict[str, Float64Array]:
@@ -321,23 +286,10 @@ class RelationMetric(Metric[RelationCounts]):
         return columns
 
     def resampled(self, counts: Sequence[RelationCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
-        return recalls(resampled(counts, weights))
+        return recalls(RelationCounts.drawn(counts, weights))
 
     def resampled_classes(
         self, counts: Sequence[RelationCounts], weights: Int64Array
     ) -> dict[str, dict[str, Float64Array]]:
-        whole = self._single(resampled(counts, np.ones((1, len(counts)), np.int64)))
-        table = self._single(resampled(counts, weights))
-        return {name: {"R@1": table[name]} for name, value in whole.items() if not np.isnan(value[0])}
-
-
-def _rows_of(ids: Int64Array, instance: np.ndarray) -> Int64Array:
-    """The row in ``ids``, ascending, of each number of ``instance`` (N,), -1 where it is none of them."""
-    if not len(ids):
-        return np.full(len(instance), -1, np.int64)
-    row = np.minimum(np.searchsorted(ids, instance), len(ids) - 1)
-    return np.where(ids[row] == instance, row, -1)
-
-
-def _box(points: np.ndarray) -> list[np.ndarray]:
-    return [points.min(axis=0), points.max(axis=0)]
+        table = self._single(RelationCounts.drawn(counts, weights))
+        return {name: {"R@1": table[name]} for name in self.pooled(counts).classes}

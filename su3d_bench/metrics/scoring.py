@@ -29,17 +29,9 @@ from su3d_bench.metrics.metric import MOST_COUNTED, Counts, Metric, SceneScore, 
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.score import CategoriesMetric, QueryMetric, QueryTruth
 from su3d_bench.metrics.protocols.model import Kind, ProtocolRules
+from su3d_bench.metrics.questions import score as questions
 from su3d_bench.metrics.questions.grounding import ChainMetric, GroundingMetric
 from su3d_bench.metrics.questions.presence import PresenceMetric
-from su3d_bench.metrics.questions.score import (
-    AnnotationMetric,
-    AnnotationTruth,
-    PresenceTruth,
-    ReasoningMetric,
-    ReasoningTruth,
-    RetrievalMetric,
-    RetrievalTruth,
-)
 from su3d_bench.metrics.relations import RelationMetric
 from su3d_bench.metrics.semantic.panoptic import PanopticMetric
 from su3d_bench.metrics.semantic.score import SemanticMetric
@@ -58,7 +50,9 @@ __all__ = [
 ]
 
 EVERY_SCENE = "every scene"  # stands before a warning that all scenes share, where else the name of one stands
-QuestionTruth = RetrievalTruth | PresenceTruth | AnnotationTruth | ReasoningTruth
+QuestionTruth = (
+    questions.RetrievalTruth | questions.PresenceTruth | questions.AnnotationTruth | questions.ReasoningTruth
+)
 Truth = GroundTruth | OpenLexTruth | QueryTruth | QuestionTruth
 METRICS: dict[Kind, type[Metric[Any]]] = {
     "semantic": SemanticMetric,
@@ -73,10 +67,10 @@ METRICS: dict[Kind, type[Metric[Any]]] = {
     "relations": RelationMetric,
     "objects": ObjectMetric,
     "places": PlaceMetric,
-    "retrieval": RetrievalMetric,
+    "retrieval": questions.RetrievalMetric,
     "presence": PresenceMetric,
-    "annotation": AnnotationMetric,
-    "reasoning": ReasoningMetric,
+    "annotation": questions.AnnotationMetric,
+    "reasoning": questions.ReasoningMetric,
 }
 _COUNTS: dict[str, type[Counts]] = {metric.counts.stored_as: metric.counts for metric in METRICS.values()}
 
@@ -285,7 +279,7 @@ def pack_scores(scores: Mapping[str, SceneScore]) -> bytes:
             "warnings": score.warnings,
         }
         arrays[f"{name}/about"] = np.frombuffer(json.dumps(about, sort_keys=True).encode(), np.uint8)
-        arrays |= {f"{name}/{array}": getattr(score.counts, array) for array in score.counts.arrays}
+        arrays |= {f"{name}/{array}": getattr(score.counts, array) for array in score.counts.arrays()}
     # numpy dates every member 1980-01-01, so the bytes say nothing of when they were written
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
@@ -322,7 +316,7 @@ def _unpack_one(name: str, arrays: Mapping[str, NDArray[Any]]) -> SceneScore:
     return SceneScore(
         protocol=about["protocol"],
         version=about["version"],
-        counts=kind.checked({array: arrays[f"{name}/{array}"] for array in kind.arrays}),
+        counts=kind.checked({array: arrays[f"{name}/{array}"] for array in kind.arrays()}),
         n_predictions=about["n_predictions"],
         n_scored=about["n_scored"],
         n_farther=n_farther,

@@ -82,8 +82,7 @@ class Relations:
 
     def of(self, relation: Relation) -> BoolArray:
         """Which pairs (K, K) stand in ``relation``."""
-        matrix: BoolArray = getattr(self, {"in": "inside", "next to": "next_to"}.get(relation, relation))
-        return matrix
+        return np.asarray(getattr(self, {"in": "inside", "next to": "next_to"}.get(relation, relation)))
 
     def doubtful(self, relation: Relation) -> BoolArray:
         """The pairs (K, K) of which a slightly other threshold, or another reading of the word, says otherwise."""
@@ -114,34 +113,29 @@ class Relations:
     def _is_pair(self) -> BoolArray:
         """Pairs of two things of which neither is a surface of the room."""
         is_pair = self._is_thing[:, None] & self._is_thing[None]
-        answer: BoolArray = is_pair & ~np.eye(len(self), dtype=bool)
-        return answer
+        return np.asarray(is_pair & ~np.eye(len(self), dtype=bool))
 
     @cached_property
     def _apart(self) -> Float64Array:
         """Metres (K, K, 3) between two boxes along each axis; 0 where they overlap."""
         low, high = self._boxes[:, 0], self._boxes[:, 1]
-        apart: Float64Array = np.maximum(low[:, None] - high[None], low[None] - high[:, None]).clip(min=0.0)
-        return apart
+        return np.maximum(low[:, None] - high[None], low[None] - high[:, None]).clip(min=0.0)
 
     @cached_property
     def _area(self) -> Float64Array:
         """Square metres (K,) of the footprints, above 0 so that one can divide by them."""
-        area: Float64Array = np.prod((self._boxes[:, 1] - self._boxes[:, 0])[:, :2], axis=1).clip(min=1e-9)
-        return area
+        return np.asarray(np.prod((self._boxes[:, 1] - self._boxes[:, 0])[:, :2], axis=1).clip(min=1e-9))
 
     def _shared(self, pad_m: float = 0.0) -> Float64Array:
         """Square metres (K, K) that a footprint shares with another that is grown by ``pad_m``."""
         low, high = self._boxes[:, 0, :2], self._boxes[:, 1, :2]
         sides = np.minimum(high[:, None], high[None] + pad_m) - np.maximum(low[:, None], low[None] - pad_m)
-        area: Float64Array = np.prod(sides.clip(min=0.0), axis=2)
-        return area
+        return np.asarray(np.prod(sides.clip(min=0.0), axis=2))
 
     @cached_property
     def _risen(self) -> Float64Array:
         """Metres (K, K) by which the bottom of one thing is above the top of the other."""
-        metres: Float64Array = self._boxes[:, None, 0, 2] - self._boxes[None, :, 1, 2]
-        return metres
+        return self._boxes[:, None, 0, 2] - self._boxes[None, :, 1, 2]
 
     @cached_property
     def _rests_on_top(self) -> BoolArray:
@@ -152,8 +146,7 @@ class Relations:
         is_fixed = self._is_fixture[:, None] | self._is_fixture[None]
         rests = ~is_fixed & touches & begins_higher & (share >= ON_SHARE / self._slack) & self._is_pair
         gap_m = np.where(rests, np.abs(self._risen), np.inf)
-        answer: BoolArray = rests & (gap_m <= gap_m.min(axis=1, initial=np.inf)[:, None] + SAME_TOP_M)
-        return answer
+        return np.asarray(rests & (gap_m <= gap_m.min(axis=1, initial=np.inf)[:, None] + SAME_TOP_M))
 
     @cached_property
     def _rests_inside(self) -> BoolArray:
@@ -162,15 +155,13 @@ class Relations:
         is_within = self._shared() / self._area[:, None] >= min(1.0, WITHIN_SHARE / self._slack)
         is_smaller = self._area[:, None] < self._area[None]
         begins = (low[:, None] >= low[None] - CONTACT_M) & (low[:, None] < high[None] - CONTACT_M)
-        answer: BoolArray = is_within & is_smaller & begins & self._is_pair
-        return answer
+        return is_within & is_smaller & begins & self._is_pair
 
     @cached_property
     def _stands_inside(self) -> BoolArray:
         """As ``_rests_inside``, above the holder's foot: on a seat or an inner board."""
         foot = self._boxes[:, 0, 2]
-        answer: BoolArray = self._rests_inside & (foot[:, None] >= foot[None] + INNER_FLOOR_M / self._slack)
-        return answer
+        return self._rests_inside & (foot[:, None] >= foot[None] + INNER_FLOOR_M / self._slack)
 
     @cached_property
     def _is_over(self) -> BoolArray:
@@ -179,8 +170,7 @@ class Relations:
         centre = self._boxes.mean(axis=1)[:, None, :2]
         low, high = self._boxes[:, 0, :2] - OVER_PAD_M, self._boxes[:, 1, :2] + OVER_PAD_M
         has_centre = ((centre >= low[None]) & (centre <= high[None])).all(axis=2)
-        answer: BoolArray = (share >= OVER_SHARE / self._slack) | (has_centre & (share >= 0.25 / self._slack))
-        return answer
+        return np.asarray((share >= OVER_SHARE / self._slack) | (has_centre & (share >= 0.25 / self._slack)))
 
     @cached_property
     def _hangs_before(self) -> BoolArray:
@@ -192,34 +182,29 @@ class Relations:
         row = np.arange(len(self))
         of_subject = shared[row[:, None], row[None], along[:, None]]
         least = np.minimum(sides[row, along][:, None], sides[row, along][None])
-        answer: BoolArray = (along[:, None] == along[None]) & (of_subject > ON_SHARE * least)
-        return answer
+        return np.asarray((along[:, None] == along[None]) & (of_subject > ON_SHARE * least))
 
     @cached_property
     def _is_spread_out(self) -> BoolArray:
         sides = self._boxes[:, 1] - self._boxes[:, 0]
-        answer: BoolArray = (sides[:, 2] < FLAT_M) & (sides[:, :2].max(axis=1, initial=0.0) > SPREAD_M)
-        return answer
+        return np.asarray((sides[:, 2] < FLAT_M) & (sides[:, :2].max(axis=1, initial=0.0) > SPREAD_M))
 
     @cached_property
     def holders(self) -> BoolArray:
         """What (K, K) each thing rests on or lies in; rugs, which are part of the floor, hold nothing."""
-        answer: BoolArray = (self.on | self.inside) & ~self._is_spread_out[None]
-        return answer
+        return (self.on | self.inside) & ~self._is_spread_out[None]
 
     @cached_property
     def is_on_floor(self) -> BoolArray:
         """Which things (K,) stand on the floor: at the top of what is called so, or as low as the lowest one."""
         foot, top = self._boxes[:, 0, 2], self._boxes[:, 1, 2]
         floor_m = top.min(initial=foot.min(initial=np.inf, where=self._is_thing), where=self._is_floor)
-        answer: BoolArray = foot <= floor_m + CONTACT_M
-        return answer
+        return np.asarray(foot <= floor_m + CONTACT_M)
 
     @cached_property
     def hangs(self) -> BoolArray:
         """Which things (K,) rest on nothing: on a wall, or from the ceiling."""
-        hangs: BoolArray = ~self.holders.any(axis=1) & ~self.is_on_floor
-        return hangs
+        return ~self.holders.any(axis=1) & ~self.is_on_floor
 
     @cached_property
     def one_place(self) -> BoolArray:
@@ -227,22 +212,19 @@ class Relations:
         stands = self.is_on_floor & ~self.holders.any(axis=1)
         shares_holder = (self.holders[:, None] & self.holders[None]).any(axis=2)
         is_one = (stands[:, None] & stands[None]) | (self.hangs[:, None] & self.hangs[None])
-        answer: BoolArray = (shares_holder | is_one) & self._is_pair
-        return answer
+        return (shares_holder | is_one) & self._is_pair
 
     # ---- the rules
 
     @cached_property
     def on(self) -> BoolArray:
         """The first rests on the top of the second, or on an inner board or seat of it."""
-        answer: BoolArray = self._rests_on_top | (self._stands_inside & ~self._is_container[None])
-        return answer
+        return np.asarray(self._rests_on_top | (self._stands_inside & ~self._is_container[None]))
 
     @cached_property
     def inside(self) -> BoolArray:
         """The first lies in the second: a container that it may stick out of."""
-        answer: BoolArray = self._rests_inside & self._is_container[None]
-        return answer
+        return np.asarray(self._rests_inside & self._is_container[None])
 
     @cached_property
     def above(self) -> BoolArray:
@@ -263,8 +245,7 @@ class Relations:
         is_covered = self._shared() / self._area[:, None] >= min(1.0, WITHIN_SHARE / self._slack)
         stands_under = is_low & is_covered & (self._area[:, None] < self._area[None]) & ~self._is_container[None]
         is_covered_floor = stands_under & ~self._is_spread_out[:, None] & self._is_pair
-        answer: BoolArray = self.on.T | self.above.T | is_covered_floor
-        return answer
+        return np.asarray(self.on.T | self.above.T | is_covered_floor)
 
     @cached_property
     def next_to(self) -> BoolArray:
@@ -295,8 +276,7 @@ class Relations:
         is_rug = self._is_spread_out[:, None] | self._is_spread_out[None]
         is_aside = self._shared() <= ON_SHARE * self._slack * np.minimum(self._area[:, None], self._area[None])
         is_aside &= ~(self.hangs[:, None] & self.hangs[None]) | ~self._hangs_before
-        beside: BoolArray = (gap_m <= reach_m) & is_aside & is_level & ~stacked & ~stacked.T & ~is_rug & self._is_pair
-        return beside
+        return np.asarray((gap_m <= reach_m) & is_aside & is_level & ~stacked & ~stacked.T & ~is_rug & self._is_pair)
 
     def _without_between(self, pairs: BoolArray) -> BoolArray:
         """The symmetrical ``pairs`` (K, K) between which nothing stands."""
@@ -318,8 +298,7 @@ class Relations:
     @cached_property
     def near(self) -> BoolArray:
         """No more than a metre from box to box."""
-        answer: BoolArray = (np.linalg.norm(self._apart, axis=2) <= NEAR_M * self._slack) & self._is_pair
-        return answer
+        return np.asarray((np.linalg.norm(self._apart, axis=2) <= NEAR_M * self._slack) & self._is_pair)
 
 
 def is_between(a: Float64Array, b: Float64Array, c: Float64Array) -> bool:

@@ -64,8 +64,7 @@ def has_part(values: Float64Array, has_value: BoolArray) -> BoolArray:
     another.
     """
     n_with_value = np.bincount(_group_of_scene(len(has_value)), weights=has_value, minlength=len(values) - 1)
-    is_part: BoolArray = (n_with_value > 0) | (values[1:] != values[0])
-    return is_part
+    return np.asarray((n_with_value > 0) | (values[1:] != values[0]))
 
 
 def pseudo_values(values: Float64Array, is_part: BoolArray | None = None) -> Float64Array:
@@ -79,8 +78,7 @@ def pseudo_values(values: Float64Array, is_part: BoolArray | None = None) -> Flo
     """
     whole, left_out = values[0], values[1:]
     kept = left_out if is_part is None else left_out[is_part]
-    pseudo: Float64Array = len(kept) * whole - (len(kept) - 1) * kept
-    return pseudo
+    return np.asarray(len(kept) * whole - (len(kept) - 1) * kept)
 
 
 def jackknife_interval(
@@ -166,6 +164,16 @@ def t_quantile(level: float, n_free: float) -> float:
     return float(ndtri(level) if np.isinf(n_free) else stdtrit(n_free, level))
 
 
+def ratio(part: Float64Array | Int64Array, whole: Float64Array | Int64Array) -> Float64Array:
+    """``part / whole``; NaN of nothing.
+
+    >>> ratio(np.array([1, 0]), np.array([4, 0])).tolist()
+    [0.25, nan]
+    """
+    quotient: Float64Array = np.full(part.shape, np.nan)
+    return np.divide(part, whole, out=quotient, where=whole > 0)
+
+
 def nan_mean(values: Float64Array) -> float:
     """Mean of the values that are not NaN; NaN where there is none.
 
@@ -184,8 +192,7 @@ def row_means(values: Float64Array) -> Float64Array:
     [0.5, nan]
     """
     is_number = ~np.isnan(values)
-    n = is_number.sum(axis=1)
-    return np.where(n > 0, np.where(is_number, values, 0.0).sum(axis=1) / np.maximum(n, 1), np.nan)
+    return ratio(np.where(is_number, values, 0.0).sum(axis=1), is_number.sum(axis=1))
 
 
 @dataclass(frozen=True)
@@ -338,8 +345,7 @@ def _slopes_of_blocks(x: Float64Array, y: Float64Array, starts: Int64Array, leng
 
 def _block_sums(values: Float64Array, starts: Int64Array, lengths: Int64Array) -> Float64Array:
     running = np.concatenate([[0.0], np.cumsum(values)])
-    total: Float64Array = (running[starts + lengths] - running[starts]).sum(axis=1)
-    return total
+    return np.asarray((running[starts + lengths] - running[starts]).sum(axis=1))
 
 
 @dataclass(frozen=True)

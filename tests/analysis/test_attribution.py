@@ -282,7 +282,7 @@ def test_the_gain_of_a_mended_mask_is_that_of_the_whole_evaluation(aggregate: st
         before = reported(rules, counts)
         truth, predicted = scenes[0]
         overlaps = measure_overlaps(true_instances(truth, scored), predicted, scored)
-        pool = Pool(metric_of(rules), counts[0], counts[1:], instance_ap.concatenate)
+        pool = Pool(metric_of(rules), counts[0], counts[1:])
         found = single_mask_errors(truth, overlaps, scored, pool)
         errors = find_errors(overlaps)
         assert len(found) == len(errors)
@@ -316,7 +316,7 @@ def test_an_error_is_told_by_its_masks_and_objects() -> None:
     truth = np.concatenate([np.repeat([first * 1000 + 1, second * 1000 + 2], 100), np.zeros(50, np.int64)])
     masks = LabelledMasks(Masks.of_sets([np.arange(90)]), np.array([second]), np.array([0.8]))
     overlaps = measure_overlaps(true_instances(truth, scored), masks, scored)
-    pool = Pool(metric_of(MASK_RULES), count_masks(truth, masks, scored), [], instance_ap.concatenate)
+    pool = Pool(metric_of(MASK_RULES), count_masks(truth, masks, scored), [])
     named, missed = single_mask_errors(truth, overlaps, scored, pool)
     assert (named.kind, named.true, named.called, named.masks) == ("mislabelled", (first,), (second,), (0,))
     assert (named.score, named.iou) == (0.8, 0.9)
@@ -345,7 +345,7 @@ def test_the_gain_of_mended_points_is_that_of_the_whole_evaluation(aggregate: st
     for seed in range(4):
         scenes = [made_points(3 * seed + k) for k in range(3)]
         counts = [mend_points(points, is_counted).as_is for points in scenes]
-        pool = Pool(metric, counts[0], counts[1:], semantic.concatenate)
+        pool = Pool(metric, counts[0], counts[1:])
         n, found = single_point_errors(scenes[0], is_counted, pool, has_masks=True, most=10_000)
         assert n == len(found) > 20
         before = metric.reported(counts)

@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scored_room import (
     ENCODER,
     ID,
@@ -30,34 +28,11 @@ from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.types import LabelSet
-from su3d_bench.metrics.instance.average_precision import InstanceCounts
-from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectCounts
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.questions.score import ShareCounts
 from su3d_bench.metrics.scoring import combine, combined_metrics, pack_scores, score_scene, unpack_scores
-from su3d_bench.metrics.semantic.confusion import SemanticCounts
 
 # ---- several scenes
-
-
-@settings(max_examples=20, deadline=None)
-@given(order=st.permutations(range(5)), name=st.sampled_from([*SEMANTIC, *INSTANCE]))
-def test_the_order_of_scenes_changes_no_bit(order: list[int], name: str) -> None:
-    scores = noisy_scores(name, 5)
-    rules = load_protocol(name)
-    shuffled = {f"rooms/{seed}": scores[f"rooms/{seed}"] for seed in order}
-    assert json.dumps(combine(rules, shuffled).to_json()) == json.dumps(combine(rules, scores).to_json())
-
-
-@settings(max_examples=20, deadline=None)
-@given(seeds=st.sets(st.integers(0, 7), min_size=1), name=st.sampled_from([*SEMANTIC, *INSTANCE]))
-def test_a_subset_of_scenes_is_scored_from_counts_alone(seeds: set[int], name: str) -> None:
-    rules = load_protocol(name)
-    packed = {scene: pack_scores({name: score}) for scene, score in noisy_scores(name, 8).items()}
-    chosen = {f"rooms/{seed}": unpack_scores(packed[f"rooms/{seed}"])[name] for seed in seeds}
-    fresh = {f"rooms/{seed}": score_scene(rules, *noisy(seed), None) for seed in seeds}
-    assert combine(rules, chosen).to_json() == combine(rules, fresh).to_json()
 
 
 @pytest.mark.parametrize("name", [*SEMANTIC, *INSTANCE])
@@ -239,90 +214,6 @@ def test_damaged_counts_are_a_data_error(cut: int) -> None:
     data = pack_scores({"rooms-semantic": score_scene(ROOM, *noisy(0), None)})
     with pytest.raises(DataError, match="counts: are damaged"):
         unpack_scores(data[:cut])
-
-
-def of_one_class(**changed: Any) -> dict[str, Any]:
-    """Arrays of counts with two predictions, of one class at two thresholds."""
-    arrays = {
-        "class_index": np.zeros(2, np.int32),
-        "threshold_index": np.array([0, 1], np.int32),
-        "score": np.array([0.5, 0.25]),
-        "is_true": np.array([True, False]),
-        "n_missed": np.array([[0, 1]]),
-        **{name: np.ones(1, np.int64) for name in ("n_truth", "n_small_truth", "n_predictions")},
-    }
-    return arrays | {name: np.array(value) for name, value in changed.items()}
-
-
-@pytest.mark.parametrize(
-    ("changed", "line"),
-    [
-        ({"class_index": [0, 1]}, "'class_index' counts beyond the 1 classes"),
-        ({"threshold_index": [0, 2]}, "'threshold_index' counts beyond the 2 thresholds"),
-        ({"score": [0.5, np.nan]}, "'score' has values that are NaN or infinite"),
-        ({"score": [1, 0]}, r"'score' is int64 \(2,\)"),
-        ({"is_true": [True]}, r"'is_true' is bool \(1,\)"),
-        ({"n_missed": [0, 1]}, r"'n_missed' is int64 \(2,\)"),
-        ({"n_small_truth": [1 << 60]}, f"'n_small_truth' counts from {1 << 60} to {1 << 60}"),
-        ({"n_truth": [2]}, "'n_truth' of class 0 is 2, met and missed are 1"),
-        ({"is_true": [False, False]}, "'n_truth' of class 0 is 1, met and missed are 0"),
-    ],
-)
-def test_counts_that_do_not_fit_together_are_refused(changed: dict[str, Any], line: str) -> None:
-    assert InstanceCounts.checked(of_one_class()).sizes == {"rows": 2, "classes": 1, "thresholds": 2}
-    with pytest.raises(DataError, match=f"counts: {line}; score the scene again"):
-        InstanceCounts.checked(of_one_class(**changed))
-
-
-@pytest.mark.parametrize(
-    ("n_points", "total", "line"),
-    [
-        ([0], 0.0, "'n_points' has an object without points"),
-        ([4], 4.5, "'totals' has 4.5 over 4 points"),
-        ([4], -1.0, "'totals' has -1 over 4 points"),
-        ([4], np.inf, "'totals' has inf over 4 points"),
-        ([4], 7e300, r"'totals' has 7e\+300 over 4 points"),
-    ],
-)
-def test_totals_that_no_points_come_to_are_refused(n_points: list[int], total: float, line: str) -> None:
-    whole = {"n_points": np.array([4]), "totals": np.array([[4.0, np.nan]])}
-    assert len(ObjectCounts.checked(whole).totals) == 1
-    with pytest.raises(DataError, match=f"counts: {line}; score the scene again"):
-        ObjectCounts.checked({"n_points": np.array(n_points), "totals": np.array([[total, np.nan]])})
-
-
-@pytest.mark.parametrize(
-    ("changed", "line"),
-    [
-        ({"n_right": [5, 0]}, "'n_right' has 5 of 4 judged"),
-        ({"n_right": [-1, 0]}, "'n_right' counts from -1 to 0"),
-        ({"by_chance": [1.5, 0.5]}, "'by_chance' has 0.5 of 0 judged"),
-        ({"by_name": [-0.5, np.nan]}, "'by_name' has -0.5 of 4 judged"),
-    ],
-)
-def test_more_that_is_right_than_was_judged_is_refused(changed: dict[str, Any], line: str) -> None:
-    whole = {
-        "n_judged": np.array([4, 0]),
-        "n_right": np.array([4, 0]),
-        **{name: np.array([1.5, np.nan]) for name in ("by_chance", "by_name")},
-    }
-    assert ShareCounts.checked(whole).n_right.tolist() == [4, 0]
-    with pytest.raises(DataError, match=f"counts: {line}; score the scene again"):
-        ShareCounts.checked(whole | {name: np.array(value) for name, value in changed.items()})
-
-
-@pytest.mark.parametrize(
-    ("confusion", "line"),
-    [
-        ([[5, -1, 0], [0, 0, 0]], "'confusion' counts from -1 to 5"),
-        ([[5, 0, 0], [0, 1, 0]], "'confusion' has points of class 1, which the scene does not have"),
-    ],
-)
-def test_a_confusion_that_no_scene_gives_is_refused(confusion: list[list[int]], line: str) -> None:
-    is_present = np.array([True, False])
-    assert SemanticCounts.checked({"confusion": np.array([[5, 1, 0], [0, 0, 0]]), "is_present": is_present}) is not None
-    with pytest.raises(DataError, match=f"counts: {line}; score the scene again"):
-        SemanticCounts.checked({"confusion": np.array(confusion), "is_present": is_present})
 
 
 @pytest.mark.parametrize(

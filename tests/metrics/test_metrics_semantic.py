@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from places import CASES
 from scored_room import instances
 
@@ -16,7 +14,6 @@ from su3d_bench.core.maps import DenseFeatures, Partition
 from su3d_bench.metrics.semantic.confusion import (
     SemanticCounts,
     SemanticMetrics,
-    concatenate,
     conceptgraphs_metrics,
     confusion_matrix,
     per_scene,
@@ -116,7 +113,7 @@ def test_scannet_cases_are_equal_in_every_bit(case: str) -> None:
             per_scene(index_of[archive[f"gt_{s}"]], index_of[archive[f"pred_{s}"]], np.ones(len(ids), bool))
             for s in range(len(archive["scene_names"]))
         ]
-    whole = concatenate(counts)
+    whole = SemanticCounts.joined(counts)
     assert whole.confusion.tolist() == official["confusion_valid_plus_unknown"]
     metrics = scannet_metrics(whole.confusion)
     iou = [np.nan if value is None else value for value in official["iou"].values()]
@@ -159,15 +156,6 @@ def test_classes_are_counted_above_a_level_and_not_at_it() -> None:
     assert metrics.n_classes_above == (8, 6, 3, 1)
 
 
-@given(st.lists(st.tuples(st.integers(-1, 4), st.integers(-1, 4)), max_size=60), st.integers(0, 60))
-def test_counts_of_parts_add_up_to_the_whole(points: list[tuple[int, int]], cut: int) -> None:
-    truth, predicted = np.array(points, np.int64).reshape(-1, 2).T
-    present = np.ones(5, bool)
-    parts = [per_scene(truth[:cut], predicted[:cut], present), per_scene(truth[cut:], predicted[cut:], present)]
-    assert np.array_equal(concatenate(parts).confusion, per_scene(truth, predicted, present).confusion)
-    assert per_scene(truth, predicted, present).confusion.sum() == (truth >= 0).sum()
-
-
 def test_a_point_belongs_to_the_first_instance_that_takes_part_and_else_to_none() -> None:
     points = np.zeros((5, 3), np.float32)
     features = np.ones((3, 2), np.float32)
@@ -205,7 +193,7 @@ def test_points_of_a_class_that_the_scene_does_not_score_are_left_out() -> None:
 def test_concatenated_scenes_contain_the_classes_of_each() -> None:
     empty = confusion_matrix(np.zeros(0, int), np.zeros(0, int), 2)
     a, b = SemanticCounts(empty, np.array([True, False])), SemanticCounts(empty, np.array([False, True]))
-    assert concatenate([a, b]).is_present.tolist() == [True, True]
+    assert SemanticCounts.joined([a, b]).is_present.tolist() == [True, True]
 
 
 def test_ovo_counts_a_class_that_is_only_predicted_as_0_in_the_mean_accuracy_too() -> None:

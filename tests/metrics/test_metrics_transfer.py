@@ -174,7 +174,8 @@ def test_duplicates_are_those_of_a_comparison_of_every_pair(seed: int, n: int, i
 def test_features_that_no_class_may_name_are_none_of_the_classes() -> None:
     features = np.ones((2, OneHotEncoder().dim), np.float32)
     partition = Partition(np.zeros((3, 3), np.float32), np.array([0, 1, -1], np.int32), features)
-    nothing = labelling.classes_of_prediction(ROOM, partition, OneHotEncoder(), np.zeros(0, np.int64))
+    rules, none = ROOM.model_copy(update={"vocabulary": "scene"}), np.zeros(len(ROOM.classes), bool)
+    nothing = labelling.classes_of_prediction(rules, partition, OneHotEncoder(), none)
     assert nothing.tolist() == [-1, -1]
     assert labelling.class_index_of_ids(ROOM, []).tolist() == []
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -14,13 +13,12 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.average_precision import InstanceCounts, resampled_ap
-from su3d_bench.metrics.metric import Arrays, Counts, SceneScore, Values, present, scene_mean
+from su3d_bench.metrics.metric import Counts, SceneScore, Values, present, scene_mean
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine, metric_of, plain_json
 from su3d_bench.metrics.semantic.confusion import (
     SemanticCounts,
-    concatenate,
     conceptgraphs_metrics,
     resampled_semantic,
 )
@@ -152,7 +150,7 @@ def test_a_class_is_present_with_a_single_point() -> None:
 
 
 class Nothing(Counts):
-    arrays: ClassVar[Arrays] = {}
+    """Of no array."""
 
 
 def test_counts_without_the_axis_of_a_single_class_are_refused() -> None:
@@ -231,7 +229,7 @@ def test_what_is_called_a_class_without_points_is_sliced_away_from_the_pooled_ro
     other = confusion({A: {A: 2}, B: {B: 1, N: 3}})
     result = combine(ROOM, {"a": score(ROOM, one), "b": score(ROOM, other)})
     keep = np.array([A, B])
-    whole = concatenate([one, other]).confusion
+    whole = SemanticCounts.joined([one, other]).confusion
     sliced = np.concatenate([whole[np.ix_(keep, keep)], whole[keep, -1:]], axis=1)
     expected = conceptgraphs_metrics(sliced, np.arange(2))
     assert result.pooled["mAcc"] == expected.mean_accuracy == pytest.approx((1.0 + 4 / 8) / 2)

@@ -13,9 +13,6 @@ import scipy.stats
 
 import su3d_bench.numerics.statistics
 from su3d_bench.core.types import Float64Array
-from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.instance import scene_counts
-from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.numerics.statistics import (
     EXACT_STEPS,
     MIN_FIT,
@@ -128,51 +125,6 @@ def test_rank_intervals_of_equal_rows_hold_all_ranks_in_95_of_100() -> None:
 
 
 # ---- values over drawn scenes
-
-
-def random_scene(rng: np.random.Generator) -> instance_ap.InstanceCounts:
-    truth = np.repeat(rng.integers(0, 4, 12) * 1000 + np.arange(1, 13), rng.integers(80, 200, 12))
-    masks = [np.flatnonzero(rng.random(len(truth)) < 0.02) for _ in range(4)]
-    for _ in range(20):
-        start = rng.integers(0, len(truth) - 200)
-        masks.append(np.arange(start, start + rng.integers(100, 200)))
-    indptr = np.concatenate([[0], np.cumsum([len(m) for m in masks])])
-    labels, scores = rng.integers(1, 4, len(masks)), rng.integers(1, 6, len(masks)) / 5
-    return scene_counts.per_scene(truth, indptr, np.concatenate(masks), labels, scores, [1, 2, 3])
-
-
-def test_resampled_ap_equals_the_ap_of_the_scenes_drawn() -> None:
-    rng = np.random.default_rng(11)
-    counts = [random_scene(rng) for _ in range(5)]
-    weights = np.concatenate([np.ones((1, 5), np.int64), rng.multinomial(5, [0.2] * 5, size=20), [[0, 0, 5, 0, 0]]])
-    resampled = instance_ap.resampled_ap(counts, weights)
-    for row, weight in enumerate(weights):
-        ap = instance_ap.combine([counts[s] for s in range(5) for _ in range(weight[s])])
-        drawn = [resampled["AP"][row], resampled["AP50"][row], resampled["AP25"][row]]
-        np.testing.assert_allclose(drawn, [ap.ap, ap.ap50, ap.ap25], rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("metric", ["conceptgraphs", "scannet"])
-def test_resampled_semantic_metrics_equal_those_of_the_scenes_drawn(metric: str) -> None:
-    rng = np.random.default_rng(2)
-    counts = []
-    for scene in range(4):
-        truth = rng.integers(0, 3, 200) + scene % 2
-        truth[: 50 * (scene == 1)] = 4
-        counts.append(semantic.per_scene(truth, rng.integers(-1, 6, 200), np.ones(6, bool)))
-    weights = rng.multinomial(4, [0.25] * 4, size=30)
-    resampled = semantic.resampled_semantic(counts, weights, "scannet" if metric == "scannet" else "conceptgraphs")
-    for row, weight in enumerate(weights):
-        whole = semantic.concatenate([counts[s] for s in range(4) for _ in range(weight[s])]).confusion
-        if metric == "scannet":
-            expected = semantic.scannet_metrics(whole)
-        else:
-            keep = np.flatnonzero(whole.sum(axis=1) > 0)
-            whole[:, [c for c in range(6) if c not in keep]] = 0  # all six are in every scene: sliced away
-            expected = semantic.conceptgraphs_metrics(whole, keep)
-        drawn = [resampled["mAcc"][row], resampled["mIoU"][row], resampled["F-mIoU"][row]]
-        values = [expected.mean_accuracy, expected.mean_iou, expected.frequency_weighted_iou]
-        np.testing.assert_allclose(drawn, values, rtol=0, atol=1e-12)
 
 
 def drawn_values(n_steps: int, seed: int = 1) -> list[float]:

@@ -37,7 +37,7 @@ from su3d_bench.core.files.atomic import filling
 from su3d_bench.core.files.locks import is_unfinished
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.metrics.attribution.arrays import EXPLAINED, MendedScene
-from su3d_bench.metrics.attribution.masks import Mended, MendedPoints
+from su3d_bench.metrics.attribution.masks import Mended
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.matching.nearest import COVERAGE_RADII_M
 from su3d_bench.metrics.metric import Counts, SceneScore
@@ -232,6 +232,5 @@ def _of_protocol(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> Mend
     kinds = EXPLAINED[rules.kind][0]
     alone = {kind: counts(kind) for kind in kinds}
     n = {kind: scores[f"{rules.name} {kind}"].n_predictions for kind in kinds}
-    if isinstance(as_is, InstanceCounts):
-        return Mended(as_is, alone, everything, n, labelled)
-    return MendedPoints(as_is, alone, everything, labelled, n, scores[f"{rules.name} {AS_IS}"].n_scored)
+    n_scored = None if isinstance(as_is, InstanceCounts) else scores[f"{rules.name} {AS_IS}"].n_scored
+    return Mended(as_is, alone, everything, n, labelled, n_scored)

@@ -38,7 +38,6 @@ from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
 from su3d_bench.core.types import Float32Array, Frame, Int64Array
 from su3d_bench.metrics.attribution.arrays import LookedAt, SceneOfMasks
 from su3d_bench.metrics.matching.labelling import (
-    candidate_classes,
     class_index_of_ids,
     classes_of_prediction,
     cosines,
@@ -369,8 +368,7 @@ def shown_classes(
     if isinstance(prediction, DenseFeatures):
         prediction = DenseFeatures(cloud.points, np.asarray(prediction.features[cloud.rows]))
     is_present = scored_classes(rules) if truth is None else present(truth, len(rules.classes))
-    candidates = candidate_classes(rules, is_present & scored_classes(rules))
-    called = classes_of_prediction(rules, prediction, spaces.naming(run, prediction), candidates)
+    called = classes_of_prediction(rules, prediction, spaces.naming(run, prediction), is_present)
     return np.where(has_feature(prediction), called, -1) if isinstance(prediction, DenseFeatures) else called
 
 

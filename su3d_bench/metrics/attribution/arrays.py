@@ -12,11 +12,10 @@ from functools import cached_property
 from typing import Any, Generic, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
-from su3d_bench.core.types import BoolArray, GroundTruth, Int64Array
+from su3d_bench.core.types import BoolArray, GroundTruth, Int64Array, IntArray
 from su3d_bench.metrics.attribution import masks as corrections
 from su3d_bench.metrics.attribution.masks import CAUSES, LabelledPoints, MaskError, causes_of, find_errors, repaired
 from su3d_bench.metrics.attribution.overlaps import (
@@ -34,11 +33,8 @@ from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import class_index_of_ids
 from su3d_bench.metrics.metric import C, Metric, Values
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.semantic import confusion
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
 from su3d_bench.metrics.semantic.score import SemanticMetric, call_points, transfer_votes
-
-IntArray = NDArray[np.integer[Any]]
 
 
 @dataclass(frozen=True)
@@ -65,10 +61,9 @@ class SingleError:
 class Pool(Generic[C]):
     """The counts of all scenes under a protocol, of which those of one scene are to change."""
 
-    def __init__(self, metric: Metric[C], mine: C, others: Sequence[C], summed: Callable[[Sequence[C]], C]) -> None:
-        self.metric, self.mine, self._sum = metric, mine, summed
+    def __init__(self, metric: Metric[C], mine: C, others: Sequence[C]) -> None:
+        self.metric, self.mine, self._others = metric, mine, others
         self.is_pooled = metric.rules.aggregate == "pooled"
-        self._others = others
         self.before = self.values(mine)
 
     def values(self, mine: C) -> Values:
@@ -80,7 +75,7 @@ class Pool(Generic[C]):
     @cached_property
     def others(self) -> Sequence[C]:
         """What joins the counts of the scene before ratios are formed: those of all other scenes as one, or nothing."""
-        return [self._sum(self._others)] if self.is_pooled and self._others else []
+        return [type(self.mine).joined(self._others)] if self.is_pooled and self._others else []
 
     @cached_property
     def _n_scenes(self) -> Mapping[str, int]:
@@ -165,7 +160,7 @@ def _values_after(pool: Pool[InstanceCounts], mended: Sequence[Mapping[int, Inst
             if index not in others:
                 others[index] = [instance_ap.only(one, index) for one in pool.others]
             alone = replace(counts, class_index=np.zeros_like(counts.class_index))
-            changed.append(instance_ap.concatenate([alone, *others[index]]))
+            changed.append(InstanceCounts.joined([alone, *others[index]]))
     curves = iter(instance_ap.combine_each(changed, thresholds) if changed else [])
     for of_classes in mended:
         table = before.copy()
@@ -295,7 +290,7 @@ def _object_ids(rules: ProtocolRules, truth: GroundTruth) -> Int64Array:
     return np.where(instance > 0, instance, instance.max(initial=0) + 2 + class_index_of_ids(rules, truth.semantic))
 
 
-MendedScene = corrections.Mended | corrections.MendedPoints
+MendedScene = corrections.Mended[InstanceCounts] | corrections.Mended[SemanticCounts]
 Errors = tuple[int, Sequence[SingleError]]
 
 
@@ -347,7 +342,7 @@ class SceneOfMasks:
         return replace(mended, with_true_labels=corrections.count_masks(self._values, relabelled, self._scoring))
 
     def errors(self, rules: ProtocolRules, counts: Any, others: Sequence[Any], most: int) -> Errors:
-        pool = Pool[InstanceCounts](InstanceMetric(rules), counts, others, instance_ap.concatenate)
+        pool = Pool[InstanceCounts](InstanceMetric(rules), counts, others)
         found = single_mask_errors(self._values, self.overlaps, self._scoring, pool)
         first = rules.headline[0]
         return len(found), sorted(found, key=lambda error: -error.gains[first])[:most]
@@ -374,7 +369,7 @@ class SceneOfPoints:
 
     def errors(self, rules: ProtocolRules, counts: Any, others: Sequence[Any], most: int) -> Errors:
         scored = self.scored
-        pool = Pool[SemanticCounts](SemanticMetric(rules), counts, others, confusion.concatenate)
+        pool = Pool[SemanticCounts](SemanticMetric(rules), counts, others)
         return single_point_errors(scored.points, scored.is_counted, pool, has_masks=scored.has_masks, most=most)
 
     def class_name(self, number: int) -> str:

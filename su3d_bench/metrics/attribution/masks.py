@@ -38,6 +38,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Generic
 
 import numpy as np
 
@@ -53,35 +54,32 @@ from su3d_bench.metrics.attribution.overlaps import (
 )
 from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
+from su3d_bench.metrics.metric import C
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
-
-__all__ = [
-    "KINDS", "Errors", "LabelledMasks", "MaskError", "Mended", "Repair", "ScoringRules", "count_masks", "errors_of",
-    "find_errors", "mend_scene", "repaired", "with_true_labels",
-]  # fmt: skip
 
 KINDS = ("merged", "split", "duplicate", "mislabelled", "background", "missed")
 
 
 @dataclass(frozen=True)
-class Mended:
-    """A scene's counts as they are, after each mending alone and after ``all``; ``n`` errors of each kind.
+class Mended(Generic[C]):
+    """A scene's counts as they are, after each mending alone and after ``all``; ``n`` errors, or points, of each kind.
 
-    ``with_true_labels``: each mask named by the truth, where labels count. Points are not counted here.
+    ``with_true_labels``: each mask named by the truth, nothing else changed; None without masks or where no label
+    counts. ``n_scored`` points in all, None where errors are of masks.
     """
 
-    as_is: InstanceCounts
-    alone: Mapping[str, InstanceCounts]
-    all: InstanceCounts
+    as_is: C
+    alone: Mapping[str, C]
+    all: C
     n: Mapping[str, int]
-    with_true_labels: InstanceCounts | None = None
+    with_true_labels: C | None = None
     n_scored: int | None = None
 
 
 def mend_scene(
     truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules, overlaps: Overlaps | None = None
-) -> Mended:
+) -> Mended[InstanceCounts]:
     """The counts of one scene with its errors mended; ``truth`` (N,) is label * 1000 + instance, 0 where void.
 
     ``overlaps`` of the predictions with it, where they were measured before.
@@ -404,30 +402,14 @@ def _most_frequent(key: Int64Array, value: Int64Array, n_keys: int) -> Int64Arra
     return answer
 
 
-@dataclass(frozen=True)
-class MendedPoints:
-    """A scene's counts as they are, after each cause alone is mended, after ``all``, and with the truth's labels.
-
-    ``with_true_labels``: each mask called by the class that most of its points have, nothing else changed; None
-    without masks. ``n`` points of each cause, ``n_scored`` in all.
-    """
-
-    as_is: SemanticCounts
-    alone: Mapping[str, SemanticCounts]
-    all: SemanticCounts
-    with_true_labels: SemanticCounts | None
-    n: Mapping[str, int]
-    n_scored: int
-
-
-def mend_points(points: LabelledPoints, is_counted: BoolArray, *, has_masks: bool = True) -> MendedPoints:
+def mend_points(points: LabelledPoints, is_counted: BoolArray, *, has_masks: bool = True) -> Mended[SemanticCounts]:
     """The counts of one scene with its errors mended; ``is_counted`` (C,) marks the classes of the confusion matrix."""
     cause = causes_of(points, has_masks=has_masks)
 
     def count(predicted: Int64Array) -> SemanticCounts:
         return semantic.per_scene(points.true_class, predicted, is_counted)
 
-    return MendedPoints(
+    return Mended(
         as_is=count(points.predicted),
         alone={name: count(np.where(cause == k, points.true_class, points.predicted)) for k, name in enumerate(CAUSES)},
         all=count(np.where(cause >= 0, points.true_class, points.predicted)),

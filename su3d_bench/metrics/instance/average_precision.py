@@ -11,15 +11,13 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array
-from su3d_bench.metrics.metric import Arrays, Counts
+from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array, IntArray
+from su3d_bench.metrics.metric import ROWS, Counts, axes
 from su3d_bench.numerics.statistics import row_means
 
 _SPLITTER = 134217729.0  # 2**27 + 1: Veltkamp's constant, cuts a double into two halves of 26 bits
@@ -174,8 +172,6 @@ THRESHOLDS: tuple[float, ...] = (*(float(t) for t in np.arange(0.5, 0.95, 0.05))
 MIN_REGION_SIZE = 100  # points; the official script's --min_region_size, opt.min_region_sizes
 INSTANCES_PER_CLASS = 1000  # ground truth is label * 1000 + instance
 
-IntArray = NDArray[np.integer[Any]]
-
 
 @dataclass(frozen=True)
 class InstanceCounts(Counts):
@@ -188,25 +184,15 @@ class InstanceCounts(Counts):
     """
 
     stored_as = "instance"
-    arrays: ClassVar[Arrays] = {
-        "class_index": ("i", ("rows",)),
-        "threshold_index": ("i", ("rows",)),
-        "score": ("f", ("rows",)),
-        "is_true": ("b", ("rows",)),
-        "n_missed": ("i", ("classes", "thresholds")),
-        "n_truth": ("i", ("classes",)),
-        "n_small_truth": ("i", ("classes",)),
-        "n_predictions": ("i", ("classes",)),
-    }
 
-    class_index: Int32Array
-    threshold_index: Int32Array
-    score: Float64Array
-    is_true: BoolArray
-    n_missed: Int64Array
-    n_truth: Int64Array
-    n_small_truth: Int64Array
-    n_predictions: Int64Array
+    class_index: Int32Array = field(metadata=axes(ROWS))
+    threshold_index: Int32Array = field(metadata=axes(ROWS))
+    score: Float64Array = field(metadata=axes(ROWS))
+    is_true: BoolArray = field(metadata=axes(ROWS))
+    n_missed: Int64Array = field(metadata=axes("classes", "thresholds"))
+    n_truth: Int64Array = field(metadata=axes("classes"))
+    n_small_truth: Int64Array = field(metadata=axes("classes"))
+    n_predictions: Int64Array = field(metadata=axes("classes"))
 
     def contradiction(self) -> str | None:
         """Rows beyond the classes or thresholds, scores without an order, other instances than met and missed ones."""
@@ -222,9 +208,6 @@ class InstanceCounts(Counts):
             return None
         row, column = wrong[0]
         return f"'n_truth' of class {row} is {self.n_truth[row]}, met and missed are {known[row, column]}"
-
-
-_ROWS = [name for name, (_, axes) in InstanceCounts.arrays.items() if axes == ("rows",)]
 
 
 @dataclass(frozen=True)
@@ -245,11 +228,6 @@ class InstanceAP:
         row = self.table[index]
         at_50, at_25 = self.thresholds.index(0.5), self.thresholds.index(0.25)
         return float(np.average(row[ap_columns(self.thresholds)][None, :])), float(row[at_50]), float(row[at_25])
-
-    def of_group(self, members: Sequence[int]) -> tuple[float, float, float]:
-        """AP, AP50 and AP25 averaged over the classes ``members`` that have ground truth; NaN where none has."""
-        rows = np.array([self.of_class(index) for index in members]).reshape(-1, 3)
-        return _nanmean(rows[:, 0]), _nanmean(rows[:, 1]), _nanmean(rows[:, 2])
 
 
 def ap_columns(thresholds: Sequence[float]) -> Int64Array:
@@ -313,22 +291,17 @@ def last_line_of_each_mask_file(files: Sequence[str]) -> list[tuple[int, int]]:
 
 def stacked(parts: Sequence[InstanceCounts]) -> InstanceCounts:
     """The counts of classes one after another."""
-    names = InstanceCounts.arrays
-    return InstanceCounts(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
-
-
-def concatenate(counts: Sequence[InstanceCounts]) -> InstanceCounts:
-    """The counts of several scenes as one: rows one after another, numbers summed."""
-    columns = {name: [getattr(of_scene, name) for of_scene in counts] for name in InstanceCounts.arrays}
-    return InstanceCounts(
-        **{name: np.concatenate(each) if name in _ROWS else np.sum(each, axis=0) for name, each in columns.items()}
-    )
+    names = InstanceCounts.arrays()
+    return InstanceCounts(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def only(counts: InstanceCounts, index: int) -> InstanceCounts:
     """The counts of one class alone."""
     rows = np.flatnonzero(counts.class_index == index)
-    own = {name: getattr(counts, name)[rows if name in _ROWS else [index]] for name in InstanceCounts.arrays}
+    own = {
+        name: getattr(counts, name)[rows if names == (ROWS,) else [index]]
+        for name, (_, names) in InstanceCounts.arrays().items()
+    }
     return InstanceCounts(**own | {"class_index": np.zeros(len(rows), np.int32)})
 
 
@@ -343,9 +316,7 @@ def combine(counts: Sequence[InstanceCounts], thresholds: Sequence[float] = THRE
     >>> combine([hit, miss]).ap
     0.5
     """
-    if not counts:
-        raise ValueError("combine needs the counts of at least one scene")
-    return combine_each([concatenate(counts)], thresholds)[0]
+    return combine_each([InstanceCounts.joined(counts)], thresholds)[0]
 
 
 def combine_each(counts: Sequence[InstanceCounts], thresholds: Sequence[float] = THRESHOLDS) -> list[InstanceAP]:

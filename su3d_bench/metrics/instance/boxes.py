@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import permutations
-from typing import ClassVar
 
 import numpy as np
 
@@ -14,16 +13,11 @@ from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Partition
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int32Array, Int64Array, OrientedBox
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE, masks_and_scores
-from su3d_bench.metrics.matching.labelling import (
-    candidate_classes,
-    class_index_of_ids,
-    classes_of_prediction,
-    encoder_warning,
-    scored_classes,
-)
-from su3d_bench.metrics.metric import Arrays, Counts, Metric, Pooled, SceneScore, Values, present
+from su3d_bench.metrics.matching import labelling
+from su3d_bench.metrics.matching.nearest import Points
+from su3d_bench.metrics.metric import ROWS, Counts, Metric, Pooled, SceneScore, Values, axes, first_row, present
 from su3d_bench.metrics.protocols.model import BOX_AXES
-from su3d_bench.numerics.statistics import row_means
+from su3d_bench.numerics.statistics import ratio, row_means
 
 # A cube of half sides 1 in six tetrahedra (6, 4, 3): one for each order in which its axes lead from corner to corner.
 _TETRAHEDRA: Float64Array = np.array(
@@ -40,6 +34,12 @@ def smallest_box(points: Float64Array, rotation: Float64Array) -> OrientedBox:
     along_axes = rotation.T @ points.T  # (3, N): each axis in one piece, which takes a fraction of the time of (N, 3)
     low, high = along_axes.min(axis=1), along_axes.max(axis=1)
     return OrientedBox(rotation @ ((low + high) / 2), high - low, rotation)
+
+
+def box_around(points: Points) -> Float64Array:
+    """The lowest and the highest corner (2, 3) of the smallest box around points (N, 3) along the axes of the world."""
+    known = np.asarray(points, np.float64)
+    return np.stack([known.min(axis=0), known.max(axis=0)])
 
 
 def box_iou(first: OrientedBox, second: OrientedBox) -> float:
@@ -82,8 +82,7 @@ def _cut(parts: Float64Array, inside: Float64Array) -> Float64Array:
     def crossing(rows: np.ndarray, near: int, far: int) -> Float64Array:
         """Where the edges from the corners ``near`` to the corners ``far`` leave."""
         share = inside[rows, near] / (inside[rows, near] - inside[rows, far])
-        point: Float64Array = parts[rows, near] + share[:, None] * (parts[rows, far] - parts[rows, near])
-        return point
+        return np.asarray(parts[rows, near] + share[:, None] * (parts[rows, far] - parts[rows, near]))
 
     one, two, three = (np.flatnonzero(n_inside == n) for n in (1, 2, 3))
     left.append(np.stack([parts[one, 0], *(crossing(one, 0, far) for far in (1, 2, 3))], axis=1))
@@ -118,23 +117,14 @@ class BoxCounts(Counts):
     """
 
     stored_as = "boxes"
-    arrays: ClassVar[Arrays] = {
-        "class_index": ("i", ("rows",)),
-        "score": ("f", ("rows",)),
-        "is_true": ("b", ("rows", "thresholds")),
-        "n_truth": ("i", ("classes",)),
-        "n_centred": ("i", ("classes",)),
-        "n_located": ("i", ("classes",)),
-        "n_named": ("i", ("classes",)),
-    }
 
-    class_index: Int32Array
-    score: Float64Array
-    is_true: BoolArray
-    n_truth: Int64Array
-    n_centred: Int64Array
-    n_located: Int64Array
-    n_named: Int64Array
+    class_index: Int32Array = field(metadata=axes(ROWS))
+    score: Float64Array = field(metadata=axes(ROWS))
+    is_true: BoolArray = field(metadata=axes(ROWS, "thresholds"))
+    n_truth: Int64Array = field(metadata=axes("classes"))
+    n_centred: Int64Array = field(metadata=axes("classes"))
+    n_located: Int64Array = field(metadata=axes("classes"))
+    n_named: Int64Array = field(metadata=axes("classes"))
 
     def contradiction(self) -> str | None:
         """Rows beyond the classes, scores without an order, more boxes found or named than there are or can be."""
@@ -269,26 +259,19 @@ def _curves(
     return np.where(n_truth > 0, area, np.nan), np.where(n_truth > 0, recall, np.nan)
 
 
-def share_values(counts: Sequence[BoxCounts], weights: Int64Array) -> dict[str, tuple[Int64Array, Int64Array]]:
+def share_values(counts: Sequence[BoxCounts], weights: Int64Array) -> dict[str, tuple[Float64Array, Float64Array]]:
     """The numerator and denominator (R, C) of the shares ``centroid``, ``class`` and precision at each threshold."""
-    drawn = {
-        name: weights @ np.stack([getattr(of_scene, name) for of_scene in counts])
-        for name in ("n_truth", "n_centred", "n_located", "n_named")
-    }
+    drawn = BoxCounts.drawn(counts, weights, "n_truth", "n_centred", "n_located", "n_named")
     n_classes = drawn["n_truth"].shape[1]
 
-    def rows(which: Sequence[BoolArray]) -> Int64Array:
-        each = [
-            np.bincount(of_scene.class_index[chosen], minlength=n_classes)
-            for of_scene, chosen in zip(counts, which, strict=True)
-        ]
-        drawn_rows: Int64Array = weights @ np.stack(each).astype(np.int64)
-        return drawn_rows
+    def rows(classes: Sequence[Int32Array]) -> Float64Array:
+        each = [np.bincount(of_scene, minlength=n_classes) for of_scene in classes]
+        return weights.astype(np.float64) @ np.stack(each).astype(np.float64)
 
-    n_rows = rows([np.ones(len(of_scene.score), bool) for of_scene in counts])
+    n_rows = rows([c.class_index for c in counts])
     shares = {"centroid": (drawn["n_centred"], drawn["n_truth"]), "class": (drawn["n_named"], drawn["n_located"])}
     for t, place in enumerate(PLACES):
-        shares[f"precision{place}"] = rows([of_scene.is_true[:, t] for of_scene in counts]), n_rows
+        shares[f"precision{place}"] = rows([c.class_index[c.is_true[:, t]] for c in counts]), n_rows
     return shares
 
 
@@ -312,12 +295,10 @@ class BoxMetric(Metric[BoxCounts]):
             raise DataError(f"{rules.name}: the truth '{truth.variant}' has no boxes")
         boxes = list(truth.boxes.boxes.values())
         ids = np.array([truth.boxes.class_of_instance[instance] for instance in truth.boxes.boxes], np.int64)
-        known = class_index_of_ids(rules, ids)
-        is_scored = scored_classes(rules)
-        # of each class its place among the scored ones; -1 for one that is not, and at the end for no class
-        place = np.append(np.where(is_scored, np.cumsum(is_scored) - 1, -1), -1)
-        is_present = present(known, len(rules.classes)) & is_scored
-        called = place[classes_of_prediction(rules, prediction, encoder, candidate_classes(rules, is_present))]
+        known = labelling.class_index_of_ids(rules, ids)
+        place = labelling.places_among_scored(rules)
+        is_present = present(known, len(rules.classes))
+        called = place[labelling.classes_of_prediction(rules, prediction, encoder, is_present)]
         masks, scores = masks_and_scores(prediction)
         scores = np.ones(len(scores)) if rules.confidence == "ones" else scores
         kept = np.flatnonzero(masks.sizes >= rules.min_region_size)
@@ -325,48 +306,36 @@ class BoxMetric(Metric[BoxCounts]):
         wanted = np.flatnonzero(place[known] >= 0)
         iou, holds_centroid = _meet(shapes, [boxes[g] for g in wanted], rules.box_axes)
         counts = count_boxes(iou, holds_centroid, place[known[wanted]], called[kept], scores[kept], len(rules.scored))
-        warnings = [encoder_warning(rules, prediction, encoder), _constant_warning(scores[kept])]
+        warnings = [labelling.encoder_warning(rules, prediction, encoder), _constant_warning(scores[kept])]
         # the sides of a box are no surface that a map should have: there is no coverage
         return self.score(counts, prediction, np.zeros(0), warnings)
 
     def pooled(self, counts: Sequence[BoxCounts]) -> Pooled:
-        of_class = self._of_classes(counts, np.ones((1, len(counts)), np.int64))
-        classes = {
-            entry.name: {name: float(table[0, c]) for name, table in of_class.items()}
-            for c, entry in enumerate(self.rules.scored)
-        }
-        return Pooled(self.combine(counts), classes)
+        tables = self._of_classes(counts, np.ones((1, len(counts)), np.int64))
+        columns = self.class_columns(tables, np.ones(len(self.rules.scored), bool))
+        return Pooled(self.combine(counts), {name: first_row(values) for name, values in columns.items()})
 
     def combine(self, counts: Sequence[BoxCounts]) -> Values:
-        once = np.ones((1, len(counts)), np.int64)
-        return {name: float(value[0]) for name, value in self.resampled(counts, once).items()}
+        return self.values_once(counts)
 
     def resampled(self, counts: Sequence[BoxCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
         values = {name: row_means(table) for name, table in class_values(counts, weights).items()}
         for name, (part, whole) in share_values(counts, weights).items():
-            values[name] = _share(part.sum(axis=1), whole.sum(axis=1))
+            values[name] = ratio(part.sum(axis=1), whole.sum(axis=1))
         return {name: values[name] for name in self.rules.value_names}
 
     def resampled_classes(self, counts: Sequence[BoxCounts], weights: Int64Array) -> dict[str, dict[str, Float64Array]]:
         tables = self._of_classes(counts, weights)
         has_truth = np.any([of_scene.n_truth > 0 for of_scene in counts], axis=0)
-        return {
-            entry.name: {name: tables[name][:, c] for name in self.rules.headline}
-            for c, entry in enumerate(self.rules.scored)
-            if has_truth[c]
-        }
+        return self.class_columns({name: tables[name] for name in self.rules.headline}, has_truth)
 
     def _of_classes(self, counts: Sequence[BoxCounts], weights: Int64Array) -> dict[str, Float64Array]:
         """Each value (R, C) of each class alone; NaN where a draw has no true box of it."""
+        shares = share_values(counts, weights)
+        has_truth = shares["centroid"][1] > 0
         tables = class_values(counts, weights)
-        shares = {name: _share(*parts) for name, parts in share_values(counts, weights).items()}
-        has_truth = weights @ np.stack([of_scene.n_truth for of_scene in counts]) > 0
-        tables |= {name: np.where(has_truth, table, np.nan) for name, table in shares.items()}
+        tables |= {name: np.where(has_truth, ratio(*parts), np.nan) for name, parts in shares.items()}
         return {name: tables[name] for name in self.rules.value_names}
-
-
-def _share(part: Int64Array, whole: Int64Array) -> Float64Array:
-    return np.where(whole > 0, part / np.maximum(whole, 1), np.nan)
 
 
 def _constant_warning(scores: Float64Array) -> str | None:

@@ -12,17 +12,10 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.maps import Masks
-from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
-from su3d_bench.metrics.instance.average_precision import (
-    INSTANCES_PER_CLASS,
-    MIN_REGION_SIZE,
-    THRESHOLDS,
-    InstanceCounts,
-    IntArray,
-    stacked,
-)
+from su3d_bench.core.types import BoolArray, Float64Array, Int64Array, IntArray
+from su3d_bench.metrics.instance import average_precision as instance_ap
 
-_MAX_VALUE = 10_000 * INSTANCES_PER_CLASS  # ScanNet's largest label is 1357
+_MAX_VALUE = 10_000 * instance_ap.INSTANCES_PER_CLASS  # ScanNet's largest label is 1357
 
 
 def per_scene(
@@ -32,11 +25,11 @@ def per_scene(
     labels: IntArray | None,
     scores: Float64Array,
     class_ids: Sequence[int],
-    min_region_size: int = MIN_REGION_SIZE,
-    thresholds: Sequence[float] = THRESHOLDS,
+    min_region_size: int = instance_ap.MIN_REGION_SIZE,
+    thresholds: Sequence[float] = instance_ap.THRESHOLDS,
     *,
     forgives_void: bool = True,
-) -> InstanceCounts:
+) -> instance_ap.InstanceCounts:
     """The additive counts of one scene.
 
     ``ground_truth`` (N,) holds label * 1000 + instance a point, 0 where unannotated; prediction k covers the points
@@ -57,9 +50,9 @@ def per_scene(
     >>> counts.n_predictions.tolist(), counts.is_true.tolist()
     ([2, 2], [True, False, True, False, True, False, True, False])
     """
-    _check_predictions(ground_truth, indptr, indices, len(scores) if labels is None else len(labels), scores)
+    _check_predictions(len(ground_truth), indptr, indices, len(scores) if labels is None else len(labels), scores)
     classes = class_overlaps(ground_truth, indptr, indices, labels, class_ids, min_region_size)
-    return stacked(
+    return instance_ap.stacked(
         [one.counts(index, scores, thresholds, forgives_void=forgives_void) for index, one in enumerate(classes)]
     )
 
@@ -80,7 +73,7 @@ class ClassOverlaps:
 
     def counts(
         self, class_index: int, scores: Float64Array, thresholds: Sequence[float], *, forgives_void: bool
-    ) -> InstanceCounts:
+    ) -> instance_ap.InstanceCounts:
         """The counts of the class; ``scores`` (K,) are those of all masks in line."""
         return count_class(
             class_index,
@@ -129,7 +122,7 @@ def overlaps_of_class(
     min_region_size: int,
 ) -> ClassOverlaps:
     """The ``predictions`` (R,) of one class; ``intersection`` (R, S) with all segments, by ascending value."""
-    segment_label = segment_value // INSTANCES_PER_CLASS
+    segment_label = segment_value // instance_ap.INSTANCES_PER_CLASS
     columns = np.flatnonzero(segment_label == class_id)  # ascending value, as the original walks them
     n_void = intersection[:, ~np.isin(segment_label, class_ids)].sum(axis=1)
     shared, is_small = intersection[:, columns], segment_size[columns] < min_region_size
@@ -149,7 +142,7 @@ def count_class(
     scores: Float64Array,
     ignored_share: Float64Array,
     thresholds: Sequence[float],
-) -> InstanceCounts:
+) -> instance_ap.InstanceCounts:
     """The counts of one class: ``iou`` (R, G) of its predictions, in line order, with its instances, ascending."""
     limits, n_objects = np.array(thresholds, np.float64)[:, None], int(takes_part.sum())
     # a prediction that met any instance of its class, even a small or a taken one, is no false positive here
@@ -169,7 +162,7 @@ def count_class(
         order = np.argsort(at, kind="stable")
         at, score = at[order], np.concatenate([np.array([score for _, score, _ in rows]), score])[order]
         is_true = np.concatenate([np.array([is_hit for _, _, is_hit in rows]), is_true])[order]
-    return InstanceCounts(
+    return instance_ap.InstanceCounts(
         class_index=np.full(len(at), class_index, np.int32),
         threshold_index=at.astype(np.int32),
         score=score.astype(np.float64, copy=False),
@@ -208,33 +201,20 @@ def met_instances(over: BoolArray, takes_part: BoolArray) -> Iterator[tuple[int,
 
 
 def _check_predictions(
-    ground_truth: IntArray, indptr: IntArray, indices: IntArray, n_predictions: int, scores: Float64Array
+    n_points: int, indptr: IntArray, indices: IntArray, n_predictions: int, scores: Float64Array
 ) -> None:
-    n_points = len(ground_truth)
-    if len(indptr) != n_predictions + 1 or len(scores) != n_predictions:
-        raise PredictionError(
-            f"{n_predictions} labels, {len(indptr) - 1} masks, {len(scores)} scores; they must pair up"
-        )
-    # the original ranks inf above all numbers; here it is taken for an overflow, in which order was lost (README.md)
-    if not np.isfinite(scores).all():
-        bad = int(np.flatnonzero(~np.isfinite(scores))[0])
-        raise PredictionError(f"instance {bad}: its confidence is {scores[bad]}; confidences are finite numbers")
-    if len(indices):
-        starts = np.zeros(len(indices), bool)
-        starts[indptr[:-1][indptr[:-1] < len(indices)]] = True
-        unsorted = np.flatnonzero((np.diff(indices) <= 0) & ~starts[1:])
-        if len(unsorted):
-            owner = int(np.searchsorted(indptr, unsorted[0], side="right") - 1)
-            raise PredictionError(
-                f"instance {owner}: its point indices are not strictly ascending; sort them, each once"
-            )
-        if indices.min() < 0 or indices.max() >= n_points:
-            worst = int(np.flatnonzero((indices < 0) | (indices >= n_points))[0])
-            owner = int(np.searchsorted(indptr, worst, side="right") - 1)
-            raise PredictionError(
-                f"instance {owner}: mask holds index {int(indices[worst])}, the scene has {n_points} points "
-                f"(0..{n_points - 1})"
-            )
+    """A ``PredictionError`` for masks that no reader and no ``Instances.of`` gives.
+
+    The original ranks a confidence of infinity above all numbers; here it is taken for an overflow, in which order was
+    lost (README.md).
+    """
+    if len(indptr) != n_predictions + 1 or len(scores) != n_predictions or not np.isfinite(scores).all():
+        raise PredictionError(f"{n_predictions} masks: need as many labels, and confidences that are finite numbers")
+    rises = np.diff(indices) > 0
+    starts = indptr[1:-1]
+    rises[starts[(starts > 0) & (starts < len(indices))] - 1] = True
+    if not rises.all() or indices.min(initial=0) < 0 or indices.max(initial=-1) >= n_points:
+        raise PredictionError(f"{n_predictions} masks: need ascending point indices, each once, below {n_points}")
 
 
 def segments_of(ground_truth: IntArray) -> tuple[Int64Array, Int64Array, Int64Array]:
@@ -252,7 +232,11 @@ def segments_of(ground_truth: IntArray) -> tuple[Int64Array, Int64Array, Int64Ar
 
 
 def intersections(
-    segment_of_point: Int64Array, n_segments: int, indptr: IntArray, indices: IntArray, kept: Int64Array
+    segment_of_point: Int64Array,
+    n_segments: int,
+    indptr: IntArray,
+    indices: IntArray,
+    kept: Int64Array,
 ) -> Int64Array:
     """Points that prediction ``kept[r]`` shares with each segment, (R, n_segments), by one bincount."""
     size = np.diff(indptr)

@@ -4,37 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Masks, Partition
-from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array
+from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array, IntArray
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.average_precision import InstanceAP, InstanceCounts, resampled_ap
+from su3d_bench.metrics.matching import labelling
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.checks import duplicate_pairs
-from su3d_bench.metrics.matching.labelling import (
-    candidate_classes,
-    class_index_of_ids,
-    classes_of_prediction,
-    encoder_warning,
-    scored_classes,
-)
 from su3d_bench.metrics.metric import C, Metric, Pooled, SceneScore, Values, n_predictions, present
 from su3d_bench.metrics.protocols.kinds import AP_NAMES
 from su3d_bench.metrics.protocols.model import ProtocolRules, TransferRules
-
-IntArray = NDArray[np.integer[Any]]
 
 CONSTANT_CONFIDENCE = "every confidence is"
 DUPLICATE_IOU = 0.9  # pairs above it are the same object twice; duplicates can raise AP under constant confidences
 OBJECT = 1  # the one label that all have where the protocol has no classes
 NO_OBJECT = 0
+AP_COLUMNS = {name: name for name in AP_NAMES}
 
 
 class CurveMetric(Metric[InstanceCounts]):
@@ -48,23 +39,13 @@ class CurveMetric(Metric[InstanceCounts]):
 
     def pooled(self, counts: Sequence[InstanceCounts]) -> Pooled:
         curve = instance_ap.combine(counts, self.rules.thresholds)
-        of_class = {name: _named(curve.of_class(index)) for index, name in enumerate(self.rules.curve_names)}
-        return Pooled(_ap_values(curve), of_class, self._groups(curve), self._warnings(counts))
-
-    def _groups(self, curve: InstanceAP) -> dict[str, Values]:
-        """The mean of each group over those of its classes that have a value."""
-        members: dict[str, list[int]] = {}
-        for index, entry in enumerate(() if self.rules.class_agnostic is not None else self.rules.scored):
-            if entry.group:
-                members.setdefault(entry.group, []).append(index)
-        return {name: _named(curve.of_group(indices)) for name, indices in members.items()}
-
-    def _warnings(self, counts: Sequence[InstanceCounts]) -> tuple[str, ...]:
-        whole = instance_ap.concatenate(counts)
-        small = np.flatnonzero((whole.n_truth == 0) & (whole.n_small_truth > 0))
+        classes = {name: _named(curve.of_class(index)) for index, name in enumerate(self.rules.curve_names)}
+        groups = self.group_means(classes, AP_COLUMNS) if self.rules.class_agnostic is None else {}
+        n_truth, n_small_truth = (sum(getattr(c, name) for c in counts) for name in ("n_truth", "n_small_truth"))
+        small = np.flatnonzero((n_truth == 0) & (n_small_truth > 0))
         names = ", ".join(f"'{self.rules.curve_names[index]}'" for index in small)
-        size = self.rules.min_region_size
-        return (f"not scored, because no scene has an instance of {size} points: {names}",) if names else ()
+        warning = f"not scored, because no scene has an instance of {self.rules.min_region_size} points: {names}"
+        return Pooled(_ap_values(curve), classes, groups, (warning,) if names else ())
 
     def combine(self, counts: Sequence[InstanceCounts]) -> Values:
         return _ap_values(instance_ap.combine(counts, self.rules.thresholds))
@@ -118,7 +99,7 @@ class InstanceMetric(CurveMetric):
             forgives_void=rules.void is None,
         )
         wanted = np.isin(scored.values // instance_ap.INSTANCES_PER_CLASS, scored.class_ids)
-        warnings = [None if rules.class_agnostic else encoder_warning(rules, prediction, encoder)]
+        warnings = [None if rules.class_agnostic else labelling.encoder_warning(rules, prediction, encoder)]
         warnings += _mask_warnings(rules, truth, scored)
         return score_of_masks(self, counts, prediction, truth.points, wanted, warnings)
 
@@ -194,8 +175,8 @@ def named_classes(
     rules: ProtocolRules, semantic: IntArray, prediction: Instances | Partition, encoder: Encoder | None
 ) -> Int64Array:
     """The class id (K,) that each mask is called in a scene with the class ids ``semantic`` (N,), 0 for none."""
-    is_present = present(class_index_of_ids(rules, semantic), len(rules.classes)) & scored_classes(rules)
-    classes = classes_of_prediction(rules, prediction, encoder, candidate_classes(rules, is_present))
+    is_present = present(labelling.class_index_of_ids(rules, semantic), len(rules.classes))
+    classes = labelling.classes_of_prediction(rules, prediction, encoder, is_present)
     ids = np.array([entry.id for entry in rules.classes], np.int64)
     return np.where(classes >= 0, ids[classes], 0)
 
@@ -223,8 +204,8 @@ def encode_without_classes(rules: ProtocolRules, semantic: IntArray, instance: I
         return values
     label = np.asarray(semantic, np.int64)
     if rules.class_agnostic == "scored":
-        label = class_index_of_ids(rules, label)
-        values[~np.append(scored_classes(rules), False)[label]] = 0
+        label = labelling.class_index_of_ids(rules, label)
+        values[~np.append(labelling.scored_classes(rules), False)[label]] = 0
     is_object = values > 0
     key = label[is_object] * instance_ap.INSTANCES_PER_CLASS + np.asarray(instance)[is_object]
     distinct, number = np.unique(key, return_inverse=True)

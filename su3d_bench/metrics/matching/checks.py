@@ -117,31 +117,22 @@ def empty_warnings(scene: str, facts: MaskFacts, masks: Masks, keys: Sequence[st
     if not facts.n_empty:
         return []
     first = int(np.flatnonzero(masks.sizes == 0)[0])
-    return [f"{scene}: {_number(facts.n_empty, 'empty mask')}, the first is mask {first}{_key(keys, first)}"]
+    return [f"{scene}: {counted(facts.n_empty, 'empty mask')}, the first is mask {first}{_key(keys, first)}"]
 
 
 def duplicate_warnings(scene: str, facts: MaskFacts, keys: Sequence[str]) -> list[str]:
     """Sentences on masks that are there twice, with the number of pairs and the first of them."""
     lines = []
-    for pairs, what in ((facts.identical, "identical masks"), (_only(facts.near, facts.identical), "near-duplicates")):
+    identical = set(facts.identical)
+    only_near = tuple(pair for pair in facts.near or () if pair not in identical)
+    for pairs, what in ((facts.identical, "identical masks"), (only_near, "near-duplicates")):
         if pairs:
             first, other = pairs[0]
             names = f"{first}{_key(keys, first)} and {other}{_key(keys, other)}"
-            lines.append(f"{scene}: {_number(len(pairs), 'pair')} of {what}, the first is {names}; they can move AP")
+            lines.append(f"{scene}: {counted(len(pairs), 'pair')} of {what}, the first is {names}; they can move AP")
     if facts.near is None:
         lines.append(f"{scene}: the masks overlap so much that duplicates were not looked for")
     return lines
-
-
-def _only(
-    near: tuple[tuple[int, int], ...] | None, identical: tuple[tuple[int, int], ...]
-) -> tuple[tuple[int, int], ...]:
-    equal = set(identical)
-    return tuple(pair for pair in near or () if pair not in equal)
-
-
-def _number(n: int, what: str) -> str:
-    return f"{n} {what}" + ("" if n == 1 else "s")
 
 
 def _key(keys: Sequence[str], k: int) -> str:
@@ -163,7 +154,8 @@ def class_warnings(scene: str, rules: ProtocolRules, numbers: Int32Array | None,
         return []
     values, counts = np.unique(np.asarray(numbers)[is_dropped], return_counts=True)
     most = np.argsort(-counts, kind="stable")[:3]
-    texts = [f"{counts[row]} of class {values[row]}{_known(name_of.get(int(values[row])))}" for row in most]
+    names = {row: f" ({name_of[int(values[row])]})" if int(values[row]) in name_of else "" for row in most}
+    texts = [f"{counts[row]} of class {values[row]}{names[row]}" for row in most]
     more = f" and {counted(len(values) - 3, 'class')} more" if len(values) > 3 else ""
     first = int(np.argmax(is_dropped))
     verb = "has" if is_dropped.sum() == 1 else "have"
@@ -171,10 +163,6 @@ def class_warnings(scene: str, rules: ProtocolRules, numbers: Int32Array | None,
         f"{scene}: {int(is_dropped.sum())} of {len(ids)} masks {verb} a class that is not scored and "
         f"{'counts' if verb == 'has' else 'count'} for nothing: {', '.join(texts)}{more}; the first is mask {first}"
     ]
-
-
-def _known(name: str | None) -> str:
-    return f" ({name})" if name else ""
 
 
 def label_warnings(scene: str, rules: ProtocolRules, class_ids: Int64Array) -> list[str]:

@@ -14,7 +14,8 @@ from su3d_bench.core.files.atomic import row_blocks
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Prediction
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array
-from su3d_bench.metrics.matching.nearest import remembered
+from su3d_bench.metrics.matching.nearest import remembered, rows_of
+from su3d_bench.metrics.metric import n_predictions
 from su3d_bench.metrics.protocols.model import ProtocolRules
 
 if TYPE_CHECKING:
@@ -31,6 +32,12 @@ def scored_classes(rules: ProtocolRules) -> BoolArray:
     return np.array([not rules.is_ignored(entry.name) for entry in rules.classes], bool)
 
 
+def places_among_scored(rules: ProtocolRules) -> Int64Array:
+    """The place (C + 1,) of each class among the scored ones, -1 for others; the last is for no class."""
+    is_scored = scored_classes(rules)
+    return np.append(np.where(is_scored, np.cumsum(is_scored) - 1, -1), -1)
+
+
 def candidate_classes(rules: ProtocolRules, is_present: BoolArray) -> Int64Array:
     """Indices of the classes among which the classifier may choose in a scene that contains ``is_present`` (C,)."""
     if rules.vocabulary == "all":
@@ -40,12 +47,14 @@ def candidate_classes(rules: ProtocolRules, is_present: BoolArray) -> Int64Array
 
 
 def classes_of_prediction(
-    rules: ProtocolRules, prediction: Prediction, encoder: Encoder | None, candidates: Int64Array
+    rules: ProtocolRules, prediction: Prediction, encoder: Encoder | None, is_present: BoolArray
 ) -> Int64Array:
     """A class index for each instance, row of features or point; -1 where it is none of the protocol's classes.
 
-    Labels that the method itself decided are taken as they are; otherwise features are classified among ``candidates``.
+    Labels that the method itself decided are taken as they are; otherwise features are classified among the candidates
+    of a scene that contains ``is_present`` (C,).
     """
+    candidates = candidate_classes(rules, is_present)
     labels = getattr(prediction, "labels", None)
     if labels is None:
         return _classes_of_features(rules, prediction, encoder, candidates)
@@ -58,16 +67,18 @@ def classes_of_prediction(
 
 
 def ranked_classes(
-    rules: ProtocolRules, prediction: Prediction, encoder: Encoder | None, candidates: Int64Array, k: int
+    rules: ProtocolRules, prediction: Prediction, encoder: Encoder | None, is_present: BoolArray, k: int
 ) -> Int64Array:
     """The ``k`` likeliest classes (K, k) of each instance, row of features or point, the best first, -1 for no more.
 
-    The labels of the method itself, in its order; otherwise the ``candidates`` of highest similarity.
+    The labels of the method itself, in its order; otherwise the candidates of highest similarity of a scene that
+    contains ``is_present`` (C,).
     """
-    ranked = np.full((n_rows(prediction), k), -1, np.int64)
+    candidates = candidate_classes(rules, is_present)
+    ranked = np.full((n_predictions(prediction), k), -1, np.int64)
     labels = getattr(prediction, "labels", None)
     if len(ranked):
-        ranked[:, 0] = classes_of_prediction(rules, prediction, encoder, candidates)
+        ranked[:, 0] = classes_of_prediction(rules, prediction, encoder, is_present)
     if labels is not None:
         index_of = {entry.name: index for index, entry in enumerate(rules.classes)}
         for row, further in enumerate(getattr(prediction, "further_labels", None) or ()):
@@ -76,17 +87,11 @@ def ranked_classes(
     if prediction.features is not None and encoder is not None and len(ranked) and len(candidates):
         is_open = np.array([labels is None or labels[row] == "" for row in range(len(ranked))], bool)
         if is_open.any():
-            text = text_features(
-                rules, [rules.classes[index].name for index in candidates], prediction.features, encoder
-            )
+            names = [rules.classes[index].name for index in candidates]
+            text = text_features(rules, names, prediction.features, encoder)
             best = candidates[most_similar_each(prediction.features, text, k)]
             ranked[is_open, : best.shape[1]] = best[is_open]
     return ranked
-
-
-def n_rows(prediction: Prediction) -> int:
-    """How many instances, rows of features or points a prediction gives classes to."""
-    return len(prediction) if isinstance(prediction, Instances) else len(prediction.features)
 
 
 def has_every_label(prediction: object) -> bool:
@@ -98,20 +103,13 @@ def has_every_label(prediction: object) -> bool:
 def _classes_of_features(
     rules: ProtocolRules, prediction: Prediction, encoder: Encoder | None, candidates: Int64Array
 ) -> Int64Array:
-    features = prediction.features
-    if features is None:
-        if isinstance(prediction, Instances) and not len(prediction):
-            return np.zeros(0, np.int64)
-        raise PredictionError(
-            f"{rules.name}: the prediction has neither labels nor features; give each instance one of them"
-        )
-    if encoder is None:
-        raise PredictionError(f"{rules.name}: the prediction has features, but there is no encoder to name them with")
+    if prediction.features is None and isinstance(prediction, Instances) and not len(prediction):
+        return np.zeros(0, np.int64)
+    features, encoder = needed_features(rules, prediction, encoder)
     if not len(candidates) or not len(features):
         return np.full(len(features), -1, np.int64)
     text = text_features(rules, [rules.classes[index].name for index in candidates], features, encoder)
-    named: Int64Array = candidates[most_similar(features, text, device_of(encoder))]
-    return named
+    return np.asarray(candidates[most_similar(features, text, device_of(encoder))])
 
 
 def text_features(
@@ -132,13 +130,33 @@ def text_features(
     if n_prompts == 1:
         return encoded
     directions = _normalised(np.asarray(encoded, np.float64))
-    mean: Float64Array = directions.reshape(len(names), n_prompts, -1).mean(axis=1)
-    return mean
+    return np.asarray(directions.reshape(len(names), n_prompts, -1).mean(axis=1))
 
 
 @remembered
 def _encoded(encoder: Encoder, texts: list[str]) -> Float32Array:
     return encoder.encode_texts(texts)
+
+
+def needed_features(
+    rules: ProtocolRules, prediction: Prediction, encoder: Encoder | None
+) -> tuple[Float32Array | NDArray[np.float16], Encoder]:
+    """The features of a prediction and the encoder; ``PredictionError`` where one of them is missing."""
+    if prediction.features is None or encoder is None:
+        raise PredictionError(f"{rules.name}: needs features and an encoder, or labels where it has classes")
+    return prediction.features, encoder
+
+
+def similarities(
+    rules: ProtocolRules,
+    texts: Sequence[str],
+    prediction: Prediction,
+    encoder: Encoder | None,
+    rows: Int64Array | slice = slice(None),
+) -> Float64Array:
+    """The cosine (K, Q) of the features of a prediction, all or some ``rows``, with those of texts."""
+    features, encoder = needed_features(rules, prediction, encoder)
+    return cosines(features[rows], text_features(rules, texts, features, encoder), device_of(encoder))
 
 
 def device_of(encoder: Encoder) -> str:
@@ -262,7 +280,6 @@ def class_index_of_ids(rules: ProtocolRules, ids: Sequence[int] | np.ndarray) ->
             if low <= entry.id <= high:
                 index_of[entry.id - low] = index
         return index_of[values - low]
-    known = np.array([*(entry.id for entry in rules.classes), np.iinfo(np.int64).max], np.int64)
+    known = np.array([entry.id for entry in rules.classes], np.int64)
     order = np.argsort(known)
-    place = order[np.searchsorted(known, values, sorter=order)]
-    return np.where((known[place] == values) & (place < len(rules.classes)), place, -1)
+    return np.append(order, -1)[rows_of(known[order], values)]

@@ -235,6 +235,17 @@ def row_ids(rows: Int64Array | Float64Array) -> Int64Array:
     return ids
 
 
+def rows_of(ids: IntArray, values: IntArray) -> Int64Array:
+    """The row in ``ids``, ascending, of each of ``values`` (N,), -1 where it is none of them.
+
+    >>> rows_of(np.array([3, 7]), np.array([7, 0, 3, 9])).tolist()
+    [1, -1, 0, -1]
+    """
+    known = np.append(ids, np.iinfo(np.int64).max).astype(np.int64)
+    row = np.searchsorted(known, values)
+    return np.where((known[row] == values) & (row < len(ids)), row, -1)
+
+
 def _packed(rows: Int64Array | Float64Array) -> Int64Array | None:
     """One number a row of whole numbers, ordered as the rows from their last column on; None where 63 bits are few."""
     if not len(rows) or rows.dtype.kind not in "iu":

@@ -86,8 +86,7 @@ def _most_votes(votes: Int64Array) -> Int64Array:
     n = np.stack([(votes == column[:, None]).sum(axis=1) for column in votes.T], axis=1)
     n[votes < 0] = 0
     has_most = n == n.max(axis=1, keepdims=True)
-    smallest: Int64Array = np.where(has_most, votes, votes.max()).min(axis=1)
-    return smallest
+    return np.asarray(np.where(has_most, votes, votes.max()).min(axis=1))
 
 
 class _Search:
@@ -170,5 +169,4 @@ def _within(own: Float64Array, places: Float64Array, along_x: Int64Array, x: Flo
     near, own_index = near[own_index < len(own)], own_index[own_index < len(own)]
     offset = own[own_index] - places[near]
     squared = offset[:, 0] ** 2 + offset[:, 1] ** 2 + offset[:, 2] ** 2
-    within: Int64Array = near[squared < cap_m * cap_m]
-    return within
+    return np.asarray(near[squared < cap_m * cap_m])

@@ -7,15 +7,15 @@ by pair of object and predicted unit (an instance, or a point of a dense map), a
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, GroundTruth, Int64Array, LabelSet
-from su3d_bench.metrics.metric import Arrays, Counts
+from su3d_bench.metrics.metric import ROWS, Counts, axes
 from su3d_bench.metrics.protocols.kinds import CATEGORIES
+from su3d_bench.numerics.statistics import ratio
 
 SPACE = "openlex3d"
 _SYNONYMS, _DEPICTIONS, _VIS_SIM, _CLUTTER, _MISSING, _INCORRECT = range(len(CATEGORIES))
@@ -33,10 +33,9 @@ class ObjectCounts(Counts):
     """
 
     stored_as = "objects"
-    arrays: ClassVar[Arrays] = {"n_points": ("i", ("objects",)), "totals": ("f", ("objects", "values"))}
 
-    n_points: Int64Array
-    totals: Float64Array
+    n_points: Int64Array = field(metadata=axes(ROWS))
+    totals: Float64Array = field(metadata=axes(ROWS, "values"))
 
     def contradiction(self) -> str | None:
         """An object without points, or a total of shares that is more than its points."""
@@ -50,22 +49,13 @@ class ObjectCounts(Counts):
         return f"'totals' has {self.totals[row, column]:g} over {self.n_points[row]} points"
 
 
-def concatenate(counts: Sequence[ObjectCounts]) -> ObjectCounts:
-    """The counts of several scenes as one: rows one after another."""
-    return ObjectCounts(
-        np.concatenate([of_scene.n_points for of_scene in counts]),
-        np.concatenate([of_scene.totals for of_scene in counts]),
-    )
-
-
 def combine(counts: Sequence[ObjectCounts]) -> Float64Array:
     """The mean (V,) over the objects of the mean over each one's points; NaN rows are left out.
 
     >>> combine([ObjectCounts(np.array([4, 1]), np.array([[2.0, np.nan], [1.0, 0.25]]))]).tolist()
     [0.75, 0.25]
     """
-    whole = concatenate(counts)
-    return _means(*_sums(whole))
+    return ratio(*_sums(ObjectCounts.joined(counts)))
 
 
 def _sums(counts: ObjectCounts) -> tuple[Float64Array, Int64Array]:
@@ -73,10 +63,6 @@ def _sums(counts: ObjectCounts) -> tuple[Float64Array, Int64Array]:
     of_object = counts.totals / counts.n_points[:, None]
     has_value = ~np.isnan(of_object)
     return np.where(has_value, of_object, 0.0).sum(axis=0), has_value.sum(axis=0)
-
-
-def _means(sums: Float64Array, n_objects: Int64Array) -> Float64Array:
-    return np.where(n_objects > 0, sums / np.maximum(n_objects, 1), np.nan)
 
 
 def resampled(counts: Sequence[ObjectCounts], weights: Int64Array) -> Float64Array:
@@ -88,7 +74,7 @@ def resampled(counts: Sequence[ObjectCounts], weights: Int64Array) -> Float64Arr
     """
     per_scene = [_sums(of_scene) for of_scene in counts]
     sums: Float64Array = weights.astype(np.float64) @ np.stack([total for total, _ in per_scene])
-    return _means(sums, weights @ np.stack([n for _, n in per_scene]))
+    return ratio(sums, weights @ np.stack([n for _, n in per_scene]))
 
 
 @dataclass(frozen=True)
@@ -261,8 +247,7 @@ class RankedLabels:
 
 
 def _row_mean(values: Float64Array) -> Float64Array:
-    mean: Float64Array = values.mean(axis=1) if values.shape[1] else np.full(len(values), np.nan)
-    return mean
+    return values.mean(axis=1) if values.shape[1] else np.full(len(values), np.nan)
 
 
 def ranked_labels(labels: ObjectLabels, prompts: Sequence[str]) -> RankedLabels:

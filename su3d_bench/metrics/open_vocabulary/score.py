@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from su3d_bench.core.errors import DataError, PredictionError
+from su3d_bench.core.errors import DataError
 from su3d_bench.core.files.atomic import release_pages
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition, Prediction
@@ -18,8 +17,8 @@ from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import scene_counts
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.instance.score import CurveMetric, score_of_masks
+from su3d_bench.metrics.matching import labelling
 from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, has_every_label, text_features
 from su3d_bench.metrics.matching.votes import transfer_each_mask
 from su3d_bench.metrics.metric import Metric, Pooled, SceneScore
 from su3d_bench.metrics.open_vocabulary import openlex3d
@@ -65,14 +64,6 @@ class QueryTruth:
     space: str = SPACE
     alignment: Float64Array | None = None
 
-    def __post_init__(self) -> None:
-        n = len(self.points)
-        if self.points.shape != (n, 3) or self.object_of_point.shape != (n,):
-            raise DataError(
-                f"ground truth '{self.variant}': points {self.points.shape} and objects {self.object_of_point.shape} "
-                "do not agree"
-            )
-
 
 def confidences(similarity: Float64Array, rule: Literal["similarity", "similarity-min-max"]) -> Float64Array:
     """The confidence (K, Q) of each mask for each query: its cosine, or that stretched to 0..1 over the masks.
@@ -86,8 +77,7 @@ def confidences(similarity: Float64Array, rule: Literal["similarity", "similarit
         return similarity
     halved = (similarity + 1.0) / 2.0
     low, high = halved.min(axis=0), halved.max(axis=0)
-    stretched: Float64Array = (halved - low) / np.maximum(high - low, _SMALLEST_RANGE)
-    return stretched
+    return np.asarray((halved - low) / np.maximum(high - low, _SMALLEST_RANGE))
 
 
 def per_scene(
@@ -123,7 +113,8 @@ def per_scene(
     order = np.argsort(-confidence, axis=0, kind="stable")[:top_k]
     if not matches_by_confidence:
         order = np.sort(order, axis=0)
-    parts = [_no_counts(thresholds)]
+    none = np.zeros(0)
+    parts = [scene_counts.count_class(0, np.zeros((0, 0)), none.astype(bool), none, none, thresholds)]
     for q, query in enumerate(queries):
         columns = [column_of[object_id] for object_id in query.object_ids if object_id in column_of]
         takes_part = size_of_object[columns] >= min_region_size
@@ -137,12 +128,7 @@ def per_scene(
             thresholds=thresholds,
         )
         parts.append(of_query)
-    return instance_ap.concatenate(parts)
-
-
-def _no_counts(thresholds: Sequence[float]) -> InstanceCounts:
-    none = np.zeros(0)
-    return scene_counts.count_class(0, np.zeros((0, 0)), none.astype(bool), none, none, thresholds)
+    return InstanceCounts.joined(parts)
 
 
 _NOT_KNOWN = "what the truth itself would score is not known"
@@ -163,21 +149,23 @@ class CategoriesMetric(Metric[ObjectCounts]):
 
     def per_scene(self, truth: OpenLexTruth, prediction: Prediction, encoder: Encoder | None) -> SceneScore:
         rules = self.rules
-        cloud = _units(prediction, rules.transfer.evaluation_voxel_m)
+        points, unit_of_point = _units(prediction, rules.transfer.evaluation_voxel_m)
         is_ranking = rules.metric == "openlex3d-ranking"
         ids = sorted(truth.objects) if is_ranking else openlex3d.scored_objects(truth.objects, rules.ignore)
-        object_row = _rows_of(truth.object_of_point, ids)
+        object_row = transfer.rows_of(np.array(ids, np.int64), truth.object_of_point)
         scored = object_row >= 0
         cap_m = rules.transfer.cap_m
         reach_m = np.inf if cap_m is None else max(cap_m, *transfer.COVERAGE_RADII_M)
         unit, distance = np.full(len(scored), -1, np.int64), np.full(len(scored), np.inf)
-        distance[scored], nearest = transfer.nearest(cloud.points, truth.points[scored], reach_m)
-        unit[scored] = np.where(nearest >= 0, cloud.unit[nearest], -1) if len(cloud.unit) else -1
+        distance[scored], nearest = transfer.nearest(points, truth.points[scored], reach_m)
+        unit[scored] = np.append(unit_of_point, -1)[nearest]
         if cap_m is not None:
             unit[distance > cap_m] = -1
+        # the units that some point has, ascending, and each point's place among them, -1 for none
+        used = np.unique(unit[unit >= 0])
         count = _count_ranks if is_ranking else _count_categories
-        warnings = (encoder_warning(rules, prediction, encoder), _shared_points_warning(prediction))
-        counts = count(rules, truth, prediction, encoder, ids, object_row, unit)
+        counts = count(rules, truth, prediction, encoder, ids, object_row, used, transfer.rows_of(used, unit))
+        warnings = (labelling.encoder_warning(rules, prediction, encoder), _shared_points_warning(prediction))
         return self.score(counts, prediction, distance[scored], warnings)
 
     @property
@@ -185,24 +173,18 @@ class CategoriesMetric(Metric[ObjectCounts]):
         return {"values": len(self.rules.value_names)}
 
     def pooled(self, counts: Sequence[ObjectCounts]) -> Pooled:
-        means = openlex3d.combine(counts)
-        return Pooled(dict(zip(self.rules.value_names, means.tolist(), strict=True)))
+        return Pooled(dict(zip(self.rules.value_names, openlex3d.combine(counts).tolist(), strict=True)))
 
     def resampled(self, counts: Sequence[ObjectCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
         values = openlex3d.resampled(counts, weights)
         return dict(zip(self.rules.value_names, values.T, strict=True))
 
 
-@dataclass(frozen=True)
-class _Units:
-    """The predicted cloud: ``points`` (M, 3) and what each belongs to, an instance or a point of a dense map."""
+def _units(prediction: Prediction, voxel_m: float) -> tuple[Float32Array, Int64Array]:
+    """The points (M, 3) that belong to a unit, an instance or a point of a dense map, and that unit (M,).
 
-    points: Float32Array
-    unit: Int64Array
-
-
-def _units(prediction: Prediction, voxel_m: float) -> _Units:
-    """The points that have a unit, reduced to the mean of those in a voxel with the unit of the nearest of all."""
+    Reduced to the mean of those in a voxel with the unit of the nearest of all.
+    """
     if isinstance(prediction, DenseFeatures):
         unit = np.where(has_feature(prediction), np.arange(len(prediction.points)), -1)
     elif isinstance(prediction, Partition):
@@ -211,10 +193,10 @@ def _units(prediction: Prediction, voxel_m: float) -> _Units:
         unit = transfer.first_owner(prediction, len(prediction.points))
     points, unit = np.asarray(prediction.points[unit >= 0], np.float32), unit[unit >= 0]
     if not len(points) or voxel_m <= 0:
-        return _Units(points, unit)
+        return points, unit
     means = voxel_means(points, voxel_m)
     _, nearest = transfer.nearest(points, means)
-    return _Units(means, unit[nearest])
+    return means, unit[nearest]
 
 
 def voxel_means(points: Float32Array, voxel_m: float) -> Float32Array:
@@ -229,15 +211,7 @@ def voxel_means(points: Float32Array, voxel_m: float) -> Float32Array:
     voxel = transfer.row_ids(np.floor(points / np.float32(voxel_m)).astype(np.int64))
     sums = np.zeros((int(voxel.max()) + 1, 3), np.float32)
     np.add.at(sums, voxel, points)
-    means: Float32Array = sums / np.bincount(voxel).astype(np.float32)[:, None]
-    return means
-
-
-def _rows_of(object_of_point: Int64Array, ids: list[int]) -> Int64Array:
-    """Where in ``ids`` (ascending) each point's object stands, -1 where it does not."""
-    known = np.array([*ids, np.iinfo(np.int64).max], np.int64)
-    row = np.searchsorted(known, object_of_point)
-    return np.where((known[row] == object_of_point) & (object_of_point >= 0), row, -1)
+    return sums / np.bincount(voxel).astype(np.float32)[:, None]
 
 
 def _count_categories(
@@ -247,14 +221,14 @@ def _count_categories(
     encoder: Encoder | None,
     ids: list[int],
     object_row: Int64Array,
-    unit: Int64Array,
+    used: Int64Array,
+    of_point: Int64Array,
 ) -> ObjectCounts:
     assert rules.top_k is not None
     labels = getattr(prediction, "labels", None)
-    used, of_point = _used_units(unit)
     if not len(used):
         vocabulary, top = list[str](), np.zeros((0, 1), np.int64)
-    elif labels is not None and has_every_label(prediction):
+    elif labels is not None and labelling.has_every_label(prediction):
         vocabulary = sorted(set(labels))
         top = np.array([[vocabulary.index(labels[row])] for row in used], np.int64).reshape(-1, 1)
     else:
@@ -274,11 +248,16 @@ def _count_ranks(
     encoder: Encoder | None,
     ids: list[int],
     object_row: Int64Array,
-    unit: Int64Array,
+    used: Int64Array,
+    of_point: Int64Array,
 ) -> ObjectCounts:
-    used, of_point = _used_units(unit)
     labels = [openlex3d.ranked_labels(truth.objects[object_id], truth.prompts) for object_id in ids]
     rows, units, _ = openlex3d.distinct_pairs(object_row, of_point)
+    if len(units) == 0 and (object_row >= 0).any():  # nothing is predicted: no label has a rank, each counts 0
+        n_points = np.bincount(object_row[object_row >= 0], minlength=len(labels))
+        has = np.array([(len(ranked.synonyms) > 0, len(ranked.secondary) > 0) for ranked in labels])
+        totals = np.where(np.column_stack([has.any(axis=1), has]), 0.0, np.nan)
+        return ObjectCounts(n_points[n_points > 0].astype(np.int64), totals[n_points > 0])
     scores = np.full((len(rows), 3), np.nan)
     start = 0
     for similarity in _similarity_blocks(rules, truth, prediction, encoder, used) if len(used) else ():
@@ -288,44 +267,18 @@ def _count_ranks(
             mine = np.flatnonzero(here & (rows == row))
             scores[mine] = labels[row].scores(ranks[units[mine] - start])
         start += len(ranks)
-    if len(units) == 0 and (object_row >= 0).any():  # nothing is predicted: no label has a rank, each counts 0
-        return _nothing_ranked(labels, object_row)
     return openlex3d.count_ranks(object_row, of_point, scores, len(ids))
-
-
-def _nothing_ranked(labels: list[openlex3d.RankedLabels], object_row: Int64Array) -> ObjectCounts:
-    n_points = np.bincount(object_row[object_row >= 0], minlength=len(labels))
-    has = np.array([(len(ranked.synonyms) > 0, len(ranked.secondary) > 0) for ranked in labels])
-    totals = np.where(np.stack([has.any(axis=1), has[:, 0], has[:, 1]], axis=1), 0.0, np.nan)
-    return ObjectCounts(n_points[n_points > 0].astype(np.int64), totals[n_points > 0])
-
-
-def _used_units(unit: Int64Array) -> tuple[Int64Array, Int64Array]:
-    """The units that some point has, ascending, and each point's place among them, -1 for none."""
-    used, place = np.unique(unit, return_inverse=True)
-    n_without = int(len(used) > 0 and used[0] < 0)
-    return used[n_without:], place.astype(np.int64) - n_without
 
 
 def _similarity_blocks(
     rules: ProtocolRules, truth: OpenLexTruth, prediction: Prediction, encoder: Encoder | None, used: Int64Array
 ) -> Iterator[Float64Array]:
     """The cosines (B, P) of the units ``used`` with the prompts, a block of units after another."""
-    features, known = _features(rules, prediction, encoder)
-    text = text_features(rules, truth.prompts, features, known)
+    features, known = labelling.needed_features(rules, prediction, encoder)
+    text = labelling.text_features(rules, truth.prompts, features, known)
     for start in range(0, len(used), _BLOCK_UNITS):
-        yield cosines(features[used[start : start + _BLOCK_UNITS]], text, device_of(known))
+        yield labelling.cosines(features[used[start : start + _BLOCK_UNITS]], text, labelling.device_of(known))
         release_pages(features)
-
-
-def _features(
-    rules: ProtocolRules, prediction: Prediction, encoder: Encoder | None
-) -> tuple[Float32Array | NDArray[np.float16], Encoder]:
-    if prediction.features is None:
-        raise PredictionError(f"{rules.name}: {NEEDS_FEATURES}")
-    if encoder is None:
-        raise PredictionError(f"{rules.name}: there is no encoder to turn texts into features with")
-    return prediction.features, encoder
 
 
 def _shared_points_warning(prediction: Prediction) -> str | None:
@@ -351,13 +304,17 @@ class QueryMetric(CurveMetric):
         masks = transfer.masks_of(prediction)
         similarity = np.empty((len(masks), len(truth.queries)))
         if len(masks) and truth.queries:
-            features, known = _features(rules, prediction, encoder)
-            text = text_features(rules, [query.text for query in truth.queries], features, known)
-            similarity = cosines(features, text, device_of(known))
+            similarity = labelling.similarities(rules, [query.text for query in truth.queries], prediction, encoder)
+        cap_m, voxel_m = rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
+        if rules.transfer.candidates == "each-mask":
+            assert cap_m is not None
+            moved = transfer_each_mask(prediction.points, masks, truth.points, cap_m)
+        else:
+            moved = transfer.transfer_masks(prediction.points, masks, truth.points, cap_m, voxel_m)
         counts = per_scene(
             truth.object_of_point,
             truth.queries,
-            _moved(rules, prediction.points, masks, truth.points),
+            moved,
             confidences(similarity, rules.confidence),
             top_k=rules.top_k,
             min_region_size=rules.min_region_size,
@@ -366,13 +323,5 @@ class QueryMetric(CurveMetric):
         )
         asked_for = np.unique(np.array([each for query in truth.queries for each in query.object_ids], np.int64))
         wanted = np.isin(truth.object_of_point, asked_for[asked_for >= 0])
-        warnings = [encoder_warning(rules, prediction, encoder)]
+        warnings = [labelling.encoder_warning(rules, prediction, encoder)]
         return score_of_masks(self, counts, prediction, truth.points, wanted, warnings)
-
-
-def _moved(rules: ProtocolRules, points: Float32Array, masks: Masks, targets: Float32Array) -> Masks:
-    cap_m = rules.transfer.cap_m
-    if rules.transfer.candidates == "each-mask":
-        assert cap_m is not None
-        return transfer_each_mask(points, masks, targets, cap_m)
-    return transfer.transfer_masks(points, masks, targets, cap_m, rules.transfer.evaluation_voxel_m)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
-from su3d_bench.core.errors import suggest
-from su3d_bench.metrics.protocols.model import CURVE_FIELDS, OWN_FIELDS, Kind, ProtocolRules, ValuesOfMetric
+from su3d_bench.metrics.protocols.model import CURVE_FIELDS, Kind, ProtocolRules, ValuesOfMetric
 
+Allowed = Mapping[str, tuple[object, ...]]
+GENERATED: Allowed = {"questions": ("generated",)}
 AP_NAMES = ("AP", "AP50", "AP25")
 GEOMETRIC = ("on", "under", "in", "above", "next to", "near")  # what boxes tell, as numerics.relations has it
 OBJECT_RANKS = (5, 10, 25, 100, 250, 500)  # config/eval_graph.yaml of hovsg/HOV-SG at 71a8069
@@ -25,12 +27,6 @@ class SemanticRules(ProtocolRules):
     takes_votes = True
     needs = ("classes", "vocabulary")
     takes = ("unnamed",)
-
-    def _check_metric(self) -> None:
-        super()._check_metric()
-        names = [entry.name for entry in self.classes]
-        if self.unnamed is not None and self.unnamed not in names:
-            raise ValueError(f"unnamed: '{self.unnamed}' is no class{suggest(self.unnamed, names)}")
 
 
 class TopKRules(ProtocolRules):
@@ -54,17 +50,15 @@ class InstanceRules(ProtocolRules):
     values_of_metric: ClassVar[ValuesOfMetric] = {"scannet": AP_NAMES}
     needs_instances = True
     confidences = ("ones", "prediction")
-    takes = ("class_agnostic", "void", "labels", *CURVE_FIELDS)
-
-    def _check_texts(self) -> None:
-        super()._check_texts()
-        if self.class_agnostic is not None and self.labels is not None:
-            raise ValueError(OWN_FIELDS["labels"])
+    allowed: ClassVar[Allowed] = {"confidence": confidences}
+    takes = ("class_agnostic", "void", "labels")
 
     def _needed(self) -> tuple[str, ...]:
         if self.class_agnostic is None:
-            return ("classes", "vocabulary")
-        return ("classes",) if self.class_agnostic == "scored" else ()
+            return ("classes", "vocabulary", *CURVE_FIELDS)
+        if self.labels is not None:
+            raise ValueError("labels: where no label counts, neither one nor several do")
+        return ("classes", *CURVE_FIELDS) if self.class_agnostic == "scored" else CURVE_FIELDS
 
 
 class PanopticRules(ProtocolRules):
@@ -80,13 +74,6 @@ class PanopticRules(ProtocolRules):
     def _needed(self) -> tuple[str, ...]:
         return (*self.needs, "min_region_size") if self.metric == "semantic-kitti" else self.needs
 
-    def _check_metric(self) -> None:
-        super()._check_metric()
-        scored = [entry.name for entry in self.scored]
-        for name in self.stuff:
-            if name not in scored:
-                raise ValueError(f"stuff: '{name}' is no scored class{suggest(name, scored)}")
-
 
 class BoxRules(ProtocolRules):
     """Boxes with a class."""
@@ -97,16 +84,12 @@ class BoxRules(ProtocolRules):
     needs_own_points = True
     needs_boxes = True
     transfers = False
+    takes_voxels = False
     confidences = ("ones", "prediction")
-    needs = ("classes", "vocabulary", "box_axes")
-    takes = CURVE_FIELDS
-
-    def _check_metric(self) -> None:
-        super()._check_metric()
-        if self.thresholds != (0.25, 0.5):
-            raise ValueError("thresholds: kind 'boxes' takes [0.25, 0.5]")
-        if self.box_axes == "aligned":
-            raise ValueError("box_axes: kind 'boxes' takes 'truth' or 'world'")
+    allowed: ClassVar[Allowed] = {
+        "confidence": confidences, "thresholds": ((0.25, 0.5),), "box_axes": ("truth", "world")
+    }  # fmt: skip
+    needs = ("classes", "vocabulary", "box_axes", *CURVE_FIELDS)
 
 
 class QueryRules(ProtocolRules):
@@ -117,15 +100,13 @@ class QueryRules(ProtocolRules):
     needs_own_points = True
     text_metrics = ("query-ap", "opensun3d")
     confidences = ("similarity", "similarity-min-max")
-    takes = ("top_k", "questions", "per_kind", *CURVE_FIELDS)
+    allowed: ClassVar[Allowed] = {"confidence": confidences}
+    takes = ("top_k", "questions", "per_kind")
 
     def _needed(self) -> tuple[str, ...]:
-        return ("synonyms",) if self.questions == "generated" else ()
-
-    def _check_metric(self) -> None:
-        super()._check_metric()
         if self.metric == "opensun3d" and self.top_k is not None:
             raise ValueError("top_k: metric 'opensun3d' counts every mask of a scene")
+        return ("synonyms", *CURVE_FIELDS) if self.questions == "generated" else CURVE_FIELDS
 
 
 class CategoryRules(ProtocolRules):
@@ -158,13 +139,10 @@ class GroundingRules(ProtocolRules):
     }
     needs_own_points = True
     transfers = False
+    takes_voxels = False
     text_metrics = ("scanrefer", "referit3d")
     needs = ("box_axes",)
-
-    def _check_transfer(self) -> None:
-        super()._check_transfer()
-        if self.box_axes not in ("world", "aligned"):
-            raise ValueError("box_axes: kind 'grounding' takes 'world' or 'aligned'")
+    allowed: ClassVar[Allowed] = {"box_axes": ("world", "aligned")}
 
 
 class RelationRules(ProtocolRules):
@@ -174,6 +152,8 @@ class RelationRules(ProtocolRules):
         "replicassg": ("object R@1", "predicate R@1", "relationship R@1", "object mR@1", "predicate mR@1")
     }
     needs_instances = True
+    needs_cap = True
+    takes_voxels = False
     needs = ("classes", "vocabulary", "predicates", "relations")
 
     def _check_metric(self) -> None:
@@ -184,17 +164,13 @@ class RelationRules(ProtocolRules):
         if self.relations == "geometric" and strange:
             raise ValueError(f"predicates: boxes do not tell '{strange[0]}', but {', '.join(GEOMETRIC)}")
 
-    def _check_transfer(self) -> None:
-        super()._check_transfer()
-        if self.transfer.cap_m is None or self.transfer.evaluation_voxel_m > 0:
-            raise ValueError("transfer.cap_m: kind 'relations' needs one, and no evaluation_voxel_m")
-
 
 class _GraphRules(ProtocolRules):
     """Parts of a scene graph, matched one to one with the true ones."""
 
     needs_own_points = True
     transfers = False
+    takes_voxels = False
 
 
 class ObjectRules(_GraphRules):
@@ -235,11 +211,7 @@ class _JudgedRules(ProtocolRules):
 
     is_judged = True
     needs_own_points = True
-
-    def _check_transfer(self) -> None:
-        super()._check_transfer()
-        if self.transfer.cap_m is None:
-            raise ValueError(f"transfer.cap_m: kind '{self.kind}' needs one")
+    needs_cap = True
 
 
 class RetrievalRules(_JudgedRules):
@@ -266,10 +238,9 @@ class ObjectChainRules(_JudgedRules):
         )
     }
     text_metrics = ("beacon3d",)
+    allowed: ClassVar[Allowed] = GENERATED
 
     def _needed(self) -> tuple[str, ...]:
-        if self.questions == "dataset":
-            raise ValueError("questions: kind 'object-chains' takes 'generated', or queries of a file where absent")
         return ("questions", "min_region_size", "synonyms") if self.questions == "generated" else ()
 
 
@@ -279,6 +250,7 @@ class PresenceQuestionRules(ProtocolRules):
     is_judged = True
     needs_own_points = True
     transfers = False
+    takes_voxels = False
     values_of_metric: ClassVar[ValuesOfMetric] = {
         "pope": tuple(
             f"{measure} {sampling}"
@@ -288,11 +260,7 @@ class PresenceQuestionRules(ProtocolRules):
     }
     text_metrics = ("pope",)
     needs = ("questions", "min_region_size", "synonyms", "per_kind", "presence")
-
-    def _needed(self) -> tuple[str, ...]:
-        if self.questions == "dataset":
-            raise ValueError("questions: kind 'presence' takes 'generated'")
-        return self.needs
+    allowed: ClassVar[Allowed] = GENERATED
 
 
 class AnnotationRules(_JudgedRules):
@@ -315,11 +283,7 @@ class ReasoningRules(_JudgedRules):
     goes_by_names = True
     needs = ("questions", "min_region_size", "synonyms", "answers")
     takes = ("per_kind",)
-
-    def _needed(self) -> tuple[str, ...]:
-        if self.questions == "dataset":
-            raise ValueError("questions: kind 'reasoning' takes 'generated'")
-        return self.needs
+    allowed: ClassVar[Allowed] = GENERATED
 
 
 RULES_OF_KIND: dict[Kind, type[ProtocolRules]] = {

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.core.system.files import file_text, parse_toml
 from su3d_bench.metrics.protocols.kinds import RULES_OF_KIND
-from su3d_bench.metrics.protocols.model import SECTIONS, ProtocolRules
+from su3d_bench.metrics.protocols.model import SECTIONS, ProtocolRules, TransferRules
 
 Text = Annotated[str, Field(min_length=1, max_length=400)]
 _OF_CODE = ("code", "commit", "files", "licence", "compared")
@@ -50,13 +50,9 @@ class Original(BaseModel):
     @model_validator(mode="after")
     def _is_whole(self) -> Self:
         there = [field for field in _OF_CODE if getattr(self, field)]
-        if self.none is not None:
-            if there or self.problems or self.cases:
-                raise ValueError("none: says that there is no original; leave out all else but data")
-        elif lacking := [field for field in _OF_CODE if field not in there]:
-            raise ValueError(
-                f"{lacking[0]}: is missing; give {', '.join(_OF_CODE)}, or none = why there is no original"
-            )
+        expected = [*_OF_CODE] if self.none is None else []
+        if there != expected or (self.none is not None and (self.problems or self.cases)):
+            raise ValueError(f"give {', '.join(_OF_CODE)}, or none = why there is no original with data alone")
         if (self.largest_difference is not None) != (self.problems > 0):
             raise ValueError("largest_difference: belongs to problems that both answered, and these need it")
         return self
@@ -145,23 +141,10 @@ def original_of(name: str) -> Stated | None:
 
 def read_original(file: Path, table: Mapping[str, Any]) -> Original:
     """The table ``[original]`` of a file, as TOML has it; a ``ConfigError`` of one line where it is none."""
-    values = {key: tuple(value) if isinstance(value, list) else value for key, value in table.items()}
     try:
-        return Original.model_validate(values)
+        return Original.model_validate(_with_tuples(table))
     except ValidationError as error:
-        raise ConfigError(_line(file, error)) from error
-
-
-def _line(file: Path, error: ValidationError) -> str:
-    first = min(error.errors(), key=lambda complaint: complaint["type"] != "extra_forbidden")
-    key = str(first["loc"][0]) if first["loc"] else ""
-    if first["type"] == "extra_forbidden":
-        return f"{line_of([file], key)}: unknown key 'original.{key}'{suggest(key, Original.model_fields)}"
-    if first["type"] == "missing":
-        return f"{file}: the key 'original.{key}' is missing"
-    message = first["msg"].removeprefix("Value error, ")
-    message = message[0].lower() + message[1:]
-    return f"{line_of([file], key)}: original.{key}: {message}" if key else f"{file}: original.{message}"
+        raise ConfigError(_first_line([file], error, "original")) from error
 
 
 RULES = Path(__file__).parents[1] / "rules"  # a folder for the protocols of each dataset
@@ -238,7 +221,7 @@ def read_content(path: Path) -> Content:
             raise ConfigError(f"{line_of(files, 'classes')}: unknown class table '{table}'{hint}")
         values["classes"] = _class_rows(tables[table])
     if "classes" in values:
-        values["classes"] = _entries(files, values.get("classes"))
+        values["classes"] = _entries(files, values["classes"])
     return Content(values, files, original)
 
 
@@ -318,8 +301,6 @@ def read_remarks(file: Path) -> dict[str, list[str]]:
     A comment ``no cap_m ...`` speaks of the rule that it names; comments with no rule after them belong to their
     section.
     """
-    from su3d_bench.metrics.protocols.model import ProtocolRules, TransferRules
-
     remarks: dict[str, list[str]] = {}
     section, waiting, has_key = "", list[str](), False
     for line in file_text(file).splitlines():
@@ -427,18 +408,18 @@ def _with_tuples(value: Any) -> Any:
     return value
 
 
-def _first_line(files: Sequence[Path], error: ValidationError) -> str:
+def _first_line(files: Sequence[Path], error: ValidationError, *section: str) -> str:
     """The first complaint as one line with the file, the line and, for an unknown key, the likely one."""
     # a misspelt key is both unknown and, under its right name, missing: the first says more
     first = min(error.errors(), key=lambda complaint: complaint["type"] != "extra_forbidden")
-    key = ".".join(str(part) for part in first["loc"])
+    path = [*section, *map(str, first["loc"])]
+    key = ".".join(path)
     if first["type"] == "extra_forbidden":
-        last = str(first["loc"][-1])
-        fields = SECTIONS.get(key.partition(".")[0], ProtocolRules).model_fields
-        return f"{line_of(files, last)}: unknown key '{key}'{suggest(last, fields)}"
+        fields = (SECTIONS | {"original": Original}).get(path[0], ProtocolRules).model_fields
+        return f"{line_of(files, path[-1])}: unknown key '{key}'{suggest(path[-1], fields)}"
     if first["type"] == "missing":
         return f"{files[0]}: the key '{key}' is missing"
     message = first["msg"].removeprefix("Value error, ")
-    where = line_of(files, str(first["loc"][-1]) if first["loc"] else message.split(":")[0])
-    message = message[0].lower() + message[1:]
-    return f"{where}: {key}: {message}, not {first['input']!r}" if key else f"{where}: {message}"
+    where = line_of(files, path[-1] if first["loc"] else message.split(":")[0])
+    message = message[0].lower() + message[1:] + (f", not {first['input']!r}" if first["loc"] else "")
+    return f"{where}: {key}: {message}" if key else f"{where}: {message}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -23,33 +23,11 @@ MetricName = Literal[
 ValuesOfMetric = Mapping[MetricName, tuple[str, ...]]
 BOX_AXES = Literal["truth", "world", "aligned"]
 CURVE_FIELDS = ("min_region_size", "thresholds", "confidence")
-_NEEDS_QUESTIONS = (
-    "questions: kinds 'retrieval', 'reasoning' and 'presence' need them, and min_region_size; 'queries' may have them"
-)
-_ONLY_CURVES = "min_region_size, thresholds and confidence belong to kind 'instance', 'boxes' or 'queries'"
-# The fields that not every kind has, and what is said where one is missing or out of place.
-OWN_FIELDS = {
-    "classes": "classes: needed where labels count, that is under kinds 'semantic', 'instance', 'panoptic' and 'boxes'",
-    "class_agnostic": "class_agnostic: belongs to kind 'instance'",
-    "void": "void: belongs to kind 'instance'",
-    "stuff": "stuff: kind 'panoptic' needs the classes that are no things, others take none",
-    "unnamed": "unnamed: belongs to kind 'semantic'",
-    "labels": "labels: belongs to kind 'instance', where masks have classes",
-    "vocabulary": "vocabulary: belongs to protocols that choose among classes, and these need it",
-    "min_region_size": _ONLY_CURVES,
-    "thresholds": _ONLY_CURVES,
-    "confidence": _ONLY_CURVES,
-    "top_k": "top_k: belongs to kind 'queries', and to kind 'top-k' and metric 'openlex3d-topn', which need it",
-    "questions": _NEEDS_QUESTIONS,
-    "per_kind": "per_kind: belongs to generated questions",
-    "synonyms": "synonyms: kind 'annotation' and generated questions need a table, others take none",
-    "merging": "merging: kind 'annotation' needs it, others take none",
-    "answers": "answers: kind 'reasoning' needs it, others take none",
-    "box_axes": "box_axes: kinds 'boxes' and 'grounding' need it, others take none",
-    "presence": "presence: kind 'presence' needs it, others take none",
-    "predicates": "predicates: kind 'relations' needs those that are asked for, others take none",
-    "relations": "relations: kind 'relations' needs to say whose they are, others take none",
-}
+# The fields that not every kind has.
+OWN_FIELDS = (
+    "classes", "class_agnostic", "void", "stuff", "unnamed", "labels", "vocabulary", *CURVE_FIELDS, "top_k",
+    "questions", "per_kind", "synonyms", "merging", "answers", "box_axes", "presence", "predicates", "relations",
+)  # fmt: skip
 
 
 class _Strict(BaseModel):
@@ -200,7 +178,8 @@ class ProtocolRules(_Strict):
     # What the kinds differ in
     values_of_metric: ClassVar[ValuesOfMetric] = {}  # of each metric, what its values are called
     candidates: ClassVar[tuple[str, ...]] = ("map-points",)
-    confidences: ClassVar[tuple[str, ...]] = ()
+    confidences: ClassVar[tuple[str, ...]] = ()  # where there are precision-recall curves
+    allowed: ClassVar[Mapping[str, tuple[object, ...]]] = {}  # of those of OWN_FIELDS that take less than their type
     takes_dense: ClassVar[bool] = False  # a map with one feature a point
     goes_by_names: ClassVar[bool] = False  # of instances, without features
     needs_own_points: ClassVar[bool] = False  # objects are found by the points of the map itself
@@ -211,6 +190,8 @@ class ProtocolRules(_Strict):
     needs_instances: ClassVar[bool] = False  # in the truth and in the prediction
     takes_votes: ClassVar[bool] = False  # of several neighbours
     transfers: ClassVar[bool] = True  # masks or classes to the points of the truth
+    needs_cap: ClassVar[bool] = False  # how far that may be
+    takes_voxels: ClassVar[bool] = True  # of masks that are reduced to one point a voxel
     text_metrics: ClassVar[tuple[str, ...]] = ()  # compare features with texts whatever labels there are
     ignores_classes: ClassVar[bool] = True  # ``ignore`` and ``prompt_names`` speak of ``classes``
     needs: ClassVar[tuple[str, ...]] = ()  # those of OWN_FIELDS that must be there
@@ -227,63 +208,65 @@ class ProtocolRules(_Strict):
             raise ValueError("classes: each id and each name may stand there once")
         self._check_texts()
         needed = self._needed()
-        for field, message in OWN_FIELDS.items():
-            is_there = getattr(self, field) not in (None, ())
-            if is_there != (field in needed) and not (is_there and field in self.takes):
-                is_size = field == "min_region_size" and self.is_judged
-                raise ValueError(_NEEDS_QUESTIONS if is_size else message)
-        unknown = [name for name in (*self.ignore, *self.prompt_names) if not any(name in known for known in names)]
-        if unknown and self.ignores_classes:
-            raise ValueError(f"ignore or prompt_names: '{unknown[0]}' is no class{suggest(unknown[0], names)}")
+        for field in OWN_FIELDS:
+            value = getattr(self, field)
+            if value in (None, ()) and field in needed:
+                raise ValueError(f"{field}: is missing, and kind '{self.kind}' needs it with these rules")
+            if value not in (None, ()) and field not in (*needed, *self.takes):
+                raise ValueError(f"{field}: kind '{self.kind}' does not take it with these rules")
+            if value not in (None, (), *self.allowed.get(field, (value,))):
+                raise ValueError(f"{field}: kind '{self.kind}' takes {' or '.join(map(repr, self.allowed[field]))}")
+        self._check_classes(names)
         self._check_metric()
         self._check_transfer()
         if self.per_kind is not None and self.questions != "generated":
             raise ValueError("per_kind: belongs to generated questions")
         return self
 
+    def _check_classes(self, names: Sequence[str]) -> None:
+        unknown = [name for name in (*self.ignore, *self.prompt_names) if not any(name in known for known in names)]
+        if unknown and self.ignores_classes:
+            raise ValueError(f"ignore or prompt_names: '{unknown[0]}' is no class{suggest(unknown[0], names)}")
+        if self.unnamed is not None and self.unnamed not in names:
+            raise ValueError(f"unnamed: '{self.unnamed}' is no class{suggest(self.unnamed, names)}")
+        scored = [entry.name for entry in self.scored]
+        for name in self.stuff:
+            if name not in scored:
+                raise ValueError(f"stuff: '{name}' is no scored class{suggest(name, scored)}")
+
     def _check_texts(self) -> None:
         texts = self.prompts if self.prompt is None else (self.prompt, *self.prompts)
-        if self.class_agnostic is not None and self.needs_instances:
-            if texts or self.vocabulary or self.encoder:
-                raise ValueError("class_agnostic: takes no prompt, vocabulary or encoder")
-        elif self.goes_by_names or self.needs_places:
-            if texts or self.encoder:
-                raise ValueError(f"prompt: kind '{self.kind}' compares no features; it takes no prompt and no encoder")
-        elif (self.prompt is None) == (not self.prompts):
+        compares = self.names_masks or not (self.needs_instances or self.goes_by_names or self.needs_places)
+        if not compares and (texts or self.encoder):
+            raise ValueError("prompt: these rules compare no features; they take no prompt and no encoder")
+        if compares and (self.prompt is None) == (not self.prompts):
             raise ValueError("prompt: give either prompt or prompts")
-        without = [text for text in texts if "{}" not in text]
-        if without:
+        if without := [text for text in texts if "{}" not in text]:
             raise ValueError(f"prompt: '{without[0]}' has no {{}} for the class name")
 
     def _check_metric(self) -> None:
-        has_curve = bool(self.confidences)
-        lacks_curve = has_curve and None in (self.min_region_size, self.confidence)
-        if self.metric not in self.values_of_metric or lacks_curve:
-            names = " or ".join(f"'{name}'" for name in self.values_of_metric)
-            rest = ", min_region_size, thresholds and confidence" if has_curve else ""
-            raise ValueError(f"kind '{self.kind}' needs metric {names}{rest}")
+        if self.metric not in self.values_of_metric:
+            raise ValueError(f"metric: kind '{self.kind}' takes {' or '.join(map(repr, self.values_of_metric))}")
         if not set(self.headline) <= set(self.value_names):
             raise ValueError(f"headline: a protocol of kind '{self.kind}' has {', '.join(self.value_names)}")
-        if has_curve and not {0.25, 0.5} <= set(self.thresholds):
+        if self.confidences and not {0.25, 0.5} <= set(self.thresholds):
             raise ValueError("thresholds: 0.25 and 0.5 must be among them")
-        if has_curve and self.confidence not in self.confidences:
-            raise ValueError(f"confidence: kind '{self.kind}' takes {' or '.join(self.confidences)}")
 
     def _check_transfer(self) -> None:
-        transfer = self.transfer
-        if not self.transfers and (transfer.cap_m is not None or transfer.evaluation_voxel_m > 0):
-            raise ValueError(f"transfer.cap_m: kind '{self.kind}' transfers nothing; no cap_m, no evaluation_voxel_m")
+        transfer, kind = self.transfer, f"kind '{self.kind}'"
+        is_each = transfer.candidates == "each-mask"
         if transfer.candidates not in self.candidates:
-            names = " or ".join(f"'{name}'" for name in self.candidates)
-            raise ValueError(f"transfer.candidates: kind '{self.kind}' takes {names}")
-        if transfer.candidates == "each-mask" and (transfer.cap_m is None or transfer.evaluation_voxel_m > 0):
-            raise ValueError("transfer.cap_m: 'each-mask' needs one, and no evaluation_voxel_m")
+            raise ValueError(f"transfer.candidates: {kind} takes {' or '.join(map(repr, self.candidates))}")
+        if transfer.cap_m is None and (self.needs_cap or is_each):
+            raise ValueError(f"transfer.cap_m: {kind} needs one, with {transfer.candidates}")
+        if transfer.cap_m is not None and not self.transfers:
+            raise ValueError(f"transfer.cap_m: {kind} transfers nothing")
+        if transfer.evaluation_voxel_m > 0 and (not self.takes_voxels or is_each or transfer.neighbours > 1):
+            raise ValueError(f"transfer.evaluation_voxel_m: {kind} leaves no point out here; set it to 0")
         if transfer.neighbours > 1 and not self.takes_votes:
             raise ValueError("transfer.neighbours: belongs to kind 'semantic'")
         if transfer.neighbours == 1 and transfer.votes == "masks":
             raise ValueError("transfer.votes: a single neighbour holds no vote; give more neighbours")
-        if transfer.neighbours > 1 and transfer.evaluation_voxel_m > 0:
-            raise ValueError("transfer.evaluation_voxel_m: of neighbours that vote nothing is left out; set it to 0")
 
     @property
     def value_names(self) -> tuple[str, ...]:

@@ -13,13 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.core.errors import DataError, PredictionError
+from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.maps import Instances, Masks, Partition
-from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array, LabelSet
+from su3d_bench.core.maps import Instances, Partition
+from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, LabelSet
+from su3d_bench.metrics.instance.boxes import box_around
 from su3d_bench.metrics.instance.score import covered_objects, score_of_masks
 from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, text_features
+from su3d_bench.metrics.matching.labelling import encoder_warning, similarities
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.open_vocabulary.score import QueryTruth, TextQuery
 from su3d_bench.metrics.questions.score import ShareMetric, first_instances, share_counts
@@ -44,7 +45,8 @@ class GroundingMetric(ShareMetric):
         true_points = aligned(truth.points, turn)
         given = [box_around(true_points[truth.object_of_point == key]) for key in ids.tolist()]
         is_meant = np.array([np.isin(ids, query.object_ids) for query in truth.queries]).reshape(-1, len(ids))
-        boxes = _boxes_of(aligned(prediction.points, turn), masks)
+        points = aligned(prediction.points, turn)
+        boxes = {row: box_around(points[masks.mask(row)]) for row in np.flatnonzero(masks.sizes).tolist()}
         if self.rules.metric == "referit3d":
             is_right = self._chosen(truth, prediction, encoder, boxes, given, is_meant)
             judged = {"": is_right}
@@ -79,13 +81,10 @@ class GroundingMetric(ShareMetric):
         rows = np.array([row for row, values in iou.items() if values.any()], np.int64)
         if not len(rows) or not truth.queries:
             return np.zeros(len(truth.queries), bool)
-        if prediction.features is None or encoder is None:
-            raise PredictionError(f"{self.rules.name}: needs features and an encoder to compare texts with them")
-        text = text_features(self.rules, [query.text for query in truth.queries], prediction.features, encoder)
-        first = rows[cosines(prediction.features[rows], text, device_of(encoder)).argmax(axis=0)]
-        choice: Int64Array = np.array([choose(iou[row]) for row in first.tolist()], np.int64)
-        answer: BoolArray = is_meant[np.arange(len(choice)), choice]
-        return answer
+        texts = [query.text for query in truth.queries]
+        first = rows[similarities(self.rules, texts, prediction, encoder, rows).argmax(axis=0)]
+        choice = [choose(iou[row]) for row in first.tolist()]
+        return is_meant[np.arange(len(choice)), choice]
 
 
 def choose(scores: Float64Array) -> int:
@@ -101,11 +100,9 @@ def in_group(groups: Sequence[Sequence[str]], group: str, metric: str) -> BoolAr
     >>> in_group([("easy",), ("left out",)], "accuracy", "referit3d").tolist()
     [True, False]
     """
-    wanted = {group}
-    if metric == "referit3d" and group == "accuracy":
-        wanted = {"easy", "hard"}
-    elif group == EVERY:
+    if group == EVERY:
         return np.ones(len(groups), bool)
+    wanted = {"easy", "hard"} if metric == "referit3d" and group == "accuracy" else {group}
     return np.array([not wanted.isdisjoint(of_text) for of_text in groups], bool)
 
 
@@ -117,21 +114,10 @@ def aligned(points: transfer.Points, motion: Float64Array | None) -> transfer.Po
     return moved[:, :3].astype(np.float32)
 
 
-def _boxes_of(points: transfer.Points, masks: Masks) -> dict[int, Float64Array]:
-    """The box of each mask that has points, by its row."""
-    return {row: box_around(points[masks.mask(row)]) for row in np.flatnonzero(masks.sizes).tolist()}
-
-
 def _best_iou(box: Float64Array | None, given: Sequence[Float64Array], is_meant: BoolArray) -> float:
     if box is None:
         return 0.0
     return max((box_iou(box, given[place]) for place in np.flatnonzero(is_meant).tolist()), default=0.0)
-
-
-def box_around(points: transfer.Points) -> Float64Array:
-    """The lowest and the highest corner (2, 3) of the smallest box around points (N, 3) along the axes of the world."""
-    known = np.asarray(points, np.float64)
-    return np.stack([known.min(axis=0), known.max(axis=0)])
 
 
 def box_iou(first: Float64Array, second: Float64Array) -> float:
@@ -142,12 +128,10 @@ def box_iou(first: Float64Array, second: Float64Array) -> float:
     (0.333333, 0.0)
     """
     sides = np.maximum(np.minimum(first[1], second[1]) - np.maximum(first[0], second[0]), 0.0)
-    shared, (one, other) = _volume(sides), (_volume(box[1] - box[0]) for box in (first, second))
+    shared, one, other = (
+        float(each[0] * each[1] * each[2]) for each in (sides, first[1] - first[0], second[1] - second[0])
+    )
     return shared / (one + other - shared + _SMALLEST_VOLUME)
-
-
-def _volume(sides: Float64Array) -> float:
-    return float(sides[0] * sides[1] * sides[2])
 
 
 TAGS = ("class", "appearance", "geometry", "spatial", "functionality")

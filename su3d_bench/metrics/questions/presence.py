@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Partition
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
-from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, text_features
-from su3d_bench.metrics.metric import Arrays, Counts, Metric, Pooled, SceneScore, Values, n_predictions
+from su3d_bench.metrics.matching.labelling import encoder_warning, similarities
+from su3d_bench.metrics.metric import ROWS, Counts, Metric, Pooled, SceneScore, Values, axes, n_predictions
 from su3d_bench.metrics.protocols.model import PresenceRules
 from su3d_bench.metrics.questions.score import AskedThing, PresenceTruth
+from su3d_bench.numerics.statistics import ratio
 
 SAMPLINGS = ("random", "popular", "adversarial")  # POPE's, of things that are not there
 MEASURES = ("precision", "recall", "F1", "accuracy", "yes-rate", "AUROC")
@@ -31,17 +30,11 @@ class PresenceCounts(Counts):
     """
 
     stored_as = "presence"
-    arrays: ClassVar[Arrays] = {
-        "sampling": ("i", ("rows",)),
-        "is_there": ("b", ("rows",)),
-        "says_yes": ("b", ("rows",)),
-        "similarity": ("f", ("rows",)),
-    }
 
-    sampling: Int64Array
-    is_there: BoolArray
-    says_yes: BoolArray
-    similarity: Float64Array
+    sampling: Int64Array = field(metadata=axes(ROWS))
+    is_there: BoolArray = field(metadata=axes(ROWS))
+    says_yes: BoolArray = field(metadata=axes(ROWS))
+    similarity: Float64Array = field(metadata=axes(ROWS))
 
     def contradiction(self) -> str | None:
         """Samplings that there are not, and similarities that no cosine has."""
@@ -74,27 +67,26 @@ def measured(counts: Sequence[PresenceCounts], weights: Int64Array) -> dict[str,
 
 def _of_sampling(counts: PresenceCounts, place: int) -> PresenceCounts:
     mine = counts.sampling == place
-    return PresenceCounts(*(getattr(counts, name)[mine] for name in PresenceCounts.arrays))
+    return PresenceCounts(*(getattr(counts, name)[mine] for name in PresenceCounts.arrays()))
 
 
 def _shares(rows: Sequence[PresenceCounts], weights: Int64Array) -> dict[str, Float64Array]:
     def total(kept: list[BoolArray]) -> Float64Array:
-        whole: Float64Array = (weights @ np.array([int(one.sum()) for one in kept], np.int64)).astype(np.float64)
-        return whole
+        return (weights @ np.array([int(one.sum()) for one in kept], np.int64)).astype(np.float64)
 
     true_yes = total([row.is_there & row.says_yes for row in rows])
     false_yes = total([~row.is_there & row.says_yes for row in rows])
     true_no = total([~row.is_there & ~row.says_yes for row in rows])
     false_no = total([row.is_there & ~row.says_yes for row in rows])
     n = true_yes + false_yes + true_no + false_no
-    precision, recall = _ratio(true_yes, true_yes + false_yes), _ratio(true_yes, true_yes + false_no)
-    f1 = np.where(true_yes > 0, _ratio(2 * precision * recall, precision + recall), 0.0)
+    precision, recall = ratio(true_yes, true_yes + false_yes), ratio(true_yes, true_yes + false_no)
+    f1 = np.where(true_yes > 0, ratio(2 * precision * recall, precision + recall), 0.0)
     return {
         "precision": precision,
         "recall": recall,
         "F1": np.where(true_yes + false_no > 0, f1, np.nan),
-        "accuracy": _ratio(true_yes + true_no, n),
-        "yes-rate": _ratio(true_yes + false_yes, n),
+        "accuracy": ratio(true_yes + true_no, n),
+        "yes-rate": ratio(true_yes + false_yes, n),
     }
 
 
@@ -114,13 +106,8 @@ def _auroc(rows: Sequence[PresenceCounts], weights: Int64Array) -> Float64Array:
         n_absent = np.add.reduceat(drawn * ~is_there, first, axis=1)
         n_below = np.cumsum(n_absent, axis=1) - n_absent
         n_won = (n_there * (n_below + 0.5 * n_absent)).sum(axis=1)
-        areas[start : start + step] = _ratio(n_won, n_there.sum(axis=1) * n_absent.sum(axis=1))
+        areas[start : start + step] = ratio(n_won, n_there.sum(axis=1) * n_absent.sum(axis=1))
     return areas
-
-
-def _ratio(part: Float64Array, whole: Float64Array) -> Float64Array:
-    answer: Float64Array = np.divide(part, whole, out=np.full(part.shape, np.nan), where=whole > 0)
-    return answer
 
 
 NOWHERE = -1.0  # the similarity of a text with the best instance of an empty map
@@ -157,11 +144,8 @@ class PresenceMetric(Metric[PresenceCounts]):
         assert rules is not None
         if not n_predictions(prediction) or not asked:
             return np.full(len(asked), NOWHERE), np.zeros(len(asked))
-        if prediction.features is None or encoder is None:
-            raise PredictionError(f"{self.rules.name}: needs features and an encoder to compare texts with them")
         texts = list(dict.fromkeys(thing.text for thing in asked))
-        known = text_features(self.rules, [*texts, *rules.canonical], prediction.features, encoder)
-        cosine = np.clip(cosines(prediction.features, known, device_of(encoder)), -1.0, 1.0)
+        cosine = similarities(self.rules, [*texts, *rules.canonical], prediction, encoder).clip(-1.0, 1.0)
         of_text = cosine[:, : len(texts)]
         relevant = relevancies(of_text, cosine[:, len(texts) :], rules)
         row = np.array([texts.index(thing.text) for thing in asked], np.int64)
@@ -179,8 +163,7 @@ class PresenceMetric(Metric[PresenceCounts]):
         """The measures of each sampling, and beside them how many things were asked for, ``n_<sampling>``."""
         sampling = np.concatenate([of_scene.sampling for of_scene in counts])
         n_asked: Values = {f"n_{name}": int((sampling == place).sum()) for place, name in enumerate(SAMPLINGS)}
-        values = measured(counts, np.ones((1, len(counts)), np.int64))
-        return Pooled({name: float(value[0]) for name, value in values.items()} | n_asked)
+        return Pooled(self.values_once(counts) | n_asked)
 
     def resampled(self, counts: Sequence[PresenceCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
         return measured(counts, weights)
@@ -197,5 +180,4 @@ def relevancies(cosine: Float64Array, canonical: Float64Array, rules: PresenceRu
     [[0.731, 0.269]]
     """
     nearest = canonical.max(axis=1, keepdims=True)
-    answer: Float64Array = 1.0 / (1.0 + np.exp(rules.sharpness * (nearest - cosine)))
-    return answer
+    return np.asarray(1.0 / (1.0 + np.exp(rules.sharpness * (nearest - cosine))))

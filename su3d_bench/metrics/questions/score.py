@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
 
-from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.interfaces import Encoder, KnowsRelativeTexts
 from su3d_bench.core.maps import Instances, Partition
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array
 from su3d_bench.metrics.instance.score import NO_OBJECT, Covered, covered_objects, score_of_masks
-from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, text_features
-from su3d_bench.metrics.metric import Arrays, Counts, Metric, Pooled, SceneScore, n_predictions
+from su3d_bench.metrics.matching.labelling import encoder_warning, similarities
+from su3d_bench.metrics.metric import Counts, Metric, Pooled, SceneScore, axes, n_predictions
 from su3d_bench.metrics.protocols.model import AnswerRules, MergeRules, ProtocolRules
+from su3d_bench.numerics.statistics import ratio
 
 ROUNDING = 1e-6  # by how much a sum of shares may pass what it is a sum over
 
@@ -29,17 +29,11 @@ class ShareCounts(Counts):
     """
 
     stored_as = "shares"
-    arrays: ClassVar[Arrays] = {
-        "n_judged": ("i", ("values",)),
-        "n_right": ("i", ("values",)),
-        "by_chance": ("f", ("values",)),
-        "by_name": ("f", ("values",)),
-    }
 
-    n_judged: Int64Array
-    n_right: Int64Array
-    by_chance: Float64Array
-    by_name: Float64Array
+    n_judged: Int64Array = field(metadata=axes("values"))
+    n_right: Int64Array = field(metadata=axes("values"))
+    by_chance: Float64Array = field(metadata=axes("values"))
+    by_name: Float64Array = field(metadata=axes("values"))
 
     def contradiction(self) -> str | None:
         """More that is right, or that a guess gets right, than was judged."""
@@ -49,18 +43,6 @@ class ShareCounts(Counts):
             if len(beyond):
                 return f"'{name}' has {right[beyond[0]]:g} of {self.n_judged[beyond[0]]} judged"
         return None
-
-
-def combine(counts: Sequence[ShareCounts]) -> ShareCounts:
-    """The counts of several scenes as one.
-
-    >>> a, b = share_counts([2], [1]), share_counts([2], [2])
-    >>> combine([a, b]).n_right.tolist()
-    [3]
-    """
-    return ShareCounts(
-        *(np.sum([getattr(of_scene, name) for of_scene in counts], axis=0) for name in ShareCounts.arrays)
-    )
 
 
 def share_counts(
@@ -85,13 +67,7 @@ def shares(counts: ShareCounts) -> Float64Array:
     >>> shares(share_counts([4, 0], [3, 0])).tolist()
     [0.75, nan]
     """
-    return _ratio(counts.n_right.astype(np.float64), counts.n_judged.astype(np.float64))
-
-
-def baselines(counts: ShareCounts) -> tuple[Float64Array, Float64Array]:
-    """The shares (V,) that a guess gets right, and who knows names alone; NaN where nobody can say."""
-    n_judged = counts.n_judged.astype(np.float64)
-    return _ratio(counts.by_chance, n_judged), _ratio(counts.by_name, n_judged)
+    return ratio(counts.n_right, counts.n_judged)
 
 
 def resampled(counts: Sequence[ShareCounts], weights: Int64Array) -> Float64Array:
@@ -101,13 +77,7 @@ def resampled(counts: Sequence[ShareCounts], weights: Int64Array) -> Float64Arra
     >>> resampled([a, b], np.array([[2, 0], [0, 2]])).tolist()
     [[0.5], [1.0]]
     """
-    drawn = weights.astype(np.float64)
-    n_right = drawn @ np.stack([of_scene.n_right for of_scene in counts]).astype(np.float64)
-    return _ratio(n_right, drawn @ np.stack([of_scene.n_judged for of_scene in counts]).astype(np.float64))
-
-
-def _ratio(n_right: Float64Array, n_judged: Float64Array) -> Float64Array:
-    return np.where(n_judged > 0, n_right / np.maximum(n_judged, 1.0), np.nan)
+    return ratio(*ShareCounts.drawn(counts, weights, "n_right", "n_judged").values())
 
 
 @dataclass(frozen=True)
@@ -238,10 +208,11 @@ class ShareMetric(Metric[ShareCounts]):
         ``n_<name>``: their number; ``chance_<name>``: what a guess gets right; ``names-alone_<name>``: what who knows
         each object's name and no more does, both of the values that one can guess.
         """
-        whole, names = combine(counts), self.rules.value_names
+        whole, names = ShareCounts.joined(counts), self.rules.value_names
         values = dict(zip(names, shares(whole).tolist(), strict=True))
         values |= {f"n_{name}": n for name, n in zip(names, whole.n_judged.tolist(), strict=True)}
-        for prefix, cheap in zip(("chance", "names-alone"), baselines(whole), strict=True):
+        for prefix, right in (("chance", whole.by_chance), ("names-alone", whole.by_name)):
+            cheap = ratio(right, whole.n_judged)
             values |= {f"{prefix}_{name}": float(cheap[names.index(name)]) for name in self.guessed}
         return Pooled(values)
 
@@ -309,11 +280,7 @@ def first_instances(
     """The instance (Q,) whose feature is nearest to each text, the first of equals; -1 in an empty map."""
     if not n_predictions(prediction) or not texts:
         return np.full(len(texts), -1, np.int64)
-    if prediction.features is None or encoder is None:
-        raise PredictionError(f"{rules.name}: needs features and an encoder to compare texts with them")
-    text = text_features(rules, list(texts), prediction.features, encoder)
-    first: Int64Array = cosines(prediction.features, text, device_of(encoder)).argmax(axis=0)
-    return first
+    return np.asarray(similarities(rules, list(texts), prediction, encoder).argmax(axis=0))
 
 
 def judge_retrieval(main_object: Int64Array, first: Int64Array, questions: Sequence[AskedText]) -> BoolArray:

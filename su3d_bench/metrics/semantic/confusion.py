@@ -7,17 +7,15 @@ classes. Matrices of scenes add up; only the functions that give ``SemanticMetri
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
-from su3d_bench.metrics.metric import Arrays, Counts
-from su3d_bench.numerics.statistics import nan_mean, row_means
-
-IntArray = NDArray[np.integer[Any]]
+from su3d_bench.core.types import BoolArray, Float64Array, Int64Array, IntArray
+from su3d_bench.metrics.metric import Counts, axes
+from su3d_bench.numerics.statistics import nan_mean, ratio, row_means
 
 IOU_LEVELS = (0.15, 0.25, 0.50, 0.75)  # conceptgraph/utils/eval.py counts the classes above these
 
@@ -27,10 +25,9 @@ class SemanticCounts(Counts):
     """What one scene, or several, adds: ``confusion`` (C, C + 1) int64 and the classes that the scenes contain (C,)."""
 
     stored_as = "semantic"
-    arrays: ClassVar[Arrays] = {"confusion": ("i", ("classes", "columns")), "is_present": ("b", ("classes",))}
 
-    confusion: Int64Array
-    is_present: BoolArray
+    confusion: Int64Array = field(metadata=axes("classes", "columns"))
+    is_present: BoolArray = field(metadata=axes("classes"))
 
     def contradiction(self) -> str | None:
         """Points of a class that the scenes do not contain."""
@@ -84,13 +81,6 @@ def confusion_matrix(truth: IntArray, predicted: IntArray, n_classes: int) -> In
     column[column < 0] = n_classes
     width = n_classes + 1
     return np.bincount(row * width + column, minlength=n_classes * width).reshape(n_classes, width).astype(np.int64)
-
-
-def concatenate(counts: Sequence[SemanticCounts]) -> SemanticCounts:
-    """The counts of several scenes as one."""
-    return SemanticCounts(
-        np.sum([c.confusion for c in counts], axis=0, dtype=np.int64), np.any([c.is_present for c in counts], axis=0)
-    )
 
 
 def conceptgraphs_metrics(
@@ -152,17 +142,23 @@ def scannet_metrics(confusion: IntArray, *, counts_unseen: bool = False) -> Sema
     >>> metrics.iou.tolist(), metrics.mean_iou, metrics.mean_accuracy
     ([0.75, 0.0], 0.375, 0.75)
     """
-    n_classes = len(confusion)
-    hit = np.diag(confusion[:, :n_classes]).astype(np.float64)
-    n_true = confusion.sum(axis=1).astype(np.float64)
-    n_predicted = confusion[:, :n_classes].sum(axis=0).astype(np.float64)
-    iou = _ratio(hit, n_true + n_predicted - hit)
-    recall = _ratio(hit, n_true)
+    hit, n_true, n_predicted = _points(confusion)
+    iou = ratio(hit, n_true + n_predicted - hit)
+    recall = ratio(hit, n_true)
     if counts_unseen:
         recall[(n_true == 0) & (n_predicted > 0)] = 0.0
-    precision = _ratio(hit, n_predicted)
-    f1 = _ratio(2 * hit, n_true + n_predicted)
-    return _with_means(np.arange(n_classes), recall, precision, iou, f1, n_true)
+    f1 = ratio(2 * hit, n_true + n_predicted)
+    return _with_means(np.arange(len(hit)), recall, ratio(hit, n_predicted), iou, f1, n_true)
+
+
+def _points(confusion: IntArray) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Points (C,) of each class that are called rightly, are true, are predicted."""
+    square = confusion[:, : len(confusion)]
+    return (
+        np.diag(square).astype(np.float64),
+        confusion.sum(axis=1).astype(np.float64),
+        square.sum(axis=0).astype(np.float64),
+    )
 
 
 def hovsg_metrics(confusion: IntArray, is_scored: BoolArray) -> SemanticMetrics:
@@ -177,16 +173,12 @@ def hovsg_metrics(confusion: IntArray, is_scored: BoolArray) -> SemanticMetrics:
     >>> metrics.mean_accuracy, metrics.mean_iou
     (0.75, 0.75)
     """
-    n_classes = len(confusion)
     keep = np.flatnonzero(is_scored & (confusion.sum(axis=1) > 0))
-    hit = np.diag(confusion[:, :n_classes])[keep].astype(np.float64)
-    n_true = confusion.sum(axis=1)[keep].astype(np.float64)
-    n_predicted = confusion[:, :n_classes].sum(axis=0)[keep].astype(np.float64)
-    recall = _ratio(hit, n_true)
+    hit, n_true, n_predicted = (points[keep] for points in _points(confusion))
     precision = hit / np.maximum(1.0, n_predicted)
-    iou = _ratio(hit, n_true + n_predicted - hit)
-    f1 = _ratio(2 * hit, n_true + n_predicted)
-    return _with_means(keep, recall, precision, iou, f1, n_true)
+    iou = ratio(hit, n_true + n_predicted - hit)
+    f1 = ratio(2 * hit, n_true + n_predicted)
+    return _with_means(keep, ratio(hit, n_true), precision, iou, f1, n_true)
 
 
 def _with_means(
@@ -216,12 +208,6 @@ def _with_means(
         point_accuracy=float((n_true * np.nan_to_num(recall)).sum() / n_points) if n_points > 0 else float("nan"),
         n_classes_above=_n_above(iou),
     )
-
-
-def _ratio(numerator: Float64Array, denominator: Float64Array) -> Float64Array:
-    quotient = np.full(len(numerator), np.nan)
-    np.divide(numerator, denominator, out=quotient, where=denominator > 0)
-    return quotient
 
 
 def resampled_semantic(
@@ -261,12 +247,9 @@ def resampled_points(
     counts: Sequence[SemanticCounts], weights: Int64Array
 ) -> tuple[Float64Array, Float64Array, Float64Array]:
     """Points (R, C) of each class that are called rightly, are true, are predicted, in the scenes that were drawn."""
-    n_classes = len(counts[0].is_present)
     drawn = weights.astype(np.float64)
-    hit = drawn @ np.stack([np.diag(c.confusion[:, :n_classes]) for c in counts]).astype(np.float64)
-    n_true = drawn @ np.stack([c.confusion.sum(axis=1) for c in counts]).astype(np.float64)
-    n_predicted = drawn @ np.stack([c.confusion[:, :n_classes].sum(axis=0) for c in counts]).astype(np.float64)
-    return hit, n_true, n_predicted
+    hit, n_true, n_predicted = zip(*(_points(of_scene.confusion) for of_scene in counts), strict=True)
+    return drawn @ np.stack(hit), drawn @ np.stack(n_true), drawn @ np.stack(n_predicted)
 
 
 def resampled_points_sliced_away(

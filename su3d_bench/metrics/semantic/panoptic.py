@@ -9,8 +9,8 @@ SemanticKITTI and the one of OneFormer3D on ScanNet.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances, Masks, Partition
-from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array
+from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array, IntArray
 from su3d_bench.metrics.instance.score import masks_and_scores, named_classes, score_of_masks
 from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.matching.labelling import class_index_of_ids, encoder_warning, scored_classes
-from su3d_bench.metrics.metric import Arrays, Counts, Metric, Pooled, SceneScore, Values
+from su3d_bench.metrics.matching.labelling import class_index_of_ids, encoder_warning, places_among_scored
+from su3d_bench.metrics.metric import Counts, Metric, Pooled, SceneScore, axes, first_row
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.numerics.statistics import nan_mean
+from su3d_bench.numerics.statistics import ratio
 
 Rule = Literal["panopticapi", "semantic-kitti"]
 MATCHED = 0.5  # an IoU must be above it; of segments that do not overlap, only one can then match
@@ -39,17 +39,11 @@ class PanopticCounts(Counts):
     ``n_false`` and true ones ``n_missed``, and the sum of the IoUs of those that are matched, ``iou`` float64."""
 
     stored_as = "panoptic"
-    arrays: ClassVar[Arrays] = {
-        "n_matched": ("i", ("classes",)),
-        "n_false": ("i", ("classes",)),
-        "n_missed": ("i", ("classes",)),
-        "iou": ("f", ("classes",)),
-    }
 
-    n_matched: Int64Array
-    n_false: Int64Array
-    n_missed: Int64Array
-    iou: Float64Array
+    n_matched: Int64Array = field(metadata=axes("classes"))
+    n_false: Int64Array = field(metadata=axes("classes"))
+    n_missed: Int64Array = field(metadata=axes("classes"))
+    iou: Float64Array = field(metadata=axes("classes"))
 
     def contradiction(self) -> str | None:
         """A sum of IoUs that so many matches cannot have."""
@@ -151,39 +145,19 @@ def _sums(class_index: Int64Array, iou: Float64Array, n_classes: int, *, one_by_
     return np.array([np.sum(iou[class_index == index]) for index in range(n_classes)], np.float64)
 
 
-def combine(counts: Sequence[PanopticCounts]) -> PanopticCounts:
-    """The counts of several scenes as one, summed in the order of the scenes."""
-    whole = {name: np.zeros_like(getattr(counts[0], name)) for name in PanopticCounts.arrays}
-    for of_scene in counts:
-        whole = {name: total + getattr(of_scene, name) for name, total in whole.items()}
-    return PanopticCounts(**whole)
+def class_qualities(sums: Mapping[str, NDArray[Any]], rule: Rule) -> dict[str, Float64Array]:
+    """PQ, SQ and RQ (R, C) of each class from sums of counts; NaN for what is neither in the truth nor predicted.
 
-
-def class_qualities(counts: PanopticCounts, rule: Rule) -> dict[str, Float64Array]:
-    """PQ, SQ and RQ of each class; NaN for what is neither in the truth nor predicted.
-
-    The arrays of ``counts`` may be (C,) or, of several resamples, (R, C). A class without a match has SQ 0 in both
-    originals, and under ``semantic-kitti`` one of which there is nothing at all scores 0 as well.
+    A class without a match has SQ 0 in both originals, and under ``semantic-kitti`` one of which there is nothing at
+    all scores 0 as well.
     """
-    matched = counts.n_matched.astype(np.float64)
+    matched, iou = sums["n_matched"].astype(np.float64), sums["iou"]
+    halves = matched + 0.5 * sums["n_false"] + 0.5 * sums["n_missed"]
     if rule == "semantic-kitti":
-        sq = counts.iou / np.maximum(matched, _EPS)
-        rq = matched / np.maximum(matched + 0.5 * counts.n_false + 0.5 * counts.n_missed, _EPS)
+        sq, rq = iou / np.maximum(matched, _EPS), matched / np.maximum(halves, _EPS)
         return {"PQ": sq * rq, "SQ": sq, "RQ": rq}
-    halves = matched + 0.5 * counts.n_false + 0.5 * counts.n_missed
-    there, n = halves > 0, np.maximum(halves, 0.5)
-    return {
-        "PQ": np.where(there, counts.iou / n, np.nan),
-        "SQ": np.where(there, np.where(matched > 0, counts.iou / np.maximum(matched, 1.0), 0.0), np.nan),
-        "RQ": np.where(there, matched / n, np.nan),
-    }
-
-
-def resampled(counts: Sequence[PanopticCounts], weights: Int64Array) -> PanopticCounts:
-    """The counts (R, C) of the scenes drawn ``weights`` (R, S) times."""
-    return PanopticCounts(
-        *(weights @ np.stack([getattr(of_scene, name) for of_scene in counts]) for name in PanopticCounts.arrays)
-    )
+    sq = np.where(halves > 0, np.where(matched > 0, iou / np.maximum(matched, 1.0), 0.0), np.nan)
+    return {"PQ": ratio(iou, halves), "SQ": sq, "RQ": ratio(matched, halves)}
 
 
 def means(values: dict[str, Float64Array], is_thing: BoolArray, rule: Rule) -> dict[str, Float64Array]:
@@ -203,10 +177,9 @@ def means(values: dict[str, Float64Array], is_thing: BoolArray, rule: Rule) -> d
 def _mean_of_rows(table: Float64Array, rule: Rule) -> Float64Array:
     """The classes summed one after another, or as numpy sums: the last bit tells."""
     is_number = ~np.isnan(table)
-    n = is_number.sum(axis=1)
     filled = np.where(is_number, table, 0.0)
     total = filled.sum(axis=1) if rule == "semantic-kitti" else np.cumsum(filled, axis=1)[:, -1:].sum(axis=1)
-    return np.where(n > 0, total / np.maximum(n, 1), np.nan)
+    return ratio(total, is_number.sum(axis=1))
 
 
 class PanopticMetric(Metric[PanopticCounts]):
@@ -233,53 +206,28 @@ class PanopticMetric(Metric[PanopticCounts]):
         return {"classes": len(self.rules.scored)}
 
     def pooled(self, counts: Sequence[PanopticCounts]) -> Pooled:
-        table = self._classes(combine(counts))
-        classes = {
-            entry.name: {name: float(table[name][0, c]) for name in QUALITIES}
-            for c, entry in enumerate(self.rules.scored)
-        }
-        return Pooled(self._values(table), classes, self._groups(classes))
+        table = self._once(counts)
+        columns = self.class_columns(table, np.ones(len(self.rules.scored), bool))
+        classes = {name: first_row(values) for name, values in columns.items()}
+        n_classes = int((~np.isnan(table["PQ"])).sum())
+        values = first_row(means(table, things_of(self.rules), rule_of(self.rules))) | {"n_classes": n_classes}
+        return Pooled(values, classes, self.group_means(classes, {name: name for name in QUALITIES}))
 
-    def _groups(self, classes: Mapping[str, Values]) -> dict[str, Values]:
-        """The mean of each group over those of its classes that have a value."""
-        members: dict[str, list[Values]] = {}
-        for entry in self.rules.scored:
-            if entry.group:
-                members.setdefault(entry.group, []).append(classes[entry.name])
-        return {
-            group: {name: nan_mean(np.array([row[name] for row in rows])) for name in QUALITIES}
-            for group, rows in members.items()
-        }
-
-    def combine(self, counts: Sequence[PanopticCounts]) -> Values:
-        return self._values(self._classes(combine(counts)))
+    def _once(self, counts: Sequence[PanopticCounts]) -> dict[str, Float64Array]:
+        """The qualities (1, C) of all scenes, whose IoUs are summed in their order: the last bit tells."""
+        sums = vars(PanopticCounts.joined(counts))
+        return class_qualities({name: values[None] for name, values in sums.items()}, rule_of(self.rules))
 
     def resampled(self, counts: Sequence[PanopticCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
-        return self._means(self._classes(resampled(counts, weights)))
+        rule = rule_of(self.rules)
+        return means(class_qualities(PanopticCounts.drawn(counts, weights), rule), things_of(self.rules), rule)
 
     def resampled_classes(
         self, counts: Sequence[PanopticCounts], weights: Int64Array
     ) -> dict[str, dict[str, Float64Array]]:
-        table = self._classes(resampled(counts, weights))
-        whole = combine(counts)
-        has_truth = whole.n_matched + whole.n_missed > 0
-        return {
-            entry.name: {name: table[name][:, c] for name in QUALITIES}
-            for c, entry in enumerate(self.rules.scored)
-            if has_truth[c]
-        }
-
-    def _classes(self, counts: PanopticCounts) -> dict[str, Float64Array]:
-        qualities = class_qualities(counts, rule_of(self.rules))
-        return {name: np.atleast_2d(values) for name, values in qualities.items()}
-
-    def _means(self, table: dict[str, Float64Array]) -> dict[str, Float64Array]:
-        return means(table, things_of(self.rules), rule_of(self.rules))
-
-    def _values(self, table: dict[str, Float64Array]) -> Values:
-        means = self._means(table)
-        n_classes = int((~np.isnan(table["PQ"][0])).sum())
-        return {name: float(value[0]) for name, value in means.items()} | {"n_classes": n_classes}
+        table = class_qualities(PanopticCounts.drawn(counts, weights), rule_of(self.rules))
+        has_truth = np.sum([of_scene.n_matched + of_scene.n_missed for of_scene in counts], axis=0) > 0
+        return self.class_columns(table, has_truth)
 
 
 def things_of(rules: ProtocolRules) -> BoolArray:
@@ -297,7 +245,7 @@ def told_truth(rules: ProtocolRules, truth: GroundTruth) -> GroundTruth:
     There every labelled point belongs to a segment, and what the annotation gives a class and no instance, as
     ScanNet++'s does with walls, becomes one instance a class.
 
-    >>> from su3d_bench.core.types import LabelSet
+    >>> from su3d_bench.core.types import LabelSet, IntArray
     >>> from su3d_bench.metrics.protocols.loading import load_protocol
     >>> names = LabelSet("replica", (93, 20), ("wall", "chair"))
     >>> ids = np.array([93, 20, 0, 93], np.int32), np.array([0, 5, 0, 0], np.int32)
@@ -316,8 +264,8 @@ def told_truth(rules: ProtocolRules, truth: GroundTruth) -> GroundTruth:
 
 def count_segments(
     rules: ProtocolRules,
-    semantic: NDArray[np.integer[Any]],
-    instance: NDArray[np.integer[Any]],
+    semantic: IntArray,
+    instance: IntArray,
     masks: Masks,
     scores: Float64Array,
     class_ids: Int64Array,
@@ -338,11 +286,9 @@ def count_segments(
     return per_scene(truth, predicted, things_of(rules), rule_of(rules), size)
 
 
-def _scored_index(rules: ProtocolRules, ids: NDArray[np.integer[Any]]) -> Int64Array:
+def _scored_index(rules: ProtocolRules, ids: IntArray) -> Int64Array:
     """The place of each class id among the scored classes, -1 where it is none of them."""
-    is_scored = scored_classes(rules)
-    place = np.append(np.where(is_scored, np.cumsum(is_scored) - 1, -1), -1)
-    return place[class_index_of_ids(rules, ids)]
+    return places_among_scored(rules)[class_index_of_ids(rules, ids)]
 
 
 def _shared_warning(masks: Masks, scores: Float64Array, n_points: int) -> str | None:

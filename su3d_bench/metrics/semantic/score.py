@@ -12,20 +12,13 @@ from su3d_bench.core.geometry import voxel_coordinates
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import DenseFeatures, Partition, Prediction
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array
+from su3d_bench.metrics.matching import labelling
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching import votes as neighbours
-from su3d_bench.metrics.matching.labelling import (
-    candidate_classes,
-    class_index_of_ids,
-    classes_of_prediction,
-    encoder_warning,
-    scored_classes,
-)
 from su3d_bench.metrics.metric import Metric, Pooled, SceneScore, Values, present
 from su3d_bench.metrics.protocols.model import ClassEntry, ProtocolRules
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, SemanticMetrics
-from su3d_bench.numerics.statistics import nan_mean
 
 GROUP_COLUMNS = {"mAcc": "recall", "mIoU": "IoU"}  # what a group of classes is called by, and what it averages
 
@@ -43,7 +36,7 @@ class SemanticMetric(Metric[SemanticCounts]):
     def per_scene(self, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None) -> SceneScore:
         rules = self.rules
         called = call_points(rules, truth, prediction, encoder)
-        warnings = [encoder_warning(rules, prediction, encoder)]
+        warnings = [labelling.encoder_warning(rules, prediction, encoder)]
         has_points = present(called.true_class[called.is_wanted], len(rules.classes))
         without_points = np.flatnonzero(called.is_present & ~has_points)
         if len(without_points):
@@ -59,7 +52,7 @@ class SemanticMetric(Metric[SemanticCounts]):
         return {"classes": len(self.rules.classes), "columns": len(self.rules.classes) + 1}
 
     def pooled(self, counts: Sequence[SemanticCounts]) -> Pooled:
-        metrics = self._metrics(semantic.concatenate(counts), pooled=True)
+        metrics = self._metrics(SemanticCounts.joined(counts), pooled=True)
         classes = {
             self._entries[index].name: {
                 "recall": float(metrics.recall[row]),
@@ -70,13 +63,13 @@ class SemanticMetric(Metric[SemanticCounts]):
             }
             for row, index in enumerate(metrics.class_index)
         }
-        return Pooled(self._values(metrics), classes, self._groups(classes))
+        return Pooled(self._values(metrics), classes, self.group_means(classes, GROUP_COLUMNS))
 
     def combine_each(self, counts: Sequence[SemanticCounts]) -> list[Values]:
-        return [self._values(self._metrics(semantic.concatenate([of_scene]), pooled=False)) for of_scene in counts]
+        return [self._values(self._metrics(of_scene, pooled=False)) for of_scene in counts]
 
     def resampled(self, counts: Sequence[SemanticCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
-        is_scored = scored_classes(self.rules) if self.rules.metric == "hovsg" else None
+        is_scored = labelling.scored_classes(self.rules) if self.rules.metric == "hovsg" else None
         return semantic.resampled_semantic(counts, weights, self.rules.metric, is_scored)
 
     def resampled_classes(
@@ -90,7 +83,7 @@ class SemanticMetric(Metric[SemanticCounts]):
         iou = np.where(counted, hit / np.maximum(n_true + n_predicted - hit, 1), np.nan)
         return {
             self.rules.classes[index].name: {"recall": recall[:, index], "IoU": iou[:, index]}
-            for index in np.flatnonzero(scored_classes(self.rules))
+            for index in np.flatnonzero(labelling.scored_classes(self.rules))
             if any(of_scene.confusion[index].any() for of_scene in counts)
         }
 
@@ -112,22 +105,8 @@ class SemanticMetric(Metric[SemanticCounts]):
             **{f"n_IoU>{level:.2f}": n for level, n in zip(semantic.IOU_LEVELS, metrics.n_classes_above, strict=True)},
         }
 
-    def _groups(self, classes: Mapping[str, Values]) -> dict[str, Values]:
-        """The mean of each group over those of its classes that have a value."""
-        rows: dict[str, list[Values]] = {}
-        for entry in self.rules.scored:
-            if entry.group:
-                rows.setdefault(entry.group, []).append(classes.get(entry.name, {}))
-        return {
-            name: {
-                shown: nan_mean(np.array([row.get(column, np.nan) for row in of_group]))
-                for shown, column in GROUP_COLUMNS.items()
-            }
-            for name, of_group in rows.items()
-        }
-
     def _metrics(self, whole: SemanticCounts, *, pooled: bool) -> SemanticMetrics:
-        is_scored = scored_classes(self.rules)
+        is_scored = labelling.scored_classes(self.rules)
         if self.rules.metric == "hovsg":
             return semantic.hovsg_metrics(whole.confusion, is_scored)
         if self.rules.metric in {"scannet", "ovo"}:
@@ -179,8 +158,8 @@ def call_points(
     rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
 ) -> CalledPoints:
     """What each evaluation point is and is called."""
-    class_of_label = class_index_of_ids(rules, truth.semantic)
-    is_scored = scored_classes(rules)
+    class_of_label = labelling.class_index_of_ids(rules, truth.semantic)
+    is_scored = labelling.scored_classes(rules)
     is_present = present(class_of_label, len(rules.classes)) & is_scored
     targets, source = truth.points, np.arange(len(truth.points))
     true_class = class_of_label
@@ -190,8 +169,7 @@ def call_points(
         true_class = np.where(source >= 0, class_of_label[source], -1)
     is_counted = _counted_classes(rules, is_scored, is_present)
     is_wanted = (true_class >= 0) & is_counted[true_class]
-    candidates = candidate_classes(rules, is_present)
-    classes = with_unnamed(rules, classes_of_prediction(rules, prediction, encoder, candidates))
+    classes = with_unnamed(rules, labelling.classes_of_prediction(rules, prediction, encoder, is_present))
     votes_for_masks = rules.transfer.votes == "masks" and not isinstance(prediction, DenseFeatures)
     if votes_for_masks and not transfer.are_same_points(prediction.points, targets):
         mask, distance_m = transfer_votes(rules, prediction, classes, targets, is_wanted, of_masks=True)

@@ -6,8 +6,7 @@ Source: semantic/eval/eval_semantic.py and semantic/utils/confmat.py of scannetp
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -15,18 +14,13 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array
-from su3d_bench.metrics.matching.labelling import (
-    candidate_classes,
-    class_index_of_ids,
-    encoder_warning,
-    ranked_classes,
-    scored_classes,
-)
-from su3d_bench.metrics.metric import Arrays, Counts, Metric, Pooled, SceneScore, present
+from su3d_bench.metrics.matching import labelling
+from su3d_bench.metrics.metric import Counts, Metric, Pooled, SceneScore, axes, present
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, SemanticMetrics
 from su3d_bench.metrics.semantic.score import owners_at
+from su3d_bench.numerics.statistics import ratio
 
 ONE_CLASS = "the prediction names one class a point: top {k} is top 1"
 
@@ -40,15 +34,10 @@ class TopKCounts(Counts):
     """
 
     stored_as = "top-k"
-    arrays: ClassVar[Arrays] = {
-        "best": ("i", ("classes", "columns")),
-        "any": ("i", ("classes", "columns")),
-        "is_present": ("b", ("classes",)),
-    }
 
-    best: Int64Array
-    any: Int64Array
-    is_present: BoolArray
+    best: Int64Array = field(metadata=axes("classes", "columns"))
+    any: Int64Array = field(metadata=axes("classes", "columns"))
+    is_present: BoolArray = field(metadata=axes("classes"))
 
     def contradiction(self) -> str | None:
         """Points of a class that the scenes do not contain, other numbers of points, fewer hits among more classes."""
@@ -105,11 +94,11 @@ def ranked_at(
     """What the ``wanted`` (N,) points of a truth are called: the classes of the nearest object, or row of features."""
     assert rules.top_k is not None
     is_present = present(_labels(rules, truth).ravel(), len(rules.classes))
-    ranked = ranked_classes(rules, prediction, encoder, candidate_classes(rules, is_present), rules.top_k)
-    ranked[~np.append(scored_classes(rules), False)[ranked]] = -1
+    ranked = labelling.ranked_classes(rules, prediction, encoder, is_present, rules.top_k)
+    ranked[~np.append(labelling.scored_classes(rules), False)[ranked]] = -1
     row, distance_m = owners_at(rules, prediction, np.ones(len(ranked), np.bool_), truth.points, wanted)
     classes = np.append(ranked, np.full((1, rules.top_k), -1), axis=0)[row]
-    warning = encoder_warning(rules, prediction, encoder)
+    warning = labelling.encoder_warning(rules, prediction, encoder)
     return RankedPoints(classes, distance_m, () if warning is None else (warning,))
 
 
@@ -157,7 +146,7 @@ class TopKMetric(Metric[TopKCounts]):
                 f"top-{self._k} recall": float(any_of_k.recall[index]),
                 f"top-{self._k} IoU": float(any_of_k.iou[index]),
             }
-            for index in np.flatnonzero(scored_classes(self.rules))
+            for index in np.flatnonzero(labelling.scored_classes(self.rules))
         }
         values = (best.mean_iou, best.mean_accuracy, any_of_k.mean_iou, any_of_k.mean_accuracy)
         return Pooled(dict(zip(self.rules.value_names, values, strict=True)), classes)
@@ -176,9 +165,8 @@ class TopKMetric(Metric[TopKCounts]):
         answer: dict[str, dict[str, Float64Array]] = {}
         for which, prefix in ((0, ""), (1, f"top-{self._k} ")):
             hit, n_true, n_predicted = semantic.resampled_points([c.each[which] for c in counts], weights)
-            recall = np.where(n_true > 0, hit / np.maximum(n_true, 1), np.nan)
-            iou = np.where(n_true > 0, hit / np.maximum(n_true + n_predicted - hit, 1), np.nan)
-            for index in np.flatnonzero(scored_classes(self.rules)):
+            recall, iou = ratio(hit, n_true), np.where(n_true > 0, ratio(hit, n_true + n_predicted - hit), np.nan)
+            for index in np.flatnonzero(labelling.scored_classes(self.rules)):
                 if any(c.is_present[index] for c in counts):
                     row = answer.setdefault(self.rules.classes[index].name, {})
                     row |= {f"{prefix}recall": recall[:, index], f"{prefix}IoU": iou[:, index]}
@@ -186,17 +174,14 @@ class TopKMetric(Metric[TopKCounts]):
 
     def _metrics(self, counts: Sequence[TopKCounts]) -> tuple[SemanticMetrics, SemanticMetrics]:
         """Of the first class and of the k, over all classes; those that are not scored have no point and no value."""
-        best, any_of_k = zip(*(of_scene.each for of_scene in counts), strict=True)
-        return (
-            semantic.scannet_metrics(semantic.concatenate(best).confusion),
-            semantic.scannet_metrics(semantic.concatenate(any_of_k).confusion),
-        )
+        whole = TopKCounts.joined(counts)
+        return semantic.scannet_metrics(whole.best), semantic.scannet_metrics(whole.any)
 
 
 def _labels(rules: ProtocolRules, truth: GroundTruth) -> Int64Array:
     """The class indices (N, L) of the labels of each point, -1 for no more, none for points that are left out."""
     ids = truth.semantic[:, None] if truth.every_semantic is None else truth.every_semantic
-    labels = class_index_of_ids(rules, ids.ravel()).reshape(ids.shape)
-    labels[~np.append(scored_classes(rules), False)[labels]] = -1
+    labels = labelling.class_index_of_ids(rules, ids.ravel()).reshape(ids.shape)
+    labels[~np.append(labelling.scored_classes(rules), False)[labels]] = -1
     labels[truth.semantic < 0] = -1
     return labels

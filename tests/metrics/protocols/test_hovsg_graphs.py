@@ -22,7 +22,6 @@ from su3d_bench.metrics.graphs import (
     NEEDS_PLACES,
     Cloud,
     MatchedObjects,
-    PlaceCounts,
     covered_share,
     floor_bounds,
     larger_share,
@@ -181,26 +180,6 @@ def test_another_number_of_floors_finds_no_bound_and_says_so(tmp_path: Any) -> N
     both = numbers(PLACE_RULES, (truth, right), (truth, wrong))
     assert (both["number of floors"], both["floor recall"], both["room recall"]) == (0.5, 0.5, 1.0)
     assert floor_bounds([], [Floor(0, 1)])[0].tolist() == [0, 2]
-
-
-def test_counts_that_no_scene_gives_are_refused() -> None:
-    objects = {"n_objects": np.array([2, 3]), "n_found": np.array([2, 1]), "n_ranked": np.array([1, 0, 1])}
-    assert MatchedObjects.checked(objects).contradiction() is None
-    for name, values in (("n_found", [1, 2]), ("n_ranked", [2, 0, 1]), ("n_objects", [1, 3]), ("n_objects", [9])):
-        with pytest.raises(DataError, match="score the scene again"):
-            MatchedObjects.checked(objects | {name: np.array(values)})
-    places = {
-        "n_scenes": np.array([1, 1]), "n_bounds": np.array([2, 2]), "n_bounds_found": np.array([1]),
-        "n_rooms": np.array([2, 3]), "n_rooms_found": np.array([2, 1]), "room_shares": np.array([2.0, 2.5]),
-    }  # fmt: skip
-    assert PlaceCounts.checked(places).contradiction() is None
-    for name, wrong in (
-        ("n_scenes", np.array([2, 1])), ("n_bounds_found", np.array([3])), ("n_bounds_found", np.array([1, 1])),
-        ("n_rooms_found", np.array([3, 1])), ("room_shares", np.array([2.5, 0.0])),
-        ("room_shares", np.array([-1.0, 0.0])),
-    ):  # fmt: skip
-        with pytest.raises(DataError, match="score the scene again"):
-            PlaceCounts.checked(places | {name: wrong})
 
 
 def test_points_at_the_radius_are_not_near_and_shares_are_of_the_right_side() -> None:

@@ -5,16 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from places import CASES
 from scored_room import ENCODER, ID, LABELS, OneHotEncoder, instances, noisy, nothing, room, truth_as_prediction
 
-from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
 from su3d_bench.core.types import Float32Array, GroundTruth, LabelSet, UInt8Array
 from su3d_bench.evaluation.scoring import score_on_vertices
@@ -22,7 +18,7 @@ from su3d_bench.evaluation.truth import VertexTruth
 from su3d_bench.metrics.matching.labelling import text_features
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.scoring import combine, pack_scores, score_scene, unpack_scores
+from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.metrics.semantic.confusion import hovsg_metrics, per_scene
 from su3d_bench.predictions.base import VertexLabels
 
@@ -105,25 +101,6 @@ def test_the_mean_of_the_prompts_is_that_of_their_directions() -> None:
 # ---- a whole scene
 
 
-@pytest.mark.parametrize("with_labels", [True, False])
-@pytest.mark.parametrize("rules", VOTED.values(), ids=VOTED)
-def test_objects_apart_from_each_other_score_exactly_one(rules: ProtocolRules, with_labels: bool) -> None:
-    truth = known_to(rules, room())
-    prediction = truth_as_prediction(truth, with_labels=with_labels)
-    assert set(metrics(rules, truth, prediction)) == {1.0}
-
-
-def known_to(rules: ProtocolRules, truth: GroundTruth) -> GroundTruth:
-    """The room without what the protocol has no class for."""
-    ids = [entry.id for entry in rules.classes]
-    known = np.isin(truth.semantic, ids)
-    return replace(
-        truth,
-        semantic=np.where(known, truth.semantic, 0).astype(np.int32),
-        instance=np.where(known, truth.instance, 0).astype(np.int32),
-    )
-
-
 @pytest.mark.parametrize("rules", [HOVSG, EXACT], ids=lambda rules: str(rules.name))
 def test_the_truth_on_its_own_points_does_not_reach_one_where_objects_meet(rules: ProtocolRules) -> None:
     """The vote of the neighbours smooths the border, on the scored points themselves too."""
@@ -163,22 +140,6 @@ def two_that_meet(rules: ProtocolRules) -> GroundTruth:
     points = rng.random((400, 3)).astype(np.float32)
     semantic = np.where(points[:, 0] < 0.5, ID["chair"], ID["table"]).astype(np.int32)
     return GroundTruth(points, semantic, (semantic == ID["chair"]) + np.int32(1), LABELS, rules.ground_truth, "test")
-
-
-@pytest.mark.parametrize("rules", VOTED.values(), ids=VOTED)
-def test_an_empty_prediction_scores_exactly_zero(rules: ProtocolRules) -> None:
-    assert set(metrics(rules, room(), nothing(room()))) == {0.0}
-
-
-@pytest.mark.parametrize("rules", VOTED.values(), ids=VOTED)
-def test_shuffled_instances_change_nothing(rules: ProtocolRules) -> None:
-    truth, prediction = noisy(3)
-    order = np.random.default_rng(0).permutation(len(prediction))
-    labels = prediction.labels or ()
-    shuffled = instances(truth.points, [prediction.mask(k) for k in order], [labels[k] for k in order])
-    before = metrics(rules, truth, prediction)
-    assert 0 < before[0] < 1
-    assert metrics(rules, truth, shuffled) == before
 
 
 def test_what_is_predicted_on_an_ignored_surface_lowers_the_iou_under_hovsg_and_not_under_conceptgraphs() -> None:
@@ -225,20 +186,6 @@ def test_under_ovo_what_has_no_class_is_called_the_last_class_of_its_list() -> N
     assert set(metrics(OVO, with_switch, nothing(truth))) == {0.0}
 
 
-@pytest.mark.parametrize(
-    ("base", "line", "message"),
-    [
-        ("replica-ovo51", 'unnamed = "swich"', "unnamed: 'swich' is no class; did you mean 'switch'?"),
-        ("rooms-instance", 'unnamed = "chair"', "unnamed: belongs to kind 'semantic'"),
-    ],
-)
-def test_a_wrong_class_for_what_has_none_is_one_line(base: str, line: str, message: str, tmp_path: Path) -> None:
-    (tmp_path / "mine.toml").write_text(f'extends = "{base}"\nname = "mine"\n{line}\n')
-    with pytest.raises(ConfigError) as caught:
-        load_protocol(str(tmp_path / "mine.toml"))
-    assert message in str(caught.value) and "mine.toml:3" in str(caught.value)
-
-
 def test_a_class_a_vertex_beside_files_of_truth_counts_alike() -> None:
     rules = load_protocol("scannet-ovo20")
     labels = np.array([1, 1, 2, 0])
@@ -271,15 +218,6 @@ def test_hovsg_reports_the_mean_of_the_scenes_and_its_interval() -> None:
     assert 0 < result.metrics["pAcc"] < 1
     assert interval is not None
     assert interval[0] < result.metrics["mIoU"] < interval[1]
-
-
-@settings(max_examples=15, deadline=None)
-@given(seeds=st.sets(st.integers(0, 5), min_size=1), name=st.sampled_from(sorted(VOTED)))
-def test_counts_of_scenes_combine_to_the_whole(seeds: set[int], name: str) -> None:
-    rules = VOTED[name]
-    scores = {f"s{seed}": score_scene(rules, fitting(rules, noisy(seed)[0]), noisy(seed)[1], None) for seed in seeds}
-    stored = {scene: unpack_scores(pack_scores({name: score}))[name] for scene, score in scores.items()}
-    assert combine(rules, dict(reversed(stored.items()))).to_json() == combine(rules, scores).to_json()
 
 
 # ---- ScanNet

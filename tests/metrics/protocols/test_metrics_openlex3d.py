@@ -34,13 +34,11 @@ from su3d_bench.metrics.open_vocabulary.openlex3d import (
     OpenLexTruth,
     category_table,
     combine,
-    concatenate,
     count_categories,
     count_ranks,
     point_categories,
     rank_scores,
     ranked_labels,
-    resampled,
     scored_objects,
 )
 from su3d_bench.metrics.open_vocabulary.score import voxel_means
@@ -180,12 +178,6 @@ def test_ranks_outside_their_box_count_by_how_far_they_lie_from_it() -> None:
 
 
 # ---- a whole scene
-
-
-def test_the_truth_itself_is_all_synonyms_and_ranks_first() -> None:
-    truth = lex_truth()
-    assert values_of(TOPN, truth, perfect(truth)) == {name: float(name == "synonyms") for name in CATEGORIES}
-    assert values_of(RANKING, truth, perfect(truth)) == {"overall": 1.0, "synonyms": 1.0, "secondary": 1.0}
 
 
 def test_an_empty_prediction_is_all_missing_and_ranks_nothing() -> None:
@@ -334,29 +326,6 @@ def test_a_point_just_as_far_as_the_cap_has_the_label_of_its_nearest(far_m: floa
 
 
 # ---- scenes together
-
-
-def some_counts(seed: int, n_objects: int) -> ObjectCounts:
-    rng = np.random.default_rng(seed)
-    n_points = rng.integers(1, 20, n_objects)
-    totals = rng.random((n_objects, 3)) * n_points[:, None]
-    totals[rng.random((n_objects, 3)) < 0.2] = np.nan
-    return ObjectCounts(n_points, totals)
-
-
-@given(seed=st.integers(0, 1000), n=st.integers(0, 12), cut=st.integers(0, 12))
-def test_counts_of_parts_combine_to_the_whole(seed: int, n: int, cut: int) -> None:
-    whole = some_counts(seed, n)
-    parts = [ObjectCounts(whole.n_points[rows], whole.totals[rows]) for rows in (slice(None, cut), slice(cut, None))]
-    assert np.array_equal(combine(parts), combine([whole]), equal_nan=True)
-    assert np.array_equal(concatenate(parts).totals, whole.totals, equal_nan=True)
-
-
-@given(seed=st.integers(0, 1000))
-def test_resampled_means_are_those_of_the_drawn_scenes(seed: int) -> None:
-    counts = [some_counts(seed + s, 3 + s) for s in range(3)]
-    drawn = resampled(counts, np.array([[2, 0, 1]]))[0]
-    np.testing.assert_allclose(drawn, combine([counts[0], counts[0], counts[2]]), rtol=1e-12)
 
 
 # ---- what a reader is told, and what is refused

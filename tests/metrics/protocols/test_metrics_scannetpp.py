@@ -13,15 +13,14 @@ import pytest
 from places import CASES
 from scored_room import ID, LABELS, OneHotEncoder, instances
 
-from su3d_bench.core.errors import DataError
 from su3d_bench.core.maps import DenseFeatures, Masks
 from su3d_bench.core.types import GroundTruth, LabelSet
 from su3d_bench.evaluation.scoring import map_of, skips_missing_scenes
 from su3d_bench.metrics.fitness import ContentFacts, why_not_content
 from su3d_bench.metrics.instance.score import without_labels
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.metrics.scoring import ProtocolResult, combine, metric_of, pack_scores, score_scene, unpack_scores
-from su3d_bench.metrics.semantic.top_k import ONE_CLASS, TopKCounts, top_k_confusion
+from su3d_bench.metrics.scoring import ProtocolResult, combine, pack_scores, score_scene, unpack_scores
+from su3d_bench.metrics.semantic.top_k import ONE_CLASS, top_k_confusion
 from su3d_bench.predictions.base import VertexLabels
 from su3d_bench.predictions.export import _runs_json
 from su3d_bench.predictions.formats import recognise
@@ -199,36 +198,6 @@ def test_one_class_a_point_makes_top_k_top_1_and_is_said() -> None:
     assert combine(TOP_K, {"s": ranked}).metrics["top-3 mIoU"] > metrics["mIoU"]
 
 
-def test_resampling_once_is_the_value_itself() -> None:
-    truth = room_truth()
-    rng = np.random.default_rng(3)
-    scores = {}
-    for s in range(3):
-        rows = rng.choice(truth.semantic, (60, 3)).astype(np.int32)
-        content = VertexLabels(rows[:, 0], rows[:, 1:])
-        scores[f"s{s}"] = score_scene(TOP_K, truth, map_of(content, truth.points, TOP_K), None)
-    metric, counts = metric_of(TOP_K), [score.counts for score in scores.values()]
-    pooled, drawn = metric.pooled(counts).values, metric.resampled(counts, np.ones((1, 3), np.int64))
-    assert {name: float(values[0]) for name, values in drawn.items()} == pytest.approx(pooled, abs=1e-12)
-    each = metric.resampled_classes(counts, np.ones((1, 3), np.int64))
-    for name, row in each.items():
-        assert {key: float(values[0]) for key, values in row.items()} == pytest.approx(
-            {key: metric.pooled(counts).classes[name][key] for key in row}, abs=1e-12
-        )
-
-
 def test_a_point_without_any_label_is_skipped_and_one_without_a_class_is_missed() -> None:
     labels, ranked = np.array([[-1, -1], [-1, 2], [1, 0]]), np.array([[0, 1], [-1, -1], [2, 0]])
     assert top_k_confusion(labels, ranked, 3).tolist() == [[1, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]]
-
-
-@pytest.mark.parametrize("name", ["best", "any"])
-def test_counts_that_no_scene_gives_are_refused(name: str) -> None:
-    whole = {"best": np.array([[1, 1, 0], [0, 0, 0]]), "any": np.array([[2, 0, 0], [0, 0, 0]])}
-    arrays = {**whole, "is_present": np.array([True, False])}
-    TopKCounts.checked(arrays)
-    for wrong in (np.array([[0, 0, 0], [2, 0, 0]]), np.array([[3, 0, 0], [0, 0, 0]])):
-        with pytest.raises(DataError, match="score the scene again"):
-            TopKCounts.checked({**arrays, name: wrong})
-    with pytest.raises(DataError, match="fewer hits"):
-        TopKCounts.checked({**arrays, "best": whole["any"], "any": whole["best"]})

@@ -71,7 +71,7 @@ def test_points_that_evaluations_leave_out_are_in_no_predicted_segment_either() 
     whole, chair = count_segments(RULES, truth.semantic, truth.instance, masks, masks.scores, ids), ID["chair"]
     left_out = np.where((truth.semantic == chair) & (np.arange(len(truth.points)) % 3 > 0), -1, truth.semantic)
     counts = count_segments(RULES, left_out, truth.instance, masks, masks.scores, ids)
-    for name in PanopticCounts.arrays:
+    for name in PanopticCounts.arrays():
         assert getattr(counts, name).tolist() == getattr(whole, name).tolist()
     gone = count_segments(RULES, np.where(left_out == chair, -1, left_out), truth.instance, masks, masks.scores, ids)
     assert gone.n_false.sum() == 0 and gone.n_matched.sum() == whole.n_matched.sum() - 2

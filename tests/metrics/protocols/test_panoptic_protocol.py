@@ -4,22 +4,18 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from places import CASES
-from scored_room import ENCODER, ID, instances, noisy, noisy_scores, nothing, room, truth_as_prediction
+from scored_room import ID, instances, room
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import DataError
 from su3d_bench.core.maps import Masks
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, score_scene, unpack_scores
+from su3d_bench.metrics.scoring import metric_of, score_scene
 from su3d_bench.metrics.semantic import panoptic
 from su3d_bench.metrics.semantic.panoptic import PanopticCounts, Rule, Segments, count_segments
 
@@ -43,7 +39,7 @@ def test_the_answer_of_the_original_holds_to_the_last_bit(name: str, index: int)
     size = problem.get("min_region_size", 1)
     counts = [panoptic.per_scene(Segments(*one[:2]), Segments(*one[2:]), is_thing, rule, size) for one in scenes]
     answer: dict[str, Any] = problem["answer"]
-    qualities = panoptic.class_qualities(panoptic.combine(counts), rule)
+    qualities = panoptic.class_qualities(vars(PanopticCounts.joined(counts)), rule)
     means = panoptic.means({key: values[None] for key, values in qualities.items()}, is_thing, rule)
     for key, values in qualities.items():
         assert np.nan_to_num(values).tolist() == answer["classes"][key]  # of what is nowhere the original prints 0
@@ -90,34 +86,6 @@ def test_small_segments_are_neither_missed_nor_wrong_where_there_is_a_least_size
         assert (counts.n_false.tolist(), counts.n_missed.tolist()) == (expected, expected)
 
 
-def test_the_truth_scores_one_and_nothing_scores_zero() -> None:
-    truth = room()
-    for prediction, expected in ((truth_as_prediction(truth, with_labels=True), 1.0), (nothing(truth), 0.0)):
-        result = combine(RULES, {"room": score_scene(RULES, truth, prediction, ENCODER)})
-        assert {result.metrics[name] for name in RULES.headline} == {expected}
-    assert result.metrics["n_classes"] == 7
-    assert result.per_class["wall"] == {"PQ": 0.0, "SQ": 0.0, "RQ": 0.0}
-    assert np.isnan(result.per_class["bed"]["PQ"])
-
-
-def test_the_order_of_masks_and_the_numbers_of_objects_change_nothing() -> None:
-    truth, prediction = noisy(3)
-    order = np.random.default_rng(0).permutation(len(prediction))
-    assert prediction.labels is not None
-    mixed = instances(
-        truth.points,
-        [prediction.mask(k) for k in order],
-        [prediction.labels[k] for k in order],
-        scores=prediction.scores[order].tolist(),
-    )
-    other = replace(truth, instance=np.where(truth.instance > 0, 9 - truth.instance, 0).astype(np.int32))
-    one = score_scene(RULES, truth, prediction, None).counts
-    for counts in (score_scene(RULES, truth, mixed, None).counts, score_scene(RULES, other, prediction, None).counts):
-        assert isinstance(one, PanopticCounts) and isinstance(counts, PanopticCounts)
-        for name in PanopticCounts.arrays:
-            np.testing.assert_allclose(getattr(counts, name), getattr(one, name), rtol=1e-15)
-
-
 def test_a_point_in_several_masks_is_that_of_the_greatest_confidence_and_the_first_of_equals() -> None:
     masks = Masks.of_sets([np.arange(4), np.arange(4), np.arange(4)])
     semantic, instance = np.full(4, ID["chair"]), np.ones(4, np.int64)
@@ -140,52 +108,11 @@ def test_a_reader_is_told_how_many_points_several_masks_claim() -> None:
     )
 
 
-@settings(max_examples=25, deadline=None)
-@given(st.integers(2, 5), st.integers(0, 1000))
-def test_parts_combine_to_the_whole_and_weights_of_ones_are_it(n_scenes: int, seed: int) -> None:
-    scores = {f"rooms/{k}": score_scene(RULES, *noisy(seed + k), None) for k in range(n_scenes)}
-    metric, counts = metric_of(RULES), [score.counts for score in scores.values()]
-    whole = metric.combine(counts)
-    in_parts = metric.combine([panoptic.combine(counts[:1]), panoptic.combine(counts[1:])])  # type: ignore[arg-type]
-    assert whole == pytest.approx(in_parts, rel=1e-14, nan_ok=True)
-    once = metric.resampled(counts, np.ones((1, n_scenes), np.int64))
-    assert {name: float(value[0]) for name, value in once.items()} == pytest.approx(
-        {name: whole[name] for name in once}, rel=1e-14, nan_ok=True
-    )
-    alone = metric.resampled(counts, np.eye(n_scenes, dtype=np.int64))
-    for k, row in enumerate(metric.combine_each(counts)):
-        assert {name: float(value[k]) for name, value in alone.items()} == pytest.approx(
-            {name: row[name] for name in alone}, rel=1e-14, nan_ok=True
-        )
-
-
-def test_each_class_is_resampled_as_it_is_scored() -> None:
-    scores = noisy_scores(RULES.name, 4)
-    result, counts = combine(RULES, scores), [score.counts for score in scores.values()]
-    classes = metric_of(RULES).resampled_classes(counts, np.ones((1, 4), np.int64))
-    assert set(classes) == {"wall", "chair", "table", "lamp", "cushion", "book", "backpack"}
-    for name, values in classes.items():
-        assert {key: float(value[0]) for key, value in values.items()} == pytest.approx(result.per_class[name])
-    assert result.intervals["PQ"] is not None
-
-
 def test_groups_of_classes_have_means_of_their_own() -> None:
     rules = load_protocol("scannet200-panoptic")
     none, one_each = np.zeros(200, np.int64), np.ones(200, np.int64)
     whole = metric_of(rules).pooled([PanopticCounts(none, none, one_each, np.zeros(200))])
     assert whole.groups == {name: {"PQ": 0.0, "SQ": 0.0, "RQ": 0.0} for name in ("head", "common", "tail")}
-
-
-def test_counts_survive_their_file_and_impossible_ones_are_refused() -> None:
-    score = noisy_scores(RULES.name, 1)["rooms/0"]
-    kept = unpack_scores(pack_scores({RULES.name: score}))[RULES.name]
-    assert combine(RULES, {"a": kept}).metrics == combine(RULES, {"a": score}).metrics
-    counts = score.counts
-    assert isinstance(counts, PanopticCounts)
-    arrays = {name: getattr(counts, name) for name in PanopticCounts.arrays}
-    for iou in (np.full_like(counts.iou, 9.0), np.full_like(counts.iou, np.nan)):
-        with pytest.raises(DataError, match="'iou' of class 0"):
-            PanopticCounts.checked(arrays | {"iou": iou})
 
 
 def test_the_splits_are_those_that_are_named() -> None:

@@ -15,13 +15,13 @@ from places import CASES
 from scored_room import ENCODER, LABELS, instances, nothing, room, truth_as_prediction
 
 from su3d_bench.core import registry
-from su3d_bench.core.errors import DataError, PredictionError
+from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.types import Float32Array, GroundTruth, LabelSet, UInt8Array
 from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.presence import MEASURES, SAMPLINGS, PresenceCounts, measured, relevancies
 from su3d_bench.metrics.questions.score import AskedThing, PresenceTruth
-from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, plain_json, score_scene, unpack_scores
+from su3d_bench.metrics.scoring import metric_of, plain_json, score_scene
 from su3d_bench.questions.generated import absent_names, counted_rooms, drawn, presence_questions
 from su3d_bench.questions.scene_map import is_called, is_room_surface, known_objects, plain_name
 
@@ -208,17 +208,3 @@ def test_the_rooms_over_which_it_is_counted_are_those_of_the_generator(scene: st
     rooms = counted_rooms()
     assert tuple(dict.fromkeys(name for name in names if not is_room_surface(name))) in rooms
     assert len(rooms) == 48
-
-
-def test_counts_survive_their_file_and_impossible_ones_are_refused() -> None:
-    score = score_scene(RULES, QUESTIONS, PERFECT, ENCODER)
-    kept = unpack_scores(pack_scores({RULES.name: score}))[RULES.name]
-    assert plain_json(combine(RULES, {"a": kept}).metrics) == plain_json(combine(RULES, {"a": score}).metrics)
-    arrays = {name: getattr(score.counts, name) for name in PresenceCounts.arrays}
-    for name, value, message in (
-        ("sampling", np.full(4, 3, np.int64), "counts beyond the 3 samplings"),
-        ("similarity", np.full(4, np.nan), "no cosines"),
-        ("similarity", np.full(4, 1.1), "no cosines"),
-    ):
-        with pytest.raises(DataError, match=message):
-            PresenceCounts.checked(arrays | {name: value})

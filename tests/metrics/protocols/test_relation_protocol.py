@@ -23,8 +23,8 @@ from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.metrics.protocols.kinds import GEOMETRIC
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ClassEntry
-from su3d_bench.metrics.relations import RelationCounts, geometric_edges
-from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, plain_json, score_scene, unpack_scores
+from su3d_bench.metrics.relations import geometric_edges
+from su3d_bench.metrics.scoring import combine, pack_scores, plain_json, score_scene, unpack_scores
 from su3d_bench.numerics.relations import RELATIONS
 from su3d_bench.predictions.formats import recognise
 from su3d_bench.predictions.objects import scene_graph
@@ -122,18 +122,6 @@ def test_a_wrong_class_costs_the_triplet_and_an_edge_of_its_own_the_predicate() 
     assert right["predicate R@1"] == right["relationship R@1"] == 1 / right["n_predicate R@1"]
 
 
-def test_the_order_of_instances_changes_nothing_and_parts_add_up_to_the_whole() -> None:
-    truth = stacked()
-    whole = truth_as_prediction(truth, with_labels=True)
-    assert whole.labels is not None
-    order = np.random.default_rng(0).permutation(len(whole))
-    masks, labels = [whole.mask(k) for k in order], [whole.labels[k] for k in order]
-    turned = Instances.of(truth.points, masks, labels=labels)
-    assert values(truth, turned) == values(truth, whole)
-    scores = {name: score_scene(RULES, truth, one, None) for name, one in (("a", whole), ("b", nothing(truth)))}
-    assert combine(RULES, scores).metrics["object R@1"] == 0.5
-
-
 def test_the_first_relation_of_a_pair_counts_and_a_doubtful_one_is_not_true() -> None:
     boxes = np.array([[[0, 0, 0], [1, 1, 0.7]], [[0.4, 0.4, 0.7], [0.6, 0.6, 1.0]], [[3, 0, 0], [4, 1, 0.7]]])
     names = ("table", "lamp", "table")
@@ -142,15 +130,6 @@ def test_the_first_relation_of_a_pair_counts_and_a_doubtful_one_is_not_true() ->
     assert geometric_edges(boxes, names, ("on",)) == {(1, 0): 0}
     assert geometric_edges(boxes, names, ("on",), sure=True) == {}
     assert GEOMETRIC == RELATIONS
-
-
-def test_counts_that_no_scene_gives_are_refused() -> None:
-    one, two = np.ones(2, np.int64), np.full(2, 2, np.int64)
-    with pytest.raises(DataError, match="'n_objects_found' has more than 'n_objects'"):
-        RelationCounts.checked(dict(zip(RelationCounts.arrays, (one, two, one, one, one), strict=True)))
-    other = RelationCounts(one, one, one, one, one)
-    with pytest.raises(DataError, match="was scored with 2 classes"):
-        metric_of(RULES).check("a", other)
 
 
 def written(folder: Path) -> Replica:

@@ -26,10 +26,8 @@ from su3d_bench.metrics.questions.score import (
     ShareCounts,
     TrueAnswer,
     are_objects_right,
-    baselines,
     first_instances,
     is_answer_right,
-    share_counts,
 )
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, plain_json, score_scene, unpack_scores
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
@@ -118,10 +116,6 @@ def test_what_a_guess_and_names_alone_get_right_is_a_share_of_what_was_asked() -
     assert (found["chance_instance"], found["names-alone_instance"]) == (0.1875, 0.75)
     assert (found["chance_property"], found["names-alone_property"]) == (0.5, 0.25)
     assert (found["chance_all"], found["chance_relative"]) == (0.875 / 3, None)
-    by_chance, by_name = baselines(share_counts([4, 0], [3, 0], by_name=[1.0, 0.0]))
-    assert np.isnan(by_chance).all()
-    assert by_name[0] == 0.25
-    assert np.isnan(by_name[1])
 
 
 def test_texts_to_which_the_name_alone_is_the_answer_stand_apart() -> None:

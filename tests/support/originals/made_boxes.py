@@ -20,47 +20,7 @@ from su3d_bench.metrics.scoring import score_scene
 Scene = dict[str, Any]
 Problem = list[Scene]
 SLOTS = range(4)
-OFF = 0.0002  # sides of true boxes lie on half millimetres
 CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))
-
-
-def drawn(seed: int, index: int) -> Problem:
-    """Problem ``index``: boxes near the true ones, beside them, twice, of other classes, none, of a missing one.
-
-    No side of a found box lies on one of a true box: there the clipping of the original goes wrong, and a box has an
-    IoU of 3.6 with itself.
-    """
-    rng = np.random.default_rng([seed, index])
-    n_found = iter(rng.permutation(100) / 100)
-    return [_drawn_scene(rng, n_found) for _ in range(rng.integers(1, 4))]
-
-
-def _drawn_scene(rng: np.random.Generator, confidences: Any) -> Scene:
-    true = [
-        {
-            "slot": int(rng.choice(SLOTS)),
-            "middle": _short(rng.uniform(0, 3, 3)),
-            "sizes": _short(rng.uniform(0.3, 2, 3)),
-        }
-        for _ in range(rng.integers(1, 6))
-    ]
-    found: list[dict[str, Any]] = []
-    for _ in range(rng.choice([0, 1, 3, 5, 8])):
-        of = true[int(rng.integers(len(true)))]
-        away, by = rng.choice([0.02, 0.05, 0.2, 0.6], 2)
-        one = {
-            "slot": of["slot"] if rng.random() < 0.8 else int(rng.choice(SLOTS)),
-            "middle": [round(one + OFF, 4) for one in _short(of["middle"] + away * rng.normal(size=3))],
-            "sizes": _short(of["sizes"] * np.exp(by * rng.normal(size=3))),
-        }
-        if found and rng.random() < 0.15:
-            one = {**found[-1]}  # the same box again, under another confidence
-        found.append({**one, "score": float(next(confidences))})
-    return {"heading": float(rng.choice([0.0, round(rng.uniform(0, 3), 3)])), "true": true, "found": found}
-
-
-def _short(metres: Float64Array) -> list[float]:
-    return [float(one) for one in metres.round(3)]
 
 
 def turn(heading: float) -> Float64Array:

@@ -20,47 +20,6 @@ Scene = dict[str, Any]
 Problem = list[Scene]
 VOID, LEFT_OUT = -1, -2
 SCORED = (0, 1, 2, 3)
-LENGTHS = (20, 60, 99, 100, 101, 150, 200, 400)  # around the minimum size of 100 points
-
-
-def drawn(seed: int, index: int) -> Problem:
-    """Problem ``index``: one to three scenes with ties, duplicates, empty and small masks, void and missing classes."""
-    rng = np.random.default_rng([seed, index])
-    one_score = np.float32(rng.random())
-    return [_drawn_scene(rng, one_score) for _ in range(rng.integers(1, 4))]
-
-
-def _drawn_scene(rng: np.random.Generator, one_score: np.float32) -> Scene:
-    truth: list[list[int]] = []
-    for number in range(1, rng.integers(2, 9)):
-        slot = int(rng.choice([*SCORED, 0, LEFT_OUT, VOID]))
-        truth.append([slot, 0 if slot == VOID else number, int(rng.choice(LENGTHS))])
-    starts = np.cumsum([0, *(length for *_, length in truth)]).tolist()
-    masks: list[dict[str, Any]] = []
-    for _ in range(rng.choice([0, 1, 2, 4, 6, 8])):
-        if masks and rng.random() < 0.15:
-            mask = {**masks[int(rng.integers(len(masks)))]}  # a duplicate, under its own or another score
-        else:
-            run = int(rng.integers(len(truth)))
-            slot = (
-                truth[run][0] if rng.random() < 0.7 and truth[run][0] != VOID else int(rng.choice([*SCORED, LEFT_OUT]))
-            )
-            mask = {"slot": slot, "runs": _drawn_runs(rng, starts, run)}
-        mask["score"] = float(one_score if rng.random() < 0.3 else np.float32(rng.random()))
-        masks.append(mask)
-    return {"truth": truth, "masks": masks}
-
-
-def _drawn_runs(rng: np.random.Generator, starts: list[int], run: int) -> list[list[int]]:
-    first, last = starts[run], starts[run + 1]
-    if rng.random() < 0.2:
-        return [[first, last]]
-    start = int(rng.integers(max(0, first - 60), last))
-    runs = [[start, int(rng.integers(start, min(starts[-1], last + 60) + 1))]]
-    if rng.random() < 0.2:  # a second part elsewhere
-        beyond = int(rng.integers(runs[0][1], starts[-1] + 1))
-        runs.append([beyond, min(starts[-1], beyond + int(rng.integers(0, 200)))])
-    return [one for one in runs if one[0] < one[1]] or [[first, first + 1]]
 
 
 def members(mask: dict[str, Any]) -> Int64Array:

@@ -22,33 +22,6 @@ OVERALL = ("mIoU", "mAcc", "F-mIoU", "pAcc")
 GROUPS = ("head", "common", "tail")
 
 
-def drawn(seed: int, index: int) -> Problem:
-    """Problem ``index`` in slots, the last for what is unnamed: void, missing classes, objects of no class."""
-    rng = np.random.default_rng([seed, index, 5])
-    scenes = []
-    for _ in range(rng.integers(1, 4)):
-        there = rng.choice(N_SLOTS, rng.integers(1, 5), replace=False)
-        truth = rng.choice([*there, *there, NONE], n := int(rng.integers(3, 18)))
-        scene: dict[str, Any] = {"truth": truth.tolist()}
-        if rng.random() < 0.3:
-            called = np.where(rng.random(n) < 0.5, truth, rng.choice([*there, N_SLOTS - 1, NONE], n))
-            scenes.append(scene | {"called": called.tolist()})
-            continue
-        n_objects, n_points = int(rng.integers(1, 6)), int(rng.integers(7, 20))
-        owner = rng.integers(-1, n_objects, n_points)
-        owner[:5] = rng.integers(0, n_objects, 5)  # it ends in an error where fewer than five points vote
-        scenes.append(
-            scene
-            | {
-                "places_mm": rng.integers(0, 1000, (n, 3)).tolist(),
-                "own_mm": rng.integers(-100, 1100, (n_points, 3)).tolist(),
-                "owner": owner.tolist(),
-                "of_object": rng.choice([*there, *there, rng.integers(N_SLOTS), NONE], n_objects).tolist(),
-            }
-        )
-    return scenes
-
-
 def slots_of(rules: ProtocolRules, problem: Problem) -> Problem:
     """The problem in the indices of a protocol's classes."""
     named = [k for k, entry in enumerate(rules.classes) if entry.name != rules.unnamed]

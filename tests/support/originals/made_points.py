@@ -22,42 +22,6 @@ Problem = list[Scene]
 VOID, OTHER = -1, 8
 
 
-def drawn(seed: int, index: int) -> Problem:
-    """Problem ``index`` on the points themselves: missing classes, void, nothing called, wrong classes."""
-    rng = np.random.default_rng([seed, index])
-    scenes = []
-    for _ in range(rng.integers(1, 4)):
-        there = rng.choice(8, rng.integers(1, 5), replace=False)
-        truth = rng.choice([*there, *there, OTHER, VOID], n := int(rng.integers(1, 18)))
-        guess = rng.choice([*range(OTHER + 1), VOID], n)
-        scenes.append({"truth": truth.tolist(), "called": np.where(rng.random(n) < 0.5, truth, guess).tolist()})
-    return scenes
-
-
-def drawn_in_space(seed: int, index: int) -> Problem:
-    """Problem ``index`` with three clouds: points of the truth, of the prediction and to be scored; some coincide.
-
-    The prediction has classes that are scored and true in the scene alone.
-    """
-    rng = np.random.default_rng([seed, index, 3])
-    scenes = []
-    for _ in range(rng.integers(1, 4)):
-        there = rng.choice(8, rng.integers(1, 5), replace=False)
-        clouds = [rng.integers(0, 1000, (rng.integers(4, 14), 3)) for _ in range(3)]
-        for cloud in clouds:
-            cloud[-1] = clouds[0][rng.integers(len(clouds[0]))]
-        truth = [*there, *rng.choice([*there, OTHER], len(clouds[0]))][: len(clouds[0])]
-        scored = sorted({int(one) for one in truth} - {OTHER})
-        scenes.append(
-            {
-                "truth": [int(one) for one in truth],
-                "called": rng.choice(scored, len(clouds[1])).tolist(),
-                **{key: cloud.tolist() for key, cloud in zip(("places_mm", "own_mm", "seen_mm"), clouds, strict=True)},
-            }
-        )
-    return scenes
-
-
 def classes_of(rules: ProtocolRules) -> dict[int, tuple[int, str]]:
     """The id and name that a protocol has for each slot but void."""
     left = [(entry.id, entry.name) for entry in rules.classes if rules.is_ignored(entry.name)]

@@ -19,28 +19,6 @@ Scene = dict[str, Any]
 Problem = list[Scene]
 
 
-def drawn(seed: int, index: int) -> Problem:
-    """Problem ``index``: objects of several queries and of none, equal cosines, masks twice, on nothing."""
-    rng = np.random.default_rng([seed, index])
-    scenes = []
-    for _ in range(rng.integers(1, 3)):
-        ids = [int(one) for one in rng.permutation(rng.integers(2, 7))]
-        objects = [[one if rng.random() < 0.85 else -1, int(rng.integers(1, 12))] for one in ids]
-        starts = np.cumsum([0, *(length for _, length in objects)]).tolist()
-        there = [one for one, _ in objects if one >= 0] or [99]  # an object that no point has
-        queries = [sorted(rng.choice(there, min(len(there), n), replace=False).tolist()) for n in rng.integers(1, 4, 3)]
-        masks: list[list[int]] = []
-        for _ in range(rng.choice([0, 2, 4, 7])):
-            run = int(rng.integers(len(objects)))
-            start = int(rng.integers(max(0, starts[run] - 1), starts[run] + 2))
-            end = int(rng.integers(start + 1, starts[run + 1] + 3))
-            near = [min(start, starts[-1] - 1), min(max(end, start + 1), starts[-1])]
-            masks.append(masks[-1] if masks and rng.random() < 0.15 else near)
-        cosines = np.round(rng.uniform(-1, 1, (len(masks), len(queries))), 1).tolist()
-        scenes.append({"objects": objects, "queries": queries, "masks": masks, "cosines": cosines})
-    return scenes
-
-
 def objects_of(scene: Scene) -> Any:
     """The object (N,) of every point."""
     ids, lengths = (np.array(column, np.int64) for column in zip(*scene["objects"], strict=True))

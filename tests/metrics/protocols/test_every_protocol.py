@@ -1,0 +1,137 @@
+"""What holds under every protocol: the truth scores 1, an empty map 0, order is nothing, parts come to the whole."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import open_scene
+import pytest
+import scored_room
+
+from su3d_bench.core.maps import Instances
+from su3d_bench.core.types import GroundTruth
+from su3d_bench.metrics.metric import SceneScore
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, score_scene, unpack_scores
+
+OF_ROOMS = (
+    "rooms-semantic", "replica-mesh-ex6", "replica-openmask3d-semantic", "replica-hovsg", "replica-hovsg-exact",
+    "replica-ovo51", "rooms-top-k", "rooms-instance", "replica-openmask3d", "rooms-panoptic", "rooms-relations",
+)  # fmt: skip
+OF_TEXTS = ("openlex3d-topn", "openlex3d-ranking", "query-ap", "openlex3d-queries")
+EMPTY = {"openlex3d-topn": {"missing": 1.0}}  # what an empty map scores beside 0
+PERFECT = {"openlex3d-topn": {"synonyms": 1.0}}
+# where perfect masks of objects that meet, or of queries for several objects, need not reach 1
+WITHOUT_CEILING = {"openlex3d-queries", "query-ap"}
+
+
+def truth_of(name: str, seed: int) -> Any:
+    rules = load_protocol(name)
+    if name in OF_TEXTS:
+        is_lex = rules.kind == "categories"
+        made = open_scene.lex_truth(seed) if is_lex else open_scene.query_truth(seed)
+        return replace(made, variant=rules.ground_truth, space=rules.label_space)
+    truth = scored_room.room(seed, n_each=150 + 25 * (seed % 3))
+    is_known = np.isin(truth.semantic, [entry.id for entry in rules.classes])
+    semantic, instance = (np.where(is_known, array, 0).astype(np.int32) for array in (truth.semantic, truth.instance))
+    points = truth.points.copy()
+    if rules.kind == "relations":  # the lamp on the table, or nothing is related
+        points[truth.instance == 5] += np.float32([-1, 0, 0.81])
+    return replace(truth, points=points, semantic=semantic, instance=instance, variant=rules.ground_truth)
+
+
+def encoder_of(name: str) -> Any:
+    return open_scene.ENCODER if name in OF_TEXTS else scored_room.ENCODER
+
+
+def perfect(truth: Any, *, with_labels: bool = False) -> Instances:
+    if isinstance(truth, GroundTruth):
+        return scored_room.truth_as_prediction(truth, with_labels=with_labels)
+    return open_scene.perfect(truth)
+
+
+def noisy(truth: Any, seed: int) -> Instances:
+    """Parts of the objects, each with a feature between its own and others, the second with that of the last."""
+    rng = np.random.default_rng(seed)
+    whole = perfect(truth)
+    assert whole.features is not None
+    masks = [whole.mask(k)[rng.random(len(whole.mask(k))) < rng.uniform(0.4, 1)] for k in range(len(whole))]
+    features = whole.features + 0.7 * rng.random(whole.features.shape).astype(np.float32)
+    features[1] = features[-1]
+    return scored_room.instances(whole.points, masks, None, features, scores=list(rng.random(len(masks))))
+
+
+def values(name: str, truth: Any, prediction: Instances) -> dict[str, float]:
+    rules = load_protocol(name)
+    found = combine(rules, {"a": score_scene(rules, truth, prediction, encoder_of(name))}).metrics
+    return {value: found[value] for value in rules.headline}
+
+
+@cache
+def scores_of(name: str) -> dict[str, SceneScore]:
+    """The scores of four noisy scenes."""
+    truths = {f"scene {seed}": truth_of(name, seed) for seed in range(4)}
+    rules, encoder = load_protocol(name), encoder_of(name)
+    return {
+        scene: score_scene(rules, truth, noisy(truth, seed), encoder)
+        for seed, (scene, truth) in enumerate(truths.items())
+    }
+
+
+@pytest.mark.parametrize("name", [*OF_ROOMS, *OF_TEXTS])
+def test_the_truth_scores_one_and_an_empty_map_nothing(name: str) -> None:
+    truth = truth_of(name, 0)
+    nothing = scored_room.instances(truth.points, [], None)
+    headline = load_protocol(name).headline
+    assert values(name, truth, nothing) == dict.fromkeys(headline, 0.0) | EMPTY.get(name, {})
+    if name not in WITHOUT_CEILING:
+        expected = dict.fromkeys(headline, 0.0) | PERFECT[name] if name in PERFECT else dict.fromkeys(headline, 1.0)
+        assert values(name, truth, perfect(truth)) == expected
+        assert values(name, truth, perfect(truth, with_labels=True)) == expected
+
+
+@pytest.mark.parametrize("name", [*OF_ROOMS, *OF_TEXTS])
+def test_the_order_of_instances_and_the_numbers_of_objects_change_nothing(name: str) -> None:
+    truth = truth_of(name, 3)
+    prediction = noisy(truth, 3)
+    order = np.random.default_rng(0).permutation(len(prediction))
+    assert prediction.features is not None
+    masks, scores = [prediction.mask(k) for k in order], prediction.scores[order].tolist()
+    shuffled = scored_room.instances(prediction.points, masks, None, prediction.features[order], scores)
+    before = values(name, truth, prediction)
+    assert any(0 < value < 1 for value in before.values())
+    renamed = truth
+    if isinstance(truth, GroundTruth):
+        renamed = replace(truth, instance=np.where(truth.instance > 0, 9 - truth.instance, 0).astype(np.int32))
+    after = values(name, renamed, shuffled)
+    # AP25 may depend on the order of masks, as ScanNet's does
+    assert {key: value for key, value in after.items() if key != "AP25"} == pytest.approx(
+        {key: value for key, value in before.items() if key != "AP25"}, rel=1e-12
+    )
+
+
+@pytest.mark.parametrize("name", [*OF_ROOMS, *OF_TEXTS])
+def test_scenes_come_to_the_same_from_their_files_and_in_whatever_order(name: str) -> None:
+    rules, scores = load_protocol(name), scores_of(name)
+    stored = {scene: unpack_scores(pack_scores({name: score}))[name] for scene, score in reversed(scores.items())}
+    assert json.dumps(combine(rules, stored).to_json()) == json.dumps(combine(rules, scores).to_json())
+
+
+@pytest.mark.parametrize("name", [*OF_ROOMS, *OF_TEXTS])
+def test_scenes_drawn_several_times_count_as_so_many_scenes(name: str) -> None:
+    metric, counts = metric_of(load_protocol(name)), [score.counts for score in scores_of(name).values()]
+    weights = np.array([[1, 1, 1, 1], [0, 2, 1, 0], [0, 0, 0, 1]])
+    drawn, classes = metric.resampled(counts, weights), metric.resampled_classes(counts, weights)
+    for row, n_times in enumerate(weights):
+        pooled = metric.pooled([one for one, n in zip(counts, n_times, strict=True) for _ in range(n)])
+        assert {key: value[row] for key, value in drawn.items()} == pytest.approx(
+            {key: pooled.values[key] for key in drawn}, rel=1e-9, nan_ok=True
+        )
+        for of_class, columns in classes.items():
+            known = pooled.classes.get(of_class, {})
+            known = {key: known.get(key, np.nan) for key in columns}
+            assert {key: column[row] for key, column in columns.items()} == pytest.approx(known, rel=1e-9, nan_ok=True)
