@@ -19,7 +19,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from su3d_bench.baselines.command.folders import ColourFormat, FrameFolder, as_prediction, class_names, read_output
-from su3d_bench.baselines.command.process import ContainerWatch, Finished, Leaving, TreeWatch, run_program
+from su3d_bench.baselines.command.process import Finished, run_program
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError, printable
 from su3d_bench.core.files.atomic import TemporaryFolder, is_file
@@ -45,16 +45,6 @@ def variable_of(name: str) -> str:
     'SU3D_SCENE'
     """
     return f"SU3D_{name.upper()}"
-
-
-def words_of(command: str | Sequence[str]) -> list[str]:
-    """The words of a command; what a shell alone can split is split at spaces."""
-    if not isinstance(command, str):
-        return list(command)
-    try:
-        return shlex.split(command)
-    except ValueError:
-        return command.split()
 
 
 def check_placeholders(command: str | Sequence[str], *, is_shell: bool) -> None:
@@ -215,7 +205,11 @@ class Command:
         """Digest of each file that the command names, so that another version of a program is another run."""
         if self.config.runner == "docker":
             return {}  # its words are files of the image
-        words = words_of(self.config.command)
+        command = self.config.command
+        try:
+            words = shlex.split(command) if isinstance(command, str) else command
+        except ValueError:  # what a shell alone can split is split at spaces
+            words = str(command).split()
         files = {word: _program_file(word) for word in words}
         return {f"file {word}": digest_file(path) for word, path in files.items() if path is not None}
 
@@ -290,9 +284,9 @@ class Command:
             folder=folders["work"],
             environment=environment,
             timeout_s=self.config.timeout_s,
-            watch_of=TreeWatch if container is None else lambda pid: ContainerWatch(id_file),
+            id_file=None if container is None else id_file,
             # `docker run` may end before its container does: ending the client is not enough.
-            leaving=Leaving(() if container is None else ("docker", "kill", container), folders["frames"].parent),
+            afterwards=() if container is None else ("docker", "kill", container),
         )
         self._record(done)
         last = _last_line(done.stderr)

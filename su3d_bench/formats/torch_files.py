@@ -110,17 +110,9 @@ def _tensor(storage: object, offset: object, size: object, stride: object, *_: o
     return _view(storage, storage.code if isinstance(storage, Storage) else None, offset, size, stride)
 
 
-def _tensor_with_type(
-    storage: object,
-    offset: object,
-    size: object,
-    stride: object,
-    _grad: object,
-    _hooks: object,
-    kind: object,
-    *_: object,
-) -> NDArray[Any]:
-    """``_rebuild_tensor_v3``."""
+def _tensor_with_type(*parts: Any) -> NDArray[Any]:
+    """``_rebuild_tensor_v3(storage, offset, size, stride, grad, hooks, type, ...)``."""
+    storage, offset, size, stride, _, _, kind = parts[:7]
     code = DTYPES.get(kind.name.removeprefix("torch.")) if isinstance(kind, Named) else None
     return _view(storage, code, offset, size, stride)
 

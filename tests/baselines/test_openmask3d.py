@@ -14,7 +14,6 @@ from proposals_by_hand import made_proposals
 from pydantic import ValidationError
 
 from su3d_bench.baselines.openmask3d.method import (
-    FeatureMeans,
     MaskViews,
     OpenMask3D,
     OpenMask3DConfig,
@@ -162,13 +161,6 @@ class TestCrops:
         corner = np.zeros((30, 30), bool)
         corner[:20, 10:] = True
         assert crop_boxes(corner, 3, 0.1).tolist() == [[10, 0, 30, 20], [8, 0, 30, 22], [6, 0, 30, 24]]
-
-    def test_the_mean_of_unit_features_is_not_of_unit_length(self) -> None:
-        means = FeatureMeans(3, 2)
-        means.add(0, np.array([[1, 0], [0, 1]], np.float32))
-        means.add(0, np.array([[0, 1], [0, 1]], np.float32))
-        means.add(1, np.array([[0.6, 0.8]], np.float32))
-        assert means.means.tolist() == [[0.25, 0.75], pytest.approx([0.6, 0.8]), [0, 0]]
 
 
 class WallOfPatches:

@@ -42,7 +42,7 @@ from su3d_bench.store.predictions import prediction_arrays
         ("\x1b[31m" + "x" * 9000 + " 5 0.5", "cannot be read"),
         ("pred_mask/short.txt 5 0.5", "is of 2 points and 'pred_mask/a.txt' of 3;"),
         ("pred_mask/word.txt 5 0.5", ":2: 'one' is not an integer"),
-        ("pred_mask/large.txt 5 0.5", ":1: '99999999999999999999999' is out of range"),
+        ("pred_mask/large.txt 5 0.5", ":1: '99999999999999999999999' is not an integer"),
         ("pred_mask/bad.json 5 0.5", "is not readable as JSON"),
         ("pred_mask/huge.json 5 0.5", "'length' is 1000000000000"),
         ("pred_mask/beyond.json 5 0.5", "run of 3 points from 2 on, of 3 points"),
