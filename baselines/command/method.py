@@ -50,9 +50,9 @@ def variable_of(name: str) -> str:
 def check_placeholders(command: str | Sequence[str], *, is_shell: bool) -> None:
     """Raises ``ValueError`` for an unknown placeholder, or one whose value a program would read as code."""
     if isinstance(command, str) and is_shell:
-        for name, place in _misplaced(command):
+        for name in _misplaced(command):
             right = f'write {{{name}}} outside of quotes, or "${variable_of(name)}"'
-            raise ValueError(f"'{{{name}}}' is {place}, where a shell would read its value as commands; {right}")
+            raise ValueError(f"'{{{name}}}' stands where a shell would read its value as commands; {right}")
         return
     words = shlex.split(command) if isinstance(command, str) else command
     for k, word in enumerate(words):
@@ -68,17 +68,14 @@ def check_placeholders(command: str | Sequence[str], *, is_shell: bool) -> None:
             )
 
 
-def _misplaced(line: str) -> Iterator[tuple[str, str]]:
+def _misplaced(line: str) -> Iterator[str]:
     """The placeholders of a shell's line that stand where its quotes would be undone, or where a shell is fed."""
     for found in PLACEHOLDER.finditer(line):
         before = line[: found.start()]
         unescaped = re.sub(r"\\.|(?:^|\s)#[^\n]*", "", before)
         is_quoted = unescaped.count("'") % 2 or unescaped.count('"') % 2
-        places = {"within quotes": is_quoted, "in or after a here-document": "<<" in before}
-        places |= {f"behind a {sign}": before.endswith(sign) for sign in ("$", "\\")}
-        place = next((place for place, is_there in places.items() if is_there), None)
-        if found[1] in PLACEHOLDERS and place is not None:
-            yield found[1], place
+        if found[1] in PLACEHOLDERS and (is_quoted or "<<" in before or before.endswith(("$", "\\"))):
+            yield found[1]
 
 
 def _is_code(words: Sequence[str], k: int) -> bool:
@@ -103,7 +100,6 @@ Name = Annotated[str, Field(pattern=r"^([^-\s]\S*)?$")]  # no option in the plac
 # What a program finds in its environment unless more is allowed: enough to start it, no credentials.
 ENVIRONMENT = ("PATH", "HOME", "LANG", "LC_ALL", "TZ", "CUDA_VISIBLE_DEVICES", "LD_LIBRARY_PATH")
 INSIDE = {"frames": "/su3d/frames", "output": "/su3d/output", "work": "/su3d/work"}  # of a container
-MOUNT = re.compile(r"(?P<here>/[^:]*):(?P<there>/[^:]*)")
 
 
 class CommandConfig(BaseModel):
@@ -128,7 +124,7 @@ class CommandConfig(BaseModel):
     gpus: str = ""
     network: bool = False
     environment: Name = ""
-    mounts: tuple[str, ...] = ()
+    mounts: tuple[Annotated[str, Field(pattern=r"^/[^:]*:/[^:]*$")], ...] = ()
     pass_variables: tuple[Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")], ...] = ENVIRONMENT
     timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3600.0
     format: str | None = None
@@ -148,9 +144,6 @@ class CommandConfig(BaseModel):
             raise ValueError("image, mounts, gpus and network belong to runner 'docker'")
         if self.environment and self.runner != "conda":
             raise ValueError("environment belongs to runner 'conda'")
-        for mount in self.mounts:
-            if not MOUNT.fullmatch(mount):
-                raise ValueError(f"mount '{mount}' is not HERE:THERE with two absolute paths")
         if self.format is not None:
             from su3d_bench.predictions.formats import READERS  # not for a list of methods
 

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
@@ -121,28 +120,19 @@ class _Tail(Thread):
     def __init__(self, stream: IO[bytes]) -> None:
         super().__init__(daemon=True)
         self._stream = stream
-        self._chunks: deque[bytes] = deque()
-        self._n_kept = self._n_dropped = 0
+        self._kept, self._n_read = b"", 0
 
     def run(self) -> None:
         # ValueError: the stream was closed because a runaway child still holds its other end.
-        try:
+        with suppress(OSError, ValueError):
             while chunk := os.read(self._stream.fileno(), 65536):
-                self._chunks.append(chunk)
-                self._n_kept += len(chunk)
-                while self._n_kept - len(self._chunks[0]) >= KEPT_CHARACTERS:
-                    dropped = len(self._chunks.popleft())
-                    self._n_kept -= dropped
-                    self._n_dropped += dropped
-        except (OSError, ValueError):
-            return
+                self._n_read += len(chunk)
+                self._kept = (self._kept + chunk)[-KEPT_CHARACTERS:]
 
     def text(self) -> str:
         self.join(GRACE_S)
-        kept = b"".join(list(self._chunks))
-        n_dropped = self._n_dropped + max(len(kept) - KEPT_CHARACTERS, 0)
-        text = kept[-KEPT_CHARACTERS:].decode("utf-8", "replace")
-        return f"[{n_dropped} bytes before are left out]\n{text}" if n_dropped else text
+        text, n_dropped = self._kept.decode("utf-8", "replace"), self._n_read - len(self._kept)
+        return f"[{n_dropped} bytes before are left out]\n{text}" if n_dropped > 0 else text
 
 
 class _Supervised:

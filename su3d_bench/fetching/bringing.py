@@ -21,7 +21,7 @@ from su3d_bench.core.files.locks import clear_unfinished, hold_folder
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.datasets.replica import folders
 from su3d_bench.fetching.archives import members, unpack_tar_gz, unpack_zip
-from su3d_bench.fetching.download import Patience, Stated, Wanted, Watch, bring, checked, hub_files, part_of, size_of
+from su3d_bench.fetching.download import N_RETRIES, Stated, Wanted, Watch, bring, checked, hub_files, part_of, size_of
 from su3d_bench.fetching.sources import Source, Sources
 from su3d_bench.perception.models.catalogue import MODELS, PAPERS_ENCODERS, PROFILE_MODELS
 from su3d_bench.perception.models.files import locate
@@ -135,7 +135,7 @@ def _replica_here(source: Source, root: Path) -> Path | None:
     return whole[0].parent if len(whole) == len(folders.OFFICIAL_SCENES) else None
 
 
-def fetch(planned: Planned, watch: Watch, patience: Patience | None = None, *, keep_archives: bool = False) -> Brought:
+def fetch(planned: Planned, watch: Watch, n_retries: int = N_RETRIES, *, keep_archives: bool = False) -> Brought:
     """Bring a source to its place; raises ``ConfigError``, ``DataError`` or ``StoreError`` where it does not get there.
 
     A second call goes on where the first one ended.
@@ -147,7 +147,7 @@ def fetch(planned: Planned, watch: Watch, patience: Patience | None = None, *, k
     missing = wanted if source.archive is not None else [file for file in wanted if not _is_there(file, place)]
     check_space(planned, missing)
     with held_state(planned):
-        arrived = tuple(bring_file(planned, file, watch, patience) for file in missing)
+        arrived = tuple(bring_file(planned, file, watch, n_retries) for file in missing)
         left: list[str] = []
         if source.archive is None:  # the weights last, without which nothing takes the folder for a model
             move([planned.state / file.name for file in missing], place)
@@ -181,7 +181,7 @@ def plain_files(source: Source) -> list[Wanted]:
     ]
 
 
-def bring_file(planned: Planned, wanted: Wanted, watch: Watch, patience: Patience | None = None) -> Arrived:
+def bring_file(planned: Planned, wanted: Wanted, watch: Watch, n_retries: int = N_RETRIES) -> Arrived:
     """Bring one file into the state of ``planned``, where it may lie already, and record it."""
     place, known = planned.state / wanted.name, None
     if not wanted.stated.is_published:
@@ -194,7 +194,7 @@ def bring_file(planned: Planned, wanted: Wanted, watch: Watch, patience: Patienc
             raise DataError(f"{place}: {wrong or 'has another size than is stated'}; delete it and fetch it again")
     else:
         try:
-            sha256 = bring(wanted, place, watch, patience)
+            sha256 = bring(wanted, place, watch, n_retries)
         except DataError as error:
             if known is not None and known in str(error):
                 raise DataError(f"{error}; the first one is recorded in {record_path(planned.root)}") from error

@@ -22,7 +22,7 @@ from su3d_bench.core.errors import ConfigError, DataError, StoreError, printable
 from su3d_bench.datasets.scannet.folders import PAPER_SCENES, SCAN_NAME, SPLITS, find_scans, split_scenes
 from su3d_bench.datasets.scannet.truth import TABLE_NAME
 from su3d_bench.fetching.bringing import Arrived, Brought, Planned, bring_file, held_state, move, write_arrival
-from su3d_bench.fetching.download import Patience, Stated, Wanted, Watch, checked
+from su3d_bench.fetching.download import N_RETRIES, Stated, Wanted, Watch, checked
 from su3d_bench.fetching.sources import Source, check_address
 
 RECORDING = ".sens"
@@ -110,7 +110,7 @@ def fetch_by_script(source: Source, scans: Scans, script: Path, watch: Watch) ->
     return _fetch(source, scans, bring_one)
 
 
-def fetch_from(source: Source, scans: Scans, address: str, watch: Watch, patience: Patience | None = None) -> Brought:
+def fetch_from(source: Source, scans: Scans, address: str, watch: Watch, n_retries: int = N_RETRIES) -> Brought:
     """Bring what is missing out of the user's own link, the folder in which ``v1`` and ``v2`` lie."""
     try:
         check_address(address)
@@ -121,7 +121,7 @@ def fetch_from(source: Source, scans: Scans, address: str, watch: Watch, patienc
     def bring_one(planned: Planned, scan: str, name: str) -> tuple[Path, Arrived]:
         release = "v1" if name.endswith(RECORDING) else "v2"
         wanted = Wanted(name, f"{base}/{release}/{f'scans/{scan}' if scan else 'tasks'}/{name}", hosts)
-        return planned.state / name, bring_file(planned, wanted, watch, patience)
+        return planned.state / name, bring_file(planned, wanted, watch, n_retries)
 
     return _fetch(source, scans, bring_one)
 

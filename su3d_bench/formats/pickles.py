@@ -70,9 +70,7 @@ class Unbuilt:
     value: object = None
 
 
-@dataclass(frozen=True)
-class ObjectType:
-    """NumPy's dtype of Python objects."""
+OBJECTS = Named("numpy.object_")  # NumPy's dtype of Python objects
 
 
 class Source:
@@ -209,7 +207,7 @@ def _array(payload: object, kind: object, shape: object, is_fortran: object) -> 
     """The array of a pickle; one of objects becomes a list, or its only item where it has no dimension."""
     if isinstance(payload, Forgotten):
         return payload
-    if isinstance(kind, ObjectType) and isinstance(payload, list) and isinstance(shape, tuple) and len(shape) < 2:
+    if kind == OBJECTS and isinstance(payload, list) and isinstance(shape, tuple) and len(shape) < 2:
         return list(payload) if shape else payload[0]
     if not isinstance(payload, bytes) or not isinstance(kind, np.dtype):
         raise ValueError("an array without values or type")
@@ -235,7 +233,7 @@ def _dtype(code: object, *_: object) -> Unbuilt:
     def build(state: Any) -> object:
         if any(part is not None for part in state[2:5]):
             raise ValueError("an array type with fields")
-        return ObjectType() if is_object else plain_type(f"{state[1]}{code}")
+        return OBJECTS if is_object else plain_type(f"{state[1]}{code}")
 
     return Unbuilt(build)
 

@@ -115,22 +115,19 @@ class VertexLabels:
 
     def _masks(self, rows: Int32Array) -> tuple[VertexMasks, Int32Array]:
         """One mask a distinct row (R,) of ``rows`` (N, k), and these rows."""
-        if rows.shape[1] == 1:
-            values, row = np.unique(rows, return_inverse=True)
-            distinct = values[:, None]
-        else:
-            distinct, row = np.unique(rows, axis=0, return_inverse=True)
+        values, row = np.unique(rows if rows.shape[1] > 1 else rows[:, 0], axis=0, return_inverse=True)
+        distinct = values.reshape(-1, rows.shape[1]).astype(np.int32)
         masks, first = masks_of_partition(row.ravel(), len(distinct)), distinct[:, 0]
         of_rows = VertexMasks(
             masks.indptr,
             masks.indices,
             n_points=len(rows),
             scores=np.ones(len(distinct)),
-            class_numbers=first.astype(np.int32),
+            class_numbers=first,
             numbering=self.numbering,
             keys=tuple(f"class {number}" for number in first),
         )
-        return of_rows, distinct.astype(np.int32)
+        return of_rows, distinct
 
 
 Content = VertexMasks | VertexLabels | Instances | Partition | DenseFeatures  # the last three have their own points

@@ -226,6 +226,12 @@ class TestMethod:
         assert np.array_equal(found.points, WALL) and found.mask(1).tolist() == MIDDLE
         assert found.boxes[0].tolist() == [WALL[LEFT].min(axis=0).tolist(), WALL[LEFT].max(axis=0).tolist()]
 
+    def test_the_feature_is_the_plain_mean_over_all_crops(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        crops = np.eye(3, dtype=np.float32)[[0, 1, 1]]
+        monkeypatch.setattr(WallOfPatches, "encode_regions", lambda *_: crops)
+        features = ran(made_proposals(WALL, LEFT), [frame(0), frame(1)])[1].features
+        assert features is not None and features[0] == pytest.approx([1 / 3, 2 / 3, 0])
+
     def test_two_objects_that_a_proposal_merges_stay_merged(self) -> None:
         _, found, _, _ = ran(made_proposals(WALL, LEFT + MIDDLE, RIGHT), [frame()])
         assert len(found) == 2 and found.mask(0).tolist() == LEFT + MIDDLE
