@@ -14,7 +14,7 @@ import h5py
 import numpy as np
 import pytest
 from hm3dsem_walk import write_graph
-from prediction_files import TorchFile, torch_text
+from prediction_files import Tensor, tensors, write_torch
 
 from su3d_bench.formats.pcd import write_pcd_points
 from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
@@ -127,9 +127,7 @@ def write_gradslam(folder: Path, points: Any, embeddings: Any, **options: Any) -
 
 
 def write_tensor(path: Path, values: Any) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    file = TorchFile()
-    file.write(path, file.tensor(values))
+    write_torch(path, Tensor(values))
 
 
 def write_object(path: Path, points: Any) -> None:
@@ -160,27 +158,20 @@ def write_openlex(folder: Path, points: Any, index: Any, features: Any, cloud: s
 
 def write_ovo(folder: Path, points: Any, ids: Any, features: dict[int, Any], *, is_stream: bool = True) -> None:
     """A checkpoint of OVO: the points of its SLAM with the object of each in a column, a feature an object."""
-    folder.mkdir(parents=True, exist_ok=True)
-    file = TorchFile(is_stream=is_stream)
     cloud = {
         "xyz": np.asarray(points, np.float32),
         "obj_ids": np.asarray(ids, np.int32)[:, np.newaxis],
         "ids": np.arange(len(points), dtype=np.int32)[:, np.newaxis],
         "max_id": len(points),
     }
-    numbers = torch_text("ins_3d_ids") + file.array(np.array(list(features), np.int64))
-    for number, feature in features.items():
-        numbers += torch_text(f"ins3d_{number}_clip_feature") + file.value(feature)
-        numbers += torch_text(f"ins3d_{number}_clip_feature_kf") + file.value(None)
-    objects = b"}(" + numbers + b"u"
-    both = torch_text("map_params") + file.value(cloud) + torch_text("ovo_map_params") + objects
-    file.write(folder / "ovo_map.ckpt", b"}(" + both + b"u")
+    objects = {f"ins3d_{number}_clip_feature": feature for number, feature in features.items()}
+    numbers = {"ins_3d_ids": np.array(list(features), np.int64), "ins3d_0_clip_feature_kf": None}
+    value = {"map_params": tensors(cloud), "ovo_map_params": numbers | tensors(objects)}
+    write_torch(folder / "ovo_map.ckpt", value, is_stream=is_stream)
 
 
 def write_rayfronts(path: Path, value: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    file = TorchFile()
-    file.write(path, file.value(value))
+    write_torch(path, tensors(value))
 
 
 def write_esam(folder: Path, points: Any, groups: Any) -> None:
