@@ -19,7 +19,7 @@ from stat import S_ISREG
 from typing import IO, Any, Self
 
 from su3d_bench.core.errors import DataError, StoreError, printable
-from su3d_bench.core.files.atomic import Allowance, UnpackingError, allowance_of, check_member, replacing, write_error
+from su3d_bench.core.files.atomic import Allowance, allowance_of, check_member, replacing, write_error
 from su3d_bench.core.system.files import opened
 from su3d_bench.fetching.download import Watch
 
@@ -27,17 +27,8 @@ PIECE = 1 << 20
 MAX_HEADER_BYTES = 1 << 20  # of the long name or extended header before a member of a tar archive
 MAX_MEMBERS = 1_000_000
 LONG_HEADERS = (tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK, tarfile.XHDTYPE, tarfile.XGLTYPE)
-FAULTS = (
-    DataError,
-    UnpackingError,
-    zipfile.BadZipFile,
-    tarfile.TarError,
-    zlib.error,
-    EOFError,
-    OSError,
-    ValueError,
-    RuntimeError,  # of zipfile: a password, a way of packing
-)
+# RuntimeError is of zipfile: a password, a way of packing.
+FAULTS = (DataError, zipfile.BadZipFile, tarfile.TarError, zlib.error, EOFError, OSError, ValueError, RuntimeError)
 GoesTo = Callable[[PurePosixPath], PurePosixPath | None]
 
 

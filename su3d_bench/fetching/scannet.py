@@ -28,12 +28,7 @@ from su3d_bench.fetching.sources import Source, check_address
 RECORDING = ".sens"
 TEST_SUFFIXES = (".txt", "_vh_clean_2.ply", RECORDING)
 # What datasets/scannet reads of a scan, the recording last: it is what makes a folder a scan with frames.
-SUFFIXES = (
-    ".aggregation.json",
-    "_vh_clean_2.0.010000.segs.json",
-    "_vh_clean_2.labels.ply",
-    *TEST_SUFFIXES,
-)
+SUFFIXES = (".aggregation.json", "_vh_clean_2.0.010000.segs.json", "_vh_clean_2.labels.ply", *TEST_SUFFIXES)
 KEYS = b"\n" * 8  # for the script's questions: the terms were confirmed here, and nothing is left out
 LAST_WORDS = 4000
 

@@ -243,16 +243,6 @@ def _scalar(kind: object, payload: object) -> object:
     return array if isinstance(array, Forgotten) else array[()]
 
 
-def _no_bytes() -> bytes:
-    """``bytes()``, how protocol 2 holds no bytes."""
-    return b""
-
-
-def empty_dict(*_factory: object) -> dict[object, object]:
-    """``OrderedDict()`` or ``defaultdict(factory)``, whose items follow."""
-    return {}
-
-
 # ConceptGraphs stores its settings beside the map, a tree of omegaconf nodes with paths in it, and pictures beside its
 # detections.
 _INERT = (
@@ -280,9 +270,10 @@ NAMES: dict[str, object] = {
     "numpy.core.multiarray._reconstruct": _reconstruct,
     "numpy.core.multiarray.scalar": _scalar,
     "numpy.core.numeric._frombuffer": _frombuffer,
-    "collections.OrderedDict": empty_dict,
-    "collections.defaultdict": empty_dict,
-    "builtins.bytes": _no_bytes,
+    # OrderedDict() and defaultdict(factory), whose items follow; bytes(), how protocol 2 holds no bytes
+    "collections.OrderedDict": lambda *_: {},
+    "collections.defaultdict": lambda *_: {},
+    "builtins.bytes": lambda: b"",
 }
 
 

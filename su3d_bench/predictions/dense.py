@@ -27,7 +27,7 @@ from su3d_bench.core.errors import DataError, PredictionError, StoreError, conve
 from su3d_bench.core.maps import DenseFeatures, Partition
 from su3d_bench.core.types import Float32Array, Int32Array, Int64Array
 from su3d_bench.formats import arrays
-from su3d_bench.formats.hdf5 import n_columns_of, read_rows, row_blocks
+from su3d_bench.formats.hdf5 import read_rows, row_blocks
 from su3d_bench.formats.numpy_files import read_npy
 from su3d_bench.formats.poses import moved, read_first_pose
 from su3d_bench.formats.torch_files import read_torch
@@ -87,14 +87,13 @@ def _features(file: Path, n_points: int) -> tuple[NDArray[np.float16], int]:
 
     Rows with what float16 cannot hold become zeros.
     """
-    where, n_rows, n_without = shown(file), 0, 0
-    n_columns = n_columns_of(file, where)
+    where, n_rows, n_without, n_columns = shown(file), 0, 0, 0
     try:
         # Sparse writes would crash the process on a full disk when the map is touched; plain ones fail here.
         with tempfile.TemporaryFile() as stored:
-            for block in row_blocks(file, n_columns, where):
+            for block in row_blocks(file, None, where):
                 rows = arrays.half_rows(block)
-                n_rows += len(rows)
+                n_rows, n_columns = n_rows + len(rows), rows.shape[1]
                 n_without += int((~rows.any(axis=1)).sum())
                 if n_rows <= n_points:
                     stored.write(rows.tobytes())

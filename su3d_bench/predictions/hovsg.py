@@ -10,7 +10,6 @@ them: where overlaps are equal, who is matched depends on it.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
@@ -18,7 +17,7 @@ from typing import Annotated, Literal, TypeVar
 import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
-from su3d_bench.core.errors import DataError, PredictionError, converted, printable, reading, shown
+from su3d_bench.core.errors import DataError, PredictionError, converted, printable, reading, shown, some
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.types import UP, Float32Array, Floor, Places, Room
 from su3d_bench.formats.arrays import MOST_MASKS, as_float32, checked_points, feature_table, without_nonfinite
@@ -84,25 +83,14 @@ def _object_files(folder: Path) -> dict[int, Path]:
 
 
 def _gap_remarks(numbers: list[int], n_rows: int) -> tuple[str, ...]:
-    is_there = np.zeros(n_rows, np.bool_)
-    is_there[numbers] = True
-    missing = np.flatnonzero(~is_there).tolist()
+    missing = np.setdiff1d(np.arange(n_rows), numbers).astype(str).tolist()
     if not missing:
         return ()
-    remarks = [f"{len(missing)} rows of {FEATURES} have no object file and are not used ({some(missing)})"]
-    lost = [number for number in numbers if number >= len(numbers)]
+    remarks = [f"{len(missing)} rows of {FEATURES} have no object file and are not used ({some(missing, 5)})"]
+    lost = [str(number) for number in numbers if number >= len(numbers)]
     if lost:
-        remarks.append(f"the original's loader would not read the last {len(lost)} objects ({some(lost)})")
+        remarks.append(f"the original's loader would not read the last {len(lost)} objects ({some(lost, 5)})")
     return tuple(remarks)
-
-
-def some(numbers: Sequence[int]) -> str:
-    """The first of ``numbers`` for a message.
-
-    >>> some([1, 2, 3, 4, 5, 6])
-    '1, 2, 3, 4, 5, ...'
-    """
-    return ", ".join(str(number) for number in numbers[:5]) + (", ..." if len(numbers) > 5 else "")
 
 
 # ---- the scene graph

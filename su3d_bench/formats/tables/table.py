@@ -209,16 +209,7 @@ MOST_XML_BYTES = 32 << 20  # of all that is in the archive, beside pictures, whi
 MOST_SHEET_CELLS = 2_000_000  # of all worksheets
 MOST_COLUMNS = 64  # beyond which nothing is looked at
 # What openpyxl raises on damaged workbooks, beside what zipfile does.
-WORKBOOK_DAMAGE = (
-    *ZIP_DAMAGE,
-    LookupError,
-    TypeError,
-    AttributeError,
-    OSError,
-    SyntaxError,
-    OverflowError,
-    RecursionError,
-)
+WORKBOOK_DAMAGE = (*ZIP_DAMAGE, LookupError, TypeError, AttributeError, OSError, SyntaxError, OverflowError)
 
 Row = tuple[int, list[str | None]]  # its number from 1 on, and its cells from column A on
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import pickle
 import sys
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -17,42 +16,7 @@ from hm3dsem_walk import write_graph
 from prediction_files import Tensor, tensors, write_torch
 
 from su3d_bench.formats.pcd import write_pcd_points
-from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
-
-
-def write_ply_as(path: Path, elements: Sequence[PlyElement], format: str, comments: Sequence[str] = ()) -> None:
-    """As ``write_ply``, in another ``format``."""
-    write_ply(path, elements)
-    header, end, body = path.read_bytes().partition(b"end_header\n")
-    lines = header.decode().splitlines()
-    lines[1:2] = [f"format {format} 1.0", *(f"comment {comment}" for comment in comments)]
-    if format != "binary_little_endian":
-        is_text = format == "ascii"
-        body = b"".join(text(row) if is_text else big_endian(row) for element in elements for row in rows(element))
-    path.write_bytes("\n".join([*lines, ""]).encode() + end + body)
-
-
-def rows(element: PlyElement) -> Iterator[list[np.ndarray]]:
-    """The values of each row, those of a list behind their number."""
-    for row in range(element.n_rows):
-        cells: list[np.ndarray] = []
-        for column in element.columns.values():
-            if isinstance(column, ListColumn):
-                items = column.values[column.indptr[row] : column.indptr[row + 1]]
-                cells += [np.array([len(items)], column.count_type), items]
-            else:
-                cells.append(column[row : row + 1])
-        yield cells
-
-
-def text(row: list[np.ndarray]) -> bytes:
-    """The shortest digits that give each value back."""
-    return (" ".join(str(value) for cell in row for value in cell) + "\n").encode()
-
-
-def big_endian(row: list[np.ndarray]) -> bytes:
-    return b"".join(cell.astype(cell.dtype.newbyteorder(">")).tobytes() for cell in row)
-
+from su3d_bench.formats.ply import PlyElement, write_ply
 
 RNG = np.random.default_rng(0)
 NAMES = ["couch", "lamp", "wall"]
@@ -135,8 +99,7 @@ def write_object(path: Path, points: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     columns = {axis: np.asarray(points)[:, k].astype(np.float64) for k, axis in enumerate("xyz")}
     colours = {name: np.full(len(points), 7, np.uint8) for name in ("red", "green", "blue")}
-    vertex = PlyElement("vertex", len(points), {**columns, **colours})
-    write_ply_as(path, [vertex], "binary_little_endian", ["Created by Open3D"])
+    write_ply(path, [PlyElement("vertex", len(points), {**columns, **colours})])
 
 
 def write_hovsg(folder: Path, clouds: dict[int, Any], features: Any) -> None:
