@@ -160,15 +160,13 @@ def _descendants() -> list[int]:
 
 def _run_afterwards(order: dict[str, Any]) -> None:
     if order["afterwards"]:
-        nowhere = subprocess.DEVNULL
         with suppress(OSError, ValueError, subprocess.SubprocessError):
             subprocess.run(
                 order["afterwards"],
                 cwd="/",
                 env=order["environment"],
-                stdin=nowhere,
-                stdout=nowhere,
-                stderr=nowhere,
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
                 timeout=AFTERWARDS_S,
                 check=False,
             )

@@ -70,16 +70,16 @@ def checked(path: Path, stated: Stated) -> tuple[str, str | None]:
         while piece := stream.read(PIECE):
             for digest in wanted:
                 digest.update(piece)
-    found = sha256.hexdigest()
-    if stated.sha256 not in (None, found):
-        return found, f"SHA-256 is {found}, published is {stated.sha256}"
-    if stated.md5_prefix is not None and not md5.hexdigest().startswith(stated.md5_prefix):
-        return found, f"MD5 is {md5.hexdigest()}, its published beginning {stated.md5_prefix}"
-    if stated.git_blob not in (None, blob.hexdigest()):
-        return found, f"git's SHA-1 is {blob.hexdigest()}, published is {stated.git_blob}"
-    if stated.recorded not in (None, found):
-        return found, f"SHA-256 is {found}, that of the first download was {stated.recorded}"
-    return found, None
+    found, git_blob = sha256.hexdigest(), blob.hexdigest()
+    beginning = md5.hexdigest()[: len(stated.md5_prefix or "")]
+    facts = (
+        ("SHA-256", found, "published is", stated.sha256),
+        ("MD5 begins with", beginning, "published is", stated.md5_prefix),
+        ("git's SHA-1", git_blob, "published is", stated.git_blob),
+        ("SHA-256", found, "that of the first download was", stated.recorded),
+    )
+    wrong = (f"{name} {value}, {said} {fact}" for name, value, said, fact in facts if fact not in (None, value))
+    return found, next(wrong, None)
 
 
 @dataclass(frozen=True)

@@ -163,18 +163,12 @@ class OpenSU3D:
 
     def close(self) -> None:
         """Forgets the scene, says in the log what was left out of it, and gives memory and disk space back."""
-        if self._losses["n_swallowed"]:
-            logger.info(
-                "opensu3d: %d of %d detections lie whole in the rings of others (border_px %g)",
-                self._losses["n_swallowed"],
-                self._n_detections,
-                self.config.border_px,
-            )
-        if self._losses["n_too_far"]:
-            logger.info(
-                "opensu3d: %d pixels lie beyond depth_max %g m and are left out",
-                self._losses["n_too_far"],
-                self.config.depth_max,
-            )
+        n_swallowed, n_too_far = self._losses["n_swallowed"], self._losses["n_too_far"]
+        if n_swallowed:
+            of_all = n_swallowed, self._n_detections, self.config.border_px
+            logger.info("opensu3d: %d of %d detections lie whole in the rings of others (border_px %g)", *of_all)
+        if n_too_far:
+            depth_max = self.config.depth_max
+            logger.info("opensu3d: %d pixels lie beyond depth_max %g m and are left out", n_too_far, depth_max)
         self._clear()
         self._scratch.close()
