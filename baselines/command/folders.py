@@ -14,15 +14,15 @@ from su3d_bench.core.errors import DataError, PredictionError, printable
 from su3d_bench.core.files.atomic import make_folder, write_bytes, write_text
 from su3d_bench.core.maps import Instances, Prediction
 from su3d_bench.core.types import Float64Array, Frame, SceneInfo, Surface
-from su3d_bench.metrics.matching.nearest import masks_of_partition, select
+from su3d_bench.formats.images import depth_in_units, jpeg_bytes, list_column, png_bytes
+from su3d_bench.formats.ply import PlyElement, write_ply
+from su3d_bench.metrics.matching.nearest import select
 from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
 
 LAYOUT_VERSION = 1
 MILLIMETRES = 1000.0
-MOST_MILLIMETRES = 65535  # of 16 bits; what lies farther is written as no depth
 ColourFormat = Literal["png", "jpg"]
-JPEG_QUALITY = 95
 
 # The same folder as the dataset `rgbd` reads it; {index} stands for the frame's number.
 DESCRIPTION = """colour = "colour/{{index}}.{colour}"
@@ -62,8 +62,10 @@ class FrameFolder:
             )
         self._size = size
         name = f"{frame.index:06d}"
-        write_bytes(self.path / "colour" / f"{name}.{self.colour}", _colour_bytes(frame, self.colour))
-        write_bytes(self.path / "depth" / f"{name}.png", _depth_bytes(frame))
+        encode = jpeg_bytes if self.colour == "jpg" else png_bytes
+        depth_m = np.maximum(np.nan_to_num(frame.depth_m, posinf=0.0, neginf=0.0), 0.0)
+        write_bytes(self.path / "colour" / f"{name}.{self.colour}", encode(frame.rgb))
+        write_bytes(self.path / "depth" / f"{name}.png", png_bytes(depth_in_units(depth_m, MILLIMETRES)))
         write_text(self.path / "pose" / f"{name}.txt", matrix_text(frame.camera_to_world))
         self._numbers.append(frame.index)
         self._times_s.append(float(frame.timestamp_s))
@@ -118,37 +120,12 @@ def matrix_text(matrix: Float64Array) -> str:
     return "".join(" ".join(repr(float(value)) for value in row) + "\n" for row in matrix)
 
 
-def _colour_bytes(frame: Frame, colour: ColourFormat) -> bytes:
-    import cv2
-
-    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if colour == "jpg" else []
-    done, content = cv2.imencode(f".{colour}", cv2.cvtColor(frame.rgb, cv2.COLOR_RGB2BGR), options)
-    assert done
-    return content.tobytes()
-
-
-def _depth_bytes(frame: Frame) -> bytes:
-    import cv2
-
-    depth_m = np.nan_to_num(frame.depth_m.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
-    millimetres = np.rint(depth_m * MILLIMETRES)
-    millimetres[(millimetres < 0) | (millimetres > MOST_MILLIMETRES)] = 0
-    done, content = cv2.imencode(".png", millimetres.astype(np.uint16))
-    assert done
-    return content.tobytes()
-
-
 def write_mesh(path: Path, surface: Surface) -> None:
     """The mesh as binary PLY, vertices in their order, which is the order that masks over them refer to."""
-    n_vertices, n_triangles = len(surface.vertices), len(surface.triangles)
-    header = (
-        f"ply\nformat binary_little_endian 1.0\nelement vertex {n_vertices}\nproperty float x\nproperty float y\n"
-        f"property float z\nelement face {n_triangles}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    faces = np.zeros(n_triangles, np.dtype([("n", "u1"), ("corners", "<i4", (3,))]))
-    faces["n"] = 3
-    faces["corners"] = surface.triangles
-    write_bytes(path, header.encode() + surface.vertices.astype("<f4").tobytes() + faces.tobytes())
+    axes = {axis: surface.vertices[:, k].astype(np.float32) for k, axis in enumerate("xyz")}
+    corners = list_column(surface.triangles)
+    vertices = PlyElement("vertex", len(surface.vertices), axes)
+    write_ply(path, [vertices, PlyElement("face", len(corners), {"vertex_indices": corners})])
 
 
 def read_output(folder: Path, scene: str, format: str | None) -> ScenePrediction:
@@ -183,39 +160,20 @@ def as_prediction(content: Content, surface: Surface | None, names: Mapping[int,
     n_points = len(content.class_ids) if isinstance(content, VertexLabels) else content.n_points
     if n_points not in {None, n}:
         raise PredictionError(f"its masks are over {n_points} points, the mesh has {n} vertices; they must be the same")
-    masks = _masks_of_labels(content) if isinstance(content, VertexLabels) else content
+    masks = content.masks() if isinstance(content, VertexLabels) else content
+    numbers, kept = masks.class_numbers, np.arange(len(masks))
+    if isinstance(content, VertexLabels) and numbers is not None:
+        # ids of 0 and below are no class, nor are places in a list below 0
+        kept = np.flatnonzero(numbers >= (content.numbering == "id"))
     return Instances.of(
         surface.vertices,
-        masks,
-        masks.scores,
-        masks.features,
-        labels=_labels(masks, names),
-        names=tuple(printable(key, 200) for key in masks.keys),
-        ids=range(1, len(masks) + 1),
+        select(masks, kept),
+        masks.scores[kept],
+        None if masks.features is None else masks.features[kept],
+        labels=None if numbers is None else [names.get(one, f"class {one}") for one in numbers[kept].tolist()],
+        names=[printable(masks.keys[k], 200) for k in kept],
+        ids=range(1, len(kept) + 1),
     )
-
-
-def _masks_of_labels(content: VertexLabels) -> VertexMasks:
-    """One mask a class; ids of 0 and below are no class, nor are places in a list below 0."""
-    distinct, row = np.unique(content.class_ids, return_inverse=True)
-    is_class = distinct >= (content.numbering == "id")
-    masks = select(masks_of_partition(row, len(distinct)), np.flatnonzero(is_class))
-    kept = distinct[is_class].astype(np.int32)
-    return VertexMasks(
-        masks.indptr,
-        masks.indices,
-        n_points=len(content.class_ids),
-        scores=np.ones(len(kept)),
-        class_numbers=kept,
-        numbering=content.numbering,
-        keys=tuple(f"class {number}" for number in kept),
-    )
-
-
-def _labels(masks: VertexMasks, names: Mapping[int, str]) -> tuple[str, ...] | None:
-    if masks.class_numbers is None:
-        return None
-    return tuple(names.get(number, f"class {number}") for number in masks.class_numbers.tolist())
 
 
 def class_names(content: Content, dataset: str, protocol: str | None) -> dict[int, str]:
@@ -223,19 +181,18 @@ def class_names(content: Content, dataset: str, protocol: str | None) -> dict[in
 
     Empty where it has none. Raises ``PredictionError`` where the protocols give one number different names.
     """
-    has_numbers = isinstance(content, VertexMasks) and content.class_numbers is not None and len(content) > 0
-    if not (has_numbers or isinstance(content, VertexLabels)):
+    if not isinstance(content, VertexMasks | VertexLabels):
+        return {}
+    if isinstance(content, VertexMasks) and (content.class_numbers is None or not len(content)):
         return {}
     own = [load_protocol(protocol)] if protocol is not None else list(map(load_protocol, protocols_for(dataset)))
     own = [rules for rules in own if rules.classes]
-    lists = [[(entry.id, entry.name) for entry in rules.classes] for rules in own]
-    if isinstance(content, VertexMasks) and content.numbering == "index":
-        scored = dict.fromkeys(tuple(entry.name for entry in rules.scored) for rules in own if rules.kind == "instance")
-        lists = [list(enumerate(names)) for names in scored]
-    elif isinstance(content, VertexMasks | VertexLabels) and content.numbering == "line":
-        whole = dict.fromkeys(tuple(entry.name for entry in rules.classes) for rules in own)
-        lists = [list(enumerate(names)) for names in whole]
-    pairs = {pair for listed in lists for pair in listed}
+    pairs = {(entry.id, entry.name) for rules in own for entry in rules.classes}
+    if content.numbering != "id":
+        lists = [rules.classes for rules in own]
+        if content.numbering == "index":
+            lists = [rules.scored for rules in own if rules.kind == "instance"]
+        pairs = {(number, entry.name) for entries in lists for number, entry in enumerate(entries)}
     if not pairs or len(pairs) > len({number for number, _ in pairs}):
         known = ", ".join(rules.name for rules in own) or "any that has classes"
         raise PredictionError(f"whose are its class numbers? name a protocol in classes_of (known: {known})")

@@ -19,7 +19,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from su3d_bench.baselines.command.folders import ColourFormat, FrameFolder, as_prediction, class_names, read_output
-from su3d_bench.baselines.command.process import ContainerWatch, Finished, Leaving, TreeWatch, run_program
+from su3d_bench.baselines.command.process import Finished, run_program
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError, printable
 from su3d_bench.core.files.atomic import TemporaryFolder, is_file
@@ -47,22 +47,12 @@ def variable_of(name: str) -> str:
     return f"SU3D_{name.upper()}"
 
 
-def words_of(command: str | Sequence[str]) -> list[str]:
-    """The words of a command; what a shell alone can split is split at spaces."""
-    if not isinstance(command, str):
-        return list(command)
-    try:
-        return shlex.split(command)
-    except ValueError:
-        return command.split()
-
-
 def check_placeholders(command: str | Sequence[str], *, is_shell: bool) -> None:
     """Raises ``ValueError`` for an unknown placeholder, or one whose value a program would read as code."""
     if isinstance(command, str) and is_shell:
-        for name, place in _misplaced(command):
+        for name in _misplaced(command):
             right = f'write {{{name}}} outside of quotes, or "${variable_of(name)}"'
-            raise ValueError(f"'{{{name}}}' is {place}, where a shell would read its value as commands; {right}")
+            raise ValueError(f"'{{{name}}}' stands where a shell would read its value as commands; {right}")
         return
     words = shlex.split(command) if isinstance(command, str) else command
     for k, word in enumerate(words):
@@ -78,17 +68,14 @@ def check_placeholders(command: str | Sequence[str], *, is_shell: bool) -> None:
             )
 
 
-def _misplaced(line: str) -> Iterator[tuple[str, str]]:
+def _misplaced(line: str) -> Iterator[str]:
     """The placeholders of a shell's line that stand where its quotes would be undone, or where a shell is fed."""
     for found in PLACEHOLDER.finditer(line):
         before = line[: found.start()]
         unescaped = re.sub(r"\\.|(?:^|\s)#[^\n]*", "", before)
         is_quoted = unescaped.count("'") % 2 or unescaped.count('"') % 2
-        places = {"within quotes": is_quoted, "in or after a here-document": "<<" in before}
-        places |= {f"behind a {sign}": before.endswith(sign) for sign in ("$", "\\")}
-        place = next((place for place, is_there in places.items() if is_there), None)
-        if found[1] in PLACEHOLDERS and place is not None:
-            yield found[1], place
+        if found[1] in PLACEHOLDERS and (is_quoted or "<<" in before or before.endswith(("$", "\\"))):
+            yield found[1]
 
 
 def _is_code(words: Sequence[str], k: int) -> bool:
@@ -113,7 +100,6 @@ Name = Annotated[str, Field(pattern=r"^([^-\s]\S*)?$")]  # no option in the plac
 # What a program finds in its environment unless more is allowed: enough to start it, no credentials.
 ENVIRONMENT = ("PATH", "HOME", "LANG", "LC_ALL", "TZ", "CUDA_VISIBLE_DEVICES", "LD_LIBRARY_PATH")
 INSIDE = {"frames": "/su3d/frames", "output": "/su3d/output", "work": "/su3d/work"}  # of a container
-MOUNT = re.compile(r"(?P<here>/[^:]*):(?P<there>/[^:]*)")
 
 
 class CommandConfig(BaseModel):
@@ -138,7 +124,7 @@ class CommandConfig(BaseModel):
     gpus: str = ""
     network: bool = False
     environment: Name = ""
-    mounts: tuple[str, ...] = ()
+    mounts: tuple[Annotated[str, Field(pattern=r"^/[^:]*:/[^:]*$")], ...] = ()
     pass_variables: tuple[Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")], ...] = ENVIRONMENT
     timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3600.0
     format: str | None = None
@@ -158,9 +144,6 @@ class CommandConfig(BaseModel):
             raise ValueError("image, mounts, gpus and network belong to runner 'docker'")
         if self.environment and self.runner != "conda":
             raise ValueError("environment belongs to runner 'conda'")
-        for mount in self.mounts:
-            if not MOUNT.fullmatch(mount):
-                raise ValueError(f"mount '{mount}' is not HERE:THERE with two absolute paths")
         if self.format is not None:
             from su3d_bench.predictions.formats import READERS  # not for a list of methods
 
@@ -215,7 +198,11 @@ class Command:
         """Digest of each file that the command names, so that another version of a program is another run."""
         if self.config.runner == "docker":
             return {}  # its words are files of the image
-        words = words_of(self.config.command)
+        command = self.config.command
+        try:
+            words = shlex.split(command) if isinstance(command, str) else command
+        except ValueError:  # what a shell alone can split is split at spaces
+            words = str(command).split()
         files = {word: _program_file(word) for word in words}
         return {f"file {word}": digest_file(path) for word, path in files.items() if path is not None}
 
@@ -290,9 +277,9 @@ class Command:
             folder=folders["work"],
             environment=environment,
             timeout_s=self.config.timeout_s,
-            watch_of=TreeWatch if container is None else lambda pid: ContainerWatch(id_file),
+            id_file=None if container is None else id_file,
             # `docker run` may end before its container does: ending the client is not enough.
-            leaving=Leaving(() if container is None else ("docker", "kill", container), folders["frames"].parent),
+            afterwards=() if container is None else ("docker", "kill", container),
         )
         self._record(done)
         last = _last_line(done.stderr)

@@ -9,8 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from threading import Thread
 from typing import IO, Any
 
 from su3d_bench.baselines.command import supervisor
-from su3d_bench.baselines.command.supervisor import AFTERWARDS_S, DONE, END, STOP
+from su3d_bench.baselines.command.supervisor import AFTERWARDS_S, STOP
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.system.files import file_text
 
@@ -54,61 +53,56 @@ class Finished:
 
 
 class Watch:
-    """The most memory that something held; ``look`` is called again and again while it runs.
+    """The most memory that a program held; ``look`` is called again and again while it runs.
 
-    ``source``: how the memory was measured, or that it was not.
+    That of a process and all its descendants, where pages that several share count once for each; or, where docker
+    writes the id of a container into ``id_file``, the peak that its cgroup keeps, with the files that it caches.
+    ``source``: how it was measured, or why not.
     """
 
-    source = "not measured"
-    peak_bytes: int | None = None
+    def __init__(self, pid: int, id_file: Path | None = None) -> None:
+        self._pid, self._id_file = pid, id_file
+        self._seen: dict[int, Any] = {}
+        self.peak_bytes: int | None = None
+        self.source = "resident memory of all processes together, sampled"
+        if id_file is not None:
+            self.source = "not measured: the cgroup cannot be read here"
 
     def look(self) -> None:
         """Note what is held now."""
-
-    def end(self) -> None:
-        """End what was seen and is left running."""
-
-
-class TreeWatch(Watch):
-    """A process and all its descendants; pages that several share count once for each."""
-
-    source = "resident memory of all processes together, sampled"
-
-    def __init__(self, pid: int) -> None:
+        if self._id_file is not None:
+            self._look_at_container(self._id_file)
+            return
         import psutil
 
-        self._errors: type[Exception] = psutil.Error
-        self._seen: dict[int, Any] = {}
-        try:
-            self._root: Any = psutil.Process(pid)
-        except psutil.Error:
-            self._root = None
+        with suppress(psutil.Error):
+            root = psutil.Process(self._pid)
+            together, peak = 0, self.peak_bytes or 0
+            for process in (root, *root.children(recursive=True)):
+                self._seen.setdefault(process.pid, process)
+                with suppress(psutil.Error):
+                    together += process.memory_info().rss
+                    peak = max(peak, _own_peak_bytes(process.pid))
+            self.peak_bytes = max(peak, together) or None
 
-    def look(self) -> None:
-        if self._root is None:
-            return
-        try:
-            processes = [self._root, *self._root.children(recursive=True)]
-        except self._errors:
-            return
-        together, peak = 0, self.peak_bytes or 0
-        for process in processes:
-            self._seen[process.pid] = process
-            try:
-                together += int(process.memory_info().rss)
-            except self._errors:
-                continue
-            peak = max(peak, _own_peak_bytes(process.pid))
-        self.peak_bytes = max(peak, together) or None
+    def _look_at_container(self, id_file: Path) -> None:
+        identity = file_text(id_file).strip() if id_file.is_file() else ""
+        for pattern in PEAK_FILES if identity.isalnum() else ():
+            with suppress(OSError, ValueError):
+                self.peak_bytes = int(file_text(CGROUPS / pattern.format(id=identity)))
+                self.source = "the container's cgroup"
 
     def end(self) -> None:
-        # Where the system has no orphans that can be adopted, or the supervisor was killed.
+        """End what was seen and is left running.
+
+        Where the system has no orphans that can be adopted, or the supervisor was killed.
+        """
+        import psutil
+
         for process in self._seen.values():
-            try:
+            with suppress(psutil.Error):
                 if process.is_running():
                     process.kill()
-            except self._errors:
-                continue
 
 
 def _own_peak_bytes(pid: int) -> int:
@@ -120,109 +114,62 @@ def _own_peak_bytes(pid: int) -> int:
     return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM:")), 0)
 
 
-class ContainerWatch(Watch):
-    """A docker container, by the peak that its cgroup keeps; files that it caches in memory count too."""
-
-    source = "not measured: the cgroup cannot be read here"
-
-    def __init__(self, id_file: Path, cgroups: Path = CGROUPS) -> None:
-        self._id_file = id_file
-        self._cgroups = cgroups
-
-    def look(self) -> None:
-        try:
-            identity = file_text(self._id_file).strip()
-        except OSError:
-            return
-        if not identity.isalnum():
-            return
-        for pattern in PEAK_FILES:
-            try:
-                self.peak_bytes = int(file_text(self._cgroups / pattern.format(id=identity)))
-            except (OSError, ValueError):
-                continue
-            self.source = "the container's cgroup"
-            return
-
-
 class _Tail(Thread):
     """Reads a stream to its end and keeps its last characters, whatever comes."""
 
     def __init__(self, stream: IO[bytes]) -> None:
         super().__init__(daemon=True)
         self._stream = stream
-        self._chunks: deque[bytes] = deque()
-        self._n_kept = self._n_dropped = 0
+        self._kept, self._n_read = b"", 0
 
     def run(self) -> None:
         # ValueError: the stream was closed because a runaway child still holds its other end.
-        try:
+        with suppress(OSError, ValueError):
             while chunk := os.read(self._stream.fileno(), 65536):
-                self._chunks.append(chunk)
-                self._n_kept += len(chunk)
-                while self._n_kept - len(self._chunks[0]) >= KEPT_CHARACTERS:
-                    dropped = len(self._chunks.popleft())
-                    self._n_kept -= dropped
-                    self._n_dropped += dropped
-        except (OSError, ValueError):
-            return
+                self._n_read += len(chunk)
+                self._kept = (self._kept + chunk)[-KEPT_CHARACTERS:]
 
     def text(self) -> str:
         self.join(GRACE_S)
-        kept = b"".join(list(self._chunks))
-        n_dropped = self._n_dropped + max(len(kept) - KEPT_CHARACTERS, 0)
-        text = kept[-KEPT_CHARACTERS:].decode("utf-8", "replace")
-        return f"[{n_dropped} bytes before are left out]\n{text}" if n_dropped else text
+        text, n_dropped = self._kept.decode("utf-8", "replace"), self._n_read - len(self._kept)
+        return f"[{n_dropped} bytes before are left out]\n{text}" if n_dropped > 0 else text
 
 
 class _Supervised:
-    """A program under its supervisor, ``supervisor.py``, which ends it when this process does, however that comes."""
+    """A program under its supervisor, ``supervisor.py``, which ends it when this process does, however that comes.
 
-    def __init__(self, words: Sequence[str], folder: Path, environment: Mapping[str, str], leaving: Leaving) -> None:
+    ``afterwards`` is run wherever the program is ended and does not end by itself.
+    """
+
+    def __init__(
+        self, words: Sequence[str], folder: Path, environment: Mapping[str, str], afterwards: Sequence[str]
+    ) -> None:
         self.exit_code: int | None = None
-        orders, self._orders = os.pipe()
+        self._said = b""
         self._answers, answers = os.pipe()
         try:
-            self._process = subprocess.Popen(
-                [sys.executable, "-I", "-S", str(SUPERVISOR), str(orders), str(answers)],
-                pass_fds=(orders, answers),
-                stdin=subprocess.DEVNULL,
+            process = subprocess.Popen(
+                [sys.executable, "-I", "-S", str(SUPERVISOR), str(answers)],
+                pass_fds=(answers,),
+                stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 start_new_session=True,  # what ends this process's group leaves the supervisor to do its work
             )
-        except OSError as error:
-            self._close_pipes()
-            raise ConfigError(f"'{sys.executable}' cannot be started: {error.strerror}") from error
-        except BaseException:
-            self._close_pipes()
-            raise
         finally:
-            os.close(orders)
             os.close(answers)
-        self._said = b""
-        assert self._process.stdout is not None and self._process.stderr is not None
-        self.streams: tuple[IO[bytes], IO[bytes]] = (self._process.stdout, self._process.stderr)
+        assert process.stdin is not None and process.stdout is not None and process.stderr is not None
+        self._process, self._orders, self.streams = process, process.stdin, (process.stdout, process.stderr)
+        order = {"words": list(words), "folder": str(folder), "environment": dict(environment)}
         try:
-            self.pid = self._started(words, folder, environment, leaving)
+            self._order(json.dumps(order | {"afterwards": list(afterwards)}).encode() + b"\n")
+            answer = self._answer(None) or {"error": "its supervisor was ended"}
+            if "error" in answer:
+                raise ConfigError(f"'{words[0]}' cannot be started: {answer['error']}")
+            self.pid = int(answer["pid"])
         except BaseException:
             self.close()
             raise
-
-    def _started(self, words: Sequence[str], folder: Path, environment: Mapping[str, str], leaving: Leaving) -> int:
-        order = {
-            "words": list(words),
-            "folder": str(folder),
-            "environment": dict(environment),
-            "scratch": str(leaving.scratch or ""),
-            "afterwards": list(leaving.words),
-        }
-        with suppress(BrokenPipeError), open(self._orders, "wb", closefd=False) as pipe:
-            pipe.write(json.dumps(order).encode() + b"\n")
-        answer = self._answer(None) or {"error": "its supervisor was ended"}
-        if "error" in answer:
-            raise ConfigError(f"'{words[0]}' cannot be started: {answer['error']}")
-        return int(answer["pid"])
 
     def has_ended(self, wait_s: float) -> bool:
         """Whether the program has ended, at the latest after ``wait_s``."""
@@ -237,25 +184,22 @@ class _Supervised:
 
     def end(self) -> None:
         """End the program and all that it started."""
-        if self.exit_code is None:
-            self._order(END)
-            self.has_ended(ENDING_S)
-        self._order(DONE)
+        with suppress(BrokenPipeError):
+            self._orders.close()
+        self.has_ended(ENDING_S)
 
     def close(self) -> None:
-        self._close_pipes()
-        for stream in self.streams:
-            stream.close()
+        os.close(self._answers)
+        for stream in (self._orders, *self.streams):
+            with suppress(BrokenPipeError):
+                stream.close()
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(GRACE_S)
 
-    def _close_pipes(self) -> None:
-        os.close(self._orders)
-        os.close(self._answers)
-
     def _order(self, order: bytes) -> None:
         with suppress(BrokenPipeError):
-            os.write(self._orders, order)
+            self._orders.write(order)
+            self._orders.flush()
 
     def _answer(self, wait_s: float | None) -> dict[str, Any] | None:
         """The next answer, empty where no supervisor is left to give one; None where none came within ``wait_s``."""
@@ -272,37 +216,26 @@ class _Supervised:
         return answer
 
 
-@dataclass(frozen=True)
-class Leaving:
-    """What the supervisor does where a program does not end by itself.
-
-    ``words`` are run wherever it is ended; ``scratch`` is removed where this process is gone and cannot do it.
-    """
-
-    words: Sequence[str] = ()
-    scratch: Path | None = None
-
-
 def run_program(
     words: Sequence[str],
     *,
     folder: Path,
     environment: Mapping[str, str],
     timeout_s: float,
-    watch_of: Callable[[int], Watch] = TreeWatch,
-    leaving: Leaving | None = None,
+    id_file: Path | None = None,
+    afterwards: Sequence[str] = (),
 ) -> Finished:
     """Run ``words`` in ``folder`` until it ends or ``timeout_s`` is over; nothing that it started outlives the call.
 
-    Nor this process, however that ends. ``watch_of`` makes the watch of a process id. A program that cannot be started
-    is a ``ConfigError``.
+    Nor this process, however that ends. into ``id_file`` docker writes the id of a container; ``afterwards`` is
+    run where the program is ended and does not end by itself. A program that cannot be started is a ``ConfigError``.
     """
     start = time.perf_counter()
-    with closing(_Supervised(words, folder, environment, leaving or Leaving())) as program:
+    with closing(_Supervised(words, folder, environment, afterwards)) as program:
         tails = [_Tail(stream) for stream in program.streams]
         for tail in tails:
             tail.start()
-        watch = watch_of(program.pid)
+        watch = Watch(program.pid, id_file)
         is_timed_out = False
         try:
             is_timed_out = not _ends_within(program, watch, start, timeout_s)

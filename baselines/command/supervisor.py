@@ -4,9 +4,9 @@ A script, started with ``python -I -S``: it imports nothing of the harness, and 
 memory. It stands between a run and somebody's program because a process that is killed can do nothing any more, but the
 system closes its pipes, and that can be waited for.
 
-It is told through the pipe ``ORDERS``, first one line of JSON, then ``STOP``, ``END`` or ``DONE``; the end of the pipe
-is the end of whoever held it. It answers through a second pipe, a line of JSON each: the program's process id or why it
-cannot be started, then its exit code.
+It is told through its standard input, first one line of JSON, then ``STOP``; the end of that pipe, which comes with
+the end of whoever held it, ends the program. It answers through a second pipe, a line of JSON each: the program's
+process id or why it cannot be started, then its exit code.
 """
 
 from __future__ import annotations
@@ -15,22 +15,21 @@ import ctypes
 import json
 import os
 import select
-import shutil
 import signal
 import subprocess
 import sys
 import time
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
-STOP, END, DONE = b"S", b"E", b"D"  # ask the program to stop; end it; nothing is left for the supervisor to do
-MOST_ORDER_BYTES = 1 << 24  # an environment and a command line; Linux gives them 2 MiB together
+STOP = b"S"  # asks the program to stop
 ENDING_S = 5.0  # for processes that were killed to be gone; what waits for a dead disk stays
 AFTERWARDS_S = 60.0  # for `docker kill`
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36  # linux/prctl.h
 
 
-def main(orders: int, answers: int) -> None:
+def main(answers: int) -> None:
     # A child of nobody: Ray ends the children of a worker that it ends, and others end whole trees of processes.
     if os.fork() > 0:
         os._exit(0)
@@ -43,9 +42,10 @@ def main(orders: int, answers: int) -> None:
     os.set_blocking(woken, False)
     signal.signal(signal.SIGCHLD, lambda number, frame: None)
     signal.set_wakeup_fd(waker, warn_on_full_buffer=False)
-    _adopt_orphans()
-    line = _first_line(orders)
-    if line is None:
+    _prctl(PR_SET_CHILD_SUBREAPER, 1)  # what the program started and left becomes a child of this process
+    with open(0, "rb", buffering=0, closefd=False) as orders:
+        line = orders.readline()
+    if not line.endswith(b"\n"):  # whoever asked is gone already
         return
     order = json.loads(line)
     try:
@@ -53,54 +53,29 @@ def main(orders: int, answers: int) -> None:
     except (OSError, ValueError, subprocess.SubprocessError) as error:
         _answer(answers, {"error": getattr(error, "strerror", None) or str(error)})
         return
-    _let_go_of_streams()
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    for stream in (1, 2):  # the program's streams end with the program
+        os.dup2(nowhere, stream)
     _answer(answers, {"pid": program})
-    exit_code, last = _wait(program, orders, woken)
+    exit_code, has_ended_itself = _wait(program, woken)
     ended = _end_all(program)
-    exit_code = ended if exit_code is None else exit_code
-    if last is not None:  # it did not end by itself
+    if not has_ended_itself:
         _run_afterwards(order)
-    if last == b"":
-        shutil.rmtree(order["scratch"], ignore_errors=True)
-        return
+    exit_code = ended if exit_code is None else exit_code
     _answer(answers, {"exit_code": -signal.SIGKILL if exit_code is None else exit_code})
-    if _next_order(orders) != DONE:  # whoever asked is gone before it heard the answer
-        shutil.rmtree(order["scratch"], ignore_errors=True)
 
 
-def _first_line(orders: int) -> bytes | None:
-    """The line of JSON; None where whoever asked is gone already."""
-    content = b""
-    while not content.endswith(b"\n") and len(content) <= MOST_ORDER_BYTES:
-        chunk = os.read(orders, 65536)
-        if not chunk:
-            return None
-        content += chunk
-    return content
-
-
-def _start(order: dict[str, object]) -> int:
-    words, folder, environment = order["words"], order["folder"], order["environment"]
-    assert isinstance(words, list) and isinstance(folder, str) and isinstance(environment, dict)
+def _start(order: dict[str, Any]) -> int:
     process = subprocess.Popen(
-        words,
-        cwd=folder,
-        env=environment,
+        order["words"],
+        cwd=order["folder"],
+        env=order["environment"],
         stdin=subprocess.DEVNULL,
         start_new_session=True,  # a process group of its own, which can be ended as a whole
-        preexec_fn=_die_with_supervisor,
+        preexec_fn=lambda: _prctl(PR_SET_PDEATHSIG, signal.SIGKILL),
     )
     process.returncode = 0  # it is waited for here, with all that is adopted
     return process.pid
-
-
-def _die_with_supervisor() -> None:
-    _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-
-
-def _adopt_orphans() -> None:
-    """What the program started and left becomes a child of this process, not of the system's first."""
-    _prctl(PR_SET_CHILD_SUBREAPER, 1)
 
 
 def _prctl(option: int, value: int) -> None:
@@ -108,42 +83,27 @@ def _prctl(option: int, value: int) -> None:
         ctypes.CDLL(None).prctl(option, ctypes.c_ulong(value), 0, 0, 0)
 
 
-def _let_go_of_streams() -> None:
-    """The program's streams end with the program."""
-    nowhere = os.open(os.devnull, os.O_RDWR)
-    for stream in (1, 2):
-        os.dup2(nowhere, stream)
-    os.close(nowhere)
-
-
 def _answer(answers: int, content: dict[str, object]) -> None:
     with suppress(OSError):  # nobody is there to hear it
         os.write(answers, json.dumps(content).encode() + b"\n")
 
 
-def _wait(program: int, orders: int, woken: int) -> tuple[int | None, bytes | None]:
-    """The program's exit code once it has ended, and the last order, empty at the end of the pipe, None without one."""
-    last = None
+def _wait(program: int, woken: int) -> tuple[int | None, bool]:
+    """The program's exit code once it has ended, None where it is to be ended, and whether it was left to itself."""
+    is_left_alone = True
     while True:
-        ready, _, _ = select.select([orders, woken], [], [])
+        ready, _, _ = select.select([0, woken], [], [])
         if woken in ready:
             with suppress(BlockingIOError):
                 os.read(woken, 65536)
         exit_code = _reap(program)
         if exit_code is not None:
-            return exit_code, last
-        if orders in ready:
-            last = _next_order(orders)
-            if last != STOP:
-                return None, last
+            return exit_code, is_left_alone
+        if 0 in ready:
+            is_left_alone = False
+            if os.read(0, 1) != STOP:
+                return None, False
             _signal_group(program, signal.SIGTERM)
-
-
-def _next_order(orders: int) -> bytes:
-    try:
-        return os.read(orders, 1)
-    except OSError:
-        return b""
 
 
 def _reap(program: int) -> int | None:
@@ -198,23 +158,19 @@ def _descendants() -> list[int]:
     return found
 
 
-def _run_afterwards(order: dict[str, object]) -> None:
-    words, environment = order["afterwards"], order["environment"]
-    assert isinstance(words, list) and isinstance(environment, dict)
-    if not words:
-        return
-    with suppress(OSError, ValueError, subprocess.SubprocessError):
-        subprocess.run(
-            words,
-            cwd="/",
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            timeout=AFTERWARDS_S,
-            check=False,
-        )
+def _run_afterwards(order: dict[str, Any]) -> None:
+    if order["afterwards"]:
+        with suppress(OSError, ValueError, subprocess.SubprocessError):
+            subprocess.run(
+                order["afterwards"],
+                cwd="/",
+                env=order["environment"],
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                timeout=AFTERWARDS_S,
+                check=False,
+            )
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), int(sys.argv[2]))
+    main(int(sys.argv[1]))

@@ -6,6 +6,7 @@ nothing that is scored reads them. The table holds one half-precision feature pe
 
 from __future__ import annotations
 
+import os
 import tempfile
 from typing import IO, Any, Literal, NamedTuple
 
@@ -26,15 +27,14 @@ BLOCK_ROWS = 4096  # 16 MB of float32 at 1024 dimensions
 class FeatureTable:
     """Features (N, D) float16 and the confidence of each.
 
-    On disk they lie in a file without a name, which is gone with the process, however that ends. Both places do the
-    same arithmetic: a block in float32, rounded to half precision once an update. ``average_in_half`` leaves the length
-    of features apart, so that it does not leave half precision.
+    They lie in a file without a name, on disk or in memory, which is gone with the process, however that ends. The
+    arithmetic is that of a block in float32, rounded to half precision once an update. ``average_in_half`` leaves the
+    length of features apart, so that it does not leave half precision.
     """
 
     def __init__(self, n_dimensions: int, place: Place) -> None:
         self.n_dimensions = n_dimensions
-        self._file: IO[bytes] | None = _nameless_file() if place == "disk" else None
-        self._held = np.empty((0, n_dimensions), np.float16)
+        self._file = _nameless_file(place)
         self._confidences = np.empty(0)
         self._lengths: Float64Array | None = None  # (N,) by what each row is to be multiplied
         self._n = 0
@@ -60,19 +60,13 @@ class FeatureTable:
         if self._lengths is not None:
             self._lengths = with_room(self._lengths, self._n, end)
             self._lengths[self._n : end] = 1.0
-        if self._file is None:
-            self._held = with_room(self._held, self._n, end)
         for start in range(0, len(row), BLOCK_ROWS):
             block = features[row[start : start + BLOCK_ROWS]]
-            if self._file is None:
-                self._held[self._n + start : self._n + start + len(block)] = block
-            else:
-                self._write(block, self._n + start)
+            self._write(block, self._n + start)
         self._n = end
 
     def _write(self, block: HalfArray, first_row: int) -> None:
         # A plain write fails where the disk is full; writing through a map of a sparse file would end the process.
-        assert self._file is not None
         try:
             self._file.seek(first_row * self.n_dimensions * 2)
             self._file.write(block.tobytes())
@@ -88,7 +82,7 @@ class FeatureTable:
         if not len(point):
             return
         order = np.argsort(point, kind="stable")  # neighbours in the file are read together
-        table = self._mapped("r+") if self._file is not None else self._held
+        table = self._mapped("r+")
         for start in range(0, len(order), BLOCK_ROWS):
             chosen = order[start : start + BLOCK_ROWS]
             of_point = point[chosen]
@@ -107,7 +101,7 @@ class FeatureTable:
         its features are of single precision, and a row that nothing is averaged into is multiplied by its rounded
         confidence and divided by the one that is not. Source: fuse_with_map of gradslam at 59ca872.
         """
-        table = self._mapped("r+") if self._file is not None else self._held[: self._n]
+        table = self._mapped("r+")
         held = self._confidences[: self._n].copy()
         rounded = held.astype(np.float16)
         is_first = self._lengths is None
@@ -136,24 +130,20 @@ class FeatureTable:
 
     def _mapped(self, mode: Literal["r", "r+"]) -> HalfArray:
         # mapped anew at each use, for the file grows between them
-        assert self._file is not None
         return np.memmap(self._file, np.float16, mode, shape=(self._n, self.n_dimensions))
 
     def features(self) -> HalfArray:
         """The features (N, D), read-only: a view of the table, whose rows move with the next ``average``."""
-        if self._file is not None and self.n_bytes:
-            return self._mapped("r")
-        view = self._held[: self._n].view()
-        view.flags.writeable = False
-        return view
+        return self._mapped("r") if self.n_bytes else np.zeros((self._n, self.n_dimensions), np.float16)
 
     def close(self) -> None:
         """Give the disk space back; a view that is still held keeps it until it goes."""
-        if self._file is not None:
-            self._file.close()
+        self._file.close()
 
 
-def _nameless_file() -> IO[bytes]:
+def _nameless_file(place: Place) -> IO[bytes]:
+    if place == "memory" and hasattr(os, "memfd_create"):
+        return os.fdopen(os.memfd_create("features"), "w+b")
     try:
         file: IO[bytes] = tempfile.TemporaryFile(dir=scratch_folder())  # noqa: SIM115  (closed by the table)
     except OSError as error:

@@ -11,27 +11,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from su3d_bench.baselines.conceptgraphs.objects import (
-    InstanceScore,
-    LiftedRegion,
-    MapObject,
-    MappingConfig,
-    Sighting,
-    are_coplanar,
-    axis_aligned_iou,
-    denoised,
-    extents_of_boxes,
-    extents_of_clouds,
-    grown,
-    kept_regions,
-    lift,
-    merge_overlapping,
-    merged,
-    oriented_iou,
-    seen_enough,
-    subtract_contained,
-    unit,
-)
+from su3d_bench.baselines.conceptgraphs import objects as steps
+from su3d_bench.baselines.conceptgraphs.objects import MapObject, MappingConfig, Sighting
 from su3d_bench.core.interfaces import StageTimer
 from su3d_bench.core.maps import Instances, Masks, starts_of
 from su3d_bench.core.types import Detections, Float32Array, Float64Array, Frame, Int64Array
@@ -47,12 +28,13 @@ def box_iou(detections: Sequence[MapObject], objects: Sequence[MapObject]) -> Fl
     Where one box of the frame or the map is not flat-sided enough for PyTorch3D, that of the clouds' axis-aligned
     extents for all pairs, as the original does on PyTorch3D's error.
     """
-    of_detections = grown([item.box for item in detections], LEAST_SIDE_M)
-    of_objects = grown([item.box for item in objects], LEAST_SIDE_M)
-    if are_coplanar([*of_detections, *of_objects]):
-        return oriented_iou(of_detections, of_objects)
-    return axis_aligned_iou(
-        extents_of_clouds([item.points for item in detections]), extents_of_clouds([item.points for item in objects])
+    of_detections = steps.grown([item.box for item in detections], LEAST_SIDE_M)
+    of_objects = steps.grown([item.box for item in objects], LEAST_SIDE_M)
+    if steps.are_coplanar([*of_detections, *of_objects]):
+        return steps.oriented_iou(of_detections, of_objects)
+    return steps.axis_aligned_iou(
+        steps.extents_of_clouds([item.points for item in detections]),
+        steps.extents_of_clouds([item.points for item in objects]),
     )
 
 
@@ -70,8 +52,9 @@ def geometric_similarity(
     """s_geo (M, N) of the configured kind, 0..1."""
     if config.spatial_sim_type == "overlap":
         return overlap_similarity(detections, objects, config.downsample_voxel_size)
-    return axis_aligned_iou(
-        extents_of_boxes([item.box for item in detections]), extents_of_boxes([item.box for item in objects])
+    return steps.axis_aligned_iou(
+        steps.extents_of_boxes([item.box for item in detections]),
+        steps.extents_of_boxes([item.box for item in objects]),
     )
 
 
@@ -144,10 +127,10 @@ class ObjectMap:
         self._feature_size = detections.crop_features.shape[2]
         with timer.stage("filter"):
             is_background = np.array([name in self._background for name in detections.names], np.bool_)
-            rows = kept_regions(detections, is_background, self._config)
-            masks = subtract_contained(detections.boxes[rows], detections.masks[rows])
+            rows = steps.kept_regions(detections, is_background, self._config)
+            masks = steps.subtract_contained(detections.boxes[rows], detections.masks[rows])
         with timer.stage("backproject"):
-            lifted = list(lift(frame, rows, masks, self._config, self._seed))
+            lifted = list(steps.lift(frame, rows, masks, self._config, self._seed))
         fresh = [self._object_of(region, detections, text_features) for region in lifted]
         if self._background:
             with timer.stage("background"):
@@ -161,7 +144,7 @@ class ObjectMap:
         self._associate(foreground, timer)
         self._tidy_up(timer)
 
-    def _object_of(self, region: LiftedRegion, detections: Detections, text_features: Float32Array) -> MapObject:
+    def _object_of(self, region: steps.LiftedRegion, detections: Detections, text_features: Float32Array) -> MapObject:
         k = region.detection
         self._n_created += 1
         seen = Sighting(
@@ -175,8 +158,8 @@ class ObjectMap:
             number=self._n_created,
             points=region.points,
             box=region.box,
-            feature=unit(detections.crop_features[k, 0].astype(np.float64)),
-            text_feature=unit(text_features[k].astype(np.float64)),
+            feature=steps.unit(detections.crop_features[k, 0].astype(np.float64)),
+            text_feature=steps.unit(text_features[k].astype(np.float64)),
             sightings=(seen,),
         )
 
@@ -186,7 +169,7 @@ class ObjectMap:
             if name in self._background:
                 before = self._background[name]
                 self._background[name] = (
-                    item if before is None else merged(before, item, self._config, with_dbscan=False)
+                    item if before is None else steps.merged(before, item, self._config, with_dbscan=False)
                 )
 
     def _associate(self, fresh: Sequence[MapObject], timer: StageTimer) -> None:
@@ -198,28 +181,28 @@ class ObjectMap:
                 if j == NEW_OBJECT:
                     self._objects.append(item)
                 else:
-                    self._objects[j] = merged(self._objects[j], item, self._config, with_dbscan=False)
+                    self._objects[j] = steps.merged(self._objects[j], item, self._config, with_dbscan=False)
 
     def _tidy_up(self, timer: StageTimer) -> None:
         """What happens at every so many frames."""
         config = self._config
         if self._is_due(config.denoise_interval):
             with timer.stage("denoise"):
-                self._objects = [denoised(item, config) for item in self._objects]
+                self._objects = [steps.denoised(item, config) for item in self._objects]
         if self._is_due(config.filter_interval):
-            self._objects = seen_enough(self._objects, config)
+            self._objects = steps.seen_enough(self._objects, config)
         if self._is_due(config.merge_interval):
             with timer.stage("overlap"):
-                self._objects = merge_overlapping(self._objects, config)
+                self._objects = steps.merge_overlapping(self._objects, config)
 
     def _is_due(self, interval: int) -> bool:
         return interval > 0 and self._n_frames % interval == 0
 
     def finish(self) -> Instances:
         """The map so far after its last clean-up, background objects last and labelled with their names."""
-        background = [denoised(item, self._config) for item in self._background.values() if item is not None]
-        objects = [denoised(item, self._config) for item in self._objects]
-        objects = merge_overlapping(seen_enough(objects, self._config), self._config)
+        background = [steps.denoised(item, self._config) for item in self._background.values() if item is not None]
+        objects = [steps.denoised(item, self._config) for item in self._objects]
+        objects = steps.merge_overlapping(steps.seen_enough(objects, self._config), self._config)
         everything = [*objects, *background]
         descriptions = [_description(item) for item in everything]
         names, captions = tuple(name for name, _ in descriptions), tuple(caption for _, caption in descriptions)
@@ -250,7 +233,7 @@ def _description(item: MapObject) -> tuple[str, str]:
     return name, best.caption
 
 
-def _score(item: MapObject, rule: InstanceScore) -> float:
+def _score(item: MapObject, rule: steps.InstanceScore) -> float:
     if rule == "ones":
         return 1.0
     return float(item.n_detections if rule == "num-detections" else max(seen.score for seen in item.sightings))

@@ -14,7 +14,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from su3d_bench.baselines.openmask3d.proposals import ProposalConfig, make_proposals
+from su3d_bench.baselines.openmask3d.proposals import SOURCE, ProposalConfig, digest_of_folder, make_proposals
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import MethodAbout, RegionPerception, SceneTools, StageTimer
 from su3d_bench.core.maps import Instances, Proposals
@@ -61,27 +61,6 @@ def crop_boxes(mask: BoolArray, n_levels: int, growth: float) -> Int64Array:
     steps = np.arange(n_levels)[:, None] * np.array([-step_x, -step_y, step_x, step_y])
     height, width = mask.shape
     return np.asarray(np.clip(np.array([x0, y0, x1, y1]) + steps, 0, [width, height, width, height]), np.int64)
-
-
-class FeatureMeans:
-    """Plain means of the unit features of all crops of each mask; not of unit length themselves.
-
-    A mask without a crop has a feature of zeros.
-    """
-
-    def __init__(self, n_masks: int, dim: int) -> None:
-        self._sums = np.zeros((n_masks, dim), np.float64)
-        self._n = np.zeros(n_masks, np.int64)
-
-    def add(self, mask: int, features: np.ndarray) -> None:
-        """Enter the features (B, dim) of some crops."""
-        self._sums[mask] += features.astype(np.float64).sum(axis=0)
-        self._n[mask] += len(features)
-
-    @property
-    def means(self) -> Float64Array:
-        """One feature (K, dim) a mask."""
-        return self._sums / np.maximum(self._n, 1)[:, None]
 
 
 NO_VIEW = -1
@@ -230,12 +209,14 @@ class OpenMask3D:
 
     @property
     def caveat(self) -> str | None:
-        return self.config.caveat
+        """What must be said beside numbers from these proposals."""
+        return SOURCE if self.config.kind == "surface" else None
 
     @property
     def inputs(self) -> Mapping[str, str]:
-        """Digest of the proposals' files."""
-        return self.config.inputs
+        """Digest of the proposals' files, which are no part of the configuration."""
+        folder = self.config.proposals_folder
+        return {} if folder is None else {"proposals": digest_of_folder(folder)}
 
     @property
     def n_points(self) -> int:
@@ -276,23 +257,28 @@ class OpenMask3D:
     def finish(self) -> Instances:
         """The proposals with the mean feature of their best views so far; changes nothing.
 
-        The chosen frames are read again, once each and in order.
+        It is the plain mean of the unit features of all crops of a mask, itself not of unit length, and zeros without a
+        crop. The chosen frames are read again, once each and in order.
         """
         start = time.perf_counter()
-        means = FeatureMeans(len(self.proposals), self._tools.regions.dim)
+        k = len(self.proposals)
+        sums, n_crops = np.zeros((k, self._tools.regions.dim)), np.zeros(k, np.int64)
         chosen = np.unique(self._views.positions[self._views.positions != NO_VIEW])
         n_views = 0
         for position in chosen.tolist():
             frame = self._frame_again(position)
             pixels = self._visible(frame)
             for mask in np.flatnonzero((self._views.positions == position).any(axis=1)).tolist():
-                n_views += self._look(mask, frame, pixels, means)
+                features = self._look(mask, frame, pixels)
+                sums[mask] += features.astype(np.float64).sum(axis=0)
+                n_crops[mask] += len(features)
+                n_views += len(features) > 0
         self.finish_costs = {
             "n_frames_again": len(chosen),
             "n_views": n_views,
             "look_ms": round((time.perf_counter() - start) * 1e3, 3),
         }
-        return self._instances(means.means)
+        return self._instances(sums / np.maximum(n_crops, 1)[:, None])
 
     def _visible(self, frame: Frame) -> np.ndarray:
         config = self.config
@@ -309,18 +295,17 @@ class OpenMask3D:
             )
         return frame
 
-    def _look(self, mask: int, frame: Frame, visible: np.ndarray, means: FeatureMeans) -> int:
-        """Adds the features of the crops of one view of ``mask``; 0 where its prompts find nothing."""
+    def _look(self, mask: int, frame: Frame, visible: np.ndarray) -> Float32Array:
+        """The features of the crops of one view of ``mask``; none where its prompts find nothing."""
         config, regions = self.config, self._tools.regions
         pixels = pixels_of_mask(visible, self.proposals.mask(mask), frame.depth_m.shape[1])
         # Each view has a generator of its own, so that neither other masks nor an earlier finish move its prompts.
         rng = np.random.default_rng([self._scene.seed, mask, frame.index])
         seen = prompted_mask(regions, frame, pixels, config.num_random_rounds, config.num_selected_points, rng)
         if seen is None:
-            return 0
+            return np.zeros((0, regions.dim), np.float32)
         boxes = crop_boxes(seen, config.num_of_levels, config.multi_level_expansion_ratio)
-        means.add(mask, regions.encode_regions(frame, seen, boxes))
-        return 1
+        return regions.encode_regions(frame, seen, boxes)
 
     def _instances(self, features: Float64Array) -> Instances:
         proposals, views = self.proposals, self._views

@@ -11,7 +11,7 @@ become masks.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Literal
@@ -171,19 +171,6 @@ LEAST_BORDER = 0.2  # added to the relative length of a border, which is 0 where
 LONE_BEND = 0.3  # bend of the border of a part that touches nothing
 
 
-@dataclass(frozen=True)
-class NodeChoice:
-    """Which nodes become masks: at most ``most``, of ``min_points`` vertices to ``max_share`` of all.
-
-    Of two nested ones whose IoU exceeds ``same_iou`` only the better one.
-    """
-
-    most: int
-    min_points: int
-    max_share: float
-    same_iou: float
-
-
 def segments_of(surface: Surface, threshold: float = THRESHOLD, min_vertices: int = MIN_VERTICES) -> Int64Array:
     """The segment (V,) of each vertex, numbered 0 to S - 1: the published ones, else those of ScanNet's algorithm."""
     segments = surface.segments
@@ -192,12 +179,12 @@ def segments_of(surface: Surface, threshold: float = THRESHOLD, min_vertices: in
     return np.unique(segments, return_inverse=True)[1].reshape(-1)
 
 
-def surface_proposals(surface: Surface, row: Int64Array, choice: NodeChoice) -> Proposals:
+def surface_proposals(surface: Surface, row: Int64Array, config: ProposalConfig) -> Proposals:
     """The masks over the vertices of ``surface``, the best first; ``row`` (V,) is the segment of each vertex."""
     tree = merge_tree(contacts_of(surface.vertices, surface.triangles, row))
     n_points = np.bincount(row, minlength=len(tree.leaves))
     scores = contrast(tree)
-    nodes = chosen_nodes(tree, n_points, scores, choice)
+    nodes = chosen_nodes(tree, n_points, scores, config)
     rank = np.empty(len(tree.leaves), np.int64)
     rank[tree.leaves] = np.arange(len(tree.leaves))
     order = np.argsort(rank[row], kind="stable")  # vertices in the order of the leaves
@@ -219,17 +206,21 @@ def contrast(tree: SegmentTree) -> Float64Array:
     return result
 
 
-def chosen_nodes(tree: SegmentTree, n_points: Int64Array, scores: Float64Array, choice: NodeChoice) -> Int64Array:
-    """The nodes that ``choice`` takes, the best first, of equal ones the earlier; ``n_points`` (S,) of the segments."""
+def chosen_nodes(tree: SegmentTree, n_points: Int64Array, scores: Float64Array, config: ProposalConfig) -> Int64Array:
+    """The nodes that become masks, the best first, of equal ones the earlier; ``n_points`` (S,) of the segments.
+
+    At most ``surface_most``, of ``surface_min_points`` vertices to ``surface_max_share`` of all; of two nested ones
+    whose IoU exceeds ``surface_same_iou`` only the better one.
+    """
     before = np.concatenate([[0], np.cumsum(n_points[tree.leaves])])
     n_of_node = before[tree.end] - before[tree.start]
-    fits = (n_of_node >= choice.min_points) & (n_of_node <= choice.max_share * before[-1])
+    fits = (n_of_node >= config.surface_min_points) & (n_of_node <= config.surface_max_share * before[-1])
     taken = np.zeros(0, np.int64)
     for node in np.argsort(-scores, kind="stable"):
-        if len(taken) == choice.most:
+        if len(taken) == config.surface_most:
             break
         smaller, larger = np.minimum(n_of_node[taken], n_of_node[node]), np.maximum(n_of_node[taken], n_of_node[node])
-        is_same = is_within(tree, taken, int(node)) & (smaller > choice.same_iou * larger)
+        is_same = is_within(tree, taken, int(node)) & (smaller > config.surface_same_iou * larger)
         if fits[node] and not is_same.any():
             taken = np.append(taken, node)
     return taken
@@ -283,16 +274,6 @@ class ProposalConfig(BaseModel):
             return self.proposals
         return "surface" if self.proposals_folder is None else "files"
 
-    @property
-    def caveat(self) -> str | None:
-        """What must be said beside numbers from these proposals."""
-        return SOURCE if self.kind == "surface" else None
-
-    @property
-    def inputs(self) -> dict[str, str]:
-        """Digest of the files, which are no part of the configuration."""
-        return {"proposals": digest_of_folder(self.proposals_folder)} if self.proposals_folder is not None else {}
-
 
 def make_proposals(config: ProposalConfig, tools: SceneTools, dataset: str, scene: str) -> Proposals:
     """The proposals of a scene over the vertices of its mesh, empty masks included where files have them."""
@@ -303,11 +284,8 @@ def make_proposals(config: ProposalConfig, tools: SceneTools, dataset: str, scen
         assert config.proposals_folder is not None
         proposals = read_proposals(config.proposals_folder, scene, surface)
         return _in_parts(proposals, _segments(surface, config), config) if config.split_parts == "always" else proposals
-    choice = NodeChoice(
-        config.surface_most, config.surface_min_points, config.surface_max_share, config.surface_same_iou
-    )
     segments = _segments(surface, config)
-    proposals = surface_proposals(surface, segments, choice)
+    proposals = surface_proposals(surface, segments, config)
     return proposals if config.split_parts == "never" else _in_parts(proposals, segments, config)
 
 

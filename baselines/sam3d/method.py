@@ -15,19 +15,8 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from su3d_bench.baselines.sam3d.overlap import (
-    NO_GROUP,
-    GroupedCloud,
-    MergeRules,
-    ensemble,
-    groups_on_surface,
-    merge,
-    merge_regions,
-    numbered,
-    renumber,
-    voxelise,
-    without_small_groups,
-)
+from su3d_bench.baselines.sam3d import overlap
+from su3d_bench.baselines.sam3d.overlap import NO_GROUP, GroupedCloud
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.geometry import back_project, valid_depth
 from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
@@ -69,9 +58,9 @@ class SAM3DConfig(BaseModel):
     features: Literal["mean-of-views", "largest-view"] = "mean-of-views"  # ours
 
     @property
-    def rules(self) -> MergeRules:
+    def rules(self) -> overlap.MergeRules:
         """What merges two clouds."""
-        return MergeRules(self.voxel_m, self.ratio, self.merge_th)
+        return overlap.MergeRules(self.voxel_m, self.ratio, self.merge_th)
 
 
 @dataclass(frozen=True)
@@ -198,11 +187,11 @@ class SAM3D:
             detection = paint(frame, detections.masks)[pixels]
             cloud = self._grouped(points, detection, detections)
         with timer.stage("voxelise"):
-            cloud = voxelise(cloud, self.config.voxel_m)
+            cloud = overlap.voxelise(cloud, self.config.voxel_m)
         if not len(cloud):
             return
         if self.config.schedule == "incremental" and self._clouds:
-            merged = merge(self._clouds[0], cloud, self.config.rules, timer)
+            merged = overlap.merge(self._clouds[0], cloud, self.config.rules, timer)
             self._clouds = [merged] if merged is not None else []
         else:
             self._clouds.append(cloud)
@@ -211,7 +200,7 @@ class SAM3D:
         """The image's cloud, the last detection's group first; enters what is seen of each detection as a view."""
         n_masks = len(detections)
         n_pixels = np.bincount(detection + 1, minlength=n_masks + 1)[1:]
-        group = renumber(np.where(detection == NO_GROUP, NO_GROUP, n_masks - 1 - detection))
+        group = overlap.renumber(np.where(detection == NO_GROUP, NO_GROUP, n_masks - 1 - detection))
         visible = np.flatnonzero(n_pixels)[::-1]
         first_view = len(self._views)
         for k in visible.tolist():
@@ -234,16 +223,16 @@ class SAM3D:
         A segment of the ensemble that no group claims has no feature and is no instance.
         """
         timer = Timer()
-        cloud = merge_regions(self._clouds, self.config.rules, timer)
+        cloud = overlap.merge_regions(self._clouds, self.config.rules, timer)
         if cloud is None:
             logger.warning("%s: no frame of sam3d has a valid point; its map is empty", self._scene)
             cloud = _EMPTY
-        cloud = numbered(without_small_groups(cloud, self.config.th))
+        cloud = overlap.numbered(overlap.without_small_groups(cloud, self.config.th))
         points, group = cloud.points.astype(np.float32), cloud.group
         if self._surface is not None:
             points = self._surface.vertices
             with timer.stage("surface"):
-                group = groups_on_surface(cloud, points, self.config.max_distance_m)
+                group = overlap.groups_on_surface(cloud, points, self.config.max_distance_m)
             if self.config.ensemble:
                 with timer.stage("ensemble"):
                     group, cloud = self._in_segments(group, cloud, self._surface)
@@ -258,11 +247,11 @@ class SAM3D:
             from su3d_bench.baselines.mesh_segments.segments import mesh_segments
 
             segments = mesh_segments(surface.vertices, surface.triangles)
-        large = without_small_groups(
+        large = overlap.without_small_groups(
             GroupedCloud(surface.vertices.astype(np.float64), group, cloud.view_group, cloud.views),
             self.config.ensemble_th,
         )
-        return ensemble(group, segments, self.config.ensemble_th, self.config.ratio), numbered(large)
+        return overlap.ensemble(group, segments, self.config.ensemble_th, self.config.ratio), overlap.numbered(large)
 
     def _instances(self, points: Float32Array, group: Int64Array, cloud: GroupedCloud) -> Instances:
         ids = np.intersect1d(group, cloud.view_group)

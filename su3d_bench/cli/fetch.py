@@ -17,7 +17,7 @@ from su3d_bench.core.errors import ConfigError, suggest
 
 if TYPE_CHECKING:
     from su3d_bench.fetching.bringing import Brought, Planned
-    from su3d_bench.fetching.download import Patience, Watch
+    from su3d_bench.fetching.download import Watch
     from su3d_bench.fetching.sources import Source
 
 MB = 1_000_000
@@ -46,12 +46,10 @@ def _add_fetch_options(parser: Parser, *, has_servers: bool = True) -> None:
         )
 
 
-def patience_of(arguments: argparse.Namespace) -> Patience:
-    from su3d_bench.fetching.download import Patience
-
+def retries_of(arguments: argparse.Namespace) -> int:
     if not 0 <= arguments.retries <= 1000:
         raise ConfigError(f"--retries {arguments.retries}: expected 0 to 1000")
-    return Patience(n_retries=arguments.retries)
+    return int(arguments.retries)
 
 
 def fetch_planned(arguments: argparse.Namespace, planned: Sequence[Planned]) -> None:
@@ -63,12 +61,12 @@ def fetch_planned(arguments: argparse.Namespace, planned: Sequence[Planned]) -> 
         lines = [line for entry in planned for line in plan_lines(entry.source, entry.here)]
         answer_either(arguments, [plan_row(entry.source, entry.here) for entry in planned], *lines)
         return
-    patience = patience_of(arguments)
+    n_retries = retries_of(arguments)
     missing = [entry for entry in planned if entry.here is None]
     accept(arguments, [entry.source for entry in missing])
     keep = getattr(arguments, "keep_archives", False)
     with watching(arguments) as watch:
-        brought = [fetch(entry, watch, patience, keep_archives=keep) for entry in missing]
+        brought = [fetch(entry, watch, n_retries, keep_archives=keep) for entry in missing]
     answer_brought(arguments, [(entry.source.name, entry.here) for entry in planned if entry.here], brought)
 
 
@@ -255,5 +253,5 @@ def call_scannet(arguments: argparse.Namespace) -> None:
         if arguments.script is not None:
             brought = fetch_by_script(source, scans, arguments.script, watch)
         else:
-            brought = fetch_from(source, scans, arguments.address, watch, patience_of(arguments))
+            brought = fetch_from(source, scans, arguments.address, watch, retries_of(arguments))
     answer_brought(arguments, [], [brought])

@@ -28,8 +28,7 @@ from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
 from su3d_bench.predictions.formats import Source, open_sources
-from su3d_bench.predictions.own_runs import OwnRuns
-from su3d_bench.predictions.scannet_text import ScannetText
+from su3d_bench.predictions.own_runs import OWN_RUNS
 
 __all__ = ["Evaluation", "ProtocolEvaluation", "Request", "evaluate", "said_of"]
 
@@ -115,7 +114,7 @@ def _count_file_confidences(request: Request, sources: Sequence[Source]) -> bool
     """Whether the confidences of the files count even where a protocol has 1 for every mask."""
     if request.confidences is not None:
         return request.confidences == "file"
-    return all(source.reader.name == ScannetText.name for source in sources)
+    return all(source.reader.name == "scannet-text" for source in sources)
 
 
 def _remarks_on_files(scenes_of_remark: dict[str, list[str]], n: int) -> Iterable[str]:
@@ -222,7 +221,7 @@ class Scoring:
             return reason
         encoder: Encoder | str | None = None
         if (n_dimensions := fitness.n_feature_dimensions(rules, facts)) is not None:
-            encoder = encoder_for(rules, n_dimensions, self._texts, is_own=prediction.format == OwnRuns.name)
+            encoder = encoder_for(rules, n_dimensions, self._texts, is_own=prediction.format == OWN_RUNS.name)
         if isinstance(encoder, str):
             return encoder
         if encoder is not None:

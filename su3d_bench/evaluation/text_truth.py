@@ -37,7 +37,7 @@ from su3d_bench.metrics.instance.score import OBJECT
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.predictions.base import scene_files
 from su3d_bench.predictions.formats import Source, match_scenes
-from su3d_bench.predictions.own_runs import OwnRuns, read_stored
+from su3d_bench.predictions.own_runs import OWN_RUNS, read_stored
 from su3d_bench.questions.query_files import VARIANT as QUERY_OBJECTS
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.records import TruthRecord
@@ -280,7 +280,7 @@ class FilesOfTruth:
         said: ValuesForm | None = next((form for form in FORMS if form == record.values), None)
         protocols = tuple(run.protocols)
         request = Request((run.folder.path,), ground_truth=folder, truth_values=said, protocols=protocols)
-        return TextTruths(request, [Source(run.folder.path, OwnRuns(), tuple(scenes))])
+        return TextTruths(request, [Source(run.folder.path, OWN_RUNS, tuple(scenes))])
 
 
 def places(n: int) -> Float32Array:

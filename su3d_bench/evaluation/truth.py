@@ -245,7 +245,7 @@ class OpenLexTruths(SceneTruths):
         self.scenes = tuple(choose_scenes(request.scenes, known, self.where)) if request.scenes else known
         requested = self.scenes if request.scenes else ()
         name = self._release.dataset
-        is_named = any(source.dataset_of(scene) == name for source in sources for scene in source.scenes)
+        is_named = any(scene.startswith(f"{name}/") for source in sources for scene in source.scenes)
         matches, self.remarks = match_scenes(sources, known, name if is_named else None, self.where, requested)
         self.matches = [match for match in matches if match.scene in self.scenes]
 

@@ -13,13 +13,13 @@ import tarfile
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path, PurePosixPath
 from stat import S_ISREG
 from typing import IO, Any, Self
 
 from su3d_bench.core.errors import DataError, StoreError, printable
-from su3d_bench.core.files.atomic import Allowance, UnpackingError, allowance_of, check_member, replacing, write_error
+from su3d_bench.core.files.atomic import Allowance, allowance_of, check_member, replacing, write_error
 from su3d_bench.core.system.files import opened
 from su3d_bench.fetching.download import Watch
 
@@ -27,17 +27,8 @@ PIECE = 1 << 20
 MAX_HEADER_BYTES = 1 << 20  # of the long name or extended header before a member of a tar archive
 MAX_MEMBERS = 1_000_000
 LONG_HEADERS = (tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK, tarfile.XHDTYPE, tarfile.XGLTYPE)
-FAULTS = (
-    DataError,
-    UnpackingError,
-    zipfile.BadZipFile,
-    tarfile.TarError,
-    zlib.error,
-    EOFError,
-    OSError,
-    ValueError,
-    RuntimeError,  # of zipfile: a password, a way of packing
-)
+# RuntimeError is of zipfile: a password, a way of packing.
+FAULTS = (DataError, zipfile.BadZipFile, tarfile.TarError, zlib.error, EOFError, OSError, ValueError, RuntimeError)
 GoesTo = Callable[[PurePosixPath], PurePosixPath | None]
 
 
@@ -68,9 +59,9 @@ def unpack_zip(archive: Path, folder: Path, goes_to: GoesTo, watch: Watch) -> in
 def unpack_tar_gz(parts: Sequence[Path], folder: Path, goes_to: GoesTo, watch: Watch) -> int:
     """As ``unpack_zip``, of a packed tar archive in ``parts``, which are read one after another as one stream."""
     with _reading(parts[0]), ExitStack() as stack:
-        joined = stack.enter_context(_Joined(parts, watch))
-        packed = stack.enter_context(io.BufferedReader(joined, PIECE))
-        plain = _Bounded(stack.enter_context(gzip.GzipFile(fileobj=packed)), Allowance(joined.n_bytes))
+        joined = stack.enter_context(closing(_Joined(parts, watch)))
+        packed: Any = joined  # all that is asked of it is to be read
+        plain = _Bounded(stack.enter_context(gzip.GzipFile(fileobj=packed, mode="rb")), Allowance(joined.n_bytes))
         targets, n_found = _Targets(folder, goes_to), 0
         with tarfile.open(fileobj=plain, mode="r|", tarinfo=_BoundedMember) as archive:  # type: ignore[call-overload]
             for n, info in enumerate(archive):
@@ -147,27 +138,23 @@ class _BoundedMember(tarfile.TarInfo):
         return info
 
 
-class _Joined(io.RawIOBase):
+class _Joined:
     """Files read one after another as one."""
 
     def __init__(self, parts: Sequence[Path], watch: Watch) -> None:
         self._left, self._watch, self._stream = list(parts), watch, io.BytesIO()
         self._n_read, self.n_bytes = 0, sum(part.stat().st_size for part in parts)
 
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: Any) -> int:
-        while not (n := self._stream.readinto(buffer)) and self._left:
-            self._stream.close()
+    def read(self, n: int) -> bytes:
+        while not (content := self._stream.read(n)) and self._left:
+            self.close()
             self._stream = opened(self._left.pop(0))  # type: ignore[assignment]
-        self._n_read += n
+        self._n_read += len(content)
         self._watch("unpacking", self._n_read, self.n_bytes)
-        return n
+        return content
 
     def close(self) -> None:
         self._stream.close()
-        super().close()
 
 
 class _Bounded:

@@ -10,24 +10,18 @@ import os
 import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
-from functools import cache
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from su3d_bench.core.errors import ConfigError, DataError, ModelMissing, StoreError
 from su3d_bench.core.files.atomic import make_folder, write_error, write_json
 from su3d_bench.core.files.locks import clear_unfinished, hold_folder
 from su3d_bench.core.system.files import file_bytes
-from su3d_bench.datasets.replica.folders import (
-    OFFICIAL_SCENES,
-    ORIGINAL_FILES,
-    find_original_scene,
-    find_render_tree,
-)
+from su3d_bench.datasets.replica import folders
 from su3d_bench.fetching.archives import members, unpack_tar_gz, unpack_zip
-from su3d_bench.fetching.download import Patience, Stated, Wanted, Watch, bring, checked, hub_files, part_of, size_of
+from su3d_bench.fetching.download import N_RETRIES, Stated, Wanted, Watch, bring, checked, hub_files, part_of, size_of
 from su3d_bench.fetching.sources import Source, Sources
 from su3d_bench.perception.models.catalogue import MODELS, PAPERS_ENCODERS, PROFILE_MODELS
 from su3d_bench.perception.models.files import locate
@@ -48,17 +42,11 @@ class Arrived:
     held_against: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class Record:
+class Record(BaseModel):
     """``record.json`` below ``.fetched``: files by ``source/name``, and what an archive was unpacked to by source."""
 
-    files: dict[str, Arrived] = field(default_factory=dict)
-    unpacked: dict[str, tuple[str, ...]] = field(default_factory=dict)
-
-
-@cache
-def _records() -> TypeAdapter[Record]:
-    return TypeAdapter(Record)
+    files: dict[str, Arrived] = {}
+    unpacked: dict[str, tuple[str, ...]] = {}
 
 
 def record_path(root: Path) -> Path:
@@ -69,7 +57,7 @@ def read_record(root: Path) -> Record:
     """What was brought below ``root``."""
     path = record_path(root)
     try:
-        return _records().validate_json(file_bytes(path)) if path.exists() else Record()
+        return Record.model_validate_json(file_bytes(path)) if path.exists() else Record()
     except (OSError, ValidationError) as error:
         raise StoreError(f"{path}: is no record of what was fetched; move it away to begin another") from error
 
@@ -78,7 +66,7 @@ def write_arrival(root: Path, arrived: Arrived) -> None:
     """Keep what is known of a file; the entry of an earlier one of its name is replaced."""
     record = read_record(root)
     record.files[f"{arrived.source}/{arrived.name}"] = arrived
-    write_json(record_path(root), asdict(record))
+    write_json(record_path(root), record.model_dump())
 
 
 @dataclass(frozen=True)
@@ -139,15 +127,15 @@ def _replica_here(source: Source, root: Path) -> Path | None:
     if names and all((place / name).exists() for name in names):
         return place
     if source.archive == "zip":
-        tree = find_render_tree(root)
-        is_whole = tree is not None and set(OFFICIAL_SCENES) <= set(tree.scenes)
+        tree = folders.find_render_tree(root)
+        is_whole = tree is not None and set(folders.OFFICIAL_SCENES) <= set(tree.scenes)
         return tree.folder if tree is not None and is_whole and (tree.folder / "cam_params.json").is_file() else None
-    folders = [find_original_scene(root, scene) for scene in OFFICIAL_SCENES]
-    whole = [f for f in folders if f is not None and all((f / "habitat" / n).is_file() for n in ORIGINAL_FILES)]
-    return whole[0].parent if len(whole) == len(OFFICIAL_SCENES) else None
+    found = [folders.find_original_scene(root, scene) for scene in folders.OFFICIAL_SCENES]
+    whole = [f for f in found if f is not None and all((f / "habitat" / n).is_file() for n in folders.ORIGINAL_FILES)]
+    return whole[0].parent if len(whole) == len(folders.OFFICIAL_SCENES) else None
 
 
-def fetch(planned: Planned, watch: Watch, patience: Patience | None = None, *, keep_archives: bool = False) -> Brought:
+def fetch(planned: Planned, watch: Watch, n_retries: int = N_RETRIES, *, keep_archives: bool = False) -> Brought:
     """Bring a source to its place; raises ``ConfigError``, ``DataError`` or ``StoreError`` where it does not get there.
 
     A second call goes on where the first one ended.
@@ -159,16 +147,13 @@ def fetch(planned: Planned, watch: Watch, patience: Patience | None = None, *, k
     missing = wanted if source.archive is not None else [file for file in wanted if not _is_there(file, place)]
     check_space(planned, missing)
     with held_state(planned):
-        arrived = tuple(bring_file(planned, file, watch, patience) for file in missing)
+        arrived = tuple(bring_file(planned, file, watch, n_retries) for file in missing)
         left: list[str] = []
         if source.archive is None:  # the weights last, without which nothing takes the folder for a model
             move([planned.state / file.name for file in missing], place)
         else:
             place, left = _unpack(planned, watch)
-        if keep_archives:
-            shutil.rmtree(planned.state / UNPACKED, ignore_errors=True)
-        else:
-            shutil.rmtree(planned.state, ignore_errors=True)
+        shutil.rmtree(planned.state / UNPACKED if keep_archives else planned.state, ignore_errors=True)
     return Brought(source, place, arrived, (*_remarks(planned, arrived), *left))
 
 
@@ -196,7 +181,7 @@ def plain_files(source: Source) -> list[Wanted]:
     ]
 
 
-def bring_file(planned: Planned, wanted: Wanted, watch: Watch, patience: Patience | None = None) -> Arrived:
+def bring_file(planned: Planned, wanted: Wanted, watch: Watch, n_retries: int = N_RETRIES) -> Arrived:
     """Bring one file into the state of ``planned``, where it may lie already, and record it."""
     place, known = planned.state / wanted.name, None
     if not wanted.stated.is_published:
@@ -209,7 +194,7 @@ def bring_file(planned: Planned, wanted: Wanted, watch: Watch, patience: Patienc
             raise DataError(f"{place}: {wrong or 'has another size than is stated'}; delete it and fetch it again")
     else:
         try:
-            sha256 = bring(wanted, place, watch, patience)
+            sha256 = bring(wanted, place, watch, n_retries)
         except DataError as error:
             if known is not None and known in str(error):
                 raise DataError(f"{error}; the first one is recorded in {record_path(planned.root)}") from error
@@ -290,7 +275,7 @@ def _unpack(planned: Planned, watch: Watch) -> tuple[Path, list[str]]:
     move([path for path in unpacked if path.name not in left], place)
     record = read_record(planned.root)
     record.unpacked[source.name] = tuple(sorted(path.name for path in unpacked))
-    write_json(record_path(planned.root), asdict(record))
+    write_json(record_path(planned.root), record.model_dump())
     return place, [f"{name} was there already and is left as it is" for name in left]
 
 
@@ -301,7 +286,7 @@ def _rendered(path: PurePosixPath) -> PurePosixPath | None:
 
 def _annotated(path: PurePosixPath) -> PurePosixPath | None:
     """Where a member of the release goes: the two files of a scene that datasets/replica reads, whatever is above."""
-    if len(path.parts) < 3 or path.parts[-2] != "habitat" or path.name not in ORIGINAL_FILES:
+    if len(path.parts) < 3 or path.parts[-2] != "habitat" or path.name not in folders.ORIGINAL_FILES:
         return None
     return PurePosixPath(ORIGINAL, *path.parts[-3:])
 

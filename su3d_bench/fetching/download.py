@@ -27,6 +27,9 @@ from su3d_bench.fetching.sources import MOST_BYTES, Source, check_address
 PIECE = 1 << 20
 MAX_REDIRECTS = 5
 STATUS_TO_RETRY = (408, 425, 429)
+N_RETRIES = 3  # of a broken download, counted again whenever bytes came
+FIRST_PAUSE_S = 1.0  # before the first of them
+TIMEOUT_S = 30.0  # without a byte
 Watch = Callable[[str, int, int | None], None]
 
 
@@ -67,16 +70,16 @@ def checked(path: Path, stated: Stated) -> tuple[str, str | None]:
         while piece := stream.read(PIECE):
             for digest in wanted:
                 digest.update(piece)
-    found = sha256.hexdigest()
-    if stated.sha256 not in (None, found):
-        return found, f"SHA-256 is {found}, published is {stated.sha256}"
-    if stated.md5_prefix is not None and not md5.hexdigest().startswith(stated.md5_prefix):
-        return found, f"MD5 is {md5.hexdigest()}, its published beginning {stated.md5_prefix}"
-    if stated.git_blob not in (None, blob.hexdigest()):
-        return found, f"git's SHA-1 is {blob.hexdigest()}, published is {stated.git_blob}"
-    if stated.recorded not in (None, found):
-        return found, f"SHA-256 is {found}, that of the first download was {stated.recorded}"
-    return found, None
+    found, git_blob = sha256.hexdigest(), blob.hexdigest()
+    beginning = md5.hexdigest()[: len(stated.md5_prefix or "")]
+    facts = (
+        ("SHA-256", found, "published is", stated.sha256),
+        ("MD5 begins with", beginning, "published is", stated.md5_prefix),
+        ("git's SHA-1", git_blob, "published is", stated.git_blob),
+        ("SHA-256", found, "that of the first download was", stated.recorded),
+    )
+    wrong = (f"{name} {value}, {said} {fact}" for name, value, said, fact in facts if fact not in (None, value))
+    return found, next(wrong, None)
 
 
 @dataclass(frozen=True)
@@ -88,15 +91,6 @@ class Wanted:
     hosts: tuple[str, ...]
     n_bytes: int | None = None
     stated: Stated = field(default_factory=Stated)
-
-
-@dataclass(frozen=True)
-class Patience:
-    """How often a broken download is resumed, counted again whenever bytes came, and after which pause at first."""
-
-    n_retries: int = 3
-    pause_s: float = 1.0
-    timeout_s: float = 30.0  # without a byte
 
 
 class _Broken(Exception):
@@ -113,27 +107,27 @@ def size_of(path: Path) -> int:
     return path.stat().st_size if path.is_file() else 0
 
 
-def bring(wanted: Wanted, place: Path, watch: Watch, patience: Patience | None = None) -> str:
+def bring(wanted: Wanted, place: Path, watch: Watch, n_retries: int = N_RETRIES) -> str:
     """Put the file at ``place``, where nothing is, and give its SHA-256; ``watch`` hears how much has come.
 
     Raises ``StoreError`` where the disk refuses, and ``DataError`` where the server does not give the file that was
     stated; what has come of it by then is kept, unless it is known to be wrong. One process at a time.
     """
-    patience, part, n_idle = patience or Patience(), part_of(place), 0
+    part, n_idle = part_of(place), 0
     while True:
         n_before = size_of(part)
         try:
-            _receive(wanted, part, watch, patience.timeout_s)
+            _receive(wanted, part, watch)
             break
         except _Broken as error:
             n_held = size_of(part)
             n_idle = 1 if n_held > n_before else n_idle + 1
-            if n_idle > patience.n_retries:
+            if n_idle > n_retries:
                 come = f"{n_held:,} bytes of it are here" if n_held else "nothing of it is here"
                 raise DataError(
                     f"{wanted.address}: {printable(str(error), 200)}; {come}, and the same command goes on from there"
                 ) from None
-            time.sleep(min(patience.pause_s * 2 ** (n_idle - 1), 60.0))
+            time.sleep(min(FIRST_PAUSE_S * 2 ** (n_idle - 1), 60.0))
     sha256, wrong = checked(part, wanted.stated)
     if wrong is None:
         os.replace(part, place)
@@ -152,7 +146,7 @@ def _state_of(part: Path) -> Path:
     return part.with_name(f"{part.name}.state")
 
 
-def _receive(wanted: Wanted, part: Path, watch: Watch, timeout_s: float) -> None:
+def _receive(wanted: Wanted, part: Path, watch: Watch) -> None:
     """Append to ``part`` what is missing of the file.
 
     Without a published checksum only the rest of a file of the same entity tag or time of change is taken (RFC 9110,
@@ -167,7 +161,7 @@ def _receive(wanted: Wanted, part: Path, watch: Watch, timeout_s: float) -> None
     if n_held and (is_known or wanted.stated.is_published):
         headers |= {"Range": f"bytes={n_held}-"} | ({"If-Range": tag} if is_known else {})
     try:
-        response = _opened(wanted, headers, timeout_s)
+        response = _opened(wanted, headers)
     except urllib.error.HTTPError as error:
         if error.code != 416:
             raise _refusal(wanted.address, error) from None
@@ -246,10 +240,10 @@ class _NamedHostsOnly(urllib.request.HTTPRedirectHandler):
         return super().redirect_request(req, fp, code, msg, headers, newurl)
 
 
-def _opened(wanted: Wanted, headers: dict[str, str], timeout_s: float) -> Any:
+def _opened(wanted: Wanted, headers: dict[str, str]) -> Any:
     opener = urllib.request.build_opener(_NamedHostsOnly(wanted.hosts))
     try:
-        return opener.open(urllib.request.Request(wanted.address, headers=headers), timeout=timeout_s)
+        return opener.open(urllib.request.Request(wanted.address, headers=headers), timeout=TIMEOUT_S)
     except urllib.error.HTTPError:
         raise
     except (OSError, http.client.HTTPException, ValueError) as error:
@@ -268,7 +262,6 @@ def _refusal(address: str, error: urllib.error.HTTPError) -> Exception:
 
 
 HUB = "https://huggingface.co"
-TIMEOUT_S = 30.0
 
 
 def hub_files(source: Source) -> list[Wanted]:

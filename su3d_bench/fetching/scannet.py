@@ -9,10 +9,11 @@ it waits for a key by which the terms are confirmed, and passes over what is the
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -29,18 +30,13 @@ from su3d_bench.datasets.scannet.folders import (
 )
 from su3d_bench.datasets.scannet.truth import TABLE_NAME
 from su3d_bench.fetching.bringing import Arrived, Brought, Planned, bring_file, held_state, move, write_arrival
-from su3d_bench.fetching.download import Patience, Stated, Wanted, Watch, checked
+from su3d_bench.fetching.download import N_RETRIES, Stated, Wanted, Watch, checked
 from su3d_bench.fetching.sources import Source, check_address
 
 RECORDING = ".sens"
 TEST_SUFFIXES = (".txt", "_vh_clean_2.ply", RECORDING)
 # What datasets/scannet reads of a scan, the recording last: it is what makes a folder a scan with frames.
-SUFFIXES = (
-    ".aggregation.json",
-    "_vh_clean_2.0.010000.segs.json",
-    "_vh_clean_2.labels.ply",
-    *TEST_SUFFIXES,
-)
+SUFFIXES = (".aggregation.json", "_vh_clean_2.0.010000.segs.json", "_vh_clean_2.labels.ply", *TEST_SUFFIXES)
 KEYS = b"\n" * 8  # for the script's questions: the terms were confirmed here, and nothing is left out
 LAST_WORDS = 4000
 
@@ -102,48 +98,51 @@ def fetch_by_script(source: Source, scans: Scans, script: Path, watch: Watch) ->
     """Let the user's own script bring what is missing, a file at a time, and move each whole scan to its place."""
     if not script.is_file():
         raise ConfigError(f"--script {script}: there is no such file; name the script that ScanNet's answer led to")
-    planned, n_done = Planned(source, scans.root), 0
-    arrived: list[Arrived] = []
-    with held_state(planned):
-        for scan, names in scans.missing.items():
-            folder = planned.state / _top(scan) / scan
-            for name in names:
-                watch(name, n_done, scans.n_files)
-                _run(script, planned.state, ["--id", scan, "--type", name.removeprefix(scan)], folder / name)
-                n_done += 1
-            arrived += _moved(planned, [folder / name for name in names], scans.root / _top(scan) / scan)
-        if scans.label_table:
-            _run(script, planned.state, ["--label_map"], planned.state / TABLE_NAME)
-            arrived += _moved(planned, [planned.state / TABLE_NAME], scans.root)
-    watch("scans", scans.n_files, scans.n_files)
-    return Brought(source, scans.root / "scans", tuple(arrived))
+    n_done = itertools.count()
+
+    def bring_one(planned: Planned, scan: str, name: str) -> tuple[Path, Arrived]:
+        watch(name, next(n_done), scans.n_files)
+        words = ["--id", scan, "--type", name.removeprefix(scan)] if scan else ["--label_map"]
+        path = planned.state / _folder(scan) / name
+        _run(script, planned.state, words, path)
+        sha256, n_bytes = checked(path, Stated())[0], path.stat().st_size
+        arrived = Arrived(source.name, name, "the user's own script", n_bytes, sha256, ())
+        write_arrival(planned.root, arrived)
+        return path, arrived
+
+    return _fetch(source, scans, bring_one)
 
 
-def fetch_from(source: Source, scans: Scans, address: str, watch: Watch, patience: Patience | None = None) -> Brought:
+def fetch_from(source: Source, scans: Scans, address: str, watch: Watch, n_retries: int = N_RETRIES) -> Brought:
     """Bring what is missing out of the user's own link, the folder in which ``v1`` and ``v2`` lie."""
     try:
         check_address(address)
     except ValueError as error:
         raise ConfigError(f"--from: {error}") from error
     base, hosts = address.rstrip("/"), (urlsplit(address).hostname or "",)
-    planned = Planned(source, scans.root)
-    arrived: list[Arrived] = []
+
+    def bring_one(planned: Planned, scan: str, name: str) -> tuple[Path, Arrived]:
+        release = "v1" if name.endswith(RECORDING) else "v2"
+        wanted = Wanted(name, f"{base}/{release}/{f'scans/{scan}' if scan else 'tasks'}/{name}", hosts)
+        return planned.state / name, bring_file(planned, wanted, watch, n_retries)
+
+    return _fetch(source, scans, bring_one)
+
+
+def _fetch(source: Source, scans: Scans, bring_one: Callable[[Planned, str, str], tuple[Path, Arrived]]) -> Brought:
+    """Bring each missing file and move each whole scan to its place, the table of labels (of no scan) at last."""
+    planned, files = Planned(source, scans.root), list[Arrived]()
     with held_state(planned):
-        for scan, names in scans.missing.items():
-            for name in names:
-                release = "v1" if name.endswith(RECORDING) else "v2"
-                wanted = Wanted(name, f"{base}/{release}/scans/{scan}/{name}", hosts)
-                arrived.append(bring_file(planned, wanted, watch, patience))
-            move([planned.state / name for name in names], scans.root / _top(scan) / scan)
-        if scans.label_table:
-            wanted = Wanted(TABLE_NAME, f"{base}/v2/tasks/{TABLE_NAME}", hosts)
-            arrived.append(bring_file(planned, wanted, watch, patience))
-            move([planned.state / TABLE_NAME], scans.root)
-    return Brought(source, scans.root / "scans", tuple(arrived))
+        for scan, names in (scans.missing | ({"": (TABLE_NAME,)} if scans.label_table else {})).items():
+            brought = [bring_one(planned, scan, name) for name in names]
+            files += [arrived for _, arrived in brought]
+            move([path for path, _ in brought], scans.root / _folder(scan))
+    return Brought(source, scans.root / "scans", tuple(files))
 
 
-def _top(scan: str) -> str:
-    return "scans_test" if scan in split_scenes("test") else "scans"
+def _folder(scan: str) -> Path:
+    """Where a scan lies below the root, which is the folder of what belongs to no scan."""
+    return Path("scans_test" if scan in split_scenes("test") else "scans", scan) if scan else Path()
 
 
 def _run(script: Path, folder: Path, words: Sequence[str], result: Path) -> None:
@@ -164,14 +163,3 @@ def _run(script: Path, folder: Path, words: Sequence[str], result: Path) -> None
             f"{script}: did not bring {result.name} (exit code {done.returncode}); it said last: {last}; run the same "
             "command again to go on"
         )
-
-
-def _moved(planned: Planned, paths: Sequence[Path], place: Path) -> list[Arrived]:
-    """Record and move what the script wrote."""
-    arrived = []
-    for path in paths:
-        sha256, n_bytes = checked(path, Stated())[0], path.stat().st_size
-        arrived.append(Arrived(planned.source.name, path.name, "the user's own script", n_bytes, sha256, ()))
-        write_arrival(planned.root, arrived[-1])
-    move(paths, place)
-    return arrived

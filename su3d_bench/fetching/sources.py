@@ -136,8 +136,6 @@ class Source(_Strict):
             raise ValueError(f"{self.name}: a zip archive is one file")
         if len({file.name for file in self.files}) < len(self.files):
             raise ValueError(f"{self.name}: two files of one name")
-        if (self.about_bytes is None) != (self.about_read_at is None):
-            raise ValueError(f"{self.name}: about_bytes and about_read_at belong together")
         for file in self.files:
             check_address(file.address, self.hosts)
         return self

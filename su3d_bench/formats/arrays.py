@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, PredictionError, printable, shown
+from su3d_bench.core.files.atomic import Allowance, UnpackingError
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array
 from su3d_bench.formats.images import read_bytes
 
@@ -17,15 +18,44 @@ MOST_POINTS = 100_000_000  # points of one scene; the largest scans of rooms hav
 MOST_MASKS = 100_000  # of one scene; methods give some hundred
 MOST_MEMBERS = 50_000_000  # points of all masks of a scene together; 600 of a large ScanNet scene have 10 million
 ROWS_AT_ONCE, VALUES_AT_ONCE = 1 << 16, 1 << 25  # 600 masks of 55,000 points
+NOT_EMPTY = -1
 
 
-def matrix_of(value: object, where: str, what: str = "the masks") -> NDArray[Any]:
+def array_of(value: object, found: str, expected: str, kinds: str, *shape: int | None) -> NDArray[Any]:
+    """``value``, an array of these kinds of numbers and of this ``shape``: None is any size, ``NOT_EMPTY`` any but 0.
+
+    ``found`` begins the message, up to what the value is.
+    """
+    if isinstance(value, np.ndarray) and value.dtype.kind in kinds and _has_shape(value, shape):
+        return value
+    raise PredictionError(f"{found} {kind_of(value)}; expected {expected}")
+
+
+def _has_shape(array: NDArray[Any], shape: tuple[int | None, ...]) -> bool:
+    pairs = zip(shape, array.shape, strict=False)
+    return array.ndim == len(shape) and all(n in (None, size) or (n == NOT_EMPTY and size > 0) for n, size in pairs)
+
+
+def as_float32(values: NDArray[Any]) -> Float32Array:
+    """``values`` in single precision; what it cannot hold becomes infinite."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return values.astype(np.float32)
+
+
+def check_memory(n_bytes: int, file: Path) -> None:
+    """Refuses what takes far more memory than its file: values that share what they hold cost the file a few bytes."""
+    try:
+        Allowance(file.stat().st_size).spend(n_bytes)
+    except UnpackingError as error:
+        raise PredictionError(f"{shown(file)}: {error}") from error
+
+
+def matrix_of(value: object, where: str) -> NDArray[Any]:
     """``value`` as a matrix of numbers of which none is NaN or infinite."""
-    if not isinstance(value, np.ndarray) or value.ndim != 2 or value.dtype.kind not in "biuf":
-        raise PredictionError(f"{where}: {what} are {kind_of(value)}; expected a matrix of numbers")
-    if value.dtype.kind == "f" and not np.isfinite(value).all():
-        raise PredictionError(f"{where}: {what} have values that are NaN or infinite; expected 0 and 1")
-    return value
+    matrix = array_of(value, f"{where}: the masks are", "a matrix of numbers", "biuf", None, None)
+    if matrix.dtype.kind == "f" and not np.isfinite(matrix).all():
+        raise PredictionError(f"{where}: the masks have values that are NaN or infinite; expected 0 and 1")
+    return matrix
 
 
 def check_sizes(n_points: int, n_masks: int, where: str) -> None:
@@ -97,21 +127,19 @@ def _run_numbers(counts: object, where: str) -> NDArray[np.int64]:
 
 def scores_of(value: object, n_masks: int, where: str) -> Float64Array:
     """Scores, one a mask."""
-    if not isinstance(value, np.ndarray) or value.dtype.kind not in "biuf" or value.shape != (n_masks,):
-        raise PredictionError(f"{where}: {n_masks} masks, but the scores are {kind_of(value)}")
-    return value.astype(np.float64)
+    found = f"{where}: {n_masks} masks, but the scores are"
+    return array_of(value, found, "one a mask", "biuf", n_masks).astype(np.float64)
 
 
 def classes_of(value: object, n_masks: int, where: str) -> Int32Array:
     """Class numbers, one a mask, from an array of integers or of floats without a fraction."""
-    if not isinstance(value, np.ndarray) or value.dtype.kind not in "iuf" or value.shape != (n_masks,):
-        raise PredictionError(f"{where}: {n_masks} masks, but the classes are {kind_of(value)}")
-    is_whole = np.isfinite(value) & (np.abs(value.astype(np.float64)) < 1 << 31)
-    is_whole[is_whole] = value[is_whole] == np.floor(value[is_whole])
+    classes = array_of(value, f"{where}: {n_masks} masks, but the classes are", "one a mask", "iuf", n_masks)
+    numbers = classes.astype(np.float64)
+    is_whole = (np.abs(numbers) < 1 << 31) & (numbers == np.floor(numbers))
     if not is_whole.all():
         worst = int(np.argmin(is_whole))
-        raise PredictionError(f"{where}: mask {worst} has class {value[worst]}; expected an integer")
-    return value.astype(np.int32)
+        raise PredictionError(f"{where}: mask {worst} has class {classes[worst]}; expected an integer")
+    return classes.astype(np.int32)
 
 
 def kind_of(value: object) -> str:
@@ -123,26 +151,22 @@ def kind_of(value: object) -> str:
 
 def checked_points(values: object, where: str) -> Float32Array:
     """Points (N, 3) as float32; ``PredictionError`` for another shape, and for what float32 metres cannot hold."""
-    is_table = isinstance(values, np.ndarray) and values.ndim == 2 and values.shape[1] == 3
-    if not isinstance(values, np.ndarray) or not is_table or values.dtype.kind not in "fiu":
-        raise PredictionError(f"{where}: the points are {kind_of(values)}; expected three coordinates a point")
-    if len(values) > MOST_POINTS:
-        raise PredictionError(f"{where}: has {len(values)} points; is it damaged?")
-    with np.errstate(over="ignore", invalid="ignore"):
-        points = values.astype(np.float32)
+    table = array_of(values, f"{where}: the points are", "three coordinates a point", "fiu", None, 3)
+    if len(table) > MOST_POINTS:
+        raise PredictionError(f"{where}: has {len(table)} points; is it damaged?")
+    points = as_float32(table)
     is_finite = np.isfinite(points).all(axis=1)
     if not is_finite.all():
         row = int(np.argmin(is_finite))
-        raise PredictionError(f"{where}: point {row} is at {values[row].tolist()}; expected finite metres")
+        raise PredictionError(f"{where}: point {row} is at {table[row].tolist()}; expected finite metres")
     return points
 
 
 def feature_table(value: object, file: Path) -> Float32Array:
     """A row of features an object, as float32."""
-    if not isinstance(value, np.ndarray) or value.ndim != 2 or value.dtype.kind != "f" or not value.shape[1]:
-        raise PredictionError(f"{shown(file)}: holds {kind_of(value)}; expected a row of features an object")
-    with np.errstate(over="ignore", invalid="ignore"):
-        return value.astype(np.float32, copy=False)
+    found = f"{shown(file)}: holds"
+    table = array_of(value, found, "a row of features an object", "f", None, NOT_EMPTY)
+    return table if table.dtype == np.float32 else as_float32(table)
 
 
 def without_nonfinite(features: Float32Array, what: str) -> tuple[Float32Array, tuple[str, ...]]:
@@ -166,15 +190,8 @@ def half_rows(table: NDArray[np.floating[Any]]) -> NDArray[np.float16]:
 IntegerArray = NDArray[np.integer[Any]]
 DIGIT_AND_NEWLINE = 0x0A30  # "0\n" as a little-endian pair
 MOST_DIGITS = 18  # of a number that int64 surely holds
-LIMIT = 1 << 62
-WORD = 8  # characters, the first of which is the lowest byte
+LIMIT, MAX_CHARACTERS = 1 << 62, 40  # of a number
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"  # how the file begins that stands for one not fetched
-ZEROS = 0x3030303030303030  # "00000000"
-# Neighbours become one number of twice their width: two digits, then two pairs of digits, then two of four.
-PAIRS = tuple(
-    (np.uint64(bits), np.uint64(factor), np.uint64(kept))
-    for bits, factor, kept in ((8, 10, 0x00FF00FF00FF00FF), (16, 100, 0x0000FFFF0000FFFF), (32, 10_000, 0xFFFFFFFF))
-)
 
 
 def integer_lines(content: bytes, where: str) -> IntegerArray:
@@ -213,41 +230,23 @@ def _plain_numbers(content: bytes) -> IntegerArray | None:
     lengths = ends - starts
     if np.count_nonzero(digits > 9) != len(ends) or lengths.min() < 1 or lengths.max() > MOST_DIGITS:
         return None
-    before = b"0" * MOST_DIGITS + content  # no number reaches beyond its beginning
-    eights = np.ndarray((len(before) - WORD + 1,), "<u8", before, strides=(1,))  # from every byte on
-    values = np.zeros(len(ends), np.uint64)
-    for place in range(0, int(lengths.max()), WORD):
-        of_line = eights[ends + (MOST_DIGITS - WORD - place)]
-        values += _eight_digits(of_line, lengths - place) * np.uint64(10**place)
-    return values.astype(np.int64)
-
-
-def _eight_digits(words: NDArray[np.uint64], n_digits: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """The numbers that the last ``n_digits`` characters of each eight stand for, all eight side by side in a word."""
-    others = (8 * np.clip(WORD - n_digits, 0, WORD)).astype(np.uint64)  # bits; all 64 where no digit is left
-    words = ((words ^ np.uint64(ZEROS)) >> others) << others
-    for bits, factor, kept in PAIRS:
-        words = (words * factor + (words >> bits)) & kept
-    return words
+    return np.fromstring(content, np.int64, sep="\n")
 
 
 def _any_numbers(content: bytes, where: str) -> IntegerArray:
     """The values of lines with signs or blanks around them."""
     if content.startswith(LFS_POINTER):
         raise PredictionError(f"{where}: is a pointer of Git LFS, not the file; run git lfs pull in its repository")
-    lines = content.splitlines()
-    values = np.empty(len(lines), np.int64)
-    for number, line in enumerate(lines, 1):
+    values: list[int] = []
+    for number, line in enumerate(content.splitlines(), 1):
         try:
-            value = int(line) if len(line) <= 40 else LIMIT
-        except ValueError as error:
-            text = printable(line[:40].decode("latin1"))
-            raise PredictionError(f"{where}:{number}: '{text}' is not an integer; expected one a line") from error
-        if not -LIMIT < value < LIMIT:
-            text = printable(line[:40].decode("latin1"))
-            raise PredictionError(f"{where}:{number}: '{text}' is out of range; expected one integer a line")
-        values[number - 1] = value
-    return values
+            values.append(int(line) if len(line) <= MAX_CHARACTERS else LIMIT)
+        except ValueError:
+            values.append(LIMIT)
+        if not -LIMIT < values[-1] < LIMIT:
+            text = printable(line[:MAX_CHARACTERS].decode("latin1"))
+            raise PredictionError(f"{where}:{number}: '{text}' is not an integer of 64 bits; expected one a line")
+    return np.array(values, np.int64)
 
 
 MAX_TEXT_BYTES = 64 << 20  # a trajectory of 100 poses a second for an hour has 30 MB

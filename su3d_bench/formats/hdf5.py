@@ -47,23 +47,16 @@ def largest_column(path: Path, n_columns: int, where: str) -> Int32Array:
     return np.concatenate(columns)
 
 
-def n_columns_of(path: Path, where: str) -> int:
-    """How many values a row of the table has, at least one."""
-    with _open_table(path, where) as table:
-        shape = table.shape
-        if shape is None or len(shape) != 2 or not 0 < shape[1] <= MOST_COLUMNS:
-            raise DataError(f"{where}: has the shape {str(shape)[:60]}; expected (N, D), D at most {MOST_COLUMNS}")
-        return int(shape[1])
-
-
-def row_blocks(path: Path, n_columns: int, where: str) -> Iterator[FloatArray]:
+def row_blocks(path: Path, n_columns: int | None, where: str) -> Iterator[FloatArray]:
     """The rows of the dataset that is named like the file, in order, some at a time, in the file's precision.
+
+    ``n_columns`` is None where any number of them will do.
 
     Raises ``DataError`` for a file that is missing, damaged, too short for what it promises, or of another form.
     """
     with _open_table(path, where) as table:
         _check_form(table, n_columns, path.stat().st_size, where)
-        n_rows = max(1, BLOCK_BYTES // (n_columns * table.dtype.itemsize))
+        n_rows = max(1, BLOCK_BYTES // (table.shape[1] * table.dtype.itemsize))
         for start in range(0, len(table), n_rows):
             yield table[start : start + n_rows]
 
@@ -89,7 +82,7 @@ def _open_table(path: Path, where: str) -> Iterator[Any]:
         raise DataError(f"{where}: not a readable HDF5 file ({type(error).__name__}); copy the file again") from error
 
 
-def _check_form(table: Any, n_columns: int, file_bytes: int, where: str) -> None:
+def _check_form(table: Any, n_columns: int | None, file_bytes: int, where: str) -> None:
     dtype, shape = table.dtype, table.shape
     if table.external is not None or table.is_virtual:
         raise DataError(f"{where}: the values are in other files; expected them in this one")
@@ -97,11 +90,11 @@ def _check_form(table: Any, n_columns: int, file_bytes: int, where: str) -> None
         raise DataError(f"{where}: is stored in chunks or compressed; save it as one piece, as gradslam does")
     if dtype.kind != "f" or dtype.itemsize > 8:
         raise DataError(f"{where}: holds values of type {str(dtype)[:40]}; expected float16, float32 or float64")
-    if shape is None or len(shape) != 2 or shape[1] != n_columns:
-        raise DataError(f"{where}: has the shape {str(shape)[:60]}; expected (N, {n_columns})")
-    n_bytes = shape[0] * n_columns * dtype.itemsize
+    if shape is None or len(shape) != 2 or not 0 < shape[1] <= MOST_COLUMNS or n_columns not in (None, shape[1]):
+        raise DataError(f"{where}: has the shape {str(shape)[:60]}; expected (N, {n_columns or 'D'})")
+    n_bytes = shape[0] * shape[1] * dtype.itemsize
     if n_bytes > file_bytes or table.id.get_storage_size() != n_bytes:
         raise DataError(
-            f"{where}: promises {shape[0]} rows of {n_columns} values, {n_bytes} bytes, but the file has {file_bytes}; "
+            f"{where}: promises {shape[0]} rows of {shape[1]} values, {n_bytes} bytes, but the file has {file_bytes}; "
             "it is cut short or damaged"
         )

@@ -62,22 +62,17 @@ def decode_colour(content: bytes, where: str) -> UInt8Array:
     """Pixels (H, W, 3) RGB of a JPEG, an 8-bit PNG or a PPM."""
     import cv2
 
-    kind = "PNG" if content.startswith(PNG_SIGNATURE) else "PPM" if content.startswith(b"P6") else "JPEG"
-    if kind == "PPM":
+    if content.startswith(b"P6"):
         return _portable_map(content, b"P6", where)
-    header = whole_png_header(content) if kind == "PNG" else None
+    is_png = content.startswith(PNG_SIGNATURE)
     # Some decoders fill what a cut JPEG lacks with grey.
-    is_whole = (
-        header is not None
-        if kind == "PNG"
-        else JPEG_END in content[-JPEG_END_WITHIN:] and content.count(JPEG_SCAN) <= MAX_SCANS
-    )
-    size = image_size(content)
-    image = None
+    is_whole_jpeg = JPEG_END in content[-JPEG_END_WITHIN:] and content.count(JPEG_SCAN) <= MAX_SCANS
+    is_whole = whole_png_header(content) is not None if is_png else is_whole_jpeg
+    size, image = image_size(content), None
     if is_whole and size is not None and 0 < size[0] * size[1] <= MAX_PIXELS:
         image = decoded(content, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None or image.dtype != np.uint8:
-        raise DataError(f"{where}: not a readable {kind} image; copy the file again")
+        raise DataError(f"{where}: not a readable {'PNG' if is_png else 'JPEG'} image; copy the file again")
     return np.asarray(image)
 
 

@@ -82,23 +82,19 @@ def _read_header(content: bytes, where: str) -> tuple[np.dtype[Any], int, str, i
     numbers = [lines.get(key, []) for key in ("WIDTH", "HEIGHT")]
     are_whole = all(len(words) == 1 and _NUMBER.fullmatch(words[0]) for words in numbers)
     n = int(numbers[0][0]) * int(numbers[1][0]) if are_whole else -1
+    of_axes = [(name, count) for name, count in zip(names, counts, strict=False) if name in AXES]
     is_sound = (
         len(names) == len(sizes) == len(kinds) == len(counts) <= MOST_FIELDS
         and {*types} <= TYPES
         and all(_NUMBER.fullmatch(count) and 0 < int(count) <= MOST_VALUES for count in counts)
         and lines.get("POINTS", [str(n)]) == [str(n)]
         and form in FORMS
+        and sorted(of_axes) == [(axis, "1") for axis in AXES]
     )
     if not is_sound:
         raise DataError(
-            f"{where}: fields, sizes, counts, numbers of points or form of its header do not fit; is it damaged?"
-        )
-    if any(
-        [(name, count) for name, count in zip(names, counts, strict=True) if name == axis] != [(axis, "1")]
-        for axis in AXES
-    ):
-        raise DataError(
-            f"{where}: has the fields {printable(', '.join(names), 120)}; expected x, y and z, one value each"
+            f"{where}: fields ({printable(', '.join(names), 120)}), sizes, counts, numbers of points or form of its "
+            "header do not fit; expected x, y and z, one value each"
         )
     fields = [
         (name if name in AXES else f"field {k}", f"<{kind.lower()}", (int(count),) if count != "1" else ())

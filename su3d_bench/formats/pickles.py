@@ -70,9 +70,7 @@ class Unbuilt:
     value: object = None
 
 
-@dataclass(frozen=True)
-class ObjectType:
-    """NumPy's dtype of Python objects."""
+OBJECTS = Named("numpy.object_")  # NumPy's dtype of Python objects
 
 
 class Source:
@@ -209,7 +207,7 @@ def _array(payload: object, kind: object, shape: object, is_fortran: object) -> 
     """The array of a pickle; one of objects becomes a list, or its only item where it has no dimension."""
     if isinstance(payload, Forgotten):
         return payload
-    if isinstance(kind, ObjectType) and isinstance(payload, list) and isinstance(shape, tuple) and len(shape) < 2:
+    if kind == OBJECTS and isinstance(payload, list) and isinstance(shape, tuple) and len(shape) < 2:
         return list(payload) if shape else payload[0]
     if not isinstance(payload, bytes) or not isinstance(kind, np.dtype):
         raise ValueError("an array without values or type")
@@ -235,7 +233,7 @@ def _dtype(code: object, *_: object) -> Unbuilt:
     def build(state: Any) -> object:
         if any(part is not None for part in state[2:5]):
             raise ValueError("an array type with fields")
-        return ObjectType() if is_object else plain_type(f"{state[1]}{code}")
+        return OBJECTS if is_object else plain_type(f"{state[1]}{code}")
 
     return Unbuilt(build)
 
@@ -243,16 +241,6 @@ def _dtype(code: object, *_: object) -> Unbuilt:
 def _scalar(kind: object, payload: object) -> object:
     array: Any = _array(payload, kind, (), False)
     return array if isinstance(array, Forgotten) else array[()]
-
-
-def _no_bytes() -> bytes:
-    """``bytes()``, how protocol 2 holds no bytes."""
-    return b""
-
-
-def empty_dict(*_factory: object) -> dict[object, object]:
-    """``OrderedDict()`` or ``defaultdict(factory)``, whose items follow."""
-    return {}
 
 
 # ConceptGraphs stores its settings beside the map, a tree of omegaconf nodes with paths in it, and pictures beside its
@@ -282,9 +270,10 @@ NAMES: dict[str, object] = {
     "numpy.core.multiarray._reconstruct": _reconstruct,
     "numpy.core.multiarray.scalar": _scalar,
     "numpy.core.numeric._frombuffer": _frombuffer,
-    "collections.OrderedDict": empty_dict,
-    "collections.defaultdict": empty_dict,
-    "builtins.bytes": _no_bytes,
+    # OrderedDict() and defaultdict(factory), whose items follow; bytes(), how protocol 2 holds no bytes
+    "collections.OrderedDict": lambda *_: {},
+    "collections.defaultdict": lambda *_: {},
+    "builtins.bytes": lambda: b"",
 }
 
 

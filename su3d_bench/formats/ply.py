@@ -66,10 +66,8 @@ class PlyElement:
 
 @dataclass(frozen=True)
 class PlyFile:
-    """A PLY file: ``format``, comments, and elements in the order of the file."""
+    """The elements of a PLY file in their order."""
 
-    format: str
-    comments: tuple[str, ...]
     elements: tuple[PlyElement, ...]
 
     def element(self, name: str) -> PlyElement | None:
@@ -98,7 +96,6 @@ class Promise:
 @dataclass(frozen=True)
 class Header:
     format: str
-    comments: tuple[str, ...]
     elements: tuple[Promise, ...]
     n_bytes: int
 
@@ -125,7 +122,7 @@ def read_ply(path: Path, where: str | None = None) -> PlyFile:
         elements.append(element)
     if body[at:].strip() if header.format != "ascii" else len(body) > at:
         raise DataError(f"{where}: more stands after the last element that the header names; the file is damaged")
-    return PlyFile(header.format, header.comments, tuple(elements))
+    return PlyFile(tuple(elements))
 
 
 def first_rows(path: Path, name: str) -> Mapping[str, Column]:
@@ -151,7 +148,6 @@ def read_header(content: bytes, where: str) -> Header:
     if not re.match(rb"ply[ \t]*\r?\n", content):
         raise DataError(f"{where}: not a PLY file; its first line is not 'ply'")
     at, n_lines, format_name = content.index(b"\n") + 1, 1, ""
-    comments: list[str] = []
     elements: list[Promise] = []
     while True:
         end = content.find(b"\n", at, MAX_HEADER_BYTES)
@@ -163,7 +159,7 @@ def read_header(content: bytes, where: str) -> Header:
             case ["end_header"]:
                 break
             case ["comment" | "obj_info", *_]:
-                comments.append(line.partition(" ")[2])
+                pass
             case ["format", name, "1.0"] if name in FORMATS and not format_name:
                 format_name = name
             case ["element", name, count] if _COUNT.fullmatch(count) and all(name != one.name for one in elements):
@@ -178,7 +174,7 @@ def read_header(content: bytes, where: str) -> Header:
                 )
     if not format_name:
         raise DataError(f"{where}: its header names no format; expected one of {', '.join(FORMATS)}")
-    return Header(format_name, tuple(comments), tuple(elements), at)
+    return Header(format_name, tuple(elements), at)
 
 
 def _property(words: Sequence[str]) -> Property | None:

@@ -110,17 +110,9 @@ def _tensor(storage: object, offset: object, size: object, stride: object, *_: o
     return _view(storage, storage.code if isinstance(storage, Storage) else None, offset, size, stride)
 
 
-def _tensor_with_type(
-    storage: object,
-    offset: object,
-    size: object,
-    stride: object,
-    _grad: object,
-    _hooks: object,
-    kind: object,
-    *_: object,
-) -> NDArray[Any]:
-    """``_rebuild_tensor_v3``."""
+def _tensor_with_type(*parts: Any) -> NDArray[Any]:
+    """``_rebuild_tensor_v3(storage, offset, size, stride, grad, hooks, type, ...)``."""
+    storage, offset, size, stride, _, _, kind = parts[:7]
     code = DTYPES.get(kind.name.removeprefix("torch.")) if isinstance(kind, Named) else None
     return _view(storage, code, offset, size, stride)
 
@@ -140,16 +132,6 @@ def _view(storage: object, code: str | None, offset: Any, size: object, stride: 
     return np.lib.stride_tricks.as_strided(values[offset:], sizes, [step * width for step in strides], writeable=False)
 
 
-def _parameter(tensor: object, *_: object) -> object:
-    return tensor
-
-
-def _layout(name: object) -> object:
-    if name != SPARSE:
-        raise ValueError("a layout other than torch.sparse_coo")
-    return name
-
-
 def _sparse(layout: object, parts: Any) -> SparseTensor:
     """``_rebuild_sparse_tensor("torch.sparse_coo", (indices, values, size, ...))``."""
     indices, values, shape = parts[0], parts[1], checked_shape(parts[2])
@@ -164,9 +146,9 @@ TORCH_NAMES: Names = {
     "torch._utils._rebuild_tensor": _tensor,
     "torch._utils._rebuild_tensor_v2": _tensor,
     "torch._utils._rebuild_tensor_v3": _tensor_with_type,
-    "torch._utils._rebuild_parameter": _parameter,
+    "torch._utils._rebuild_parameter": lambda tensor, *_: tensor,
     "torch._utils._rebuild_sparse_tensor": _sparse,
-    "torch.serialization._get_layout": _layout,
+    "torch.serialization._get_layout": lambda name: name,
     "torch.Size": checked_shape,
     **{
         name: Named(name)

@@ -15,18 +15,10 @@ from su3d_bench.core.files.atomic import Scratch
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Detections, Frame, Int32Array, Int64Array, PerceptionNeeds, SceneInfo
+from su3d_bench.opensu3d import tracking
 from su3d_bench.opensu3d.config import SCHEMES, OpenSU3DConfig, crop_levels
 from su3d_bench.opensu3d.frame_cloud import NO_DETECTION, FrameCloud, frame_cloud
 from su3d_bench.opensu3d.postprocess import CONFIDENCES, IDS, segments_of, to_instances
-from su3d_bench.opensu3d.tracking import (
-    ImageRecord,
-    TrackingTable,
-    View,
-    assign_ids,
-    count_overlaps,
-    overlap_ratios,
-    record_of,
-)
 from su3d_bench.opensu3d.voxel_map import NO_INSTANCE, VoxelMap
 
 logger = logging.getLogger(__name__)
@@ -68,8 +60,8 @@ class OpenSU3D:
         self._scratch.close()
         self._scratch = Scratch()
         self._map = VoxelMap(self.config.eps, self.config.density)
-        self._table = TrackingTable(list)
-        self._images: list[ImageRecord] = []
+        self._table = tracking.TrackingTable(list)
+        self._images: list[tracking.ImageRecord] = []
         self._seeds: dict[int, int] = {}
         self._next_id = NO_INSTANCE + 1
         self._n_detections = 0
@@ -121,22 +113,22 @@ class OpenSU3D:
         scene_id_of = np.full(len(detections), NO_INSTANCE, np.int32)
         if cloud.n_inside == 0:
             return scene_id_of
-        overlaps = count_overlaps(cloud.owner[: cloud.n_inside], self._map.ids_of(matched))
+        overlaps = tracking.count_overlaps(cloud.owner[: cloud.n_inside], self._map.ids_of(matched))
         wanted = np.unique(overlaps.best[overlaps.best > NO_INSTANCE])
         # An axis at a time: over rows of three, numpy's minimum is ten times slower.
         lower = np.array([axis.min() for axis in cloud.points.T]) - self.config.eps
         upper = np.array([axis.max() for axis in cloud.points.T]) + self.config.eps
         inside = np.append(self._map.count_inside(lower, upper, wanted), 0)
         n_scene = np.where(overlaps.best > NO_INSTANCE, inside[np.searchsorted(wanted, overlaps.best)], 0)
-        ratios = overlap_ratios(overlaps, n_scene, self.config.overlap_rule)
-        ids, self._next_id = assign_ids(overlaps, ratios, self.config.overlap_threshold, self._next_id)
+        ratios = tracking.overlap_ratios(overlaps, n_scene, self.config.overlap_rule)
+        ids, self._next_id = tracking.assign_ids(overlaps, ratios, self.config.overlap_threshold, self._next_id)
         if self._next_id > IDS:
             raise DataError(
                 f"frame {detections.frame_index}: the map has more than {IDS - 1:,} instances to tell apart"
             )
         scene_id_of[overlaps.segments] = ids
         for detection, scene_id in zip(overlaps.segments, ids, strict=True):
-            self._table[int(scene_id)].append(View(len(self._images), int(detection)))
+            self._table[int(scene_id)].append(tracking.View(len(self._images), int(detection)))
         return scene_id_of
 
     def _insert(self, cloud: FrameCloud, matched: Int64Array, scene_id_of: Int32Array, detections: Detections) -> None:
@@ -146,7 +138,7 @@ class OpenSU3D:
         hit = placed.copy()
         hit[: cloud.n_inside] = np.where(placed[: cloud.n_inside] >= 0, placed[: cloud.n_inside], matched)
         hit[cloud.owner == NO_DETECTION] = -1
-        self._images.append(record_of(detections, self.config.fusion, cloud.owner, hit, self._scratch))
+        self._images.append(tracking.record_of(detections, self.config.fusion, cloud.owner, hit, self._scratch))
 
     def _plant(self, cloud: FrameCloud, placed: Int64Array, scene_id_of: Int32Array) -> None:
         """Keeps of each new scene id the map point in the middle of its first mask: the cluster there bears the id."""
@@ -171,18 +163,12 @@ class OpenSU3D:
 
     def close(self) -> None:
         """Forgets the scene, says in the log what was left out of it, and gives memory and disk space back."""
-        if self._losses["n_swallowed"]:
-            logger.info(
-                "opensu3d: %d of %d detections lie whole in the rings of others (border_px %g)",
-                self._losses["n_swallowed"],
-                self._n_detections,
-                self.config.border_px,
-            )
-        if self._losses["n_too_far"]:
-            logger.info(
-                "opensu3d: %d pixels lie beyond depth_max %g m and are left out",
-                self._losses["n_too_far"],
-                self.config.depth_max,
-            )
+        n_swallowed, n_too_far = self._losses["n_swallowed"], self._losses["n_too_far"]
+        if n_swallowed:
+            of_all = n_swallowed, self._n_detections, self.config.border_px
+            logger.info("opensu3d: %d of %d detections lie whole in the rings of others (border_px %g)", *of_all)
+        if n_too_far:
+            depth_max = self.config.depth_max
+            logger.info("opensu3d: %d pixels lie beyond depth_max %g m and are left out", n_too_far, depth_max)
         self._clear()
         self._scratch.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -152,8 +153,7 @@ def to_instances(
     )
 
 
-@dataclass(frozen=True)
-class _Description:
+class _Description(NamedTuple):
     name: str
     caption: str
     score: float

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from su3d_bench.core.errors import PredictionError, printable, reading, shown
+from su3d_bench.core.errors import DataError, PredictionError, printable, reading, shown
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks, Partition, starts_of
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array
 from su3d_bench.formats.arrays import MOST_MASKS, MOST_POINTS, check_members
@@ -42,14 +42,11 @@ class VertexMasks(Masks):
 
     def __post_init__(self) -> None:
         k = len(self.keys)
-        if self.indptr.shape != (k + 1,) or self.indptr[0] != 0 or (self.sizes < 0).any():
+        shapes = [array.shape for array in (self.scores, self.class_numbers) if array is not None]
+        if self.indptr.shape != (k + 1,) or not self.is_whole or (self.n_points is None and k):
             raise PredictionError(f"{k} masks: indptr of {self.indptr.shape} does not describe them")
-        if not self.is_whole or (self.n_points is None and k):
-            raise PredictionError(f"{k} masks: {len(self.indices)} indices, {self.n_points} points")
-        if self.scores.shape != (k,) or (self.class_numbers is not None and self.class_numbers.shape != (k,)):
-            raise PredictionError(f"{k} masks, but scores of {self.scores.shape} or classes of another number")
-        if self.features is not None and (self.features.ndim != 2 or len(self.features) != k):
-            raise PredictionError(f"{k} masks, but features of {self.features.shape}; expected one row a mask")
+        if shapes.count((k,)) < len(shapes) or (self.features is not None and self.features.shape[:1] != (k,)):
+            raise PredictionError(f"{k} masks, but scores, classes or features of another number")
         if not np.isfinite(self.scores).all():
             worst = int(np.flatnonzero(~np.isfinite(self.scores))[0])
             raise PredictionError(f"mask '{self.keys[worst]}': the score is {self.scores[worst]}; it must be finite")
@@ -118,22 +115,19 @@ class VertexLabels:
 
     def _masks(self, rows: Int32Array) -> tuple[VertexMasks, Int32Array]:
         """One mask a distinct row (R,) of ``rows`` (N, k), and these rows."""
-        if rows.shape[1] == 1:
-            values, row = np.unique(rows, return_inverse=True)
-            distinct = values[:, None]
-        else:
-            distinct, row = np.unique(rows, axis=0, return_inverse=True)
+        values, row = np.unique(rows if rows.shape[1] > 1 else rows[:, 0], axis=0, return_inverse=True)
+        distinct = values.reshape(-1, rows.shape[1]).astype(np.int32)
         masks, first = masks_of_partition(row.ravel(), len(distinct)), distinct[:, 0]
         of_rows = VertexMasks(
             masks.indptr,
             masks.indices,
             n_points=len(rows),
             scores=np.ones(len(distinct)),
-            class_numbers=first.astype(np.int32),
+            class_numbers=first,
             numbering=self.numbering,
             keys=tuple(f"class {number}" for number in first),
         )
-        return of_rows, distinct.astype(np.int32)
+        return of_rows, distinct
 
 
 Content = VertexMasks | VertexLabels | Instances | Partition | DenseFeatures  # the last three have their own points
@@ -145,10 +139,8 @@ def vertex_masks(
     n_points: int | None,
     *,
     scores: Float64Array | None = None,
-    class_numbers: Int32Array | None = None,
-    numbering: Numbering = "id",
-    features: Float32Array | None = None,
     keys: Sequence[str] | None = None,
+    **more: Any,
 ) -> VertexMasks:
     """The masks whose point indices are ``members``; score 1 and keys ``mask 0``, ... where none are given."""
     parts: list[Int32Array] = []
@@ -157,31 +149,22 @@ def vertex_masks(
         check_members(n := n + len(part), where)
         parts.append(part)
     masks = Masks.of_sets(parts)
+    names = tuple(keys if keys is not None else (f"mask {k}" for k in range(len(parts))))
+    scores = np.ones(len(parts)) if scores is None else scores
+    with named(where):
+        return VertexMasks(masks.indptr, masks.indices, n_points=n_points, scores=scores, keys=names, **more)
+
+
+@contextmanager
+def named(where: str) -> Iterator[None]:
+    """Errors of the block begin with ``where``."""
     try:
-        return VertexMasks(
-            masks.indptr,
-            masks.indices,
-            n_points=n_points,
-            scores=np.ones(len(parts)) if scores is None else scores,
-            class_numbers=class_numbers,
-            numbering=numbering,
-            features=features,
-            keys=tuple(keys) if keys is not None else tuple(f"mask {k}" for k in range(len(parts))),
-        )
+        yield
     except PredictionError as error:
-        raise PredictionError(f"{where}: {error}") from error
+        raise PredictionError(f"{where}: {str(error).removeprefix(f'{where}: ')}") from error
 
 
-def instances_of(
-    clouds: Sequence[Float32Array],
-    where: str,
-    *,
-    features: Float32Array | None,
-    labels: tuple[str, ...] | None,
-    names: tuple[str, ...],
-    captions: tuple[str, ...],
-    ids: Sequence[int],
-) -> Instances:
+def instances_of(clouds: Sequence[Float32Array], where: str, features: Float32Array | None, **texts: Any) -> Instances:
     """One instance a cloud, each with points of its own, score 1 and no views; boxes of empty clouds are zeros."""
     sizes = np.array([len(cloud) for cloud in clouds], np.int64)
     n = int(sizes.sum())
@@ -189,7 +172,7 @@ def instances_of(
         raise PredictionError(f"{where}: {len(clouds)} objects of {n} points; is it damaged?")
     points = np.concatenate([np.zeros((0, 3), np.float32), *clouds])
     masks = Masks(starts_of(sizes), np.arange(n, dtype=np.int32))
-    return Instances.of(points, masks, None, features, labels=labels, names=names, captions=captions, ids=ids)
+    return Instances.of(points, masks, None, features, **texts)
 
 
 @dataclass(frozen=True)
@@ -203,69 +186,48 @@ class ScenePrediction:
     remarks: tuple[str, ...] = ()
 
 
-class Reader(ABC):
-    """One format of predictions; ``summary`` is one line for lists: whose format, which files."""
+Parsed = tuple[Content, Sequence[str]]  # of one scene, with remarks
+Parse = Callable[[Path, str], Parsed]  # by its file or folder, and its name
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One format of predictions.
+
+    ``recognise`` says why a path is of this format, from names and first bytes alone, None where it is not; ``scenes``
+    gives the file or folder of each scene by the name that the files give it; ``parse`` what is in one of these.
+    """
 
     name: str
-    summary: str
-    noun = "prediction"  # what messages call that of a scene
-
-    @abstractmethod
-    def recognise(self, path: Path) -> str | None:
-        """Why ``path`` is of this format, from names and first bytes alone; None where it is not."""
-
-    @abstractmethod
-    def scenes(self, path: Path) -> Mapping[str, Path]:
-        """The file or folder of each scene, by the name that the files give it."""
+    recognise: Callable[[Path], str | None]
+    scenes: Callable[[Path], Mapping[str, Path]]
+    parse: Parse
+    noun: str = "prediction"  # what messages call that of a scene
 
     def read(self, path: Path, scene: str) -> ScenePrediction:
         """The prediction of one of ``scenes(path)``; ``PredictionError`` where it cannot be used."""
         place = self.scenes(path).get(scene)
         if place is None:
             raise PredictionError(f"{shown(path)}: has no {self.noun} of scene '{printable(scene, 80)}'")
-        return self.read_scene(place, scene)
-
-    @abstractmethod
-    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
-        """The prediction in the file or folder of a scene."""
+        content, remarks = self.parse(place, scene)
+        return ScenePrediction(scene, self.name, place, content, tuple(remarks))
 
 
-Parsed = tuple[Content, Sequence[str]]  # of one scene, with remarks
-Parse = Callable[[Path, str], Parsed]  # by its file or folder, and its name
-
-
-class SceneFiles(Reader):
-    """A format of one file a scene, called after it and ending in the first of ``suffixes`` that fits."""
-
-    suffixes: tuple[str, ...]
-
-    def scenes(self, path: Path) -> Mapping[str, Path]:
-        return scene_files(path, self.suffixes)
-
-
-@dataclass(frozen=True)
-class FileFormat(SceneFiles):
-    """A row of the table of formats: a file a scene.
+def file_format(name: str, suffixes: Sequence[str], looks: Callable[[Path], str | None], parse: Parse) -> Reader:
+    """A file a scene, called after it and ending in the first of ``suffixes`` that fits.
 
     ``looks`` says of the first file with the last suffix, then of those with the others, why it is of this format.
     """
 
-    name: str
-    suffixes: tuple[str, ...]
-    looks: Callable[[Path], str | None]
-    parse: Parse
-    summary: str
-
-    def recognise(self, path: Path) -> str | None:
-        for suffix in reversed(self.suffixes):
+    def recognise(path: Path) -> str | None:
+        for suffix in reversed(suffixes):
             first = next(iter(scene_files(path, (suffix,)).values()), None) if path.exists() else None
-            if first is not None and (reason := self.looks(first)) is not None:
-                return reason
+            with suppress(DataError, PredictionError):
+                if first is not None and (reason := looks(first)) is not None:
+                    return reason
         return None
 
-    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
-        content, remarks = self.parse(place, scene)
-        return ScenePrediction(scene, self.name, place, content, tuple(remarks))
+    return Reader(name, recognise, lambda path: scene_files(path, suffixes), parse)
 
 
 def scene_of_folder(folder: Path, path: Path) -> str:
@@ -273,36 +235,32 @@ def scene_of_folder(folder: Path, path: Path) -> str:
     return folder.absolute().name
 
 
-@dataclass(frozen=True)
-class FolderFormat(Reader):
-    """A row of the table of formats: a folder a scene, at most ``n_above`` folders below the path.
+def folder_format(
+    name: str,
+    first: str,
+    second: str,
+    parse: Parse,
+    noun: str = "map",
+    scene_of: Callable[[Path, Path], str] = scene_of_folder,
+    n_above: int = 2,
+) -> Reader:
+    """A folder a scene, at most ``n_above`` folders below the path.
 
     ``first`` and ``second`` lie in it; ``scene_of`` names the scene of a folder that was found at a path.
     """
 
-    name: str
-    first: str
-    second: str
-    parse: Parse
-    summary: str
-    noun: str = "map"
-    scene_of: Callable[[Path, Path], str] = scene_of_folder
-    n_above: int = 2
+    def folders(path: Path) -> list[Path]:
+        files = first_found(path, ["*/" * n + first for n in range(n_above + 1)])
+        return [file.parent for file in files if (file.parent / second).exists()]
 
-    def recognise(self, path: Path) -> str | None:
-        names = " and ".join(dict.fromkeys((self.first, self.second)))
-        return f"it holds {names}" if path.is_dir() and self._folders(path) else None
+    def recognise(path: Path) -> str | None:
+        names = " and ".join(dict.fromkeys((first, second)))
+        return f"it holds {names}" if path.is_dir() and folders(path) else None
 
-    def scenes(self, path: Path) -> Mapping[str, Path]:
-        return named_once([(self.scene_of(folder, path), folder) for folder in self._folders(path)], path)
+    def scenes(path: Path) -> Mapping[str, Path]:
+        return named_once([(scene_of(folder, path), folder) for folder in folders(path)], path)
 
-    def _folders(self, path: Path) -> list[Path]:
-        files = first_found(path, ["*/" * n + self.first for n in range(self.n_above + 1)])
-        return [file.parent for file in files if (file.parent / self.second).exists()]
-
-    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
-        content, remarks = self.parse(place, scene)
-        return ScenePrediction(scene, self.name, place, content, tuple(remarks))
+    return Reader(name, recognise, scenes, parse, noun)
 
 
 def scene_files(path: Path, suffixes: Sequence[str]) -> dict[str, Path]:

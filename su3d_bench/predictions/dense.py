@@ -19,28 +19,25 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, PredictionError, StoreError, converted, shown
-from su3d_bench.core.files.atomic import Allowance, UnpackingError
 from su3d_bench.core.maps import DenseFeatures, Partition
 from su3d_bench.core.types import Float32Array, Int32Array, Int64Array
-from su3d_bench.formats.arrays import MOST_MASKS, checked_points, feature_table, half_rows, kind_of, without_nonfinite
-from su3d_bench.formats.hdf5 import n_columns_of, read_rows, row_blocks
+from su3d_bench.formats import arrays
+from su3d_bench.formats.hdf5 import read_rows, row_blocks
 from su3d_bench.formats.numpy_files import read_npy
 from su3d_bench.formats.poses import moved, read_first_pose
 from su3d_bench.formats.torch_files import read_torch
-from su3d_bench.predictions.base import Parsed, SceneFiles, ScenePrediction, first_found, named_once
-from su3d_bench.predictions.hovsg import read_cloud
+from su3d_bench.predictions.base import Parsed, file_format, first_found, named_once
+from su3d_bench.predictions.hovsg import read_points
 from su3d_bench.predictions.masks import holds
 
 POINTS, EMBEDDINGS = "pc_points.h5", "pc_embeddings.h5"  # gradslam's
 POSE_FILES = ("first_pose.txt", "traj.txt", "traj_w_c.txt")
 FOLDERS_OF_A_MAP = ("pointclouds", "saved-map", "saved-maps", "Sequence_1")
-HELD_IN_MEMORY = 64 << 20  # bytes of features; larger tables are mapped from a temporary file
 CLOUD = "point_cloud.pcd"  # OpenLex3D's
 CLOUDS = (CLOUD, "point_cloud.ply", "input.ply")  # the order in which the original looks for them
 LEX_INDEX, LEX_EMBEDDINGS = "index.npy", "embeddings.npy"
@@ -61,7 +58,7 @@ def scene_of_gradslam(folder: Path, path: Path) -> str:
 def gradslam(place: Path, scene: str) -> Parsed:
     where = shown(place / POINTS)
     with converted(DataError, PredictionError):
-        points = checked_points(read_rows(place / POINTS, 3, where), where)
+        points = arrays.checked_points(read_rows(place / POINTS, 3, where), where)
         points, pose_remark = _in_world(points, place)
         features, n_without = _features(place / EMBEDDINGS, len(points))
     if not np.isfinite(points).all():
@@ -86,43 +83,29 @@ def _in_world(points: Float32Array, folder: Path) -> tuple[Float32Array, str]:
 
 
 def _features(file: Path, n_points: int) -> tuple[NDArray[np.float16], int]:
-    """The features (N, D) and how many rows have none: rows with what float16 cannot hold become zeros."""
-    where = shown(file)
-    n_columns = n_columns_of(file, where)
-    n_rows = n_without = n_held = 0
-    stored: list[NDArray[np.float16]] = []
-    # Sparse writes would crash the process on a full disk when the map is touched; plain ones fail here.
-    with tempfile.TemporaryFile() as spill:
-        for block in row_blocks(file, n_columns, where):
-            n_rows += len(block)
-            if n_rows > n_points:
-                break
-            rows = half_rows(block)
-            n_without += int((~rows.any(axis=1)).sum())
-            stored.append(rows)
-            n_held += rows.nbytes
-            if n_held > HELD_IN_MEMORY:
-                _spill(spill, stored)
-                n_held = 0
-        if n_rows != n_points:
-            raise PredictionError(f"{where}: has other rows than {POINTS}, which has {n_points}; copy both again")
-        if not spill.tell():
-            return np.concatenate([np.zeros((0, n_columns), np.float16), *stored]), n_without
-        _spill(spill, stored)
-        return np.memmap(spill, np.float16, "r", shape=(n_points, n_columns)), n_without
+    """The features (N, D), mapped from a file without a name, and how many rows have none.
 
-
-def _spill(file: Any, stored: list[NDArray[np.float16]]) -> None:
-    """Move what is held in memory to the end of a temporary file."""
+    Rows with what float16 cannot hold become zeros.
+    """
+    where, n_rows, n_without, n_columns = shown(file), 0, 0, 0
     try:
-        for rows in stored:
-            file.write(rows.tobytes())
-        file.flush()
+        # Sparse writes would crash the process on a full disk when the map is touched; plain ones fail here.
+        with tempfile.TemporaryFile() as stored:
+            for block in row_blocks(file, None, where):
+                rows = arrays.half_rows(block)
+                n_rows, n_columns = n_rows + len(rows), rows.shape[1]
+                n_without += int((~rows.any(axis=1)).sum())
+                if n_rows <= n_points:
+                    stored.write(rows.tobytes())
+            stored.flush()
+            if n_rows != n_points:
+                raise PredictionError(f"{where}: has other rows than {POINTS}, which has {n_points}; copy both again")
+            empty = np.zeros((0, n_columns), np.float16)
+            return (np.memmap(stored, np.float16, "r", shape=(n_rows, n_columns)) if n_rows else empty), n_without
     except OSError as error:
         raise StoreError(
             f"cannot write features to {tempfile.gettempdir()}: {error.strerror or error}; set TMPDIR to a larger disk"
         ) from error
-    stored.clear()
 
 
 # ---- OpenLex3D
@@ -138,9 +121,9 @@ def openlex3d(place: Path, scene: str) -> Parsed:
     clouds = [file for name in CLOUDS if (file := place / name).is_file()]
     if not clouds:
         raise PredictionError(f"{shown(place)}: has no cloud; expected {', '.join(CLOUDS[:-1])} or {CLOUDS[-1]}")
-    points = checked_points(read_cloud(clouds[0]), shown(clouds[0]))
+    points = read_points(clouds[0])
     embeddings = place / LEX_EMBEDDINGS
-    features, remarks = without_nonfinite(feature_table(read_npy(embeddings), embeddings), "objects")
+    features, remarks = arrays.without_nonfinite(arrays.feature_table(read_npy(embeddings), embeddings), "objects")
     if len(clouds) > 1:
         names = ", ".join(file.name for file in clouds[1:])
         remarks = (f"{clouds[0].name} is read, as the original does, and not {names}", *remarks)
@@ -150,11 +133,8 @@ def openlex3d(place: Path, scene: str) -> Parsed:
 
 def _index(file: Path, n_points: int, cloud: str, n_objects: int) -> Int32Array:
     """The object of each point; every point has one."""
-    index = read_npy(file)
-    if index.shape != (n_points,) or index.dtype.kind not in "iu":
-        raise PredictionError(
-            f"{shown(file)}: holds {kind_of(index)}; expected an integer for each of the {n_points} points of {cloud}"
-        )
+    expected = f"an integer for each of the {n_points} points of {cloud}"
+    index = arrays.array_of(read_npy(file), f"{shown(file)}: holds", expected, "iu", n_points)
     is_wrong = (index < 0) | (index >= n_objects)
     if is_wrong.any():
         point = int(np.argmax(is_wrong))
@@ -176,11 +156,11 @@ def ovo(place: Path, scene: str) -> Parsed:
     objects = parts.get(OVO_OBJECTS)
     if not isinstance(cloud, dict) or not isinstance(objects, dict):
         raise PredictionError(
-            f"{where}: holds {kind_of(value)} without '{OVO_POINTS[0]}' and '{OVO_OBJECTS}'; is it of OVO?"
+            f"{where}: holds {arrays.kind_of(value)} without '{OVO_POINTS[0]}' and '{OVO_OBJECTS}'; is it of OVO?"
         )
-    points = checked_points(cloud.get("xyz"), where)
+    points = arrays.checked_points(cloud.get("xyz"), where)
     ids = _ids(objects.get("ins_3d_ids"), where)
-    features, remarks = without_nonfinite(_rows_of(objects, ids, Allowance(file.stat().st_size), where), "objects")
+    features, remarks = arrays.without_nonfinite(_rows_of(objects, ids, file), "objects")
     instance = _rows(cloud.get("obj_ids"), len(points), ids, where)
     n_lost = len(ids) - len(np.unique(instance[instance >= 0]))
     if n_lost:
@@ -190,56 +170,41 @@ def ovo(place: Path, scene: str) -> Parsed:
 
 def _ids(value: object, where: str) -> Int64Array:
     """The number of each object, in the order of the map's."""
-    is_list = isinstance(value, np.ndarray) and value.ndim == 1 and (value.dtype.kind in "iu" or not value.size)
-    if not isinstance(value, np.ndarray) or not is_list or len(value) > MOST_MASKS:
-        raise PredictionError(f"{where}: 'ins_3d_ids' is {kind_of(value)}; expected the number of each object")
+    is_empty = isinstance(value, np.ndarray) and not value.size
+    value = arrays.array_of(
+        value, f"{where}: 'ins_3d_ids' is", "the number of each object", "iuf" if is_empty else "iu", None
+    )
+    arrays.check_sizes(0, len(value), where)
     ids = value.astype(np.int64)
     if len(np.unique(ids)) != len(ids) or (len(ids) and int(ids.min()) < 0):
         raise PredictionError(f"{where}: 'ins_3d_ids' has a number twice or below 0; is it damaged?")
     return ids
 
 
-def _rows_of(objects: Mapping[object, object], ids: Int64Array, allowance: Allowance, where: str) -> Float32Array:
+def _rows_of(objects: Mapping[object, object], ids: Int64Array, file: Path) -> Float32Array:
     """A row (K, D) for each object, of zeros for those that were never described."""
-    features: Float32Array | None = None
+    where, features = shown(file), np.zeros((len(ids), 0), np.float32)
     for row, number in enumerate(ids.tolist()):
         value = objects.get(f"ins3d_{number}_clip_feature")
         if value is None:
             continue
-        n = None if features is None else features.shape[1]
-        is_row = isinstance(value, np.ndarray) and value.dtype.kind == "f" and value.shape in _row_shapes(value.size)
-        if not isinstance(value, np.ndarray) or not is_row or n not in (None, value.size):
-            beside = "" if n is None else f" of {n}"
-            raise PredictionError(
-                f"{where}: the feature of object {number} is {kind_of(value)}; expected a row{beside}"
-            )
-        if features is None:
-            try:
-                allowance.spend(4 * len(ids) * value.size)  # objects may share one row
-            except UnpackingError as error:
-                raise PredictionError(f"{where}: {error}") from error
-            features = np.zeros((len(ids), value.size), np.float32)
-        with np.errstate(over="ignore", invalid="ignore"):
-            features[row] = value.reshape(-1)
-    return np.zeros((len(ids), 1), np.float32) if features is None else features
-
-
-def _row_shapes(n: int) -> tuple[tuple[int, ...], ...]:
-    """As OVO has them: alone where one view was kept, as a table of one row where several were merged."""
-    return ((n,), (1, n)) if n else ()
+        if isinstance(value, np.ndarray) and value.ndim == 2 and len(value) == 1:  # where several views were merged
+            value = value[0]
+        n = features.shape[1]
+        found = f"{where}: the feature of object {number} is"
+        feature = arrays.array_of(value, found, f"a row of {n}" if n else "a row", "f", n or arrays.NOT_EMPTY)
+        if not n:
+            arrays.check_memory(4 * len(ids) * len(feature), file)  # objects may share one row
+            features = np.zeros((len(ids), len(feature)), np.float32)
+        features[row] = arrays.as_float32(feature)
+    return features if features.shape[1] else np.zeros((len(ids), 1), np.float32)
 
 
 def _rows(value: object, n_points: int, ids: Int64Array, where: str) -> Int32Array:
     """The row of the object of each point, -1 for none."""
-    if (
-        not isinstance(value, np.ndarray)
-        or value.dtype.kind not in "iu"
-        or value.shape not in {(n_points,), (n_points, 1)}
-    ):
-        raise PredictionError(
-            f"{where}: 'obj_ids' is {kind_of(value)}; expected an object for each of {n_points} points"
-        )
-    numbers = value.reshape(-1).astype(np.int64)
+    flat = value[:, 0] if isinstance(value, np.ndarray) and value.shape == (n_points, 1) else value
+    expected = f"an object for each of {n_points} points"
+    numbers = arrays.array_of(flat, f"{where}: 'obj_ids' is", expected, "iu", n_points).astype(np.int64)
     order = np.argsort(ids)
     known = np.array([*ids[order], np.iinfo(np.int64).max], np.int64)
     place = np.searchsorted(known, numbers)
@@ -255,45 +220,36 @@ def _rows(value: object, n_points: int, ids: Int64Array, where: str) -> Int32Arr
 # ---- RayFronts
 
 
-class RayFronts(SceneFiles):
-    name = "rayfronts"
-    summary = (
-        f"RayFronts' <scene>/{RAY_MAP} of its evaluation, or <scene>.pt of a map's save: a feature a voxel or point"
+def looks_like_rayfronts(path: Path) -> str | None:
+    if _kept(path):
+        return f"it holds {RAY_MAP}"
+    return SAVED_MAPS.recognise(path)
+
+
+def rayfronts_scenes(path: Path) -> Mapping[str, Path]:
+    if kept := _kept(path):
+        return named_once([(file.absolute().parent.name, file) for file in kept], path)
+    return SAVED_MAPS.scenes(path) if path.exists() else {}
+
+
+def rayfronts(place: Path, scene: str) -> Parsed:
+    where, value = shown(place), read_torch(place)
+    if not isinstance(value, dict):
+        raise PredictionError(f"{where}: holds {arrays.kind_of(value)}; expected a dict of RayFronts")
+    points, table = _columns(value, place)
+    places = arrays.checked_points(points, where)
+    found = f"{where}: {len(places)} places, but the features are"
+    features = arrays.half_rows(
+        arrays.array_of(table, found, "a row a voxel or point", "f", len(places), arrays.NOT_EMPTY)
     )
-    noun = "map"
-    suffixes = (".pt",)
+    n_without = int((~features.any(axis=1)).sum())
+    remarks = ["what lay beyond the reach of the depth is in no file of RayFronts: its rays are not scored"]
+    if n_without:
+        remarks.append(f"{n_without} of {len(places)} voxels or points have no feature (a row of zeros or NaN)")
+    return DenseFeatures(places, features), remarks
 
-    def recognise(self, path: Path) -> str | None:
-        if _kept(path):
-            return f"it holds {RAY_MAP}"
-        first = next(iter(super().scenes(path).values()), None) if path.exists() else None
-        return None if first is None else holds(dict, "a dict")(first)
 
-    def scenes(self, path: Path) -> Mapping[str, Path]:
-        if not path.exists():
-            return {}
-        kept = _kept(path)
-        return dict(named_once([(file.absolute().parent.name, file) for file in kept], path)) or super().scenes(path)
-
-    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
-        where, value = shown(place), read_torch(place)
-        if not isinstance(value, dict):
-            raise PredictionError(f"{where}: holds {kind_of(value)}; expected a dict of RayFronts")
-        try:
-            points, table = _columns(value, Allowance(place.stat().st_size), where)
-        except UnpackingError as error:
-            raise PredictionError(f"{where}: {error}") from error
-        places = checked_points(points, where)
-        if not isinstance(table, np.ndarray) or table.ndim != 2 or table.dtype.kind != "f" or not table.shape[1]:
-            raise PredictionError(f"{where}: the features are {kind_of(table)}; expected a row a voxel or point")
-        if len(table) != len(places):
-            raise PredictionError(f"{where}: {len(places)} places, but the features are {kind_of(table)}")
-        features = half_rows(table)
-        n_without = int((~features.any(axis=1)).sum())
-        remarks = ["what lay beyond the reach of the depth is in no file of RayFronts: its rays are not scored"]
-        if n_without:
-            remarks.append(f"{n_without} of {len(places)} voxels or points have no feature (a row of zeros or NaN)")
-        return ScenePrediction(scene, self.name, place, DenseFeatures(places, features), tuple(remarks))
+SAVED_MAPS = file_format("rayfronts", (".pt",), holds(dict, "a dict"), rayfronts)
 
 
 def _kept(path: Path) -> list[Path]:
@@ -303,8 +259,9 @@ def _kept(path: Path) -> list[Path]:
     return [file for file in first_found(path, [RAY_MAP, f"*/{RAY_MAP}", f"*/*/{RAY_MAP}"]) if file.is_file()]
 
 
-def _columns(value: Mapping[object, object], allowance: Allowance, where: str) -> tuple[object, object]:
+def _columns(value: Mapping[object, object], file: Path) -> tuple[object, object]:
     """Places and features of a map in any of the three forms."""
+    where = shown(file)
     if "feats_feats" in value:
         return value.get("feats_xyz"), value["feats_feats"]
     if "global_vox_rgb_feat_conf" in value:
@@ -313,7 +270,7 @@ def _columns(value: Mapping[object, object], allowance: Allowance, where: str) -
         return value.get("global_vox_xyz"), table[:, N_COLOURS:-N_COUNTS] if has_columns else table  # type: ignore[index]
     if "global_feat_pc" in value:
         places, features = value.get("global_xyz_pc"), value["global_feat_pc"]
-        return _joined(places, allowance, where), _joined(features, allowance, where)
+        return _joined(places, file), _joined(features, file)
     if "global_vox_occ" in value:
         raise PredictionError(f"{where}: holds which voxels are occupied and no features; save a semantic map")
     names = sorted(name for name in value if isinstance(name, str))
@@ -322,15 +279,13 @@ def _columns(value: Mapping[object, object], allowance: Allowance, where: str) -
     )
 
 
-def _joined(value: object, allowance: Allowance, where: str) -> NDArray[np.generic]:
+def _joined(value: object, file: Path) -> NDArray[np.generic]:
     """The clouds of a list as one."""
-    clouds = value if isinstance(value, list | tuple) else []
-    first = clouds[0] if clouds else None
-    for cloud in clouds:
-        is_table = isinstance(cloud, np.ndarray) and cloud.ndim == 2 and cloud.dtype.kind in "fiu"
-        if not is_table or not isinstance(first, np.ndarray) or cloud.shape[1:] != first.shape[1:]:
-            raise PredictionError(f"{where}: a cloud of the list is {kind_of(cloud)}; expected tables of one width")
+    clouds, where = value if isinstance(value, list | tuple) else [], shown(file)
     if not clouds:
         raise PredictionError(f"{where}: holds no cloud; expected a list of them")
-    allowance.spend(sum(cloud.nbytes for cloud in clouds))  # clouds may share what they hold
-    return np.concatenate(clouds)
+    width = next(iter(np.shape(clouds[0])[1:]), None)
+    found = f"{where}: a cloud of the list is"
+    tables = [arrays.array_of(cloud, found, "tables of one width", "fiu", None, width) for cloud in clouds]
+    arrays.check_memory(sum(table.nbytes for table in tables), file)  # clouds may share what they hold
+    return np.concatenate(tables)

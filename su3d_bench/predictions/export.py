@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -179,35 +179,42 @@ def masks_on_truth(
 
     Classes are those of the prediction, else what ``encoder`` calls its features among the classes of ``rules``.
     """
-    if isinstance(content, VertexLabels | DenseFeatures):
-        raise PredictionError("has no masks, and a list of masks needs them")
-    if isinstance(content, VertexMasks) and content.n_points not in {None, len(truth.points)}:
-        raise PredictionError(
-            f"is of {content.n_points} points, the ground truth of {len(truth.points)}; both must be of one mesh"
-        )
-    named = content.on(truth.points, rules) if isinstance(content, VertexMasks) else content
-    masks, scores, remarks = _masks_and_scores(named)
-    moved = transfer.transfer_masks(
-        named.points, masks, truth.points, rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
-    )
-    if isinstance(content, VertexMasks) and content.class_numbers is not None:
-        return LabelledMasks(moved, len(truth.points), content.class_ids(rules), scores, remarks)
-    class_ids = named_classes(rules, truth.semantic, named, encoder)
-    if (warning := encoder_warning(rules, named, encoder)) is not None:
-        remarks = (*remarks, warning)
-    return LabelledMasks(moved, len(truth.points), class_ids, scores, remarks)
-
-
-def _masks_and_scores(named: Instances | Partition) -> tuple[Masks, Float64Array, tuple[str, ...]]:
-    """The masks on the points of the map, a finite score for each, and what a reader of the scores must know."""
-    remarks: tuple[str, ...] = ()
+    named, remarks = _as_map(content, truth.points, rules), list[str]()
     if isinstance(named, Partition):
         _check_partition(named)
-        remarks = ("a partition has no scores: 1 for every mask",)
+        remarks.append("a partition has no scores: 1 for every mask")
     masks, scores = masks_and_scores(named)
+    moved = _moved(named, masks, scores, truth.points, rules)
+    if isinstance(content, VertexMasks) and content.class_numbers is not None:
+        class_ids = content.class_ids(rules)
+    else:
+        class_ids = named_classes(rules, truth.semantic, named, encoder)
+        remarks += [warning] if (warning := encoder_warning(rules, named, encoder)) is not None else []
+    return LabelledMasks(moved, len(truth.points), class_ids, scores, tuple(remarks))
+
+
+def _as_map(content: Content, vertices: Float32Array, rules: ProtocolRules) -> Instances | Partition:
+    """The map of masks, those of the ``vertices`` with these as their points."""
+    if isinstance(content, VertexLabels | DenseFeatures):
+        raise PredictionError("has no masks, and a list of masks needs them")
+    if not isinstance(content, VertexMasks):
+        return content
+    if content.n_points not in {None, len(vertices)}:
+        raise PredictionError(
+            f"is of {content.n_points} points, the scene of {len(vertices)}; both must be of one mesh"
+        )
+    return content.on(vertices, rules)
+
+
+def _moved(
+    named: Instances | Partition, masks: Masks, scores: Float64Array, vertices: Float32Array, rules: ProtocolRules
+) -> Masks:
+    """The ``masks`` of a map on ``vertices`` (V, 3) m."""
     if not np.isfinite(named.points).all() or not np.isfinite(scores).all():
-        raise PredictionError("has points or scores that are NaN or infinite; make it again")
-    return masks, scores, remarks
+        raise PredictionError("has points, features or scores that are NaN or infinite; make it again")
+    return transfer.transfer_masks(
+        named.points, masks, vertices, rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
+    )
 
 
 def write_scannet(labelled: LabelledMasks, scene: str, folder: Path) -> tuple[str, ...]:
@@ -281,7 +288,9 @@ def write_list(
             (folder / name).write_bytes(content_of(k))
             lines.append(f"{name} {score!r}\n" if first is None else f"{name} {place + first} {score!r}\n")
     write_text(folder / f"{scene}.txt", "".join(lines))
-    return (*labelled.remarks, *_left_out(len(sizes), n_empty, n_unnamed))
+    left_out = {"no point of the ground truth": n_empty, "none of the classes": n_unnamed}
+    remarks = [f"{n} of {len(sizes)} masks have {what} and were left out" for what, n in left_out.items() if n]
+    return (*labelled.remarks, *remarks)
 
 
 def write_scannetpp_labels(
@@ -310,15 +319,6 @@ def write_scannetpp_labels(
     return found.warnings
 
 
-def _left_out(n_masks: int, n_empty: int, n_unnamed: int) -> Sequence[str]:
-    remarks = []
-    if n_empty:
-        remarks.append(f"{n_empty} of {n_masks} masks have no point of the ground truth and were left out")
-    if n_unnamed:
-        remarks.append(f"{n_unnamed} of {n_masks} masks have none of the classes and were left out")
-    return remarks
-
-
 # ---- OpenSUN3D
 
 
@@ -340,13 +340,7 @@ def answer_to(
     ``rules``, of kind ``queries``, say how masks reach the vertices. ``PredictionError`` where the map has no masks or
     no features.
     """
-    if isinstance(content, VertexLabels | DenseFeatures):
-        raise PredictionError("has no masks, and the challenge's submission needs them")
-    if isinstance(content, VertexMasks) and content.n_points not in {None, len(vertices)}:
-        raise PredictionError(
-            f"is of {content.n_points} points, the mesh has {len(vertices)} vertices; both must be of one mesh"
-        )
-    named = content.on(vertices, rules) if isinstance(content, VertexMasks) else content
+    named = _as_map(content, vertices, rules)
     masks = transfer.masks_of(named)
     scores = np.zeros(0)
     if len(masks):
@@ -354,11 +348,7 @@ def answer_to(
             raise PredictionError(NEEDS_FEATURES)
         encoded = text_features(rules, [text], named.features, encoder)
         scores = cosines(named.features, encoded, device_of(encoder))[:, 0]
-    if not np.isfinite(named.points).all() or not np.isfinite(scores).all():
-        raise PredictionError("has points or features that are NaN or infinite; make it again")
-    moved = transfer.transfer_masks(
-        named.points, masks, vertices, rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
-    )
+    moved = _moved(named, masks, scores, vertices, rules)
     return LabelledMasks(moved, len(vertices), np.zeros(len(masks), np.int64), scores)
 
 

@@ -8,93 +8,66 @@ from pathlib import Path
 
 from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, printable, shown, suggest
 from su3d_bench.formats.torch_files import SparseTensor
-from su3d_bench.predictions import dense, hovsg, masks
-from su3d_bench.predictions.base import FileFormat, FolderFormat, Reader
-from su3d_bench.predictions.objects import ConceptGraphs, Fross
-from su3d_bench.predictions.own_runs import OwnRuns
-from su3d_bench.predictions.scannet_text import (
-    OpenSun3dText,
-    ScannetppLabels,
-    ScannetppMasks,
-    ScannetSemanticText,
-    ScannetText,
-)
+from su3d_bench.predictions import dense, hovsg, masks, objects
+from su3d_bench.predictions import scannet_text as text
+from su3d_bench.predictions.base import Reader, file_format, folder_format
+from su3d_bench.predictions.own_runs import OWN_RUNS
+from su3d_bench.predictions.scannet_text import text_format
 from su3d_bench.store.records import RequestRecord, read_record
 
-# Files of each format, how they are known and read, and whose they are.
-_ALL: tuple[Reader, ...] = (
-    OwnRuns(),
-    ScannetText(),
-    ScannetSemanticText(),
-    ScannetppMasks(),
-    ScannetppLabels(),
-    OpenSun3dText(),
-    FileFormat(
-        "openmask3d", ("_masks.pt", ".pt"), masks.looks_like_matrix, masks.openmask3d,
-        "OpenMask3D's <scene>_masks.pt (points, masks) with <scene>_openmask3d_features.npy, or <scene>.pt and .npy",
+# How the files of each format are known and read, and whose they are.
+_ALL = (
+    OWN_RUNS,  # our own prediction.npz, or a run folder with those of one method
+    # ScanNet's submission: <scene>.txt with lines 'mask file, class id, confidence' (Mask3D, Segment3D)
+    text_format("scannet-text", text.looks_like_list, text.scannet_masks),
+    # ScanNet's semantic submission: <scene>.txt with one class id a line, one line a point
+    text_format("scannet-semantic-text", text.looks_like_labels, text.scannet_labels),
+    # ScanNet++'s instance submission: <scene>.txt with lines 'mask.json, class, confidence', run-length masks
+    text_format("scannetpp", text.looks_like_scannetpp, text.scannetpp_masks),
+    # ScanNet++'s semantic submission: <scene>.txt with one class a line, or three with commas between
+    text_format("scannetpp-semantic", text.looks_like_ranked, text.ranked_labels),
+    # The OpenSUN3D challenge's submission: <scene>.txt with lines 'mask file, confidence', without classes
+    text_format("opensun3d-challenge", text.looks_like_opensun3d, text.opensun3d_masks),
+    # OpenMask3D's <scene>_masks.pt (points, masks) with <scene>_openmask3d_features.npy, or <scene>.pt and .npy
+    file_format("openmask3d", ("_masks.pt", ".pt"), masks.looks_like_matrix, masks.openmask3d),
+    # MaskClustering's <scene>.npz with pred_masks (points, masks), pred_score and pred_classes (Mask3D's too)
+    file_format("maskclustering", (".npz",), masks.looks_like_masks, masks.maskclustering),
+    # Open3DIS's <scene>.pth: a dict of ins (run-length masks or a tensor), conf and final_class
+    file_format("open3dis", (".pth",), masks.holds(dict, "a dict"), masks.open3dis),
+    # Open-YOLO 3D's <scene>.pt: proposals, masks (points, masks) and scores, or masks, classes and scores
+    file_format("openyolo3d", (".pt",), masks.holds(tuple, "a tuple"), masks.openyolo3d),
+    # OpenIns3D's masks <scene>.pt: a sparse tensor (points, masks), without scores and classes
+    file_format("openins3d", (".pt",), masks.holds(SparseTensor, "a sparse tensor"), masks.openins3d),
+    # SAM3D's <scene>.pth or .npy: a group number for each point, -1 for none, without scores and classes
+    file_format("sam3d", (".npy", ".pth"), masks.looks_like_groups, masks.sam3d),
+    # SAM3D's coloured clouds <scene>.ply: one colour a group, black for none, the points those of the scene
+    file_format("sam3d-colours", (".ply",), masks.looks_like_colours, masks.sam3d_colours),
+    # ConceptGraphs' pcd_saves/full_pcd_*.pkl.gz (_post before the other) or exps/*/pcd_*.pkl.gz of ali-dev
+    Reader(
+        "conceptgraphs", objects.looks_like_conceptgraphs, objects.conceptgraphs_scenes, objects.conceptgraphs, "map"
     ),
-    FileFormat(
-        "maskclustering", (".npz",), masks.looks_like_masks, masks.maskclustering,
-        "MaskClustering's <scene>.npz with pred_masks (points, masks), pred_score and pred_classes (Mask3D's too)",
+    # ConceptFusion's saved-map/pointclouds of gradslam
+    folder_format(
+        "gradslam", dense.POINTS, dense.EMBEDDINGS, dense.gradslam, scene_of=dense.scene_of_gradslam, n_above=3
     ),
-    FileFormat(
-        "open3dis", (".pth",), masks.holds(dict, "a dict"), masks.open3dis,
-        "Open3DIS's <scene>.pth: a dict of ins (run-length masks or a tensor), conf and final_class",
+    # HOV-SG's objects/pcd_<i>.ply (or .pcd) with row i of mask_feats.pt
+    folder_format("hovsg", hovsg.FEATURES, hovsg.OBJECTS, hovsg.hovsg),
+    # HOV-SG's graph/ with floors, rooms and objects, a .ply and a .json each; the one with floors and rooms
+    folder_format("hovsg-graph", hovsg.FLOORS, hovsg.ROOMS, hovsg.hovsg_graph, "graph", hovsg.scene_of_graph),
+    # OpenLex3D's point_cloud.pcd (or .ply, or input.ply) with two tables
+    folder_format(
+        "openlex3d", dense.LEX_INDEX, dense.LEX_EMBEDDINGS, dense.openlex3d, "prediction", dense.scene_of_openlex3d
     ),
-    FileFormat(
-        "openyolo3d", (".pt",), masks.holds(tuple, "a tuple"), masks.openyolo3d,
-        "Open-YOLO 3D's <scene>.pt: proposals, masks (points, masks) and scores, or masks, classes and scores",
-    ),
-    FileFormat(
-        "openins3d", (".pt",), masks.holds(SparseTensor, "a sparse tensor"), masks.openins3d,
-        "OpenIns3D's masks <scene>.pt: a sparse tensor (points, masks), without scores and classes",
-    ),
-    FileFormat(
-        "sam3d", (".npy", ".pth"), masks.looks_like_groups, masks.sam3d,
-        "SAM3D's <scene>.pth or .npy: a group number for each point, -1 for none, without scores and classes",
-    ),
-    FileFormat(
-        "sam3d-colours", (".ply",), masks.looks_like_colours, masks.sam3d_colours,
-        "SAM3D's coloured clouds <scene>.ply: one colour a group, black for none, the points those of the scene",
-    ),
-    ConceptGraphs(),
-    FolderFormat(
-        "gradslam", dense.POINTS, dense.EMBEDDINGS, dense.gradslam,
-        "ConceptFusion's saved-map/pointclouds of gradslam: pc_points.h5 with pc_embeddings.h5",
-        scene_of=dense.scene_of_gradslam, n_above=3,
-    ),
-    FolderFormat(
-        "hovsg", hovsg.FEATURES, hovsg.OBJECTS, hovsg.hovsg,
-        "HOV-SG's objects/pcd_<i>.ply (or .pcd) with mask_feats.pt, row i of object i",
-    ),
-    FolderFormat(
-        "hovsg-graph", hovsg.FLOORS, hovsg.ROOMS, hovsg.hovsg_graph,
-        "HOV-SG's graph/ with floors, rooms and objects, a .ply and a .json each; the one with floors and rooms",
-        noun="graph", scene_of=hovsg.scene_of_graph,
-    ),
-    FolderFormat(
-        "openlex3d", dense.LEX_INDEX, dense.LEX_EMBEDDINGS, dense.openlex3d,
-        "OpenLex3D's point_cloud.pcd (or .ply, or input.ply) with index.npy and embeddings.npy",
-        noun="prediction", scene_of=dense.scene_of_openlex3d,
-    ),
-    FolderFormat(
-        "ovo", dense.OVO_MAP, dense.OVO_MAP, dense.ovo,
-        f"OVO's <scene>/{dense.OVO_MAP}: points with the object of each, and a feature an object",
-    ),
-    dense.RayFronts(),
-    FolderFormat(
-        "esam", masks.COLOURS, masks.POINTS, masks.esam,
-        f"ESAM's <scene>/{masks.POINTS} and {masks.COLOURS} of its stream demo: one colour a mask, grey for none",
-        noun="prediction",
-    ),
-    FolderFormat(
-        "onlineanyseg", masks.ONLINE_MASKS, masks.ONLINE_CLOUD, masks.onlineanyseg,
-        f"OnlineAnySeg's <scene>/{masks.ONLINE_MASKS}, masks (points, masks) and their features, with the points "
-        f"{masks.ONLINE_CLOUD}",
-        noun="prediction",
-    ),
-    Fross(),
-)  # fmt: skip
+    folder_format("ovo", dense.OVO_MAP, dense.OVO_MAP, dense.ovo),
+    # RayFronts' <scene>/map.pt of its evaluation, or <scene>.pt of a map's save
+    Reader("rayfronts", dense.looks_like_rayfronts, dense.rayfronts_scenes, dense.rayfronts, "map"),
+    # ESAM's two tables of its stream demo: one colour a mask, grey for none
+    folder_format("esam", masks.COLOURS, masks.POINTS, masks.esam, "prediction"),
+    # OnlineAnySeg's masks (points, masks) and their features, with the points
+    folder_format("onlineanyseg", masks.ONLINE_MASKS, masks.ONLINE_CLOUD, masks.onlineanyseg, "prediction"),
+    # FROSS's scene graphs of all scenes in one file, with the classes and predicates of ReplicaSSG
+    Reader("fross", objects.looks_like_fross, objects.fross_scenes, objects.fross, "scene graph"),
+)
 READERS: dict[str, Reader] = {reader.name: reader for reader in _ALL}
 
 
@@ -125,10 +98,6 @@ class Source:
     path: Path
     reader: Reader
     scenes: tuple[str, ...]
-
-    def dataset_of(self, name: str) -> str | None:
-        """The dataset in a name such as ``rooms/living0``."""
-        return name.partition("/")[0] if "/" in name else None
 
 
 @dataclass(frozen=True)
@@ -167,9 +136,7 @@ def match_scenes(
     if len(names) < sum(len(source.scenes) for source in sources):
         twice = next(n for k, s in enumerate(sources) for n in s.scenes if any(n in t.scenes for t in sources[:k]))
         raise PredictionError(f"scene '{printable(twice, 80)}' is predicted in several of the paths; give each once")
-    foreign = [
-        name for name, source in names.items() if dataset is not None and source.dataset_of(name) not in {None, dataset}
-    ]
+    foreign = [name for name in names if dataset is not None and "/" in name and name.partition("/")[0] != dataset]
     remarks = [f"left out, of another dataset: {printable(', '.join(foreign), 200)}"] if foreign else []
     own = {name: _plain(name.rpartition("/")[2]) for name in names if name not in foreign}
     if len(requested) == 1 and len(own) == 1 and not is_known(next(iter(own)), known):
@@ -209,24 +176,20 @@ def is_known(name: str, known: Sequence[str]) -> bool:
 
 def _goes_on(name: str, scene: str) -> bool:
     """Whether ``name`` is ``scene`` with more behind it: ``room0_mesh``, not ``room01``."""
-    for form in (scene, scene.replace("_", ""), scene.replace("-", "_")):
-        if name.startswith(form) and not name[len(form) : len(form) + 1].isalnum():
-            return True
-    return False
+    forms = (scene, scene.replace("_", ""), scene.replace("-", "_"))
+    return any(name.startswith(form) and not name[len(form) : len(form) + 1].isalnum() for form in forms)
 
 
 def _only_name(scene: str, names: Sequence[str], plain: Mapping[str, str]) -> tuple[str, list[str]]:
     same = [name for name in names if plain[name] == _plain(scene)]
-    if len(same or names) > 1:
-        raise PredictionError(
-            f"{scene}: {len(same or names)} predictions match it ({printable(', '.join(same or names), 200)}); "
-            "give the one that is meant"
-        )
-    chosen = (same or names)[0]
-    others = [name for name in names if name != chosen]
-    if others:
-        return chosen, [f"{scene}: '{chosen}' is taken; its name also begins {printable(', '.join(others), 200)}"]
-    return chosen, [] if same else [f"{scene}: the prediction '{printable(chosen, 80)}' is taken for it"]
+    fitting = same or names
+    if len(fitting) > 1:
+        listed = printable(", ".join(fitting), 200)
+        raise PredictionError(f"{scene}: {len(fitting)} predictions match it ({listed}); give the one that is meant")
+    chosen, others = fitting[0], printable(", ".join(name for name in names if name not in same), 200)
+    if same:
+        return chosen, [f"{scene}: '{chosen}' is taken; its name also begins {others}"] if others else []
+    return chosen, [f"{scene}: the prediction '{printable(chosen, 80)}' is taken for it"]
 
 
 def _plain(name: str) -> str:
@@ -238,7 +201,7 @@ def planned_scenes(sources: Sequence[Source], dataset: str) -> list[str] | None:
     planned: list[str] = []
     for source in sources:
         record_file = source.path / "run.json"
-        if source.reader.name != OwnRuns.name or not record_file.is_file():
+        if source.reader is not OWN_RUNS or not record_file.is_file():
             return None
         try:
             record = read_record(RequestRecord, record_file, str(source.path))

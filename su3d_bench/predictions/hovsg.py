@@ -9,19 +9,18 @@ them: where overlaps are equal, who is matched depends on it.
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal, TypeVar
 
 import numpy as np
+from pydantic import BaseModel, Field, ValidationError
 
-from su3d_bench.core.errors import DataError, PredictionError, converted, printable, reading, shown
+from su3d_bench.core.errors import DataError, PredictionError, converted, printable, reading, shown, some
 from su3d_bench.core.system.files import file_bytes
-from su3d_bench.core.types import UP, Float32Array, Float64Array, Floor, Places, Room
-from su3d_bench.formats.arrays import MOST_MASKS, MOST_POINTS, checked_points, feature_table, without_nonfinite
+from su3d_bench.core.types import UP, Float32Array, Floor, Places, Room
+from su3d_bench.formats.arrays import MOST_MASKS, as_float32, checked_points, feature_table, without_nonfinite
 from su3d_bench.formats.pcd import read_pcd_points
 from su3d_bench.formats.ply import read_ply
 from su3d_bench.formats.torch_files import read_torch
@@ -32,6 +31,10 @@ FLOORS, ROOMS, OBJECTS, GRAPH = "floors", "rooms", "objects", "graph"
 NUMBERS = {FLOORS: r"\d{1,9}", ROOMS: r"\d{1,9}_\d{1,9}", OBJECTS: r"\d{1,9}_\d{1,9}_\d{1,9}"}
 MOST_M, MOST_DIMENSIONS = 1e6, 1 << 14
 AGAIN = "copy the graph again"
+OTHER = {".ply": ".json", ".json": ".ply"}  # what lies beside each file
+Fields = TypeVar("Fields", bound=BaseModel)
+Metres = Annotated[float, Field(ge=-MOST_M, le=MOST_M)]
+Feature = Annotated[list[float], Field(min_length=1, max_length=MOST_DIMENSIONS)]
 OBJECT_FILE = re.compile(r"pcd_(0|[1-9]\d{0,8})\.(ply|pcd)")
 
 
@@ -45,31 +48,24 @@ def hovsg(place: Path, scene: str) -> Parsed:
             "both must be of one map"
         )
     features, remarks = without_nonfinite(table[numbers], "objects")
-    instances = instances_of(
-        [checked_points(read_cloud(files[number]), shown(files[number])) for number in numbers],
-        shown(place),
-        features=features,
-        labels=None,
-        names=tuple(f"object {number}" for number in numbers),
-        captions=("",) * len(numbers),
-        ids=numbers,
-    )
+    clouds = [read_points(files[number]) for number in numbers]
+    names = [f"object {number}" for number in numbers]
+    instances = instances_of(clouds, shown(place), features, names=names, ids=numbers)
     return instances, (ONES, *remarks, *_gap_remarks(numbers, len(table)))
 
 
-def read_cloud(file: Path) -> np.ndarray:
-    """The points (N, 3) of a .ply or .pcd file, as they are; ``PredictionError`` where it is damaged."""
+def read_points(file: Path) -> Float32Array:
+    """The points (N, 3) of a .ply or .pcd file in metres; ``PredictionError`` where it is damaged."""
     where = shown(file)
     with converted(DataError, PredictionError):
         if file.suffix == ".pcd":
-            return read_pcd_points(file, where)
+            return checked_points(read_pcd_points(file, where), where)
         vertices = read_ply(file, where).element("vertex")
     columns = {} if vertices is None else vertices.columns
-    axes = [columns.get(axis) for axis in "xyz"]
-    coordinates = [axis for axis in axes if isinstance(axis, np.ndarray)]
-    if len(coordinates) != len(axes):
+    axes = [axis for name in "xyz" if isinstance(axis := columns.get(name), np.ndarray)]
+    if len(axes) < 3:
         raise PredictionError(f"{where}: its vertices have no x, y and z; expected a cloud of points")
-    return np.stack([axis.astype(np.float64) for axis in coordinates], axis=1)
+    return checked_points(np.stack([axis.astype(np.float64) for axis in axes], axis=1), where)
 
 
 def _object_files(folder: Path) -> dict[int, Path]:
@@ -77,10 +73,8 @@ def _object_files(folder: Path) -> dict[int, Path]:
     with reading(shown(folder)):
         names = [entry.name for entry in folder.iterdir() if entry.is_file()]
     files: dict[int, Path] = {}
-    for name in sorted(names):
-        match = OBJECT_FILE.fullmatch(name)
-        if match is None:
-            continue
+    for match in filter(None, map(OBJECT_FILE.fullmatch, sorted(names))):
+        name = match[0]
         if files.setdefault(int(match[1]), folder / name) != folder / name:
             raise PredictionError(f"{shown(folder)}: object {match[1]} is there as .ply and .pcd; keep one of them")
     if len(files) > MOST_MASKS:
@@ -89,25 +83,14 @@ def _object_files(folder: Path) -> dict[int, Path]:
 
 
 def _gap_remarks(numbers: list[int], n_rows: int) -> tuple[str, ...]:
-    is_there = np.zeros(n_rows, np.bool_)
-    is_there[numbers] = True
-    missing = np.flatnonzero(~is_there).tolist()
+    missing = np.setdiff1d(np.arange(n_rows), numbers).astype(str).tolist()
     if not missing:
         return ()
-    remarks = [f"{len(missing)} rows of {FEATURES} have no object file and are not used ({some(missing)})"]
-    lost = [number for number in numbers if number >= len(numbers)]
+    remarks = [f"{len(missing)} rows of {FEATURES} have no object file and are not used ({some(missing, 5)})"]
+    lost = [str(number) for number in numbers if number >= len(numbers)]
     if lost:
-        remarks.append(f"the original's loader would not read the last {len(lost)} objects ({some(lost)})")
+        remarks.append(f"the original's loader would not read the last {len(lost)} objects ({some(lost, 5)})")
     return tuple(remarks)
-
-
-def some(numbers: Sequence[int]) -> str:
-    """The first of ``numbers`` for a message.
-
-    >>> some([1, 2, 3, 4, 5, 6])
-    '1, 2, 3, 4, 5, ...'
-    """
-    return ", ".join(str(number) for number in numbers[:5]) + (", ..." if len(numbers) > 5 else "")
 
 
 # ---- the scene graph
@@ -118,120 +101,82 @@ def scene_of_graph(folder: Path, path: Path) -> str:
     return place.parent.name if place.name == GRAPH else place.name
 
 
+class _FloorFields(BaseModel, strict=True):
+    vertices: Annotated[list[tuple[Metres, Metres, Metres]], Field(min_length=1)]  # the corners of its box
+
+
+class _RoomFields(BaseModel, strict=True):
+    room_zero_level: Metres
+    room_height: Metres
+    name: str | None = None
+
+
+class _ObjectFields(BaseModel, strict=True):
+    name: str | None = None
+    embedding: Feature | Annotated[list[Feature], Field(min_length=1, max_length=1)] | Literal[""] = ""
+
+
 def hovsg_graph(place: Path, scene: str) -> Parsed:
-    floors = tuple(_floor(files) for files in _members(place, FLOORS).values())
-    rooms = _members(place, ROOMS)
-    objects = _members(place, OBJECTS)
+    floors = tuple(_floor(file) for file in _members(place, FLOORS).values())
+    rooms, objects = _members(place, ROOMS), _members(place, OBJECTS)
     stray = next((name for name in objects if name.rpartition("_")[0] not in rooms), None)
     if stray is not None:
         raise PredictionError(f"{shown(place / OBJECTS)}: object {stray} is in no room of {ROOMS}/; {AGAIN}")
-    tables = [_table(files) for files in objects.values()]
-    embeddings = [_embedding(table, files) for table, files in zip(tables, objects.values(), strict=True)]
-    features, remarks = _features(embeddings, place)
-    instances = instances_of(
-        [checked_points(read_cloud(files["ply"]), shown(files["ply"])) for files in objects.values()],
-        shown(place),
-        features=features,
-        labels=None,
-        names=tuple(f"object {name}" for name in objects),
-        captions=tuple(_text(table, "name", files) for table, files in zip(tables, objects.values(), strict=True)),
-        ids=range(len(objects)),
-    )
-    graph = Places(floors, tuple(_room(files) for files in rooms.values()))
+    tables = [_fields(file, _ObjectFields) for file in objects.values()]
+    features, remarks = _features([_embedding(table) for table in tables], place)
+    clouds = [read_points(file) for file in objects.values()]
+    names, captions = [f"object {name}" for name in objects], [printable(table.name or "", 200) for table in tables]
+    instances = instances_of(clouds, shown(place), features, names=names, captions=captions, ids=range(len(objects)))
+    graph = Places(floors, tuple(map(_room, rooms.values())))
     return replace(instances, places=graph), (ONES, *remarks)
 
 
-def _members(place: Path, kind: str) -> dict[str, dict[str, Path]]:
-    """Name -> its cloud and its JSON file, in the order of the clouds' names; both must be there."""
+def _members(place: Path, kind: str) -> dict[str, Path]:
+    """Name -> its cloud, in the order of the clouds' names; each has a JSON file beside it, and that a cloud."""
     folder = place / kind
     with reading(shown(folder)):
-        files = sorted(entry.name for entry in folder.iterdir() if entry.is_file())
-    found: dict[str, dict[str, Path]] = {}
-    for ending in ("ply", "json"):
-        for file in files:
-            match = re.fullmatch(rf"({NUMBERS[kind]})\.{ending}", file, re.ASCII)
-            if match is not None:
-                found.setdefault(match[1], {})[ending] = folder / file
-    alone = next((name for name, pair in found.items() if len(pair) < 2), None)
-    if alone is not None:
-        (there,) = found[alone].values()
-        raise PredictionError(
-            f"{shown(there)}: has no {'.json' if there.suffix == '.ply' else '.ply'} beside it; {AGAIN}"
-        )
-    if len(found) > MOST_MASKS:
-        raise PredictionError(f"{shown(folder)}: holds {len(found)} {kind}; is it damaged?")
-    return found
+        entries = sorted(entry for entry in folder.iterdir() if entry.suffix in OTHER and entry.is_file())
+    files = {entry: None for entry in entries if re.fullmatch(NUMBERS[kind], entry.stem, re.ASCII)}
+    for file in files:
+        if file.with_suffix(OTHER[file.suffix]) not in files:
+            raise PredictionError(f"{shown(file)}: has no {OTHER[file.suffix]} beside it; {AGAIN}")
+    if len(files) > 2 * MOST_MASKS:
+        raise PredictionError(f"{shown(folder)}: holds {len(files)} files of {kind}; is it damaged?")
+    return {file.stem: file for file in files if file.suffix == ".ply"}
 
 
-def _table(files: Mapping[str, Path]) -> dict[str, Any]:
-    path = files["json"]
+def _fields(cloud: Path, model: type[Fields]) -> Fields:
+    """What the JSON file beside a cloud says."""
+    path = cloud.with_suffix(".json")
     with reading(shown(path)):
         content = file_bytes(path)
     try:
-        table = json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise PredictionError(f"{shown(path)}: not JSON ({printable(str(error), 80)}); {AGAIN}") from error
-    if not isinstance(table, dict):
-        raise PredictionError(f"{shown(path)}: is no JSON object; {AGAIN}")
-    return table
+        return model.model_validate_json(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        reason = printable(f"{'.'.join(map(str, first['loc'][:1]))}: {first['msg']}", 120)
+        raise PredictionError(f"{shown(path)}: {reason.removeprefix(': ')}; {AGAIN}") from error
 
 
-def _floor(files: Mapping[str, Path]) -> Floor:
-    """The heights of a floor, from the corners of its box."""
-    corners = _numbers(_table(files), "vertices", files)
-    if corners.ndim != 2 or corners.shape[1:] != (3,) or not len(corners):
-        raise PredictionError(
-            f"{shown(files['json'])}: 'vertices' has the shape {corners.shape}; expected corners of a box"
-        )
-    middle, height = corners[:, UP].mean(), np.ptp(corners[:, UP])
+def _floor(cloud: Path) -> Floor:
+    """The heights of a floor."""
+    heights = np.array(_fields(cloud, _FloorFields).vertices)[:, UP]
+    middle, height = heights.mean(), np.ptp(heights)
     return Floor(float(middle - height / 2), float(middle + height / 2))
 
 
-def _room(files: Mapping[str, Path]) -> Room:
-    table = _table(files)
-    zero, height = (_numbers(table, key, files) for key in ("room_zero_level", "room_height"))
-    if zero.shape or height.shape:
-        raise PredictionError(f"{shown(files['json'])}: 'room_zero_level' and 'room_height' must be one number each")
-    points = checked_points(read_cloud(files["ply"]), shown(files["ply"])).astype(np.float64)
-    if not 0 < len(points) <= MOST_POINTS:
-        raise PredictionError(f"{shown(files['ply'])}: has {len(points)} points; {AGAIN}")
-    low, high, middle = float(zero), float(zero + height), float(zero + height / 2)
-    return Room(points, low, high, middle, _text(table, "name", files))
+def _room(cloud: Path) -> Room:
+    fields, points = _fields(cloud, _RoomFields), read_points(cloud).astype(np.float64)
+    if not len(points):
+        raise PredictionError(f"{shown(cloud)}: has no points; {AGAIN}")
+    low, height = fields.room_zero_level, fields.room_height
+    return Room(points, low, low + height, low + height / 2, printable(fields.name or "", 200))
 
 
-def _numbers(table: Mapping[str, Any], key: str, files: Mapping[str, Path]) -> Float64Array:
-    """The number, or list or table of numbers, under ``key``."""
-    try:
-        values = np.array(table.get(key))
-    except (ValueError, TypeError, RecursionError):
-        values = np.array(None)
-    if values.dtype.kind not in "if" or not (np.abs(values) <= MOST_M).all():
-        raise PredictionError(f"{shown(files['json'])}: '{key}' holds no metres; {AGAIN}")
-    return values.astype(np.float64)
-
-
-def _text(table: Mapping[str, Any], key: str, files: Mapping[str, Path]) -> str:
-    value = table.get(key) or ""
-    if not isinstance(value, str):
-        raise PredictionError(f"{shown(files['json'])}: '{key}' is {printable(str(value), 40)}; expected a text")
-    return printable(value, 200)
-
-
-def _embedding(table: Mapping[str, Any], files: Mapping[str, Path]) -> Float32Array | None:
+def _embedding(table: _ObjectFields) -> Float32Array | None:
     """The feature (D,) of an object; None where it has none."""
-    value = table.get("embedding", "")
-    if value == "":
-        return None
-    try:
-        feature = np.array(value)
-    except (ValueError, TypeError, RecursionError):
-        feature = np.array(None)
-    if feature.ndim == 2 and len(feature) == 1:
-        feature = feature[0]
-    if feature.dtype.kind not in "if" or feature.ndim != 1 or not 0 < len(feature) <= MOST_DIMENSIONS:
-        raise PredictionError(f"{shown(files['json'])}: 'embedding' is no list of numbers; {AGAIN}")
-    with np.errstate(over="ignore"):
-        return feature.astype(np.float32)
+    values = np.array(table.embedding or None)
+    return as_float32(values.reshape(-1)) if values.ndim else None
 
 
 def _features(embeddings: list[Float32Array | None], place: Path) -> tuple[Float32Array | None, tuple[str, ...]]:

@@ -19,28 +19,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import DataError, PredictionError, converted, reading, shown
+from su3d_bench.core.errors import DataError, PredictionError, converted, shown
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float32Array, Int32Array, Int64Array
-from su3d_bench.formats.arrays import (
-    MOST_MASKS,
-    MOST_POINTS,
-    check_members,
-    check_sizes,
-    checked_points,
-    classes_of,
-    column_members,
-    kind_of,
-    matrix_of,
-    run_members,
-    scores_of,
-    without_nonfinite,
-)
+from su3d_bench.formats import arrays
 from su3d_bench.formats.numpy_files import map_npy, npz_names, read_npy, read_npz
 from su3d_bench.formats.ply import first_rows, read_ply
 from su3d_bench.formats.torch_files import SparseTensor, read_torch
-from su3d_bench.predictions.base import NO_SCORES, Numbering, Parsed, VertexMasks, vertex_masks
-from su3d_bench.predictions.hovsg import read_cloud
+from su3d_bench.predictions.base import NO_SCORES, Parsed, VertexMasks, vertex_masks
+from su3d_bench.predictions.hovsg import read_points
 
 ALL_ONES = "Open-YOLO 3D's own evaluator puts 1 for every score"
 WITHOUT_CLASSES = "groups without classes"
@@ -60,10 +47,7 @@ def holds(kind: type | tuple[type, ...], content: str) -> Callable[[Path], str |
     """A look at a file of ``torch.save``: whether its value is of ``kind``, which messages call ``content``."""
 
     def looks(first: Path) -> str | None:
-        try:
-            is_kind = isinstance(read_torch(first, is_outline=True), kind)
-        except PredictionError:
-            return None
+        is_kind = isinstance(read_torch(first, is_outline=True), kind)
         return f"its {first.suffix} files hold {content}" if is_kind else None
 
     return looks
@@ -82,21 +66,14 @@ def looks_like_masks(first: Path) -> str | None:
 def looks_like_groups(first: Path) -> str | None:
     if first.suffix != ".npy":
         return holds(np.ndarray, "one array")(first)
-    try:
-        array = map_npy(first)
-    except PredictionError:
-        return None
+    array = map_npy(first)
     return "its .npy files hold a list of integers" if array.ndim == 1 and array.dtype.kind in "iu" else None
 
 
 def looks_like_colours(first: Path) -> str | None:
     if (first.parent / ONLINE_MASKS).is_file():  # the cloud that those masks are over
         return None
-    try:
-        with reading(shown(first)):
-            colours = _colours(first_rows(first, "vertex"))
-    except (DataError, PredictionError):
-        return None
+    colours = _colours(first_rows(first, "vertex"))
     is_group = colours is not None and len(np.unique(colours)) * POINTS_OF_A_COLOUR <= len(colours) > 0
     return "its .ply files hold clouds in which many points share a colour" if is_group else None
 
@@ -104,35 +81,28 @@ def looks_like_colours(first: Path) -> str | None:
 # ---- matrices, run lengths and sparse tensors
 
 
-def matrix_masks(
-    where: str,
-    value: object,
-    scores: object = None,
-    classes: object = None,
-    numbering: Numbering = "id",
-    features: Float32Array | None = None,
-) -> VertexMasks:
+def matrix_masks(where: str, value: object, scores: object = None, classes: object = None, **more: Any) -> VertexMasks:
     """The masks in the columns of a matrix (points, masks), with scores and classes where they are not None."""
-    matrix = matrix_of(value, where)
-    n_points, n_masks = matrix.shape
-    return vertex_masks(
-        where,
-        column_members(matrix, where),
-        n_points,
-        scores=None if scores is None else scores_of(scores, n_masks, where),
-        class_numbers=None if classes is None else classes_of(classes, n_masks, where),
-        numbering=numbering,
-        features=features,
-    )
+    matrix = arrays.matrix_of(value, where)
+    return _scored(where, arrays.column_members(matrix, where), len(matrix), scores, classes, **more)
+
+
+def _scored(
+    where: str, members: list[Int32Array], n_points: int | None, scores: object, classes: object, **more: Any
+) -> VertexMasks:
+    n = len(members)
+    more["scores"] = None if scores is None else arrays.scores_of(scores, n, where)
+    more["class_numbers"] = None if classes is None else arrays.classes_of(classes, n, where)
+    return vertex_masks(where, members, n_points, **more)
 
 
 def maskclustering(place: Path, scene: str) -> Parsed:
     where = shown(place)
-    arrays = read_npz(place, ("pred_masks", "pred_score", "pred_scores", "pred_classes"))
-    if "pred_masks" not in arrays:
+    archive = read_npz(place, ("pred_masks", "pred_score", "pred_scores", "pred_classes"))
+    if "pred_masks" not in archive:
         raise PredictionError(f"{where}: has no 'pred_masks'; expected an archive of MaskClustering or Mask3D")
-    scores, classes = arrays.get("pred_score", arrays.get("pred_scores")), arrays.get("pred_classes")
-    masks = matrix_masks(where, arrays["pred_masks"], scores, classes)
+    scores, classes = archive.get("pred_score", archive.get("pred_scores")), archive.get("pred_classes")
+    masks = matrix_masks(where, archive["pred_masks"], scores, classes)
     remarks = [] if scores is not None else [NO_SCORES]
     if classes is not None and len(masks) and not classes.any():
         remarks.append("every mask has class 0, as MaskClustering writes class-agnostic masks")
@@ -143,35 +113,33 @@ def openyolo3d(place: Path, scene: str) -> Parsed:
     where, value = shown(place), read_torch(place)
     if not isinstance(value, tuple | list) or len(value) not in (2, 3):
         raise PredictionError(
-            f"{where}: holds {kind_of(value)}; expected masks and scores, or masks, classes and scores"
+            f"{where}: holds {arrays.kind_of(value)}; expected masks and scores, or masks, classes and scores"
         )
-    masks = matrix_masks(where, value[0], value[-1], value[1] if len(value) == 3 else None, "index")
+    masks = matrix_masks(where, value[0], value[-1], value[1] if len(value) == 3 else None, numbering="index")
     return masks, (ALL_ONES,) if len(value) == 3 else ("proposals without classes", ALL_ONES)
 
 
 def openmask3d(place: Path, scene: str) -> Parsed:
     """The masks, and the features (masks, D) that lie beside them, as they are; a row with NaN is one without one."""
     where = shown(place)
-    matrix = matrix_of(read_torch(place), where)
+    matrix = arrays.matrix_of(read_torch(place), where)
     n_masks = matrix.shape[1]
     names = [f"{scene}{end}" for end in FEATURES_SUFFIXES]
     file = next((candidate for name in names if (candidate := place.parent / name).is_file()), None)
     if file is None:
         remark = f"no '{names[0]}' lies beside the masks: they have no features"
         return matrix_masks(where, matrix), (NO_SCORES, remark)
-    values = read_npy(file)
-    if values.ndim != 2 or values.dtype.kind not in "fiu" or len(values) != n_masks:
-        raise PredictionError(f"{shown(file)}: {n_masks} masks, but the features are {kind_of(values)}")
+    found = f"{shown(file)}: {n_masks} masks, but the features are"
+    values = arrays.array_of(read_npy(file), found, "a row a mask", "fiu", n_masks, None)
     # OpenMask3D normalises and puts 0 for what is NaN then, which makes a row with a NaN or infinity one of zeros.
-    with np.errstate(over="ignore", invalid="ignore"):
-        features, remarks = without_nonfinite(values.astype(np.float32), "masks")
+    features, remarks = arrays.without_nonfinite(arrays.as_float32(values), "masks")
     return matrix_masks(where, matrix, features=features), (NO_SCORES, *remarks)
 
 
 def open3dis(place: Path, scene: str) -> Parsed:
     where, value = shown(place), read_torch(place)
     if not isinstance(value, dict) or "ins" not in value:
-        raise PredictionError(f"{where}: holds {kind_of(value)} without 'ins'; expected a dict of Open3DIS")
+        raise PredictionError(f"{where}: holds {arrays.kind_of(value)} without 'ins'; expected a dict of Open3DIS")
     scores, classes = _scores_of_classes(value.get("conf"), value.get("final_class")), value.get("final_class")
     n_known = next(
         (len(column) for column in (classes, scores) if isinstance(column, np.ndarray) and column.ndim == 1), None
@@ -180,45 +148,36 @@ def open3dis(place: Path, scene: str) -> Parsed:
     remarks = [NO_SCORES if scores is None else "Open3DIS's own evaluator puts 1 for every confidence"]
     if classes is None:
         remarks.append("the file has no classes: the masks are class-agnostic")
-    masks = vertex_masks(
-        where,
-        members,
-        n_points,
-        scores=None if scores is None else scores_of(scores, len(members), where),
-        class_numbers=None if classes is None else classes_of(classes, len(members), where),
-        numbering="index",
-    )
-    return masks, remarks
+    return _scored(where, members, n_points, scores, classes, numbering="index"), remarks
 
 
 def _scores_of_classes(scores: object, classes: object) -> object:
     """The score of the class of each mask, where maskwise_vocab.py has those of all classes, mask after mask."""
-    are_lists = all(isinstance(column, np.ndarray) and column.ndim == 1 for column in (scores, classes))
-    if not are_lists or not isinstance(scores, np.ndarray) or not isinstance(classes, np.ndarray) or not len(classes):
+    if not all(isinstance(column, np.ndarray) and column.ndim == 1 and column.size for column in (scores, classes)):
         return scores
-    n_classes, rest = divmod(len(scores), len(classes))
-    is_place = classes.dtype.kind in "iu" and 0 <= int(classes.min()) <= int(classes.max()) < n_classes
-    return (
-        scores.reshape(-1, n_classes)[np.arange(len(classes)), classes]
-        if not rest and n_classes > 1 and is_place
-        else scores
-    )
+    table: Any = scores
+    places: Any = classes
+    n_classes, rest = divmod(len(table), len(places))
+    is_place = places.dtype.kind in "iu" and 0 <= int(places.min()) <= int(places.max()) < n_classes
+    if rest or n_classes == 1 or not is_place:
+        return scores
+    return table.reshape(-1, n_classes)[np.arange(len(places)), places]
 
 
 def _instances(value: object, n_known: int | None, where: str) -> tuple[list[Int32Array], int | None]:
     """Members of each mask and the number of points, from run lengths or a matrix; ``n_known`` masks, if known."""
     if isinstance(value, np.ndarray):
-        matrix = _masks_in_columns(matrix_of(value, where), n_known, where)
-        return column_members(matrix, where), len(matrix)
+        matrix = _masks_in_columns(arrays.matrix_of(value, where), n_known, where)
+        return arrays.column_members(matrix, where), len(matrix)
     if not isinstance(value, list):
-        raise PredictionError(f"{where}: 'ins' is {kind_of(value)}; expected a list of run lengths or a tensor")
+        raise PredictionError(f"{where}: 'ins' is {arrays.kind_of(value)}; expected a list of run lengths or a tensor")
     members: list[Int32Array] = []
     length, n = None, 0
     for k, mask in enumerate(value):
         if not isinstance(mask, dict) or "length" not in mask or "counts" not in mask:
-            raise PredictionError(f"{where}: mask {k} is {kind_of(mask)}; expected a dict of length and counts")
-        members.append(run_members(mask["length"], mask["counts"], f"{where}: mask {k}"))
-        check_members(n := n + len(members[-1]) + len(mask["counts"]), where)  # empty runs take time, too
+            raise PredictionError(f"{where}: mask {k} is {arrays.kind_of(mask)}; expected a dict of length and counts")
+        members.append(arrays.run_members(mask["length"], mask["counts"], f"{where}: mask {k}"))
+        arrays.check_members(n := n + len(members[-1]) + len(mask["counts"]), where)  # empty runs take time, too
         if length not in {None, int(mask["length"])}:
             raise PredictionError(f"{where}: mask {k} is of {mask['length']} points, mask 0 of {length}")
         length = int(mask["length"])
@@ -229,7 +188,9 @@ def _masks_in_columns(matrix: NDArray[Any], n_known: int | None, where: str) -> 
     """(points, masks): Open3DIS has masks in rows; the number of scores or classes tells, or else the longer side."""
     n_rows, n_columns = matrix.shape
     if n_known is not None and n_known not in {n_rows, n_columns}:
-        raise PredictionError(f"{where}: the masks are {kind_of(matrix)}, but there are {n_known} scores or classes")
+        raise PredictionError(
+            f"{where}: the masks are {arrays.kind_of(matrix)}, but there are {n_known} scores or classes"
+        )
     are_rows = n_rows == n_known if n_known is not None else n_rows <= n_columns
     return matrix.T if are_rows else matrix
 
@@ -238,16 +199,16 @@ def openins3d(place: Path, scene: str) -> Parsed:
     where, value = shown(place), read_torch(place)
     if not isinstance(value, SparseTensor) or len(value.shape) != 2:
         raise PredictionError(
-            f"{where}: holds {kind_of(value)}; expected a sparse tensor (points, masks), as OpenIns3D saves it"
+            f"{where}: holds {arrays.kind_of(value)}; expected a sparse tensor (points, masks), as OpenIns3D saves it"
         )
     remark = "masks without classes; OpenIns3D evaluates with classes and scores that it does not save"
     return _sparse_masks(value, where), (NO_SCORES, remark)
 
 
 def _sparse_masks(sparse: SparseTensor, where: str) -> VertexMasks:
-    values = matrix_of(sparse.values[np.newaxis], where)[0].astype(np.float64)
+    values = arrays.matrix_of(sparse.values[np.newaxis], where)[0].astype(np.float64)
     n_points, n_masks = sparse.shape
-    check_sizes(n_points, n_masks, where)
+    arrays.check_sizes(n_points, n_masks, where)
     limits = np.array(sparse.shape, np.int64)[:, np.newaxis]
     if ((sparse.indices < 0) | (sparse.indices >= limits)).any():
         raise PredictionError(f"{where}: a sparse tensor of shape {sparse.shape} has a value outside of it")
@@ -268,11 +229,9 @@ def _sparse_masks(sparse: SparseTensor, where: str) -> VertexMasks:
 def sam3d(place: Path, scene: str) -> Parsed:
     """One integer a point of the scene, -1 where it is in no group."""
     where = shown(place)
-    groups = read_npy(place) if place.suffix == ".npy" else read_torch(place)
-    if not isinstance(groups, np.ndarray) or groups.ndim != 1 or groups.dtype.kind not in "iu":
-        raise PredictionError(f"{where}: holds {kind_of(groups)}; expected one group number a point")
-    if len(groups) > MOST_POINTS:
-        raise PredictionError(f"{where}: holds {kind_of(groups)}; is it damaged?")
+    value = read_npy(place) if place.suffix == ".npy" else read_torch(place)
+    groups = arrays.array_of(value, f"{where}: holds", "one group number a point", "iu", None)
+    arrays.check_sizes(len(groups), 0, where)
     return masks_of_groups(groups, "group", where), (NO_SCORES, WITHOUT_CLASSES)
 
 
@@ -284,7 +243,7 @@ def sam3d_colours(place: Path, scene: str) -> Parsed:
     if colours is None:
         raise PredictionError(f"{where}: its points have no colours red, green, blue of one byte each")
     groups = np.where(colours == 0, -1, colours)
-    if len(np.unique(groups)) > MOST_MASKS:
+    if len(np.unique(groups)) > arrays.MOST_MASKS:
         raise PredictionError(
             f"{where}: {len(np.unique(groups))} colours; expected one a group: is it the cloud of a photograph?"
         )
@@ -296,11 +255,8 @@ def esam(place: Path, scene: str) -> Parsed:
     """The points of all frames, and the colour of the mask of each."""
     points, colours, where = read_npy(place / POINTS), read_npy(place / COLOURS), shown(place / COLOURS)
     cloud = points.reshape(-1, points.shape[-1]) if points.ndim == 3 else points
-    places = checked_points(cloud, shown(place / POINTS))
-    if colours.shape != points.shape or colours.dtype.kind not in "iu":
-        raise PredictionError(
-            f"{where}: holds {kind_of(colours)}; expected a colour for each of {POINTS}, {points.shape}"
-        )
+    places = arrays.checked_points(cloud, shown(place / POINTS))
+    arrays.array_of(colours, f"{where}: holds", f"a colour for each of {POINTS}, {points.shape}", "iu", *points.shape)
     if colours.size and not 0 <= int(colours.min()) <= int(colours.max()) <= 255:
         raise PredictionError(f"{where}: a channel is {int(colours.min())} or {int(colours.max())}; expected 0 to 255")
     groups = _of_channels(*colours.reshape(-1, 3).T)
@@ -341,9 +297,9 @@ def _of_channels(red: Any, green: Any, blue: Any) -> Int64Array:
 def onlineanyseg(place: Path, scene: str) -> Parsed:
     """Masks over the points that it rebuilt itself, with a feature (of the file's (D, masks)) each."""
     where = shown(place / ONLINE_MASKS)
-    points = checked_points(read_cloud(place / ONLINE_CLOUD), shown(place / ONLINE_CLOUD))
-    arrays = read_npz(place / ONLINE_MASKS, ("pred_masks", "pred_score", "pred_sem_features"))
-    masks = matrix_masks(where, arrays.get("pred_masks"), arrays.get("pred_score"))
+    points = read_points(place / ONLINE_CLOUD)
+    archive = read_npz(place / ONLINE_MASKS, ("pred_masks", "pred_score", "pred_sem_features"))
+    masks = matrix_masks(where, archive.get("pred_masks"), archive.get("pred_score"))
     if masks.n_points != len(points):
         raise PredictionError(
             f"{where}: the masks are of {masks.n_points} points, {ONLINE_CLOUD} has {len(points)}; both must be of one "
@@ -351,14 +307,9 @@ def onlineanyseg(place: Path, scene: str) -> Parsed:
         )
     features: Float32Array | None = None
     remarks: tuple[str, ...] = ("the file has no features: the masks are class-agnostic",)
-    value: Any = arrays.get("pred_sem_features")
-    if value is not None:
-        if value.ndim != 2 or value.dtype.kind != "f" or value.shape[1] != len(masks):
-            raise PredictionError(
-                f"{where}: {len(masks)} masks, but the features are {kind_of(value)}; expected a column a mask"
-            )
-        with np.errstate(over="ignore", invalid="ignore"):
-            table = np.ascontiguousarray(value.T).astype(np.float32)
-            features, remarks = without_nonfinite(table, "masks")
+    if "pred_sem_features" in archive:
+        found = f"{where}: {len(masks)} masks, but the features are"
+        table = arrays.array_of(archive["pred_sem_features"], found, "a column a mask", "f", None, len(masks))
+        features, remarks = arrays.without_nonfinite(arrays.as_float32(np.ascontiguousarray(table.T)), "masks")
     instances = Instances.of(points, masks, masks.scores, features, names=masks.keys)
-    return instances, (*remarks, *(() if "pred_score" in arrays else (NO_SCORES,)))
+    return instances, (*remarks, *(() if "pred_score" in archive else (NO_SCORES,)))

@@ -20,15 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, printable, shown
-from su3d_bench.core.files.atomic import Allowance, UnpackingError
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float32Array, Float64Array
-from su3d_bench.formats.arrays import MOST_MASKS, checked_points, kind_of, without_nonfinite
+from su3d_bench.formats import arrays
 from su3d_bench.formats.pickles import read_pickle_file
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.relations import last_best
-from su3d_bench.predictions.base import ONES, Reader, ScenePrediction, first_found, instances_of, named_once
+from su3d_bench.predictions.base import ONES, Parsed, first_found, instances_of, named_once
 
 SUFFIX = ".pkl.gz"
 POST = f"_post{SUFFIX}"
@@ -42,45 +41,44 @@ FORGOTTEN_OF_GRAPHS = ("mean", "cov")
 MOST_SCENES, MOST_EDGES = 10_000, 10_000_000
 
 
-class ConceptGraphs(Reader):
-    name = "conceptgraphs"
-    summary = "ConceptGraphs' pcd_saves/full_pcd_*.pkl.gz (_post before the other) or exps/*/pcd_*.pkl.gz of ali-dev"
-    noun = "map"
-
-    def recognise(self, path: Path) -> str | None:
-        if path.is_file():
-            is_map = path.name.endswith(SUFFIX) and path.name.startswith(("full_pcd_", "pcd_"))
-            return "its name is that of a map of ConceptGraphs" if is_map else None
-        return f"it holds {FULL} or {STREAMLINED}" if _maps(path) else None
-
-    def scenes(self, path: Path) -> Mapping[str, Path]:
-        if path.is_file():
-            return {_scene_of(path): path}
-        return named_once([(_scene_of(file), file.parent) for file in _maps(path)], path)
-
-    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
-        file, remarks = (place, []) if place.is_file() else _chosen(place)
-        where = shown(file)
-        value = read_pickle_file(file, forget=FORGOTTEN)
-        if not isinstance(value, dict) or not isinstance(value.get("objects"), list):
-            raise PredictionError(f"{where}: holds {kind_of(value)} without a list of 'objects'; expected a map")
-        background = _background(value.get("bg_objects"), where)
-        entries = [entry for entry in (*value["objects"], *background) if isinstance(entry, dict)]
-        _check_sum([entry.get(key) for entry in entries for key in ("pcd_np", "clip_ft", "class_id")], file, where)
-        instances, more = _instances(value["objects"], background, _class_names(value.get("class_names")), where)
-        return ScenePrediction(scene, self.name, file, instances, (ONES, *remarks, *more))
+def looks_like_conceptgraphs(path: Path) -> str | None:
+    if path.is_file():
+        is_map = path.name.endswith(SUFFIX) and path.name.startswith(("full_pcd_", "pcd_"))
+        return "its name is that of a map of ConceptGraphs" if is_map else None
+    return f"it holds {FULL} or {STREAMLINED}" if _maps(path) else None
 
 
-def _check_sum(values: Sequence[object], file: Path, where: str) -> None:
+def conceptgraphs_scenes(path: Path) -> Mapping[str, Path]:
+    if path.is_file():
+        return {_scene_of(path): path}
+    of_folder: dict[Path, list[Path]] = {}
+    for file in _maps(path):
+        of_folder.setdefault(file.parent, []).append(file)
+    return named_once([(_scene_of(files[0]), _chosen(files)) for files in of_folder.values()], path)
+
+
+def conceptgraphs(place: Path, scene: str) -> Parsed:
+    where, remarks = shown(place), [ONES]
+    if place.name.endswith(POST) and place.with_name(place.name.removesuffix(POST) + SUFFIX).exists():
+        remarks.append(f"'{printable(place.name, 120)}' is read, not the map before the last merging beside it")
+    value = read_pickle_file(place, forget=FORGOTTEN)
+    if not isinstance(value, dict) or not isinstance(value.get("objects"), list):
+        raise PredictionError(f"{where}: holds {arrays.kind_of(value)} without a list of 'objects'; expected a map")
+    background = _background(value.get("bg_objects"), where)
+    entries = [entry for entry in (*value["objects"], *background) if isinstance(entry, dict)]
+    _check_sum([entry.get(key) for entry in entries for key in ("pcd_np", "clip_ft", "class_id")], place)
+    instances, more = _instances(value["objects"], background, _class_names(value.get("class_names")), where)
+    return instances, (*remarks, *more)
+
+
+def _check_sum(values: Sequence[Any], file: Path) -> None:
     """Refuses objects that share what they hold, which costs the file a few bytes and memory or time for each."""
-    try:
-        Allowance(file.stat().st_size).spend(4 * sum(map(_n_values, values)))
-    except UnpackingError as error:
-        raise PredictionError(f"{where}: {error}") from error
+    sizes = [np.size(value) if isinstance(value, np.ndarray) else len(value) for value in values if _is_many(value)]
+    arrays.check_memory(4 * sum(sizes), file)
 
 
-def _n_values(value: object) -> int:
-    return value.size if isinstance(value, np.ndarray) else len(value) if isinstance(value, list | tuple) else 0
+def _is_many(value: object) -> bool:
+    return isinstance(value, np.ndarray | list | tuple)
 
 
 def _maps(path: Path) -> list[Path]:
@@ -100,15 +98,12 @@ def _scene_of(file: Path) -> str:
     return file.name.removesuffix(SUFFIX)
 
 
-def _chosen(folder: Path) -> tuple[Path, list[str]]:
-    """The only map of a folder, or of a pair the one after the last merging, with a remark."""
-    files = _maps(folder)
-    if len(files) == 1:
-        return files[0], []
-    if len(files) == 2 and files[1].name == files[0].name.removesuffix(SUFFIX) + POST:
-        return files[1], [f"'{printable(files[1].name, 120)}' is read, not the map before the last merging beside it"]
+def _chosen(files: Sequence[Path]) -> Path:
+    """The only map of a folder, or of a pair the one after the last merging."""
+    if len(files) == 1 or [file.name for file in files[1:]] == [files[0].name.removesuffix(SUFFIX) + POST]:
+        return files[-1]
     names = printable(", ".join(file.name for file in files), 200)
-    raise PredictionError(f"{shown(folder)}: holds {len(files)} maps ({names}); give one of these files")
+    raise PredictionError(f"{shown(files[0].parent)}: holds {len(files)} maps ({names}); give one of these files")
 
 
 def _class_names(value: object) -> tuple[str, ...]:
@@ -116,7 +111,9 @@ def _class_names(value: object) -> tuple[str, ...]:
     texts = value.tolist() if isinstance(value, np.ndarray) and value.dtype.kind == "U" else value
     if not isinstance(texts, list | tuple):
         return ()
-    return tuple(printable(text[:MOST_TEXT], 80) if isinstance(text, str) else "" for text in texts[:MOST_MASKS])
+    return tuple(
+        printable(text[:MOST_TEXT], 80) if isinstance(text, str) else "" for text in texts[: arrays.MOST_MASKS]
+    )
 
 
 def _instances(
@@ -128,14 +125,16 @@ def _instances(
     classes it does not load them; here they are then left out because their names are among the excluded ones.
     """
     everything = [*objects, *background]
-    if len(everything) > MOST_MASKS:
+    if len(everything) > arrays.MOST_MASKS:
         raise PredictionError(f"{where}: holds {len(everything)} objects; is it damaged?")
     clouds, names, captions = [], [], []
     for k, entry in enumerate(everything):
         at = f"{where}: object {k}"
         if not isinstance(entry, dict) or "pcd_np" not in entry:
-            raise PredictionError(f"{at}: is {kind_of(entry)} without 'pcd_np'; expected an object of ConceptGraphs")
-        clouds.append(checked_points(entry["pcd_np"], at))
+            raise PredictionError(
+                f"{at}: is {arrays.kind_of(entry)} without 'pcd_np'; expected an object of ConceptGraphs"
+            )
+        clouds.append(arrays.checked_points(entry["pcd_np"], at))
         names.append(_name(entry, _majority(entry.get("class_id")), class_names))
         caption = entry.get("consolidated_caption")
         captions.append(printable(caption[:MOST_TEXT], MOST_TEXT) if isinstance(caption, str) else "")
@@ -156,7 +155,7 @@ def _instances(
     instances = instances_of(
         clouds,
         where,
-        features=features,
+        features,
         labels=(*own, *walls) if has_labels else None,
         names=tuple(names),
         captions=tuple(captions),
@@ -171,8 +170,7 @@ def _rows_like(background: Sequence[Mapping[str, Any]], n: int) -> Float32Array:
     for k, entry in enumerate(background):
         row = entry.get("clip_ft")
         if isinstance(row, np.ndarray) and row.shape == (n,) and row.dtype.kind == "f" and np.isfinite(row).all():
-            with np.errstate(over="ignore"):
-                rows[k] = row
+            rows[k] = arrays.as_float32(row)
     rows[~np.isfinite(rows).all(axis=1)] = 0
     return rows
 
@@ -202,70 +200,63 @@ def _features(objects: Sequence[Mapping[str, Any]], where: str) -> tuple[Float32
     """The features (K, D) of the objects; None where no object has one."""
     rows_of_file = [entry.get("clip_ft") for entry in objects]
     if not any(entry is not None for entry in rows_of_file):
-        return None, ["the objects have no 'clip_ft': the names of their detections decide their classes"] * bool(
-            rows_of_file
-        )
+        remark = "the objects have no 'clip_ft': the names of their detections decide their classes"
+        return None, [remark] * bool(rows_of_file)
     rows: list[Float32Array] = []
     for k, row in enumerate(rows_of_file):
-        is_row = isinstance(row, np.ndarray) and row.ndim == 1 and row.dtype.kind == "f" and row.size > 0
-        if not isinstance(row, np.ndarray) or not is_row or (rows and row.shape != rows[0].shape):
-            beside = f" of {len(rows[0])} numbers, as object 0 has" if rows else ""
-            raise PredictionError(f"{where}: object {k}: 'clip_ft' is {kind_of(row)}; expected a list{beside}")
-        with np.errstate(over="ignore", invalid="ignore"):
-            rows.append(row.astype(np.float32))
-    features, remarks = without_nonfinite(np.stack(rows), "objects")
+        beside = f" of {len(rows[0])} numbers, as object 0 has" if rows else ""
+        found = f"{where}: object {k}: 'clip_ft' is"
+        rows.append(
+            arrays.as_float32(
+                arrays.array_of(row, found, f"a list{beside}", "f", len(rows[0]) if rows else arrays.NOT_EMPTY)
+            )
+        )
+    features, remarks = arrays.without_nonfinite(np.stack(rows), "objects")
     return features, list(remarks)
 
 
 def _background(value: object, where: str) -> list[Any]:
     """Walls, floor and ceiling, which the Detect variant keeps apart; a class that was never seen is None there."""
     if value is not None and not isinstance(value, list):
-        raise PredictionError(f"{where}: 'bg_objects' is {kind_of(value)}; expected a list")
+        raise PredictionError(f"{where}: 'bg_objects' is {arrays.kind_of(value)}; expected a list")
     return [entry for entry in value or () if entry is not None]
 
 
 # ---- FROSS
 
 
-class Fross(Reader):
-    name = "fross"
-    summary = f"FROSS's {GRAPHS}: scene graphs of all scenes, with the classes and predicates of ReplicaSSG"
-    noun = "scene graph"
+def looks_like_fross(path: Path) -> str | None:
+    return f"it is or holds {GRAPHS}" if len(_graph_files(path)) == 1 else None
 
-    def recognise(self, path: Path) -> str | None:
-        return f"it is or holds {GRAPHS}" if len(_graph_files(path)) == 1 else None
 
-    def scenes(self, path: Path) -> Mapping[str, Path]:
-        files = _graph_files(path)
-        if len(files) > 1:
-            raise PredictionError(f"{shown(path)}: has {len(files)} files {GRAPHS}; give one of them")
-        return {scene: file for file in files for scene in _graphs(file)}
+def fross_scenes(path: Path) -> Mapping[str, Path]:
+    files = _graph_files(path)
+    if len(files) > 1:
+        raise PredictionError(f"{shown(path)}: has {len(files)} files {GRAPHS}; give one of them")
+    return {scene: file for file in files for scene in _graphs(file)}
 
-    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
-        where = f"{shown(place)}: {printable(scene, 80)}"
-        graph = _graphs(place)[scene]
-        clouds = graph.get("pcd") if isinstance(graph, dict) else None
-        _check_sum(clouds if isinstance(clouds, list) else [], place, where)
-        instances = scene_graph(graph, load_protocol(LISTS), where)
-        return ScenePrediction(scene, self.name, place, instances, (ONES,))
+
+def fross(place: Path, scene: str) -> Parsed:
+    graph = _graphs(place)[scene]
+    clouds = graph.get("pcd") if isinstance(graph, dict) else None
+    _check_sum(clouds if isinstance(clouds, list) else [], place)
+    return scene_graph(graph, load_protocol(LISTS), f"{shown(place)}: {printable(scene, 80)}"), [ONES]
 
 
 def scene_graph(graph: object, rules: ProtocolRules, where: str) -> Instances:
     """The map of one scene of the file, its numbers named by the classes and predicates of ``rules``."""
     if not isinstance(graph, dict):
-        raise PredictionError(f"{where}: is {kind_of(graph)}; expected a scene graph with pcd, cls and edges")
+        raise PredictionError(f"{where}: is {arrays.kind_of(graph)}; expected a scene graph with pcd, cls and edges")
     clouds = graph.get("pcd")
-    if not isinstance(clouds, list) or len(clouds) > MOST_MASKS:
-        raise PredictionError(f"{where}: 'pcd' is {kind_of(clouds)}; expected a list of points an object")
+    if not isinstance(clouds, list) or len(clouds) > arrays.MOST_MASKS:
+        raise PredictionError(f"{where}: 'pcd' is {arrays.kind_of(clouds)}; expected a list of points an object")
     k = len(clouds)
     classes = _table(graph.get("cls"), (k, len(rules.classes)), f"{where}: 'cls'")
     edges = _edges(graph.get("edge_index"), k, f"{where}: 'edge_index'")
     scores = _table(graph.get("edge_cls"), (len(edges), len(rules.predicates)), f"{where}: 'edge_cls'")
     labels = tuple(rules.classes[place].name for place in last_best(classes).tolist())
-    points = [checked_points(cloud, f"{where}: object {row}") for row, cloud in enumerate(clouds)]
-    instances = instances_of(
-        points, where, features=None, labels=labels, names=labels, captions=("",) * k, ids=range(k)
-    )
+    points = [arrays.checked_points(cloud, f"{where}: object {row}") for row, cloud in enumerate(clouds)]
+    instances = instances_of(points, where, None, labels=labels, names=labels, ids=range(k))
     return replace(instances, edges=edges, edge_scores=scores, predicates=rules.predicates)
 
 
@@ -278,7 +269,7 @@ def _graph_files(path: Path) -> list[Path]:
 def _graphs(file: Path) -> dict[str, Any]:
     value = read_pickle_file(file, forget=FORGOTTEN_OF_GRAPHS)
     if not isinstance(value, dict) or not value or len(value) > MOST_SCENES:
-        raise PredictionError(f"{shown(file)}: holds {kind_of(value)}; expected the scene graph of each scene")
+        raise PredictionError(f"{shown(file)}: holds {arrays.kind_of(value)}; expected the scene graph of each scene")
     if not all(isinstance(scene, str) for scene in value):
         raise PredictionError(f"{shown(file)}: has a scene that is no name; expected the scene graph of each scene")
     return value
@@ -288,10 +279,8 @@ def _table(value: object, shape: tuple[int, int], where: str) -> Float64Array:
     """A table of scores; without rows whatever is empty will do."""
     if not shape[0] and _is_empty(value):
         return np.zeros(shape)
-    if not isinstance(value, np.ndarray) or value.shape != shape or value.dtype.kind not in "fiu":
-        raise PredictionError(f"{where} is {kind_of(value)}; expected {shape[0]} rows of {shape[1]}, as ReplicaSSG has")
-    with np.errstate(over="ignore"):
-        scores: Float64Array = value.astype(np.float64)
+    expected = f"{shape[0]} rows of {shape[1]}, as ReplicaSSG has"
+    scores: Float64Array = arrays.array_of(value, f"{where} is", expected, "fiu", *shape).astype(np.float64)
     if not np.isfinite(scores).all():
         raise PredictionError(f"{where} has values that are NaN or infinite")
     return scores
@@ -301,12 +290,10 @@ def _edges(value: object, n_objects: int, where: str) -> NDArray[np.int32]:
     """Rows of subject and object (E, 2) of the file's (2, E)."""
     if _is_empty(value):
         return np.zeros((0, 2), np.int32)
-    is_table = isinstance(value, np.ndarray) and value.ndim == 2 and len(value) == 2 and value.dtype.kind in "iu"
-    if not isinstance(value, np.ndarray) or not is_table or value.shape[1] > MOST_EDGES:
-        raise PredictionError(f"{where} is {kind_of(value)}; expected rows of subjects and of objects")
-    if not 0 <= int(value.min()) <= int(value.max()) < n_objects:
-        raise PredictionError(f"{where} names object {int(value.max())}; the scene graph has {n_objects}")
-    return np.ascontiguousarray(value.T).astype(np.int32)
+    table = arrays.array_of(value, f"{where} is", "rows of subjects and of objects", "iu", 2, None)
+    if table.shape[1] > MOST_EDGES or not 0 <= int(table.min()) <= int(table.max()) < n_objects:
+        raise PredictionError(f"{where} names object {int(table.max())}; the scene graph has {n_objects}")
+    return np.ascontiguousarray(table.T).astype(np.int32)
 
 
 def _is_empty(value: object) -> bool:

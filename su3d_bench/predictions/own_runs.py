@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, printable, shown
 from su3d_bench.core.files.atomic import write_npz
-from su3d_bench.core.maps import DenseFeatures, Prediction
-from su3d_bench.formats.arrays import kind_of
+from su3d_bench.core.maps import DenseFeatures
+from su3d_bench.formats.arrays import array_of
 from su3d_bench.formats.numpy_files import map_npy, npz_names, read_npz
-from su3d_bench.predictions.base import Content, Numbering, Reader, ScenePrediction, VertexLabels, VertexMasks
+from su3d_bench.predictions.base import Content, Numbering, Parsed, Reader, VertexLabels, VertexMasks, named
 from su3d_bench.store.predictions import (
     OVER_VERTICES,
     features_beside,
@@ -29,42 +29,38 @@ FILE = "prediction.npz"
 NUMBERINGS: dict[str, Numbering] = {name: name for name in get_args(Numbering)}
 
 
-class OwnRuns(Reader):
-    name = "su3d-bench"
-    summary = "our own prediction.npz, or a run folder with those of one method"
+def looks_like_ours(path: Path) -> str | None:
+    try:
+        files = _files(path)
+    except PredictionError:
+        files = {"": path}  # a run folder of several methods: reading it says so
+    if not files:
+        return None
+    return f"it holds {FILE}" if path.is_dir() or "kind" in npz_names(path) else None
 
-    def recognise(self, path: Path) -> str | None:
-        try:
-            files = _files(path)
-        except PredictionError:
-            files = {"": path}  # a run folder of several methods: reading it says so
-        if not files:
-            return None
-        is_ours = path.is_dir() or "kind" in npz_names(path)
-        return f"it holds {FILE}" if is_ours else None
 
-    def scenes(self, path: Path) -> Mapping[str, Path]:
-        return _files(path)
-
-    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
-        where, arrays = shown(place), read_npz(place)
-        if str(arrays.get("kind")) in OVER_VERTICES:
-            return ScenePrediction(scene, self.name, place, _over_vertices(arrays, where))
-        if str(arrays.get("kind")) == DenseFeatures.__name__ and "features" not in arrays:
-            arrays["features"] = _mapped_features(features_beside(place))
-        try:
-            content = prediction_from_arrays(arrays, where)
-        except PredictionError as error:
-            raise PredictionError(f"{where}: {str(error).removeprefix(f'{where}: ')}") from error
-        _check_points(where, content)
-        return ScenePrediction(scene, self.name, place, content)
+def stored_prediction(place: Path, scene: str) -> Parsed:
+    where, arrays = shown(place), read_npz(place)
+    if str(arrays.get("kind")) in OVER_VERTICES:
+        return _over_vertices(arrays, where), ()
+    if str(arrays.get("kind")) == DenseFeatures.__name__ and "features" not in arrays:
+        file = features_beside(place)
+        table = array_of(map_npy(file), f"{shown(file)}: holds", "a table of features", "f", None, None)
+        if not table.flags.c_contiguous:  # a row of it would be all over the file
+            raise PredictionError(f"{shown(file)}: holds its table column by column; copy it again")
+        arrays["features"] = table
+    with named(where):
+        content = prediction_from_arrays(arrays, where)
+        if fault := value_fault(content):
+            raise PredictionError(f"{fault}; run the scene again")
+    return content, ()
 
 
 def write_content(path: Path, content: Content) -> None:
     """Store what a reader gave at ``path``, so that ``OwnRuns`` reads the same."""
     if isinstance(content, VertexLabels):
-        numbering = np.array(content.numbering) if content.numbering != "id" else None
         labels = {"kind": np.array("VertexLabels"), "class_ids": content.class_ids, "further": content.further}
+        numbering = np.array(content.numbering) if content.numbering != "id" else None
         _write_present(path, {**labels, "numbering": numbering})
     elif isinstance(content, VertexMasks):
         arrays = {
@@ -95,7 +91,7 @@ def read_stored(path: Path) -> Content:
 
 
 # Dimensions and kind of numbers of each array of masks and labels over points without coordinates.
-_VERTEX_ARRAYS = {
+_MASK_ARRAYS = {
     "indptr": (1, "i"),
     "indices": (1, "i"),
     "n_points": (0, "i"),
@@ -104,58 +100,28 @@ _VERTEX_ARRAYS = {
     "keys": (1, "U"),
     "class_numbers": (1, "i"),
     "features": (2, "f"),
-    "class_ids": (1, "i"),
-    "further": (2, "i"),
 }
-_OPTIONAL = ("class_numbers", "features", "further")
+_LABEL_ARRAYS = {"class_ids": (1, "i"), "further": (2, "i"), "numbering": (0, "U")}
+_OPTIONAL = ("class_numbers", "features", "further", "numbering")
 
 
 def _over_vertices(arrays: Mapping[str, NDArray[Any]], where: str) -> VertexMasks | VertexLabels:
     """The masks or labels in ``arrays``; a ``PredictionError`` where they are none."""
     are_labels = str(arrays["kind"]) == "VertexLabels"
-    for name, (n_axes, kind) in _VERTEX_ARRAYS.items():
-        array = arrays.get(name)
-        is_asked = (name == "class_ids") == are_labels and name not in _OPTIONAL
-        if array is None and is_asked:
-            raise PredictionError(f"{where}: lacks '{name}'; evaluate again with --out")
-        if array is not None and (array.ndim != n_axes or array.dtype.kind != kind):
-            raise PredictionError(f"{where}: '{name}' is {kind_of(array)}; evaluate again with --out")
-    numbering = NUMBERINGS.get(str(arrays.get("numbering", "id")))
+    values: dict[str, Any] = {}
+    for name, (n_axes, kind) in (_LABEL_ARRAYS if are_labels else _MASK_ARRAYS).items():
+        if name in arrays or name not in _OPTIONAL:
+            expected = "what it was written with; evaluate again with --out"
+            values[name] = array_of(arrays.get(name), f"{where}: '{name}' is", expected, kind, *[None] * n_axes)
+    numbering = NUMBERINGS.get(str(values.pop("numbering", "id")))
+    further = values.get("further")
+    if numbering is None or (further is not None and len(further) != len(values["class_ids"])):
+        raise PredictionError(f"{where}: holds no masks or labels; evaluate again with --out")
     if are_labels:
-        further = arrays.get("further")
-        if numbering is None or (further is not None and len(further) != len(arrays["class_ids"])):
-            raise PredictionError(f"{where}: holds no labels; evaluate again with --out")
-        return VertexLabels(arrays["class_ids"], further, numbering)
-    n_points = int(arrays["n_points"])
-    if numbering is None or not len(arrays["indptr"]):
-        raise PredictionError(f"{where}: holds no masks; evaluate again with --out")
-    try:
-        return VertexMasks(
-            arrays["indptr"],
-            arrays["indices"],
-            n_points=None if n_points < 0 else n_points,
-            scores=arrays["scores"],
-            class_numbers=arrays.get("class_numbers"),
-            numbering=numbering,
-            features=arrays.get("features"),
-            keys=tuple(str(key) for key in arrays["keys"]),
-        )
-    except PredictionError as error:
-        raise PredictionError(f"{where}: {error}") from error
-
-
-def _mapped_features(file: Path) -> NDArray[Any]:
-    """The features that lie beside a dense prediction, without reading them."""
-    table = map_npy(file)
-    if table.ndim != 2 or table.dtype.kind != "f" or not table.flags.c_contiguous:
-        raise PredictionError(f"{shown(file)}: no .npy table of features; copy it beside the prediction again")
-    return table
-
-
-def _check_points(where: str, content: Prediction) -> None:
-    """Refuses what is no point, and a partition or features that do not go with their points."""
-    if fault := value_fault(content):
-        raise PredictionError(f"{where}: {fault}; run the scene again")
+        return VertexLabels(**values, numbering=numbering)
+    n_points, keys = int(values.pop("n_points")), tuple(map(str, values.pop("keys")))
+    with named(where):
+        return VertexMasks(**values, n_points=None if n_points < 0 else n_points, keys=keys, numbering=numbering)
 
 
 def _files(path: Path) -> dict[str, Path]:
@@ -184,3 +150,6 @@ def _scene_of(file: Path) -> str:
     if folder.parent.name == JOBS:
         return scene_of_folder(folder.name)
     return file.stem
+
+
+OWN_RUNS = Reader("su3d-bench", looks_like_ours, _files, stored_prediction)

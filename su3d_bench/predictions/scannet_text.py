@@ -12,9 +12,10 @@ import json
 import math
 import os
 import stat
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from su3d_bench.core.system.files import file_bytes, opened
 from su3d_bench.core.types import Int32Array
 from su3d_bench.formats.arrays import MOST_POINTS, check_members, integer_lines, run_members
 from su3d_bench.metrics.instance.average_precision import last_line_of_each_mask_file
-from su3d_bench.predictions.base import SceneFiles, ScenePrediction, VertexLabels, VertexMasks, vertex_masks
+from su3d_bench.predictions.base import Numbering, Parse, Parsed, Reader, VertexLabels, scene_files, vertex_masks
 
 OWN_OUTPUT = "semantic_instance_evaluation"  # the original evaluator's own answer, which it leaves out
 MASK3D_FOLDER = "decoder_-1"  # Mask3D and Segment3D write the lists of the last decoder here
@@ -34,8 +35,7 @@ MOST_FIRST_LINE = 4096
 MOST_LOOKED_AT = 50
 
 
-@dataclass(frozen=True)
-class Line:
+class Line(NamedTuple):
     """One line of a list: the mask file as the line says it and as a path without detours, its class and score."""
 
     number: int
@@ -44,129 +44,118 @@ class Line:
     score: float
 
 
-class TextFiles(SceneFiles):
-    """A format of ScanNet's: one text a scene."""
+def text_format(name: str, looks: Callable[[str], str | None], parse: Parse) -> Reader:
+    """A text a scene; ``looks`` says of the first line that is not empty why it is of this format."""
 
-    suffixes = (".txt",)
+    def recognise(path: Path) -> str | None:
+        lines = _first_lines(path)
+        return looks(next(filter(None, lines), "")) if lines else None
 
-    def scenes(self, path: Path) -> Mapping[str, Path]:
-        return {name: file for name, file in super().scenes(path).items() if name != OWN_OUTPUT}
-
-    def first_lines(self, path: Path) -> list[str]:
-        """The first line of some files, empty for empty ones."""
-        lines = []
-        files = self.scenes(path).values() if path.is_dir() or path.suffix == ".txt" else ()
-        for file in list(files)[:MOST_LOOKED_AT]:
-            try:
-                with opened(file) as stream:
-                    lines.append(stream.readline(MOST_FIRST_LINE).decode("utf-8", "replace").rstrip("\r\n"))
-            except OSError:
-                continue
-        return lines
+    return Reader(name, recognise, _scenes, parse)
 
 
-class ScannetText(TextFiles):
-    name = "scannet-text"
-    summary = "ScanNet's submission: <scene>.txt with lines 'mask file, class id, confidence' (Mask3D, Segment3D)"
-
-    def recognise(self, path: Path) -> str | None:
-        lines = self.first_lines(path)
-        if not lines:
-            return None
-        if not any(lines):
-            return "its .txt files are empty lists"
-        words = list_words(lines)
-        is_list = words is not None and not words[0].endswith(MASK_OF_RUNS)
-        return "its .txt files list a mask file, a class and a confidence a line" if is_list else None
-
-    def scenes(self, path: Path) -> Mapping[str, Path]:
-        return super().scenes(path / MASK3D_FOLDER if (path / MASK3D_FOLDER).is_dir() else path)
-
-    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
-        where, lines = shown(place), read_list(place)
-        pairs = last_line_of_each_mask_file([line.file for line in lines])
-        members, n_points = _read_masks(place.parent, [lines[first] for first, _ in pairs], where)
-        masks = vertex_masks(
-            where,
-            members,
-            n_points,
-            scores=np.array([lines[last].score for _, last in pairs], np.float64),
-            class_numbers=np.array([lines[last].label for _, last in pairs], np.int32),
-            keys=[printable(lines[first].file, 200) for first, _ in pairs],
-        )
-        return ScenePrediction(scene, self.name, place, masks, _remarks(lines, len(pairs)))
+def _scenes(path: Path) -> Mapping[str, Path]:
+    folder = path / MASK3D_FOLDER if (path / MASK3D_FOLDER).is_dir() else path
+    return {name: file for name, file in scene_files(folder, (".txt",)).items() if name != OWN_OUTPUT}
 
 
-class OpenSun3dText(TextFiles):
-    name = "opensun3d-challenge"
-    summary = "The OpenSUN3D challenge's submission: <scene>.txt with lines 'mask file, confidence', without classes"
-
-    def recognise(self, path: Path) -> str | None:
-        words = next((line.split() for line in self.first_lines(path) if line), [])
-        is_list = len(words) == 2 and _number(words[0]) is None and _number(words[1]) is not None
-        return "its .txt files list a mask file and a confidence a line" if is_list else None
-
-    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
-        """Every line is a mask, one that names a file again too: the original numbers them anew."""
-        where, lines = shown(place), read_list(place, has_classes=False)
-        members, n_points = _read_masks(place.parent, lines, where)
-        scores = np.array([line.score for line in lines], np.float64)
-        keys = [printable(line.file, 200) for line in lines]
-        masks = vertex_masks(where, members, n_points, scores=scores, keys=keys)
-        return ScenePrediction(scene, self.name, place, masks, ("masks without classes",))
+def _first_lines(path: Path) -> list[str]:
+    """The first line of some files, empty for empty ones."""
+    lines = []
+    files = _scenes(path).values() if path.is_dir() or path.suffix == ".txt" else ()
+    for file in list(files)[:MOST_LOOKED_AT]:
+        with suppress(OSError), opened(file) as stream:
+            lines.append(stream.readline(MOST_FIRST_LINE).decode("utf-8", "replace").rstrip("\r\n"))
+    return lines
 
 
-class ScannetSemanticText(TextFiles):
-    name = "scannet-semantic-text"
-    summary = "ScanNet's semantic submission: <scene>.txt with one class id a line, one line a point"
-
-    def recognise(self, path: Path) -> str | None:
-        words = next((line.split() for line in self.first_lines(path) if line), [])
-        is_label = len(words) == 1 and words[0].removeprefix("-").isdigit()
-        return "its .txt files hold one integer a line" if is_label else None
-
-    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
-        where = shown(place)
-        values = integer_lines(_content(place, where), where)
-        if not len(values):
-            raise PredictionError(f"{where}: is empty; expected one class id a line, one line a point")
-        limits = np.iinfo(np.int32)
-        is_wrong = (values < limits.min) | (values > limits.max)
-        if is_wrong.any():
-            line = int(np.argmax(is_wrong))
-            raise PredictionError(f"{where}:{line + 1}: {int(values[line])} is no class id")
-        return ScenePrediction(scene, self.name, place, VertexLabels(values.astype(np.int32)))
+# ---- masks
 
 
-class ScannetppMasks(ScannetText):
-    name = "scannetpp"
-    summary = "ScanNet++'s instance submission: <scene>.txt with lines 'mask.json, class, confidence', run-length masks"
-
-    def recognise(self, path: Path) -> str | None:
-        words = list_words(self.first_lines(path))
-        is_list = words is not None and words[0].endswith(MASK_OF_RUNS)
-        return "its .txt files list a .json mask, a class and a confidence a line" if is_list else None
-
-    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
-        found = super().read_scene(place, scene)
-        assert isinstance(found.content, VertexMasks)
-        return replace(found, content=replace(found.content, numbering="line"))
+def looks_like_list(line: str) -> str | None:
+    if not line:
+        return "its .txt files are empty lists"
+    is_list = _is_list(line) and not line.split(" ")[0].endswith(MASK_OF_RUNS)
+    return "its .txt files list a mask file, a class and a confidence a line" if is_list else None
 
 
-class ScannetppLabels(TextFiles):
-    name = "scannetpp-semantic"
-    summary = "ScanNet++'s semantic submission: <scene>.txt with one class a line, or three with commas between"
+def looks_like_scannetpp(line: str) -> str | None:
+    is_list = _is_list(line) and line.split(" ")[0].endswith(MASK_OF_RUNS)
+    return "its .txt files list a .json mask, a class and a confidence a line" if is_list else None
 
-    def recognise(self, path: Path) -> str | None:
-        words = next((line.split(SEPARATOR) for line in self.first_lines(path) if line), [])
-        is_ranked = len(words) > 1 and all(word.strip().isdigit() for word in words)
-        return "its .txt files hold integers with commas between" if is_ranked else None
 
-    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
-        where = shown(place)
-        numbers = _ranked_numbers(_content(place, where), where)
-        further = numbers[:, 1:] if numbers.shape[1] > 1 else None
-        return ScenePrediction(scene, self.name, place, VertexLabels(numbers[:, 0], further, "line"))
+def looks_like_opensun3d(line: str) -> str | None:
+    words = line.split()
+    is_list = len(words) == 2 and _number(words[0]) is None and _number(words[1]) is not None
+    return "its .txt files list a mask file and a confidence a line" if is_list else None
+
+
+def _is_list(line: str) -> bool:
+    """Whether a line is mask file, class and confidence."""
+    words = line.split(" ")
+    return len(words) == 3 and None not in map(_number, words[1:])
+
+
+def scannet_masks(place: Path, scene: str, numbering: Numbering = "id") -> Parsed:
+    lines = read_list(place)
+    pairs = last_line_of_each_mask_file([line.file for line in lines])
+    said = [lines[first]._replace(label=lines[last].label, score=lines[last].score) for first, last in pairs]
+    numbers = np.array([line.label for line in said], np.int32)
+    n_more = len(lines) - len(pairs)
+    remark = (
+        f"{n_more} lines name a mask file again: class and confidence of its last line count, at the place of its "
+        "first, as in the official evaluator"
+    )
+    return _masks(place, said, [remark] * bool(n_more), class_numbers=numbers, numbering=numbering)
+
+
+def scannetpp_masks(place: Path, scene: str) -> Parsed:
+    return scannet_masks(place, scene, "line")
+
+
+def opensun3d_masks(place: Path, scene: str) -> Parsed:
+    """Every line is a mask, one that names a file again too: the original numbers them anew."""
+    return _masks(place, read_list(place, has_classes=False), ["masks without classes"])
+
+
+def _masks(place: Path, lines: Sequence[Line], remarks: Sequence[str], **more: Any) -> Parsed:
+    members, n_points = _read_masks(place.parent, lines, shown(place))
+    scores = np.array([line.score for line in lines], np.float64)
+    keys = [printable(line.file, 200) for line in lines]
+    return vertex_masks(shown(place), members, n_points, scores=scores, keys=keys, **more), remarks
+
+
+# ---- labels
+
+
+def looks_like_labels(line: str) -> str | None:
+    words = line.split()
+    is_label = len(words) == 1 and words[0].removeprefix("-").isdigit()
+    return "its .txt files hold one integer a line" if is_label else None
+
+
+def looks_like_ranked(line: str) -> str | None:
+    words = line.split(SEPARATOR)
+    is_ranked = len(words) > 1 and all(word.strip().isdigit() for word in words)
+    return "its .txt files hold integers with commas between" if is_ranked else None
+
+
+def scannet_labels(place: Path, scene: str) -> Parsed:
+    where = shown(place)
+    values = integer_lines(_content(place, where), where)
+    if not len(values):
+        raise PredictionError(f"{where}: is empty; expected one class id a line, one line a point")
+    is_wrong = np.abs(values.astype(np.int64)) > np.iinfo(np.int32).max
+    if is_wrong.any():
+        line = int(np.argmax(is_wrong))
+        raise PredictionError(f"{where}:{line + 1}: {int(values[line])} is no class id")
+    return VertexLabels(values.astype(np.int32)), ()
+
+
+def ranked_labels(place: Path, scene: str) -> Parsed:
+    where = shown(place)
+    numbers = _ranked_numbers(_content(place, where), where)
+    return VertexLabels(numbers[:, 0], numbers[:, 1:] if numbers.shape[1] > 1 else None, "line"), ()
 
 
 def _ranked_numbers(content: bytes, where: str) -> Int32Array:
@@ -190,13 +179,6 @@ def _ranked_numbers(content: bytes, where: str) -> Int32Array:
         shown_row = SEPARATOR.join(map(str, numbers[line].tolist()))
         raise PredictionError(f"{where}:{line + 1}: {shown_row} is no place in a list of classes; they count from 0")
     return numbers.astype(np.int32)
-
-
-def list_words(lines: Sequence[str]) -> list[str] | None:
-    """Mask file, class and confidence of the first of ``lines`` that is not empty; None where it is no such line."""
-    words = next((line.split(" ") for line in lines if line), [])
-    is_list = len(words) == 3 and _number(words[1]) is not None and _number(words[2]) is not None
-    return words if is_list else None
 
 
 def read_list(file: Path, *, has_classes: bool = True) -> list[Line]:
@@ -238,13 +220,22 @@ def _plain_path(text: str, where: str) -> str:
 def _read_masks(folder: Path, lines: Sequence[Line], where: str) -> tuple[list[Int32Array], int | None]:
     """The points in the mask of each line, and of how many points all are; None without any."""
     members: list[Int32Array] = []
-    n_members, n_points, places = 0, None, _Places(folder)
+    n_members, n_points = 0, None
+    folders: dict[Path, Path] = {folder: folder.resolve()}
     for line in lines:
-        n, indices = _read_mask(places, line, where)
+        place = f"{where}:{line.number}: mask '{printable(line.file, 120)}'"
+        try:
+            is_inside = _is_inside(folder, folder / line.file, folders)
+        except (OSError, RuntimeError) as error:
+            reason = "does not exist" if isinstance(error, FileNotFoundError) else "cannot be read"
+            raise PredictionError(f"{place} {reason}") from error
+        if not is_inside:
+            raise PredictionError(f"{place} is no file inside the folder of the list; copy it there")
+        n, indices = _parsed_mask(_content(folder / line.file, place), line.file, place)
         if n_points not in {None, n}:
             raise PredictionError(
-                f"{where}:{line.number}: mask '{printable(line.file, 120)}' is of {n} points and "
-                f"'{printable(lines[0].file, 120)}' of {n_points}; all must have the points of the scene"
+                f"{place} is of {n} points and '{printable(lines[0].file, 120)}' of {n_points}; all must have the "
+                "points of the scene"
             )
         n_points = n
         check_members(n_members := n_members + len(indices), where)
@@ -252,42 +243,24 @@ def _read_masks(folder: Path, lines: Sequence[Line], where: str) -> tuple[list[I
     return members, n_points
 
 
-class _Places:
-    """Where the mask files of a list lie in truth; a folder of many is followed to its own place once."""
+def _is_inside(folder: Path, file: Path, folders: dict[Path, Path]) -> bool:
+    """Whether a regular file inside ``folder`` stands behind ``file``; ``OSError`` where there is none at all.
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self._root = folder.resolve()
-        self._real: dict[str, Path] = {}
-
-    def is_inside(self, file: str) -> bool:
-        """Whether a regular file inside the folder stands behind ``file``; ``OSError`` where there is none at all."""
-        parent, name = os.path.split(file)
-        if parent not in self._real:
-            self._real[parent] = (self.folder / parent).resolve(strict=True)
-        target = self._real[parent] / name
-        mode = os.lstat(target).st_mode
-        if stat.S_ISLNK(mode):
-            target = target.resolve(strict=True)
-            mode = os.lstat(target).st_mode
-        return stat.S_ISREG(mode) and target.is_relative_to(self._root)
+    ``folders`` keeps the true place of each folder: one of many masks is followed once.
+    """
+    if file.parent not in folders:
+        folders[file.parent] = file.parent.resolve(strict=True)
+    target = folders[file.parent] / file.name
+    if target.is_symlink():
+        target = target.resolve(strict=True)
+    return stat.S_ISREG(os.lstat(target).st_mode) and target.is_relative_to(folders[folder])
 
 
-def _read_mask(places: _Places, line: Line, where: str) -> tuple[int, Int32Array]:
+def _parsed_mask(content: bytes, file: str, where: str) -> tuple[int, Int32Array]:
     """The number of points of a mask and those in it."""
-    file = places.folder / line.file
-    place = f"{where}:{line.number}: mask '{printable(line.file, 120)}'"
-    try:
-        is_inside = places.is_inside(line.file)
-    except (OSError, RuntimeError) as error:
-        reason = "does not exist" if isinstance(error, FileNotFoundError) else "cannot be read"
-        raise PredictionError(f"{place} {reason}") from error
-    if not is_inside:
-        raise PredictionError(f"{place} is no file inside the folder of the list; copy it there")
-    content = _content(file, place)
-    if file.suffix == MASK_OF_RUNS:
-        return _run_length_mask(content, place)
-    values = integer_lines(content, place)
+    if file.endswith(MASK_OF_RUNS):
+        return _run_length_mask(content, where)
+    values = integer_lines(content, where)
     return len(values), np.flatnonzero(values != 0).astype(np.int32)  # of booleans they are found at once
 
 
@@ -301,16 +274,6 @@ def _run_length_mask(content: bytes, where: str) -> tuple[int, Int32Array]:
         raise PredictionError(f"{where} has no 'length' and 'counts'")
     members = run_members(value["length"], value["counts"], where)
     return value["length"], members
-
-
-def _remarks(lines: list[Line], n_files: int) -> tuple[str, ...]:
-    n_more = len(lines) - n_files
-    if not n_more:
-        return ()
-    return (
-        f"{n_more} lines name a mask file again: class and confidence of its last line count, at the place of its "
-        "first, as in the official evaluator",
-    )
 
 
 def _number(word: str) -> float | None:

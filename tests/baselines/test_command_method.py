@@ -170,22 +170,21 @@ def test_a_shell_gets_what_a_scene_is_called_as_a_value_alone(tmp_path: Path, li
 
 
 @pytest.mark.parametrize(
-    ("line", "place"),
+    "line",
     [
-        ('a "{scene}"', "within quotes"),
-        ("a '{scene}'", "within quotes"),
-        ('a "x \\" {output}/y"', "within quotes"),
-        ("a 'x \\' {output} 'y {seed}'", "within quotes"),
-        ('a "$(b {scene})"', "within quotes"),
-        ("a ${scene}", "behind a $"),
-        ("a \\{scene}", "behind a \\"),
-        ("sh <<E\nb {scene}\nE", "in or after a here-document"),
+        'a "{scene}"',
+        "a '{scene}'",
+        'a "x \\" {output}/y"',
+        "a 'x \\' {output} 'y {seed}'",
+        'a "$(b {scene})"',
+        "a ${scene}",
+        "a \\{scene}",
+        "sh <<E\nb {scene}\nE",
     ],
 )
-def test_a_placeholder_that_a_shell_would_read_as_commands_is_refused(line: str, place: str) -> None:
-    with pytest.raises(ValueError, match="where a shell would read its value as commands; write ") as caught:
+def test_a_placeholder_that_a_shell_would_read_as_commands_is_refused(line: str) -> None:
+    with pytest.raises(ValueError, match="where a shell would read its value as commands; write "):
         check_placeholders(line, is_shell=True)
-    assert f"}}' is {place}," in str(caught.value)
 
 
 def test_finish_midway_gives_the_map_of_the_frames_so_far_and_changes_nothing(tmp_path: Path) -> None:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from box_room import SIZE, write_box_room
-from scannet_scan import SCAN, write_recording
 
 from su3d_bench.baselines.conceptfusion.method import (
     ConceptFusion,
@@ -21,8 +17,6 @@ from su3d_bench.baselines.conceptfusion.method import (
 from su3d_bench.baselines.conceptfusion.point_fusion import FeatureTable
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, Float32Array, Frame, SceneInfo
-from su3d_bench.datasets.replica.dataset import Replica
-from su3d_bench.datasets.scannet.dataset import ScanNet
 
 E1, E2 = np.eye(2)
 BOX = np.array([0, 0, 2, 2], np.float32)
@@ -205,27 +199,6 @@ def test_finish_midway_changes_nothing() -> None:
         method.update(frame, detections, Timer())
     np.testing.assert_array_equal(method.finish().features, whole.features)
     np.testing.assert_array_equal(method.finish().points, whole.points)
-
-
-def test_frames_of_recordings_fuse_into_the_room_that_they_show(tmp_path: Path) -> None:
-    """Replica's layout and ScanNet's .sens files, at the size of the depth image and below."""
-    write_box_room(tmp_path, n_frames=4)
-    folder = tmp_path / "scans" / SCAN
-    folder.mkdir(parents=True)
-    write_recording(folder / f"{SCAN}.sens", n_frames=4)
-    for dataset, scene, far in ((Replica(tmp_path), "room0", SIZE), (ScanNet(tmp_path), SCAN, None)):
-        frames = dataset.frames(scene, 1)
-        height, width = frames[0].depth_m.shape
-        method = ConceptFusion(ConceptFusionConfig(height=height, width=width))
-        method.start(SCENE)
-        for k, frame in enumerate(frames):
-            none = replace(seen(frame.index), masks=np.zeros((0, height, width), bool))
-            method.update(frame, none, Timer())
-            assert k or method.n_points == (frame.depth_m > 0).sum()
-        points = method.finish().points.astype(float)
-        assert len(points) < (len(frames) - 1) * height * width  # the views overlap
-        off = np.abs(points[:, 2]) if far is None else np.minimum(np.abs(points), np.abs(points - far)).min(axis=1)
-        assert off.max() < 0.02
 
 
 # ---- what it does unlike the others

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from grouped_clouds import cal_group_by_loop, cloud, ids, nearest_by_brute_force, patch, row
+from grouped_clouds import cloud, ids, nearest_by_brute_force, patch, row
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from places import CASES
@@ -88,20 +88,6 @@ def test_the_grid_finds_what_brute_force_finds(seed: int, spread_m: float, is_co
     found = match_pairs(queries, points, 0.075)
     expected = nearest_by_brute_force(queries, points, 0.075)
     assert list(zip(found.query.tolist(), found.other.tolist(), strict=True)) == expected
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.integers(0, 10**6), st.sampled_from([0.3, 0.5, 1.0]))
-def test_cal_group_is_the_loop_over_pairs(seed: int, ratio: float) -> None:
-    rng = np.random.default_rng(seed)
-    n_other, n_group = rng.integers(1, 40, 2)
-    other, group = rng.integers(-1, 4, n_other), rng.integers(-1, 5, n_group)
-    query = np.sort(rng.permutation(n_group)[: rng.integers(0, n_group + 1)])
-    pairs = Pairs(query, rng.integers(0, n_other, len(query)))
-    listed = list(zip(pairs.query.tolist(), pairs.other.tolist(), strict=True))
-    assert (
-        cal_group(other, group, pairs, ratio).group.tolist() == cal_group_by_loop(other, group, listed, ratio).tolist()
-    )
 
 
 def test_of_equal_overlaps_the_first_met_wins_not_the_lowest_id() -> None:

@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 from prediction_files import write_openyolo3d
 from proposals_by_hand import made_proposals
-from pydantic import ValidationError
 
 from su3d_bench.baselines.openmask3d.method import (
-    FeatureMeans,
     MaskViews,
     OpenMask3D,
     OpenMask3DConfig,
@@ -163,13 +161,6 @@ class TestCrops:
         corner[:20, 10:] = True
         assert crop_boxes(corner, 3, 0.1).tolist() == [[10, 0, 30, 20], [8, 0, 30, 22], [6, 0, 30, 24]]
 
-    def test_the_mean_of_unit_features_is_not_of_unit_length(self) -> None:
-        means = FeatureMeans(3, 2)
-        means.add(0, np.array([[1, 0], [0, 1]], np.float32))
-        means.add(0, np.array([[0, 1], [0, 1]], np.float32))
-        means.add(1, np.array([[0.6, 0.8]], np.float32))
-        assert means.means.tolist() == [[0.25, 0.75], pytest.approx([0.6, 0.8]), [0, 0]]
-
 
 class WallOfPatches:
     """Regions of a wall of coloured patches: columns 0-3, 4-7 and 8-11 of the image, each with an axis of its own."""
@@ -233,6 +224,12 @@ class TestMethod:
         assert found.scores.tolist() == [1, 1, 1] and found.labels is None
         assert np.array_equal(found.points, WALL) and found.mask(1).tolist() == MIDDLE
         assert found.boxes[0].tolist() == [WALL[LEFT].min(axis=0).tolist(), WALL[LEFT].max(axis=0).tolist()]
+
+    def test_the_feature_is_the_plain_mean_over_all_crops(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        crops = np.eye(3, dtype=np.float32)[[0, 1, 1]]
+        monkeypatch.setattr(WallOfPatches, "encode_regions", lambda *_: crops)
+        features = ran(made_proposals(WALL, LEFT), [frame(0), frame(1)])[1].features
+        assert features is not None and features[0] == pytest.approx([1 / 3, 2 / 3, 0])
 
     def test_two_objects_that_a_proposal_merges_stay_merged(self) -> None:
         _, found, _, _ = ran(made_proposals(WALL, LEFT + MIDDLE, RIGHT), [frame()])
@@ -340,9 +337,3 @@ class TestVariants:
         assert cls.name == name and method.needs.masks == "none" and not method.needs.true_proposals
         assert "not a network's" in method.caveat and "reproduced" in cls.about.status
         assert cls(cls.Config(proposals="oracle")).needs.true_proposals
-
-    def test_settings_are_strict(self) -> None:
-        for text in ('{"top_k": 0}', '{"vis_treshold": 0.2}', '{"intrinsic_resolution": [0, 5]}', '{"top_k": "5"}'):
-            with pytest.raises(ValidationError):
-                OpenMask3DConfig.model_validate_json(text)
-        assert OpenMask3DConfig.model_validate_json('{"intrinsic_resolution": [480, 640]}').intrinsic_resolution

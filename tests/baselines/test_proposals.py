@@ -11,8 +11,8 @@ from prediction_files import write_openmask3d, write_openyolo3d, write_scannet_t
 from proposals_by_hand import made_proposals
 from test_mesh_segments import sheet
 
+from su3d_bench.baselines.openmask3d.method import OpenMask3D, OpenMask3DConfig
 from su3d_bench.baselines.openmask3d.proposals import (
-    NodeChoice,
     ProposalConfig,
     chosen_nodes,
     contrast,
@@ -38,6 +38,12 @@ SCENE: dict[str, Any] = {
     "labels": np.array([0, 0, 0]),
     "files": [f"pred_mask/room0_{k}.txt" for k in range(3)],
 }
+
+
+def choice(most: int, min_points: int, max_share: float, same_iou: float) -> ProposalConfig:
+    return ProposalConfig(
+        surface_most=most, surface_min_points=min_points, surface_max_share=max_share, surface_same_iou=same_iou
+    )
 
 
 def flat(n: int = 6) -> Surface:
@@ -185,13 +191,13 @@ class TestTree:
             patch_m=0.02,
         )
         points, scores = np.array([9, 1, 10]), np.array([0.8, 0.5, 0.3, 0.9, 0.1])
-        chosen = chosen_nodes(tree, points, scores, NodeChoice(10, 1, 1.0, 0.5))
+        chosen = chosen_nodes(tree, points, scores, choice(10, 1, 1.0, 0.5))
         assert chosen.tolist() == [3, 1, 2, 4]  # 0 is 9 of the 10 points of 3; 4 has twice the points: IoU 0.5 itself
-        assert chosen_nodes(tree, points, scores, NodeChoice(2, 2, 0.5, 1.0)).tolist() == [3, 0]
+        assert chosen_nodes(tree, points, scores, choice(2, 2, 0.5, 1.0)).tolist() == [3, 0]
 
     def test_a_box_on_a_floor_is_the_part_that_stands_out_most(self) -> None:
         surface = box_on_a_floor()
-        found = surface_proposals(surface, segments_of(surface), NodeChoice(5, 20, 0.5, 0.5))
+        found = surface_proposals(surface, segments_of(surface), choice(5, 20, 0.5, 0.5))
         is_box = (np.abs(surface.vertices - (2, 2, 0.5)) <= 0.501).all(axis=1)
         best = np.isin(np.arange(len(is_box)), found.mask(0))
         assert (best & is_box).sum() / (best | is_box).sum() > 0.8
@@ -201,7 +207,7 @@ class TestTree:
         vertices, triangles = sheet([[0.0] * 6] * 6)
         published = Surface(vertices, triangles, np.where(vertices[:, 0] < 0.25, 40, 7).astype(np.int32))
         assert segments_of(published).tolist() == np.where(vertices[:, 0] < 0.25, 1, 0).tolist()
-        found = surface_proposals(published, segments_of(published), NodeChoice(5, 1, 0.9, 0.5))
+        found = surface_proposals(published, segments_of(published), choice(5, 1, 0.9, 0.5))
         assert sorted(len(mask) for mask in masks_of(found)) == [18, 18]
 
 
@@ -219,7 +225,7 @@ class TestConfig:
         truth = made_proposals(np.array([(0.1, 0, 0), (2.1, 0, 0), (4.9, 0, 0)]), [0, 1], [1, 2])
         found = make_proposals(ProposalConfig(proposals="oracle"), tools(flat(), truth), "rooms", "room0")
         assert masks_of(found) == [[0, 1, 2, 3], [2, 3, 4, 5]] and found.source == "made"  # 3 is 0.9 from 2.1
-        assert ProposalConfig(proposals="oracle").caveat is None
+        assert OpenMask3D(OpenMask3DConfig(proposals="oracle")).caveat is None
 
     def test_files_stay_as_exported_unless_parts_are_asked_for(self, tmp_path: Path) -> None:
         write_openyolo3d(tmp_path, SCENE | {"masks": np.array([[1, 1, 0, 0, 1, 1]] * 3, bool)})
@@ -229,4 +235,5 @@ class TestConfig:
                                 ("always", [[0, 1], [4, 5]] * 3)):  # fmt: skip
             config = ProposalConfig(proposals_folder=tmp_path, split_parts=split, part_eps_m=1.0)  # type: ignore[arg-type]
             assert masks_of(make_proposals(config, tools(surface), "rooms", "room0")) == expected
-        assert config.caveat is None and list(config.inputs) == ["proposals"]
+        method = OpenMask3D(OpenMask3DConfig(proposals_folder=tmp_path))
+        assert method.caveat is None and list(method.inputs) == ["proposals"]

@@ -13,26 +13,28 @@ import pytest
 from file_server import FileServer, Served, file_server
 
 from su3d_bench.core.errors import DataError, StoreError
-from su3d_bench.fetching.download import Patience, Stated, Wanted, bring, part_of
+from su3d_bench.fetching import download
+from su3d_bench.fetching.download import Stated, Wanted, bring, part_of
 
 CONTENT = np.random.default_rng(0).bytes(900_000)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
 OTHER = np.random.default_rng(1).bytes(900_000)
-ONCE = Patience(n_retries=0, pause_s=0.0, timeout_s=5.0)
 NAME = "weights.pth"
 UNSTATED: dict[str, Any] = {"n_bytes": None, "stated": Stated()}
 
 
 @pytest.fixture
-def server() -> Iterator[FileServer]:
+def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[FileServer]:
+    monkeypatch.setattr(download, "FIRST_PAUSE_S", 0.0)
+    monkeypatch.setattr(download, "TIMEOUT_S", 5.0)
     with file_server() as running:
         yield running
 
 
-def fetched(server: FileServer, place: Path, patience: Patience = ONCE, **changes: Any) -> str:
+def fetched(server: FileServer, place: Path, n_retries: int = 0, **changes: Any) -> str:
     known: dict[str, Any] = {"n_bytes": len(CONTENT), "stated": Stated(sha256=SHA256)}
     wanted = Wanted(NAME, f"{server.url}/{NAME}", changes.pop("hosts", ("127.0.0.1",)), **(known | changes))
-    return bring(wanted, place, lambda *words: None, patience)
+    return bring(wanted, place, lambda *words: None, n_retries)
 
 
 def test_a_broken_download_is_resumed_where_it_ended_and_leaves_nothing_beside_it(
@@ -51,7 +53,7 @@ def test_a_broken_download_is_resumed_where_it_ended_and_leaves_nothing_beside_i
 
 def test_retries_are_counted_again_whenever_bytes_came(server: FileServer, tmp_path: Path) -> None:
     server.files[f"/{NAME}"] = Served(CONTENT, breaks_after=[100_000, 100_000, 0, 100_000, 0, 100_000])
-    fetched(server, tmp_path / NAME, Patience(n_retries=2, pause_s=0.0))
+    fetched(server, tmp_path / NAME, 2)
     assert (tmp_path / NAME).read_bytes() == CONTENT and len(server.asked) == 7
 
 
@@ -69,7 +71,7 @@ def test_parts_of_two_files_are_never_joined(server: FileServer, tmp_path: Path,
     with pytest.raises(DataError):
         fetched(server, tmp_path / NAME, **UNSTATED)
     server.files[f"/{NAME}"] = Served(CONTENT, etag=first.etag, takes_ranges=first.takes_ranges)
-    assert fetched(server, tmp_path / NAME, Patience(n_retries=1, pause_s=0.0), **UNSTATED) == SHA256
+    assert fetched(server, tmp_path / NAME, 1, **UNSTATED) == SHA256
 
 
 @pytest.mark.parametrize(

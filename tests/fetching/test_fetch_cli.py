@@ -303,18 +303,8 @@ def test_scans_come_out_of_the_users_own_link(
     server.files[f"/given/v2/tasks/{table.name}"] = Served(table.read_bytes())
     recording = server.files[f"/given/v1/scans/{SCAN}/{SCAN}.sens"]
     recording.breaks_after = [500]
-    words = [
-        "datasets",
-        "fetch",
-        "scannet",
-        SCAN,
-        "--from",
-        f"{server.url}/given/",
-        "--accept",
-        "scannet",
-        "--retries",
-        "0",
-    ]
+    words = ["datasets", "fetch", "scannet", SCAN, "--from", f"{server.url}/given/", "--accept", "scannet"]
+    words += ["--retries", "0"]
     code, _, err = called([*words, "--quiet"], capsys)
     assert code == 2 and "500 bytes of it are here" in err and not (tmp_path / "data/scans").exists()
     assert called(words, capsys)[0] == 0

@@ -114,16 +114,6 @@ def test_name_and_score_come_from_the_views() -> None:
     assert OpenSU3D().caveat is None
 
 
-def test_only_the_top_m_views_are_fused() -> None:
-    plates = {1: TWINS[1]}
-    good, bad = look(plates, 0, scores={1: 0.9}), look({9: TWINS[1]}, 1, scores={9: 0.2})
-    bad[1].crop_features[:] = np.eye(8, dtype=np.float32)[5]
-    feature = np.asarray(run([bad, good], CONFIG.model_copy(update={"top_m": 1})).finish().features)[0]
-    np.testing.assert_array_equal(feature, np.eye(8)[1])
-    feature = np.asarray(run([bad, good]).finish().features)[0]
-    np.testing.assert_array_equal(feature, (np.eye(8)[1] + np.eye(8)[5]) / 2)
-
-
 def test_an_over_split_mask_heals_into_the_instance_it_belongs_to() -> None:
     whole = {1: Plate((-0.5, 0.5), (-0.3, 0.3))}
     halves = {1: Plate((-0.5, 0.0), (-0.3, 0.3)), 2: Plate((0.0, 0.5), (-0.3, 0.3))}

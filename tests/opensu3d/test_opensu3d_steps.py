@@ -52,54 +52,6 @@ def test_zero_nan_negative_and_out_of_range_depth_is_dropped() -> None:
     assert (len(cloud.points), cloud.n_inside) == (2, 0)
 
 
-def halves() -> BoolArray:
-    masks = np.zeros((2, 24, 32), np.bool_)
-    masks[0, :, :16] = True
-    masks[1, 8:, 16:] = True
-    return masks
-
-
-def test_the_reduced_cloud_holds_the_first_point_of_each_voxel_and_detection() -> None:
-    config = OpenSU3DConfig(border_px=0, frame_voxel=0.3)
-    frame = frame_of(random_depth())
-    full = frame_cloud(frame, halves(), config.model_copy(update={"frame_voxel": 0.0}))
-    cloud = frame_cloud(frame, halves(), config)
-    assert len(full.points) == 24 * 32
-    keys = np.column_stack([np.floor(full.points / 0.3), full.owner])
-    _, first = np.unique(keys, axis=0, return_index=True)
-    kept = np.sort(first)
-    assert len(kept) < len(full.points)
-    np.testing.assert_array_equal(cloud.points, full.points[kept])
-    np.testing.assert_array_equal(cloud.owner, full.owner[kept])
-
-
-def test_points_inside_masks_come_first_then_rings_then_background() -> None:
-    config = OpenSU3DConfig(border_px=3, border_reference_width=0, border_pixels="owner", frame_voxel=0)
-    cloud = frame_cloud(frame_of(random_depth()), halves(), config)
-    n_masked = np.count_nonzero(halves())
-    n_ring = 3 * 16 + 2 + 2  # of the smaller mask, on the right: three columns beside it and a disc's corner above
-    assert (cloud.owner[:n_masked] != NO_DETECTION).all()
-    assert (cloud.owner[n_masked:] == NO_DETECTION).all()
-    assert cloud.n_inside == n_masked - n_ring
-    assert (cloud.owner[cloud.n_inside : n_masked] == 0).all()
-    by_default = frame_cloud(
-        frame_of(random_depth()), halves(), config.model_copy(update={"border_pixels": "background"})
-    )
-    assert by_default.n_inside == cloud.n_inside == np.count_nonzero(by_default.owner != NO_DETECTION)
-    assert len(by_default.points) == len(cloud.points)  # a ring's pixels are back-projected too
-
-
-def test_the_voxels_of_the_frame_cloud_follow_eps_unless_they_are_set() -> None:
-    frame = frame_of(random_depth())
-    config = OpenSU3DConfig(border_px=0, eps=0.3)
-    assert config.effective()["frame_voxel"] == 0.3
-    followed = frame_cloud(frame, halves(), config)
-    np.testing.assert_array_equal(
-        followed.points, frame_cloud(frame, halves(), config.model_copy(update={"frame_voxel": 0.3})).points
-    )
-    assert len(followed.points) < len(frame_cloud(frame, halves(), OpenSU3DConfig(border_px=0)).points)
-
-
 def rectangle(rows: slice, columns: slice, height: int = 40, width: int = 60) -> BoolArray:
     mask = np.zeros((height, width), np.bool_)
     mask[rows, columns] = True
@@ -127,15 +79,6 @@ def test_the_ring_of_a_small_mask_erases_the_large_one_around_it_and_no_other_pi
     assert (image.owner[distance_squared > 0] == 0).all()
 
 
-def test_two_instances_never_touch() -> None:
-    rng = np.random.default_rng(0)
-    masks = np.stack([rectangle(slice(r, r + 12), slice(c, c + 15)) for r, c in rng.integers(0, 40, (9, 2))])
-    image = np.pad(paint(masks, 2, "disc").ids, 2, constant_values=NO_DETECTION)
-    for shift in [(0, 1), (1, 0), (0, 2), (2, 0), (1, 1), (-1, 1)]:
-        other = np.roll(image, shift, (0, 1))
-        assert not ((image >= 0) & (other >= 0) & (image != other)).any()
-
-
 @pytest.mark.parametrize(("width", "reference", "expected"), [(1200, 1200, 20), (640, 1200, 11), (640, 0, 20)])
 def test_the_border_takes_the_same_share_of_every_image(width: int, reference: int, expected: int) -> None:
     assert OpenSU3DConfig(border_reference_width=reference).border_in(width) == expected
@@ -158,11 +101,6 @@ def test_the_best_scene_segment_is_the_one_with_most_matched_pairs() -> None:
 def test_of_scene_segments_with_equally_many_pairs_the_lower_id_is_best() -> None:
     overlaps = count_overlaps(np.zeros(5, np.int32), np.array([8, 4, 8, 4, 11], np.int32))
     assert (overlaps.best.tolist(), overlaps.shared.tolist()) == ([4], [2])
-
-
-def test_matches_with_points_of_no_instance_do_not_count() -> None:
-    overlaps = count_overlaps(np.zeros(4, np.int32), np.zeros(4, np.int32))
-    assert (overlaps.best.tolist(), overlaps.shared.tolist(), overlaps.n_frame.tolist()) == ([0], [0], [4])
 
 
 @pytest.mark.parametrize(

@@ -101,19 +101,6 @@ def test_density_stays_constant_and_memory_bounded_however_often_a_surface_is_se
     assert len(np.unique(np.floor(filled.points / EPS), axis=0)) == len(filled)
 
 
-@pytest.mark.parametrize(("density", "expected"), [("scene", [7, 8, 0, 9]), ("frame", [0, 5, 0, 9])])
-def test_a_point_of_no_instance_deletes_none_of_an_instance(density: Density, expected: list[int]) -> None:
-    """Voxels held by none, 5, none and 9 are met by 7, 8, none and none."""
-    filled = VoxelMap(EPS, density)
-    first = np.array([[0.01, 0, 0], [0.05, 0, 0], [0.09, 0, 0], [0.13, 0, 0]])
-    filled.insert(first, np.array([0, 5, 0, 9], np.int32))
-    placed = filled.insert(first + 0.001, np.array([7, 8, 0, 0], np.int32))
-    assert filled.ids.tolist() == expected
-    assert placed.tolist() == ([0, 1, 2, -1] if density == "scene" else [-1] * 4)
-    moved = np.isclose(filled.points[:, 0], first[:, 0] + 0.001)
-    assert moved.tolist() == ([True, True, True, False] if density == "scene" else [False] * 4)
-
-
 seen = st.lists(st.tuples(st.integers(0, 5), st.integers(0, 3)), max_size=12)  # a voxel of six, and an id
 
 

@@ -15,11 +15,10 @@ from prediction_files import (
     FEATURES,
     OURS,
     TOY,
-    TorchFile,
+    Tensor,
     own_instances,
     runs,
     scenes_of,
-    torch_text,
     write_maskclustering,
     write_open3dis,
     write_openins3d,
@@ -30,6 +29,7 @@ from prediction_files import (
     write_sam3d_colours,
     write_scannet_text,
     write_scannetpp_json,
+    write_torch,
     written_in,
 )
 
@@ -176,16 +176,12 @@ def test_maskclustering_and_mask3d_name_the_scores_differently(tmp_path: Path) -
 def test_open3dis_tensors_have_masks_in_rows_unless_the_scores_say_otherwise(tmp_path: Path) -> None:
     write_open3dis(tmp_path, TOY, as_tensor=True)
     assert_masks(masks_of(read(tmp_path, TOY["name"])), TOY["masks"], TOY["labels"], TOY["scores"])
-    turned = TorchFile()
-    pickled = b"}(" + torch_text("ins") + turned.tensor(TOY["masks"].T) + torch_text("conf")
-    turned.write(tmp_path / "turned.pth", pickled + turned.tensor(TOY["scores"]) + b"u")
+    turned = {"ins": Tensor(TOY["masks"].T), "conf": Tensor(TOY["scores"])}
+    write_torch(tmp_path / "turned.pth", turned)
     prediction = read(tmp_path, "turned")
     assert_masks(masks_of(prediction), TOY["masks"], None, TOY["scores"])
     assert any("class-agnostic" in remark for remark in prediction.remarks)
-    alone = TorchFile()
-    alone.write(
-        tmp_path / "alone.pth", b"}(" + torch_text("ins") + alone.tensor(TOY["masks"]) + torch_text("conf") + b"Nu"
-    )
+    write_torch(tmp_path / "alone.pth", {"ins": Tensor(TOY["masks"]), "conf": None})
     assert_masks(masks_of(read(tmp_path, "alone")), TOY["masks"])
 
 
@@ -227,8 +223,7 @@ def test_openmask3d_masks_without_a_feature_keep_a_row_of_zeros(tmp_path: Path) 
 
 
 def test_openmask3d_short_names_tensors_and_missing_features_are_read(tmp_path: Path) -> None:
-    file = TorchFile()
-    file.write(tmp_path / "room0.pt", file.tensor(TOY["masks"].T))
+    write_torch(tmp_path / "room0.pt", Tensor(TOY["masks"].T))
     prediction = read(tmp_path, "room0")
     assert_masks(masks_of(prediction), TOY["masks"])
     assert masks_of(prediction).features is None and "no features" in prediction.remarks[1]

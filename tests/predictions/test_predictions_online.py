@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from cloud_files import write_esam, write_object, write_onlineanyseg, write_ovo, write_rayfronts
 from places import CASES
-from prediction_files import TorchFile, refused, torch_text
+from prediction_files import Tensor, refused, tensors, write_torch
 
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
 from su3d_bench.predictions.formats import READERS, recognise
@@ -103,10 +103,9 @@ def test_a_map_of_ovo_as_an_archive_or_with_gaussians_is_read_too(tmp_path: Path
     write_ovo(tmp_path / "room0", POINTS, [2, 2, 7, -1, 7, 7], {7: ROW, 2: 2 * ROW}, is_stream=False)
     content = read(tmp_path)
     np.testing.assert_array_equal(content.instance, [1, 1, 0, -1, 0, 0])
-    file = TorchFile(is_stream=True)
     cloud = {"xyz": POINTS, "obj_ids": np.full((6, 1), -1, np.int32)}
     value = {"gaussian_params": cloud, "ovo_map_params": {"ins_3d_ids": np.zeros(0, np.int64)}}
-    file.write(tmp_path / "room0/ovo_map.ckpt", file.value(value))
+    write_torch(tmp_path / "room0/ovo_map.ckpt", tensors(value), is_stream=True)
     content = read(tmp_path)
     assert (content.instance == -1).all() and len(content.features) == 0
 
@@ -154,21 +153,13 @@ def test_each_fault_of_a_map_of_rayfronts_is_one_line(tmp_path: Path, value: dic
 
 def test_objects_and_clouds_that_share_one_table_are_refused(tmp_path: Path) -> None:
     """A reference costs a few bytes of the file, what it stands for memory each time."""
-    n, wide = 5_000, np.ones(100_000, np.float16)
-    keep, again = b"r\x05\x00\x00\x00", b"j\x05\x00\x00\x00"
-    file = TorchFile(is_stream=True)
-    cloud = file.value({"xyz": POINTS, "obj_ids": np.zeros((6, 1), np.int32)})
-    objects = torch_text("ins_3d_ids") + file.array(np.arange(n))
-    objects += torch_text("ins3d_0_clip_feature") + file.tensor(wide) + keep
-    objects += b"".join(torch_text(f"ins3d_{k}_clip_feature") + again for k in range(1, n))
-    (tmp_path / "room0").mkdir()
-    both = torch_text("map_params") + cloud + torch_text("ovo_map_params") + b"}(" + objects + b"u"
-    file.write(tmp_path / "room0/ovo_map.ckpt", b"}(" + both + b"u")
+    n, wide = 5_000, Tensor(np.ones(100_000, np.float16))
+    cloud = tensors({"xyz": POINTS, "obj_ids": np.zeros((6, 1), np.int32)})
+    objects = {"ins_3d_ids": np.arange(n)} | {f"ins3d_{k}_clip_feature": wide for k in range(n)}
+    write_torch(tmp_path / "room0/ovo_map.ckpt", {"map_params": cloud, "ovo_map_params": objects}, is_stream=True)
     assert "unpacks to more than" in refused(tmp_path, "room0", "ovo")
-    file = TorchFile()
-    clouds = b"](" + file.tensor(np.ones((100_000, 3), np.float32)) + keep + again * n + b"e"
-    shared = torch_text("global_xyz_pc") + clouds + torch_text("global_feat_pc") + again
-    file.write(tmp_path / "room0.pt", b"}(" + shared + b"u")
+    clouds = [Tensor(np.ones((100_000, 3), np.float32))] * n
+    write_torch(tmp_path / "room0.pt", {"global_xyz_pc": clouds, "global_feat_pc": clouds})
     assert "unpacks to more than" in refused(tmp_path / "room0.pt", "room0", "rayfronts")
 
 

@@ -18,7 +18,7 @@ from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, Frame, SceneInfo
 from su3d_bench.metrics.matching.labelling import most_similar
 from su3d_bench.metrics.semantic.score import has_feature
-from su3d_bench.predictions.own_runs import OwnRuns
+from su3d_bench.predictions.own_runs import OWN_RUNS
 from su3d_bench.store import predictions
 from su3d_bench.store.predictions import features_beside, read_prediction, write_prediction
 
@@ -120,7 +120,7 @@ def test_features_that_are_missing_or_damaged_are_one_line_for_both_readers(tmp_
     with pytest.raises(StoreError, match=r"prediction\.features\.npy: .*run again$"):
         read_prediction(path)
     with pytest.raises(PredictionError, match=r"prediction(\.features)?\.npy?z?: "):
-        OwnRuns().read(path, "prediction")
+        OWN_RUNS.read(path, "prediction")
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_hostile_features_are_refused(tmp_path: Path, header: bytes) -> None:
     content = b"\x93NUMPY\x01\x00" + len(padded).to_bytes(2, "little") + padded + ROWS.tobytes()
     features_beside(path).write_bytes(content)
     with pytest.raises(PredictionError, match=r"prediction\.features\.npy: "):
-        OwnRuns().read(path, "prediction")
+        OWN_RUNS.read(path, "prediction")
 
 
 # ---- scoring in blocks

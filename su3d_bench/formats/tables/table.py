@@ -8,6 +8,7 @@ import re
 import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Literal
 
 from su3d_bench.core.errors import DataError, printable
@@ -141,13 +142,7 @@ def text_table(
 
 def blocks_of(rows: Sequence[TableRow]) -> list[list[TableRow]]:
     """Rows that belong together, in order: measured before reported, one group after the other."""
-    blocks: list[list[TableRow]] = []
-    for row in rows:
-        if blocks and (blocks[-1][-1].is_reported, blocks[-1][-1].group) == (row.is_reported, row.group):
-            blocks[-1].append(row)
-        else:
-            blocks.append([row])
-    return blocks
+    return [list(block) for _, block in groupby(rows, lambda row: (row.is_reported, row.group))]
 
 
 MOST_ROWS = 200_000
@@ -214,16 +209,7 @@ MOST_XML_BYTES = 32 << 20  # of all that is in the archive, beside pictures, whi
 MOST_SHEET_CELLS = 2_000_000  # of all worksheets
 MOST_COLUMNS = 64  # beyond which nothing is looked at
 # What openpyxl raises on damaged workbooks, beside what zipfile does.
-WORKBOOK_DAMAGE = (
-    *ZIP_DAMAGE,
-    LookupError,
-    TypeError,
-    AttributeError,
-    OSError,
-    SyntaxError,
-    OverflowError,
-    RecursionError,
-)
+WORKBOOK_DAMAGE = (*ZIP_DAMAGE, LookupError, TypeError, AttributeError, OSError, SyntaxError, OverflowError)
 
 Row = tuple[int, list[str | None]]  # its number from 1 on, and its cells from column A on
 

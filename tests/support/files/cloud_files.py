@@ -5,7 +5,6 @@ from __future__ import annotations
 import gzip
 import pickle
 import sys
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -14,45 +13,10 @@ import h5py
 import numpy as np
 import pytest
 from hm3dsem_walk import write_graph
-from prediction_files import TorchFile, torch_text
+from prediction_files import Tensor, tensors, write_torch
 
 from su3d_bench.formats.pcd import write_pcd_points
-from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
-
-
-def write_ply_as(path: Path, elements: Sequence[PlyElement], format: str, comments: Sequence[str] = ()) -> None:
-    """As ``write_ply``, in another ``format``."""
-    write_ply(path, elements)
-    header, end, body = path.read_bytes().partition(b"end_header\n")
-    lines = header.decode().splitlines()
-    lines[1:2] = [f"format {format} 1.0", *(f"comment {comment}" for comment in comments)]
-    if format != "binary_little_endian":
-        is_text = format == "ascii"
-        body = b"".join(text(row) if is_text else big_endian(row) for element in elements for row in rows(element))
-    path.write_bytes("\n".join([*lines, ""]).encode() + end + body)
-
-
-def rows(element: PlyElement) -> Iterator[list[np.ndarray]]:
-    """The values of each row, those of a list behind their number."""
-    for row in range(element.n_rows):
-        cells: list[np.ndarray] = []
-        for column in element.columns.values():
-            if isinstance(column, ListColumn):
-                items = column.values[column.indptr[row] : column.indptr[row + 1]]
-                cells += [np.array([len(items)], column.count_type), items]
-            else:
-                cells.append(column[row : row + 1])
-        yield cells
-
-
-def text(row: list[np.ndarray]) -> bytes:
-    """The shortest digits that give each value back."""
-    return (" ".join(str(value) for cell in row for value in cell) + "\n").encode()
-
-
-def big_endian(row: list[np.ndarray]) -> bytes:
-    return b"".join(cell.astype(cell.dtype.newbyteorder(">")).tobytes() for cell in row)
-
+from su3d_bench.formats.ply import PlyElement, write_ply
 
 RNG = np.random.default_rng(0)
 NAMES = ["couch", "lamp", "wall"]
@@ -127,9 +91,7 @@ def write_gradslam(folder: Path, points: Any, embeddings: Any, **options: Any) -
 
 
 def write_tensor(path: Path, values: Any) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    file = TorchFile()
-    file.write(path, file.tensor(values))
+    write_torch(path, Tensor(values))
 
 
 def write_object(path: Path, points: Any) -> None:
@@ -137,8 +99,7 @@ def write_object(path: Path, points: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     columns = {axis: np.asarray(points)[:, k].astype(np.float64) for k, axis in enumerate("xyz")}
     colours = {name: np.full(len(points), 7, np.uint8) for name in ("red", "green", "blue")}
-    vertex = PlyElement("vertex", len(points), {**columns, **colours})
-    write_ply_as(path, [vertex], "binary_little_endian", ["Created by Open3D"])
+    write_ply(path, [PlyElement("vertex", len(points), {**columns, **colours})])
 
 
 def write_hovsg(folder: Path, clouds: dict[int, Any], features: Any) -> None:
@@ -160,27 +121,20 @@ def write_openlex(folder: Path, points: Any, index: Any, features: Any, cloud: s
 
 def write_ovo(folder: Path, points: Any, ids: Any, features: dict[int, Any], *, is_stream: bool = True) -> None:
     """A checkpoint of OVO: the points of its SLAM with the object of each in a column, a feature an object."""
-    folder.mkdir(parents=True, exist_ok=True)
-    file = TorchFile(is_stream=is_stream)
     cloud = {
         "xyz": np.asarray(points, np.float32),
         "obj_ids": np.asarray(ids, np.int32)[:, np.newaxis],
         "ids": np.arange(len(points), dtype=np.int32)[:, np.newaxis],
         "max_id": len(points),
     }
-    numbers = torch_text("ins_3d_ids") + file.array(np.array(list(features), np.int64))
-    for number, feature in features.items():
-        numbers += torch_text(f"ins3d_{number}_clip_feature") + file.value(feature)
-        numbers += torch_text(f"ins3d_{number}_clip_feature_kf") + file.value(None)
-    objects = b"}(" + numbers + b"u"
-    both = torch_text("map_params") + file.value(cloud) + torch_text("ovo_map_params") + objects
-    file.write(folder / "ovo_map.ckpt", b"}(" + both + b"u")
+    objects = {f"ins3d_{number}_clip_feature": feature for number, feature in features.items()}
+    numbers = {"ins_3d_ids": np.array(list(features), np.int64), "ins3d_0_clip_feature_kf": None}
+    value = {"map_params": tensors(cloud), "ovo_map_params": numbers | tensors(objects)}
+    write_torch(folder / "ovo_map.ckpt", value, is_stream=is_stream)
 
 
 def write_rayfronts(path: Path, value: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    file = TorchFile()
-    file.write(path, file.value(value))
+    write_torch(path, tensors(value))
 
 
 def write_esam(folder: Path, points: Any, groups: Any) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import json
 import pickle
 import struct
 import zipfile
-from collections.abc import Callable, Sequence
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -82,135 +85,126 @@ def write_maskclustering(folder: Path, scene: dict[str, Any]) -> None:
     )
 
 
-def torch_text(value: str) -> bytes:
-    return b"X" + struct.pack("<I", len(value)) + value.encode()
+class TorchName:
+    """A name of torch's, such as ``torch._utils _rebuild_tensor_v2``, which nobody needs to import."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+
+    def __call__(self) -> None: ...
 
 
-def torch_numbers(values: Sequence[int]) -> bytes:
-    return b"(" + b"".join(b"\x8a\x08" + struct.pack("<q", value) for value in values) + b"t"
+@dataclass(frozen=True, eq=False)
+class Tensor:
+    """An array that is pickled as torch pickles a tensor; one that stands in several places is written once."""
+
+    array: Any
 
 
+@dataclass(frozen=True, eq=False)
+class Sparse:
+    """The ones at ``indices`` (2, n) of a matrix, as torch pickles a sparse tensor."""
+
+    indices: Any
+    shape: tuple[int, ...]
+
+
+LAYOUT = TorchName("torch.sparse_coo")
 STORAGES = {"bool": "Bool", "float16": "Half", "float32": "Float", "float64": "Double", "int32": "Int", "int64": "Long"}
 
 
-class TorchFile:
-    """What torch.save writes, without torch: tensors become storages beside a pickle in torch's words.
+class TorchPickler(pickle._Pickler):
+    """Writes what torch.save writes, without torch: the values of tensors go into ``storages``."""
 
-    ``is_stream``: in the form before 1.6, which ``_use_new_zipfile_serialization=False`` still asks for.
-    """
-
-    def __init__(self, *, is_stream: bool = False) -> None:
+    def __init__(self, stream: Any, *, is_stream: bool) -> None:
+        super().__init__(stream, 2)
+        self.storages: list[Any] = []
         self._is_stream = is_stream
-        self._storages: list[bytes] = []
-        self._sizes: list[int] = []
 
-    def tensor(self, array: Any) -> bytes:
-        """The pickle of a contiguous tensor, whose values go into a storage."""
-        array = np.ascontiguousarray(array) if array.ndim else array
-        key = str(len(self._storages))
-        self._storages.append(array.tobytes())
-        self._sizes.append(array.size)
-        kind = STORAGES[array.dtype.name].encode()
-        reference = torch_text("storage") + b"ctorch\n" + kind + b"Storage\n" + torch_text(key) + torch_text("cpu")
-        size = b"\x8a\x08" + struct.pack("<q", array.size) + b"N" * self._is_stream
-        strides = [stride // array.itemsize for stride in array.strides]
-        return (
-            b"ctorch._utils\n_rebuild_tensor_v2\n((" + reference + size + b"tQK\x00" + torch_numbers(array.shape)
-            + torch_numbers(strides) + b"\x89ccollections\nOrderedDict\n)RtR"
-        )  # fmt: skip
+    def persistent_id(self, value: Any) -> Any:
+        if not isinstance(value, memoryview):
+            return None
+        self.storages.append(array := np.asarray(value))
+        kind = TorchName(f"torch {STORAGES[array.dtype.name]}Storage")
+        return "storage", kind, str(len(self.storages) - 1), "cpu", array.size, *[None] * self._is_stream
 
-    def array(self, array: Any) -> bytes:
-        """The pickle of a NumPy array, its bytes as latin1 text."""
-        kind: bytes = torch_text(array.dtype.str[1:]) + b"\x89\x88\x87R"
-        state = b"(K\x03" + torch_text("<") + b"NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb"
-        values: bytes = array.tobytes().decode("latin1").encode()
-        return (
-            b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85c_codecs\nencode\n" + torch_text("b")
-            + torch_text("latin1") + b"\x86R\x87R(K\x01" + torch_numbers(array.shape) + b"cnumpy\ndtype\n" + kind
-            + state + b"\x89c_codecs\nencode\nX" + struct.pack("<I", len(values)) + values + torch_text("latin1")
-            + b"\x86Rtb"
-        )  # fmt: skip
+    def reducer_override(self, value: Any) -> Any:
+        if isinstance(value, Tensor):
+            array = np.require(value.array, requirements="C")
+            strides = tuple(stride // array.itemsize for stride in array.strides)
+            parts = memoryview(array.reshape(-1)), 0, array.shape, strides, False, OrderedDict()
+            return TorchName("torch._utils _rebuild_tensor_v2"), parts
+        if isinstance(value, Sparse):
+            parts = Tensor(value.indices), Tensor(np.ones(value.indices.shape[1], np.float32)), value.shape, True
+            return TorchName("torch._utils _rebuild_sparse_tensor"), (LAYOUT, parts)
+        if value is LAYOUT:
+            return TorchName("torch.serialization _get_layout"), ("torch.sparse_coo",)
+        return value.text if isinstance(value, TorchName) else NotImplemented
 
-    def value(self, value: Any) -> bytes:
-        """The pickle of dicts, lists, texts, integers, None and tensors."""
-        if isinstance(value, dict):
-            return b"}(" + b"".join(torch_text(key) + self.value(one) for key, one in value.items()) + b"u"
-        if isinstance(value, list):
-            return b"](" + b"".join(map(self.value, value)) + b"e"
-        if isinstance(value, np.ndarray):
-            return self.tensor(value)
-        if isinstance(value, int):
-            return b"\x8a\x08" + struct.pack("<q", value)
-        return b"N" if value is None else torch_text(value)
-
-    def write(self, path: Path, pickled: bytes) -> None:
-        if self._is_stream:
-            path.write_bytes(self._stream(pickled))
+    def save_global(self, value: Any, name: Any = None) -> None:
+        if not isinstance(value, TorchName):
+            super().save_global(value, name)  # type: ignore[misc]
             return
-        with zipfile.ZipFile(path, "w") as archive:
-            archive.writestr(f"{path.stem}/data.pkl", b"\x80\x02" + pickled + b".")
-            archive.writestr(f"{path.stem}/byteorder", b"little")
-            for key, content in enumerate(self._storages):
-                archive.writestr(f"{path.stem}/data/{key}", content)
-            archive.writestr(f"{path.stem}/version", b"3\n")
+        self.write(pickle.GLOBAL + "\n".join([*value.text.split(), ""]).encode())  # type: ignore[attr-defined]
+        self.memoize(value)  # type: ignore[attr-defined]
 
-    def _stream(self, pickled: bytes) -> bytes:
-        """A magic number, a version, facts of the machine, the value, the names of the storages, and these."""
+
+def tensors(value: Any) -> Any:
+    """``value`` with tensors in place of its arrays."""
+    if isinstance(value, dict):
+        return {key: tensors(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return list(map(tensors, value))
+    return Tensor(value) if isinstance(value, np.ndarray) else value
+
+
+def write_torch(path: Path, value: Any, *, is_stream: bool = False) -> None:
+    """What torch.save writes; ``is_stream``: before 1.6, and still with ``_use_new_zipfile_serialization=False``."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pickler = TorchPickler(stream := io.BytesIO(), is_stream=is_stream)
+    pickler.dump(value)
+    storages = {str(k): array for k, array in enumerate(pickler.storages)}
+    if is_stream:  # a magic number, a version, facts of the machine, the value, the names of the storages, and these
         facts = {"protocol_version": 1001, "little_endian": True, "type_sizes": {"short": 2, "int": 4, "long": 4}}
-        names = [str(key) for key in range(len(self._storages))]
-        first = b"".join(pickle.dumps(value, 2) for value in (0x1950A86A20F9469CFC6C, 1001, facts))
-        storages = [struct.pack("<q", n) + content for n, content in zip(self._sizes, self._storages, strict=True)]
-        return first + b"\x80\x02" + pickled + b"." + pickle.dumps(names, 2) + b"".join(storages)
+        first = b"".join(pickle.dumps(one, 2) for one in (0x1950A86A20F9469CFC6C, 1001, facts))
+        contents = b"".join(struct.pack("<q", array.size) + array.tobytes() for array in storages.values())
+        path.write_bytes(first + stream.getvalue() + pickle.dumps(list(storages), 2) + contents)
+        return
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(f"{path.stem}/data.pkl", stream.getvalue())
+        archive.writestr(f"{path.stem}/byteorder", b"little")
+        for key, array in storages.items():
+            archive.writestr(f"{path.stem}/data/{key}", array.tobytes())
 
 
 def write_openmask3d(folder: Path, scene: dict[str, Any], features: Any) -> None:
     """A NumPy float16 array through torch.save, and a float64 file of features."""
-    folder.mkdir(parents=True, exist_ok=True)
-    file = TorchFile()
-    file.write(folder / f"{scene['name']}_masks.pt", file.array(scene["masks"].T.astype(np.float16)))
+    write_torch(folder / f"{scene['name']}_masks.pt", scene["masks"].T.astype(np.float16))
     np.save(folder / f"{scene['name']}_openmask3d_features.npy", features)
 
 
 def write_openyolo3d(folder: Path, scene: dict[str, Any]) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    file = TorchFile()
-    pickled = file.tensor(scene["masks"].T) + file.tensor(scene["scores"].astype(np.float32)) + b"\x86"
-    file.write(folder / f"{scene['name']}.pt", pickled)
+    columns = Tensor(scene["masks"].T), Tensor(scene["scores"].astype(np.float32))
+    write_torch(folder / f"{scene['name']}.pt", columns)
 
 
 def write_openyolo3d_labelled(folder: Path, scene: dict[str, Any]) -> None:
     """What predict of Open-YOLO 3D gives of a scene: masks, positions of their classes and scores."""
-    folder.mkdir(parents=True, exist_ok=True)
-    file = TorchFile()
-    columns = (scene["masks"].T, scene["labels"].astype(np.int64), scene["scores"].astype(np.float32))
-    file.write(folder / f"{scene['name']}.pt", b"".join(map(file.tensor, columns)) + b"\x87")
+    columns = scene["masks"].T, scene["labels"].astype(np.int64), scene["scores"].astype(np.float32)
+    write_torch(folder / f"{scene['name']}.pt", tuple(map(Tensor, columns)))
 
 
 def write_openins3d(folder: Path, scene: dict[str, Any]) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    file = TorchFile()
-    places = np.stack(np.nonzero(scene["masks"].T))
-    layout = b"ctorch.serialization\n_get_layout\n" + torch_text("torch.sparse_coo") + b"\x85R"
-    parts = file.tensor(places) + file.tensor(np.ones(places.shape[1], np.float32))
-    shape = torch_numbers(scene["masks"].T.shape)
-    pickled = b"ctorch._utils\n_rebuild_sparse_tensor\n" + layout + b"(" + parts + shape + b"\x88t\x86R"
-    file.write(folder / f"{scene['name']}.pt", pickled)
+    masks = scene["masks"].T
+    write_torch(folder / f"{scene['name']}.pt", Sparse(np.stack(np.nonzero(masks)), masks.shape))
 
 
 def write_open3dis(folder: Path, scene: dict[str, Any], *, as_tensor: bool = False) -> None:
     """A dict of run lengths (or a tensor of masks), confidences and class indices."""
-    folder.mkdir(parents=True, exist_ok=True)
-    file = TorchFile()
-    masks = b"](" + b"".join(
-        b"}(" + torch_text("length") + b"\x8a\x08" + struct.pack("<q", len(mask)) + torch_text("counts")
-        + file.array(runs(mask)) + b"u" for mask in scene["masks"]
-    ) + b"e"  # fmt: skip
-    if as_tensor:
-        masks = file.tensor(scene["masks"])
-    confidences = torch_text("conf") + file.tensor(scene["scores"])
-    classes = torch_text("final_class") + file.tensor(scene["labels"].astype(np.int64))
-    pickled = b"}(" + torch_text("ins") + masks + confidences + classes + b"u"
-    file.write(folder / f"{scene['name']}.pth", pickled)
+    masks: Any = [{"length": len(mask), "counts": runs(mask)} for mask in scene["masks"]]
+    masks = Tensor(scene["masks"]) if as_tensor else masks
+    value = {"ins": masks, "conf": Tensor(scene["scores"]), "final_class": Tensor(scene["labels"].astype(np.int64))}
+    write_torch(folder / f"{scene['name']}.pth", value)
 
 
 def write_opensun3d(folder: Path, scene: dict[str, Any]) -> None:
@@ -234,9 +228,7 @@ def write_sam3d_colours(file: Path, groups: Any) -> None:
 
 
 def write_sam3d(folder: Path, name: str, groups: Any) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    file = TorchFile()
-    file.write(folder / f"{name}.pth", file.array(groups))
+    write_torch(folder / f"{name}.pth", groups)
 
 
 RNG = np.random.default_rng(0)

@@ -49,29 +49,6 @@ def nearest_by_brute_force(queries: Float64Array, points: Float64Array, radius_m
     return pairs
 
 
-def cal_group_by_loop(
-    other: Int64Array, group: Int64Array, pairs: Sequence[tuple[int, int]], ratio: float
-) -> Int64Array:
-    """What the words of the method say, pair by pair."""
-    group = group.copy()
-    group[group != -1] += other.max() + 1
-    sizes = {key: int((group == key).sum()) for key in set(group.tolist())}
-    other_sizes = {key: int((other == key).sum()) for key in set(other.tolist())}
-    shared: dict[int, dict[int, int]] = {}
-    for i, j in pairs:
-        mine, theirs = int(group[i]), int(other[j])
-        if mine == -1:
-            group[i] = theirs
-        elif theirs != -1:
-            of_mine = shared.setdefault(mine, {})
-            of_mine[theirs] = of_mine.get(theirs, 0) + 1
-    for mine, of_mine in shared.items():
-        best = max(of_mine, key=lambda key: of_mine[key])  # the first of equals, in the order they were met
-        if np.float32(of_mine[best]) / np.float32(min(sizes[mine], other_sizes[best])) >= np.float32(ratio):
-            group[group == mine] = best
-    return group
-
-
 @dataclass(frozen=True)
 class Plate:
     """A rectangle facing the camera 2 m away: its lower and upper x and y, metres; ``axis`` is that of its feature."""
