@@ -191,7 +191,7 @@ def show_plan(plan: Plan, arguments: argparse.Namespace) -> int:
         f"about {total / 60:.1f} minutes with {counted(plan.n_workers, 'job')} ({source}); folder {plan.folder.path}"
     )
     for job in plan.jobs[:1]:
-        answer(f"protocols: {', '.join(job.protocols) or 'none'}; profile {job.profile}")
+        answer(f"protocols: {', '.join(job.protocols) or 'none'}; profile {job.config.profile}")
     return EXIT_DONE
 
 

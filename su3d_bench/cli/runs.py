@@ -91,7 +91,6 @@ def call_show(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
     from su3d_bench.analysis.leaderboard import run_entry, size_bytes
-    from su3d_bench.core.config import DEFAULT_SOURCE
     from su3d_bench.core.errors import StoreError, printable, printable_json
     from su3d_bench.formats.tables.table import percent
     from su3d_bench.runs.existing import existing_run
@@ -100,9 +99,8 @@ def call_show(arguments: argparse.Namespace) -> int:
     asked: dict[str, str] = {}
     with suppress(StoreError):  # a damaged run.toml tells nothing
         held = existing_run(arguments.run)
-        for path, value in () if held is None else held.values.items():
-            if held is not None and held.remarks.get(path) != DEFAULT_SOURCE:
-                asked[".".join(path)] = json.dumps(value, ensure_ascii=False, default=str)
+        for path, value in () if held is None else held.requested.items():
+            asked[".".join(path)] = json.dumps(value, ensure_ascii=False, default=str)
     n_bytes = size_bytes(arguments.run)
     config = arguments.run / "run.toml"
     again = shlex.join(["su3d-bench", "run", "--config", str(config), "--out", str(arguments.run)])
@@ -256,12 +254,12 @@ def _scenes(run: RunFolder) -> list[str]:
     """The scenes that the run was asked for."""
     from su3d_bench.core.errors import printable
     from su3d_bench.core.files.atomic import read_json
-    from su3d_bench.store.records import RequestRecord, checked
+    from su3d_bench.store.records import RunRecord, checked
 
     scenes: tuple[str, ...] = ()
     record = read_json(run.path / "run.json")
     with suppress(ValueError, RecursionError):  # pydantic's errors are of value
-        scenes = checked(RequestRecord, record).scenes
+        scenes = checked(RunRecord, record).scenes
     if not scenes or any(".." in scene for scene in scenes):
         raise StoreError(f"{run.path}: run.json is not as a run writes it; name the folder of a run")
     return [printable(scene, 200) for scene in scenes]

@@ -307,7 +307,7 @@ class WarmsUp(MethodAbility, Protocol):
 
 
 @runtime_checkable
-class TakesTools(Protocol):
+class TakesTools(MethodAbility, Protocol):
     """Works on the whole scene; called before ``start``."""
 
     def receive_tools(self, tools: SceneTools) -> None: ...
@@ -327,25 +327,14 @@ class TakesTruth(MethodAbility, Method, Protocol):
     def receive_truth(self, truth: GroundTruth) -> None: ...
 
 
-@runtime_checkable
-class CountsPoints(MethodAbility, Protocol):
-    """The points of its map after an update."""
+class CountsItsMap(MethodAbility, Protocol):
+    """The points, instances and bytes of memory of its map after an update; each alone may be there."""
 
     @property
     def n_points(self) -> int: ...
 
-
-@runtime_checkable
-class CountsInstances(MethodAbility, Protocol):
-    """The instances of its map after an update."""
-
     @property
     def n_instances(self) -> int: ...
-
-
-@runtime_checkable
-class CountsBytes(MethodAbility, Protocol):
-    """The memory of its map after an update."""
 
     @property
     def map_bytes(self) -> int: ...
@@ -398,43 +387,9 @@ class Closes(MethodAbility, Protocol):
 
 
 INTERFACES = {"dataset": Dataset, "method": Method}
-ABILITIES = {
-    "dataset": (
-        HasFurtherTruths,
-        HasPlaces,
-        HasStatus,
-        HasGroups,
-        HasProblems,
-        CorrectsReading,
-        SaysUp,
-        HasSurface,
-        HasQueries,
-        AsksText,
-        KnowsObjects,
-        RendersFrames,
-        HasSketches,
-        ReadsMadeRooms,
-        NamesScenes,
-    ),
-    "method": (
-        HasAbout,
-        HasPresets,
-        HasShortNames,
-        IsSystem,
-        WarmsUp,
-        TakesTools,
-        NeedsSurface,
-        TakesTruth,
-        CountsPoints,
-        CountsInstances,
-        CountsBytes,
-        CountsLosses,
-        HasFinishCosts,
-        HasInputs,
-        HasCaveat,
-        HasOwnPerception,
-        Closes,
-    ),
+ABILITIES: dict[str, Sequence[type]] = {
+    "dataset": DatasetAbility.__subclasses__(),
+    "method": MethodAbility.__subclasses__(),
 }
 
 

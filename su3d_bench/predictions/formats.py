@@ -19,7 +19,7 @@ from su3d_bench.predictions.scannet_text import (
     ScannetSemanticText,
     ScannetText,
 )
-from su3d_bench.store.records import RequestRecord, read_record
+from su3d_bench.store.records import RunRecord, read_record
 
 # Files of each format, how they are known and read, and whose they are.
 _ALL: tuple[Reader, ...] = (
@@ -241,7 +241,7 @@ def planned_scenes(sources: Sequence[Source], dataset: str) -> list[str] | None:
         if source.reader.name != OwnRuns.name or not record_file.is_file():
             return None
         try:
-            record = read_record(RequestRecord, record_file, str(source.path))
+            record = read_record(RunRecord, record_file, str(source.path))
         except StoreError:
             return None
         planned += [scene.removeprefix(f"{dataset}/") for scene in record.scenes if scene.startswith(f"{dataset}/")]

@@ -5,11 +5,10 @@ from __future__ import annotations
 import glob
 import math
 import shlex
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from su3d_bench.core.errors import DataError, Su3dError
 from su3d_bench.core.files.atomic import is_file
@@ -17,7 +16,7 @@ from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, unpack_scores
-from su3d_bench.runs.job import Part, SceneJob, build_dataset, build_method, stride_of
+from su3d_bench.runs.job import build_dataset, build_method, stride_of
 from su3d_bench.runs.plan import Plan
 from su3d_bench.runs.runner import RunResult
 from su3d_bench.store.predictions import read_prediction
@@ -46,37 +45,26 @@ class JobEstimate:
 
 def estimate(plan: Plan) -> list[JobEstimate]:
     """One estimate a scene and method, in the order of the plan; reads no frame."""
-    runs = plan.folder.path.parent
-    update_s = {part.name: recent_update_s(runs, part.name) for part in plan.jobs[0].methods}
-    roots = {job.dataset: job.data_root for job in plan.jobs}
-    datasets = {part: build_dataset(part, root) for part, root in roots.items()}
-    needs_frames = {part: bool(build_method(part).needs.frames) for part in plan.jobs[0].methods}
+    methods, runs = plan.jobs[0].methods, plan.folder.path.parent
+    update_s = {part: recent_update_s(runs, part.name) for part in methods}
+    needs_frames = {part for part in methods if build_method(part).needs.frames}
+    datasets = {part: build_dataset(part, root) for part, root in {(job.dataset, job.data_root) for job in plan.jobs}}
     going = {job.path for job in plan.removes}
-    return [
-        _of_job(plan, job, part, update_s[part.name], datasets[job.dataset] if needs_frames[part] else None, going)
-        for job in plan.jobs
-        for part in job.methods
-    ]
-
-
-def _of_job(
-    plan: Plan, job: SceneJob, part: Part, measured: float | None, dataset: Any, going: Collection[Path]
-) -> JobEstimate:
-    """``measured``: seconds an update; ``dataset`` None where the method looks at no frame.
-
-    ``going``: the folders of jobs that the plan removes.
-    """
-    folder = plan.folder.job(job.scene, part.name)
-    is_done = {"predict", "score"} <= set(folder.seals()) and folder.path not in going
-    n_updates, remark = 0, None
-    if dataset is not None:
-        try:
-            n_frames = len(dataset.frames(job.scene_name, stride_of(job.stride, part.options)))
-            n_updates = min(n_frames, job.limit or n_frames)
-        except DataError as error:
-            remark = str(error)
-    seconds = GUESSED_SCENE_S + n_updates * (GUESSED_UPDATE_S if measured is None else measured)
-    return JobEstimate(job.scene, part.name, n_updates, seconds, measured is not None, is_done, remark)
+    rows = []
+    for job, part in ((each, part) for each in plan.jobs for part in each.methods):
+        folder = plan.folder.job(job.scene, part.name)
+        is_done = {"predict", "score"} <= set(folder.seals()) and folder.path not in going
+        n_updates, remark = 0, None
+        if part in needs_frames:
+            try:
+                n_frames = len(datasets[job.dataset].frames(job.scene_name, stride_of(job, part)))
+                n_updates = min(n_frames, job.config.limit or n_frames)
+            except DataError as error:
+                remark = str(error)
+        measured = update_s[part]
+        seconds = GUESSED_SCENE_S + n_updates * (GUESSED_UPDATE_S if measured is None else measured)
+        rows.append(JobEstimate(job.scene, part.name, n_updates, seconds, measured is not None, is_done, remark))
+    return rows
 
 
 def recent_update_s(runs: Path, method: str) -> float | None:

@@ -10,7 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Generic, Self, TypeVar, overload
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 
@@ -55,16 +55,9 @@ class FirstFrames(Sequence[Frame]):
     def __len__(self) -> int:
         return self.n
 
-    @overload
-    def __getitem__(self, index: int) -> Frame: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[Frame]: ...
-
-    def __getitem__(self, index: int | slice) -> Frame | list[Frame]:
-        if isinstance(index, slice):
-            return [self.frames[i] for i in range(self.n)[index]]
-        return self.frames[range(self.n)[index]]
+    def __getitem__(self, index: Any) -> Any:
+        places = range(self.n)[index]
+        return self.frames[places] if isinstance(places, int) else [self.frames[place] for place in places]
 
 
 class TimedRegions:
@@ -89,37 +82,32 @@ class TimedRegions:
 
 def no_detections(frame: Frame, needs: PerceptionNeeds) -> Detections:
     """What a method that needs no masks gets."""
+    return _detections(frame, needs, n=0, dim=0)
+
+
+def _detections(frame: Frame, needs: PerceptionNeeds, n: int, dim: int) -> Detections:
+    """``n`` detections without a name, each of the whole image."""
     return Detections(
         frame_index=frame.index,
-        masks=np.zeros((0, *frame.depth_m.shape), np.bool_),
-        boxes=np.zeros((0, 4), np.float32),
-        scores=np.zeros(0, np.float32),
-        names=(),
-        captions=(),
+        masks=np.ones((n, *frame.depth_m.shape), np.bool_),
+        boxes=np.zeros((n, 4), np.float32),
+        scores=np.ones(n, np.float32),
+        names=("",) * n,
+        captions=("",) * n,
         crop_ratios=needs.crop_ratios,
-        crop_features=np.zeros((0, len(needs.crop_ratios), 0), np.float32),
-        global_feature=np.zeros(0, np.float32),
+        crop_features=np.ones((n, len(needs.crop_ratios), dim), np.float32),
+        global_feature=np.ones(dim, np.float32),
+        name_features=np.ones((n, dim), np.float32) if n and needs.name_features else None,
     )
 
 
 def warm_up(method: Method) -> None:
     """Feeds ``method``, which is thrown away, a made-up frame: no timed step then waits for a compiler or an import."""
-    size, needs = 32, method.needs
+    size = 32
     depth_m = 1 + np.linspace(0, 0.5, size * size, dtype=np.float32).reshape(size, size) ** 2
     intrinsics = np.array([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1]])
     frame = Frame(0, 0.0, np.zeros((size, size, 3), np.uint8), depth_m, np.eye(4), intrinsics)
-    detections = Detections(
-        frame_index=0,
-        masks=np.ones((1, size, size), np.bool_),
-        boxes=np.zeros((1, 4), np.float32),
-        scores=np.ones(1, np.float32),
-        names=("",),
-        captions=("",),
-        crop_ratios=needs.crop_ratios,
-        crop_features=np.ones((1, len(needs.crop_ratios), 1), np.float32),
-        global_feature=np.ones(1, np.float32),
-        name_features=np.ones((1, 1), np.float32) if needs.name_features else None,
-    )
+    detections = _detections(frame, method.needs, n=1, dim=1)
     method.start(SceneInfo("made-up", "made-up", N_WARM_UP, 1, "camera"))
     for _ in range(N_WARM_UP):
         method.update(frame, detections, Timer())
@@ -239,7 +227,11 @@ class Feeding:
             frame = frames.next_frame()
         if not (frame.depth_m > 0).any():
             raise DataError(f"{self._scene} frame {frame.index}: depth is empty, no pixel is above 0 m")
-        detections = self._detect(frame)
+        detections = (
+            no_detections(frame, method.needs)
+            if method.needs.masks == "none"
+            else self._perception.detect(frame, method.needs, timer)
+        )
         with self._clock.running("update"):
             method.update(frame, detections, timer)
         total_ms = (time.perf_counter() - start) * 1e3
@@ -251,12 +243,6 @@ class Feeding:
         # What is measured here goes before what a method calls by the same name.
         own |= {key: value for key, value in of_method.items() if key not in own}
         return own | {"method_ms": round(self._clock.take("update").method_ms, 3), "total_ms": round(total_ms, 3)}
-
-    def _detect(self, frame: Frame) -> Detections:
-        needs = self._method.needs
-        return (
-            no_detections(frame, needs) if needs.masks == "none" else self._perception.detect(frame, needs, self._timer)
-        )
 
     def write_map(self, path: Path) -> None:
         """Write the method's map so far."""

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core import registry
-from su3d_bench.core.config import Settings, flatten, resolve
+from su3d_bench.core.config import RunConfig, Settings, flatten, resolve
 from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_file, digest_json, package_versions
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.interfaces import HasCaveat, HasInputs, HasOwnPerception, Method, ReadsMadeRooms, TakesTruth
@@ -92,8 +92,9 @@ FIELDS_KNOWN_LATER = ("data", "profile", "perception", "packages.torch", "packag
 class SceneJob:
     """Everything that a worker needs to know of one scene; ``index`` counts the scenes of the run.
 
-    ``replaces``: a map that was made from other inputs is made anew instead of refused. ``doubts``: what must be said
-    of its poses, None where whoever made the job could not look at its data.
+    ``config`` is the run's and ``perception`` that of perception as JSON. ``replaces``: a map that was made from other
+    inputs is made anew instead of refused. ``doubts``: what must be said of its poses, None where whoever made the job
+    could not look at its data.
     """
 
     scene: str
@@ -101,20 +102,12 @@ class SceneJob:
     methods: tuple[Part, ...]
     ceiling: Part | None
     protocols: tuple[str, ...]
-    profile: str
+    config: RunConfig
     perception: str
-    stride: int
-    seed: int
-    limit: int
-    pictures: bool
-    anytime: tuple[float, ...]
     folder: Path
     data_root: Path
     cache_root: Path
     index: int = 0
-    is_offline: bool = False
-    solver: str = "built-in"
-    accepts_poses: bool = False
     replaces: bool = False
     doubts: tuple[str, ...] | None = None
 
@@ -150,19 +143,19 @@ class MethodOutcome:
     doubts: tuple[str, ...] = ()
 
 
-def stride_of(job_stride: int, options: str) -> int:
+def stride_of(job: SceneJob, part: Part) -> int:
     """Frames between updates: the run's where it is set, else the method's own, else 1."""
-    return job_stride or int(json.loads(options).get("stride", 1))
+    return job.config.stride or int(json.loads(part.options).get("stride", 1))
 
 
 def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
     """What of a prediction's key is known before any data is read, the most telling fields first."""
-    key = {"dataset": job.dataset.name, "method": part.name, "seed": str(job.seed)}
+    key = {"dataset": job.dataset.name, "method": part.name, "seed": str(job.config.seed)}
     sections = [(f"method.{part.name}", part.options), (f"dataset.{job.dataset.name}", job.dataset.options)]
     if method.needs.frames:
-        key |= {"stride": str(stride_of(job.stride, part.options)), "limit": str(job.limit or "none")}
-        if job.anytime:
-            key["anytime"] = str(job.anytime)
+        key |= {"stride": str(stride_of(job, part)), "limit": str(job.config.limit or "none")}
+        if job.config.shares:
+            key["anytime"] = str(job.config.shares)
         sections.append(("perception", job.perception))
     for prefix, options in sections:
         for path, value in flatten(json.loads(options)):
@@ -221,15 +214,15 @@ class JobInputs:
         """The key of the scores and pictures of that prediction."""
         rules = {name: load_protocol(name) for name in self.job.protocols}
         key = {"predict": digest_json(predict_key), "encoder": self.perception.encoder.digest}
-        key |= {"pictures": str(self.job.pictures)}
+        key |= {"pictures": str(self.job.config.pictures)}
         key |= {f"protocol.{name}": protocol.digest for name, protocol in rules.items()}
-        if self.job.solver == "llm" and any(protocol.answers is not None for protocol in rules.values()):
+        if self.job.config.solver == "llm" and any(protocol.answers is not None for protocol in rules.values()):
             key["solver"] = answers_digest(PerceptionConfig.model_validate_json(self.job.perception).language)
         return key | refined_digest(folder) if any(protocol.goes_by_names for protocol in rules.values()) else key
 
     def is_scored(self, folder: JobFolder, seal: SealRecord | None, key: Mapping[str, str]) -> bool:
         """Whether ``seal`` vouches for scores under ``key``; pictures that nobody asks for now may be beside them."""
-        if seal is not None and not self.job.pictures and seal.key.get("pictures") == str(True):
+        if seal is not None and not self.job.config.pictures and seal.key.get("pictures") == str(True):
             key = {**key, "pictures": str(True)}
         return folder.is_whole(seal, key)
 

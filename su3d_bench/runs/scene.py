@@ -9,8 +9,8 @@ from __future__ import annotations
 import logging
 import math
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache, cached_property, partial
 from typing import Any
@@ -44,18 +44,8 @@ from su3d_bench.questions.solver import MapSolver, by_language_model
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.reports.pictures.maps import draw_scene
 from su3d_bench.reports.tables.run import Unscored, not_scored_lines
+from su3d_bench.runs import frame_loop
 from su3d_bench.runs.executors import Event, Report
-from su3d_bench.runs.frame_loop import (
-    N_AHEAD,
-    Feeding,
-    FirstFrames,
-    ReadAhead,
-    SceneLog,
-    TimedRegions,
-    surface_of,
-    true_proposals,
-    warm_up,
-)
 from su3d_bench.runs.job import (
     JobInputs,
     MethodOutcome,
@@ -91,17 +81,7 @@ def _warm_up(part: Part) -> None:
     """Once a process for each method and its settings, where it asks for it."""
     scratch: Method = build_method(part)
     if isinstance(scratch, WarmsUp) and scratch.warms_up:
-        warm_up(scratch)
-
-
-@contextmanager
-def _closed_at_the_end(method: Method, clock: MethodClock) -> Iterator[None]:
-    try:
-        yield
-    finally:
-        if isinstance(method, Closes):
-            with clock.running("close"):
-                method.close()
+        frame_loop.warm_up(scratch)
 
 
 def failed_outcomes(job: SceneJob, reason: str) -> tuple[MethodOutcome, ...]:
@@ -127,7 +107,7 @@ def _guarded(scene: _Scene, part: Part) -> MethodOutcome:
     job = scene.job
     folder = RunFolder(job.folder).job(job.scene, part.name)
     folder.prepare()
-    log = SceneLog()
+    log = frame_loop.SceneLog()
     package = logging.getLogger("su3d_bench")
     package.addHandler(log)
     try:
@@ -145,6 +125,22 @@ def _guarded(scene: _Scene, part: Part) -> MethodOutcome:
     if outcome.error is not None:
         write_text(folder.log, log.text())
     return outcome
+
+
+def perception_of(job: SceneJob, info: SceneInfo, marked: Callable[[], Any] = lambda: None) -> Perception:
+    """What sees the frames of a scene; ``marked`` gives what perfect masks are made from."""
+    config: PerceptionConfig = PerceptionConfig.model_validate_json(job.perception)
+    profile = resolve_profile(job.config.profile, info.image_domain, config)
+    return build_perception(
+        profile,
+        config,
+        scene=info,
+        cache_root=job.cache_root,
+        mesh=marked() if profile == "oracle" else None,
+        job_index=job.index,
+        replies=job.folder / "language",
+        is_offline=job.config.offline,
+    )
 
 
 class _Scene:
@@ -169,15 +165,12 @@ class _Scene:
         """What perfect masks are made from: the annotated mesh, or else the boxes of objects."""
         try:
             mesh: InstanceMesh = self.dataset.instance_mesh(self.job.scene_name)
-        except GroundTruthMissing as error:
-            try:
-                boxes = self.truth("boxes").boxes
-            except GroundTruthMissing:
-                boxes = None
-            if boxes is None:
-                raise error from None
-            return boxes
-        return mesh
+            return mesh
+        except GroundTruthMissing:
+            with suppress(GroundTruthMissing):
+                if (boxes := self.truth("boxes").boxes) is not None:
+                    return boxes
+            raise
 
     def says(self, part: Part, doing: str) -> None:
         """What is done now, where no frame is fed."""
@@ -209,41 +202,21 @@ class _Scene:
         raise missing[0]
 
     @cached_property
-    def perception_config(self) -> PerceptionConfig:
-        config: PerceptionConfig = PerceptionConfig.model_validate_json(self.job.perception)
-        return config
-
-    @cached_property
     def solver(self) -> MapSolver | None:
         """Who answers questions about maps; None: the built-in solver."""
-        if self.job.solver == "built-in":
+        if self.job.config.solver == "built-in":
             return None
-        config = self.perception_config.language
-        client = ChatClient(config, ReplyStore(self.job.folder / "language"), offline=self.job.is_offline)
+        config = PerceptionConfig.model_validate_json(self.job.perception).language
+        client = ChatClient(config, ReplyStore(self.job.folder / "language"), offline=self.job.config.offline)
         return by_language_model(client, config)
 
-    def perception(self, info: SceneInfo) -> Perception:
-        config = self.perception_config
-        profile = resolve_profile(self.job.profile, info.image_domain, config)
-        marked = self.marked if profile == "oracle" else None
-        return build_perception(
-            profile,
-            config,
-            scene=info,
-            cache_root=self.job.cache_root,
-            mesh=marked,
-            job_index=self.job.index,
-            replies=self.job.folder / "language",
-            is_offline=self.job.is_offline,
-        )
-
-    def run(self, part: Part, folder: JobFolder, log: SceneLog) -> MethodOutcome:
+    def run(self, part: Part, folder: JobFolder, log: frame_loop.SceneLog) -> MethodOutcome:
         """Predict and score one method, each step only where its seal is missing or broken."""
         self.says(part, self.opening)
         method = build_method(part)
-        info = self.dataset.info(self.job.scene_name, stride_of(self.job.stride, part.options))
-        info = replace(info, seed=self.job.seed)
-        perception = self.perception(info)
+        info = self.dataset.info(self.job.scene_name, stride_of(self.job, part))
+        info = replace(info, seed=self.job.config.seed)
+        perception = perception_of(self.job, info, lambda: self.marked)
         config = config_key(self.job, part, method)
         inputs = JobInputs(self.job, part.name, config, method, info, perception, self.data_digest)
         key = inputs.predict_key()
@@ -269,22 +242,27 @@ class _Scene:
         perception: Perception,
         folder: JobFolder,
         key: Mapping[str, str],
-        log: SceneLog,
+        log: frame_loop.SceneLog,
     ) -> None:
         """Feed a method that is made anew, so that what it does when it is made is timed too, and seal its map."""
         clock = MethodClock()
         with clock.running("start"):
             method: Method = build_method(part)
         frames: Sequence[Frame] = ()
-        n = 0
-        doubts = self._doubts(method)
+        n, shares, doubts = 0, tuple[float, ...](), tuple[str, ...]()
+        if method.needs.frames:
+            shares, doubts = self.job.config.shares, self.job.doubts or ()
+            frames = self.dataset.frames(self.job.scene_name, info.stride)
+            n = min(len(frames), self.job.config.limit or len(frames))
         for line in doubts:
             logger.warning("%s", line)
-        if method.needs.frames:
-            frames = self.dataset.frames(self.job.scene_name, info.stride)
-            n = min(len(frames), self.job.limit or len(frames))
         if isinstance(method, TakesTools):
-            tools = self._tools(method, perception, frames, n, clock)
+            tools = SceneTools(
+                frames=frame_loop.FirstFrames(frames, n),
+                regions=frame_loop.TimedRegions(perception.regions(), clock),
+                surface=partial(frame_loop.surface_of, self.dataset, self.job.scene_name),
+                true_proposals=self._true_proposals if method.needs.true_proposals else None,
+            )
             with clock.running("start"):
                 method.receive_tools(tools)
         if isinstance(method, TakesTruth):
@@ -297,20 +275,23 @@ class _Scene:
         _warm_up(part)
         self.says(part, self.opening)
         start_memory_watch()
-        feeding = Feeding(
+        feeding = frame_loop.Feeding(
             self.job.scene, method, perception, lambda event: self.report(replace(event, label=part.name)), clock
         )
-        shares = self.job.anytime if method.needs.frames else ()
-        with _closed_at_the_end(method, clock):
+        try:
             with clock.running("start"):
                 method.start(info)
-            with ReadAhead(frames, n, n_ahead=0 if self.is_rendered else N_AHEAD) as ahead:
+            with frame_loop.ReadAhead(frames, n, n_ahead=0 if self.is_rendered else frame_loop.N_AHEAD) as ahead:
                 for share in shares:
                     feeding.up_to(math.ceil(share * n), ahead, n)
                     feeding.write_map(folder.anytime(share))
                 feeding.up_to(n, ahead, n)
             self.says(part, "finishing the map")
             feeding.write_map(folder.prediction)
+        finally:
+            if isinstance(method, Closes):
+                with clock.running("close"):
+                    method.close()
         write_text(folder.updates, feeding.updates_text())
         files = [folder.prediction, folder.updates, *map(folder.anytime, shares)]
         costs = {
@@ -323,37 +304,24 @@ class _Scene:
         }
         folder.seal("predict", key, files, {"costs": costs, REMARK: doubts} | log.remarks())
 
-    def _doubts(self, method: Method) -> tuple[str, ...]:
-        return (self.job.doubts or ()) if method.needs.frames else ()
-
-    def _tools(
-        self, method: Method, perception: Perception, frames: Sequence[Frame], n: int, clock: MethodClock
-    ) -> SceneTools:
-        return SceneTools(
-            frames=FirstFrames(frames, n),
-            regions=TimedRegions(perception.regions(), clock),
-            surface=partial(surface_of, self.dataset, self.job.scene_name),
-            true_proposals=self._true_proposals if method.needs.true_proposals else None,
-        )
-
     def _true_proposals(self) -> Proposals:
         if not self.dataset.variants:
             raise GroundTruthMissing(f"{self.job.scene}: proposals 'oracle' need ground truth, the dataset has none")
-        return true_proposals(self.truth(self.dataset.variants[0]))
+        return frame_loop.true_proposals(self.truth(self.dataset.variants[0]))
 
     def _score(
-        self, part: Part, perception: Perception, folder: JobFolder, key: Mapping[str, str], log: SceneLog
+        self, part: Part, perception: Perception, folder: JobFolder, key: Mapping[str, str], log: frame_loop.SceneLog
     ) -> None:
         """Score under every protocol that has a truth here, draw the map, and seal; reasons for the others go along."""
         prediction = read_prediction(folder.prediction)
         scores, unscored = self.scores(part, perception.encoder, prediction, folder)
         files = [folder.counts]
         write_bytes(folder.counts, pack_scores(scores))
-        for share in self.job.anytime if build_method(part).needs.frames else ():
+        for share in self.job.config.shares if build_method(part).needs.frames else ():
             early, _ = self.scores(part, perception.encoder, read_prediction(folder.anytime(share)), None)
             write_bytes(folder.anytime_counts(share), pack_scores(early))
             files.append(folder.anytime_counts(share))
-        if self.job.pictures:
+        if self.job.config.pictures:
             self.says(part, "drawing the map")
             truth_to_draw = next((known for known in self._truths.values() if isinstance(known, GroundTruth)), None)
             files += draw_scene(prediction, truth_to_draw, folder.pictures, f"{self.job.scene}, {part.name}")

@@ -123,49 +123,42 @@ class GitRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class RunRecord:
-    """``run.json``: where the numbers come from. ``models`` holds the SHA-256 of weight files by model and file name.
+    """``run.json``: where the numbers come from; that of a run that is not finished, or of an older version, says less.
+
+    ``models`` holds the SHA-256 of weight files by model and file name.
 
     ``status`` is ``running``, ``interrupted``, ``incomplete`` or ``complete``. ``predictions`` are those that were made
     elsewhere, ``ground_truth`` what they were held against.
     """
 
     schema: int = SCHEMA
-    status: str
-    is_partial: bool
-    code: str
+    status: str = ""
+    is_partial: bool = False
+    code: str = ""
     git: GitRecord | None = None
     packages: Mapping[str, str] = field(default_factory=dict)
-    hardware: str
+    hardware: str = ""
     processor: str = ""
     n_workers: int = 1
     seed: int | None = None
-    profile: str | None
+    profile: str | None = None
     models: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     encoder: str | None = None
-    encoder_digest: str | None
-    data_digests: Mapping[str, str]
-    protocols: tuple[ProtocolRecord, ...]
-    methods: Annotated[tuple[str, ...], Field(min_length=1)]
-    scenes: tuple[str, ...]
+    encoder_digest: str | None = None
+    data_digests: Mapping[str, str] = field(default_factory=dict)
+    protocols: tuple[ProtocolRecord, ...] = ()
+    methods: tuple[str, ...] = ()
+    scenes: tuple[str, ...] = ()
     failed: tuple[FailureRecord, ...] = ()
     unscored: tuple[UnscoredRecord, ...] = ()
     warnings: tuple[str, ...] = ()
     predictions: tuple[PredictionsRecord, ...] = ()
     ground_truth: TruthRecord | None = None
 
-
-@dataclass(frozen=True, kw_only=True)
-class RequestRecord:
-    """What ``run.json`` says of a run that may not be finished."""
-
-    status: str = ""
-    profile: str | None = None
-    encoder: str | None = None
-    encoder_digest: str | None = None
-    protocols: tuple[ProtocolRecord, ...] = ()
-    methods: tuple[str, ...] = ()
-    scenes: tuple[str, ...] = ()
-    ground_truth: TruthRecord | None = None
+    @property
+    def truth_files(self) -> str | None:
+        """The folder of ground truth that predictions were compared with in place of a dataset."""
+        return None if self.ground_truth is None else self.ground_truth.path
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,10 +248,10 @@ class CostsRecord:
     numbers of a map.
     """
 
-    maps: tuple[MapCost, ...]
-    calibration_ms: Amount | None
-    peak_rss_bytes: Count | None
-    device_bytes: Count | None
+    maps: tuple[MapCost, ...] = ()
+    calibration_ms: Amount | None = None
+    peak_rss_bytes: Count | None = None
+    device_bytes: Count | None = None
     start_ms: Amount | None = None
     close_ms: Amount | None = None
 
@@ -275,7 +268,7 @@ class SealRecord:
 OUT_OF_RANGE = ("value_error", "greater_than_equal", "less_than_equal")
 
 _ADAPTERS: dict[Any, TypeAdapter[Any]] = {
-    kind: TypeAdapter(kind) for kind in (RunRecord, RequestRecord, MetricsRecord, CostsRecord, SealRecord)
+    kind: TypeAdapter(kind) for kind in (RunRecord, MetricsRecord, CostsRecord, SealRecord)
 }
 
 

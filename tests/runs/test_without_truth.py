@@ -9,7 +9,6 @@ from painted import colour_perception
 from places import SCENES
 
 from su3d_bench.cli.main import main
-from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import scene as scene_run
 
 PAINTED = f"{SCENES}/painted.py"
@@ -27,8 +26,7 @@ WORDS += ["--no-pictures", "--out", "out"]
 
 @pytest.fixture(autouse=True)
 def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    for module in (scene_run, finished_scenes):
-        monkeypatch.setattr(module, "build_perception", colour_perception)
+    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
     monkeypatch.chdir(tmp_path)
 
 

@@ -12,7 +12,6 @@ from places import SCENES
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.plan import named_method
 from su3d_bench.store.run_folder import RunFolder
@@ -20,8 +19,7 @@ from su3d_bench.store.run_folder import RunFolder
 
 @pytest.fixture(autouse=True)
 def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    for module in (scene_run, finished_scenes):
-        monkeypatch.setattr(module, "build_perception", colour_perception)
+    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
     monkeypatch.chdir(tmp_path)
 
 

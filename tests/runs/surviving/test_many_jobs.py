@@ -13,10 +13,10 @@ from places import SCENES
 from su3d_bench.cli.main import main
 from su3d_bench.core.files import atomic
 from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import runner
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.runs.clusters import run_units
+from su3d_bench.runs.executors import Report
+from su3d_bench.runs.job import SceneJob
 from su3d_bench.store import run_folder as store
 
 WORDS = ["run", "--scenes", f"{SCENES}/painted.py:Painted/[ab]", "--methods", f"{SCENES}/painted.py:Collector"]
@@ -27,7 +27,6 @@ PROTOCOLS = ["--protocols", "rooms-semantic", "rooms-instance", "--no-pictures",
 def finished(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     """A run that is done, in the folder ``out`` below the current one."""
     monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    monkeypatch.setattr(finished_scenes, "build_perception", colour_perception)
     monkeypatch.chdir(tmp_path)
     assert main([*WORDS, *PROTOCOLS, "--jobs", "1"]) == 0
     return tmp_path / "out"
@@ -39,11 +38,7 @@ def test_a_finished_run_starts_no_worker_and_reads_each_seal_twice(
     before = (finished / "metrics.json").read_bytes()
     reads = count_seals_read(monkeypatch)
 
-    def no_units(work: Any, units: Any, *_: Any, **__: Any) -> Any:
-        assert not units
-        return iter(())
-
-    monkeypatch.setattr(runner, "run_units", no_units)
+    monkeypatch.setattr(runner, "run_scene", None)
     assert main([*WORDS, *PROTOCOLS]) == 0
     assert (finished / "metrics.json").read_bytes() == before
     n_jobs = len(list(finished.glob("scenes/*/*/done.json")))
@@ -56,12 +51,12 @@ def test_a_scene_with_a_damaged_file_is_run_again_to_the_same_numbers(
 ) -> None:
     asked: list[str] = []
 
-    def seen(work: Any, units: Any, *rest: Any, **options: Any) -> Any:
-        asked.extend(job.scene for job in units)
-        return run_units(work, units, *rest, **options)
+    def seen(job: SceneJob, report: Report) -> Any:
+        asked.append(job.scene)
+        return scene_run.run_scene(job, report)
 
     before = (finished / "metrics.json").read_bytes()
-    monkeypatch.setattr(runner, "run_units", seen)
+    monkeypatch.setattr(runner, "run_scene", seen)
     for name in ("prediction.npz", "counts.npz", "updates.csv", "log.txt", "done.json"):
         damaged = finished / "scenes" / "painted.a" / "collector" / name
         damaged.write_bytes(damaged.read_bytes()[: -1 if name != "done.json" else -7])

@@ -7,12 +7,10 @@ from painted import WordEncoder, colour_perception
 
 from su3d_bench.cli.main import main
 from su3d_bench.runs import finished as finished_run
-from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import scene as scene_run
 
 # At import, so that spawned workers, which import this file too, have it as well.
-for module in (scene_run, finished_scenes):
-    patch.object(module, "build_perception", colour_perception).start()
+patch.object(scene_run, "build_perception", colour_perception).start()
 patch.object(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder()).start()
 
 if __name__ == "__main__":
