@@ -129,10 +129,9 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
 
 def carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
     from su3d_bench.runs.runner import run_plan
-    from su3d_bench.runs.scenes import cache_root
-    from su3d_bench.store.caches import why_large, why_slow
+    from su3d_bench.store.caches import why_slow
 
-    for line in filter(None, (why_slow(), why_large(cache_root()))):
+    if line := why_slow():
         remark(f"su3d-bench: {line}", quiet=arguments.quiet)
     with progress(len(plan.jobs), is_quiet=arguments.quiet) as report:
         result = run_plan(plan, report)

@@ -19,7 +19,7 @@ from su3d_bench.core.errors import ConfigError, StoreError, printable, shown, so
 from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.questions.solver import MOVES_ANSWERS
-from su3d_bench.runs.job import FIELDS_KNOWN_LATER, INSTEAD, NOT_IN_KEY, Part, SceneJob, build_method, config_key
+from su3d_bench.runs.job import FIELDS_KNOWN_LATER, INSTEAD, NOT_IN_KEY, ConfiguredMethods, SceneJob
 from su3d_bench.store.records import RunRecord, read_record
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
@@ -221,32 +221,12 @@ def refuse_other_request(held: ExistingRun, now: Request, into: Into, where: str
     raise StoreError(f"{name}: holds another run ({what}); {join}{INSTEAD}")
 
 
-class ConfigKeys:
-    """What of the keys of predictions is known before any data is read; the same for all scenes of a dataset."""
-
-    def __init__(self) -> None:
-        self._keys: dict[tuple[Part, Part], dict[str, str]] = {}
-
-    def of(self, job: SceneJob, part: Part) -> dict[str, str]:
-        if (job.dataset, part) not in self._keys:
-            self._keys[job.dataset, part] = config_key(job, part, build_method(part))
-        return self._keys[job.dataset, part]
-
-
-def _kept_jobs(folder: RunFolder, jobs: Sequence[SceneJob]) -> set[Path]:
-    """Folders of jobs in a run that is replaced whose maps are those of ``jobs``, as far as the request tells."""
-    keys = ConfigKeys()
-    places = [(folder.job(job.scene, part.name), keys.of(job, part)) for job in jobs for part in job.parts]
-    return {
-        place.path
-        for place, key in places
-        if place.changed_field("predict", key, known_later=FIELDS_KNOWN_LATER) is None
-    }
-
-
 def replaced_jobs(folder: RunFolder, jobs: Sequence[SceneJob]) -> list[JobFolder]:
     """The jobs in ``folder`` that go where ``jobs`` replace its run; ``StoreError`` where files of others would go."""
-    kept = _kept_jobs(folder, jobs)
+    methods = ConfiguredMethods()
+    keys = [(folder.job(job.scene, part.name), methods.of(job, part)[1]) for job in jobs for part in job.parts]
+    # As far as the request tells, these are the maps that the new run asks for.
+    kept = {at.path for at, key in keys if at.changed_field("predict", key, known_later=FIELDS_KNOWN_LATER) is None}
     going = [job for job in folder.jobs() if job.path not in kept]
     names = {job.path.relative_to(folder.path).as_posix() for job in going}
     for stranger in folder.strangers():

@@ -173,6 +173,21 @@ def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
     )
 
 
+class ConfiguredMethods:
+    """Methods and what of the keys of their predictions is known before any data is read: the same for all scenes of a
+    dataset, made once."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[Part, Part], tuple[Any, dict[str, str]]] = {}
+
+    def of(self, job: SceneJob, part: Part) -> tuple[Any, dict[str, str]]:
+        """The method of ``part`` and its ``config_key``."""
+        if (job.dataset, part) not in self._known:
+            method = build_method(part)
+            self._known[job.dataset, part] = method, config_key(job, part, method)
+        return self._known[job.dataset, part]
+
+
 def own_code(target: str) -> str | None:
     """A key of the file of somebody's own dataset or method, which is no part of the program's code."""
     return digest_file(Path(target.rpartition(":")[0]))[:16] if ".py:" in target else None

@@ -37,7 +37,6 @@ from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
 from su3d_bench.runs.executors import ELSEWHERE, check_execution
 from su3d_bench.runs.existing import (
-    ConfigKeys,
     ExistingRun,
     Into,
     Request,
@@ -48,7 +47,16 @@ from su3d_bench.runs.existing import (
     refuse_other_request,
     replaced_jobs,
 )
-from su3d_bench.runs.job import FIELDS_KNOWN_LATER, Part, SceneJob, options_model, own_code, part_of, refuse_other_run
+from su3d_bench.runs.job import (
+    FIELDS_KNOWN_LATER,
+    ConfiguredMethods,
+    Part,
+    SceneJob,
+    options_model,
+    own_code,
+    part_of,
+    refuse_other_run,
+)
 from su3d_bench.runs.remote_store import DataPlace, LocalRun, RemoteData, RunPlace, StoredRun, data_place, is_url
 from su3d_bench.runs.scenes import cache_root, data_root, dataset_targets, expand_scenes, looks_like_scene
 from su3d_bench.store.run_folder import JobFolder, RunFolder, scene_of_folder
@@ -275,13 +283,13 @@ def _started(plan: Plan, into: Into) -> Plan:
     existing = plan.existing
     if existing is not None:
         refuse_other_request(existing, plan.request, into, plan.place.name)
-    keys = ConfigKeys()
+    methods = ConfiguredMethods()
     for job in plan.jobs:
         for part in job.methods:
             folder = plan.folder.job(job.scene, part.name)
             folder.refuse_links()
             if into != "replace":
-                refuse_other_run(folder, keys.of(job, part), FIELDS_KNOWN_LATER)
+                refuse_other_run(folder, methods.of(job, part)[1], FIELDS_KNOWN_LATER)
     if into == "replace":
         removes = tuple(replaced_jobs(plan.folder, plan.jobs))
         if removes or (existing is not None and any(differences(existing, plan.request))):

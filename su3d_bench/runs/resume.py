@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache, lru_cache
-from typing import Any
 
 from su3d_bench.core.types import SceneInfo
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, resolve_profile
 from su3d_bench.runs.job import (
+    ConfiguredMethods,
     JobInputs,
     MethodOutcome,
     Part,
     SceneJob,
     build_dataset,
-    build_method,
-    config_key,
     stride_of,
 )
 from su3d_bench.runs.poses import silent
@@ -37,7 +35,7 @@ class FinishedScenes:
     def __init__(self) -> None:
         self._dataset = cache(build_dataset)
         self._data_digest = lru_cache(maxsize=1)(self._read_digest)
-        self._methods: dict[tuple[Part, Part], tuple[Any, dict[str, str]]] = {}
+        self._methods = ConfiguredMethods()
         self._perceptions: dict[str, Perception | None] = {}  # by the domain of the images
 
     def outcomes(self, job: SceneJob) -> tuple[MethodOutcome, ...] | None:
@@ -67,7 +65,7 @@ class FinishedScenes:
 
     def inputs(self, job: SceneJob, part: Part) -> JobInputs | None:
         """What decides the numbers of a job; None where only a worker can tell."""
-        method, config = self._method(job, part)
+        method, config = self._methods.of(job, part)
         info = self._dataset(job.dataset, job.data_root).info(job.scene_name, stride_of(job, part))
         perception = self._perception(job, info)
         if perception is None:
@@ -76,12 +74,6 @@ class FinishedScenes:
 
     def _read_digest(self, job: SceneJob) -> str:
         return str(self._dataset(job.dataset, job.data_root).digest(job.scene_name))
-
-    def _method(self, job: SceneJob, part: Part) -> tuple[Any, dict[str, str]]:
-        if (job.dataset, part) not in self._methods:
-            method = build_method(part)
-            self._methods[job.dataset, part] = method, config_key(job, part, method)
-        return self._methods[job.dataset, part]
 
     def _perception(self, job: SceneJob, info: SceneInfo) -> Perception | None:
         if info.image_domain not in self._perceptions:

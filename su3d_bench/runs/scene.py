@@ -15,18 +15,9 @@ from dataclasses import replace
 from functools import cache, cached_property, partial
 from typing import Any
 
+from su3d_bench.core import interfaces
 from su3d_bench.core.errors import GroundTruthMissing, StoreError, counted, error_line, printable
 from su3d_bench.core.files.atomic import write_bytes, write_text
-from su3d_bench.core.interfaces import (
-    Closes,
-    Encoder,
-    Method,
-    RendersFrames,
-    SceneTools,
-    TakesTools,
-    TakesTruth,
-    WarmsUp,
-)
 from su3d_bench.core.maps import Prediction, Proposals
 from su3d_bench.core.printing import one_line
 from su3d_bench.core.system.timing import MethodClock, device_memory_bytes, peak_memory_bytes, start_memory_watch
@@ -79,8 +70,8 @@ def run_scene(job: SceneJob, report: Report) -> tuple[MethodOutcome, ...]:
 @cache
 def _warm_up(part: Part) -> None:
     """Once a process for each method and its settings, where it asks for it."""
-    scratch: Method = build_method(part)
-    if isinstance(scratch, WarmsUp) and scratch.warms_up:
+    scratch: interfaces.Method = build_method(part)
+    if isinstance(scratch, interfaces.WarmsUp) and scratch.warms_up:
         frame_loop.warm_up(scratch)
 
 
@@ -95,7 +86,7 @@ def failed_outcomes(job: SceneJob, reason: str) -> tuple[MethodOutcome, ...]:
     return tuple(MethodOutcome(job.scene, part.name, error=line) for part in job.methods)
 
 
-def scores_again(job: SceneJob, part: Part, encoder: Encoder) -> dict[str, SceneScore]:
+def scores_again(job: SceneJob, part: Part, encoder: interfaces.Encoder) -> dict[str, SceneScore]:
     """What the map that ``job.folder`` holds of ``part`` scores, by protocol; nothing is written."""
     folder = RunFolder(job.folder).job(job.scene, part.name)
     scores, _ = _Scene(job, lambda event: None).scores(part, encoder, read_prediction(folder.prediction), folder)
@@ -178,7 +169,7 @@ class _Scene:
 
     @cached_property
     def is_rendered(self) -> bool:
-        return isinstance(self.dataset, RendersFrames) and self.dataset.renders_frames
+        return isinstance(self.dataset, interfaces.RendersFrames) and self.dataset.renders_frames
 
     @property
     def opening(self) -> str:
@@ -247,7 +238,7 @@ class _Scene:
         """Feed a method that is made anew, so that what it does when it is made is timed too, and seal its map."""
         clock = MethodClock()
         with clock.running("start"):
-            method: Method = build_method(part)
+            method: interfaces.Method = build_method(part)
         frames: Sequence[Frame] = ()
         n, shares, doubts = 0, tuple[float, ...](), tuple[str, ...]()
         if method.needs.frames:
@@ -256,8 +247,8 @@ class _Scene:
             n = min(len(frames), self.job.config.limit or len(frames))
         for line in doubts:
             logger.warning("%s", line)
-        if isinstance(method, TakesTools):
-            tools = SceneTools(
+        if isinstance(method, interfaces.TakesTools):
+            tools = interfaces.SceneTools(
                 frames=frame_loop.FirstFrames(frames, n),
                 regions=frame_loop.TimedRegions(perception.regions(), clock),
                 surface=partial(frame_loop.surface_of, self.dataset, self.job.scene_name),
@@ -265,7 +256,7 @@ class _Scene:
             )
             with clock.running("start"):
                 method.receive_tools(tools)
-        if isinstance(method, TakesTruth):
+        if isinstance(method, interfaces.TakesTruth):
             if not self.dataset.variants:
                 raise GroundTruthMissing(f"{self.job.scene}: {method.name} needs ground truth, the dataset has none")
             truth = self.first_truth
@@ -289,7 +280,7 @@ class _Scene:
             self.says(part, "finishing the map")
             feeding.write_map(folder.prediction)
         finally:
-            if isinstance(method, Closes):
+            if isinstance(method, interfaces.Closes):
                 with clock.running("close"):
                     method.close()
         write_text(folder.updates, feeding.updates_text())
@@ -332,7 +323,7 @@ class _Scene:
         folder.seal("score", key, [*files, folder.log], remarks)
 
     def scores(
-        self, part: Part, encoder: Encoder, prediction: Prediction, refined_in: JobFolder | None
+        self, part: Part, encoder: interfaces.Encoder, prediction: Prediction, refined_in: JobFolder | None
     ) -> tuple[dict[str, SceneScore], dict[str, str]]:
         """The scores under every protocol that can score the map, and why the others cannot."""
         scores: dict[str, SceneScore] = {}

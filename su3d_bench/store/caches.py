@@ -18,7 +18,6 @@ from su3d_bench.core.files.atomic import remove_file
 from su3d_bench.core.files.locks import is_held
 
 MEGABYTE, GIGABYTE = 10**6, 10**9
-LARGE_BYTES = 20 * GIGABYTE  # of kept perception: a thousand scenes of 150 frames, and a tenth of a common disk
 _HEX = "[0-9a-f]"
 SMALL_BYTES = 1 << 16  # a kept kernel has about as many: a full disk takes none
 
@@ -133,24 +132,6 @@ def clear_cache(root: Path, kind: CacheKind, *, before: float = math.inf) -> tup
         remove_file(top / entry.name)
         n_files, n_bytes = n_files + 1, n_bytes + entry.n_bytes
     return n_files, n_bytes
-
-
-def why_large(root: Path) -> str | None:
-    """A line that says that much perception is kept, and what to do; None where it is not much.
-
-    Told from an eighth of its folders, over which keys spread evenly, for a run should not wait for it.
-    """
-    kept = KINDS["perception"]
-    n_bytes = 0
-    for name in (f"{first:x}{second:x}" for first in range(16) for second in (0, 8)):
-        with suppress(OSError), os.scandir(root / kept.name / name) as entries:
-            n_bytes += 8 * sum(entry.stat(follow_symlinks=False).st_size for entry in entries)
-    if n_bytes < LARGE_BYTES:
-        return None
-    return (
-        f"{shown(root)}: keeps about {size_text(n_bytes)} of perception; to keep what is young alone: "
-        "su3d-bench dev cache clear perception --older-than 30"
-    )
 
 
 def size_text(n_bytes: int) -> str:

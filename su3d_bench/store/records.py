@@ -265,8 +265,6 @@ class SealRecord:
     remarks: Mapping[str, Any]
 
 
-OUT_OF_RANGE = ("value_error", "greater_than_equal", "less_than_equal")
-
 _ADAPTERS: dict[Any, TypeAdapter[Any]] = {
     kind: TypeAdapter(kind) for kind in (RunRecord, MetricsRecord, CostsRecord, SealRecord)
 }
@@ -296,19 +294,13 @@ def read_record(kind: type[Kind], file: Path, shown: str) -> Kind:
     """The record in ``file``; ``shown`` begins the ``StoreError`` where it holds none."""
     try:
         return checked(kind, read_json(file))
-    except RecursionError as error:
-        raise StoreError(f"{shown}: {file.name}: is nested too deep for a record of a run; run it again") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = printable(".".join(map(str, first["loc"])), 120)
-        if first["type"] == "finite_number":
-            what = f"{file.name} is not as a run writes it: {key} is no finite number"
-        elif first["type"] in OUT_OF_RANGE:
-            fault = str(first.get("ctx", {}).get("error", f"it is {first['input']}"))
-            what = f"{file.name} is not as a run writes it: {key}: {printable(fault, 160)}"
-        else:
-            what = f"{file.name}: {key or 'it'} is not as a run writes it"
-        raise StoreError(f"{shown}: {what}; run it again") from error
+    except (RecursionError, ValidationError) as error:
+        key, reason = "it", "nested too deep"
+        if isinstance(error, ValidationError):
+            first = error.errors()[0]
+            key, reason = ".".join(map(str, first["loc"])) or "it", first["msg"].removeprefix("Value error, ")
+        what = f"{printable(key, 120)} is not as a run writes it ({printable(reason, 160)})"
+        raise StoreError(f"{shown}: {file.name}: {what}; run it again") from error
 
 
 def updates_text(rows: Sequence[Mapping[str, float | int]]) -> str:
