@@ -111,9 +111,8 @@ def call_show(arguments: argparse.Namespace) -> int:
 
 
 def _presets_of(method: Any) -> Mapping[str, Mapping[str, Any]]:
-    from su3d_bench.core.interfaces import HasPresets
 
-    return method.presets if isinstance(method, HasPresets) else {}
+    return getattr(method, "presets", {})
 
 
 def _assigned(settings: Mapping[str, Any]) -> str:

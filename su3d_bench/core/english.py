@@ -49,7 +49,7 @@ def singular(word: str) -> str:
         return word
     for several, one in _known("by_several").items():
         if word == several or (len(several) > 4 and word.endswith(several)):
-            return word[: -len(several)] + one
+            return f"{word[: -len(several)]}{one}"
     is_short = len(word) < 3 or (len(word) == 3 and word[1] in "aeiou")
     if is_short or word.endswith(("ss", "us", "is")) or word in _known("one_in_s"):
         return word
@@ -76,7 +76,7 @@ def _plural_word(word: str) -> str:
         return word
     for one, several in _known("irregular").items():
         if word == one or (len(one) > 3 and word.endswith(one)):
-            return word[: -len(one)] + several
+            return f"{word[: -len(one)]}{several}"
     if word.endswith(("s", "x", "z", "ch", "sh")):
         return f"{word}es"
     return f"{word[:-1]}ies" if word.endswith("y") and word[-2:-1] not in tuple("aeiou") else f"{word}s"

@@ -106,11 +106,20 @@ class Dataset(Protocol):
         ...
 
 
-@runtime_checkable
-class HasFurtherTruths(DatasetAbility, Protocol):
-    """Ground truths with labels of other label spaces than its own: label space -> the one of ``ground_truth``."""
+class DatasetFacts(DatasetAbility, Protocol):
+    """Values that the class may have; without one it is empty, or False.
+
+    ``further_truths``: ground truths with labels of other label spaces than its own: label space -> the one of
+    ``ground_truth``; ``renders_frames``: frames are computed and not read, so that none is made ahead, since the
+    pipeline's timed stages would wait for the interpreter; ``reads_made_rooms``: rooms that the program makes are
+    written in its layout, which are not its scenes; ``scene_names``: the regular expression of names that only its
+    scenes have, by which files of predictions are known.
+    """
 
     further_truths: Mapping[str, str]
+    renders_frames: bool
+    reads_made_rooms: bool
+    scene_names: str
 
 
 @runtime_checkable
@@ -201,34 +210,10 @@ class AsksText(DatasetAbility, Protocol):
 
 
 @runtime_checkable
-class RendersFrames(DatasetAbility, Protocol):
-    """True where frames are computed and not read.
-
-    They are not made ahead then, since the pipeline's timed stages would wait for the interpreter.
-    """
-
-    renders_frames: bool
-
-
-@runtime_checkable
 class HasSketches(DatasetAbility, Protocol):
     """A frame ``width`` pixels wide, in far less time than the whole; ``index`` is its place among all frames."""
 
     def sketch(self, scene: str, index: int, width: int) -> Frame: ...
-
-
-@runtime_checkable
-class ReadsMadeRooms(DatasetAbility, Protocol):
-    """True where rooms that the program makes are written in its layout, which are not its scenes."""
-
-    reads_made_rooms: bool
-
-
-@runtime_checkable
-class NamesScenes(DatasetAbility, Protocol):
-    """The regular expression of names that only its scenes have, by which files of predictions are known."""
-
-    scene_names: str
 
 
 class StageTimer(Protocol):
@@ -272,63 +257,31 @@ class MethodAbout:
     status: str
 
 
-@runtime_checkable
-class HasAbout(MethodAbility, Protocol):
+class MethodFacts(MethodAbility, Protocol):
+    """Values that the class may have; without one it is empty, or False, ``is_system`` True.
+
+    ``presets``: settings under a name, ``METHOD@PRESET`` is a method of its own; ``short_names``: other names of
+    settings for sweeps, the setting and what a value written there comes to; ``is_system`` False: ``all`` methods are
+    not meant to hold it, as the truth itself or a program that must be named; ``warms_up``: its first frames wait for
+    compilers or imports, so that a scratch of its kind, without tools, is fed a made-up frame before the clock runs;
+    ``needs_surface``: it cannot do without the scan's mesh, as it is set; ``has_own_perception``: it finds masks
+    itself, so that the caveat of the run's perception is not its.
+    """
+
     about: MethodAbout
-
-
-@runtime_checkable
-class HasPresets(MethodAbility, Protocol):
-    """Settings under a name: ``METHOD@PRESET`` is a method of its own."""
-
     presets: Mapping[str, Mapping[str, Any]]
-
-
-@runtime_checkable
-class HasShortNames(MethodAbility, Protocol):
-    """Other names of settings for sweeps: the setting, and what a value written there comes to."""
-
     short_names: Mapping[str, tuple[str, Callable[[Any], Any]]]
-
-
-@runtime_checkable
-class IsSystem(MethodAbility, Protocol):
-    """False where ``all`` methods are not meant to hold it: the truth itself, a program that must be named."""
-
     is_system: bool
-
-
-@runtime_checkable
-class WarmsUp(MethodAbility, Protocol):
-    """True where its first frames wait for compilers or imports: before the clock runs, a scratch of its kind is fed a
-    made-up frame; it needs no tools for that."""
-
     warms_up: bool
-
-
-@runtime_checkable
-class TakesTools(MethodAbility, Protocol):
-    """Works on the whole scene; called before ``start``."""
-
-    def receive_tools(self, tools: SceneTools) -> None: ...
-
-
-@runtime_checkable
-class NeedsSurface(MethodAbility, Protocol):
-    """Whether it cannot do without the scan's mesh, as it is set."""
-
     needs_surface: bool
+    has_own_perception: bool
 
 
-@runtime_checkable
-class TakesTruth(MethodAbility, Method, Protocol):
-    """Is told the ground truth, and is a ceiling."""
-
-    def receive_truth(self, truth: GroundTruth) -> None: ...
-
-
-class CountsItsMap(MethodAbility, Protocol):
-    """The points, instances and bytes of memory of its map after an update; each alone may be there."""
+class MethodFigures(MethodAbility, Protocol):
+    """Properties that an object may have: the points, instances and bytes of memory of its map after an update, what
+    the last update left out by the name of its column in ``updates.csv``, numbers on the last ``finish`` that stand
+    beside its time, digests by name of files outside the configuration that move its numbers, and what must be said
+    beside these."""
 
     @property
     def n_points(self) -> int: ...
@@ -339,44 +292,31 @@ class CountsItsMap(MethodAbility, Protocol):
     @property
     def map_bytes(self) -> int: ...
 
-
-@runtime_checkable
-class CountsLosses(MethodAbility, Protocol):
-    """What the last update left out, by the name of its column in ``updates.csv``."""
-
     @property
     def losses(self) -> Mapping[str, int]: ...
-
-
-@runtime_checkable
-class HasFinishCosts(MethodAbility, Protocol):
-    """Numbers on the last ``finish`` that stand beside its time."""
 
     @property
     def finish_costs(self) -> Mapping[str, float | int]: ...
 
-
-@runtime_checkable
-class HasInputs(MethodAbility, Protocol):
-    """Digests, by name, of files outside the configuration that move its numbers."""
-
     @property
     def inputs(self) -> Mapping[str, str]: ...
-
-
-@runtime_checkable
-class HasCaveat(MethodAbility, Protocol):
-    """What must be said beside its numbers."""
 
     @property
     def caveat(self) -> str | None: ...
 
 
 @runtime_checkable
-class HasOwnPerception(MethodAbility, Protocol):
-    """True where it finds masks itself, so that the caveat of the run's perception is not its."""
+class TakesTools(MethodAbility, Protocol):
+    """Works on the whole scene; called before ``start``."""
 
-    has_own_perception: bool
+    def receive_tools(self, tools: SceneTools) -> None: ...
+
+
+@runtime_checkable
+class TakesTruth(MethodAbility, Method, Protocol):
+    """Is told the ground truth, and is a ceiling."""
+
+    def receive_truth(self, truth: GroundTruth) -> None: ...
 
 
 @runtime_checkable

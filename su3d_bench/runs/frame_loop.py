@@ -218,7 +218,7 @@ class Feeding:
         total_ms = (time.perf_counter() - start) * 1e3
         own: Row = {"update": update, "frame": frame.index, "n_detections": len(detections)}
         of_method: Row = {name: int(told(method, name)) for name in SIZES if hasattr(method, name)}
-        of_method |= dict(told(method, "losses")) if isinstance(method, interfaces.CountsLosses) else {}
+        of_method |= told(method, "losses", {})
         of_method |= {"rss_bytes": memory_bytes()}
         of_method |= {f"{name}_ms": round(ms, 3) for name, ms in timer.take().items()}
         # What is measured here goes before what a method calls by the same name.
@@ -231,7 +231,7 @@ class Feeding:
             prediction = self._method.finish()
         spent = self._clock.take("finish")
         write_prediction(path, prediction)
-        costs = dict(told(self._method, "finish_costs")) if isinstance(self._method, interfaces.HasFinishCosts) else {}
+        costs = told(self._method, "finish_costs", {})
         own = {"n_updates": len(self._rows), "finish_ms": spent.total_ms, "perception_ms": spent.perception_ms}
         self.maps.append({**own, **costs, **{name: round(value, 3) for name, value in own.items()}})
 

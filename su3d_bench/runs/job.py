@@ -12,7 +12,7 @@ from su3d_bench.core import registry
 from su3d_bench.core.config import RunConfig, Settings, flatten, resolve
 from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_file, digest_json, package_versions
 from su3d_bench.core.errors import StoreError
-from su3d_bench.core.interfaces import HasCaveat, HasInputs, HasOwnPerception, Method, ReadsMadeRooms, TakesTruth
+from su3d_bench.core.interfaces import Method, TakesTruth
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.types import GroundTruth, LabelSet, SceneInfo
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
@@ -161,8 +161,7 @@ def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
         for path, value in flatten(json.loads(options)):
             key[".".join((prefix, *path))] = json.dumps(value, ensure_ascii=False)
     key = {name: text for name, text in key.items() if not name.startswith(NOT_IN_KEY)}
-    if isinstance(method, HasInputs):
-        key |= {f"input.{name}": digest for name, digest in told(method, "inputs").items()}
+    key |= {f"input.{name}": digest for name, digest in told(method, "inputs", {}).items()}
     for kind, target in (("method", part.target), ("dataset", job.dataset.target)):
         if digest := own_code(target):
             key[f"code.{kind}"] = digest
@@ -260,13 +259,12 @@ class JobInputs:
 
 def caveat_of(method: Method, perception: Perception, scene: SceneInfo) -> str | None:
     """What must be said beside every number: where the scenes, the masks, or the method's own proposals come from."""
-    own = told(method, "caveat") if isinstance(method, HasCaveat) else None
+    own = told(method, "caveat", None)
     if method.needs.true_proposals:
         own = TRUE_PROPOSALS_CAVEAT
-    has_own_perception = isinstance(method, HasOwnPerception) and method.has_own_perception
-    is_seen_by_profile = method.needs.frames and not has_own_perception
+    is_seen_by_profile = method.needs.frames and not getattr(method, "has_own_perception", False)
     dataset = registry.load("dataset", scene.dataset) if scene.dataset in registry.DATASETS else None
-    is_made = scene.image_domain == "rendered-rooms" and isinstance(dataset, ReadsMadeRooms)
+    is_made = scene.image_domain == "rendered-rooms" and getattr(dataset, "reads_made_rooms", False)
     made = f"made rooms in the layout of {scene.dataset}, not its scenes" if is_made else None
     parts = [made, perception.caveat if is_seen_by_profile else None, own]
     return "; ".join(part for part in parts if part) or None

@@ -28,7 +28,6 @@ from su3d_bench.core.config import (
 )
 from su3d_bench.core.digests import code_digest, digest_json
 from su3d_bench.core.errors import ConfigError, StoreError, counted, printable, some, suggest
-from su3d_bench.core.interfaces import HasPresets, IsSystem
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.devices import device_for
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
@@ -119,7 +118,7 @@ def named_method(text: str) -> NamedMethod:
 
 
 def _preset(text: str, base: str, method: Any, variant: str) -> Mapping[str, Any]:
-    presets = method.presets if isinstance(method, HasPresets) else {}
+    presets = getattr(method, "presets", {})
     if variant not in presets:
         hint = suggest(variant, presets, "it has") or "; it has none"
         raise ConfigError(f"--methods {text}: {base} has no preset '{variant}'{hint}; or write {base}@KEY=VALUE")
@@ -352,7 +351,7 @@ def _check_sections(kind: str, settings: Settings, used: Mapping[str, str], vari
 
 def _all_systems() -> list[str]:
     loaded = {name: registry.load("method", name) for name in registry.METHODS}
-    return [name for name, method in loaded.items() if not isinstance(method, IsSystem) or method.is_system]
+    return [name for name, method in loaded.items() if getattr(method, "is_system", True)]
 
 
 def _method_targets(methods: Sequence[str]) -> list[str]:

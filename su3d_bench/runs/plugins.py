@@ -198,10 +198,10 @@ def checked_method(method: Any) -> Any:
     return _watched(method, OF_METHODS)
 
 
-def told(method: Any, name: str) -> Any:
-    """The property ``name`` of a method."""
-    value = getattr(method, name)
-    if not is_ours(type(method)):
+def told(method: Any, name: str, without: Any = None) -> Any:
+    """The property ``name`` of a method; ``without`` where it has none."""
+    value = getattr(method, name, without)
+    if not is_ours(type(method)) and hasattr(method, name):
         known = inspect.getattr_static(type(method), name, None)
         place = place_of(type(method), name, known.fget if isinstance(known, property) else known)
         _sound(place, value, OF_PROPERTIES[name])

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.interfaces import RendersFrames, SaysUp
+from su3d_bench.core.interfaces import SaysUp
 from su3d_bench.core.registry import DATASETS
 from su3d_bench.datasets.recordings.pose_convention import judge_scene
 from su3d_bench.runs.job import SceneJob, build_dataset, build_method
@@ -60,7 +60,7 @@ def _remarks(job: SceneJob) -> Remarks:
             if said is not None:
                 return tuple(map(str, said)), False
         dataset = build_dataset(job.dataset, job.data_root)
-        if not reading or (isinstance(dataset, RendersFrames) and dataset.renders_frames):
+        if not reading or getattr(dataset, "renders_frames", False):
             return NOTHING
         verdict = judge_scene(dataset, job.scene_name)
         lines = [] if verdict is None else [verdict.line]

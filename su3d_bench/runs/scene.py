@@ -71,7 +71,7 @@ def run_scene(job: SceneJob, report: Report) -> tuple[MethodOutcome, ...]:
 def _warm_up(part: Part) -> None:
     """Once a process for each method and its settings, where it asks for it."""
     scratch: interfaces.Method = build_method(part)
-    if isinstance(scratch, interfaces.WarmsUp) and scratch.warms_up:
+    if getattr(scratch, "warms_up", False):
         frame_loop.warm_up(scratch)
 
 
@@ -169,7 +169,7 @@ class _Scene:
 
     @cached_property
     def is_rendered(self) -> bool:
-        return isinstance(self.dataset, interfaces.RendersFrames) and self.dataset.renders_frames
+        return bool(getattr(self.dataset, "renders_frames", False))
 
     @property
     def opening(self) -> str:

@@ -11,7 +11,7 @@ from waiting import wait_until
 
 from su3d_bench.core import registry
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.interfaces import TakesTools, WarmsUp
+from su3d_bench.core.interfaces import TakesTools
 from su3d_bench.core.types import Frame
 from su3d_bench.runs.frame_loop import ReadAhead, warm_up
 
@@ -90,7 +90,7 @@ def test_leaving_early_ends_the_threads_and_reads_nothing_more(n_taken: int) -> 
     assert len(frames.begun) == n_begun
 
 
-WARMED = [name for name in registry.METHODS if isinstance(registry.load("method", name), WarmsUp)]
+WARMED = [name for name in registry.METHODS if getattr(registry.load("method", name), "warms_up", False)]
 
 
 @pytest.mark.parametrize("name", WARMED)

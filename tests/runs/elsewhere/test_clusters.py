@@ -22,8 +22,8 @@ from su3d_bench.runs import scene as scene_run
 ray = pytest.importorskip("ray", reason="the ray extra is not installed")
 pytest.importorskip("submitit", reason="the slurm extra is not installed")
 
-PAINTED = f"{SCENES}/painted_anywhere.py:Painted"
-COLLECTOR = f"{SCENES}/painted_anywhere.py:Collector"
+PAINTED = f"{SCENES}/painted_cli.py:Painted"
+COLLECTOR = f"{SCENES}/painted_cli.py:Collector"
 NOISE = ("--set", "collector.noise_m=0.02", "painted.frame_ms=50")
 WHILE_LOADED_S = 300
 
@@ -159,7 +159,7 @@ def test_an_option_that_means_nothing_is_one_line(
 @pytest.mark.parametrize(
     ("executor", "line"),
     [
-        ("ray", "no Ray cluster runs on this machine; add --ray-address local to start one here for this run, or"),
+        ("ray", "no Ray cluster on this machine takes this run (Could not find any running Ray instance"),
         (
             "slurm",
             "no Slurm cluster is here: there is no srun; give the command where there is, or add --slurm cluster",

@@ -43,19 +43,8 @@ def room_bundle(folder: Path, *, data: Path) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SU3D_DATA", str(data))
         patch.setenv("SU3D_CACHE", str(folder / "cache"))
-        words = [
-            "run",
-            "--scenes",
-            ROOM,
-            "--methods",
-            "opensu3d",
-            "conceptfusion",
-            "oracle",
-            "--protocols",
-            *PROTOCOLS,
-            "--set",
-            *SMALL,
-        ]
+        words = ["run", "--scenes", ROOM, "--methods", "opensu3d", "conceptfusion", "oracle", "--protocols", *PROTOCOLS]
+        words += ["--set", *SMALL]
         words += ["--profile", "oracle", "--no-pictures", "--jobs", "1", "--quiet", "--stride", "2"]
         assert main([*words, "--out", str(folder / "room")]) == 0
         assert main(["report", "bundle", str(folder / "room"), "--out", str(folder / "room.zip"), "--quiet"]) == 0
