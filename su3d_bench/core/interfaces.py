@@ -11,24 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+from su3d_bench.core import types
 from su3d_bench.core.maps import Prediction, Proposals
-from su3d_bench.core.types import (
-    BoolArray,
-    Detections,
-    Float32Array,
-    Float64Array,
-    Frame,
-    GroundTruth,
-    InstanceMesh,
-    Int64Array,
-    PerceptionNeeds,
-    Regions,
-    SceneInfo,
-    Surface,
-    UInt8Array,
-    WholeObject,
-    WorldUp,
-)
 
 
 class DatasetAbility(Protocol):
@@ -45,11 +29,11 @@ class RegionPerception(Protocol):
     @property
     def dim(self) -> int: ...
 
-    def mask_at(self, frame: Frame, points: Int64Array) -> tuple[BoolArray, float]:
+    def mask_at(self, frame: types.Frame, points: types.Int64Array) -> tuple[types.BoolArray, float]:
         """The mask (H, W) of what lies under the pixels ``points`` (P, 2), x y, and how sure the segmenter is of it."""
         ...
 
-    def encode_regions(self, frame: Frame, mask: BoolArray, boxes: Int64Array) -> Float32Array:
+    def encode_regions(self, frame: types.Frame, mask: types.BoolArray, boxes: types.Int64Array) -> types.Float32Array:
         """Features (B, dim), L2-normalised, of the crops ``boxes`` (B, 4), x0 y0 x1 y1, around the region ``mask``."""
         ...
 
@@ -62,9 +46,9 @@ class SceneTools:
     where the dataset has no mesh; ``true_proposals`` is there where ``PerceptionNeeds.true_proposals`` asks for it.
     """
 
-    frames: Sequence[Frame]
+    frames: Sequence[types.Frame]
     regions: RegionPerception
-    surface: Callable[[], Surface]
+    surface: Callable[[], types.Surface]
     true_proposals: Callable[[], Proposals] | None = None
 
 
@@ -91,17 +75,17 @@ class Dataset(Protocol):
         """A content key: equal only where frames and ground truth are equal."""
         ...
 
-    def info(self, scene: str, stride: int) -> SceneInfo: ...
+    def info(self, scene: str, stride: int) -> types.SceneInfo: ...
 
-    def frames(self, scene: str, stride: int) -> Sequence[Frame]:
+    def frames(self, scene: str, stride: int) -> Sequence[types.Frame]:
         """Every ``stride``-th frame from 0, read lazily; ``len()`` and random access."""
         ...
 
-    def ground_truth(self, scene: str, variant: str) -> GroundTruth:
+    def ground_truth(self, scene: str, variant: str) -> types.GroundTruth:
         """The truth in the form that a protocol names; raises ``GroundTruthMissing`` where there is none."""
         ...
 
-    def instance_mesh(self, scene: str) -> InstanceMesh:
+    def instance_mesh(self, scene: str) -> types.InstanceMesh:
         """The annotated mesh, for the oracle profile; raises ``GroundTruthMissing`` where there is none."""
         ...
 
@@ -164,21 +148,21 @@ class CorrectsReading(DatasetAbility, Protocol):
 class SaysUp(DatasetAbility, Protocol):
     """Its files may have any world: which axis of it points up."""
 
-    def up(self, scene: str) -> WorldUp: ...
+    def up(self, scene: str) -> types.WorldUp: ...
 
 
 @runtime_checkable
 class HasSurface(DatasetAbility, Protocol):
     """The scan's mesh without labels."""
 
-    def surface(self, scene: str) -> Surface: ...
+    def surface(self, scene: str) -> types.Surface: ...
 
 
 @runtime_checkable
 class KnowsObjects(DatasetAbility, Protocol):
     """The objects of a scene as they are, of which the ground truth may hold what a recording saw alone."""
 
-    def whole_objects(self, scene: str) -> Sequence[WholeObject]: ...
+    def whole_objects(self, scene: str) -> Sequence[types.WholeObject]: ...
 
 
 @runtime_checkable
@@ -192,7 +176,7 @@ class NamesCategories(Protocol):
 class IsAligned(Protocol):
     """The rigid motion (4, 4) from the frame of the truth to one whose axes are the walls."""
 
-    def axis_alignment(self, scene: str) -> Float64Array: ...
+    def axis_alignment(self, scene: str) -> types.Float64Array: ...
 
 
 @runtime_checkable
@@ -213,7 +197,7 @@ class AsksText(DatasetAbility, Protocol):
 class HasSketches(DatasetAbility, Protocol):
     """A frame ``width`` pixels wide, in far less time than the whole; ``index`` is its place among all frames."""
 
-    def sketch(self, scene: str, index: int, width: int) -> Frame: ...
+    def sketch(self, scene: str, index: int, width: int) -> types.Frame: ...
 
 
 class StageTimer(Protocol):
@@ -232,11 +216,11 @@ class Method(Protocol):
     Config: type
 
     @property
-    def needs(self) -> PerceptionNeeds: ...
+    def needs(self) -> types.PerceptionNeeds: ...
 
-    def start(self, scene: SceneInfo) -> None: ...
+    def start(self, scene: types.SceneInfo) -> None: ...
 
-    def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None: ...
+    def update(self, frame: types.Frame, detections: types.Detections, timer: StageTimer) -> None: ...
 
     def finish(self) -> Prediction: ...
 
@@ -316,7 +300,7 @@ class TakesTools(MethodAbility, Protocol):
 class TakesTruth(MethodAbility, Method, Protocol):
     """Is told the ground truth, and is a ceiling."""
 
-    def receive_truth(self, truth: GroundTruth) -> None: ...
+    def receive_truth(self, truth: types.GroundTruth) -> None: ...
 
 
 @runtime_checkable
@@ -348,11 +332,11 @@ class Encoder(Protocol):
         """A key that moves with the weights and with everything else that moves a feature."""
         ...
 
-    def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:
+    def encode_images(self, images: Sequence[types.UInt8Array]) -> types.Float32Array:
         """Features (N, dim) of RGB crops (h, w, 3) at their native size."""
         ...
 
-    def encode_texts(self, texts: Sequence[str]) -> Float32Array:
+    def encode_texts(self, texts: Sequence[str]) -> types.Float32Array:
         """Features (N, dim) of texts."""
         ...
 
@@ -380,4 +364,4 @@ class Segmenter(Protocol):
     name: str
     digest: str
 
-    def segment(self, frame: Frame) -> Regions: ...
+    def segment(self, frame: types.Frame) -> types.Regions: ...

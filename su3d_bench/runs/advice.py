@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import glob
-import math
 import shlex
-from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,15 +11,11 @@ from pathlib import Path
 from su3d_bench.core.errors import DataError, Su3dError
 from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.registry import CEILING_METHOD
-from su3d_bench.core.system.files import file_bytes
-from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.metrics.scoring import combine, unpack_scores
 from su3d_bench.runs.job import build_dataset, build_method, stride_of
 from su3d_bench.runs.plan import Plan
 from su3d_bench.runs.runner import RunResult
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.records import read_updates
-from su3d_bench.store.run_folder import JobFolder
 
 # Where no earlier run says better: an update of opensu3d under the embedded profile at 640x480, and reading, scoring
 # and drawing one room under two protocols, both on two cores of a 2020s server.
@@ -106,32 +100,26 @@ def next_commands(result: RunResult) -> list[str]:
 
 
 def _query(result: RunResult, run: str) -> list[list[str]]:
-    """A text that means a class of a scene, asked of a map with features."""
+    """A text that means a class, asked of a map with features."""
     for outcome in result.outcomes:
         job = result.plan.folder.job(outcome.scene, outcome.method)
         is_map = outcome.method in result.plan.methods and outcome.method != CEILING_METHOD and is_file(job.prediction)
         features = read_prediction(job.prediction).features if is_map else None
-        if features is None or not features.size:
-            continue
-        known = sorted(_classes(result, job, outcome.scene), key=lambda pair: -pair[1])
-        if known:
+        name = None if features is None or not features.size else _best_class(result, outcome.method)
+        if name is not None:
             method = [] if outcome.method == "opensu3d" else ["--method", outcome.method]
-            return [["query", "text", outcome.scene, known[0][0], "--run", run, *method]]
+            return [["query", "text", outcome.scene, name, "--run", run, *method]]
     return []
 
 
-def _classes(result: RunResult, job: JobFolder, scene: str) -> Iterator[tuple[str, float]]:
-    """The classes that the scene has, each with what the map scores on it, of the first protocol that tells classes."""
-    scores = unpack_scores(file_bytes(job.counts))
-    asked = dict.fromkeys(name for scene_job in result.plan.jobs for name in scene_job.protocols)
-    rules = {rules.name: rules for rules in map(load_protocol, asked)}
-    for name in sorted(scores, key=lambda name: rules[name].kind not in THINGS_FIRST):
-        rows: Mapping[str, Mapping[str, float]]
-        rows = combine(rules[name], {scene: scores[name]}, with_intervals=False).per_class
-        values = {cls: next(iter(row.values()), math.nan) for cls, row in rows.items()}
-        if any(math.isfinite(value) for value in values.values()):
-            yield from ((cls, value) for cls, value in values.items() if math.isfinite(value))
-            return
+def _best_class(result: RunResult, method: str) -> str | None:
+    """The class on which ``method`` scores best, under the first protocol that tells classes."""
+    rows = [row for row in result.metrics["results"] if row["method"] == method and row["result"] is not None]
+    for row in sorted(rows, key=lambda row: (row["kind"] not in THINGS_FIRST, row["protocol"])):
+        first = {name: next(iter(values.values()), None) for name, values in row["result"]["per_class"].items()}
+        if known := {name: value for name, value in first.items() if value is not None}:
+            return str(max(known, key=known.__getitem__))
+    return None
 
 
 def _numbers(result: RunResult, run: str) -> list[list[str]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -192,9 +192,9 @@ def own_code(target: str) -> str | None:
     return digest_file(Path(target.rpartition(":")[0]))[:16] if ".py:" in target else None
 
 
-def refuse_other_run(folder: JobFolder, key: Mapping[str, str], known_later: Sequence[str] = ()) -> None:
-    """A ``StoreError`` where ``folder`` was sealed under another key, fields in ``known_later`` aside."""
-    if changed := folder.changed_field("predict", key, known_later=known_later):
+def refuse_other_run(folder: JobFolder, key: Mapping[str, str], *, is_early: bool = False) -> None:
+    """A ``StoreError`` where ``folder`` was sealed under another key; ``is_early``: what is known later aside."""
+    if changed := folder.changed_field("predict", key, known_later=FIELDS_KNOWN_LATER if is_early else ()):
         raise StoreError(f"{folder.path}: holds another run ({changed}); {INSTEAD}")
 
 

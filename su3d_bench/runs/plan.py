@@ -46,16 +46,7 @@ from su3d_bench.runs.existing import (
     refuse_other_request,
     replaced_jobs,
 )
-from su3d_bench.runs.job import (
-    FIELDS_KNOWN_LATER,
-    ConfiguredMethods,
-    Part,
-    SceneJob,
-    options_model,
-    own_code,
-    part_of,
-    refuse_other_run,
-)
+from su3d_bench.runs.job import ConfiguredMethods, Part, SceneJob, options_model, own_code, part_of, refuse_other_run
 from su3d_bench.runs.remote_store import DataPlace, LocalRun, RemoteData, RunPlace, StoredRun, data_place, is_url
 from su3d_bench.runs.scenes import cache_root, data_root, dataset_targets, expand_scenes, looks_like_scene
 from su3d_bench.store.run_folder import JobFolder, RunFolder, scene_of_folder
@@ -288,7 +279,7 @@ def _started(plan: Plan, into: Into) -> Plan:
             folder = plan.folder.job(job.scene, part.name)
             folder.refuse_links()
             if into != "replace":
-                refuse_other_run(folder, methods.of(job, part)[1], FIELDS_KNOWN_LATER)
+                refuse_other_run(folder, methods.of(job, part)[1], is_early=True)
     if into == "replace":
         removes = tuple(replaced_jobs(plan.folder, plan.jobs))
         if removes or (existing is not None and any(differences(existing, plan.request))):

@@ -7,15 +7,7 @@ from functools import cache, lru_cache
 
 from su3d_bench.core.types import SceneInfo
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, resolve_profile
-from su3d_bench.runs.job import (
-    ConfiguredMethods,
-    JobInputs,
-    MethodOutcome,
-    Part,
-    SceneJob,
-    build_dataset,
-    stride_of,
-)
+from su3d_bench.runs.job import ConfiguredMethods, JobInputs, MethodOutcome, Part, SceneJob, build_dataset, stride_of
 from su3d_bench.runs.poses import silent
 from su3d_bench.runs.scene import perception_of
 from su3d_bench.store.records import SealRecord

@@ -59,39 +59,25 @@ def _takes_files(folder: Path) -> bool:
 class CacheKind:
     """One kind of what the cache folder keeps: the folder's name, the form of a file's path in it, and what it is.
 
-    ``is_paid``: it is not computed again but asked for anew, which may cost money.
+    ``form`` is a regular expression. ``is_paid``: it is not computed again but asked for anew, which may cost money.
     """
 
     name: str
-    form: re.Pattern[str]
+    form: str
     what: str
     is_paid: bool = False
 
 
-KINDS = {
-    kind.name: kind
-    for kind in (
-        CacheKind(
-            "perception",
-            re.compile(f"{_HEX}{{2}}/{_HEX}{{64}}\\.npz"),
-            "what was found in frames: runs over the same frames are many times as fast",
-        ),
-        CacheKind(
-            "model-digests", re.compile(f"{_HEX}{{32}}\\.json"), "digests of weights, which take seconds a gigabyte"
-        ),
-        CacheKind(
-            "runs",
-            re.compile(f"[^/]*-{_HEX}{{8}}/(run\\.toml|[a-z]+\\.json|(scenes|language)/.+|\\.lock)"),
-            "the small files of runs that are kept in a store such as s3://",
-        ),
-        CacheKind(
-            "replies",
-            re.compile(f"(images/)?{_HEX}+\\.(json|png)"),
-            "replies of language models outside a run, which may have cost money",
-            is_paid=True,
-        ),
-    )
-}
+_PERCEPTION = f"{_HEX}{{2}}/{_HEX}{{64}}\\.npz"
+_RUN = f"[^/]*-{_HEX}{{8}}/(run\\.toml|[a-z]+\\.json|(scenes|language)/.+|\\.lock)"
+_REPLY = f"(images/)?{_HEX}+\\.(json|png)"
+_KINDS = (
+    CacheKind("perception", _PERCEPTION, "what was found in frames: runs over the same frames are many times as fast"),
+    CacheKind("model-digests", f"{_HEX}{{32}}\\.json", "digests of weights, which take seconds a gigabyte"),
+    CacheKind("runs", _RUN, "the small files of runs that are kept in a store such as s3://"),
+    CacheKind("replies", _REPLY, "replies of language models outside a run, which may have cost money", is_paid=True),
+)
+KINDS = {kind.name: kind for kind in _KINDS}
 
 
 @dataclass(frozen=True)
@@ -112,7 +98,7 @@ def cache_entries(root: Path, kind: CacheKind) -> Iterator[CacheEntry]:
             name = path.relative_to(top).as_posix()
             with suppress(FileNotFoundError):  # gone meanwhile
                 status = path.lstat()
-                if stat.S_ISREG(status.st_mode) and kind.form.fullmatch(name):
+                if stat.S_ISREG(status.st_mode) and re.fullmatch(kind.form, name):
                     yield CacheEntry(name, status.st_size, status.st_mtime)
 
 

@@ -13,14 +13,7 @@ import pytest
 from su3d_bench.core.errors import DataError, StoreError
 from su3d_bench.core.files.atomic import write_json
 from su3d_bench.store import records
-from su3d_bench.store.records import (
-    MetricsRecord,
-    MidwayRecord,
-    NumbersRecord,
-    ResultRecord,
-    plain,
-    read_record,
-)
+from su3d_bench.store.records import MetricsRecord, MidwayRecord, NumbersRecord, ResultRecord, plain, read_record
 
 VALUES = NumbersRecord(
     scenes=("d/a",),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -100,21 +99,3 @@ def test_values_are_toml_and_lists_may_hold_commas() -> None:
 def test_a_wrong_variant_is_one_line(text: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         named_method(text)
-
-
-def test_variants_stand_side_by_side_and_run_toml_repeats_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    method = f"{PAINTED_FILE}:Collector"
-    words = ["run", "--scenes", f"{PAINTED_FILE}:Painted/a", "--protocols", "rooms-semantic", "--no-pictures"]
-    words += ["--jobs", "1"]
-    out = tmp_path / "out"
-    assert main([*words, "--methods", method, f"{method}@stride=2", "--out", str(out)]) == 0
-    results = json.loads((out / "metrics.json").read_text())["results"]
-    assert [one["method"] for one in results] == ["collector", "collector@stride=2"]
-    n_updates = [len((out / "scenes/painted.a" / one["method"] / "updates.csv").read_text().split()) for one in results]
-    assert n_updates[0] == 2 * n_updates[1] - 1
-    before = (out / "metrics.json").read_bytes()
-    assert main(["run", "--config", str(out / "run.toml"), "--out", str(out)]) == 0
-    assert (out / "metrics.json").read_bytes() == before

@@ -10,7 +10,6 @@ import random
 import shutil
 import subprocess
 import sys
-import threading
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -126,51 +125,7 @@ def test_memory_that_ends_fails_its_scene_alone_and_says_so(capsys: pytest.Captu
     assert "score" in json.loads((job("a") / "done.json").read_text())["steps"]
 
 
-def test_of_many_runs_that_start_at_once_one_has_the_folder_and_the_others_a_line(tmp_path: Path) -> None:
-    inside, most_inside, refused = 0, 0, []
-    start = threading.Barrier(8)
-
-    def hold() -> None:
-        nonlocal inside, most_inside
-        start.wait()
-        for _ in range(50):
-            try:
-                with RunFolder(tmp_path).locked():
-                    inside += 1
-                    most_inside = max(most_inside, inside)
-                    os.sched_yield()
-                    inside -= 1
-            except StoreError as error:
-                refused.append(str(error))
-
-    threads = [threading.Thread(target=hold) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert most_inside == 1
-    assert set(refused) <= {f"{tmp_path}: another run is writing here; wait for it or choose another folder with --out"}
-    assert refused
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_disk_whose_folders_cannot_be_locked_has_a_lock_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    lock = fcntl.flock
-
-    def as_on_a_network_disk(handle: int, operation: int) -> None:
-        if os.path.isdir(f"/proc/self/fd/{handle}"):
-            raise OSError(errno.EBADF, "Bad file descriptor")
-        lock(handle, operation)
-
-    monkeypatch.setattr(fcntl, "flock", as_on_a_network_disk)
-    for _ in range(2):
-        with (
-            RunFolder(tmp_path).locked(),
-            pytest.raises(StoreError, match="another run is writing here; wait for it"),
-            RunFolder(tmp_path).locked(),
-        ):
-            pass
-
+def test_a_disk_without_locks_is_no_place_for_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def without_locks(handle: int, operation: int) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
 
