@@ -29,21 +29,13 @@ from su3d_bench.runs import executors
 from su3d_bench.runs.executors import Outcome, Report, Unit, Work, answer_of, limit_threads, unwrap
 from su3d_bench.store.run_folder import refuse_links
 
-Lost = Callable[[Unit, str], Outcome]
 RunUnits = Callable[..., Iterator[Any]]
-CONNECT_S = 5.0  # a machine of a cluster in one network answers within milliseconds
 ENDED = "ended"  # the kind of answer of a worker that was asked to end
 MOST_AT_ONCE = 1000  # a pending task of Ray costs the driver memory; Slurm's MaxArraySize is 1001 where nobody set it
 
 
 def run_ray(
-    work: Work[Unit, Outcome],
-    units: Sequence[Unit],
-    lost: Lost[Unit, Outcome],
-    *,
-    jobs: int,
-    config: RunConfig,
-    ray: Any,
+    work: Work[Unit, Outcome], units: Sequence[Unit], lost: Any, *, jobs: int, config: RunConfig, ray: Any
 ) -> Iterator[Outcome]:
     """Outcomes of ``units`` as they come in, at most ``jobs`` of them handed to the cluster at once.
 
@@ -119,7 +111,6 @@ def connected(config: RunConfig) -> Iterator[Any]:
         raise ModelMissing("the executor 'ray' needs the ray extra: pip install 'su3d-bench[ray]'") from error
     was_connected = ray.is_initialized()
     if not was_connected:
-        _refuse_silent(config.ray_address)
         _connect(ray, config.ray_address)
     try:
         _refuse_too_many_gpus(ray, config.gpus_per_job)
@@ -142,21 +133,6 @@ def _connect(ray: Any, address: str) -> None:
         ) from error
 
 
-def _refuse_silent(address: str) -> None:
-    """Ray waits a minute for a machine that is not there."""
-    host, colon, port = address.removeprefix("ray://").rpartition(":")
-    if not colon or not port.isdigit():
-        return
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_S).close()
-    except (OSError, OverflowError) as error:
-        reason = (getattr(error, "strerror", None) or str(error) or "no answer").lower()
-        raise ConfigError(
-            f"no Ray cluster answers at '{address}' ({reason}); start one with ray start --head, or name another with "
-            "--ray-address"
-        ) from error
-
-
 def _refuse_too_many_gpus(ray: Any, gpus_per_job: float) -> None:
     """Ray waits for ever for a machine that has what a task asks for."""
     most = max((node["Resources"].get("GPU", 0.0) for node in ray.nodes() if node["Alive"]), default=0.0)
@@ -172,13 +148,7 @@ POLL_S = 0.5
 
 
 def run_slurm(
-    work: Work[Unit, Outcome],
-    units: Sequence[Unit],
-    lost: Lost[Unit, Outcome],
-    *,
-    jobs: int,
-    config: RunConfig,
-    folder: Path,
+    work: Work[Unit, Outcome], units: Sequence[Unit], lost: Any, *, jobs: int, config: RunConfig, folder: Path
 ) -> Iterator[Outcome]:
     """Outcomes of ``units`` as they come in, at most ``jobs`` of them submitted at once, as job arrays.
 

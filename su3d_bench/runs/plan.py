@@ -109,7 +109,7 @@ def named_method(text: str) -> NamedMethod:
 
 
 def _preset(text: str, base: str, method: Any, variant: str) -> Mapping[str, Any]:
-    presets = getattr(method, "presets", {})
+    presets: Mapping[str, Mapping[str, Any]] = getattr(method, "presets", {})
     if variant not in presets:
         hint = suggest(variant, presets, "it has") or "; it has none"
         raise ConfigError(f"--methods {text}: {base} has no preset '{variant}'{hint}; or write {base}@KEY=VALUE")

@@ -7,18 +7,19 @@ import traceback
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
-from functools import partial, wraps
+from functools import cache, partial, wraps
 from pathlib import Path
-from types import CodeType, NoneType
-from typing import Any, get_args
+from types import CodeType, NoneType, UnionType
+from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 from pydantic import BaseModel
 
 from su3d_bench.core import maps, types
 from su3d_bench.core.errors import PlugInError, Su3dError, own_line, printable
+from su3d_bench.core.interfaces import ABILITIES, INTERFACES
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
-from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, PerceptionNeeds, SceneInfo, Surface, WorldUp
+from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, PerceptionNeeds, SceneInfo, Surface
 from su3d_bench.store.predictions import array_fault, prediction_arrays, value_fault
 
 # The types in which arrays are kept. What is of the same kind is brought into them, what is of another is refused.
@@ -35,7 +36,6 @@ ARRAYS: dict[type, dict[str, tuple[int, ...]]] = {
     Surface: {"vertices": (3,), "triangles": (3,)},
     InstanceMesh: {"vertices": (3,), "triangles": (3,), "instance_of_triangle": ()},
 }
-ELEMENTS: dict[str, type] = {"scenes": str, "files": Path, "places": Path, "problems": str}
 
 
 # ---- what is wrong with values of the right type: their dataclasses check shapes that must agree
@@ -139,30 +139,16 @@ def _fault_of_prediction(prediction: Instances | Partition | DenseFeatures) -> s
 
 # ---- where user-defined datasets and methods answer
 
-Kinds = tuple[type, ...]
-# What each function of a dataset and of a method returns; nothing is asked of those that return nothing. A sequence has
-# a length and gives its k-th. Optional functions are checked where they are there.
-OF_DATASETS: dict[str, Kinds] = {
-    **dict.fromkeys(("scenes", "files", "frames", "places", "problems", "whole_objects", "queries"), (Sequence,)),
-    **dict.fromkeys(("digest", "status"), (str,)),
-    "info": (SceneInfo,),
-    "ground_truth": (GroundTruth,),
-    "instance_mesh": (InstanceMesh,),
-    "groups": (Mapping,),
-    "up": (WorldUp,),
-    "surface": (Surface,),
-}
-OF_METHODS: dict[str, Kinds] = {
-    **dict.fromkeys(("receive_tools", "receive_truth", "start", "update", "close"), ()),
-    "finish": (Instances, Partition, DenseFeatures),
-}
-# What a method says without being called.
-OF_PROPERTIES: dict[str, Kinds] = {
-    "needs": (PerceptionNeeds,),
-    **dict.fromkeys(("n_points", "n_instances", "map_bytes"), (int, np.integer)),
-    **dict.fromkeys(("losses", "finish_costs", "inputs"), (Mapping,)),
-    "caveat": (str, NoneType),
-}
+NUMPY: dict[type, type] = {int: np.integer, bool: np.bool_}  # which will do in the place of Python's own
+
+
+@cache
+def _answers(kind: str) -> dict[str, Any]:
+    """What each function and property of a dataset or method gives, those that it may have too, as their annotations
+    say."""
+    members = {name: member for each in (INTERFACES[kind], *ABILITIES[kind]) for name, member in vars(each).items()}
+    functions = {name: getattr(member, "fget", member) for name, member in members.items() if name[0] != "_"}
+    return {name: get_type_hints(one)["return"] for name, one in functions.items() if inspect.isfunction(one)}
 
 
 def is_ours(plug_in: type) -> bool:
@@ -187,7 +173,7 @@ def made(plug_in: type, *words: Any) -> Any:
 
 def checked_dataset(dataset: Any) -> Any:
     """``dataset``; a user-defined one checks from now on what it gives."""
-    return dataset if is_ours(type(dataset)) else _watched(dataset, OF_DATASETS)
+    return dataset if is_ours(type(dataset)) else _watched(dataset, "dataset")
 
 
 def checked_method(method: Any) -> Any:
@@ -195,7 +181,7 @@ def checked_method(method: Any) -> Any:
     if is_ours(type(method)):
         return method
     told(method, "needs")
-    return _watched(method, OF_METHODS)
+    return _watched(method, "method")
 
 
 def told(method: Any, name: str, without: Any = None) -> Any:
@@ -204,7 +190,7 @@ def told(method: Any, name: str, without: Any = None) -> Any:
     if not is_ours(type(method)) and hasattr(method, name):
         known = inspect.getattr_static(type(method), name, None)
         place = place_of(type(method), name, known.fget if isinstance(known, property) else known)
-        _sound(place, value, OF_PROPERTIES[name])
+        _sound(place, value, _answers("method")[name])
     return value
 
 
@@ -220,27 +206,25 @@ def place_of(plug_in: type, name: str = "", function: Any = None) -> str:
     return printable(f"{where}{plug_in.__name__}{f'.{name}' if name else ''}", 300)
 
 
-def _watched(plug_in: Any, expected: Mapping[str, Kinds]) -> Any:
-    for name, kinds in expected.items():
-        if callable(function := getattr(plug_in, name, None)):
-            watching = wraps(function)(partial(_asked, plug_in, name, function, kinds))
+def _watched(plug_in: Any, kind: str) -> Any:
+    for name, answer in _answers(kind).items():
+        if callable(getattr(type(plug_in), name, None)):  # no property, which may not have a value yet
+            function = getattr(plug_in, name)
+            watching = wraps(function)(partial(_asked, plug_in, name, function, answer))
             with suppress(AttributeError):  # of a class with slots, which then answers unwatched
                 object.__setattr__(plug_in, name, watching)
     return plug_in
 
 
-def _asked(plug_in: Any, name: str, function: Callable[..., Any], kinds: Kinds, *words: Any, **named: Any) -> Any:
+def _asked(plug_in: Any, name: str, function: Callable[..., Any], answer: Any, *words: Any, **named: Any) -> Any:
     place = place_of(type(plug_in), name, function)
-    found = _called(place, function, words, named)
-    if not kinds:
-        return found
-    found = _sound(place, found, kinds)
+    found = _sound(place, _called(place, function, words, named), answer)
     if name == "frames":
         return _Frames(place, found)
     if name == "digest" and not found:
         raise PlugInError(f"{place} gave an empty text; expected a key that is equal only where the data are")
-    for k, entry in enumerate(found if name in ELEMENTS else ()):
-        _sound(f"{place}(...)[{k}]", entry, (ELEMENTS[name],))
+    for k, entry in enumerate(found if get_origin(answer) is Sequence else ()):
+        _sound(f"{place}(...)[{k}]", entry, get_args(answer)[0])
     return found
 
 
@@ -259,10 +243,14 @@ def _called(place: str, function: Callable[..., Any], words: Sequence[Any], name
         raise
 
 
-def _sound(place: str, found: Any, kinds: Kinds) -> Any:
-    """``found`` in its stored form; a ``PlugInError`` where it is of none of ``kinds`` or holds what cannot be."""
+def _sound(place: str, found: Any, answer: Any) -> Any:
+    """``found`` in its stored form; a ``PlugInError`` where it is no ``answer`` or holds what cannot be."""
+    if answer in (Any, NoneType):
+        return found
+    kinds = get_args(answer) if isinstance(answer, UnionType) else (get_origin(answer) or answer,)
     is_listed = hasattr(found, "__len__") and hasattr(found, "__getitem__") and not isinstance(found, str | Mapping)
-    if not (is_listed if kinds == (Sequence,) else isinstance(found, kinds)):
+    will_do = (*kinds, *(NUMPY[kind] for kind in kinds if kind in NUMPY))
+    if not (is_listed if kinds == (Sequence,) else isinstance(found, will_do)):
         wanted = " or ".join("None" if kind is NoneType else kind.__name__ for kind in kinds)
         raise PlugInError(f"{place} gave {_kind_of(found)}; expected {wanted}")
     found = in_stored_form(found)
@@ -283,7 +271,7 @@ class _Frames(Sequence[Frame]):
 
     def __getitem__(self, k: Any) -> Any:
         place = f"{self._place}(...)[{k}]"
-        return _sound(place, _called(place, self._frames.__getitem__, (k,), {}), (Frame,))
+        return _sound(place, _called(place, self._frames.__getitem__, (k,), {}), Frame)
 
 
 def _kind_of(value: Any) -> str:

@@ -39,10 +39,11 @@ from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 Scores = Mapping[tuple[str, str], SceneScore]
+Outcomes = Sequence[MethodOutcome]
 BY_THE_METHOD = "computed by the method"
 
 
-def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> records.MetricsRecord:
+def summarise(plan: Plan, outcomes: Outcomes) -> records.MetricsRecord:
     """One result a method and protocol, with ceiling and the scenes that are missing.
 
     The counts of one method and of the ceiling are in memory at a time.
@@ -78,7 +79,7 @@ def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> records.MetricsR
     )
 
 
-def _read_scores(plan: Plan, outcomes: Sequence[MethodOutcome], file_of: Callable[[JobFolder], Path]) -> Scores:
+def _read_scores(plan: Plan, outcomes: Outcomes, file_of: Callable[[JobFolder], Path]) -> Scores:
     """(protocol, scene) -> counts, from the files of the outcomes that did not fail and have one."""
     scores: dict[tuple[str, str], SceneScore] = {}
     for outcome in outcomes:
@@ -95,12 +96,7 @@ def _metrics_over(scenes: Sequence[str], rules: ProtocolRules, scores: Scores) -
 
 
 def _result(
-    plan: Plan,
-    method: str,
-    rules: ProtocolRules,
-    outcomes: Sequence[MethodOutcome],
-    scores: Scores,
-    early: Mapping[float, Scores],
+    plan: Plan, method: str, rules: ProtocolRules, outcomes: Outcomes, scores: Scores, early: Mapping[float, Scores]
 ) -> records.ResultRecord:
     """The result without its ceiling; the maps midway count where all scenes of the final one are scored."""
     planned = dict.fromkeys(
@@ -154,7 +150,7 @@ def _join(texts: Iterable[str | None], separator: str = ", ") -> str | None:
     return separator.join(dict.fromkeys(text for text in texts if text)) or None
 
 
-def _model_files(plan: Plan, outcomes: Sequence[MethodOutcome]) -> dict[str, dict[str, str]]:
+def _model_files(plan: Plan, outcomes: Outcomes) -> dict[str, dict[str, str]]:
     """SHA-256 of every weight file of the profiles that the run used, by model and file name."""
     from su3d_bench.perception.models.catalogue import PROFILE_MODELS
     from su3d_bench.perception.models.loading import models_record
@@ -164,7 +160,7 @@ def _model_files(plan: Plan, outcomes: Sequence[MethodOutcome]) -> dict[str, dic
     return models_record(names, PerceptionConfig.model_validate_json(plan.jobs[0].perception).models) if names else {}
 
 
-def record(plan: Plan, outcomes: Sequence[MethodOutcome], status: str) -> records.RunRecord:
+def record(plan: Plan, outcomes: Outcomes, status: str) -> records.RunRecord:
     """Where the numbers come from."""
     git = git_state()
     return records.RunRecord(
@@ -198,9 +194,7 @@ def record(plan: Plan, outcomes: Sequence[MethodOutcome], status: str) -> record
 # ---- what must be said
 
 
-def remarks_of(
-    plan: Plan, outcomes: Sequence[MethodOutcome], without_score: Sequence[tuple[str, str]]
-) -> tuple[str, ...]:
+def remarks_of(plan: Plan, outcomes: Outcomes, without_score: Sequence[tuple[str, str]]) -> tuple[str, ...]:
     """What is worth saying of scenes that did not fail: warnings, protocols left out, ceilings that are missing."""
     failed = {outcome.scene for outcome in outcomes if outcome.error is not None and outcome.method in plan.methods}
     lines = [line for outcome in outcomes for line in outcome.warnings]
@@ -220,7 +214,7 @@ def remarks_of(
     return tuple(dict.fromkeys(lines))
 
 
-def outcomes_without_score(plan: Plan, outcomes: Sequence[MethodOutcome]) -> list[tuple[str, str]]:
+def outcomes_without_score(plan: Plan, outcomes: Outcomes) -> list[tuple[str, str]]:
     """(scene, method) of what did not fail and that no protocol scored."""
     n_protocols = {job.scene: len(job.protocols) for job in plan.jobs}
     return [

@@ -3,7 +3,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -118,16 +117,6 @@ def test_a_scene_that_takes_every_worker_down_fails_alone_after_its_retries(
     error = capsys.readouterr().err
     assert "painted/b: the worker or its machine was lost, 2 times; see the cluster's logs, or raise --retries" in error
     assert json.loads(Path("killed/metrics.json").read_text())["results"][0]["result"]["scenes"] == ["painted/a"]
-
-
-def test_an_address_without_a_cluster_is_one_line_within_seconds(capsys: pytest.CaptureFixture[str]) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{taken.getsockname()[1]}"
-        assert run("--executor", "ray", "--ray-address", address, out="nowhere") == 2
-    error = capsys.readouterr().err
-    assert error.startswith(f"su3d-bench: no Ray cluster answers at '{address}' (connection refused); start one with")
-    assert error.count("\n") == 1
 
 
 def test_submitit_gives_the_same_bytes_as_inline() -> None:
