@@ -22,10 +22,7 @@ COLLECTOR = f"{SCENES}/painted.py:Collector"
 REST = ["--no-pictures", "--jobs", "1", "--quiet"]
 
 
-@pytest.fixture(autouse=True)
-def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("painted_place")
 
 
 def run(scenes: str, *more: str, methods: tuple[str, ...] = (COLLECTOR,), out: str = "out") -> int:

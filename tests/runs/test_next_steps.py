@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from painted import colour_perception
 from places import SCENES
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.config import Setting, Settings
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import FinishedRun, RunData
 from su3d_bench.store.run_folder import RunFolder
 
@@ -20,10 +18,7 @@ PAINTED = f"{SCENES}/painted.py:Painted"
 COLLECTOR = f"{SCENES}/painted.py:Collector"
 
 
-@pytest.fixture(autouse=True)
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("painted_place")
 
 
 def lines_of(capsys: pytest.CaptureFixture[str], *words: str) -> list[str]:

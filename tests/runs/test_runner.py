@@ -15,11 +15,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.runs import frame_loop as scene_feeding
 from su3d_bench.runs import scene as scene_run
 
-
-@pytest.fixture(autouse=True)
-def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("painted_place")
 
 
 @pytest.fixture(scope="module")

@@ -11,12 +11,10 @@ from typing import Any
 
 import psutil
 import pytest
-from painted import colour_perception
 from places import SCENES
 from waiting import wait_until
 
 from su3d_bench.cli.main import main
-from su3d_bench.runs import scene as scene_run
 
 ray = pytest.importorskip("ray", reason="the ray extra is not installed")
 pytest.importorskip("submitit", reason="the slurm extra is not installed")
@@ -41,11 +39,7 @@ def cluster() -> Iterator[Any]:
     made.shutdown()
 
 
-@pytest.fixture(autouse=True)
-def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+pytestmark = pytest.mark.usefixtures("painted_place")
 
 
 def words(*more: str, out: str) -> list[str]:

@@ -5,20 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from painted import colour_perception
 from painted_runs import COLLECTOR, PAINTED, run, words
 from places import SCENES
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.plan import named_method
 
-
-@pytest.fixture(autouse=True)
-def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("painted_place")
 
 
 def test_another_request_for_the_same_folder_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from painted import colour_perception
 from places import SCENES
 
 from su3d_bench.cli.main import main
@@ -22,12 +21,10 @@ PROTOCOLS = ["--protocols", "rooms-semantic", "rooms-instance", "--no-pictures",
 
 
 @pytest.fixture
-def finished(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+def finished(painted_place: Path) -> Path:
     """A run that is done, in the folder ``out`` below the current one."""
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    monkeypatch.chdir(tmp_path)
     assert main([*WORDS, *PROTOCOLS, "--jobs", "1"]) == 0
-    return tmp_path / "out"
+    return painted_place / "out"
 
 
 def test_a_finished_run_starts_no_worker_and_reads_each_seal_twice(

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from painted import colour_perception
 from painted_runs import PAINTED, in_process
 from places import ROOT, SCENES
 
@@ -25,18 +24,13 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.files.atomic import TemporaryFolder, filling
 from su3d_bench.perception.cache import FrameCache
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.run_folder import RunFolder
 
 SUBJECT = f"{SCENES}/kill_subject.py"
 SETTINGS = ("--set", "painted.n_frames=3", "--protocols", "rooms-semantic", "--no-pictures", "--jobs", "1", "--quiet")
 
 
-@pytest.fixture(autouse=True)
-def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("painted_place")
 
 
 def run(*more: str, scenes: str = "[ab]", out: str = "out") -> int:
