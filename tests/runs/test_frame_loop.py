@@ -17,7 +17,7 @@ N_FRAMES = 40
 
 
 class Watched(Sequence[int]):
-    """Frames, each its position, whose reading is noted; ``read`` is called with the position before the frame is given."""
+    """Frames, each its position, whose reading is noted; ``read`` is called before a frame is given."""
 
     def __init__(self, read: Callable[[int], object] = lambda _: None) -> None:
         self.begun: list[int] = []

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from painted_runs import COLLECTOR, painted_run
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.digests import digest_bytes
