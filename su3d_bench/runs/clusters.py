@@ -189,8 +189,7 @@ def run_slurm(
 
 def _submit(executor: Any, work: Work[Unit, Outcome], fresh: Sequence[tuple[Unit, int]]) -> list[tuple[Any, Unit, int]]:
     with executor.batch():
-        jobs = [executor.submit(_in_job, work, unit) for unit, _ in fresh]
-    return [(job, unit, attempt) for job, (unit, attempt) in zip(jobs, fresh, strict=True)]
+        return [(executor.submit(_in_job, work, unit), unit, attempt) for unit, attempt in fresh]
 
 
 def _in_job(work: Work[Unit, Outcome], unit: Unit) -> tuple[str, Any]:

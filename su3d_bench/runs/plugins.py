@@ -117,8 +117,9 @@ def _fault_of_mesh(mesh: InstanceMesh | Surface) -> str | None:
         return None
     if len(mesh.instance_of_triangle) != len(corners):
         return f"instance_of_triangle is {mesh.instance_of_triangle.shape} for {len(corners)} triangles"
+    classes: Any = mesh.class_of_instance
     for instance in np.unique(mesh.instance_of_triangle[mesh.instance_of_triangle > 0]).tolist():
-        known = mesh.class_of_instance.get(instance, "no class")
+        known = classes.get(instance, "no class") if isinstance(classes, Mapping) else "no class"
         if known not in mesh.labels.ids:
             return f"class_of_instance has {known} for instance {instance}; expected a class id of its labels"
     return None
