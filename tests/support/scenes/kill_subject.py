@@ -68,6 +68,6 @@ def kept_perception(*_: Any, cache_root: Path, **__: Any) -> KeptPerception:
     return KeptPerception(cache_root)
 
 
-scene_run.build_perception = kept_perception  # type: ignore[assignment]
+scene_run.build_perception = kept_perception  # type: ignore[attr-defined]
 
 __all__ = ["Dense", "Painted"]

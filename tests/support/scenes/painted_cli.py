@@ -15,8 +15,8 @@ from su3d_bench.cli.main import main
 from su3d_bench.runs import finished, scene
 
 if "pytest" not in sys.modules:  # a test patches, and unpatches, its own process
-    scene.build_perception = colour_perception  # type: ignore[assignment]
-    finished.encoder_of = lambda folder, device="cpu": WordEncoder()
+    scene.build_perception = colour_perception  # type: ignore[attr-defined]
+    finished.encoder_of = lambda run, device="cpu": WordEncoder()
 
 __all__ = ["Collector", "Painted"]
 

@@ -65,8 +65,8 @@ def instances(
     features: Float32Array | None = None,
     scores: Sequence[float] | None = None,
 ) -> Instances:
-    scores = np.linspace(0.9, 0.5, len(masks)) if scores is None else scores
-    return Instances.of(points, list(masks), scores, features, labels=labels)
+    confidences = np.linspace(0.9, 0.5, len(masks)) if scores is None else scores
+    return Instances.of(points, list(masks), confidences, features, labels=labels)
 
 
 def truth_as_prediction(truth: GroundTruth, *, with_labels: bool) -> Instances:
