@@ -94,20 +94,3 @@ def test_a_fault_that_no_test_sees_survives_and_one_that_a_test_sees_does_not(
     (tree / "tests/metrics/test_small.py").write_text(test + "    assert not above(3) and above(4)\n")
     verdicts = {one.mutant.text: one.outcome for one in mutants.run_mutants(every, 1, tmp_path / "again")}
     assert verdicts == {"(value >= 3)": "killed", "4": "killed"}
-
-
-def test_a_survivor_without_a_reason_fails_and_one_with_a_reason_is_listed(
-    mutants: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    one = mutants.mutants_of("a.py", SOURCE)[0]
-    verdicts = [mutants.Verdict(one, "survived", 1.0)] + [mutants.Verdict(one, "killed", 1.0)] * 19
-    arguments = mutants.argparse.Namespace(json=tmp_path / "out.json", mutants=20, seed=0)
-    monkeypatch.setattr(mutants, "REASONS", tmp_path / "mutants.toml")
-    assert mutants.report(verdicts, arguments) == 1
-    assert "NO REASON" in capsys.readouterr().out
-    rows = [f'{name} = "{getattr(one, name)}"' for name in ("module", "where", "before", "after")]
-    (tmp_path / "mutants.toml").write_text("\n".join(["[[survivor]]", *rows, 'why = "a name for tests"']))
-    assert mutants.report(verdicts, arguments) == 0
-    assert "a name for tests" in capsys.readouterr().out
-    assert '"20",\n   "19",\n   "0",\n   "1"' in (tmp_path / "out.json").read_text()
-    assert mutants.report(verdicts[:10], arguments) == 1  # more than one in twenty

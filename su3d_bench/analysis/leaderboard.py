@@ -29,7 +29,7 @@ from su3d_bench.numerics.statistics import rank_intervals
 from su3d_bench.reports.tables.model import confidence_notes, few_scenes, is_ceiling
 from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.runs.verify import rules_of_run, why_not_counted
-from su3d_bench.store.records import MetricsRecord, RequestRecord, read_record
+from su3d_bench.store.records import MetricsRecord, RunRecord, read_record
 from su3d_bench.store.run_folder import MARKS, RunFolder
 
 MOST_RUNS = 10_000
@@ -360,10 +360,10 @@ def run_entry(path: Path, name: str | None = None) -> RunEntry:
     """The entry of the run in the folder ``path``; a ``StoreError`` where it holds none."""
     if not any(is_file(path / mark) for mark in MARKS):
         raise StoreError(f"{shown(path)}: holds no run; a run has a run.json")
-    record, is_damaged = RequestRecord(), False
+    record, is_damaged = RunRecord(), False
     try:
         if is_file(path / "run.json"):
-            record = read_record(RequestRecord, path / "run.json", shown(path))
+            record = read_record(RunRecord, path / "run.json", shown(path))
     except StoreError:
         is_damaged = True
     metrics = None
@@ -384,7 +384,7 @@ def _written(path: Path) -> float:
     return max((os.stat(path / mark).st_mtime for mark in MARKS if is_file(path / mark)), default=0.0)
 
 
-def _state(path: Path, record: RequestRecord, metrics: MetricsRecord | None) -> str:
+def _state(path: Path, record: RunRecord, metrics: MetricsRecord | None) -> str:
     if is_held(path):
         return "running now"
     if record.status in ("complete", "incomplete"):

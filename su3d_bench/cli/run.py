@@ -99,14 +99,13 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
 def carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
     """Run what was planned, or with ``--dry-run`` tell what it takes."""
     from su3d_bench.runs.runner import run_plan
-    from su3d_bench.runs.scenes import cache_root
-    from su3d_bench.store.caches import why_large, why_slow
+    from su3d_bench.store.caches import why_slow
 
     if arguments.dry_run:
         _show_plan(plan, arguments)
         return EXIT_DONE
-    warnings = [f"su3d-bench: {line}" for line in (why_slow(), why_large(cache_root())) if line]
-    remark(*warnings, quiet=arguments.quiet)
+    if line := why_slow():
+        remark(f"su3d-bench: {line}", quiet=arguments.quiet)
     with output.progress(len(plan.jobs), is_quiet=arguments.quiet) as report:
         result = run_plan(plan, report)
     _answer_result(result, arguments)
@@ -150,7 +149,7 @@ def _show_plan(plan: Plan, arguments: argparse.Namespace) -> None:
     source = "measured in earlier runs" if all(row.is_measured for row in rows) else "a rough guess"
     n_jobs = counted(plan.n_workers, "job")
     lines.append(f"about {minutes:.1f} minutes with {n_jobs} ({source}); folder {plan.folder.path}")
-    lines += [f"protocols: {', '.join(job.protocols) or 'none'}; profile {job.profile}" for job in plan.jobs[:1]]
+    lines += [f"protocols: {', '.join(job.protocols) or 'none'}; profile {job.config.profile}" for job in plan.jobs[:1]]
     value = {"folder": str(plan.folder.path), "n_workers": plan.n_workers, "jobs": [asdict(row) for row in rows]}
     output.answer_either(arguments, value, *lines)
 

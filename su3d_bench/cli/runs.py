@@ -89,7 +89,6 @@ def call_show(arguments: argparse.Namespace) -> None:
     su3d-bench runs show runs/demo --json
     """
     from su3d_bench.analysis.leaderboard import run_entry, size_bytes
-    from su3d_bench.core.config import DEFAULT_SOURCE
     from su3d_bench.formats.tables.table import percent
     from su3d_bench.runs.existing import existing_run
 
@@ -99,8 +98,7 @@ def call_show(arguments: argparse.Namespace) -> None:
         if (run := existing_run(arguments.run)) is not None:
             asked = {
                 ".".join(path): json.dumps(value, ensure_ascii=False, default=str)
-                for path, value in run.values.items()
-                if run.remarks.get(path) != DEFAULT_SOURCE
+                for path, value in run.requested.items()
             }
     n_bytes = size_bytes(arguments.run)
     config = arguments.run / "run.toml"
@@ -201,10 +199,10 @@ def _filter(arguments: argparse.Namespace) -> FilterConfig:
 
 def _jobs(run: RunFolder, arguments: argparse.Namespace) -> dict[str, JobFolder]:
     """Scene -> folder of its map, of the scenes asked for."""
-    from su3d_bench.store.records import RequestRecord, read_record
+    from su3d_bench.store.records import RunRecord, read_record
 
     shown = printable(str(run.path), 200)
-    known = [printable(scene, 200) for scene in read_record(RequestRecord, run.path / "run.json", shown).scenes]
+    known = [printable(scene, 200) for scene in read_record(RunRecord, run.path / "run.json", shown).scenes]
     for scene in arguments.scenes:
         if scene not in known:
             raise ConfigError(f"{shown}: holds no scene '{scene}'{suggest(scene, known, 'it has')}")

@@ -132,6 +132,11 @@ class RunConfig(BaseModel):
     retries: int = Field(default=2, ge=0)
     slurm: tuple[str, ...] = ()
 
+    @property
+    def shares(self) -> tuple[float, ...]:
+        """Those of ``anytime``, ascending, each once."""
+        return tuple(sorted(set(self.anytime)))
+
 
 @dataclass(frozen=True)
 class Setting:

@@ -7,46 +7,21 @@ is asked and understood goes by these words.
 from __future__ import annotations
 
 import re
+import tomllib
+from functools import cache
+from pathlib import Path
+from typing import Any
 
-IRREGULAR = {
-    "person": "people", "man": "men", "woman": "women", "child": "children", "foot": "feet", "tooth": "teeth",
-    "mouse": "mice", "goose": "geese", "die": "dice", "knife": "knives", "life": "lives", "wife": "wives",
-    "shelf": "shelves", "half": "halves", "calf": "calves", "wolf": "wolves", "leaf": "leaves", "loaf": "loaves",
-    "scarf": "scarves", "thief": "thieves", "hoof": "hooves", "elf": "elves", "potato": "potatoes",
-    "tomato": "tomatoes", "hero": "heroes", "echo": "echoes", "movie": "movies", "cookie": "cookies", "pie": "pies",
-    "tie": "ties", "quiz": "quizzes", "axis": "axes", "ox": "oxen",
-}  # fmt: skip
-_SINGULAR = {several: one for one, several in IRREGULAR.items()}
-# Things of two parts, or many: one of them is called as several are.
-ALWAYS_PLURAL = frozenset(
-    ("blinds", "clothes", "curtains", "glasses", "goggles", "headphones", "jeans", "pants", "pyjamas", "pajamas",
-     "scissors", "shears", "shorts", "stairs", "tongs", "trousers", "tweezers")
-)  # fmt: skip
-# Stuff, of which there are not two.
-UNCOUNTABLE = frozenset(
-    ("bedding", "bread", "clothing", "cutlery", "equipment", "flooring", "food", "furniture", "hair", "jewelry",
-     "laundry", "luggage", "otherfurniture", "paper", "rubbish", "trash", "water", "wood", "wine", "toilet paper",
-     "tissue paper")
-)  # fmt: skip
-# Words that end in "as" or "es" and mean one.
-_ONE_IN_S = frozenset(("atlas", "bias", "canvas", "christmas", "gas", "lens", "series", "species"))
-_ENDS_IN_USE = frozenset(("house", "greenhouse", "dollhouse", "birdhouse", "mouse", "blouse", "fuse", "cause"))
-_ARTICLES = frozenset(("a", "an", "the"))
-# Spelt with a vowel but spoken with a consonant, but for some in "uni"; and the other way round.
-_SPOKEN_WITH_CONSONANT = ("uni", "use", "usu", "uten", "util", "uku", "urin", "uran", "eu", "ewe", "one", "once")
-_NOT_UNI = ("unid", "unim", "unin", "unill")
-_SPOKEN_WITH_VOWEL = ("hour", "heir", "honest", "honor", "honour")
-# Said letter by letter also where they are written small; capitals of up to three letters always are.
-_SPELT_OUT = frozenset(("atm", "hdmi", "hdtv", "hvac", "lcd", "led", "mp3", "usb"))
-# "to" is none of them: a window goes from floor to ceiling.
-_PREPOSITIONS = frozenset(
-    ("above", "against", "at", "behind", "below", "beneath", "beside", "between", "by", "for", "from", "in", "inside",
-     "near", "next", "of", "on", "over", "that", "under", "where", "which", "with", "without")
-)  # fmt: skip
-# What is a part of a wall is wall.
-_PARTS = frozenset(("area", "part", "patch", "piece", "portion", "section", "side", "strip", "surface"))
 _JOINED = re.compile(r"\s+(?:and|or)\s+|[,;/&|+]")
 _WORD = re.compile(r"[a-z0-9]+")
+
+
+@cache
+def _known(kind: str) -> Any:
+    """The words of a kind in ``english.toml``; ``by_several`` is ``irregular`` the other way round."""
+    if kind == "by_several":
+        return {several: one for one, several in _known("irregular").items()}
+    return tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))[kind]
 
 
 def words(text: str) -> tuple[str, ...]:
@@ -56,7 +31,7 @@ def words(text: str) -> tuple[str, ...]:
     (('two', 'sofa'), ('indoor', 'plant'), ('canvas',))
     """
     parts = _WORD.findall(text.lower().replace("'", "").replace("’", ""))
-    return tuple(singular(word) for word in parts if word not in _ARTICLES)
+    return tuple(singular(word) for word in parts if word not in _known("articles"))
 
 
 def last_word(name: str) -> str:
@@ -70,19 +45,19 @@ def singular(word: str) -> str:
     >>> [singular(word) for word in ("sofas", "vases", "buses", "bookshelves", "stoves", "glass", "cookies", "candies")]
     ['sofa', 'vase', 'bus', 'bookshelf', 'stove', 'glass', 'cookie', 'candy']
     """
-    if not word.endswith("s") and word not in _SINGULAR:
+    if not word.endswith("s") and word not in _known("by_several"):
         return word
-    for several, one in _SINGULAR.items():
+    for several, one in _known("by_several").items():
         if word == several or (len(several) > 4 and word.endswith(several)):
-            return word[: -len(several)] + one
+            return f"{word[: -len(several)]}{one}"
     is_short = len(word) < 3 or (len(word) == 3 and word[1] in "aeiou")
-    if is_short or word.endswith(("ss", "us", "is")) or word in _ONE_IN_S:
+    if is_short or word.endswith(("ss", "us", "is")) or word in _known("one_in_s"):
         return word
     if word.endswith("ies"):
         return word[:-3] + "y"
-    if word.endswith(("sses", "shes", "ches", "xes", "zzes", "uses")) and word[:-1] not in _ENDS_IN_USE:
+    if word.endswith(("sses", "shes", "ches", "xes", "zzes", "uses")) and word[:-1] not in _known("ends_in_use"):
         return word[:-2]
-    return word[:-2] if word.endswith("es") and word[:-2] in _ONE_IN_S else word[:-1]
+    return word[:-2] if word.endswith("es") and word[:-2] in _known("one_in_s") else word[:-1]
 
 
 def plural(name: str) -> str:
@@ -97,11 +72,11 @@ def plural(name: str) -> str:
 
 
 def _plural_word(word: str) -> str:
-    if word in ALWAYS_PLURAL or word in UNCOUNTABLE or singular(word) != word:
+    if word in _known("always_plural") or word in _known("uncountable") or singular(word) != word:
         return word
-    for one, several in IRREGULAR.items():
+    for one, several in _known("irregular").items():
         if word == one or (len(one) > 3 and word.endswith(one)):
-            return word[: -len(one)] + several
+            return f"{word[: -len(one)]}{several}"
     if word.endswith(("s", "x", "z", "ch", "sh")):
         return f"{word}es"
     return f"{word[:-1]}ies" if word.endswith("y") and word[-2:-1] not in tuple("aeiou") else f"{word}s"
@@ -109,13 +84,13 @@ def _plural_word(word: str) -> str:
 
 def is_countable(name: str) -> bool:
     """Whether one asks how many there are."""
-    return name not in UNCOUNTABLE and name.rpartition(" ")[2] not in UNCOUNTABLE
+    return name not in _known("uncountable") and name.rpartition(" ")[2] not in _known("uncountable")
 
 
 def is_plural(name: str) -> bool:
     """Whether one thing of this name is spoken of as of several: "which blinds are"."""
     head = name.partition(" of ")[0].rpartition(" ")[2]
-    return head in ALWAYS_PLURAL or singular(head) != head
+    return head in _known("always_plural") or singular(head) != head
 
 
 def with_article(noun: str) -> str:
@@ -125,7 +100,7 @@ def with_article(noun: str) -> str:
     ('an indoor-plant', 'a utensil holder', 'blinds', 'an LCD screen')
     """
     name = noun.strip().lower()
-    if is_plural(name) or not is_countable(name) or name.partition(" ")[0] in _ARTICLES:
+    if is_plural(name) or not is_countable(name) or name.partition(" ")[0] in _known("articles"):
         return noun
     return f"{'an' if _begins_with_vowel(noun.strip()) else 'a'} {noun}"
 
@@ -134,14 +109,14 @@ def _begins_with_vowel(name: str) -> bool:
     """Whether the first sound of ``name`` is a vowel."""
     first = (re.findall(r"[^\W_]+", name) or [""])[0]
     word = first.lower()
-    if len(first) == 1 or (first.isupper() and len(first) <= 3) or word in _SPELT_OUT:
+    if len(first) == 1 or (first.isupper() and len(first) <= 3) or word in _known("spelt_out"):
         return word[:1] in tuple("8aefhilmnorsx")
     if word[0:1].isdigit():
         return word.startswith("8") or re.match(r"1[18](\D|$)", word) is not None
-    if word.startswith(_SPOKEN_WITH_VOWEL):
+    if word.startswith(tuple(_known("spoken_with_vowel"))):
         return True
     return word[:1] in tuple("aeiou") and not (
-        word.startswith(_SPOKEN_WITH_CONSONANT) and not word.startswith(_NOT_UNI)
+        word.startswith(tuple(_known("spoken_with_consonant"))) and not word.startswith(tuple(_known("not_uni")))
     )
 
 
@@ -158,9 +133,9 @@ def head_phrases(name: str) -> list[tuple[str, ...]]:
 def _head_phrase(text: str) -> tuple[str, ...]:
     phrase = list(words(text))
     for place, word in enumerate(phrase):
-        if word in _PREPOSITIONS:
-            is_part = word == "of" and place > 0 and phrase[place - 1] in _PARTS
+        if word in _known("prepositions"):
+            is_part = word == "of" and place > 0 and phrase[place - 1] in _known("parts")
             return _head_phrase(" ".join(phrase[place + 1 :])) if is_part else tuple(phrase[:place])
-    while len(phrase) > 1 and (phrase[-1] in _PARTS or phrase[-1].isdigit()):
+    while len(phrase) > 1 and (phrase[-1] in _known("parts") or phrase[-1].isdigit()):
         phrase.pop()
     return tuple(phrase)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.english import plural
-from su3d_bench.core.printing import escaped
+from su3d_bench.core.printing import escaped, plain_value
 
 MESSAGE_CHARACTERS = 500  # of one message: a hostile file may hold a line of any length
 
@@ -45,11 +45,7 @@ def shown(path: Path) -> str:
 
 def printable_json(value: Any) -> Any:
     """A JSON-like value with every text in it made printable; paths become texts."""
-    if isinstance(value, dict):
-        return {printable(str(key)): printable_json(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [printable_json(item) for item in value]
-    return printable(str(value)) if isinstance(value, str | Path) else value
+    return plain_value(value, printable)
 
 
 MOST_CHOICES = 30  # that a line lists; every verb is among so many

@@ -11,24 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+from su3d_bench.core import types
 from su3d_bench.core.maps import Prediction, Proposals
-from su3d_bench.core.types import (
-    BoolArray,
-    Detections,
-    Float32Array,
-    Float64Array,
-    Frame,
-    GroundTruth,
-    InstanceMesh,
-    Int64Array,
-    PerceptionNeeds,
-    Regions,
-    SceneInfo,
-    Surface,
-    UInt8Array,
-    WholeObject,
-    WorldUp,
-)
 
 
 class DatasetAbility(Protocol):
@@ -45,11 +29,11 @@ class RegionPerception(Protocol):
     @property
     def dim(self) -> int: ...
 
-    def mask_at(self, frame: Frame, points: Int64Array) -> tuple[BoolArray, float]:
+    def mask_at(self, frame: types.Frame, points: types.Int64Array) -> tuple[types.BoolArray, float]:
         """The mask (H, W) of what lies under the pixels ``points`` (P, 2), x y, and how sure the segmenter is of it."""
         ...
 
-    def encode_regions(self, frame: Frame, mask: BoolArray, boxes: Int64Array) -> Float32Array:
+    def encode_regions(self, frame: types.Frame, mask: types.BoolArray, boxes: types.Int64Array) -> types.Float32Array:
         """Features (B, dim), L2-normalised, of the crops ``boxes`` (B, 4), x0 y0 x1 y1, around the region ``mask``."""
         ...
 
@@ -62,9 +46,9 @@ class SceneTools:
     where the dataset has no mesh; ``true_proposals`` is there where ``PerceptionNeeds.true_proposals`` asks for it.
     """
 
-    frames: Sequence[Frame]
+    frames: Sequence[types.Frame]
     regions: RegionPerception
-    surface: Callable[[], Surface]
+    surface: Callable[[], types.Surface]
     true_proposals: Callable[[], Proposals] | None = None
 
 
@@ -91,26 +75,35 @@ class Dataset(Protocol):
         """A content key: equal only where frames and ground truth are equal."""
         ...
 
-    def info(self, scene: str, stride: int) -> SceneInfo: ...
+    def info(self, scene: str, stride: int) -> types.SceneInfo: ...
 
-    def frames(self, scene: str, stride: int) -> Sequence[Frame]:
+    def frames(self, scene: str, stride: int) -> Sequence[types.Frame]:
         """Every ``stride``-th frame from 0, read lazily; ``len()`` and random access."""
         ...
 
-    def ground_truth(self, scene: str, variant: str) -> GroundTruth:
+    def ground_truth(self, scene: str, variant: str) -> types.GroundTruth:
         """The truth in the form that a protocol names; raises ``GroundTruthMissing`` where there is none."""
         ...
 
-    def instance_mesh(self, scene: str) -> InstanceMesh:
+    def instance_mesh(self, scene: str) -> types.InstanceMesh:
         """The annotated mesh, for the oracle profile; raises ``GroundTruthMissing`` where there is none."""
         ...
 
 
-@runtime_checkable
-class HasFurtherTruths(DatasetAbility, Protocol):
-    """Ground truths with labels of other label spaces than its own: label space -> the one of ``ground_truth``."""
+class DatasetFacts(DatasetAbility, Protocol):
+    """Values that the class may have; without one it is empty, or False.
+
+    ``further_truths``: ground truths with labels of other label spaces than its own: label space -> the one of
+    ``ground_truth``; ``renders_frames``: frames are computed and not read, so that none is made ahead, since the
+    pipeline's timed stages would wait for the interpreter; ``reads_made_rooms``: rooms that the program makes are
+    written in its layout, which are not its scenes; ``scene_names``: the regular expression of names that only its
+    scenes have, by which files of predictions are known.
+    """
 
     further_truths: Mapping[str, str]
+    renders_frames: bool
+    reads_made_rooms: bool
+    scene_names: str
 
 
 @runtime_checkable
@@ -155,21 +148,21 @@ class CorrectsReading(DatasetAbility, Protocol):
 class SaysUp(DatasetAbility, Protocol):
     """Its files may have any world: which axis of it points up."""
 
-    def up(self, scene: str) -> WorldUp: ...
+    def up(self, scene: str) -> types.WorldUp: ...
 
 
 @runtime_checkable
 class HasSurface(DatasetAbility, Protocol):
     """The scan's mesh without labels."""
 
-    def surface(self, scene: str) -> Surface: ...
+    def surface(self, scene: str) -> types.Surface: ...
 
 
 @runtime_checkable
 class KnowsObjects(DatasetAbility, Protocol):
     """The objects of a scene as they are, of which the ground truth may hold what a recording saw alone."""
 
-    def whole_objects(self, scene: str) -> Sequence[WholeObject]: ...
+    def whole_objects(self, scene: str) -> Sequence[types.WholeObject]: ...
 
 
 @runtime_checkable
@@ -183,7 +176,7 @@ class NamesCategories(Protocol):
 class IsAligned(Protocol):
     """The rigid motion (4, 4) from the frame of the truth to one whose axes are the walls."""
 
-    def axis_alignment(self, scene: str) -> Float64Array: ...
+    def axis_alignment(self, scene: str) -> types.Float64Array: ...
 
 
 @runtime_checkable
@@ -201,34 +194,10 @@ class AsksText(DatasetAbility, Protocol):
 
 
 @runtime_checkable
-class RendersFrames(DatasetAbility, Protocol):
-    """True where frames are computed and not read.
-
-    They are not made ahead then, since the pipeline's timed stages would wait for the interpreter.
-    """
-
-    renders_frames: bool
-
-
-@runtime_checkable
 class HasSketches(DatasetAbility, Protocol):
     """A frame ``width`` pixels wide, in far less time than the whole; ``index`` is its place among all frames."""
 
-    def sketch(self, scene: str, index: int, width: int) -> Frame: ...
-
-
-@runtime_checkable
-class ReadsMadeRooms(DatasetAbility, Protocol):
-    """True where rooms that the program makes are written in its layout, which are not its scenes."""
-
-    reads_made_rooms: bool
-
-
-@runtime_checkable
-class NamesScenes(DatasetAbility, Protocol):
-    """The regular expression of names that only its scenes have, by which files of predictions are known."""
-
-    scene_names: str
+    def sketch(self, scene: str, index: int, width: int) -> types.Frame: ...
 
 
 class StageTimer(Protocol):
@@ -247,11 +216,11 @@ class Method(Protocol):
     Config: type
 
     @property
-    def needs(self) -> PerceptionNeeds: ...
+    def needs(self) -> types.PerceptionNeeds: ...
 
-    def start(self, scene: SceneInfo) -> None: ...
+    def start(self, scene: types.SceneInfo) -> None: ...
 
-    def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None: ...
+    def update(self, frame: types.Frame, detections: types.Detections, timer: StageTimer) -> None: ...
 
     def finish(self) -> Prediction: ...
 
@@ -272,122 +241,66 @@ class MethodAbout:
     status: str
 
 
-@runtime_checkable
-class HasAbout(MethodAbility, Protocol):
+class MethodFacts(MethodAbility, Protocol):
+    """Values that the class may have; without one it is empty, or False, ``is_system`` True.
+
+    ``presets``: settings under a name, ``METHOD@PRESET`` is a method of its own; ``short_names``: other names of
+    settings for sweeps, the setting and what a value written there comes to; ``is_system`` False: ``all`` methods are
+    not meant to hold it, as the truth itself or a program that must be named; ``warms_up``: its first frames wait for
+    compilers or imports, so that a scratch of its kind, without tools, is fed a made-up frame before the clock runs;
+    ``needs_surface``: it cannot do without the scan's mesh, as it is set; ``has_own_perception``: it finds masks
+    itself, so that the caveat of the run's perception is not its.
+    """
+
     about: MethodAbout
-
-
-@runtime_checkable
-class HasPresets(MethodAbility, Protocol):
-    """Settings under a name: ``METHOD@PRESET`` is a method of its own."""
-
     presets: Mapping[str, Mapping[str, Any]]
-
-
-@runtime_checkable
-class HasShortNames(MethodAbility, Protocol):
-    """Other names of settings for sweeps: the setting, and what a value written there comes to."""
-
     short_names: Mapping[str, tuple[str, Callable[[Any], Any]]]
-
-
-@runtime_checkable
-class IsSystem(MethodAbility, Protocol):
-    """False where ``all`` methods are not meant to hold it: the truth itself, a program that must be named."""
-
     is_system: bool
-
-
-@runtime_checkable
-class WarmsUp(MethodAbility, Protocol):
-    """True where its first frames wait for compilers or imports: before the clock runs, a scratch of its kind is fed a
-    made-up frame; it needs no tools for that."""
-
     warms_up: bool
-
-
-@runtime_checkable
-class TakesTools(Protocol):
-    """Works on the whole scene; called before ``start``."""
-
-    def receive_tools(self, tools: SceneTools) -> None: ...
-
-
-@runtime_checkable
-class NeedsSurface(MethodAbility, Protocol):
-    """Whether it cannot do without the scan's mesh, as it is set."""
-
     needs_surface: bool
+    has_own_perception: bool
 
 
-@runtime_checkable
-class TakesTruth(MethodAbility, Method, Protocol):
-    """Is told the ground truth, and is a ceiling."""
-
-    def receive_truth(self, truth: GroundTruth) -> None: ...
-
-
-@runtime_checkable
-class CountsPoints(MethodAbility, Protocol):
-    """The points of its map after an update."""
+class MethodFigures(MethodAbility, Protocol):
+    """Properties that an object may have: the points, instances and bytes of memory of its map after an update, what
+    the last update left out by the name of its column in ``updates.csv``, numbers on the last ``finish`` that stand
+    beside its time, digests by name of files outside the configuration that move its numbers, and what must be said
+    beside these."""
 
     @property
     def n_points(self) -> int: ...
 
-
-@runtime_checkable
-class CountsInstances(MethodAbility, Protocol):
-    """The instances of its map after an update."""
-
     @property
     def n_instances(self) -> int: ...
-
-
-@runtime_checkable
-class CountsBytes(MethodAbility, Protocol):
-    """The memory of its map after an update."""
 
     @property
     def map_bytes(self) -> int: ...
 
-
-@runtime_checkable
-class CountsLosses(MethodAbility, Protocol):
-    """What the last update left out, by the name of its column in ``updates.csv``."""
-
     @property
     def losses(self) -> Mapping[str, int]: ...
-
-
-@runtime_checkable
-class HasFinishCosts(MethodAbility, Protocol):
-    """Numbers on the last ``finish`` that stand beside its time."""
 
     @property
     def finish_costs(self) -> Mapping[str, float | int]: ...
 
-
-@runtime_checkable
-class HasInputs(MethodAbility, Protocol):
-    """Digests, by name, of files outside the configuration that move its numbers."""
-
     @property
     def inputs(self) -> Mapping[str, str]: ...
-
-
-@runtime_checkable
-class HasCaveat(MethodAbility, Protocol):
-    """What must be said beside its numbers."""
 
     @property
     def caveat(self) -> str | None: ...
 
 
 @runtime_checkable
-class HasOwnPerception(MethodAbility, Protocol):
-    """True where it finds masks itself, so that the caveat of the run's perception is not its."""
+class TakesTools(MethodAbility, Protocol):
+    """Works on the whole scene; called before ``start``."""
 
-    has_own_perception: bool
+    def receive_tools(self, tools: SceneTools) -> None: ...
+
+
+@runtime_checkable
+class TakesTruth(MethodAbility, Method, Protocol):
+    """Is told the ground truth, and is a ceiling."""
+
+    def receive_truth(self, truth: types.GroundTruth) -> None: ...
 
 
 @runtime_checkable
@@ -398,43 +311,9 @@ class Closes(MethodAbility, Protocol):
 
 
 INTERFACES = {"dataset": Dataset, "method": Method}
-ABILITIES = {
-    "dataset": (
-        HasFurtherTruths,
-        HasPlaces,
-        HasStatus,
-        HasGroups,
-        HasProblems,
-        CorrectsReading,
-        SaysUp,
-        HasSurface,
-        HasQueries,
-        AsksText,
-        KnowsObjects,
-        RendersFrames,
-        HasSketches,
-        ReadsMadeRooms,
-        NamesScenes,
-    ),
-    "method": (
-        HasAbout,
-        HasPresets,
-        HasShortNames,
-        IsSystem,
-        WarmsUp,
-        TakesTools,
-        NeedsSurface,
-        TakesTruth,
-        CountsPoints,
-        CountsInstances,
-        CountsBytes,
-        CountsLosses,
-        HasFinishCosts,
-        HasInputs,
-        HasCaveat,
-        HasOwnPerception,
-        Closes,
-    ),
+ABILITIES: dict[str, Sequence[type]] = {
+    "dataset": DatasetAbility.__subclasses__(),
+    "method": MethodAbility.__subclasses__(),
 }
 
 
@@ -453,11 +332,11 @@ class Encoder(Protocol):
         """A key that moves with the weights and with everything else that moves a feature."""
         ...
 
-    def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:
+    def encode_images(self, images: Sequence[types.UInt8Array]) -> types.Float32Array:
         """Features (N, dim) of RGB crops (h, w, 3) at their native size."""
         ...
 
-    def encode_texts(self, texts: Sequence[str]) -> Float32Array:
+    def encode_texts(self, texts: Sequence[str]) -> types.Float32Array:
         """Features (N, dim) of texts."""
         ...
 
@@ -485,4 +364,4 @@ class Segmenter(Protocol):
     name: str
     digest: str
 
-    def segment(self, frame: Frame) -> Regions: ...
+    def segment(self, frame: types.Frame) -> types.Regions: ...

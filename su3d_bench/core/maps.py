@@ -139,22 +139,21 @@ class Instances(Masks):
     def __post_init__(self) -> None:
         arrays = ("points", "indptr", "indices", "scores", "boxes", "centroids", "view_indptr", "views", "ids")
         check_arrays(self, "instances", arrays, PredictionError)
-        k = len(self.scores)
+        k, v = len(self.scores), len(self.views)
         if len(self.indptr) != k + 1 or len(self.names) != k or len(self.captions) != k:
             raise PredictionError(f"instances: {k} scores, {len(self.indptr) - 1} masks, {len(self.names)} names")
+        if len(self.boxes) != k or len(self.centroids) != k or len(self.ids) not in (0, k):
+            raise PredictionError(f"instances: {k} masks and {len(self.boxes)} boxes, {len(self.centroids)} centroids")
+        if len(self.view_indptr) != k + 1 or not Masks(self.view_indptr, self.views).is_whole:
+            raise PredictionError(f"instances: view_indptr does not describe {v} views of {k} instances")
         _check_masks(self, len(self.points))
-        if self.features is not None and len(self.features) != k:
-            raise PredictionError(f"instances: {k} masks and {len(self.features)} features")
-        if self.labels is not None and len(self.labels) != k:
-            raise PredictionError(f"instances: {k} masks and {len(self.labels)} labels")
+        for name, n, of in (("features", k, "masks"), ("labels", k, "masks"), ("view_names", v, "views"),
+                            ("view_scores", v, "views")):  # fmt: skip
+            if (value := getattr(self, name)) is not None and len(value) != n:
+                raise PredictionError(f"instances: {n} {of} and {len(value)} {name}")
         further = self.further_labels
         if further is not None and (self.labels is None or len(further) != k or len(set(map(len, further))) > 1):
             raise PredictionError(f"instances: {k} masks need labels and equally many further labels each")
-        for of_views in (self.view_names, self.view_scores):
-            if of_views is not None and len(of_views) != len(self.views):
-                raise PredictionError(
-                    f"instances: {len(self.views)} views and {len(of_views)} names or scores of views"
-                )
         self._check_graph(k)
 
     def _check_graph(self, k: int) -> None:

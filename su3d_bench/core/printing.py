@@ -48,13 +48,15 @@ def plain_text(text: str) -> str:
     return "\n".join(map(one_line, text.split("\n")))
 
 
-def plain_value(value: Any) -> Any:
-    """A JSON-like value with every text in it as a page shows it: ``escaped`` but for its new lines."""
+def plain_value(value: Any, plain: Callable[[str], str] | None = None) -> Any:
+    """A JSON-like value with every text in it as ``plain`` makes it, else ``escaped`` but for its new lines; paths
+    become texts."""
+    plain = plain or (lambda text: "\n".join(map(escaped, text.split("\n"))))
     if isinstance(value, Mapping):
-        return {escaped(str(key)): plain_value(item) for key, item in value.items()}
+        return {plain(str(key)): plain_value(item, plain) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain_value(item) for item in value]
-    return "\n".join(map(escaped, value.split("\n"))) if isinstance(value, str) else value
+        return [plain_value(item, plain) for item in value]
+    return plain(str(value)) if isinstance(value, str | Path) else value
 
 
 def escaped_json(value: Any, **form: Any) -> str:

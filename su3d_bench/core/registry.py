@@ -68,7 +68,8 @@ def load(kind: str, name: str) -> Any:
 
 def _found(kind: str, name: str) -> Any:
     if name in BUILT_IN[kind]:
-        return _from_module(BUILT_IN[kind][name])
+        module, _, attribute = BUILT_IN[kind][name].partition(":")
+        return getattr(importlib.import_module(module), attribute)
     for entry in entry_points(group=GROUPS[kind]):
         if entry.name == name:
             return entry.load()
@@ -76,11 +77,6 @@ def _found(kind: str, name: str) -> Any:
         return _from_file(kind, name)
     known = names(kind)
     raise ConfigError(f"unknown {kind} '{name}'{suggest(name, known)}")
-
-
-def _from_module(target: str) -> Any:
-    module, _, attribute = target.partition(":")
-    return getattr(importlib.import_module(module), attribute)
 
 
 def _from_file(kind: str, target: str) -> Any:
@@ -135,9 +131,10 @@ def checked(kind: str, target: str, plug_in: Any) -> Any:
 
     if not isinstance(plug_in, type):
         return plug_in
-    interface = INTERFACES[kind]
-    file = _file_of(plug_in)
-    where = f"{_line_of(plug_in, file)}: {kind} '{target}'" if file else f"{kind} '{target}'"
+    interface, where = INTERFACES[kind], f"{kind} '{target}'"
+    if not plug_in.__module__.startswith("su3d_bench."):
+        module = sys.modules.get(plug_in.__module__)
+        where = f"{_line_of(plug_in, Path(getattr(module, '__file__', None) or '').name)}: {where}"
     own = {name: is_called for base in plug_in.__mro__[:-1] for name, is_called in _members(base).items()}
     known = {name: called for each in (interface, *ABILITIES[kind]) for name, called in _members(each).items()}
     required = {*OF_THE_CLASS[kind], *(name for name, called in _members(interface).items() if called)}
@@ -154,13 +151,6 @@ def checked(kind: str, target: str, plug_in: Any) -> Any:
         if name in required and not isinstance(value, wanted):
             raise PlugInError(f"{where}: its {name} is {value!r}; a {wanted.__name__} is expected")
     return plug_in
-
-
-def _file_of(plug_in: type) -> str:
-    """The name of the file that holds a class of somebody's own; empty for ours."""
-    module = sys.modules.get(plug_in.__module__)
-    own = not plug_in.__module__.startswith("su3d_bench.")
-    return Path(getattr(module, "__file__", None) or "").name if own else ""
 
 
 def _members(plug_in: type) -> dict[str, bool]:

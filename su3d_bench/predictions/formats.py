@@ -13,7 +13,7 @@ from su3d_bench.predictions import scannet_text as text
 from su3d_bench.predictions.base import Reader, file_format, folder_format
 from su3d_bench.predictions.own_runs import OWN_RUNS
 from su3d_bench.predictions.scannet_text import text_format
-from su3d_bench.store.records import RequestRecord, read_record
+from su3d_bench.store.records import RunRecord, read_record
 
 # How the files of each format are known and read, and whose they are.
 _ALL = (
@@ -204,7 +204,7 @@ def planned_scenes(sources: Sequence[Source], dataset: str) -> list[str] | None:
         if source.reader is not OWN_RUNS or not record_file.is_file():
             return None
         try:
-            record = read_record(RequestRecord, record_file, str(source.path))
+            record = read_record(RunRecord, record_file, str(source.path))
         except StoreError:
             return None
         planned += [scene.removeprefix(f"{dataset}/") for scene in record.scenes if scene.startswith(f"{dataset}/")]

@@ -9,7 +9,6 @@ from typing import Any
 
 from su3d_bench.core.config import read_assignments, resolve
 from su3d_bench.core.errors import ModelMissing, Su3dError, counted
-from su3d_bench.core.interfaces import NeedsSurface
 from su3d_bench.core.system.devices import require_installed
 from su3d_bench.fetching.sources import built_in
 from su3d_bench.formats.tables.table import Table, text_table
@@ -104,7 +103,7 @@ def _surface(run: AskedRun, dataset: Any, scene: str, how: str) -> Iterator[Need
     named = [named_method(text) for text in run.methods]
     settings = read_assignments(run.settings, tuple({*run.methods, *(one.base for one in named)}), (run.dataset,))
     methods = {one.name: build_method(method_part(one, settings)) for one in named}
-    asking = [name for name, method in methods.items() if isinstance(method, NeedsSurface) and method.needs_surface]
+    asking = [name for name, method in methods.items() if getattr(method, "needs_surface", False)]
     if not asking:
         return
     try:

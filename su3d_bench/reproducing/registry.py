@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.analysis.leaderboard import RankingRow, Refused, entries_of, in_order, ranked
-from su3d_bench.core.config import DEFAULT_SOURCE, MOVES_NO_NUMBER, KeyPath, RunConfig, toml_value
+from su3d_bench.core.config import MOVES_NO_NUMBER, KeyPath, RunConfig, toml_value
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, DataError, StoreError, Su3dError, counted, printable, reading, shown
 from su3d_bench.core.files.atomic import TemporaryFolder, make_folder, replacing
@@ -39,7 +39,7 @@ def command_of(run: FinishedRun, method: str) -> str:
     held = existing_run(run.folder.path)
     if held is None or not held.is_known:
         return UNKNOWN
-    asked = {path: value for path, value in held.values.items() if held.remarks.get(path) != DEFAULT_SOURCE}
+    asked = held.requested
     words = ["su3d-bench", "run", *_flags(asked, run, method), *_settings(asked, method)]
     return printable(shlex.join(words), MOST_CHARACTERS)
 

@@ -17,7 +17,6 @@ from su3d_bench.core import registry
 from su3d_bench.core.config import parse_value, toml_value
 from su3d_bench.core.errors import ConfigError, StoreError, suggest
 from su3d_bench.core.files.atomic import read_json, write_json
-from su3d_bench.core.interfaces import HasShortNames
 from su3d_bench.reports.tables.ablation import SweepRow
 from su3d_bench.runs.plan import COMMA_OUTSIDE_BRACKETS
 
@@ -58,7 +57,7 @@ def _choices(method: str, method_class: Any, text: str) -> list[_Choice]:
     parameter = parameter.strip()
     if not equals or not values.strip():
         raise ConfigError(f"--vary {text}: expected KEY=VALUE,VALUE such as top_m=1,5,10")
-    shorts: Mapping[str, Short] = method_class.short_names if isinstance(method_class, HasShortNames) else {}
+    shorts: Mapping[str, Short] = getattr(method_class, "short_names", {})
     known = [*shorts, *method_class.Config.model_fields]
     if parameter not in known:
         raise ConfigError(f"--vary {text}: {method} has no setting '{parameter}'{suggest(parameter, known)}")

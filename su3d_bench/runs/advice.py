@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 import glob
-import math
 import shlex
-from collections.abc import Collection, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from su3d_bench.core.errors import DataError, Su3dError
 from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.registry import CEILING_METHOD
-from su3d_bench.core.system.files import file_bytes
-from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.metrics.scoring import combine, unpack_scores
-from su3d_bench.runs.job import Part, SceneJob, build_dataset, build_method, stride_of
+from su3d_bench.runs.job import build_dataset, build_method, stride_of
 from su3d_bench.runs.plan import Plan
 from su3d_bench.runs.runner import RunResult
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.records import read_updates
-from su3d_bench.store.run_folder import JobFolder
 
 # Where no earlier run says better: an update of opensu3d under the embedded profile at 640x480, and reading, scoring
 # and drawing one room under two protocols, both on two cores of a 2020s server.
@@ -46,37 +39,26 @@ class JobEstimate:
 
 def estimate(plan: Plan) -> list[JobEstimate]:
     """One estimate a scene and method, in the order of the plan; reads no frame."""
-    runs = plan.folder.path.parent
-    update_s = {part.name: recent_update_s(runs, part.name) for part in plan.jobs[0].methods}
-    roots = {job.dataset: job.data_root for job in plan.jobs}
-    datasets = {part: build_dataset(part, root) for part, root in roots.items()}
-    needs_frames = {part: bool(build_method(part).needs.frames) for part in plan.jobs[0].methods}
+    methods, runs = plan.jobs[0].methods, plan.folder.path.parent
+    update_s = {part: recent_update_s(runs, part.name) for part in methods}
+    needs_frames = {part for part in methods if build_method(part).needs.frames}
+    datasets = {part: build_dataset(part, root) for part, root in {(job.dataset, job.data_root) for job in plan.jobs}}
     going = {job.path for job in plan.removes}
-    return [
-        _of_job(plan, job, part, update_s[part.name], datasets[job.dataset] if needs_frames[part] else None, going)
-        for job in plan.jobs
-        for part in job.methods
-    ]
-
-
-def _of_job(
-    plan: Plan, job: SceneJob, part: Part, measured: float | None, dataset: Any, going: Collection[Path]
-) -> JobEstimate:
-    """``measured``: seconds an update; ``dataset`` None where the method looks at no frame.
-
-    ``going``: the folders of jobs that the plan removes.
-    """
-    folder = plan.folder.job(job.scene, part.name)
-    is_done = {"predict", "score"} <= set(folder.seals()) and folder.path not in going
-    n_updates, remark = 0, None
-    if dataset is not None:
-        try:
-            n_frames = len(dataset.frames(job.scene_name, stride_of(job.stride, part.options)))
-            n_updates = min(n_frames, job.limit or n_frames)
-        except DataError as error:
-            remark = str(error)
-    seconds = GUESSED_SCENE_S + n_updates * (GUESSED_UPDATE_S if measured is None else measured)
-    return JobEstimate(job.scene, part.name, n_updates, seconds, measured is not None, is_done, remark)
+    rows = []
+    for job, part in ((each, part) for each in plan.jobs for part in each.methods):
+        folder = plan.folder.job(job.scene, part.name)
+        is_done = {"predict", "score"} <= set(folder.seals()) and folder.path not in going
+        n_updates, remark = 0, None
+        if part in needs_frames:
+            try:
+                n_frames = len(datasets[job.dataset].frames(job.scene_name, stride_of(job, part)))
+                n_updates = min(n_frames, job.config.limit or n_frames)
+            except DataError as error:
+                remark = str(error)
+        measured = update_s[part]
+        seconds = GUESSED_SCENE_S + n_updates * (GUESSED_UPDATE_S if measured is None else measured)
+        rows.append(JobEstimate(job.scene, part.name, n_updates, seconds, measured is not None, is_done, remark))
+    return rows
 
 
 def recent_update_s(runs: Path, method: str) -> float | None:
@@ -118,32 +100,26 @@ def next_commands(result: RunResult) -> list[str]:
 
 
 def _query(result: RunResult, run: str) -> list[list[str]]:
-    """A text that means a class of a scene, asked of a map with features."""
+    """A text that means a class, asked of a map with features."""
     for outcome in result.outcomes:
         job = result.plan.folder.job(outcome.scene, outcome.method)
         is_map = outcome.method in result.plan.methods and outcome.method != CEILING_METHOD and is_file(job.prediction)
         features = read_prediction(job.prediction).features if is_map else None
-        if features is None or not features.size:
-            continue
-        known = sorted(_classes(result, job, outcome.scene), key=lambda pair: -pair[1])
-        if known:
+        name = None if features is None or not features.size else _best_class(result, outcome.method)
+        if name is not None:
             method = [] if outcome.method == "opensu3d" else ["--method", outcome.method]
-            return [["query", "text", outcome.scene, known[0][0], "--run", run, *method]]
+            return [["query", "text", outcome.scene, name, "--run", run, *method]]
     return []
 
 
-def _classes(result: RunResult, job: JobFolder, scene: str) -> Iterator[tuple[str, float]]:
-    """The classes that the scene has, each with what the map scores on it, of the first protocol that tells classes."""
-    scores = unpack_scores(file_bytes(job.counts))
-    asked = dict.fromkeys(name for scene_job in result.plan.jobs for name in scene_job.protocols)
-    rules = {rules.name: rules for rules in map(load_protocol, asked)}
-    for name in sorted(scores, key=lambda name: rules[name].kind not in THINGS_FIRST):
-        rows: Mapping[str, Mapping[str, float]]
-        rows = combine(rules[name], {scene: scores[name]}, with_intervals=False).per_class
-        values = {cls: next(iter(row.values()), math.nan) for cls, row in rows.items()}
-        if any(math.isfinite(value) for value in values.values()):
-            yield from ((cls, value) for cls, value in values.items() if math.isfinite(value))
-            return
+def _best_class(result: RunResult, method: str) -> str | None:
+    """The class on which ``method`` scores best, under the first protocol that tells classes."""
+    rows = [row for row in result.metrics["results"] if row["method"] == method and row["result"] is not None]
+    for row in sorted(rows, key=lambda row: (row["kind"] not in THINGS_FIRST, row["protocol"])):
+        first = {name: next(iter(values.values()), None) for name, values in row["result"]["per_class"].items()}
+        if known := {name: value for name, value in first.items() if value is not None}:
+            return str(max(known, key=known.__getitem__))
+    return None
 
 
 def _numbers(result: RunResult, run: str) -> list[list[str]]:

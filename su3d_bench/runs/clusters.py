@@ -14,8 +14,9 @@ import shutil
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,41 +25,22 @@ from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, package_versi
 from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError
 from su3d_bench.core.files.atomic import TemporaryFolder
 from su3d_bench.core.system.endings import Ended, ending_in_order, kept_handlers
-from su3d_bench.runs.executors import (
-    Outcome,
-    Report,
-    Unit,
-    Work,
-    answer_of,
-    executor_of,
-    limit_threads,
-    run_inline,
-    run_processes,
-    slurm_parameters,
-    unwrap,
-)
+from su3d_bench.runs import executors
+from su3d_bench.runs.executors import Outcome, Report, Unit, Work, answer_of, limit_threads, unwrap
 from su3d_bench.store.run_folder import refuse_links
 
-CONNECT_S = 5.0  # a machine of a cluster in one network answers within milliseconds
+RunUnits = Callable[..., Iterator[Any]]
 ENDED = "ended"  # the kind of answer of a worker that was asked to end
 MOST_AT_ONCE = 1000  # a pending task of Ray costs the driver memory; Slurm's MaxArraySize is 1001 where nobody set it
 
 
 def run_ray(
-    work: Work[Unit, Outcome],
-    units: Sequence[Unit],
-    report: Report,
-    *,
-    jobs: int,
-    config: RunConfig,
-    ray: Any,
-    lost: Callable[[Unit, str], Outcome],
+    work: Work[Unit, Outcome], units: Sequence[Unit], lost: Any, *, jobs: int, config: RunConfig, ray: Any
 ) -> Iterator[Outcome]:
     """Outcomes of ``units`` as they come in, at most ``jobs`` of them handed to the cluster at once.
 
     ``ray`` is what ``connected`` gave. A unit whose worker or machine was lost ``config.retries`` + 1 times has the
-    outcome that ``lost`` makes. A ``Su3dError`` that leaves ``work``, or an interrupt, stops all. ``report`` hears
-    nothing from inside a unit.
+    outcome that ``lost`` makes. A ``Su3dError`` that leaves ``work``, or an interrupt, stops all.
     """
     remote = ray.remote(num_cpus=1, num_gpus=config.gpus_per_job, max_retries=0, max_calls=1)(_on_node)
     versions = _versions()
@@ -129,7 +111,6 @@ def connected(config: RunConfig) -> Iterator[Any]:
         raise ModelMissing("the executor 'ray' needs the ray extra: pip install 'su3d-bench[ray]'") from error
     was_connected = ray.is_initialized()
     if not was_connected:
-        _refuse_silent(config.ray_address)
         _connect(ray, config.ray_address)
     try:
         _refuse_too_many_gpus(ray, config.gpus_per_job)
@@ -144,32 +125,11 @@ def _connect(ray: Any, address: str) -> None:
         with kept_handlers():  # Ray's own would end the process as if a check had failed
             ray.init(address=address or "auto", log_to_driver=False, logging_level="error")
     except (ConnectionError, RuntimeError, ValueError, OSError, TimeoutError) as error:
-        if not address and isinstance(error, ConnectionError):
-            named = os.environ.get("RAY_ADDRESS")
-            where = f"at RAY_ADDRESS={named}" if named else "on this machine"
-            raise ConfigError(
-                f"no Ray cluster runs {where}; add --ray-address local to start one here for this run, or name another "
-                "with --ray-address HOST:PORT"
-            ) from error
-        line = " ".join(str(error).split())[:300]
+        named = address or os.environ.get("RAY_ADDRESS")
+        where = f"at '{named}'" if named else "on this machine"
         raise ConfigError(
-            f"no Ray cluster at '{address}' takes this run: {line}; start one with ray start --head, or name another "
-            "with --ray-address"
-        ) from error
-
-
-def _refuse_silent(address: str) -> None:
-    """Ray waits a minute for a machine that is not there."""
-    host, colon, port = address.removeprefix("ray://").rpartition(":")
-    if not colon or not port.isdigit():
-        return
-    try:
-        socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_S).close()
-    except (OSError, OverflowError) as error:
-        reason = (getattr(error, "strerror", None) or str(error) or "no answer").lower()
-        raise ConfigError(
-            f"no Ray cluster answers at '{address}' ({reason}); start one with ray start --head, or name another with "
-            "--ray-address"
+            f"no Ray cluster {where} takes this run ({' '.join(str(error).split())[:300]}); start one with ray start "
+            "--head, add --ray-address local to start one here for this run, or name another with --ray-address"
         ) from error
 
 
@@ -188,24 +148,16 @@ POLL_S = 0.5
 
 
 def run_slurm(
-    work: Work[Unit, Outcome],
-    units: Sequence[Unit],
-    report: Report,
-    *,
-    jobs: int,
-    config: RunConfig,
-    folder: Path,
-    parameters: Mapping[str, Any],
-    lost: Callable[[Unit, str], Outcome],
+    work: Work[Unit, Outcome], units: Sequence[Unit], lost: Any, *, jobs: int, config: RunConfig, folder: Path
 ) -> Iterator[Outcome]:
     """Outcomes of ``units`` as they come in, at most ``jobs`` of them submitted at once, as job arrays.
 
-    ``parameters`` are those of submitit's ``AutoExecutor``, and ``cluster``; ``folder`` is on a shared disk. A unit
-    whose job died ``config.retries`` + 1 times has the outcome that ``lost`` makes. A ``Su3dError`` that leaves
-    ``work``, or an interrupt, stops all. ``report`` hears nothing from inside a unit.
+    ``folder`` is on a shared disk. A unit whose job died ``config.retries`` + 1 times has the outcome that ``lost``
+    makes. A ``Su3dError`` that leaves ``work``, or an interrupt, stops all.
     """
+    refuse_links(folder.parent, folder)
     n_at_once = min(jobs, MOST_AT_ONCE)
-    executor, failures = slurm_executor(folder, parameters, int(config.gpus_per_job), n_at_once)
+    executor, failures = slurm_executor(folder, config, n_at_once)
     waiting = deque((unit, 1) for unit in units)
     running: list[tuple[Any, Unit, int]] = []
     is_clean = True
@@ -237,8 +189,7 @@ def run_slurm(
 
 def _submit(executor: Any, work: Work[Unit, Outcome], fresh: Sequence[tuple[Unit, int]]) -> list[tuple[Any, Unit, int]]:
     with executor.batch():
-        jobs = [executor.submit(_in_job, work, unit) for unit, _ in fresh]
-    return [(job, unit, attempt) for job, (unit, attempt) in zip(jobs, fresh, strict=True)]
+        return [(executor.submit(_in_job, work, unit), unit, attempt) for unit, attempt in fresh]
 
 
 def _in_job(work: Work[Unit, Outcome], unit: Unit) -> tuple[str, Any]:
@@ -246,15 +197,13 @@ def _in_job(work: Work[Unit, Outcome], unit: Unit) -> tuple[str, Any]:
     return answer_of(work, unit, lambda event: None)
 
 
-def slurm_executor(
-    folder: Path, given: Mapping[str, Any], n_gpus: int, n_at_once: int
-) -> tuple[Any, tuple[type[Exception], ...]]:
+def slurm_executor(folder: Path, config: RunConfig, n_at_once: int) -> tuple[Any, tuple[type[Exception], ...]]:
     """submitit's executor, which may make ``folder``, and the errors by which it says that a job died."""
     try:
         import submitit
     except ImportError as error:
         raise ModelMissing("the executor 'slurm' needs the slurm extra: pip install 'su3d-bench[slurm]'") from error
-    parameters = {**DEFAULTS, "slurm_array_parallelism": n_at_once, **given}
+    parameters = {**DEFAULTS, "slurm_array_parallelism": n_at_once, **executors.slurm_parameters(config)}
     cluster = parameters.pop("cluster", CLUSTERS[0])
     if cluster not in CLUSTERS:
         raise ConfigError(f"--slurm cluster={cluster}: expected {' or '.join(CLUSTERS)}")
@@ -263,8 +212,8 @@ def slurm_executor(
             "no Slurm cluster is here: there is no srun; give the command where there is, or add --slurm cluster=local "
             "to try it on this machine"
         )
-    if n_gpus:
-        parameters["gpus_per_node"] = n_gpus
+    if config.gpus_per_job:
+        parameters["gpus_per_node"] = int(config.gpus_per_job)
     try:
         executor = submitit.AutoExecutor(folder=folder, cluster=cluster)
         executor.update_parameters(**parameters)
@@ -282,41 +231,20 @@ def _last_line(error: Exception) -> str:
 
 
 @contextmanager
-def reached(config: RunConfig, n_workers: int) -> Iterator[Any]:
-    """What the executor of ``config`` works through, for ``run_units`` in the block; a ``Su3dError`` where no cluster
-    answers, before a run has left anything."""
-    executor = executor_of(config, n_workers)
-    if executor == "ray":
-        with connected(config) as ray:
-            yield ray
-    elif executor == "slurm":
-        with TemporaryFolder("su3d-slurm-") as scratch:  # submitit makes the folder when it only looks
-            slurm_executor(scratch, slurm_parameters(config), int(config.gpus_per_job), n_workers)
-        yield None
-    else:
-        yield None
+def executor_for(config: RunConfig, n_workers: int, folder: Path, report: Report) -> Iterator[RunUnits]:
+    """The executor of ``config`` as a function ``run(work, units, lost)`` that gives outcomes as they come in.
 
-
-def run_units(
-    work: Work[Unit, Outcome],
-    units: Sequence[Unit],
-    report: Report,
-    *,
-    config: RunConfig,
-    n_workers: int,
-    folder: Path,
-    through: Any,
-    lost: Callable[[Unit, str], Outcome],
-) -> Iterator[Outcome]:
-    """Outcomes of ``units`` as they come in, from the executor of ``config``; ``folder`` is the run's, and ``through``
-    what ``reached`` gave."""
-    executor = executor_of(config, n_workers)
+    ``folder`` is the run's. A ``Su3dError`` where no cluster answers, before a run has left anything.
+    """
+    executor = executors.executor_of(config, n_workers)
     if executor == "inline":
-        return run_inline(work, units, report)
-    if executor == "processes":
-        return run_processes(work, units, report, jobs=n_workers, lost=lost)
-    if executor == "ray":
-        return run_ray(work, units, report, jobs=n_workers, config=config, ray=through, lost=lost)
-    at, parameters = folder.absolute() / "slurm", slurm_parameters(config)
-    refuse_links(at.parent, at)
-    return run_slurm(work, units, report, jobs=n_workers, config=config, folder=at, parameters=parameters, lost=lost)
+        yield lambda work, units, lost: executors.run_inline(work, units, report)
+    elif executor == "processes":
+        yield partial(executors.run_processes, report=report, jobs=n_workers)
+    elif executor == "ray":
+        with connected(config) as ray:
+            yield partial(run_ray, jobs=n_workers, config=config, ray=ray)
+    else:
+        with TemporaryFolder("su3d-slurm-") as scratch:  # submitit makes the folder when it only looks
+            slurm_executor(scratch, config, n_workers)
+        yield partial(run_slurm, jobs=n_workers, config=config, folder=folder.absolute() / "slurm")

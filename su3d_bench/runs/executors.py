@@ -34,17 +34,8 @@ FOR_THE_PARENT = frozenset({signal.SIGINT, signal.SIGHUP})  # a terminal sends t
 SCENE_DONE = "scene"  # label of the event that says that a unit is finished
 Unit = TypeVar("Unit")
 Outcome = TypeVar("Outcome")
-ONE_THREAD = dict.fromkeys(
-    (
-        "OMP_NUM_THREADS",
-        "OPENBLAS_NUM_THREADS",
-        "MKL_NUM_THREADS",
-        "NUMEXPR_NUM_THREADS",
-        "VECLIB_MAXIMUM_THREADS",
-        "NUMBA_NUM_THREADS",
-    ),
-    "1",
-)
+_LIBRARIES = ("OMP", "OPENBLAS", "MKL", "NUMEXPR", "NUMBA")
+ONE_THREAD = {"VECLIB_MAXIMUM_THREADS": "1", **{f"{library}_NUM_THREADS": "1" for library in _LIBRARIES}}
 
 
 @dataclass(frozen=True)

@@ -13,14 +13,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from su3d_bench.core.config import MOVES_NO_NUMBER, KeyPath, Settings, read_file
+from su3d_bench.core.config import DEFAULT_SOURCE, MOVES_NO_NUMBER, KeyPath, Setting, Settings, read_file
 from su3d_bench.core.digests import digest_bytes
-from su3d_bench.core.errors import ConfigError, StoreError, counted, printable, shown
+from su3d_bench.core.errors import ConfigError, StoreError, printable, shown, some
 from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.questions.solver import MOVES_ANSWERS
-from su3d_bench.runs.job import FIELDS_KNOWN_LATER, INSTEAD, NOT_IN_KEY, Part, SceneJob, build_method, config_key
-from su3d_bench.store.records import RequestRecord, read_record
+from su3d_bench.runs.job import FIELDS_KNOWN_LATER, INSTEAD, NOT_IN_KEY, ConfiguredMethods, SceneJob
+from su3d_bench.store.records import RunRecord, read_record
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 Into = Literal["own", "extend", "replace"]  # what a request wants of a folder that holds a run
@@ -46,16 +46,15 @@ class Request:
 class ExistingRun:
     """The run in a folder: what ``run.json`` says, None where it is not there, and the settings of its ``run.toml``.
 
-    ``content`` is ``run.toml`` as it lies there; ``is_known`` says whether it is whole. ``remarks`` say where each
-    value came from when the run was first asked for.
+    ``content`` is ``run.toml`` as it lies there; ``is_known`` says whether it is whole. The source of a setting is
+    where its value came from when the run was first asked for.
     """
 
     folder: Path
     content: bytes | None
-    record: RequestRecord | None
+    record: RunRecord | None
     is_known: bool = False
     settings: Settings = field(default_factory=Settings)
-    remarks: Mapping[KeyPath, str] = field(default_factory=dict)
 
     @property
     def is_finished(self) -> bool:
@@ -65,6 +64,11 @@ class ExistingRun:
     @property
     def values(self) -> dict[KeyPath, Any]:
         return {entry.path: entry.value for entry in self.settings.entries}
+
+    @property
+    def requested(self) -> dict[KeyPath, Any]:
+        """The values that are no defaults."""
+        return {entry.path: entry.value for entry in self.settings.entries if entry.source != DEFAULT_SOURCE}
 
     def asked(self, name: str) -> tuple[str, ...]:
         """The list of texts that was asked for as ``name``, such as patterns of scenes."""
@@ -88,20 +92,22 @@ def existing_run(folder: Path) -> ExistingRun | None:
     record = None
     if is_file(folder / "run.json"):
         with suppress(StoreError):  # what stands in run.toml counts then
-            record = read_record(RequestRecord, folder / "run.json", shown(folder))
+            record = read_record(RunRecord, folder / "run.json", shown(folder))
     if not is_file(folder / "run.toml"):
         return None if record is None else ExistingRun(folder, None, record)
     content = file_bytes(folder / "run.toml")
     text, seal, digest = content.rpartition(SEAL.encode())
     if not seal or digest != f"{digest_bytes(text)}\n".encode():
         return ExistingRun(folder, content, record)
-    settings = read_file(folder / "run.toml")
     lines = text.decode().splitlines()
-    numbers = {entry.path: int(entry.source.rpartition(":")[2]) for entry in settings.entries}
-    remarks = {
-        path: lines[n - 1].rpartition("  # ")[2].strip() for path, n in numbers.items() if "  # " in lines[n - 1]
-    }
-    return ExistingRun(folder, content, record, True, settings, remarks)
+    entries = (_as_first_asked(entry, lines) for entry in read_file(folder / "run.toml").entries)
+    return ExistingRun(folder, content, record, True, Settings(tuple(entries)))
+
+
+def _as_first_asked(entry: Setting, lines: Sequence[str]) -> Setting:
+    """``entry`` of a file with these ``lines``, its source that of the remark which stands behind it there."""
+    _, mark, remark = lines[int(entry.source.rpartition(":")[2]) - 1].rpartition("  # ")
+    return replace(entry, source=remark.strip()) if mark else entry
 
 
 def extended(asked: Settings, held: ExistingRun | None, where: str) -> Settings:
@@ -123,52 +129,32 @@ def extended(asked: Settings, held: ExistingRun | None, where: str) -> Settings:
     return Settings((*old, *new, *joined))
 
 
-def remembered(settings: Settings, held: ExistingRun) -> Settings:
-    """``settings`` of an extension, those of the run before with the remarks that they had."""
-    own = {id(entry) for entry in held.settings.entries}
-    return Settings(
-        tuple(
-            replace(entry, source=held.remarks.get(entry.path, entry.source)) if id(entry) in own else entry
-            for entry in settings.entries
-        )
-    )
+def differences(held: ExistingRun, now: Request) -> tuple[list[str], list[str]]:
+    """Clauses on the names and on the values in which the request of the run in a folder differs from ``now``.
 
-
-@dataclass(frozen=True)
-class Difference:
-    """A clause on what differs; ``can_join``: both may stand in one run."""
-
-    clause: str
-    can_join: bool = False
-
-
-def differences(held: ExistingRun, now: Request) -> list[Difference]:
-    """In what the request of the run in a folder differs from ``now``; none where the same command was given again."""
-    found: list[Difference] = []
+    None where the same command was given again; requests that differ in names alone may stand in one run.
+    """
+    names: list[str] = []
     if held.record is None and not held.is_known:
-        return found
+        return names, []
     for noun, name in (("scene", "scenes"), ("method", "methods"), ("protocol", "protocols")):
         before = held.asked(name) if held.record is None else _names(held.record, name)
         after = getattr(now, name) if held.record is not None else tuple(map(str, now.values[(name,)]))
-        gone, new = [one for one in before if one not in after], [one for one in after if one not in before]
-        if gone:
-            found.append(Difference(f"{_some(noun, gone)} not asked for now", can_join=True))
-        if new:
-            found.append(Difference(f"{_some(noun, new)} new", can_join=True))
-    if held.is_known:
-        found += [Difference(clause) for clause in _changed_values(held, now)]
-    return found
+        if gone := [one for one in before if one not in after]:
+            names.append(f"{_some(noun, gone)} not asked for now")
+        if new := [one for one in after if one not in before]:
+            names.append(f"{_some(noun, new)} new")
+    return names, _changed_values(held, now) if held.is_known else []
 
 
-def _names(record: RequestRecord, name: str) -> tuple[str, ...]:
+def _names(record: RunRecord, name: str) -> tuple[str, ...]:
     return tuple(rules.name for rules in record.protocols) if name == "protocols" else getattr(record, name)
 
 
 def _some(noun: str, names: Sequence[str]) -> str:
     """``scenes a, b, c and 2 more are``"""
-    shown_names = ", ".join(printable(name, 80) for name in names[:MOST_NAMED])
-    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-    return f"{noun if len(names) == 1 else noun + 's'} {shown_names}{more} {'is' if len(names) == 1 else 'are'}"
+    shown_names = some([printable(name, 80) for name in names], MOST_NAMED)
+    return f"{noun} {shown_names} is" if len(names) == 1 else f"{noun}s {shown_names} are"
 
 
 def _changed_values(held: ExistingRun, now: Request) -> list[str]:
@@ -223,51 +209,24 @@ def _stride(values: Mapping[KeyPath, Any], method: str) -> Any:
 
 def refuse_other_request(held: ExistingRun, now: Request, into: Into, where: str) -> None:
     """A ``StoreError`` that says how the run at ``where`` differs from ``now``, with the choices that there are."""
-    found = differences(held, now)
+    names, values = differences(held, now)
     if into == "extend":  # what is new is what it is for
-        found = [one for one in found if not one.clause.endswith(" new")]
-    if into == "replace" or not found:
+        names = [clause for clause in names if not clause.endswith(" new")]
+    if into == "replace" or not (names or values):
         return
-    rest = f" and {counted(len(found) - MOST_NAMED, 'difference')} more" if len(found) > MOST_NAMED else ""
-    what = ", ".join(one.clause for one in found[:MOST_NAMED]) + rest
-    name = printable(where, 300)
+    what, name = some([*names, *values], MOST_NAMED), printable(where, 300)
     if into == "extend":
-        raise StoreError(f"{name}: cannot be extended by this ({what}); {choices(can_join=False)}")
-    raise StoreError(f"{name}: holds another run ({what}); {choices(can_join=all(one.can_join for one in found))}")
-
-
-def choices(*, can_join: bool) -> str:
-    """What whoever meets another run in a folder may do."""
-    join = "--extend adds this one to it, " if can_join else ""
-    return join + INSTEAD
-
-
-class ConfigKeys:
-    """What of the keys of predictions is known before any data is read; the same for all scenes of a dataset."""
-
-    def __init__(self) -> None:
-        self._keys: dict[tuple[Part, Part], dict[str, str]] = {}
-
-    def of(self, job: SceneJob, part: Part) -> dict[str, str]:
-        if (job.dataset, part) not in self._keys:
-            self._keys[job.dataset, part] = config_key(job, part, build_method(part))
-        return self._keys[job.dataset, part]
-
-
-def _kept_jobs(folder: RunFolder, jobs: Sequence[SceneJob]) -> set[Path]:
-    """Folders of jobs in a run that is replaced whose maps are those of ``jobs``, as far as the request tells."""
-    keys = ConfigKeys()
-    places = [(folder.job(job.scene, part.name), keys.of(job, part)) for job in jobs for part in job.parts]
-    return {
-        place.path
-        for place, key in places
-        if place.changed_field("predict", key, known_later=FIELDS_KNOWN_LATER) is None
-    }
+        raise StoreError(f"{name}: cannot be extended by this ({what}); {INSTEAD}")
+    join = "" if values else "--extend adds this one to it, "
+    raise StoreError(f"{name}: holds another run ({what}); {join}{INSTEAD}")
 
 
 def replaced_jobs(folder: RunFolder, jobs: Sequence[SceneJob]) -> list[JobFolder]:
     """The jobs in ``folder`` that go where ``jobs`` replace its run; ``StoreError`` where files of others would go."""
-    kept = _kept_jobs(folder, jobs)
+    methods = ConfiguredMethods()
+    keys = [(folder.job(job.scene, part.name), methods.of(job, part)[1]) for job in jobs for part in job.parts]
+    # As far as the request tells, these are the maps that the new run asks for.
+    kept = {at.path for at, key in keys if at.changed_field("predict", key, known_later=FIELDS_KNOWN_LATER) is None}
     going = [job for job in folder.jobs() if job.path not in kept]
     names = {job.path.relative_to(folder.path).as_posix() for job in going}
     for stranger in folder.strangers():

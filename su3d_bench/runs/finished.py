@@ -40,20 +40,8 @@ from su3d_bench.metrics.scoring import unpack_scores
 from su3d_bench.predictions.formats import recognise
 from su3d_bench.runs.job import Part, build_dataset, part_of
 from su3d_bench.runs.scenes import cache_root, data_root, dataset_targets, looks_like_scene, nearest_scene
+from su3d_bench.store import records
 from su3d_bench.store.predictions import read_prediction
-from su3d_bench.store.records import (
-    CostsRecord,
-    MetricsRecord,
-    PredictionsRecord,
-    ProtocolRecord,
-    RequestRecord,
-    ResultRecord,
-    RunRecord,
-    TruthRecord,
-    checked,
-    read_record,
-    read_updates,
-)
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 if TYPE_CHECKING:
@@ -68,15 +56,11 @@ def made_elsewhere(formats: Sequence[str]) -> str:
     return f"predictions made elsewhere, read from files ({printable(', '.join(formats), 120)})"
 
 
-class OtherDataError(DataError):
-    """The data here are not those that a run was made from."""
-
-
 @dataclass(frozen=True)
 class RunData:
     """The data of a run, opened with the options that it had; ``digests`` are those of its scenes.
 
-    ``truth_files``: the folder of ground truth that predictions made elsewhere were held against in place of a dataset.
+    ``truth_files``: the folder of ground truth with which predictions made elsewhere were compared, not a dataset.
     """
 
     settings: Settings
@@ -104,7 +88,7 @@ class RunData:
             raise DataError(f"{printable(scene, 100)}: run.toml names no dataset '{printable(name, 60)}'")
         dataset = self._datasets[name]
         if dataset.digest(of_dataset) != self.digests.get(scene):
-            raise OtherDataError(f"{printable(scene, 100)}: its data are not those of the run; run it again")
+            raise DataError(f"{printable(scene, 100)}: its data are not those of the run; run it again")
         return dataset
 
 
@@ -113,9 +97,9 @@ class FinishedRun:
     """The records of a run; ``protocols`` holds the rules that scored it, ``results`` are by method and protocol."""
 
     folder: RunFolder
-    record: RunRecord
-    protocols: Mapping[str, ProtocolRecord]
-    results: Mapping[tuple[str, str], ResultRecord]
+    record: records.RunRecord
+    protocols: Mapping[str, records.ProtocolRecord]
+    results: Mapping[tuple[str, str], records.ResultRecord]
     limit: int
     data: RunData
 
@@ -165,7 +149,7 @@ class FinishedRun:
         return printable(str(self.folder.path), 200)
 
     @cached_property
-    def made_elsewhere(self) -> Mapping[str, PredictionsRecord]:
+    def made_elsewhere(self) -> Mapping[str, records.PredictionsRecord]:
         """The predictions that were made elsewhere, by the method that they are called."""
         return {record.method: record for record in self.record.predictions}
 
@@ -198,7 +182,7 @@ class FinishedRun:
             raise ConfigError(f"{self.name}: the rules of {shown} are not those that scored it (same version)")
         return here
 
-    def _own_rules(self, then: ProtocolRecord) -> ProtocolRules:
+    def _own_rules(self, then: records.ProtocolRecord) -> ProtocolRules:
         """User-defined rules, which ``run.json`` keeps."""
         where = f"{self.name}: the rules of {printable(then.name, 80)}"
         own = None if then.rules is None else read_rules(then.rules, where)
@@ -241,10 +225,10 @@ class FinishedRun:
         return scores
 
 
-def record_of_rules(rules: ProtocolRules) -> ProtocolRecord:
+def record_of_rules(rules: ProtocolRules) -> records.ProtocolRecord:
     """What ``run.json`` says of the rules that scored a run."""
     own = None if rules.name in protocol_names() else rules.as_json
-    return ProtocolRecord(rules.name, rules.version, rules.digest, own)
+    return records.ProtocolRecord(rules.name, rules.version, rules.digest, own)
 
 
 def read_run(path: Path) -> FinishedRun:
@@ -254,12 +238,19 @@ def read_run(path: Path) -> FinishedRun:
         raise StoreError(f"{shown}: {_why_no_run(path)}")
     if not is_file(path / "metrics.json"):
         raise StoreError(f"{shown}: holds no metrics.json, so the run is not finished; run its command again")
-    record = read_record(RunRecord, path / "run.json", shown)
-    metrics = read_record(MetricsRecord, path / "metrics.json", shown)
-    _named_once(f"{shown}: run.json", "protocol", [rules.name for rules in record.protocols])
-    _named_once(f"{shown}: run.json", "scene", record.scenes)
-    _named_once(f"{shown}: run.json", "method", record.methods)
-    _named_once(f"{shown}: metrics.json", "result", [f"{one.method} / {one.protocol}" for one in metrics.results])
+    record = records.read_record(records.RunRecord, path / "run.json", shown)
+    metrics = records.read_record(records.MetricsRecord, path / "metrics.json", shown)
+    if not record.methods:
+        raise StoreError(f"{shown}: run.json: methods is not as a run writes it; run it again")
+    named = {
+        "run.json: names the protocol": [rules.name for rules in record.protocols],
+        "run.json: names the scene": record.scenes,
+        "run.json: names the method": record.methods,
+        "metrics.json: names the result": [f"{one.method} / {one.protocol}" for one in metrics.results],
+    }
+    for what, names in named.items():  # of two that differ, one would be read and the other passed over
+        if twice := [name for name, n in Counter(names).items() if n > 1]:
+            raise StoreError(f"{shown}: {what} '{printable(twice[0], 100)}' twice; run its command again")
     protocols = {rules.name: rules for rules in record.protocols}
     if unnamed := [one.protocol for one in metrics.results if one.protocol not in protocols]:
         raise StoreError(f"{shown}: run.json does not name the protocol '{unnamed[0]}'; run its command again")
@@ -269,22 +260,20 @@ def read_run(path: Path) -> FinishedRun:
         protocols=protocols,
         results={(result.method, result.protocol): result for result in metrics.results},
         limit=metrics.limit,
-        data=RunData(read_file(path / "run.toml"), record.data_digests, _path_of(record.ground_truth)),
+        data=RunData(read_file(path / "run.toml"), record.data_digests, record.truth_files),
     )
 
 
 def _why_no_run(path: Path) -> str:
     """What is at ``path`` in place of a run, and what would be one."""
-    if is_file(path):
-        if is_numbers_alone(path):
-            return (
-                "holds numbers without the counts of scenes, from which this is made anew; evaluate again with --out "
-                "runs/mine, and name that folder"
-            )
-        return "is a file; name the folder of a run, such as runs/my-run"
+    if is_file(path) and is_numbers_alone(path):
+        return (
+            "holds numbers without the counts of scenes, from which this is made anew; evaluate again with --out "
+            "runs/mine, and name that folder"
+        )
     with suppress(Su3dError, OSError):
         reader = recognise(path)
-        if reader.scenes(path):
+        if path.is_dir() and reader.scenes(path):
             made = f"su3d-bench evaluate {shlex.quote(str(path))} --out runs/mine"
             return f"holds predictions ({reader.name}) and no run.json; make a run of them with: {made}"
     return "holds no run.json; name the folder of a run, such as runs/my-run"
@@ -301,17 +290,6 @@ def is_numbers_alone(file: Path) -> bool:
     return isinstance(first, dict) and {"formats", "ground_truth", "protocols"} <= first.keys()
 
 
-def _path_of(truth: TruthRecord | None) -> str | None:
-    return None if truth is None else truth.path
-
-
-def _named_once(where: str, what: str, names: Sequence[str]) -> None:
-    """A ``StoreError`` where a name stands twice: of two that differ, one would be read and the other passed over."""
-    twice = next((name for name, n in Counter(names).items() if n > 1), None)
-    if twice is not None:
-        raise StoreError(f"{where}: names the {what} '{printable(twice, 100)}' twice; run its command again")
-
-
 def map_of_scene(scene: str, method: str, run: Path | None) -> tuple[RunFolder, JobFolder, Prediction]:
     """The map of ``scene`` by ``method`` in ``run``, or in the latest of ``runs/`` that has it, with its place."""
     folder = latest_run(scene, method) if run is None else RunFolder(run)
@@ -326,8 +304,7 @@ def latest_run(scene: str, method: str) -> RunFolder:
     runs = [RunFolder(path) for path in Path("runs").glob("*") if path.is_dir()]
     made = [(run.job(scene, method).prediction, run) for run in runs if run.job(scene, method).prediction.is_file()]
     if not made:
-        records = [_request_of(run) for run in runs]
-        known = dict.fromkeys(name for record in records for name in record.scenes)
+        known = dict.fromkeys(name for run in runs for name in _request_of(run).scenes)
         hint = nearest_scene(scene, known)
         if not hint and looks_like_scene(scene):
             command = shlex.join(["su3d-bench", "run", scene, "--methods", method])
@@ -352,21 +329,18 @@ def _no_map(run: RunFolder, scene: str, method: str) -> StoreError:
     return StoreError(f"{shown(run.path)}: holds no map of {printable(scene, 120)} by {printable(method, 80)}{hint}")
 
 
-def _request_of(run: RunFolder) -> RequestRecord:
+def _request_of(run: RunFolder) -> records.RunRecord:
     """What the run was asked for; nothing where its record is missing or damaged."""
     with suppress(StoreError):
-        return read_record(RequestRecord, run.path / "run.json", shown(run.path))
-    return RequestRecord()
+        return records.read_record(records.RunRecord, run.path / "run.json", shown(run.path))
+    return records.RunRecord()
 
 
 def data_of_map(run: Path, scene: str, map_file: Path) -> RunData:
     """The data from which ``map_file`` was made, a sealed map of ``scene`` in the folder ``run``, finished or not."""
     seal = JobFolder(map_file.parent).seals().get("predict")
     digests = {} if seal is None else {scene: seal.key.get("data", "")}
-    request = RequestRecord()
-    with suppress(StoreError):
-        request = read_record(RequestRecord, run / "run.json", printable(str(run), 200))
-    return RunData(read_file(run / "run.toml"), digests, _path_of(request.ground_truth))
+    return RunData(read_file(run / "run.toml"), digests, _request_of(RunFolder(run)).truth_files)
 
 
 def encoder_of(run: RunFolder, device: str = "cpu") -> Encoder:
@@ -378,7 +352,7 @@ def encoder_of(run: RunFolder, device: str = "cpu") -> Encoder:
     from su3d_bench.perception.models.loading import load_encoder
     from su3d_bench.perception.profiles import PerceptionConfig
 
-    record = read_record(RequestRecord, run.path / "run.json", printable(str(run.path), 200))
+    record = records.read_record(records.RunRecord, run.path / "run.json", shown(run.path))
     entry = encoder_known_as(record.encoder)
     config = PerceptionConfig()
     if entry is not None:
@@ -407,17 +381,11 @@ def read_update_times(run: FinishedRun, method: str) -> list[UpdateTimes]:
         if not is_file(job.updates):
             continue
         where = f"{printable(scene, 120)}: {job.updates.name}"
-        columns = read_updates(job.updates, where)
+        columns = records.read_updates(job.updates, where)
         if columns and len(columns["total_ms"]):
-            costs = _costs(job.remarks("predict").get("costs"), where)
+            try:
+                costs = records.checked(records.CostsRecord, job.remarks("predict").get("costs") or {})
+            except (ValidationError, RecursionError) as error:
+                raise DataError(f"{where}: the costs in done.json are damaged; run the scene again") from error
             times.append(UpdateTimes(run.name, scene, method, columns, **vars(costs)))
     return times
-
-
-def _costs(costs: Any, where: str) -> CostsRecord:
-    if costs is None:
-        return CostsRecord((), None, None, None)
-    try:
-        return checked(CostsRecord, costs)
-    except (ValidationError, RecursionError) as error:
-        raise DataError(f"{where}: the costs in done.json are not as a run writes them; run it again") from error

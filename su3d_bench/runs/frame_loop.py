@@ -10,34 +10,15 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Generic, Self, TypeVar, overload
+from typing import Any, Generic, Self, TypeVar
 
 import numpy as np
 
+from su3d_bench.core import interfaces, types
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.interfaces import (
-    Closes,
-    CountsLosses,
-    Dataset,
-    HasFinishCosts,
-    HasSurface,
-    Method,
-    RegionPerception,
-)
 from su3d_bench.core.maps import Proposals, starts_of
 from su3d_bench.core.printing import one_line, plain_text
 from su3d_bench.core.system.timing import MethodClock, Timer, calibration_ms, memory_bytes
-from su3d_bench.core.types import (
-    BoolArray,
-    Detections,
-    Float32Array,
-    Frame,
-    GroundTruth,
-    Int64Array,
-    PerceptionNeeds,
-    SceneInfo,
-    Surface,
-)
 from su3d_bench.perception.profiles import Perception
 from su3d_bench.runs.executors import Event, Report
 from su3d_bench.runs.plugins import told
@@ -46,31 +27,24 @@ from su3d_bench.store.records import updates_text
 
 
 @dataclass(frozen=True)
-class FirstFrames(Sequence[Frame]):
+class FirstFrames(Sequence[types.Frame]):
     """The first ``n`` of ``frames``, read anew at every access."""
 
-    frames: Sequence[Frame]
+    frames: Sequence[types.Frame]
     n: int
 
     def __len__(self) -> int:
         return self.n
 
-    @overload
-    def __getitem__(self, index: int) -> Frame: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[Frame]: ...
-
-    def __getitem__(self, index: int | slice) -> Frame | list[Frame]:
-        if isinstance(index, slice):
-            return [self.frames[i] for i in range(self.n)[index]]
-        return self.frames[range(self.n)[index]]
+    def __getitem__(self, index: Any) -> Any:
+        places = range(self.n)[index]
+        return self.frames[places] if isinstance(places, int) else [self.frames[place] for place in places]
 
 
 class TimedRegions:
     """Perception on demand, its time told apart from that of the method that asks for it."""
 
-    def __init__(self, regions: RegionPerception, clock: MethodClock) -> None:
+    def __init__(self, regions: interfaces.RegionPerception, clock: MethodClock) -> None:
         self._regions = regions
         self._clock = clock
 
@@ -78,64 +52,59 @@ class TimedRegions:
     def dim(self) -> int:
         return self._regions.dim
 
-    def mask_at(self, frame: Frame, points: Int64Array) -> tuple[BoolArray, float]:
+    def mask_at(self, frame: types.Frame, points: types.Int64Array) -> tuple[types.BoolArray, float]:
         with self._clock.perception():
             return self._regions.mask_at(frame, points)
 
-    def encode_regions(self, frame: Frame, mask: BoolArray, boxes: Int64Array) -> Float32Array:
+    def encode_regions(self, frame: types.Frame, mask: types.BoolArray, boxes: types.Int64Array) -> types.Float32Array:
         with self._clock.perception():
             return self._regions.encode_regions(frame, mask, boxes)
 
 
-def no_detections(frame: Frame, needs: PerceptionNeeds) -> Detections:
+def no_detections(frame: types.Frame, needs: types.PerceptionNeeds) -> types.Detections:
     """What a method that needs no masks gets."""
-    return Detections(
+    return _detections(frame, needs, n=0, dim=0)
+
+
+def _detections(frame: types.Frame, needs: types.PerceptionNeeds, n: int, dim: int) -> types.Detections:
+    """``n`` detections without a name, each of the whole image."""
+    return types.Detections(
         frame_index=frame.index,
-        masks=np.zeros((0, *frame.depth_m.shape), np.bool_),
-        boxes=np.zeros((0, 4), np.float32),
-        scores=np.zeros(0, np.float32),
-        names=(),
-        captions=(),
+        masks=np.ones((n, *frame.depth_m.shape), np.bool_),
+        boxes=np.zeros((n, 4), np.float32),
+        scores=np.ones(n, np.float32),
+        names=("",) * n,
+        captions=("",) * n,
         crop_ratios=needs.crop_ratios,
-        crop_features=np.zeros((0, len(needs.crop_ratios), 0), np.float32),
-        global_feature=np.zeros(0, np.float32),
+        crop_features=np.ones((n, len(needs.crop_ratios), dim), np.float32),
+        global_feature=np.ones(dim, np.float32),
+        name_features=np.ones((n, dim), np.float32) if n and needs.name_features else None,
     )
 
 
-def warm_up(method: Method) -> None:
+def warm_up(method: interfaces.Method) -> None:
     """Feeds ``method``, which is thrown away, a made-up frame: no timed step then waits for a compiler or an import."""
-    size, needs = 32, method.needs
+    size = 32
     depth_m = 1 + np.linspace(0, 0.5, size * size, dtype=np.float32).reshape(size, size) ** 2
     intrinsics = np.array([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1]])
-    frame = Frame(0, 0.0, np.zeros((size, size, 3), np.uint8), depth_m, np.eye(4), intrinsics)
-    detections = Detections(
-        frame_index=0,
-        masks=np.ones((1, size, size), np.bool_),
-        boxes=np.zeros((1, 4), np.float32),
-        scores=np.ones(1, np.float32),
-        names=("",),
-        captions=("",),
-        crop_ratios=needs.crop_ratios,
-        crop_features=np.ones((1, len(needs.crop_ratios), 1), np.float32),
-        global_feature=np.ones(1, np.float32),
-        name_features=np.ones((1, 1), np.float32) if needs.name_features else None,
-    )
-    method.start(SceneInfo("made-up", "made-up", N_WARM_UP, 1, "camera"))
+    frame = types.Frame(0, 0.0, np.zeros((size, size, 3), np.uint8), depth_m, np.eye(4), intrinsics)
+    detections = _detections(frame, method.needs, n=1, dim=1)
+    method.start(types.SceneInfo("made-up", "made-up", N_WARM_UP, 1, "camera"))
     for _ in range(N_WARM_UP):
         method.update(frame, detections, Timer())
     method.finish()
-    if isinstance(method, Closes):
+    if isinstance(method, interfaces.Closes):
         method.close()
 
 
-def surface_of(dataset: Dataset, scene: str) -> Surface:
+def surface_of(dataset: interfaces.Dataset, scene: str) -> types.Surface:
     """The mesh of a scene without labels; ``DataError`` where its dataset has none."""
-    if not isinstance(dataset, HasSurface):
+    if not isinstance(dataset, interfaces.HasSurface):
         raise DataError(f"{dataset.name}/{scene}: the dataset has no mesh; this method works on one")
     return dataset.surface(scene)
 
 
-def true_proposals(truth: GroundTruth) -> Proposals:
+def true_proposals(truth: types.GroundTruth) -> Proposals:
     """Every annotated instance of ``truth`` as a class-agnostic mask, in the order of the instance ids."""
     order = np.argsort(truth.instance, kind="stable").astype(np.int32)
     order = order[truth.instance[order] > 0]
@@ -198,10 +167,10 @@ class Feeding:
     """One method on one scene: ``maps`` holds, for each map written, the updates before it and what it took."""
 
     def __init__(
-        self, scene: str, method: Method, perception: Perception, report: Report, clock: MethodClock | None = None
+        self, scene: str, method: interfaces.Method, perception: Perception, report: Report, clock: MethodClock
     ) -> None:
         self.maps: list[dict[str, float | int]] = []
-        self._clock = clock or MethodClock()
+        self._clock = clock
         self._scene = scene
         self._method = method
         self._perception = perception
@@ -215,7 +184,7 @@ class Feeding:
         """The median time of the calibrating piece of work between the updates; None where there was none."""
         return round(float(np.median(self._calibrations)), 4) if self._calibrations else None
 
-    def up_to(self, n_fed: int, frames: ReadAhead[Frame], n_frames: int) -> None:
+    def up_to(self, n_fed: int, frames: ReadAhead[types.Frame], n_frames: int) -> None:
         """Feed the frames that are missing to ``n_fed``; ``n_frames`` are all that will come.
 
         Stage ``decode`` is what an update waited for its frame.
@@ -232,31 +201,29 @@ class Feeding:
                 Event(self._scene, self._method.name, update + 1, n_frames, None if size is None else int(size))
             )
 
-    def _feed(self, update: int, frames: ReadAhead[Frame]) -> Row:
+    def _feed(self, update: int, frames: ReadAhead[types.Frame]) -> Row:
         timer, method = self._timer, self._method
         start = time.perf_counter()
         with timer.stage("decode"):
             frame = frames.next_frame()
         if not (frame.depth_m > 0).any():
             raise DataError(f"{self._scene} frame {frame.index}: depth is empty, no pixel is above 0 m")
-        detections = self._detect(frame)
+        detections = (
+            no_detections(frame, method.needs)
+            if method.needs.masks == "none"
+            else self._perception.detect(frame, method.needs, timer)
+        )
         with self._clock.running("update"):
             method.update(frame, detections, timer)
         total_ms = (time.perf_counter() - start) * 1e3
         own: Row = {"update": update, "frame": frame.index, "n_detections": len(detections)}
         of_method: Row = {name: int(told(method, name)) for name in SIZES if hasattr(method, name)}
-        of_method |= dict(told(method, "losses")) if isinstance(method, CountsLosses) else {}
+        of_method |= told(method, "losses", {})
         of_method |= {"rss_bytes": memory_bytes()}
         of_method |= {f"{name}_ms": round(ms, 3) for name, ms in timer.take().items()}
         # What is measured here goes before what a method calls by the same name.
         own |= {key: value for key, value in of_method.items() if key not in own}
         return own | {"method_ms": round(self._clock.take("update").method_ms, 3), "total_ms": round(total_ms, 3)}
-
-    def _detect(self, frame: Frame) -> Detections:
-        needs = self._method.needs
-        return (
-            no_detections(frame, needs) if needs.masks == "none" else self._perception.detect(frame, needs, self._timer)
-        )
 
     def write_map(self, path: Path) -> None:
         """Write the method's map so far."""
@@ -264,7 +231,7 @@ class Feeding:
             prediction = self._method.finish()
         spent = self._clock.take("finish")
         write_prediction(path, prediction)
-        costs = dict(told(self._method, "finish_costs")) if isinstance(self._method, HasFinishCosts) else {}
+        costs = told(self._method, "finish_costs", {})
         own = {"n_updates": len(self._rows), "finish_ms": spent.total_ms, "perception_ms": spent.perception_ms}
         self.maps.append({**own, **costs, **{name: round(value, 3) for name, value in own.items()}})
 

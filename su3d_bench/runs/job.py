@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from su3d_bench.core import registry
-from su3d_bench.core.config import Settings, flatten, resolve
+from su3d_bench.core.config import RunConfig, Settings, flatten, resolve
 from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_file, digest_json, package_versions
 from su3d_bench.core.errors import StoreError
-from su3d_bench.core.interfaces import HasCaveat, HasInputs, HasOwnPerception, Method, ReadsMadeRooms, TakesTruth
+from su3d_bench.core.interfaces import Method, TakesTruth
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.types import GroundTruth, LabelSet, SceneInfo
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
@@ -92,8 +92,9 @@ FIELDS_KNOWN_LATER = ("data", "profile", "perception", "packages.torch", "packag
 class SceneJob:
     """Everything that a worker needs to know of one scene; ``index`` counts the scenes of the run.
 
-    ``replaces``: a map that was made from other inputs is made anew instead of refused. ``doubts``: what must be said
-    of its poses, None where whoever made the job could not look at its data.
+    ``config`` is the run's and ``perception`` that of perception as JSON. ``replaces``: a map that was made from other
+    inputs is made anew instead of refused. ``doubts``: what must be said of its poses, None where whoever made the job
+    could not look at its data.
     """
 
     scene: str
@@ -101,20 +102,12 @@ class SceneJob:
     methods: tuple[Part, ...]
     ceiling: Part | None
     protocols: tuple[str, ...]
-    profile: str
+    config: RunConfig
     perception: str
-    stride: int
-    seed: int
-    limit: int
-    pictures: bool
-    anytime: tuple[float, ...]
     folder: Path
     data_root: Path
     cache_root: Path
     index: int = 0
-    is_offline: bool = False
-    solver: str = "built-in"
-    accepts_poses: bool = False
     replaces: bool = False
     doubts: tuple[str, ...] | None = None
 
@@ -150,26 +143,25 @@ class MethodOutcome:
     doubts: tuple[str, ...] = ()
 
 
-def stride_of(job_stride: int, options: str) -> int:
+def stride_of(job: SceneJob, part: Part) -> int:
     """Frames between updates: the run's where it is set, else the method's own, else 1."""
-    return job_stride or int(json.loads(options).get("stride", 1))
+    return job.config.stride or int(json.loads(part.options).get("stride", 1))
 
 
 def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
     """What of a prediction's key is known before any data is read, the most telling fields first."""
-    key = {"dataset": job.dataset.name, "method": part.name, "seed": str(job.seed)}
+    key = {"dataset": job.dataset.name, "method": part.name, "seed": str(job.config.seed)}
     sections = [(f"method.{part.name}", part.options), (f"dataset.{job.dataset.name}", job.dataset.options)]
     if method.needs.frames:
-        key |= {"stride": str(stride_of(job.stride, part.options)), "limit": str(job.limit or "none")}
-        if job.anytime:
-            key["anytime"] = str(job.anytime)
+        key |= {"stride": str(stride_of(job, part)), "limit": str(job.config.limit or "none")}
+        if job.config.shares:
+            key["anytime"] = str(job.config.shares)
         sections.append(("perception", job.perception))
     for prefix, options in sections:
         for path, value in flatten(json.loads(options)):
             key[".".join((prefix, *path))] = json.dumps(value, ensure_ascii=False)
     key = {name: text for name, text in key.items() if not name.startswith(NOT_IN_KEY)}
-    if isinstance(method, HasInputs):
-        key |= {f"input.{name}": digest for name, digest in told(method, "inputs").items()}
+    key |= {f"input.{name}": digest for name, digest in told(method, "inputs", {}).items()}
     for kind, target in (("method", part.target), ("dataset", job.dataset.target)):
         if digest := own_code(target):
             key[f"code.{kind}"] = digest
@@ -180,14 +172,29 @@ def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
     )
 
 
+class ConfiguredMethods:
+    """Methods and what of the keys of their predictions is known before any data is read: the same for all scenes of a
+    dataset, made once."""
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[Part, Part], tuple[Any, dict[str, str]]] = {}
+
+    def of(self, job: SceneJob, part: Part) -> tuple[Any, dict[str, str]]:
+        """The method of ``part`` and its ``config_key``."""
+        if (job.dataset, part) not in self._known:
+            method = build_method(part)
+            self._known[job.dataset, part] = method, config_key(job, part, method)
+        return self._known[job.dataset, part]
+
+
 def own_code(target: str) -> str | None:
     """A key of the file of somebody's own dataset or method, which is no part of the program's code."""
     return digest_file(Path(target.rpartition(":")[0]))[:16] if ".py:" in target else None
 
 
-def refuse_other_run(folder: JobFolder, key: Mapping[str, str], known_later: Sequence[str] = ()) -> None:
-    """A ``StoreError`` where ``folder`` was sealed under another key, fields in ``known_later`` aside."""
-    if changed := folder.changed_field("predict", key, known_later=known_later):
+def refuse_other_run(folder: JobFolder, key: Mapping[str, str], *, is_early: bool = False) -> None:
+    """A ``StoreError`` where ``folder`` was sealed under another key; ``is_early``: what is known later aside."""
+    if changed := folder.changed_field("predict", key, known_later=FIELDS_KNOWN_LATER if is_early else ()):
         raise StoreError(f"{folder.path}: holds another run ({changed}); {INSTEAD}")
 
 
@@ -221,15 +228,15 @@ class JobInputs:
         """The key of the scores and pictures of that prediction."""
         rules = {name: load_protocol(name) for name in self.job.protocols}
         key = {"predict": digest_json(predict_key), "encoder": self.perception.encoder.digest}
-        key |= {"pictures": str(self.job.pictures)}
+        key |= {"pictures": str(self.job.config.pictures)}
         key |= {f"protocol.{name}": protocol.digest for name, protocol in rules.items()}
-        if self.job.solver == "llm" and any(protocol.answers is not None for protocol in rules.values()):
+        if self.job.config.solver == "llm" and any(protocol.answers is not None for protocol in rules.values()):
             key["solver"] = answers_digest(PerceptionConfig.model_validate_json(self.job.perception).language)
         return key | refined_digest(folder) if any(protocol.goes_by_names for protocol in rules.values()) else key
 
     def is_scored(self, folder: JobFolder, seal: SealRecord | None, key: Mapping[str, str]) -> bool:
         """Whether ``seal`` vouches for scores under ``key``; pictures that nobody asks for now may be beside them."""
-        if seal is not None and not self.job.pictures and seal.key.get("pictures") == str(True):
+        if seal is not None and not self.job.config.pictures and seal.key.get("pictures") == str(True):
             key = {**key, "pictures": str(True)}
         return folder.is_whole(seal, key)
 
@@ -252,13 +259,12 @@ class JobInputs:
 
 def caveat_of(method: Method, perception: Perception, scene: SceneInfo) -> str | None:
     """What must be said beside every number: where the scenes, the masks, or the method's own proposals come from."""
-    own = told(method, "caveat") if isinstance(method, HasCaveat) else None
+    own = told(method, "caveat", None)
     if method.needs.true_proposals:
         own = TRUE_PROPOSALS_CAVEAT
-    has_own_perception = isinstance(method, HasOwnPerception) and method.has_own_perception
-    is_seen_by_profile = method.needs.frames and not has_own_perception
+    is_seen_by_profile = method.needs.frames and not getattr(method, "has_own_perception", False)
     dataset = registry.load("dataset", scene.dataset) if scene.dataset in registry.DATASETS else None
-    is_made = scene.image_domain == "rendered-rooms" and isinstance(dataset, ReadsMadeRooms)
+    is_made = scene.image_domain == "rendered-rooms" and getattr(dataset, "reads_made_rooms", False)
     made = f"made rooms in the layout of {scene.dataset}, not its scenes" if is_made else None
     parts = [made, perception.caveat if is_seen_by_profile else None, own]
     return "; ".join(part for part in parts if part) or None

@@ -28,15 +28,14 @@ from su3d_bench.core.config import (
 )
 from su3d_bench.core.digests import code_digest, digest_json
 from su3d_bench.core.errors import ConfigError, StoreError, counted, printable, some, suggest
-from su3d_bench.core.interfaces import HasPresets, IsSystem
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.devices import device_for
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names, protocols_for
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
 from su3d_bench.runs.executors import ELSEWHERE, check_execution
 from su3d_bench.runs.existing import (
-    ConfigKeys,
     ExistingRun,
     Into,
     Request,
@@ -45,10 +44,9 @@ from su3d_bench.runs.existing import (
     existing_run,
     extended,
     refuse_other_request,
-    remembered,
     replaced_jobs,
 )
-from su3d_bench.runs.job import FIELDS_KNOWN_LATER, Part, SceneJob, options_model, own_code, part_of, refuse_other_run
+from su3d_bench.runs.job import ConfiguredMethods, Part, SceneJob, options_model, own_code, part_of, refuse_other_run
 from su3d_bench.runs.remote_store import DataPlace, LocalRun, RemoteData, RunPlace, StoredRun, data_place, is_url
 from su3d_bench.runs.scenes import cache_root, data_root, dataset_targets, expand_scenes, looks_like_scene
 from su3d_bench.store.run_folder import JobFolder, RunFolder, scene_of_folder
@@ -111,7 +109,7 @@ def named_method(text: str) -> NamedMethod:
 
 
 def _preset(text: str, base: str, method: Any, variant: str) -> Mapping[str, Any]:
-    presets = method.presets if isinstance(method, HasPresets) else {}
+    presets: Mapping[str, Mapping[str, Any]] = getattr(method, "presets", {})
     if variant not in presets:
         hint = suggest(variant, presets, "it has") or "; it has none"
         raise ConfigError(f"--methods {text}: {base} has no preset '{variant}'{hint}; or write {base}@KEY=VALUE")
@@ -170,14 +168,14 @@ class Plan:
         return leaves
 
     @property
-    def protocols(self) -> tuple[str, ...]:
-        """Names of the protocols that score some scene."""
-        names = dict.fromkeys(name for job in self.jobs for name in job.protocols)
-        return tuple(dict.fromkeys(load_protocol(name).name for name in names))
+    def rules(self) -> list[ProtocolRules]:
+        """The protocols that score some scene."""
+        return [load_protocol(name) for name in dict.fromkeys(name for job in self.jobs for name in job.protocols)]
 
     @property
     def request(self) -> Request:
-        return Request(tuple(job.scene for job in self.jobs), self.methods, self.protocols, dict(self.values))
+        protocols = tuple(dict.fromkeys(rules.name for rules in self.rules))
+        return Request(tuple(job.scene for job in self.jobs), self.methods, protocols, dict(self.values))
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -201,7 +199,9 @@ def make_plan(
     """
     if into != "own" and out is None:
         raise ConfigError(f"--{into}: say which run with --out, such as --out runs/demo")
-    place = None if out is None else _place(out)
+    place: RunPlace | None = LocalRun(RunFolder(out)) if isinstance(out, Path) else None
+    if isinstance(out, str):
+        place = StoredRun.opened(out, cache_root())
     existing = None if place is None else existing_run(place.folder.path)
     check_keys(settings)
     if into == "extend":
@@ -212,40 +212,47 @@ def make_plan(
         raise ConfigError(f"unknown profile '{config.profile}'{suggest(config.profile, PROFILES)}")
     named_methods = [named_method(text) for text in _method_targets(config.methods)]
     _check_one_a_name("--methods", [(method.name, method.essence) for method in named_methods])
-    methods = {method.name: method for method in named_methods}
+    named = {method.name: method for method in named_methods}
     named_datasets = [(str(registry.load("dataset", target).name), target) for target in dataset_targets(config.scenes)]
     _check_one_a_name("--scenes", named_datasets)
-    datasets = dict(named_datasets)
-    settings += read_assignments(assignments, [*{method.base for method in methods.values()}, *methods], list(datasets))
-    _check_sections("method", settings, {method.base: method.target for method in methods.values()}, list(methods))
-    _check_sections("dataset", settings, datasets)
-    perception = resolve(settings, ("perception",), PerceptionConfig)
-    check_models(config.profile, perception)
+    targets = dict(named_datasets)
+    settings += read_assignments(assignments, [*{method.base for method in named_methods}, *named], list(targets))
+    _check_sections("method", settings, {method.base: method.target for method in named_methods}, list(named))
+    _check_sections("dataset", settings, targets)
+    of_perception = resolve(settings, ("perception",), PerceptionConfig)
+    check_models(config.profile, of_perception)
     if config.executor not in ELSEWHERE:
-        device_for(perception.models.device, 0)  # raises where there is no such GPU
-    parts = _Parts(
-        tuple(method_part(method, settings) for method in methods.values()),
-        {target: part_of("dataset", target, settings) for target in datasets.values()},
-        None if CEILING_METHOD in methods else part_of("method", CEILING_METHOD, settings),
-        perception.model_dump_json(),
-        protocols_of_run(config.protocols, list(datasets.values())),
-    )
-    if config.solver == "llm" and not any(map(asks_questions, parts.protocols.values())):
+        device_for(of_perception.models.device, 0)  # raises where there is no such GPU
+    perception = of_perception.model_dump_json()
+    methods = tuple(method_part(method, settings) for method in named_methods)
+    ceiling = None if CEILING_METHOD in named else part_of("method", CEILING_METHOD, settings)
+    datasets = {target: part_of("dataset", target, settings) for target in targets.values()}
+    protocols = protocols_of_run(config.protocols, list(datasets))
+    if config.solver == "llm" and not any(map(asks_questions, protocols.values())):
         raise ConfigError(
             "--solver llm: answers the questions of reasoning protocols; add such as --protocols rooms-reasoning"
         )
     if place is None:
-        place = LocalRun(RunFolder(Path("runs") / _run_name(config, parts)))
+        place = LocalRun(RunFolder(Path("runs") / _run_name(config, methods, tuple(datasets.values()), perception)))
         existing = existing_run(place.folder.path)
     if place.url is None:
         place.folder.refuse_other_content()
-    named = os.environ.get("SU3D_DATA") or ""
-    with data_place(named) if is_url(named) else nullcontext(DataPlace(data_root())) as data_root_here:
-        chosen, notes = expand_scenes(config.scenes, parts.datasets, data_root_here.root)
-        data = data_root_here.needed({parts.datasets[target] for target, _ in chosen})
+    root = os.environ.get("SU3D_DATA") or ""
+    with data_place(root) if is_url(root) else nullcontext(DataPlace(data_root())) as data_root_here:
+        chosen, notes = expand_scenes(config.scenes, datasets, data_root_here.root)
+        data = data_root_here.needed({datasets[target] for target, _ in chosen})
     jobs = tuple(
-        replace(
-            _scene_job(config, parts, place.folder.path, data_root_here.root, target, scene),
+        SceneJob(
+            scene=f"{datasets[target].name}/{scene}",
+            dataset=datasets[target],
+            methods=methods,
+            ceiling=ceiling if protocols[target] else None,
+            protocols=protocols[target],
+            config=config,
+            perception=perception,
+            folder=place.folder.path,
+            data_root=data_root_here.root,
+            cache_root=cache_root(),
             index=index,
             replaces=into == "replace",
         )
@@ -253,7 +260,7 @@ def make_plan(
     )
     n_here = len(jobs) if config.executor in ELSEWHERE else os.cpu_count() or 1
     n_workers = min(config.jobs or n_here, len(jobs))
-    notes += tuple(_notes_on_protocols(parts.protocols, config.protocols))
+    notes += tuple(_notes_on_protocols(protocols, config.protocols))
     plan = Plan(config, settings, place, jobs, n_workers, notes, data, existing)
     try:
         return _started(plan, into)
@@ -261,29 +268,23 @@ def make_plan(
         raise StoreError(str(error).replace(str(place.folder.path), place.name)) from error
 
 
-def _place(out: Path | str) -> RunPlace:
-    return LocalRun(RunFolder(out)) if isinstance(out, Path) else StoredRun.opened(out, cache_root())
-
-
 def _started(plan: Plan, into: Into) -> Plan:
     """``plan`` with what becomes of the run in its folder; a ``StoreError`` where that is another one."""
     existing = plan.existing
     if existing is not None:
         refuse_other_request(existing, plan.request, into, plan.place.name)
-    keys = ConfigKeys()
+    methods = ConfiguredMethods()
     for job in plan.jobs:
         for part in job.methods:
             folder = plan.folder.job(job.scene, part.name)
             folder.refuse_links()
             if into != "replace":
-                refuse_other_run(folder, keys.of(job, part), FIELDS_KNOWN_LATER)
+                refuse_other_run(folder, methods.of(job, part)[1], is_early=True)
     if into == "replace":
         removes = tuple(replaced_jobs(plan.folder, plan.jobs))
-        if removes or (existing is not None and differences(existing, plan.request)):
+        if removes or (existing is not None and any(differences(existing, plan.request))):
             return replace(plan, start="replaced", removes=removes, notes=(*plan.notes, *_what_goes(plan, removes)))
         # else the run that replaced another is resumed
-    if existing is not None and into == "extend":
-        plan = replace(plan, settings=remembered(plan.settings, existing))
     return replace(plan, start="begun" if existing is None or not existing.is_finished else "kept")
 
 
@@ -315,17 +316,6 @@ def check_folder_name(flag: str, name: str) -> None:
         )
 
 
-@dataclass(frozen=True)
-class _Parts:
-    """The resolved parts of a run; ``datasets`` and ``protocols`` by the dataset's target."""
-
-    methods: tuple[Part, ...]
-    datasets: dict[str, Part]
-    ceiling: Part | None
-    perception: str
-    protocols: dict[str, tuple[str, ...]]
-
-
 def method_part(method: NamedMethod, settings: Settings) -> Part:
     """A method with the settings of its base, then those of its variant, then those under its own full name."""
     path = "method", method.name
@@ -352,7 +342,7 @@ def _check_sections(kind: str, settings: Settings, used: Mapping[str, str], vari
 
 def _all_systems() -> list[str]:
     loaded = {name: registry.load("method", name) for name in registry.METHODS}
-    return [name for name, method in loaded.items() if not isinstance(method, IsSystem) or method.is_system]
+    return [name for name, method in loaded.items() if getattr(method, "is_system", True)]
 
 
 def _method_targets(methods: Sequence[str]) -> list[str]:
@@ -411,32 +401,9 @@ def asks_questions(protocols: Sequence[str]) -> bool:
     return any(load_protocol(name).answers is not None for name in protocols)
 
 
-def _run_name(config: RunConfig, parts: _Parts) -> str:
+def _run_name(config: RunConfig, methods: Sequence[Part], datasets: Sequence[Part], perception: str) -> str:
     request = config.model_dump(mode="json", exclude=set(MOVES_NO_NUMBER))
-    options = [part.options for part in (*parts.methods, *parts.datasets.values())]
-    own = [digest for part in (*parts.methods, *parts.datasets.values()) if (digest := own_code(part.target))]
-    key = digest_json([request, options, parts.perception, code_digest(), *own])[:8]
-    return "-".join([*(part.name for part in parts.datasets.values()), config.profile, key])
-
-
-def _scene_job(config: RunConfig, parts: _Parts, folder: Path, root: Path, target: str, scene: str) -> SceneJob:
-    return SceneJob(
-        scene=f"{parts.datasets[target].name}/{scene}",
-        dataset=parts.datasets[target],
-        methods=parts.methods,
-        ceiling=parts.ceiling if parts.protocols[target] else None,
-        protocols=parts.protocols[target],
-        profile=config.profile,
-        perception=parts.perception,
-        stride=config.stride,
-        seed=config.seed,
-        limit=config.limit,
-        pictures=config.pictures,
-        anytime=tuple(sorted(set(config.anytime))),
-        folder=folder,
-        data_root=root,
-        cache_root=cache_root(),
-        is_offline=config.offline,
-        accepts_poses=config.accept_poses,
-        solver=config.solver,
-    )
+    options = [part.options for part in (*methods, *datasets)]
+    own = [digest for part in (*methods, *datasets) if (digest := own_code(part.target))]
+    key = digest_json([request, options, perception, code_digest(), *own])[:8]
+    return "-".join([*(part.name for part in datasets), config.profile, key])

@@ -11,10 +11,10 @@ import os
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.interfaces import RendersFrames, SaysUp
+from su3d_bench.core.interfaces import SaysUp
 from su3d_bench.core.registry import DATASETS
 from su3d_bench.datasets.recordings.pose_convention import judge_scene
 from su3d_bench.runs.job import SceneJob, build_dataset, build_method
@@ -28,12 +28,8 @@ class PosesContradicted(DataError):
     """Another reading of poses or depth agrees clearly better than the one that a run would take."""
 
 
-@dataclass(frozen=True)
-class _Remarks:
-    """What is to be said of a scene, and whether it must not be run."""
-
-    lines: tuple[str, ...] = ()
-    is_wrong: bool = False
+Remarks = tuple[tuple[str, ...], bool]  # what is to be said of a scene, and whether it must not be run
+NOTHING: Remarks = ((), False)
 
 
 def judged(jobs: Sequence[SceneJob]) -> tuple[SceneJob, ...]:
@@ -41,11 +37,11 @@ def judged(jobs: Sequence[SceneJob]) -> tuple[SceneJob, ...]:
     with silent(), ThreadPoolExecutor(os.cpu_count()) as threads:
         remarks = list(threads.map(_remarks, jobs))
     pairs = list(zip(jobs, remarks, strict=True))
-    wrong = [said.lines[0] for job, said in pairs if said.is_wrong and not job.accepts_poses]
+    wrong = [lines[0] for job, (lines, is_wrong) in pairs if is_wrong and not job.config.accept_poses]
     if wrong:
         others = f" (and {len(wrong) - 1} more of {len(jobs)} scenes)" if len(wrong) > 1 else ""
         raise PosesContradicted(f"{wrong[0]}{others}; {ALL_THE_SAME}")
-    return tuple(replace(job, doubts=said.lines) for job, said in pairs)
+    return tuple(replace(job, doubts=lines) for job, (lines, _) in pairs)
 
 
 def judged_where_read_here(jobs: Sequence[SceneJob]) -> tuple[SceneJob, ...]:
@@ -55,24 +51,24 @@ def judged_where_read_here(jobs: Sequence[SceneJob]) -> tuple[SceneJob, ...]:
     return tuple(known.get(job.scene, job) for job in jobs)
 
 
-def _remarks(job: SceneJob) -> _Remarks:
+def _remarks(job: SceneJob) -> Remarks:
     """Of a scene whose frames are files and will be read; of one that was begun, what was said then."""
     try:
         reading = [part for part in job.methods if build_method(part).needs.frames]
         for part in reading:
             said = RunFolder(job.folder).job(job.scene, part.name).remarks("predict").get(REMARK)
             if said is not None:
-                return _Remarks(tuple(map(str, said)))
+                return tuple(map(str, said)), False
         dataset = build_dataset(job.dataset, job.data_root)
-        if not reading or (isinstance(dataset, RendersFrames) and dataset.renders_frames):
-            return _Remarks()
+        if not reading or getattr(dataset, "renders_frames", False):
+            return NOTHING
         verdict = judge_scene(dataset, job.scene_name)
         lines = [] if verdict is None else [verdict.line]
         if isinstance(dataset, SaysUp) and (doubt := dataset.up(job.scene_name).doubt) is not None:
             lines.append(f"{job.scene}: {doubt}")
-        return _Remarks(tuple(lines), verdict is not None and verdict.is_wrong)
+        return tuple(lines), verdict is not None and verdict.is_wrong
     except Exception:  # noqa: BLE001 - a plug-in may raise anything; the scene's own work meets it and records it
-        return _Remarks()
+        return NOTHING
 
 
 @contextmanager

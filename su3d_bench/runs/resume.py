@@ -4,21 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import cache, lru_cache
-from typing import Any
 
 from su3d_bench.core.types import SceneInfo
-from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
-from su3d_bench.runs.job import (
-    JobInputs,
-    MethodOutcome,
-    Part,
-    SceneJob,
-    build_dataset,
-    build_method,
-    config_key,
-    stride_of,
-)
+from su3d_bench.perception.profiles import Perception, PerceptionConfig, resolve_profile
+from su3d_bench.runs.job import ConfiguredMethods, JobInputs, MethodOutcome, Part, SceneJob, build_dataset, stride_of
 from su3d_bench.runs.poses import silent
+from su3d_bench.runs.scene import perception_of
 from su3d_bench.store.records import SealRecord
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
@@ -36,7 +27,7 @@ class FinishedScenes:
     def __init__(self) -> None:
         self._dataset = cache(build_dataset)
         self._data_digest = lru_cache(maxsize=1)(self._read_digest)
-        self._methods: dict[tuple[Part, Part], tuple[Any, dict[str, str]]] = {}
+        self._methods = ConfiguredMethods()
         self._perceptions: dict[str, Perception | None] = {}  # by the domain of the images
 
     def outcomes(self, job: SceneJob) -> tuple[MethodOutcome, ...] | None:
@@ -66,8 +57,8 @@ class FinishedScenes:
 
     def inputs(self, job: SceneJob, part: Part) -> JobInputs | None:
         """What decides the numbers of a job; None where only a worker can tell."""
-        method, config = self._method(job, part)
-        info = self._dataset(job.dataset, job.data_root).info(job.scene_name, stride_of(job.stride, part.options))
+        method, config = self._methods.of(job, part)
+        info = self._dataset(job.dataset, job.data_root).info(job.scene_name, stride_of(job, part))
         perception = self._perception(job, info)
         if perception is None:
             return None
@@ -76,27 +67,10 @@ class FinishedScenes:
     def _read_digest(self, job: SceneJob) -> str:
         return str(self._dataset(job.dataset, job.data_root).digest(job.scene_name))
 
-    def _method(self, job: SceneJob, part: Part) -> tuple[Any, dict[str, str]]:
-        if (job.dataset, part) not in self._methods:
-            method = build_method(part)
-            self._methods[job.dataset, part] = method, config_key(job, part, method)
-        return self._methods[job.dataset, part]
-
     def _perception(self, job: SceneJob, info: SceneInfo) -> Perception | None:
         if info.image_domain not in self._perceptions:
             config: PerceptionConfig = PerceptionConfig.model_validate_json(job.perception)
-            profile = resolve_profile(job.profile, info.image_domain, config)
-            self._perceptions[info.image_domain] = (
-                build_perception(
-                    profile,
-                    config,
-                    scene=info,
-                    cache_root=job.cache_root,
-                    mesh=None,
-                    replies=job.folder / "language",
-                    is_offline=job.is_offline,
-                )
-                if profile in SAME_EVERYWHERE and config.models.device == "cpu"
-                else None
-            )
+            profile = resolve_profile(job.config.profile, info.image_domain, config)
+            is_same = profile in SAME_EVERYWHERE and config.models.device == "cpu"
+            self._perceptions[info.image_domain] = perception_of(job, info) if is_same else None
         return self._perceptions[info.image_domain]

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 from su3d_bench.core.config import KeyPath, write_toml
@@ -21,7 +20,7 @@ from su3d_bench.core.errors import StoreError
 from su3d_bench.core.files.atomic import is_file, read_json, remove_abandoned, remove_file, write_json, write_text
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.reports.tables.run import Found
-from su3d_bench.runs.clusters import reached, run_units
+from su3d_bench.runs.clusters import RunUnits, executor_for
 from su3d_bench.runs.distant import distant_jobs, failed_distant, run_distant_scene
 from su3d_bench.runs.executors import SCENE_DONE, Event, Report
 from su3d_bench.runs.existing import differences, sealed
@@ -61,10 +60,10 @@ def run_plan(plan: Plan, report: Report) -> RunResult:
     """
     if plan.data is None:  # else each worker looks at the data that it fetches
         plan = replace(plan, jobs=judged_where_read_here(plan.jobs))
-    with reached(plan.config, plan.n_workers) as cluster, _prepared(plan):
+    with executor_for(plan.config, plan.n_workers, plan.folder.path, report) as run, _prepared(plan):
         if plan.start != "kept":
             _write_request(plan)
-        outcomes = _execute(plan, report, cluster)
+        outcomes = _execute(plan, report, run)
         report(Event("", SCENE_DONE, doing="adding up"))
         metrics = plain(summarise(plan, outcomes))
         if not _is_unchanged(plan, outcomes, metrics):
@@ -136,15 +135,16 @@ def resolved_values(plan: Plan) -> list[tuple[KeyPath, Any, str]]:
 # ---- 3: execute the jobs
 
 
-def _execute(plan: Plan, report: Report, cluster: Any) -> tuple[MethodOutcome, ...]:
-    """The outcomes of all scenes, in the order of the plan; ``cluster``: what the executor works through.
+def _execute(plan: Plan, report: Report, run: RunUnits) -> tuple[MethodOutcome, ...]:
+    """The outcomes of all scenes, in the order of the plan; ``run``: what the executor is.
 
     What ends it is recorded, so that whoever looks at the folder knows that the run can be resumed.
     """
+    by_scene = {}
     try:
-        by_scene = {
-            outcomes[0].scene: outcomes for outcomes in _reported(_finished_scenes(plan, report, cluster), plan, report)
-        }
+        for n, outcomes in enumerate(_finished_scenes(plan, run), 1):
+            report(Event(outcomes[0].scene, SCENE_DONE, n, len(plan.jobs)))
+            by_scene[outcomes[0].scene] = outcomes
     except BaseException:
         if plan.start != "kept":
             write_json(plan.folder.path / "run.json", plain(record(plan, (), "interrupted")))
@@ -155,12 +155,8 @@ def _execute(plan: Plan, report: Report, cluster: Any) -> tuple[MethodOutcome, .
     return tuple(outcome for job in plan.jobs for outcome in by_scene[job.scene])
 
 
-def _finished_scenes(plan: Plan, report: Report, cluster: Any) -> Iterator[tuple[MethodOutcome, ...]]:
+def _finished_scenes(plan: Plan, run: RunUnits) -> Iterator[tuple[MethodOutcome, ...]]:
     """The outcomes of each scene as it is finished, here or elsewhere; first those that need no worker."""
-    folder = plan.folder.path
-    run = partial(
-        run_units, report=report, config=plan.config, n_workers=plan.n_workers, folder=folder, through=cluster
-    )
     if plan.is_distant:
         yield from run(run_distant_scene, distant_jobs(plan), lost=failed_distant)
         return
@@ -172,14 +168,6 @@ def _finished_scenes(plan: Plan, report: Report, cluster: Any) -> Iterator[tuple
         else:
             yield outcomes
     yield from run(run_scene, left, lost=failed_outcomes)
-
-
-def _reported(
-    scenes: Iterator[tuple[MethodOutcome, ...]], plan: Plan, report: Report
-) -> Iterator[tuple[MethodOutcome, ...]]:
-    for n, outcomes in enumerate(scenes, 1):
-        report(Event(outcomes[0].scene, SCENE_DONE, n, len(plan.jobs)))
-        yield outcomes
 
 
 # ---- 4: collect and combine (``summarise``), and 5: write the results
@@ -206,7 +194,7 @@ def _is_unchanged(plan: Plan, outcomes: Sequence[MethodOutcome], metrics: Mappin
     existing = plan.existing
     if plan.start != "kept" or existing is None or existing.record is None or existing.record.status != "complete":
         return False
-    if differences(existing, plan.request) or not all(outcome.was_resumed for outcome in outcomes):
+    if any(differences(existing, plan.request)) or not all(outcome.was_resumed for outcome in outcomes):
         return False
     try:
         before = read_json(plan.folder.path / "metrics.json")

@@ -9,24 +9,15 @@ from __future__ import annotations
 import logging
 import math
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache, cached_property, partial
 from typing import Any
 
+from su3d_bench.core import interfaces
 from su3d_bench.core.errors import GroundTruthMissing, StoreError, counted, error_line, printable
 from su3d_bench.core.files.atomic import write_bytes, write_text
-from su3d_bench.core.interfaces import (
-    Closes,
-    Encoder,
-    Method,
-    RendersFrames,
-    SceneTools,
-    TakesTools,
-    TakesTruth,
-    WarmsUp,
-)
 from su3d_bench.core.maps import Prediction, Proposals
 from su3d_bench.core.printing import one_line
 from su3d_bench.core.system.timing import MethodClock, device_memory_bytes, peak_memory_bytes, start_memory_watch
@@ -44,30 +35,10 @@ from su3d_bench.questions.solver import MapSolver, by_language_model
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.reports.pictures.maps import draw_scene
 from su3d_bench.reports.tables.run import Unscored, not_scored_lines
+from su3d_bench.runs import frame_loop
+from su3d_bench.runs import job as jobs
 from su3d_bench.runs.executors import Event, Report
-from su3d_bench.runs.frame_loop import (
-    N_AHEAD,
-    Feeding,
-    FirstFrames,
-    ReadAhead,
-    SceneLog,
-    TimedRegions,
-    surface_of,
-    true_proposals,
-    warm_up,
-)
-from su3d_bench.runs.job import (
-    JobInputs,
-    MethodOutcome,
-    Part,
-    SceneJob,
-    as_told,
-    build_dataset,
-    build_method,
-    config_key,
-    refuse_other_run,
-    stride_of,
-)
+from su3d_bench.runs.frame_loop import SceneLog
 from su3d_bench.runs.poses import REMARK, PosesContradicted, judged
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.run_folder import JobFolder, RunFolder
@@ -75,7 +46,7 @@ from su3d_bench.store.run_folder import JobFolder, RunFolder
 logger = logging.getLogger(__name__)
 
 
-def run_scene(job: SceneJob, report: Report) -> tuple[MethodOutcome, ...]:
+def run_scene(job: jobs.SceneJob, report: Report) -> tuple[jobs.MethodOutcome, ...]:
     """Outcomes of all methods on one scene, that of the ceiling last; a method that fails leaves the others alone."""
     if job.doubts is None:
         try:
@@ -87,24 +58,14 @@ def run_scene(job: SceneJob, report: Report) -> tuple[MethodOutcome, ...]:
 
 
 @cache
-def _warm_up(part: Part) -> None:
+def _warm_up(part: jobs.Part) -> None:
     """Once a process for each method and its settings, where it asks for it."""
-    scratch: Method = build_method(part)
-    if isinstance(scratch, WarmsUp) and scratch.warms_up:
-        warm_up(scratch)
+    scratch: interfaces.Method = jobs.build_method(part)
+    if getattr(scratch, "warms_up", False):
+        frame_loop.warm_up(scratch)
 
 
-@contextmanager
-def _closed_at_the_end(method: Method, clock: MethodClock) -> Iterator[None]:
-    try:
-        yield
-    finally:
-        if isinstance(method, Closes):
-            with clock.running("close"):
-                method.close()
-
-
-def failed_outcomes(job: SceneJob, reason: str) -> tuple[MethodOutcome, ...]:
+def failed_outcomes(job: jobs.SceneJob, reason: str) -> tuple[jobs.MethodOutcome, ...]:
     """The outcome of a scene whose worker died; what its methods finished before stays and is resumed next time."""
     line = f"{job.scene}: {reason}"
     for part in job.methods:
@@ -112,17 +73,17 @@ def failed_outcomes(job: SceneJob, reason: str) -> tuple[MethodOutcome, ...]:
         folder.prepare()
         if "score" not in folder.seals():
             write_text(folder.log, f"failed: {one_line(line)}\n")
-    return tuple(MethodOutcome(job.scene, part.name, error=line) for part in job.methods)
+    return tuple(jobs.MethodOutcome(job.scene, part.name, error=line) for part in job.methods)
 
 
-def scores_again(job: SceneJob, part: Part, encoder: Encoder) -> dict[str, SceneScore]:
+def scores_again(job: jobs.SceneJob, part: jobs.Part, encoder: interfaces.Encoder) -> dict[str, SceneScore]:
     """What the map that ``job.folder`` holds of ``part`` scores, by protocol; nothing is written."""
     folder = RunFolder(job.folder).job(job.scene, part.name)
     scores, _ = _Scene(job, lambda event: None).scores(part, encoder, read_prediction(folder.prediction), folder)
     return scores
 
 
-def _guarded(scene: _Scene, part: Part) -> MethodOutcome:
+def _guarded(scene: _Scene, part: jobs.Part) -> jobs.MethodOutcome:
     """The one place where a scene's failure, of whatever kind, becomes a record instead of the end of the sweep."""
     job = scene.job
     folder = RunFolder(job.folder).job(job.scene, part.name)
@@ -139,7 +100,7 @@ def _guarded(scene: _Scene, part: Part) -> MethodOutcome:
         name = printable(job.scene)
         line = line if line.startswith(name) else f"{name}: {line}"
         log.lines.append("".join(traceback.format_exception(error)) + f"failed: {line}")
-        outcome = MethodOutcome(job.scene, part.name, error=line)
+        outcome = jobs.MethodOutcome(job.scene, part.name, error=line)
     finally:
         package.removeHandler(log)
     if outcome.error is not None:
@@ -147,17 +108,33 @@ def _guarded(scene: _Scene, part: Part) -> MethodOutcome:
     return outcome
 
 
+def perception_of(job: jobs.SceneJob, info: SceneInfo, marked: Callable[[], Any] = lambda: None) -> Perception:
+    """What sees the frames of a scene; ``marked`` gives what perfect masks are made from."""
+    config: PerceptionConfig = PerceptionConfig.model_validate_json(job.perception)
+    profile = resolve_profile(job.config.profile, info.image_domain, config)
+    return build_perception(
+        profile,
+        config,
+        scene=info,
+        cache_root=job.cache_root,
+        mesh=marked() if profile == "oracle" else None,
+        job_index=job.index,
+        replies=job.folder / "language",
+        is_offline=job.config.offline,
+    )
+
+
 class _Scene:
     """One scene with what its methods share: the dataset, the truth."""
 
-    def __init__(self, job: SceneJob, report: Report) -> None:
+    def __init__(self, job: jobs.SceneJob, report: Report) -> None:
         self.job = job
         self.report = report
         self._truths: dict[str, GroundTruth] = {}
 
     @cached_property
     def dataset(self) -> Any:
-        return build_dataset(self.job.dataset, self.job.data_root)
+        return jobs.build_dataset(self.job.dataset, self.job.data_root)
 
     @cached_property
     def data_digest(self) -> str:
@@ -169,23 +146,20 @@ class _Scene:
         """What perfect masks are made from: the annotated mesh, or else the boxes of objects."""
         try:
             mesh: InstanceMesh = self.dataset.instance_mesh(self.job.scene_name)
-        except GroundTruthMissing as error:
-            try:
-                boxes = self.truth("boxes").boxes
-            except GroundTruthMissing:
-                boxes = None
-            if boxes is None:
-                raise error from None
-            return boxes
-        return mesh
+            return mesh
+        except GroundTruthMissing:
+            with suppress(GroundTruthMissing):
+                if (boxes := self.truth("boxes").boxes) is not None:
+                    return boxes
+            raise
 
-    def says(self, part: Part, doing: str) -> None:
+    def says(self, part: jobs.Part, doing: str) -> None:
         """What is done now, where no frame is fed."""
         self.report(Event(self.job.scene, part.name, doing=doing))
 
     @cached_property
     def is_rendered(self) -> bool:
-        return isinstance(self.dataset, RendersFrames) and self.dataset.renders_frames
+        return bool(getattr(self.dataset, "renders_frames", False))
 
     @property
     def opening(self) -> str:
@@ -209,53 +183,33 @@ class _Scene:
         raise missing[0]
 
     @cached_property
-    def perception_config(self) -> PerceptionConfig:
-        config: PerceptionConfig = PerceptionConfig.model_validate_json(self.job.perception)
-        return config
-
-    @cached_property
     def solver(self) -> MapSolver | None:
         """Who answers questions about maps; None: the built-in solver."""
-        if self.job.solver == "built-in":
+        if self.job.config.solver == "built-in":
             return None
-        config = self.perception_config.language
-        client = ChatClient(config, ReplyStore(self.job.folder / "language"), offline=self.job.is_offline)
+        config = PerceptionConfig.model_validate_json(self.job.perception).language
+        client = ChatClient(config, ReplyStore(self.job.folder / "language"), offline=self.job.config.offline)
         return by_language_model(client, config)
 
-    def perception(self, info: SceneInfo) -> Perception:
-        config = self.perception_config
-        profile = resolve_profile(self.job.profile, info.image_domain, config)
-        marked = self.marked if profile == "oracle" else None
-        return build_perception(
-            profile,
-            config,
-            scene=info,
-            cache_root=self.job.cache_root,
-            mesh=marked,
-            job_index=self.job.index,
-            replies=self.job.folder / "language",
-            is_offline=self.job.is_offline,
-        )
-
-    def run(self, part: Part, folder: JobFolder, log: SceneLog) -> MethodOutcome:
+    def run(self, part: jobs.Part, folder: JobFolder, log: SceneLog) -> jobs.MethodOutcome:
         """Predict and score one method, each step only where its seal is missing or broken."""
         self.says(part, self.opening)
-        method = build_method(part)
-        info = self.dataset.info(self.job.scene_name, stride_of(self.job.stride, part.options))
-        info = replace(info, seed=self.job.seed)
-        perception = self.perception(info)
-        config = config_key(self.job, part, method)
-        inputs = JobInputs(self.job, part.name, config, method, info, perception, self.data_digest)
+        method = jobs.build_method(part)
+        info = self.dataset.info(self.job.scene_name, jobs.stride_of(self.job, part))
+        info = replace(info, seed=self.job.config.seed)
+        perception = perception_of(self.job, info, lambda: self.marked)
+        config = jobs.config_key(self.job, part, method)
+        inputs = jobs.JobInputs(self.job, part.name, config, method, info, perception, self.data_digest)
         key = inputs.predict_key()
         if self.job.replaces and folder.changed_field("predict", key) is not None:
             folder.remove()
             folder.prepare()
-        refuse_other_run(folder, key)
+        jobs.refuse_other_run(folder, key)
         was_resumed = folder.is_done("predict", key)
         if was_resumed:
             log.recall(folder.remarks("predict"))
         else:
-            self._predict(part, info, perception, folder, key, log)
+            self._predict(part, inputs, folder, key, log)
         score_key = inputs.score_key(key, folder)
         if not inputs.is_scored(folder, folder.seals().get("score"), score_key):
             self._score(part, perception, folder, score_key, log)
@@ -263,31 +217,30 @@ class _Scene:
         return inputs.outcome(folder.remarks("score"), was_resumed=was_resumed)
 
     def _predict(
-        self,
-        part: Part,
-        info: SceneInfo,
-        perception: Perception,
-        folder: JobFolder,
-        key: Mapping[str, str],
-        log: SceneLog,
+        self, part: jobs.Part, inputs: jobs.JobInputs, folder: JobFolder, key: Mapping[str, str], log: SceneLog
     ) -> None:
         """Feed a method that is made anew, so that what it does when it is made is timed too, and seal its map."""
         clock = MethodClock()
         with clock.running("start"):
-            method: Method = build_method(part)
+            method: interfaces.Method = jobs.build_method(part)
         frames: Sequence[Frame] = ()
-        n = 0
-        doubts = self._doubts(method)
+        n, shares, doubts = 0, tuple[float, ...](), tuple[str, ...]()
+        if method.needs.frames:
+            shares, doubts = self.job.config.shares, self.job.doubts or ()
+            frames = self.dataset.frames(self.job.scene_name, inputs.info.stride)
+            n = min(len(frames), self.job.config.limit or len(frames))
         for line in doubts:
             logger.warning("%s", line)
-        if method.needs.frames:
-            frames = self.dataset.frames(self.job.scene_name, info.stride)
-            n = min(len(frames), self.job.limit or len(frames))
-        if isinstance(method, TakesTools):
-            tools = self._tools(method, perception, frames, n, clock)
+        if isinstance(method, interfaces.TakesTools):
+            tools = interfaces.SceneTools(
+                frames=frame_loop.FirstFrames(frames, n),
+                regions=frame_loop.TimedRegions(inputs.perception.regions(), clock),
+                surface=partial(frame_loop.surface_of, self.dataset, self.job.scene_name),
+                true_proposals=self._true_proposals if method.needs.true_proposals else None,
+            )
             with clock.running("start"):
                 method.receive_tools(tools)
-        if isinstance(method, TakesTruth):
+        if isinstance(method, interfaces.TakesTruth):
             if not self.dataset.variants:
                 raise GroundTruthMissing(f"{self.job.scene}: {method.name} needs ground truth, the dataset has none")
             truth = self.first_truth
@@ -297,20 +250,23 @@ class _Scene:
         _warm_up(part)
         self.says(part, self.opening)
         start_memory_watch()
-        feeding = Feeding(
-            self.job.scene, method, perception, lambda event: self.report(replace(event, label=part.name)), clock
+        feeding = frame_loop.Feeding(
+            self.job.scene, method, inputs.perception, lambda event: self.report(replace(event, label=part.name)), clock
         )
-        shares = self.job.anytime if method.needs.frames else ()
-        with _closed_at_the_end(method, clock):
+        try:
             with clock.running("start"):
-                method.start(info)
-            with ReadAhead(frames, n, n_ahead=0 if self.is_rendered else N_AHEAD) as ahead:
+                method.start(inputs.info)
+            with frame_loop.ReadAhead(frames, n, n_ahead=0 if self.is_rendered else frame_loop.N_AHEAD) as ahead:
                 for share in shares:
                     feeding.up_to(math.ceil(share * n), ahead, n)
                     feeding.write_map(folder.anytime(share))
                 feeding.up_to(n, ahead, n)
             self.says(part, "finishing the map")
             feeding.write_map(folder.prediction)
+        finally:
+            if isinstance(method, interfaces.Closes):
+                with clock.running("close"):
+                    method.close()
         write_text(folder.updates, feeding.updates_text())
         files = [folder.prediction, folder.updates, *map(folder.anytime, shares)]
         costs = {
@@ -323,37 +279,24 @@ class _Scene:
         }
         folder.seal("predict", key, files, {"costs": costs, REMARK: doubts} | log.remarks())
 
-    def _doubts(self, method: Method) -> tuple[str, ...]:
-        return (self.job.doubts or ()) if method.needs.frames else ()
-
-    def _tools(
-        self, method: Method, perception: Perception, frames: Sequence[Frame], n: int, clock: MethodClock
-    ) -> SceneTools:
-        return SceneTools(
-            frames=FirstFrames(frames, n),
-            regions=TimedRegions(perception.regions(), clock),
-            surface=partial(surface_of, self.dataset, self.job.scene_name),
-            true_proposals=self._true_proposals if method.needs.true_proposals else None,
-        )
-
     def _true_proposals(self) -> Proposals:
         if not self.dataset.variants:
             raise GroundTruthMissing(f"{self.job.scene}: proposals 'oracle' need ground truth, the dataset has none")
-        return true_proposals(self.truth(self.dataset.variants[0]))
+        return frame_loop.true_proposals(self.truth(self.dataset.variants[0]))
 
     def _score(
-        self, part: Part, perception: Perception, folder: JobFolder, key: Mapping[str, str], log: SceneLog
+        self, part: jobs.Part, perception: Perception, folder: JobFolder, key: Mapping[str, str], log: SceneLog
     ) -> None:
         """Score under every protocol that has a truth here, draw the map, and seal; reasons for the others go along."""
         prediction = read_prediction(folder.prediction)
         scores, unscored = self.scores(part, perception.encoder, prediction, folder)
         files = [folder.counts]
         write_bytes(folder.counts, pack_scores(scores))
-        for share in self.job.anytime if build_method(part).needs.frames else ():
+        for share in self.job.config.shares if jobs.build_method(part).needs.frames else ():
             early, _ = self.scores(part, perception.encoder, read_prediction(folder.anytime(share)), None)
             write_bytes(folder.anytime_counts(share), pack_scores(early))
             files.append(folder.anytime_counts(share))
-        if self.job.pictures:
+        if self.job.config.pictures:
             self.says(part, "drawing the map")
             truth_to_draw = next((known for known in self._truths.values() if isinstance(known, GroundTruth)), None)
             files += draw_scene(prediction, truth_to_draw, folder.pictures, f"{self.job.scene}, {part.name}")
@@ -364,7 +307,7 @@ class _Scene:
         folder.seal("score", key, [*files, folder.log], remarks)
 
     def scores(
-        self, part: Part, encoder: Encoder, prediction: Prediction, refined_in: JobFolder | None
+        self, part: jobs.Part, encoder: interfaces.Encoder, prediction: Prediction, refined_in: JobFolder | None
     ) -> tuple[dict[str, SceneScore], dict[str, str]]:
         """The scores under every protocol that can score the map, and why the others cannot."""
         scores: dict[str, SceneScore] = {}
@@ -381,7 +324,7 @@ class _Scene:
                 unscored[rules.name] = reason
                 continue
             self.says(part, f"scoring {n} of {counted(len(self.job.protocols), 'protocol')}")
-            told = as_told(part, rules, truth, prediction, lambda: self.first_truth.labels)
+            told = jobs.as_told(part, rules, truth, prediction, lambda: self.first_truth.labels)
             known = self._truth_of(rules, truth, refined_in)
             scores[rules.name] = score_scene(rules, known, told, encoder)
         return scores, unscored

@@ -19,40 +19,31 @@ import numpy as np
 from su3d_bench.core.digests import code_digest, git_state, package_versions
 from su3d_bench.core.errors import printable
 from su3d_bench.core.files.atomic import is_file
-from su3d_bench.core.maps import Instances, Partition, Prediction
+from su3d_bench.core.maps import DenseFeatures, Instances
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.core.system.timing import hardware_line, processor_digest
 from su3d_bench.metrics.fitness import labels_counted
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
-from su3d_bench.metrics.metric import SceneScore
+from su3d_bench.metrics.metric import SceneScore, n_predictions
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import EVERY_SCENE, combine, combined_metrics, plain_json, unpack_scores
 from su3d_bench.perception.profiles import PerceptionConfig
 from su3d_bench.reports.tables.run import Found, Unscored, not_scored_lines
 from su3d_bench.runs.finished import FinishedRun, record_of_rules
-from su3d_bench.runs.job import MethodOutcome, SceneJob
+from su3d_bench.runs.job import MethodOutcome
 from su3d_bench.runs.plan import Plan
+from su3d_bench.store import records
 from su3d_bench.store.predictions import read_prediction
-from su3d_bench.store.records import (
-    FailureRecord,
-    GitRecord,
-    MetricsRecord,
-    MidwayRecord,
-    NumbersRecord,
-    ResultRecord,
-    RunRecord,
-    UnscoredRecord,
-    read_updates,
-)
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 Scores = Mapping[tuple[str, str], SceneScore]
+Outcomes = Sequence[MethodOutcome]
 BY_THE_METHOD = "computed by the method"
 
 
-def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> MetricsRecord:
+def summarise(plan: Plan, outcomes: Outcomes) -> records.MetricsRecord:
     """One result a method and protocol, with ceiling and the scenes that are missing.
 
     The counts of one method and of the ceiling are in memory at a time.
@@ -61,7 +52,7 @@ def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> MetricsRecord:
     for outcome in outcomes:
         by_method.setdefault(outcome.method, []).append(outcome)
     perfect = _read_scores(plan, by_method.get(CEILING_METHOD, ()), attrgetter("counts"))
-    rules = {rule.name: rule for rule in _rules(plan)}
+    rules = {rule.name: rule for rule in plan.rules}
 
     @cache
     def ceiling(protocol: str, scenes: tuple[str, ...]) -> Any:
@@ -73,13 +64,13 @@ def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> MetricsRecord:
         scores = perfect if method == CEILING_METHOD else _read_scores(plan, mine, attrgetter("counts"))
         early = {
             share: _read_scores(plan, mine, partial(JobFolder.anytime_counts, share=share))
-            for share in sorted(set(plan.config.anytime))
+            for share in plan.config.shares
         }
         for rule in rules.values():
             result = _result(plan, method, rule, mine, scores, early)
             scored = tuple(result.result.scenes) if result.result else ()
             results[rule.name, method] = replace(result, ceiling=ceiling(rule.name, scored))
-    return MetricsRecord(
+    return records.MetricsRecord(
         is_partial=plan.is_partial,
         limit=plan.config.limit,
         seed=plan.config.seed,
@@ -88,11 +79,7 @@ def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> MetricsRecord:
     )
 
 
-def _rules(plan: Plan) -> list[ProtocolRules]:
-    return [load_protocol(name) for name in dict.fromkeys(name for job in plan.jobs for name in job.protocols)]
-
-
-def _read_scores(plan: Plan, outcomes: Sequence[MethodOutcome], file_of: Callable[[JobFolder], Path]) -> Scores:
+def _read_scores(plan: Plan, outcomes: Outcomes, file_of: Callable[[JobFolder], Path]) -> Scores:
     """(protocol, scene) -> counts, from the files of the outcomes that did not fail and have one."""
     scores: dict[tuple[str, str], SceneScore] = {}
     for outcome in outcomes:
@@ -109,26 +96,23 @@ def _metrics_over(scenes: Sequence[str], rules: ProtocolRules, scores: Scores) -
 
 
 def _result(
-    plan: Plan,
-    method: str,
-    rules: ProtocolRules,
-    outcomes: Sequence[MethodOutcome],
-    scores: Scores,
-    early: Mapping[float, Scores],
-) -> ResultRecord:
+    plan: Plan, method: str, rules: ProtocolRules, outcomes: Outcomes, scores: Scores, early: Mapping[float, Scores]
+) -> records.ResultRecord:
     """The result without its ceiling; the maps midway count where all scenes of the final one are scored."""
-    planned = {job.scene: job for job in plan.jobs if rules.name in _protocol_names(job)}
+    planned = dict.fromkeys(
+        job.scene for job in plan.jobs if any(load_protocol(name).name == rules.name for name in job.protocols)
+    )
     mine = {outcome.scene: outcome for outcome in outcomes if outcome.scene in planned}
     scored = {scene: scores[rules.name, scene] for scene in planned if (rules.name, scene) in scores}
     failed = {scene: mine[scene].error for scene in planned if mine[scene].error is not None}
     scenes = [scene for protocol, scene in scores if protocol == rules.name]
     doubts = tuple(line for scene in sorted(scored) for line in mine[scene].doubts)
-    numbers = NumbersRecord(**combine(rules, scored).to_json()) if scored else None
+    numbers = records.NumbersRecord(**combine(rules, scored).to_json()) if scored else None
     if numbers is not None:
         numbers = replace(numbers, warnings=(*numbers.warnings, *doubts))
     encoder = _join(outcome.encoder for outcome in mine.values() if outcome.profile is not None)
     midway = [(share, _metrics_over(scenes, rules, counts)) for share, counts in early.items()]
-    return ResultRecord(
+    return records.ResultRecord(
         method=method,
         protocol=rules.name,
         version=rules.version,
@@ -143,13 +127,13 @@ def _result(
         unscored=tuple(scene for scene in planned if scene not in scored and scene not in failed),
         ceiling=None,
         result=numbers,
-        anytime=tuple(MidwayRecord(share, metrics) for share, metrics in midway if metrics) if early else None,
+        anytime=tuple(records.MidwayRecord(share, metrics) for share, metrics in midway if metrics) if early else None,
         confidences=None if numbers is None else confidences_of(rules, numbers),
         labels=None if numbers is None else labels_counted(rules, by_features=encoder is not None),
     )
 
 
-def confidences_of(rules: ProtocolRules, numbers: NumbersRecord) -> str | None:
+def confidences_of(rules: ProtocolRules, numbers: records.NumbersRecord) -> str | None:
     """What ranks the predictions of an average precision; None where the protocol forms none."""
     if rules.confidence is None:
         return None
@@ -161,16 +145,12 @@ def confidences_of(rules: ProtocolRules, numbers: NumbersRecord) -> str | None:
     return "the same for all instances of a scene" if are_equal else BY_THE_METHOD
 
 
-def _protocol_names(job: SceneJob) -> list[str]:
-    return [load_protocol(name).name for name in job.protocols]
-
-
 def _join(texts: Iterable[str | None], separator: str = ", ") -> str | None:
     """Each text once; None where there is none."""
     return separator.join(dict.fromkeys(text for text in texts if text)) or None
 
 
-def _model_files(plan: Plan, outcomes: Sequence[MethodOutcome]) -> dict[str, dict[str, str]]:
+def _model_files(plan: Plan, outcomes: Outcomes) -> dict[str, dict[str, str]]:
     """SHA-256 of every weight file of the profiles that the run used, by model and file name."""
     from su3d_bench.perception.models.catalogue import PROFILE_MODELS
     from su3d_bench.perception.models.loading import models_record
@@ -180,14 +160,14 @@ def _model_files(plan: Plan, outcomes: Sequence[MethodOutcome]) -> dict[str, dic
     return models_record(names, PerceptionConfig.model_validate_json(plan.jobs[0].perception).models) if names else {}
 
 
-def record(plan: Plan, outcomes: Sequence[MethodOutcome], status: str) -> RunRecord:
+def record(plan: Plan, outcomes: Outcomes, status: str) -> records.RunRecord:
     """Where the numbers come from."""
     git = git_state()
-    return RunRecord(
+    return records.RunRecord(
         status=status,
         is_partial=plan.is_partial,
         code=code_digest(),
-        git=None if git is None else GitRecord(**git),
+        git=None if git is None else records.GitRecord(**git),
         packages=package_versions(),
         hardware=hardware_line(),
         processor=processor_digest(),
@@ -198,16 +178,14 @@ def record(plan: Plan, outcomes: Sequence[MethodOutcome], status: str) -> RunRec
         encoder=_join(outcome.encoder for outcome in outcomes),
         encoder_digest=_join(outcome.encoder_digest for outcome in outcomes),
         data_digests={outcome.scene: outcome.data_digest for outcome in outcomes if outcome.data_digest is not None},
-        protocols=tuple(map(record_of_rules, _rules(plan))),
+        protocols=tuple(map(record_of_rules, plan.rules)),
         methods=plan.methods,
         scenes=tuple(job.scene for job in plan.jobs),
         failed=tuple(
-            FailureRecord(outcome.scene, outcome.method, outcome.error)
-            for outcome in outcomes
-            if outcome.error is not None
+            records.FailureRecord(one.scene, one.method, one.error) for one in outcomes if one.error is not None
         ),
         unscored=tuple(
-            UnscoredRecord(outcome.scene, outcome.method, *pair) for outcome in outcomes for pair in outcome.unscored
+            records.UnscoredRecord(one.scene, one.method, *pair) for one in outcomes for pair in one.unscored
         ),
         warnings=tuple(dict.fromkeys(line for outcome in outcomes for line in outcome.warnings)),
     )
@@ -216,9 +194,7 @@ def record(plan: Plan, outcomes: Sequence[MethodOutcome], status: str) -> RunRec
 # ---- what must be said
 
 
-def remarks_of(
-    plan: Plan, outcomes: Sequence[MethodOutcome], without_score: Sequence[tuple[str, str]]
-) -> tuple[str, ...]:
+def remarks_of(plan: Plan, outcomes: Outcomes, without_score: Sequence[tuple[str, str]]) -> tuple[str, ...]:
     """What is worth saying of scenes that did not fail: warnings, protocols left out, ceilings that are missing."""
     failed = {outcome.scene for outcome in outcomes if outcome.error is not None and outcome.method in plan.methods}
     lines = [line for outcome in outcomes for line in outcome.warnings]
@@ -238,7 +214,7 @@ def remarks_of(
     return tuple(dict.fromkeys(lines))
 
 
-def outcomes_without_score(plan: Plan, outcomes: Sequence[MethodOutcome]) -> list[tuple[str, str]]:
+def outcomes_without_score(plan: Plan, outcomes: Outcomes) -> list[tuple[str, str]]:
     """(scene, method) of what did not fail and that no protocol scored."""
     n_protocols = {job.scene: len(job.protocols) for job in plan.jobs}
     return [
@@ -262,16 +238,18 @@ def found_in(folder: RunFolder, jobs: Iterable[tuple[str, str]]) -> Iterator[Fou
         job = folder.job(scene, method)
         if is_file(job.prediction):
             where = f"{printable(scene, 120)}: {job.updates.name}"
-            columns = read_updates(job.updates, where) if is_file(job.updates) else {}
+            columns = records.read_updates(job.updates, where) if is_file(job.updates) else {}
             times = columns.get("total_ms", np.zeros(0))
             prediction = read_prediction(job.prediction)
+            objects = prediction if isinstance(prediction, Instances) else None
+            n_instances = None if isinstance(prediction, DenseFeatures) else n_predictions(prediction)
             yield Found(
                 scene=printable(scene, 200),
                 method=printable(method, 200),
                 n_points=len(prediction.points),
-                n_instances=_n_instances(prediction),
-                names=_names(prediction),
-                extents_m=_extents_m(prediction),
+                n_instances=n_instances,
+                names=() if objects is None else _names(objects),
+                extents_m=None if objects is None or not n_instances else _extents_m(objects),
                 n_updates=len(times),
                 update_ms=float(np.median(times)) if len(times) else None,
             )
@@ -285,22 +263,12 @@ def without_score(run: FinishedRun) -> list[tuple[str, str]]:
     return [(scene, method) for scene in run.scenes for method in run.methods if (scene, method) not in told]
 
 
-def _n_instances(prediction: Prediction) -> int | None:
-    if isinstance(prediction, Instances):
-        return len(prediction)
-    return len(prediction.features) if isinstance(prediction, Partition) else None
-
-
-def _names(prediction: Prediction) -> tuple[tuple[str, int], ...]:
-    if not isinstance(prediction, Instances):
-        return ()
+def _names(prediction: Instances) -> tuple[tuple[str, int], ...]:
     labels = prediction.labels or ("",) * len(prediction)
     names = (printable(label or name, MOST_OF_A_NAME) for label, name in zip(labels, prediction.names, strict=True))
     return tuple(Counter(names).most_common())
 
 
-def _extents_m(prediction: Prediction) -> tuple[float, float, float] | None:
-    if not isinstance(prediction, Instances) or not len(prediction):
-        return None
+def _extents_m(prediction: Instances) -> tuple[float, float, float]:
     longest = np.sort(np.ptp(prediction.boxes, axis=1).max(axis=1).astype(np.float64))
     return float(longest[0]), float(np.median(longest)), float(longest[-1])

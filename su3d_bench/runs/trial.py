@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -71,22 +72,20 @@ def try_dataset(dataset: Any, scene: str) -> None:
     """
     if is_ours(type(dataset)):
         return
-    with suppress(DataError, OSError):
-        _try_frames(dataset, scene)
-    with suppress(DataError, OSError):
-        dataset.files(scene)
-    with suppress(DataError, OSError):
-        dataset.digest(scene)
-    for variant in dataset.variants:
+    asked = [partial(_try_frames, dataset), dataset.files, dataset.digest]
+    asked += [partial(_try_truth, dataset, variant) for variant in dataset.variants]
+    for ask in (*asked, dataset.instance_mesh):
         with suppress(DataError, OSError):
-            truth = dataset.ground_truth(scene, variant)
-            if truth.labels.space != dataset.label_space:
-                raise PlugInError(
-                    f"{_place(dataset, 'ground_truth')}: its labels are of '{truth.labels.space}', and the class says "
-                    f"label_space = '{dataset.label_space}'"
-                )
-    with suppress(DataError, OSError):
-        dataset.instance_mesh(scene)
+            ask(scene)
+
+
+def _try_truth(dataset: Any, variant: str, scene: str) -> None:
+    space = dataset.ground_truth(scene, variant).labels.space
+    if space != dataset.label_space:
+        raise PlugInError(
+            f"{_place(dataset, 'ground_truth')}: its labels are of '{space}', and the class says label_space = "
+            f"'{dataset.label_space}'"
+        )
 
 
 def _try_frames(dataset: Any, scene: str) -> None:

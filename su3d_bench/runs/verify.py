@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any
 
+from su3d_bench.core.config import flatten
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, Su3dError, printable
 from su3d_bench.core.files.atomic import is_file
@@ -34,10 +34,10 @@ def contradiction(said: NumbersRecord, counted: ProtocolResult) -> str | None:
         return f"it has {len(said.scenes)} scenes, the counts {len(counted.scenes)}"
     record, numbers = plain(said), counted.to_json()
     for table in SAID:
-        for where, value in _leaves(record[table]):
-            known = _at(numbers[table], where)
-            if known is _NOTHING or not _agree(value, known):
-                shown = "nothing" if known is _NOTHING else _shown(known)
+        known = dict(flatten(numbers[table]))
+        for where, value in flatten(record[table]):
+            if where not in known or not _agree(value, known[where]):
+                shown = _shown(known[where]) if where in known else "nothing"
                 return f"{table}.{'.'.join(where)} is {_shown(value)}, the counts give {shown}"
     for name in counted.headline:
         rows = {"metrics": said.metrics, **{f"per_scene.{scene}": said.per_scene.get(scene) for scene in said.scenes}}
@@ -47,33 +47,12 @@ def contradiction(said: NumbersRecord, counted: ProtocolResult) -> str | None:
     return None
 
 
-_NOTHING = object()
+def _agree(said: float | None, known: float | None) -> bool:
+    return said is known if said is None or known is None else abs(said - known) <= ROUNDING
 
 
-def _leaves(value: Any, where: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], float | None]]:
-    if isinstance(value, Mapping):
-        for key, item in value.items():
-            yield from _leaves(item, (*where, key))
-    else:
-        yield where, value
-
-
-def _at(value: Any, where: tuple[str, ...]) -> Any:
-    for key in where:
-        if not isinstance(value, Mapping) or key not in value:
-            return _NOTHING
-        value = value[key]
-    return value
-
-
-def _agree(said: float | None, known: Any) -> bool:
-    if said is None or known is None:
-        return said is known
-    return not isinstance(known, Mapping) and abs(said - known) <= ROUNDING
-
-
-def _shown(value: Any) -> str:
-    return "undefined" if value is None else f"{value:.12g}" if isinstance(value, float | int) else "a table"
+def _shown(value: float | None) -> str:
+    return "undefined" if value is None else f"{value:.12g}"
 
 
 def why_not_counted(run: FinishedRun, method: str, protocol: str, scores: Mapping[str, SceneScore]) -> str | None:
@@ -101,20 +80,16 @@ def damaged_files(run: FinishedRun) -> Iterator[tuple[str, str]]:
 
 
 def _damage(job: JobFolder) -> str | None:
-    seals = job.seals()
-    sealed = {
-        name: digest for step in ("predict", "score") if step in seals for name, digest in seals[step].files.items()
-    }
-    for file in (job.prediction, job.updates, job.counts):
+    sealed: dict[str, str] = {}
+    for seal in job.seals().values():
+        sealed |= seal.files
+    for file in (job.prediction, features_beside(job.prediction), job.updates, job.counts):
         if file.name not in sealed:
-            return f"done.json does not vouch for {file.name}"
-    beside = features_beside(job.prediction)
-    for file in dict.fromkeys((job.prediction, beside, job.updates, job.counts)):
-        if file.name not in sealed:
-            continue
-        if not is_file(file):
+            if file != features_beside(job.prediction):
+                return f"done.json does not vouch for {file.name}"
+        elif not is_file(file):
             return f"{file.name} is missing"
-        if digest_file(file) != sealed[file.name]:
+        elif digest_file(file) != sealed[file.name]:
             return f"{file.name} is not the file that the run wrote"
     try:
         read_stored(job.prediction)

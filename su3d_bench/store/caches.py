@@ -18,7 +18,6 @@ from su3d_bench.core.files.atomic import remove_file
 from su3d_bench.core.files.locks import is_held
 
 MEGABYTE, GIGABYTE = 10**6, 10**9
-LARGE_BYTES = 20 * GIGABYTE  # of kept perception: a thousand scenes of 150 frames, and a tenth of a common disk
 _HEX = "[0-9a-f]"
 SMALL_BYTES = 1 << 16  # a kept kernel has about as many: a full disk takes none
 
@@ -60,39 +59,25 @@ def _takes_files(folder: Path) -> bool:
 class CacheKind:
     """One kind of what the cache folder keeps: the folder's name, the form of a file's path in it, and what it is.
 
-    ``is_paid``: it is not computed again but asked for anew, which may cost money.
+    ``form`` is a regular expression. ``is_paid``: it is not computed again but asked for anew, which may cost money.
     """
 
     name: str
-    form: re.Pattern[str]
+    form: str
     what: str
     is_paid: bool = False
 
 
-KINDS = {
-    kind.name: kind
-    for kind in (
-        CacheKind(
-            "perception",
-            re.compile(f"{_HEX}{{2}}/{_HEX}{{64}}\\.npz"),
-            "what was found in frames: runs over the same frames are many times as fast",
-        ),
-        CacheKind(
-            "model-digests", re.compile(f"{_HEX}{{32}}\\.json"), "digests of weights, which take seconds a gigabyte"
-        ),
-        CacheKind(
-            "runs",
-            re.compile(f"[^/]*-{_HEX}{{8}}/(run\\.toml|[a-z]+\\.json|(scenes|language)/.+|\\.lock)"),
-            "the small files of runs that are kept in a store such as s3://",
-        ),
-        CacheKind(
-            "replies",
-            re.compile(f"(images/)?{_HEX}+\\.(json|png)"),
-            "replies of language models outside a run, which may have cost money",
-            is_paid=True,
-        ),
-    )
-}
+_PERCEPTION = f"{_HEX}{{2}}/{_HEX}{{64}}\\.npz"
+_RUN = f"[^/]*-{_HEX}{{8}}/(run\\.toml|[a-z]+\\.json|(scenes|language)/.+|\\.lock)"
+_REPLY = f"(images/)?{_HEX}+\\.(json|png)"
+_KINDS = (
+    CacheKind("perception", _PERCEPTION, "what was found in frames: runs over the same frames are many times as fast"),
+    CacheKind("model-digests", f"{_HEX}{{32}}\\.json", "digests of weights, which take seconds a gigabyte"),
+    CacheKind("runs", _RUN, "the small files of runs that are kept in a store such as s3://"),
+    CacheKind("replies", _REPLY, "replies of language models outside a run, which may have cost money", is_paid=True),
+)
+KINDS = {kind.name: kind for kind in _KINDS}
 
 
 @dataclass(frozen=True)
@@ -113,7 +98,7 @@ def cache_entries(root: Path, kind: CacheKind) -> Iterator[CacheEntry]:
             name = path.relative_to(top).as_posix()
             with suppress(FileNotFoundError):  # gone meanwhile
                 status = path.lstat()
-                if stat.S_ISREG(status.st_mode) and kind.form.fullmatch(name):
+                if stat.S_ISREG(status.st_mode) and re.fullmatch(kind.form, name):
                     yield CacheEntry(name, status.st_size, status.st_mtime)
 
 
@@ -133,24 +118,6 @@ def clear_cache(root: Path, kind: CacheKind, *, before: float = math.inf) -> tup
         remove_file(top / entry.name)
         n_files, n_bytes = n_files + 1, n_bytes + entry.n_bytes
     return n_files, n_bytes
-
-
-def why_large(root: Path) -> str | None:
-    """A line that says that much perception is kept, and what to do; None where it is not much.
-
-    Told from an eighth of its folders, over which keys spread evenly, for a run should not wait for it.
-    """
-    kept = KINDS["perception"]
-    n_bytes = 0
-    for name in (f"{first:x}{second:x}" for first in range(16) for second in (0, 8)):
-        with suppress(OSError), os.scandir(root / kept.name / name) as entries:
-            n_bytes += 8 * sum(entry.stat(follow_symlinks=False).st_size for entry in entries)
-    if n_bytes < LARGE_BYTES:
-        return None
-    return (
-        f"{shown(root)}: keeps about {size_text(n_bytes)} of perception; to keep what is young alone: "
-        "su3d-bench dev cache clear perception --older-than 30"
-    )
 
 
 def size_text(n_bytes: int) -> str:

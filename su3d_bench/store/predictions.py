@@ -9,45 +9,36 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import PredictionError, StoreError, counted
+from su3d_bench.core.errors import PredictionError, StoreError
 from su3d_bench.core.files.atomic import DAMAGE, read_npz, remove_file, replacing, row_blocks, write_npz
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.core.system.files import regular
 
 MOST_TEXTS = 1 << 20  # of one field; each becomes an object of its own
 ROWS_AT_ONCE = 8192  # 16 MB of half precision at 1024 dimensions
-# Dimensions and kinds of values of each field of a stored prediction, in the order of the file.
-FIELDS = {
-    "points": (2, "f"),
-    "indptr": (1, "i"),
-    "indices": (1, "i"),
-    "scores": (1, "f"),
-    "instance": (1, "i"),
-    "features": (2, "f"),
-    "labels": (1, "U"),
-    "names": (1, "U"),
-    "captions": (1, "U"),
-    "boxes": (3, "f"),
-    "centroids": (2, "f"),
-    "view_indptr": (1, "i"),
-    "views": (2, "i"),
-    "ids": (1, "i"),
-    "view_names": (1, "U"),
-    "view_scores": (1, "f"),
-    "further_labels": (2, "U"),
-    "edges": (2, "i"),
-    "edge_scores": (2, "f"),
-    "predicates": (1, "U"),
+# Kind of values and shape of each field of a stored prediction, None for any length, in the order of the file.
+FIELDS: dict[str, tuple[str, tuple[int | None, ...]]] = {
+    "points": ("f", (None, 3)),
+    "indptr": ("i", (None,)),
+    "indices": ("i", (None,)),
+    "scores": ("f", (None,)),
+    "instance": ("i", (None,)),
+    "features": ("f", (None, None)),
+    "labels": ("U", (None,)),
+    "names": ("U", (None,)),
+    "captions": ("U", (None,)),
+    "boxes": ("f", (None, 2, 3)),
+    "centroids": ("f", (None, 3)),
+    "view_indptr": ("i", (None,)),
+    "views": ("i", (None, 2)),
+    "ids": ("i", (None,)),
+    "view_names": ("U", (None,)),
+    "view_scores": ("f", (None,)),
+    "further_labels": ("U", (None, None)),
+    "edges": ("i", (None, 2)),
+    "edge_scores": ("f", (None, None)),
+    "predicates": ("U", (None,)),
 }
-
-
-ROWS = {
-    "points": (3,),
-    "boxes": (2, 3),
-    "centroids": (3,),
-    "views": (2,),
-    "edges": (2,),
-}  # the shape of each row, where it is fixed
 # Kinds of what is kept of predictions over the points of files that have no coordinates; ``predictions.own_runs`` reads
 # them.
 OVER_VERTICES = ("VertexMasks", "VertexLabels")
@@ -87,10 +78,8 @@ def prediction_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Pr
     for name in _fields_of(kind):
         value = arrays.get(name)
         values[name] = _texts(value) if value is not None and value.dtype.kind == "U" else value
-    optional = {
-        "features", "labels", "view_names", "view_scores", "further_labels", "edges", "edge_scores", "predicates"
-    }  # fmt: skip
-    missing = [name for name, value in values.items() if value is None and name not in optional]
+    types = {name: str(field.type) for name, field in kind.__dataclass_fields__.items()}
+    missing = [name for name, value in values.items() if value is None and "None" not in types[name]]
     if missing:
         raise PredictionError(f"{where}: lacks '{missing[0]}'; write it again with su3d-bench run")
     prediction: Prediction = kind(**values)
@@ -105,13 +94,11 @@ def array_fault(arrays: Mapping[str, NDArray[Any]]) -> str | None:
     """Which array of a prediction has another shape or kind of values than it must, and what it must have."""
     kinds = {"f": "floats", "i": "integers", "U": "texts"}
     for name in (name for name in FIELDS if name in arrays):
-        array, (n_dimensions, kind) = np.asarray(arrays[name]), FIELDS[name]
-        if array.ndim != n_dimensions or array.dtype.kind != kind or (name == "indptr" and not array.size):
-            wanted = f"{kinds[kind]} in {counted(n_dimensions, 'dimension')}"
+        array, (kind, shape) = np.asarray(arrays[name]), FIELDS[name]
+        fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
+        if not fits or array.dtype.kind != kind or (name == "indptr" and not array.size):
+            wanted = f"{kinds[kind]} ({', '.join('N' if n is None else str(n) for n in shape)})"
             return f"'{name}' is an array of shape {array.shape} {array.dtype.name}, not {wanted}"
-        if array.shape[1:] != ROWS.get(name, array.shape[1:]):
-            wanted = ", ".join(map(str, ("N", *ROWS[name])))
-            return f"'{name}' is an array of shape {array.shape}, not ({wanted})"
     return None
 
 

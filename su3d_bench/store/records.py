@@ -123,49 +123,42 @@ class GitRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class RunRecord:
-    """``run.json``: where the numbers come from. ``models`` holds the SHA-256 of weight files by model and file name.
+    """``run.json``: where the numbers come from; that of a run that is not finished, or of an older version, says less.
+
+    ``models`` holds the SHA-256 of weight files by model and file name.
 
     ``status`` is ``running``, ``interrupted``, ``incomplete`` or ``complete``. ``predictions`` are those that were made
     elsewhere, ``ground_truth`` what they were held against.
     """
 
     schema: int = SCHEMA
-    status: str
-    is_partial: bool
-    code: str
+    status: str = ""
+    is_partial: bool = False
+    code: str = ""
     git: GitRecord | None = None
     packages: Mapping[str, str] = field(default_factory=dict)
-    hardware: str
+    hardware: str = ""
     processor: str = ""
     n_workers: int = 1
     seed: int | None = None
-    profile: str | None
+    profile: str | None = None
     models: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     encoder: str | None = None
-    encoder_digest: str | None
-    data_digests: Mapping[str, str]
-    protocols: tuple[ProtocolRecord, ...]
-    methods: Annotated[tuple[str, ...], Field(min_length=1)]
-    scenes: tuple[str, ...]
+    encoder_digest: str | None = None
+    data_digests: Mapping[str, str] = field(default_factory=dict)
+    protocols: tuple[ProtocolRecord, ...] = ()
+    methods: tuple[str, ...] = ()
+    scenes: tuple[str, ...] = ()
     failed: tuple[FailureRecord, ...] = ()
     unscored: tuple[UnscoredRecord, ...] = ()
     warnings: tuple[str, ...] = ()
     predictions: tuple[PredictionsRecord, ...] = ()
     ground_truth: TruthRecord | None = None
 
-
-@dataclass(frozen=True, kw_only=True)
-class RequestRecord:
-    """What ``run.json`` says of a run that may not be finished."""
-
-    status: str = ""
-    profile: str | None = None
-    encoder: str | None = None
-    encoder_digest: str | None = None
-    protocols: tuple[ProtocolRecord, ...] = ()
-    methods: tuple[str, ...] = ()
-    scenes: tuple[str, ...] = ()
-    ground_truth: TruthRecord | None = None
+    @property
+    def truth_files(self) -> str | None:
+        """The folder of ground truth that predictions were compared with in place of a dataset."""
+        return None if self.ground_truth is None else self.ground_truth.path
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,10 +248,10 @@ class CostsRecord:
     numbers of a map.
     """
 
-    maps: tuple[MapCost, ...]
-    calibration_ms: Amount | None
-    peak_rss_bytes: Count | None
-    device_bytes: Count | None
+    maps: tuple[MapCost, ...] = ()
+    calibration_ms: Amount | None = None
+    peak_rss_bytes: Count | None = None
+    device_bytes: Count | None = None
     start_ms: Amount | None = None
     close_ms: Amount | None = None
 
@@ -272,10 +265,8 @@ class SealRecord:
     remarks: Mapping[str, Any]
 
 
-OUT_OF_RANGE = ("value_error", "greater_than_equal", "less_than_equal")
-
 _ADAPTERS: dict[Any, TypeAdapter[Any]] = {
-    kind: TypeAdapter(kind) for kind in (RunRecord, RequestRecord, MetricsRecord, CostsRecord, SealRecord)
+    kind: TypeAdapter(kind) for kind in (RunRecord, MetricsRecord, CostsRecord, SealRecord)
 }
 
 
@@ -303,19 +294,13 @@ def read_record(kind: type[Kind], file: Path, shown: str) -> Kind:
     """The record in ``file``; ``shown`` begins the ``StoreError`` where it holds none."""
     try:
         return checked(kind, read_json(file))
-    except RecursionError as error:
-        raise StoreError(f"{shown}: {file.name}: is nested too deep for a record of a run; run it again") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = printable(".".join(map(str, first["loc"])), 120)
-        if first["type"] == "finite_number":
-            what = f"{file.name} is not as a run writes it: {key} is no finite number"
-        elif first["type"] in OUT_OF_RANGE:
-            fault = str(first.get("ctx", {}).get("error", f"it is {first['input']}"))
-            what = f"{file.name} is not as a run writes it: {key}: {printable(fault, 160)}"
-        else:
-            what = f"{file.name}: {key or 'it'} is not as a run writes it"
-        raise StoreError(f"{shown}: {what}; run it again") from error
+    except (RecursionError, ValidationError) as error:
+        key, reason = "it", "nested too deep"
+        if isinstance(error, ValidationError):
+            first = error.errors()[0]
+            key, reason = ".".join(map(str, first["loc"])) or "it", first["msg"].removeprefix("Value error, ")
+        what = f"{printable(key, 120)} is not as a run writes it ({printable(reason, 160)})"
+        raise StoreError(f"{shown}: {file.name}: {what}; run it again") from error
 
 
 def updates_text(rows: Sequence[Mapping[str, float | int]]) -> str:

@@ -137,9 +137,7 @@ class RunFolder:
                 os.rename(self.path, place)
             except OSError as error:
                 reason = error.strerror or error
-                raise StoreError(
-                    f"{shown(self.path)}: cannot be removed: {reason}; nothing in it was changed"
-                ) from error
+                raise StoreError(f"{shown(self.path)}: cannot be removed: {reason}; nothing was changed") from error
             shutil.rmtree(place, ignore_errors=True)
         if place.exists():
             raise StoreError(f"{shown(place)}: a part of what was removed cannot be; remove it yourself")

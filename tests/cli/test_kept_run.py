@@ -14,7 +14,6 @@ from places import SCENES
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.digests import digest_file
-from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import scene as scene_run
 
 PAINTED = f"{SCENES}/painted.py:Painted"
@@ -72,8 +71,7 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def _painted(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for module in (scene_run, finished_scenes):
-        monkeypatch.setattr(module, "build_perception", colour_perception)
+    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
     monkeypatch.chdir(kept)
     monkeypatch.setenv("SU3D_CACHE", str(kept / "cache"))
     monkeypatch.setenv("SU3D_MODELS", str(kept / "no-models"))

@@ -52,7 +52,7 @@ METHODS = {
         'masks="boxes"',
         "needs: masks is 'boxes'; 'grounded', 'class-agnostic', 'none'",
     ),
-    "no map": ("return Instances.of", "Instances.of", "MyMethod.finish gave None; an Instances or a Partition or"),
+    "no map": ("return Instances.of", "Instances.of", "MyMethod.finish gave None; expected Instances or Partition"),
     "undefined scores": (
         "np.ones(len(kept))",
         "np.full(len(kept), np.nan)",
@@ -71,7 +71,7 @@ def test_a_mistake_in_a_method(mistake: str, capsys: pytest.CaptureFixture[str])
 
 
 DATASETS = {
-    "no info": ("return SceneInfo(", "SceneInfo(", "MyDataset.info gave None; a SceneInfo is expected"),
+    "no info": ("return SceneInfo(", "SceneInfo(", "MyDataset.info gave None; expected SceneInfo"),
     "a stride that counts for nothing": (
         "for index in range(0, self._options.n_frames, stride)]",
         "for index in range(0, self._options.n_frames)]",

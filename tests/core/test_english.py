@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import doctest
 import json
 import tomllib
 from typing import Any
@@ -9,7 +10,8 @@ from typing import Any
 import pytest
 from places import ROOT
 
-from su3d_bench.core.english import is_countable, is_plural, plural, singular, with_article, words
+from su3d_bench.core import english
+from su3d_bench.core.english import is_countable, is_plural, plural, with_article, words
 from su3d_bench.perception.embedded.lexicon import SYNONYMS, vocabulary
 from su3d_bench.questions.scene_map import plain_name
 
@@ -37,19 +39,8 @@ def test_several_of_a_thing_give_its_name_back_for_every_class() -> None:
     assert [name for name in names if words(plural(name)) != words(name)] == []
 
 
-@pytest.mark.parametrize(
-    ("one", "several"),
-    [
-        ("sofa", "sofas"), ("camera", "cameras"), ("shelf", "shelves"), ("bookshelf", "bookshelves"), ("box", "boxes"),
-        ("couch", "couches"), ("dish", "dishes"), ("glass", "glasses"), ("bus", "buses"), ("vase", "vases"),
-        ("knife", "knives"), ("mouse", "mice"), ("tv", "tvs"), ("house", "houses"), ("case", "cases"),
-    ],
-)  # fmt: skip
-def test_one_and_several(one: str, several: str) -> None:
-    assert plural(one) == several
-    if one != "glass":  # glasses are worn, too: what is called so already is one pair
-        assert singular(several) == one
-    assert singular(one) == one
+def test_the_examples_of_the_docstrings_hold() -> None:
+    assert doctest.testmod(english).failed == 0
 
 
 def test_what_is_always_several_or_stuff_is_spoken_of_so() -> None:

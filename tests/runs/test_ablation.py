@@ -6,12 +6,10 @@ import json
 from pathlib import Path
 
 import pytest
-from painted import colour_perception
 from places import SCENES
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.ablation import ablation_rows, read_rows
 
 PAINTED = f"{SCENES}/painted.py"
@@ -45,12 +43,11 @@ def test_a_wrong_sweep_is_one_line(vary: list[str], message: str) -> None:
         ablation_rows("opensu3d", vary, is_grid=False)
 
 
-def test_a_sweep_is_one_run_with_its_rows_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+def test_a_sweep_is_one_run_with_its_rows_beside_it(painted_place: Path) -> None:
     words = ["ablate", "--method", f"{PAINTED}:Collector", "--vary", "stride=1,2", "drop=0,1", "--no-pictures"]
     words += ["--scenes", f"{PAINTED}:Painted/a", "--protocols", "rooms-semantic", "--jobs", "1"]
-    assert main([*words, "--out", str(tmp_path / "out")]) == 0
-    rows = read_rows(tmp_path / "out")
+    assert main([*words, "--out", "out"]) == 0
+    rows = read_rows(painted_place / "out")
     assert [row.method for row in rows] == ["collector", "collector@stride=2", "collector", "collector@drop=1"]
-    results = json.loads((tmp_path / "out" / "metrics.json").read_text())["results"]
+    results = json.loads((painted_place / "out" / "metrics.json").read_text())["results"]
     assert [one["method"] for one in results] == ["collector", "collector@stride=2", "collector@drop=1"]

@@ -14,7 +14,6 @@ from places import SCENES
 
 from su3d_bench.cli.main import main
 from su3d_bench.runs import frame_loop as scene_feeding
-from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
@@ -23,11 +22,7 @@ COLLECTOR = f"{SCENES}/painted.py:Collector"
 REST = ["--no-pictures", "--jobs", "1", "--quiet"]
 
 
-@pytest.fixture(autouse=True)
-def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    for module in (scene_run, finished_scenes):
-        monkeypatch.setattr(module, "build_perception", colour_perception)
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("painted_place")
 
 
 def run(scenes: str, *more: str, methods: tuple[str, ...] = (COLLECTOR,), out: str = "out") -> int:
@@ -127,8 +122,7 @@ def test_a_map_of_other_data_is_made_anew_only_where_the_run_is_replaced(
     before = {path: path.read_bytes() for path in Path("out").rglob("*") if path.is_file()}
     other = colour_perception()
     other.digest = "colours-2"
-    for module in (scene_run, finished_scenes):
-        monkeypatch.setattr(module, "build_perception", lambda *_, **__: other)
+    monkeypatch.setattr(scene_run, "build_perception", lambda *_, **__: other)
     capsys.readouterr()
     assert run("a") == 2
     assert "(perception was colours-1, now colours-2); --replace puts this one in its place" in capsys.readouterr().err

@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from painted import colour_perception
 from places import SCENES
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.config import Setting, Settings
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import FinishedRun, RunData
 from su3d_bench.store.run_folder import RunFolder
 
@@ -20,10 +18,7 @@ PAINTED = f"{SCENES}/painted.py:Painted"
 COLLECTOR = f"{SCENES}/painted.py:Collector"
 
 
-@pytest.fixture(autouse=True)
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("painted_place")
 
 
 def lines_of(capsys: pytest.CaptureFixture[str], *words: str) -> list[str]:
@@ -57,14 +52,9 @@ def run_with(**given: Any) -> FinishedRun:
 
 
 def test_settings_that_are_not_the_methods_own_are_named_with_their_values() -> None:
+    """A stride of the whole run is a setting of each method that has another; of an unknown method none is named."""
     run = run_with(method__opensu3d__eps=0.05, method__opensu3d__top_m=5, method__opensu3d__border_px=20)
     assert run.changed("opensu3d") == ("eps = 0.05",)
-
-
-def test_a_stride_of_the_whole_run_is_a_setting_of_each_method_that_has_another() -> None:
     assert run_with(stride=10).changed("opensu3d") == ("stride = 10",)
     assert run_with(stride=40).changed("opensu3d") == run_with(stride=0).changed("opensu3d") == ()
-
-
-def test_of_a_method_that_is_not_known_here_no_setting_is_named() -> None:
     assert run_with(stride=10, method__mine__x=1).changed("mine") == ()

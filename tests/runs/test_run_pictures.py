@@ -19,22 +19,8 @@ def plate(z: float, half: float = 0.5) -> Float32Array:
 def two_plates(names: tuple[str, ...] = ("rug", "lamp")) -> Instances:
     """A large plate with a small one above it; the large mask holds the small one's points too."""
     points = np.concatenate([plate(0.0), plate(0.4, half=0.2)])
-    n_all, n_low = len(points), len(plate(0.0))
-    indices = np.concatenate([np.arange(n_all), np.arange(n_low, n_all)]).astype(np.int32)
-    return Instances(
-        points=points,
-        indptr=np.array([0, n_all, len(indices)]),
-        indices=indices,
-        scores=np.ones(2),
-        features=None,
-        labels=None,
-        names=names,
-        captions=names,
-        boxes=np.zeros((2, 2, 3), np.float32),
-        centroids=np.zeros((2, 3), np.float32),
-        view_indptr=np.zeros(3, np.int64),
-        views=np.zeros((0, 2), np.int32),
-    )
+    n_low = len(plate(0.0))
+    return Instances.of(points, [np.arange(len(points)), np.arange(n_low, len(points))], names=names, captions=names)
 
 
 def camera(width: int = 40, height: int = 40) -> Camera:

@@ -8,20 +8,14 @@ from typing import Any
 
 import pytest
 from painted import ColourPerception, colour_perception
-from painted_runs import job, metrics, run, words
+from painted_runs import COLLECTOR, PAINTED, job, metrics, run, words
 from places import SCENES
 
 from su3d_bench.cli.main import main
 from su3d_bench.runs import frame_loop as scene_feeding
-from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import scene as scene_run
 
-
-@pytest.fixture(autouse=True)
-def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    for module in (scene_run, finished_scenes):
-        monkeypatch.setattr(module, "build_perception", colour_perception)
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("painted_place")
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +122,7 @@ def test_a_scene_that_failed_is_taken_up_again_once_it_is_mended(monkeypatch: py
 
 
 def test_scenes_whose_names_differ_in_a_slash_have_a_map_each(capsys: pytest.CaptureFixture[str]) -> None:
-    twins = ["run", "--scenes", f"{SCENES}/twins.py:Twins/*", *words()[3:]]
+    twins = ["run", "--scenes", f"{SCENES}/painted.py:Twins/*", *words()[3:]]
     assert main(twins) == 0
     folders = sorted(path.name for path in Path("out/scenes").iterdir())
     assert folders == ["twins.a%252Fb", "twins.a%2Fb", "twins.a_b"]
@@ -143,3 +137,19 @@ def test_scenes_whose_names_differ_in_a_slash_have_a_map_each(capsys: pytest.Cap
         == 2
     )
     assert "scene 'a/b': cannot be the name of a file" in capsys.readouterr().err
+
+
+def test_what_was_found_stands_in_place_of_dashes(capsys: pytest.CaptureFixture[str]) -> None:
+    noisy = [*words(scenes="b")[3:], "--methods", COLLECTOR, f"{COLLECTOR}@noise_m=0.3"]
+    assert main(["run", "--scenes", f"{PAINTED}/b", *noisy, "--set", "painted.fault=no-truth"]) == 0
+    said = capsys.readouterr()
+    assert said.out.startswith("no protocol scores these scenes\n\n**Found, not scored**\n")
+    rows = [line for line in said.out.splitlines() if line.startswith("| painted/b")]
+    assert [row.split("|")[2].strip() for row in rows] == ["collector", "collector@noise_m=0.3"]
+    assert all(" / " in row.split("|")[5] and row.split("|")[8].strip() != "-" for row in rows)
+    why = "not scored under rooms-semantic, rooms-instance: painted/b: has no ground truth"
+    assert [line for line in said.err.splitlines() if "not scored" in line] == [
+        f"collector, collector@noise_m=0.3: {why}"
+    ]
+    log = next(Path("out").glob("scenes/*/collector/log.txt")).read_text()
+    assert log.count("\n") == 3 and f"collector: {why}\n" in log

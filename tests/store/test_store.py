@@ -17,7 +17,7 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, StoreError
-from su3d_bench.core.files.atomic import npz_bytes, read_json, read_npz, write_bytes, write_json, write_npz
+from su3d_bench.core.files.atomic import Scratch, npz_bytes, read_json, read_npz, write_bytes, write_json, write_npz
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
 from su3d_bench.store.predictions import read_prediction, write_prediction
 from su3d_bench.store.run_folder import JobFolder, RunFolder
@@ -26,20 +26,15 @@ KEY = {"method": "collector", "stride": "40", "data": "abc"}
 
 
 def small_map() -> Instances:
-    return Instances(
-        points=np.arange(12, dtype=np.float32).reshape(4, 3),
-        indptr=np.array([0, 2, 3]),
-        indices=np.array([0, 1, 3], np.int32),
-        scores=np.array([1.0, 0.5]),
-        features=np.ones((2, 5), np.float32),
-        labels=None,
+    return Instances.of(
+        np.arange(12, dtype=np.float32).reshape(4, 3),
+        [[0, 1], [3]],
+        [1.0, 0.5],
+        np.ones((2, 5), np.float32),
         names=("chair", "plant ü"),
         captions=("a chair", ""),
-        boxes=np.zeros((2, 2, 3), np.float32),
-        centroids=np.zeros((2, 3), np.float32),
-        view_indptr=np.array([0, 1, 1]),
-        views=np.array([[0, 0]], np.int32),
-        ids=np.array([4, 9], np.int32),
+        views=[[(0, 0)], []],
+        ids=[4, 9],
     )
 
 
@@ -186,3 +181,43 @@ def test_two_runs_on_one_folder_are_refused_until_the_first_is_killed(tmp_path: 
     with RunFolder(tmp_path).locked():
         pass
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("most_in_memory_bytes", [1 << 20, 1])
+def test_rows_come_out_as_they_were_put_in(most_in_memory_bytes: int) -> None:
+    scratch = Scratch(most_in_memory_bytes)
+    generator = np.random.default_rng(0)
+    arrays: list[NDArray[Any]] = [
+        generator.normal(size=(5, 7)),
+        np.arange(9, dtype=np.int32),
+        np.empty((0, 3)),
+        np.arange(12.0)[::2],
+    ]
+    stored = [scratch.put(array) for array in arrays]
+    for array, one in zip(arrays, stored, strict=True):
+        everything = one.rows(0, len(array))
+        assert everything.dtype == array.dtype
+        np.testing.assert_array_equal(everything, array)
+    np.testing.assert_array_equal(stored[0].rows(2, 4), arrays[0][2:4])
+    with pytest.raises(IndexError, match="rows 4 to 6 of 5"):
+        stored[0].rows(4, 6)
+    scratch.close()
+
+
+def _open_files(folder: Path) -> list[str]:
+    """This process's open files that lay in ``folder``, nameless ones too."""
+    links = (os.path.realpath(link) for link in Path("/proc/self/fd").iterdir())
+    return [link for link in links if link.startswith(str(folder))]
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="open files are listed on Linux alone")
+def test_what_is_much_lies_on_disk_under_no_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    scratch = Scratch(1000)
+    scratch.put(np.zeros(100))
+    assert list(_open_files(tmp_path)) == []
+    scratch.put(np.zeros(100))
+    assert len(_open_files(tmp_path)) == 1
+    assert list(tmp_path.iterdir()) == []
+    scratch.close()

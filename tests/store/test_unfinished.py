@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -108,6 +109,13 @@ def test_a_folder_is_held_by_a_file_where_folders_have_no_locks(
     with unfinished_folder(tmp_path / "x") as folder:
         clear_unfinished(tmp_path)
         assert folder.is_dir()
+    with (
+        RunFolder(tmp_path / "run").locked(),
+        pytest.raises(StoreError, match="another run is writing here; wait for it"),
+        RunFolder(tmp_path / "run").locked(),
+    ):
+        pass
+    shutil.rmtree(tmp_path / "run")
     (tmp_path / ".x.0123456789ab.unfinished").mkdir()
     clear_unfinished(tmp_path)
     assert names(tmp_path) == []

@@ -64,8 +64,7 @@ MORE = {
     "report attribution": "Merged, split, duplicate, mislabelled, background, missed; geometry, association, label.",
     "datasets check": "Names what is missing, damaged or contradictory, and whether frames and ground truth meet: "
     "[datasets.md](datasets.md).",
-    "datasets make": "In the exact layout of Replica or ScanNet (`.sens`): "
-    "[datasets.md](datasets.md).",
+    "datasets make": "In the exact layout of Replica or ScanNet (`.sens`): [datasets.md](datasets.md).",
     "models list": "Where files are looked for, sizes, licences: [methods/models.md](methods/models.md).",
     "dev cache list": "What is kept, and which variable says where: [environment.md](running/environment.md).",
     "dev doctor": "What each line means: [running/environment.md](running/environment.md).",

@@ -181,27 +181,24 @@ def hardware_line() -> str:
 
 def processor_name() -> str:
     """What the processor is called, with the numbers that tell those of one name apart: virtual ones have no other."""
-    numbers = {key: value for key, value in _first_processor() if key in ("cpu family", "model", "stepping")}
-    return f"{_processor()} ({', '.join(f'{key} {numbers[key]}' for key in numbers)})" if numbers else _processor()
+    about = _first_processor()
+    name = about.get("model name") or platform.processor() or "unknown processor"
+    numbers = [f"{key} {about[key]}" for key in about if key in ("cpu family", "model", "stepping")]
+    return f"{name} ({', '.join(numbers)})" if numbers else name
 
 
 def processor_digest() -> str:
     """A digest of the processor's kind, its instruction sets included: numerical kernels are chosen by them."""
     fields = ("cpu family", "model", "stepping", "flags", "Features")
-    kind = [platform.machine(), _processor()]
-    kind += [line for line in _cpu_info() if line.partition(":")[0].strip() in fields]
+    name = _first_processor().get("model name") or platform.processor() or "unknown processor"
+    kind = [platform.machine(), name, *(line for line in _cpu_info() if line.partition(":")[0].strip() in fields)]
     return hashlib.sha256("\n".join(kind).encode()).hexdigest()[:16]
 
 
-def _processor() -> str:
-    names = [value for key, value in _first_processor() if key == "model name"]
-    return names[0] if names else platform.processor() or "unknown processor"
-
-
-def _first_processor() -> list[tuple[str, str]]:
+def _first_processor() -> dict[str, str]:
     """What Linux says of the first processor, by key."""
     pairs = [line.partition(":") for line in _cpu_info()]
-    return [(key.strip(), value.strip()) for key, _, value in pairs]
+    return {key.strip(): value.strip() for key, _, value in pairs}
 
 
 def _cpu_info() -> list[str]:

@@ -3,7 +3,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -12,18 +11,16 @@ from typing import Any
 
 import psutil
 import pytest
-from painted import colour_perception
 from places import SCENES
 from waiting import wait_until
 
 from su3d_bench.cli.main import main
-from su3d_bench.runs import scene as scene_run
 
 ray = pytest.importorskip("ray", reason="the ray extra is not installed")
 pytest.importorskip("submitit", reason="the slurm extra is not installed")
 
-PAINTED = f"{SCENES}/painted_anywhere.py:Painted"
-COLLECTOR = f"{SCENES}/painted_anywhere.py:Collector"
+PAINTED = f"{SCENES}/painted_cli.py:Painted"
+COLLECTOR = f"{SCENES}/painted_cli.py:Collector"
 NOISE = ("--set", "collector.noise_m=0.02", "painted.frame_ms=50")
 WHILE_LOADED_S = 300
 
@@ -42,11 +39,7 @@ def cluster() -> Iterator[Any]:
     made.shutdown()
 
 
-@pytest.fixture(autouse=True)
-def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+pytestmark = pytest.mark.usefixtures("painted_place")
 
 
 def words(*more: str, out: str) -> list[str]:
@@ -120,16 +113,6 @@ def test_a_scene_that_takes_every_worker_down_fails_alone_after_its_retries(
     assert json.loads(Path("killed/metrics.json").read_text())["results"][0]["result"]["scenes"] == ["painted/a"]
 
 
-def test_an_address_without_a_cluster_is_one_line_within_seconds(capsys: pytest.CaptureFixture[str]) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{taken.getsockname()[1]}"
-        assert run("--executor", "ray", "--ray-address", address, out="nowhere") == 2
-    error = capsys.readouterr().err
-    assert error.startswith(f"su3d-bench: no Ray cluster answers at '{address}' (connection refused); start one with")
-    assert error.count("\n") == 1
-
-
 def test_submitit_gives_the_same_bytes_as_inline() -> None:
     scenes = ("--scenes", f"{PAINTED}/[ad]")
     assert run(*scenes, "--jobs", "1", out="inline") == 0
@@ -159,7 +142,7 @@ def test_an_option_that_means_nothing_is_one_line(
 @pytest.mark.parametrize(
     ("executor", "line"),
     [
-        ("ray", "no Ray cluster runs on this machine; add --ray-address local to start one here for this run, or"),
+        ("ray", "no Ray cluster on this machine takes this run (Could not find any running Ray instance"),
         (
             "slurm",
             "no Slurm cluster is here: there is no srun; give the command where there is, or add --slurm cluster",

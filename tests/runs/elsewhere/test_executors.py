@@ -2,11 +2,8 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
-from pathlib import Path
 
 import psutil
 import pytest
@@ -47,32 +44,6 @@ def lost(unit: str, reason: str) -> str:
 
 def in_processes(units: list[str], jobs: int = 2) -> list[str]:
     return list(run_processes(work, units, lambda event: None, jobs=jobs, lost=lost))
-
-
-WATCHED = """
-import signal
-from multiprocessing import util
-from operator import is_not
-from su3d_bench.runs.executors import run_processes
-
-spawn = util.spawnv_passfds
-
-def watched(path, args, passfds):
-    if "spawn_main" in " ".join(map(str, args)):
-        print(sorted(number.name for number in signal.pthread_sigmask(signal.SIG_BLOCK, [])))
-    return spawn(path, args, passfds)
-
-util.spawnv_passfds = watched
-if __name__ == "__main__":
-    print(list(run_processes(is_not, ["a", "b"], print, jobs=1, lost=print)))
-"""
-
-
-def test_no_worker_hears_what_a_terminal_sends_while_it_starts_the_first_neither(tmp_path: Path) -> None:
-    (tmp_path / "watched.py").write_text(WATCHED)
-    words = [sys.executable, "watched.py"]
-    said = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True, timeout=120).stdout
-    assert said.splitlines() == ["['SIGHUP', 'SIGINT']"] * 2 + ["[True, True]"]
 
 
 @pytest.mark.parametrize(

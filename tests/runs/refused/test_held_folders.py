@@ -2,27 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
-from painted import colour_perception
 from painted_runs import COLLECTOR, PAINTED, run, words
 from places import SCENES
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.runs import resume as finished_scenes
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.plan import named_method
-from su3d_bench.store.run_folder import RunFolder
 
-
-@pytest.fixture(autouse=True)
-def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    for module in (scene_run, finished_scenes):
-        monkeypatch.setattr(module, "build_perception", colour_perception)
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("painted_place")
 
 
 def test_another_request_for_the_same_folder_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
@@ -34,12 +24,6 @@ def test_another_request_for_the_same_folder_is_refused_by_name(capsys: pytest.C
     assert "out: holds another run (" in error and error.count("\n") == 1
     assert "seed was 0, now 5" in error and "perception.naming.temperature was 0.05, now 0.5" in error
     assert Path("out/metrics.json").read_bytes() == before
-
-
-def test_the_second_of_two_runs_on_one_folder_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    with RunFolder(Path("out")).locked():
-        assert run(scenes="a") == 2
-    assert "another run is writing here" in capsys.readouterr().err
 
 
 def test_a_folder_of_somebody_else_is_refused_and_left_alone(capsys: pytest.CaptureFixture[str]) -> None:
@@ -55,7 +39,7 @@ def test_a_folder_of_somebody_else_is_refused_and_left_alone(capsys: pytest.Capt
 @pytest.mark.parametrize(
     ("more", "line"),
     [
-        (["--methods", f"{SCENES}/twins.py:SlashCollector"], "'../elsewhere' cannot be the name of a folder"),
+        (["--methods", f"{SCENES}/painted.py:SlashCollector"], "'../elsewhere' cannot be the name of a folder"),
         (["--methods", COLLECTOR, f"{SCENES}/./painted.py:Collector"], "different ones are called 'collector'"),
         (
             ["--scenes", f"{PAINTED}/a", f"{SCENES}/./painted.py:Painted/b"],
@@ -109,21 +93,3 @@ def test_values_are_toml_and_lists_may_hold_commas() -> None:
 def test_a_wrong_variant_is_one_line(text: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         named_method(text)
-
-
-def test_variants_stand_side_by_side_and_run_toml_repeats_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    method = f"{PAINTED_FILE}:Collector"
-    words = ["run", "--scenes", f"{PAINTED_FILE}:Painted/a", "--protocols", "rooms-semantic", "--no-pictures"]
-    words += ["--jobs", "1"]
-    out = tmp_path / "out"
-    assert main([*words, "--methods", method, f"{method}@stride=2", "--out", str(out)]) == 0
-    results = json.loads((out / "metrics.json").read_text())["results"]
-    assert [one["method"] for one in results] == ["collector", "collector@stride=2"]
-    n_updates = [len((out / "scenes/painted.a" / one["method"] / "updates.csv").read_text().split()) for one in results]
-    assert n_updates[0] == 2 * n_updates[1] - 1
-    before = (out / "metrics.json").read_bytes()
-    assert main(["run", "--config", str(out / "run.toml"), "--out", str(out)]) == 0
-    assert (out / "metrics.json").read_bytes() == before

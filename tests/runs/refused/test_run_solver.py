@@ -15,7 +15,6 @@ from painted import colour_perception
 from su3d_bench.cli.main import main
 from su3d_bench.questions.scene_map import MapObject, SceneMap
 from su3d_bench.questions.solver import Solver
-from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.run_folder import RunFolder
 
@@ -30,8 +29,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
     monkeypatch.delenv("OPENAI_BASE_URL", raising=False)
-    for module in (scene_run, finished_scenes):
-        monkeypatch.setattr(module, "build_perception", colour_perception)
+    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
     return tmp_path
 
 

@@ -10,7 +10,6 @@ import random
 import shutil
 import subprocess
 import sys
-import threading
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -18,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from painted import colour_perception
 from painted_runs import PAINTED, in_process
 from places import ROOT, SCENES
 
@@ -26,18 +24,13 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.files.atomic import TemporaryFolder, filling
 from su3d_bench.perception.cache import FrameCache
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.run_folder import RunFolder
 
 SUBJECT = f"{SCENES}/kill_subject.py"
 SETTINGS = ("--set", "painted.n_frames=3", "--protocols", "rooms-semantic", "--no-pictures", "--jobs", "1", "--quiet")
 
 
-@pytest.fixture(autouse=True)
-def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
-    monkeypatch.chdir(tmp_path)
+pytestmark = pytest.mark.usefixtures("painted_place")
 
 
 def run(*more: str, scenes: str = "[ab]", out: str = "out") -> int:
@@ -126,51 +119,7 @@ def test_memory_that_ends_fails_its_scene_alone_and_says_so(capsys: pytest.Captu
     assert "score" in json.loads((job("a") / "done.json").read_text())["steps"]
 
 
-def test_of_many_runs_that_start_at_once_one_has_the_folder_and_the_others_a_line(tmp_path: Path) -> None:
-    inside, most_inside, refused = 0, 0, []
-    start = threading.Barrier(8)
-
-    def hold() -> None:
-        nonlocal inside, most_inside
-        start.wait()
-        for _ in range(50):
-            try:
-                with RunFolder(tmp_path).locked():
-                    inside += 1
-                    most_inside = max(most_inside, inside)
-                    os.sched_yield()
-                    inside -= 1
-            except StoreError as error:
-                refused.append(str(error))
-
-    threads = [threading.Thread(target=hold) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert most_inside == 1
-    assert set(refused) <= {f"{tmp_path}: another run is writing here; wait for it or choose another folder with --out"}
-    assert refused
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_disk_whose_folders_cannot_be_locked_has_a_lock_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    lock = fcntl.flock
-
-    def as_on_a_network_disk(handle: int, operation: int) -> None:
-        if os.path.isdir(f"/proc/self/fd/{handle}"):
-            raise OSError(errno.EBADF, "Bad file descriptor")
-        lock(handle, operation)
-
-    monkeypatch.setattr(fcntl, "flock", as_on_a_network_disk)
-    for _ in range(2):
-        with (
-            RunFolder(tmp_path).locked(),
-            pytest.raises(StoreError, match="another run is writing here; wait for it"),
-            RunFolder(tmp_path).locked(),
-        ):
-            pass
-
+def test_a_disk_without_locks_is_no_place_for_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def without_locks(handle: int, operation: int) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import fsspec
 import pytest
-from painted import colour_perception
 from replica_scene import CHAIR, TABLE, write_original, write_render
 from test_clusters import PAINTED, assert_equal_runs, deterministic_files, run
 
@@ -21,11 +20,7 @@ URL = "memory://bucket/runs/one"
 TWO = ("--scenes", f"{PAINTED}/[ad]", "--jobs", "1")
 
 
-@pytest.fixture(autouse=True)
-def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+pytestmark = pytest.mark.usefixtures("painted_place")
 
 
 @pytest.fixture
@@ -66,7 +61,9 @@ def test_a_run_in_a_store_is_taken_up_again_without_the_folder_here(
     assert_equal_runs(before, brought(URL, tmp_path / "after"))
 
 
-def test_a_job_that_was_sent_in_part_is_run_again(store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_job_that_was_sent_in_part_or_cut_short_is_run_again(
+    store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert run(*TWO, out="local") == 0
 
     def stop_at_the_seal(self: RemoteFolder, folder: Path, names: list[str]) -> None:
@@ -79,13 +76,6 @@ def test_a_job_that_was_sent_in_part_is_run_again(store: Any, tmp_path: Path, mo
         patch.setattr(RemoteFolder, "send", stop_at_the_seal)
         assert run(*TWO, out=URL) == 130
     assert "scenes/painted.d/collector/prediction.npz" in RemoteFolder(URL).files()
-    assert run(*TWO, out=URL) == 0
-    assert_equal_runs("local", brought(URL, tmp_path / "came"))
-
-
-def test_a_file_that_arrived_cut_short_is_not_taken_for_whole(store: Any, tmp_path: Path) -> None:
-    assert run(*TWO, out="local") == 0
-    assert run(*TWO, out=URL) == 0
     cut = "/bucket/runs/one/scenes/painted.a/collector/prediction.npz"
     store.pipe_file(cut, store.cat_file(cut)[:-100])
     assert run(*TWO, out=URL) == 0

@@ -173,11 +173,6 @@ class Chromium:
         values = {"behavior": "allow", "downloadPath": str(folder)}
         self._call("Browser.setDownloadBehavior", values, None)
 
-    def screenshot(self, path: Path) -> None:
-        import base64
-
-        path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", {"format": "png"})["data"]))
-
     def faults(self) -> list[str]:
         """What the page complained of: errors, what was refused, every address that it asked for."""
         self.run("0")

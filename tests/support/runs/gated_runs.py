@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from painted import colour_perception
-from places import SCENES
+from painted_runs import painted_run
 
 from su3d_bench.analysis.gate import Reference, learn
 from su3d_bench.cli.main import main
@@ -20,12 +19,8 @@ from su3d_bench.core.digests import digest_file
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, pack_scores, unpack_scores
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run
 
-PAINTED = f"{SCENES}/painted.py"
-WORDS = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--methods", f"{PAINTED}:Collector"]
-WORDS += ["--protocols", "rooms-semantic", "rooms-instance", "--no-pictures", "--jobs", "1"]
 COSTS = {"calibration_ms": 5.0, "start_ms": 10.0, "close_ms": 0.0}
 
 
@@ -137,12 +132,7 @@ def results_in(run: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def gated(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("gate") / "run"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
-        assert main([*WORDS, "--out", str(folder)]) == 0
-    timed(folder)
-    return folder
+    return timed(painted_run(tmp_path_factory.mktemp("gate") / "run"))
 
 
 @pytest.fixture(scope="module")

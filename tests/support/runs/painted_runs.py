@@ -43,9 +43,9 @@ def job(scene: str = "a", method: str = "collector", out: str = "out") -> Path:
     return Path(out, "scenes", f"painted.{scene}", method)
 
 
-def painted_run(folder: Path, *more: str, methods: Sequence[str] = (COLLECTOR,)) -> Path:
-    """A finished run of two scenes, made in this process."""
-    named = ["run", f"{PAINTED}/a", f"{PAINTED}/b", "--methods", *methods, *PROTOCOLS, "--no-pictures"]
+def painted_run(folder: Path, *more: str, methods: Sequence[str] = (COLLECTOR,), scenes: str = "ab") -> Path:
+    """A finished run of some scenes, made in this process."""
+    named = ["run", *(f"{PAINTED}/{scene}" for scene in scenes), "--methods", *methods, *PROTOCOLS, "--no-pictures"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scene_run, "build_perception", colour_perception)
         assert main([*named, "--jobs", "1", "--out", str(folder), *more]) == 0

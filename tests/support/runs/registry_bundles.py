@@ -10,15 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from painted import colour_perception
-from places import SCENES
+from painted_runs import COLLECTOR, painted_run
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.digests import digest_bytes
 from su3d_bench.reproducing.bundle import bundle_runs
-from su3d_bench.runs import scene as scene_run
 
-PAINTED = f"{SCENES}/painted.py"
 ROOM = "rooms/bathroom0"
 SMALL = ("rooms.n_frames=8", "rooms.width=160", "rooms.height=120", "rooms.mesh_spacing_m=0.1")
 PROTOCOLS = ("rooms-semantic", "rooms-instance")
@@ -29,11 +26,8 @@ def painted_bundle(
     folder: Path, name: str, methods: Sequence[str], scenes: str = "abc", more: Sequence[str] = (), said: str = ""
 ) -> Path:
     """``folder/name.zip``: variants of the painted collector; it names code of its own, so no verifier takes it."""
-    words = ["run", "--scenes", *(f"{PAINTED}:Painted/{scene}" for scene in scenes), "--no-pictures", "--jobs", "1"]
-    words += ["--methods", *(f"{PAINTED}:Collector{method}" for method in methods), "--protocols", *PROTOCOLS, *more]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
-        assert main([*words, "--quiet", "--out", str(folder / "runs" / name)]) == 0
+    named = [f"{COLLECTOR}{method}" for method in methods]
+    painted_run(folder / "runs" / name, "--quiet", *more, methods=named, scenes=scenes)
     bundle_runs(folder / f"{name}.zip", [folder / "runs" / name], said)
     return folder / f"{name}.zip"
 
@@ -43,19 +37,8 @@ def room_bundle(folder: Path, *, data: Path) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SU3D_DATA", str(data))
         patch.setenv("SU3D_CACHE", str(folder / "cache"))
-        words = [
-            "run",
-            "--scenes",
-            ROOM,
-            "--methods",
-            "opensu3d",
-            "conceptfusion",
-            "oracle",
-            "--protocols",
-            *PROTOCOLS,
-            "--set",
-            *SMALL,
-        ]
+        words = ["run", "--scenes", ROOM, "--methods", "opensu3d", "conceptfusion", "oracle", "--protocols", *PROTOCOLS]
+        words += ["--set", *SMALL]
         words += ["--profile", "oracle", "--no-pictures", "--jobs", "1", "--quiet", "--stride", "2"]
         assert main([*words, "--out", str(folder / "room")]) == 0
         assert main(["report", "bundle", str(folder / "room"), "--out", str(folder / "room.zip"), "--quiet"]) == 0

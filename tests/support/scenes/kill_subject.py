@@ -21,7 +21,6 @@ from su3d_bench.core.interfaces import StageTimer
 from su3d_bench.core.maps import DenseFeatures, Prediction
 from su3d_bench.core.types import Detections, Frame, PerceptionNeeds
 from su3d_bench.perception.cache import FrameCache, content_key
-from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import scene as scene_run
 
 logger = logging.getLogger("su3d_bench.kill_subject")
@@ -69,7 +68,6 @@ def kept_perception(*_: Any, cache_root: Path, **__: Any) -> KeptPerception:
     return KeptPerception(cache_root)
 
 
-for module in (scene_run, finished_scenes):
-    module.build_perception = kept_perception  # type: ignore[attr-defined]
+scene_run.build_perception = kept_perception  # type: ignore[attr-defined]
 
 __all__ = ["Dense", "Painted"]

@@ -39,13 +39,16 @@ INTRINSICS = np.array([[30.0, 0, 15.5], [0, 30.0, 11.5], [0, 0, 1]])
 LABELS = LabelSet("replica", (20, 76, 80, 93), ("chair", "sofa", "table", "wall"))
 DELAY_S = 0.15
 COLOURS = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [120, 120, 120]], np.uint8)
-FAULTS = ("missing-frame", "nan-pose", "depth-size", "empty-depth", "unknown-class", "no-truth", "crash", "kill")
 
 
 class Painted:
-    """Four scenes of three painted boxes before a wall, seen by a camera that moves sideways."""
+    """Four scenes of three painted boxes before a wall, seen by a camera that moves sideways.
+
+    ``painted_as``: what scenes of other names are painted as.
+    """
 
     name = "painted"
+    painted_as: ClassVar[dict[str, str]] = {scene: scene for scene in "abcd"}
     label_space = "replica"
     variants: ClassVar[tuple[str, ...]] = ("mesh-vertices",)
     image_domain = "rendered-rooms"
@@ -64,21 +67,21 @@ class Painted:
         self.options = options
 
     def scenes(self) -> Sequence[str]:
-        return ("a", "b", "c", "d")
+        return tuple(self.painted_as)
 
     def files(self, scene: str) -> Sequence[Path]:
         return ()
 
     def digest(self, scene: str) -> str:
-        return hashlib.sha256(f"painted {scene} {self.options.n_frames}".encode()).hexdigest()
+        return hashlib.sha256(f"painted {self.painted_as[scene]} {self.options.n_frames}".encode()).hexdigest()
 
     def info(self, scene: str, stride: int) -> SceneInfo:
         if scene not in self.scenes():
             raise DataError(f"painted/{scene}: no such scene")
-        return SceneInfo("painted", scene, -(-self.options.n_frames // stride), stride, "rendered-rooms")
+        return SceneInfo(self.name, scene, -(-self.options.n_frames // stride), stride, "rendered-rooms")
 
     def frames(self, scene: str, stride: int) -> Sequence[Frame]:
-        return _Frames(self, scene, range(0, self.options.n_frames, stride))
+        return _Frames(self, self.painted_as[scene], range(0, self.options.n_frames, stride))
 
     def frame(self, scene: str, index: int) -> Frame:
         fault = self.options.fault if scene == self.options.fault_scene and index == 2 else ""
@@ -108,12 +111,12 @@ class Painted:
             raise GroundTruthMissing(f"painted/{scene}: has no ground truth")
         if fault == "unknown-class":
             raise DataError(f"painted/{scene}: class id 777 is unknown; the label set ends at 101")
-        points, instance = _surface(scene, self.options.n_frames)
+        points, instance = _surface(self.painted_as[scene], self.options.n_frames)
         semantic = np.array(LABELS.ids, np.int32)[instance - 1]
         return GroundTruth(points, semantic, instance, LABELS, variant, "painted")
 
     def instance_mesh(self, scene: str) -> InstanceMesh:
-        points, instance = _surface(scene, self.options.n_frames)
+        points, instance = _surface(self.painted_as[scene], self.options.n_frames)
         corners = points[:, None] + np.array([[0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 0]], np.float32)
         triangles = np.arange(3 * len(points), dtype=np.int32).reshape(-1, 3)
         classes = {k + 1: class_id for k, class_id in enumerate(LABELS.ids)}
@@ -202,23 +205,16 @@ class Collector:
                 self._features[name] = detections.crop_features[k, 0]
 
     def finish(self) -> Prediction:
-        names = tuple(sorted(self._points))
+        names = sorted(self._points)
         clouds = [np.concatenate(self._points[name]).astype(np.float32) for name in names]
-        ends = np.cumsum([0, *(len(cloud) for cloud in clouds)]).astype(np.int64)
-        views = [np.array(self._views[name], np.int32).reshape(-1, 2) for name in names]
-        return Instances(
-            points=np.concatenate(clouds) if clouds else np.zeros((0, 3), np.float32),
-            indptr=ends,
-            indices=np.arange(ends[-1], dtype=np.int32),
-            scores=np.ones(len(names)),
+        owners = np.repeat(np.arange(len(names)), [len(cloud) for cloud in clouds])
+        return Instances.of(
+            np.concatenate([np.zeros((0, 3), np.float32), *clouds]),
+            owners,
             features=np.array([self._features[name] for name in names], np.float32).reshape(len(names), 8),
-            labels=None,
             names=names,
             captions=names,
-            boxes=np.array([[c.min(0), c.max(0)] for c in clouds], np.float32).reshape(-1, 2, 3),
-            centroids=np.array([c.mean(0) for c in clouds], np.float32).reshape(-1, 3),
-            view_indptr=np.cumsum([0, *(len(view) for view in views)]).astype(np.int64),
-            views=np.concatenate(views) if views else np.zeros((0, 2), np.int32),
+            views=[self._views[name] for name in names],
             ids=np.arange(1, len(names) + 1, dtype=np.int32),
         )
 
@@ -293,6 +289,19 @@ class Delayed(Collector):
         self._delayed("close")
 
 
+class Twins(Painted):
+    """Scenes whose names differ in one character that no folder's name can hold, all painted differently."""
+
+    name = "twins"
+    painted_as: ClassVar[dict[str, str]] = {"a/b": "a", "a_b": "b", "a%2Fb": "c"}
+
+
+class SlashCollector(Collector):
+    """A method whose name is a way to another folder."""
+
+    name = "../elsewhere"
+
+
 class WordEncoder:
     """Texts to pseudo-random features, equal for equal last words; images to the feature of their colour's class."""
 
@@ -326,19 +335,11 @@ class ColourPerception:
             found = [k for k in range(4) if (frame.rgb == COLOURS[k]).all(-1).any()]
             masks = np.array([(frame.rgb == COLOURS[k]).all(-1) for k in found])
         names = tuple(LABELS.names[k] for k in found)
-        features = self.encoder.encode_texts(names)
+        features, ones = self.encoder.encode_texts(names), np.ones(len(found), np.float32)
         boxes = np.tile(np.array([0, 0, WIDTH, HEIGHT], np.float32), (len(found), 1))
         return Detections(
-            frame.index,
-            masks,
-            boxes,
-            np.ones(len(found), np.float32),
-            names,
-            names,
-            (1.0,),
-            features[:, None],
-            features[0],
-        )
+            frame.index, masks, boxes, ones, names, names, (1.0,), features[:, None], features[0]
+        )  # fmt: skip
 
 
 def colour_perception(*_: Any, **__: Any) -> ColourPerception:

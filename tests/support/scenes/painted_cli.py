@@ -1,19 +1,24 @@
-"""The command line with the perception of ``painted.py``, for tests that need a process of their own."""
+"""``painted.py`` for processes that no test can reach: importing it puts its perception in place there.
+
+As a program it is the command line.
+"""
 
 import sys
-from unittest.mock import patch
+from pathlib import Path
 
-from painted import WordEncoder, colour_perception
+if str(Path(__file__).parent) not in sys.path:
+    sys.path.insert(0, str(Path(__file__).parent))
+
+from painted import Collector, Painted, WordEncoder, colour_perception
 
 from su3d_bench.cli.main import main
-from su3d_bench.runs import finished as finished_run
-from su3d_bench.runs import resume as finished_scenes
-from su3d_bench.runs import scene as scene_run
+from su3d_bench.runs import finished, scene
 
-# At import, so that spawned workers, which import this file too, have it as well.
-for module in (scene_run, finished_scenes):
-    patch.object(module, "build_perception", colour_perception).start()
-patch.object(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder()).start()
+if "pytest" not in sys.modules:  # a test patches, and unpatches, its own process
+    scene.build_perception = colour_perception  # type: ignore[attr-defined]
+    finished.encoder_of = lambda run, device="cpu": WordEncoder()
+
+__all__ = ["Collector", "Painted"]
 
 if __name__ == "__main__":
     sys.exit(main())

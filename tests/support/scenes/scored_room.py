@@ -65,21 +65,8 @@ def instances(
     features: Float32Array | None = None,
     scores: Sequence[float] | None = None,
 ) -> Instances:
-    k = len(masks)
-    return Instances(
-        points=points,
-        indptr=np.concatenate([[0], np.cumsum([len(m) for m in masks])]).astype(np.int64),
-        indices=np.concatenate([np.zeros(0, np.int32), *masks]).astype(np.int32),
-        scores=np.linspace(0.9, 0.5, k) if scores is None else np.array(scores, np.float64),
-        features=features,
-        labels=None if labels is None else tuple(labels),
-        names=("",) * k,
-        captions=("",) * k,
-        boxes=np.zeros((k, 2, 3), np.float32),
-        centroids=np.zeros((k, 3), np.float32),
-        view_indptr=np.zeros(k + 1, np.int64),
-        views=np.zeros((0, 2), np.int32),
-    )
+    confidences = np.linspace(0.9, 0.5, len(masks)) if scores is None else scores
+    return Instances.of(points, list(masks), confidences, features, labels=labels)
 
 
 def truth_as_prediction(truth: GroundTruth, *, with_labels: bool) -> Instances:
