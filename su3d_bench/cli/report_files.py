@@ -161,9 +161,8 @@ def _add_rerun(verbs: Verbs) -> None:
 
 def call_rerun(arguments: argparse.Namespace) -> int:
     from su3d_bench.analysis.page.maps import Spaces
-    from su3d_bench.analysis.timeline import SceneTimeline, refuse_nothing
+    from su3d_bench.analysis.timeline import Recording, SceneTimeline, refuse_nothing, rerun_sdk
     from su3d_bench.core.files.atomic import make_folder, replacing
-    from su3d_bench.reports.timeline import Recording, rerun_sdk
     from su3d_bench.runs.executors import Event
     from su3d_bench.runs.finished import read_run
     from su3d_bench.sheets.sources import chosen_of

@@ -23,15 +23,7 @@ from pydantic import TypeAdapter
 from su3d_bench.analysis.attribution import Explained, MendedJob, attribution_of
 from su3d_bench.analysis.page.gallery import SceneGallery
 from su3d_bench.analysis.page.maps import PageScene
-from su3d_bench.core.digests import (
-    NUMERIC_PACKAGES,
-    code_digest,
-    digest_bytes,
-    digest_file,
-    digest_json,
-    package_digest,
-    package_versions,
-)
+from su3d_bench.core import digests
 from su3d_bench.core.errors import StoreError, Su3dError
 from su3d_bench.core.files.atomic import filling
 from su3d_bench.core.files.locks import is_unfinished
@@ -90,7 +82,7 @@ class Piece:
             self._remove_old()
 
     def _seal(self, content: bytes) -> bytes:
-        return digest_bytes(self.key.encode() + content).encode()
+        return digests.digest_bytes(self.key.encode() + content).encode()
 
     def _remove_old(self) -> None:
         of_name = [place for place in self._place.parent.glob(f"{self.name}-*") if not is_unfinished(place.name)]
@@ -100,8 +92,13 @@ class Piece:
 
 def piece(run: FinishedRun, scene: str, made_from: Any) -> Piece:
     """The piece of ``scene`` in the folder of ``run``; ``made_from`` is a JSON-like value of all that moves it."""
-    code = [FORMAT, code_digest(), package_digest("analysis", "reports"), package_versions(NUMERIC_PACKAGES)]
-    return Piece(run.folder.path, digest_json(scene)[:16], digest_json([scene, made_from, code]))
+    code = [
+        FORMAT,
+        digests.code_digest(),
+        digests.package_digest("analysis", "reports"),
+        digests.package_versions(digests.NUMERIC_PACKAGES),
+    ]
+    return Piece(run.folder.path, digests.digest_json(scene)[:16], digests.digest_json([scene, made_from, code]))
 
 
 def state_of_scene(run: FinishedRun, scene: str, method: str) -> list[Any]:
@@ -124,7 +121,7 @@ def state_of_counts(run: FinishedRun, method: str) -> list[str | None]:
 
 def _digest(file: Path) -> str | None:
     with suppress(OSError):
-        return digest_file(file)
+        return digests.digest_file(file)
     return None
 
 
