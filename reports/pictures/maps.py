@@ -166,7 +166,7 @@ def draw_scene(prediction: Prediction, truth: GroundTruth | None, folder: Path, 
     cloud = thinned(map_cloud(prediction))
     cameras = _cameras(cloud.points if truth is None else truth.points)
     views = _views(cloud, cameras)
-    names = _names_of(prediction)
+    names = names_of(prediction)
     row_colours = canvas.instance_colours(names)
     instances = folder / "instances.png"
     _write_picture(instances, f"{title}: {len(names)} instances", [Row("", _paint(views, cloud, row_colours))], {})
@@ -280,12 +280,12 @@ def _write_ranking(
     )
 
 
-def _names_of(prediction: Prediction) -> tuple[str, ...]:
+def names_of(prediction: Prediction) -> tuple[str, ...]:
+    """What a person reads of each instance: the label that the method decided, else the name that perception gave."""
     if isinstance(prediction, Instances):
         labels = prediction.labels or prediction.names
         return tuple(label or name for label, name in zip(labels, prediction.names, strict=True))
-    assert not isinstance(prediction, DenseFeatures)
-    return ("",) * len(prediction.features)
+    return () if isinstance(prediction, DenseFeatures) else ("",) * len(prediction.features)
 
 
 def map_cloud(prediction: Prediction) -> Cloud:

@@ -21,13 +21,14 @@ from su3d_bench.core.geometry import back_project, valid_depth
 from su3d_bench.core.interfaces import HasSketches
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, GroundTruth, Int64Array
-from su3d_bench.formats.images import depth_in_units, png_bytes
+from su3d_bench.formats.images import depth_in_units, jpeg_bytes, png_bytes
 from su3d_bench.metrics.matching.labelling import class_index_of_ids
 from su3d_bench.metrics.matching.nearest import nearest
 from su3d_bench.metrics.metric import n_predictions
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.reports.page.maps import Cloud, point_owners, thinned
 from su3d_bench.reports.pictures import canvas
+from su3d_bench.reports.pictures.maps import names_of
 from su3d_bench.reports.pictures.scene import evenly
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.predictions import read_prediction
@@ -108,7 +109,7 @@ class Recording:
             image_plane_distance=CAMERA_M,
         )
         self.log(CAMERA, self.sdk.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]), pinhole)
-        colour = self.sdk.EncodedImage(contents=_jpeg(frame.rgb), media_type="image/jpeg")
+        colour = self.sdk.EncodedImage(contents=jpeg_bytes(frame.rgb, JPEG_QUALITY), media_type="image/jpeg")
         self.log((*CAMERA, "colour"), colour)
         packed = png_bytes(depth_in_units(frame.depth_m, UNITS_PER_METRE))
         depth = self.sdk.EncodedDepthImage(packed, media_type="image/png", meter=UNITS_PER_METRE)
@@ -132,12 +133,6 @@ class Recording:
 def _path(place: Sequence[str]) -> list[str]:
     """A place as rerun takes it, which escapes each part itself."""
     return [printable(part, 100) for part in place]
-
-
-def _jpeg(rgb: Any) -> bytes:
-    import cv2
-
-    return bytes(cv2.imencode(".jpg", rgb[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
 
 
 def _panels(sdk: Any, methods: Sequence[str]) -> Any:
@@ -388,7 +383,7 @@ class SceneTimeline:
             if classes is not None:
                 labels = tuple(entry.name for entry in rules.classes)
                 label = classes if is_dense else np.append(classes, -1)[instance]
-        return Owned(cloud, instance, label, _names_of(prediction), _corners_of(prediction), labels)
+        return Owned(cloud, instance, label, names_of(prediction), _corners_of(prediction), labels)
 
     def _curves(self, method: str) -> dict[int, dict[str, float]]:
         """Frame -> curve -> value, of what the updates of a method say."""
@@ -485,15 +480,6 @@ def _corners(points: Float32Array, owner: Int64Array, n: int) -> Float32Array:
     np.minimum.at(low, owner, points)
     np.maximum.at(high, owner, points)
     return np.stack([low, high], axis=1)[:-1]
-
-
-def _names_of(prediction: Prediction) -> tuple[str, ...]:
-    if isinstance(prediction, DenseFeatures):
-        return ()
-    if not isinstance(prediction, Instances):
-        return ("",) * n_predictions(prediction)
-    labels = prediction.labels or prediction.names
-    return tuple(label or name for label, name in zip(labels, prediction.names, strict=True))
 
 
 def _corners_of(prediction: Prediction) -> Float32Array:
