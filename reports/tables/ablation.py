@@ -122,7 +122,8 @@ def _half(sweep: Sequence[SweepRow], members: Mapping[str, Measured], shown: pap
     )
     if smallest >= paper.LEVEL:
         return _Half(cells, (f"{difference}.", paper.nothing_can_be_marked("scenes", smallest)))
-    bold = f"Bold: the highest of its parameter where p < {paper.LEVEL}; of {own_name} where all others of the parameter differ"
+    bold = f"Bold: the highest of its parameter where p < {paper.LEVEL}"
+    bold += f"; of {own_name} where all others of the parameter differ"
     return _Half(cells, (f"{difference}. {bold}.",))
 
 
