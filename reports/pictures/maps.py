@@ -147,14 +147,6 @@ class Cloud:
     owner: Int32Array
 
 
-@dataclass(frozen=True)
-class Row:
-    """A row of a picture: three views of one cloud in one colouring."""
-
-    title: str
-    pictures: tuple[UInt8Array, ...]
-
-
 def draw_scene(prediction: Prediction, truth: GroundTruth | None, folder: Path, title: str) -> list[Path]:
     """Write ``instances.png`` and, where the map has names, ``classes.png`` with the truth below; their paths.
 
@@ -169,7 +161,7 @@ def draw_scene(prediction: Prediction, truth: GroundTruth | None, folder: Path, 
     names = names_of(prediction)
     row_colours = canvas.instance_colours(names)
     instances = folder / "instances.png"
-    _write_picture(instances, f"{title}: {len(names)} instances", [Row("", _paint(views, cloud, row_colours))], {})
+    _write_picture(instances, f"{title}: {len(names)} instances", [("", _paint(views, cloud, row_colours))], {})
     if not any(names):
         return [instances]
     classes = folder / "classes.png"
@@ -178,10 +170,10 @@ def draw_scene(prediction: Prediction, truth: GroundTruth | None, folder: Path, 
     used = [] if truth_cloud is None else _by_size(truth_cloud, truth_names)
     used += [name for name in _by_size(cloud, names) if name not in used]
     palette = canvas.class_colours([*used, *names])
-    rows = [Row("map", _paint(views, cloud, [palette[name] for name in names]))]
+    rows = [("map", _paint(views, cloud, [palette[name] for name in names]))]
     if truth_cloud is not None:
         colours = [palette.get(name, canvas.NO_INSTANCE) for name in truth_names]
-        rows.append(Row("ground truth", _paint(_views(truth_cloud, cameras), truth_cloud, colours)))
+        rows.append(("ground truth", _paint(_views(truth_cloud, cameras), truth_cloud, colours)))
     legend = {name or "without a name": palette[name] for name in used}
     if (cloud.owner < 0).any():
         legend["of no instance"] = canvas.NO_INSTANCE
@@ -205,7 +197,7 @@ def draw_heat_map(instances: Instances, similarity: Float64Array, path: Path, ti
     header = 46
     page = canvas.Canvas(3 * VIEW_WIDTH + HEAT_WIDTH, header + VIEW_HEIGHT)
     page.text(14, 16, printable(title, 110), 14, fontweight="bold")
-    for axes, owners in zip(_place_views(page, header, Row("", pictures)), seen, strict=True):
+    for axes, owners in zip(_place_views(page, header, "", pictures), seen, strict=True):
         _write_ranks(axes, owners, order[:MOST_RANKS])
     _write_ranking(page, 3 * VIEW_WIDTH + 14, header, similarity, top)
     page.write(path)
@@ -346,7 +338,9 @@ def _by_size(cloud: Cloud, names: Sequence[str]) -> list[str]:
     return sorted((name for name in totals if totals[name] > 0), key=lambda name: (-totals[name], name))
 
 
-def _write_picture(path: Path, title: str, rows: Sequence[Row], legend: Mapping[str, canvas.Colour]) -> None:
+def _write_picture(
+    path: Path, title: str, rows: Sequence[tuple[str, tuple[UInt8Array, ...]]], legend: Mapping[str, canvas.Colour]
+) -> None:
     """Compose views and legend into a PNG; the legend has as many columns as it needs."""
     header = 46
     height = len(rows) * VIEW_HEIGHT + header
@@ -354,8 +348,8 @@ def _write_picture(path: Path, title: str, rows: Sequence[Row], legend: Mapping[
     n_columns = min(MOST_COLUMNS, -(-len(legend) // a_column))
     page = canvas.Canvas(3 * VIEW_WIDTH + n_columns * COLUMN_WIDTH, height)
     page.text(14, 16, printable(title, 150), 14, fontweight="bold")
-    for r, row in enumerate(rows):
-        _place_views(page, header + r * VIEW_HEIGHT, row)
+    for r, (name, pictures) in enumerate(rows):
+        _place_views(page, header + r * VIEW_HEIGHT, name, pictures)
     shown = list(legend.items())
     most = n_columns * a_column
     if len(shown) > most:
@@ -368,12 +362,12 @@ def _write_picture(path: Path, title: str, rows: Sequence[Row], legend: Mapping[
     page.write(path)
 
 
-def _place_views(page: canvas.Canvas, top: float, row: Row) -> list[Any]:
+def _place_views(page: canvas.Canvas, top: float, name: str, pictures: Sequence[UInt8Array]) -> list[Any]:
     """The axes of the three views of a row, with their words."""
     placed = []
-    for c, picture in enumerate(row.pictures):
+    for c, picture in enumerate(pictures):
         axes = page.picture(c * VIEW_WIDTH, top, VIEW_WIDTH, VIEW_HEIGHT, picture)
-        label = f"{row.title} {VIEW_TITLES[c]}".strip()
+        label = f"{name} {VIEW_TITLES[c]}".strip()
         axes.text(14, VIEW_HEIGHT - 14, label, fontsize=10, color=PALE, va="bottom", bbox=canvas.paper())
         placed.append(axes)
     return placed
