@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from su3d_bench.core.geometry import voxel_coordinates
 from su3d_bench.core.maps import DenseFeatures, Prediction
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array, UInt8Array
+from su3d_bench.formats.images import jpeg_bytes
 from su3d_bench.metrics.matching.nearest import Candidates, first_rows
 from su3d_bench.reports.pictures.maps import map_cloud
 
@@ -120,6 +121,11 @@ def nearest_classes(points: Float32Array, truth: Candidates, classes: Int64Array
     return np.where(nearest_row >= 0, classes[nearest_row], NO_TRUTH_NEAR)
 
 
+def jpeg_text(rgb: UInt8Array, quality: int) -> str:
+    """A picture as a JPEG in base64."""
+    return base64.b64encode(jpeg_bytes(rgb, quality)).decode("ascii")
+
+
 def pack_map(cloud: Cloud, planes: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> str:
     """A map in base64. ``planes`` (n,) or (n, 3) uint8 or uint16 go beside the positions; ``about`` is plain values."""
     step = cloud.spacing_m / STEPS_A_SPACING
@@ -133,9 +139,11 @@ def pack_map(cloud: Cloud, planes: Mapping[str, NDArray[Any]], about: Mapping[st
         "spacing": cloud.spacing_m,
         "depth": len(levels),
         "planes": [
-            {"name": name, "bytes": plane.dtype.itemsize, "width": plane.reshape(len(plane), -1).shape[1] or 1}
-            if len(plane)
-            else {"name": name, "bytes": plane.dtype.itemsize, "width": 1}
+            {
+                "name": name,
+                "bytes": plane.dtype.itemsize,
+                "width": plane.shape[1] if plane.ndim > 1 and len(plane) else 1,
+            }
             for name, plane in planes.items()
         ],
         **about,

@@ -18,20 +18,8 @@ from su3d_bench.reports.tables.formats import html_tables
 HERE = Path(__file__).parent
 REGISTRY = HERE.parent / "registry"
 SCRIPTS = (  # in the order in which they run
-    "scripts/elements.js",
-    "scripts/maps/shaders.js",
-    "scripts/maps/view.js",
-    "scripts/maps/cloud.js",
-    "scripts/sections.js",
-    "scripts/maps/paint.js",
-    "scripts/maps/link.js",
-    "scripts/maps/pane.js",
-    "scripts/maps/scene.js",
-    "scripts/gallery.js",
-    "scripts/errors.js",
-    "scripts/timing.js",
-    "scripts/compare.js",
-    "scripts/page.js",
+    *("elements", "maps/shaders", "maps/view", "maps/cloud", "sections", "maps/paint", "maps/link", "maps/pane"),
+    *("maps/scene", "gallery", "errors", "timing", "compare", "page"),
 )
 STYLE = "page.css"
 TEMPLATE = "page.html.j2"
@@ -49,7 +37,11 @@ def page_html(
     galleries: Sequence[Mapping[str, Any]] = (),
 ) -> str:
     """The page. All but ``maps`` are plain values; those are in base64, in the order of ``numbers``."""
-    script = "(() => {\n'use strict';\n" + "\n".join(file_text(HERE / name) for name in SCRIPTS) + "\n})();\n"
+    script = (
+        "(() => {\n'use strict';\n"
+        + "\n".join(file_text(HERE / f"scripts/{name}.js") for name in SCRIPTS)
+        + "\n})();\n"
+    )
     return rendered(
         HERE,
         script,

@@ -14,25 +14,7 @@ from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.files.atomic import make_folder, write_bytes
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float64Array, UInt8Array
-from su3d_bench.reports.pictures.canvas import (
-    DARK,
-    GREY,
-    NO_INSTANCE,
-    Camera,
-    Canvas,
-    Colour,
-    View,
-    colour,
-    drawable,
-    figure_bytes,
-    hex_of,
-    instance_colours,
-    paper,
-    project,
-    render,
-    room_bounds,
-    view_cameras,
-)
+from su3d_bench.reports.pictures import canvas
 from su3d_bench.reports.pictures.items import Tag
 from su3d_bench.reports.pictures.maps import SQUARE_M, Cloud, map_cloud, thinned
 
@@ -108,7 +90,7 @@ def _figure_bytes(suffix: str, columns: Sequence[str], rows: Sequence[GridRow], 
                 page.text(left, top + ROW_IN + cell_height + 0.02 + CAPTION_IN * k, line, 6.5, colour=SOFT_INK)
     if scale is not None:
         page.scale(height - LEGEND_IN + 0.06, scale)
-    return figure_bytes(page.figure, suffix, DPI)
+    return canvas.figure_bytes(page.figure, suffix, DPI)
 
 
 def _caption_lines(row: GridRow) -> list[list[str]]:
@@ -124,7 +106,7 @@ def _covers(taken: Sequence[tuple[float, float, float]], x: float, row: float, h
     return any(abs(row - other[1]) < 0.045 and abs(x - other[0]) < half + other[2] for other in taken)
 
 
-class _Page(Canvas):
+class _Page(canvas.Canvas):
     """A figure of a paper, measured in inches."""
 
     def cell(self, x: float, y: float, cell_height: float, cell: Cell) -> None:
@@ -134,7 +116,7 @@ class _Page(Canvas):
         taken: list[tuple[float, float, float]] = []
         is_beside = len(cell.tags) <= FEW_TAGS
         for tag in cell.tags[:MOST_TAGS]:
-            text = drawable(printable(tag.text, 24))
+            text = canvas.drawable(printable(tag.text, 24))
             half = 0.011 * len(text) + 0.01
             row = tag.y + (AWAY if tag.y < 2 * AWAY else -AWAY) if is_beside else tag.y
             while is_beside and _covers(taken, tag.x, row, half) and 0 < row < 0.95:
@@ -142,11 +124,11 @@ class _Page(Canvas):
             if _covers(taken, tag.x, row, half):
                 continue  # a name that covers another tells nothing
             taken.append((tag.x, row, half))
-            shade = hex_of(tag.colour)
+            shade = canvas.hex_of(tag.colour)
             if is_beside:
                 places = [tag.x * width] * 2, [tag.y * height, row * height]
                 axes.plot(*places, color=shade, linewidth=0.7, marker="o", markersize=1.4, markevery=[0])
-            box = paper(shade, 0.12, 0.88, linewidth=0.5)
+            box = canvas.paper(shade, 0.12, 0.88, linewidth=0.5)
             axes.text(
                 tag.x * width, row * height, text, fontsize=4.6, color=INK, ha="center", va="center", bbox=box,
                 parse_math=False, clip_on=True,
@@ -184,7 +166,7 @@ class SpokenOf:
     def rows(self) -> tuple[int, ...]:
         return tuple(dict.fromkeys((*self.answer, *self.reference)))
 
-    def colour(self, row: int) -> Colour:
+    def colour(self, row: int) -> canvas.Colour:
         return ANSWER if row in self.answer else REFERENCE
 
 
@@ -192,43 +174,45 @@ def draw_reasoning(
     instances: Instances, spoken_of: SpokenOf, names: Sequence[str], path: Path, question: str, lines: Sequence[str]
 ) -> None:
     """Write the picture of an answer: ``names`` label the instances, ``lines`` stand under the ``question``."""
-    names = [drawable(printable(name, MOST_CHARACTERS)) for name in names]
+    names = [canvas.drawable(printable(name, MOST_CHARACTERS)) for name in names]
     written = [part for line in lines for part in textwrap.wrap(printable(line), CHARACTERS_A_LINE)][:MOST_LINES]
     header = 52 + LINE_HEIGHT * len(written)
     width, height = 2 * PANEL_WIDTH + 3 * MARGIN, header + PANEL_HEIGHT + MARGIN
-    page = Canvas(width, height)
+    page = canvas.Canvas(width, height)
     page.text(MARGIN, 14, printable(question, 110), 15, weight="bold")
     for k, line in enumerate(written):
-        page.text(MARGIN, 46 + LINE_HEIGHT * k, line, 11, colour=DARK if k == 0 else GREY)
+        page.text(MARGIN, 46 + LINE_HEIGHT * k, line, 11, colour=canvas.DARK if k == 0 else canvas.GREY)
     cloud = thinned(map_cloud(instances))
     palette = _palette(names, spoken_of)
     for column, (camera, view, title) in enumerate(_two_views(cloud, spoken_of)):
         left = MARGIN + column * (PANEL_WIDTH + MARGIN)
-        axes = page.picture(left, header, PANEL_WIDTH, PANEL_HEIGHT, colour(view, palette[cloud.owner]))
+        axes = page.picture(left, header, PANEL_WIDTH, PANEL_HEIGHT, canvas.colour(view, palette[cloud.owner]))
         _draw_spoken_of(axes, camera, instances, spoken_of, names)
-        axes.text(10, PANEL_HEIGHT - 10, title, fontsize=10, color=GREY, va="bottom")
+        axes.text(10, PANEL_HEIGHT - 10, title, fontsize=10, color=canvas.GREY, va="bottom")
     page.write(path)
 
 
 def _palette(names: Sequence[str], spoken_of: SpokenOf) -> UInt8Array:
     """A colour a row: strong for what is spoken of, pale for the rest; the last one is that of no instance."""
-    own = np.array([*instance_colours(names), NO_INSTANCE], np.float64)
+    own = np.array([*canvas.instance_colours(names), canvas.NO_INSTANCE], np.float64)
     pale = PALE * own + (1 - PALE) * 235.0
     for row in spoken_of.rows:
         pale[row] = spoken_of.colour(row)
     return np.rint(pale).astype(np.uint8)
 
 
-def _two_views(cloud: Cloud, spoken_of: SpokenOf) -> list[tuple[Camera, View, str]]:
+def _two_views(cloud: Cloud, spoken_of: SpokenOf) -> list[tuple[canvas.Camera, canvas.View, str]]:
     """The view from above, and that from the corner where most of what is spoken of is seen."""
-    cameras = view_cameras(room_bounds(cloud.points), PANEL_WIDTH, PANEL_HEIGHT)
-    above, *corners = [(camera, render(cloud.points, SQUARE_M, camera)) for camera in cameras]
+    cameras = canvas.view_cameras(canvas.room_bounds(cloud.points), PANEL_WIDTH, PANEL_HEIGHT)
+    above, *corners = [(camera, canvas.render(cloud.points, SQUARE_M, camera)) for camera in cameras]
     wanted = np.isin(cloud.owner, spoken_of.rows)
     camera, view = max(corners, key=lambda pair: wanted[pair[1].point[pair[1].point >= 0]].sum())
     return [(*above, "from above"), (camera, view, "from the corner that shows most of it")]
 
 
-def _draw_spoken_of(axes: Any, camera: Camera, instances: Instances, spoken_of: SpokenOf, names: Sequence[str]) -> None:
+def _draw_spoken_of(
+    axes: Any, camera: canvas.Camera, instances: Instances, spoken_of: SpokenOf, names: Sequence[str]
+) -> None:
     """Boxes and names of what is spoken of, and a line from each answer to the nearest reference."""
     from matplotlib.patheffects import withStroke
 
@@ -238,24 +222,26 @@ def _draw_spoken_of(axes: Any, camera: Camera, instances: Instances, spoken_of: 
         others = np.array([k for k in spoken_of.reference if k != row and not _touch(instances, k, row)], int)
         if len(others):
             nearest = int(others[np.argmin(np.linalg.norm(centres[others] - centres[row], axis=1))])
-            ends = project(camera, centres[[row, nearest]])
-            axes.plot(ends[:, 0], ends[:, 1], color=DARK, linewidth=1.2, linestyle=(0, (4, 3)), path_effects=halo)
+            ends = canvas.project(camera, centres[[row, nearest]])
+            axes.plot(
+                ends[:, 0], ends[:, 1], color=canvas.DARK, linewidth=1.2, linestyle=(0, (4, 3)), path_effects=halo
+            )
     placed: list[Float64Array] = []
     edges: dict[str, Any] = (
         {"linewidth": 1.4, "path_effects": halo} if len(spoken_of.rows) <= FEW else {"linewidth": 0.9}
     )
     for row in spoken_of.rows[:MOST_LABELS]:
-        shade = hex_of(spoken_of.colour(row))
+        shade = canvas.hex_of(spoken_of.colour(row))
         low, high = instances.boxes[row].astype(np.float64)
         corners = np.array([[high[i] if k >> i & 1 else low[i] for i in range(3)] for k in range(8)])
-        pixels = project(camera, corners)
+        pixels = canvas.project(camera, corners)
         for a, b in EDGES:
             axes.plot(pixels[[a, b], 0], pixels[[a, b], 1], color=shade, **edges)
         x, y = _free_place(pixels, names[row], placed)
         middle = np.nanmean(pixels, axis=0)
         if not ((pixels[:, 1].min() - 2 * LABEL_HEIGHT <= y) & (y <= pixels[:, 1].max())):
             axes.plot([x, middle[0]], [y, middle[1]], color=shade, linewidth=0.6, alpha=0.6)
-        box = paper(shade, 0.2, 0.92)
+        box = canvas.paper(shade, 0.2, 0.92)
         axes.text(x, y, names[row], fontsize=9.5, color=shade, ha="center", va="center", bbox=box, parse_math=False)
 
 

@@ -15,27 +15,7 @@ from su3d_bench.core.files.atomic import make_folder
 from su3d_bench.core.geometry import voxel_coordinates
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, GroundTruth, Int32Array, Int64Array, UInt8Array
-from su3d_bench.reports.pictures.canvas import (
-    DARK,
-    GREY,
-    NO_INSTANCE,
-    OVERSAMPLING,
-    Camera,
-    Canvas,
-    Colour,
-    View,
-    class_colours,
-    colour,
-    heat_colours,
-    hex_of,
-    instance_colours,
-    paper,
-    project,
-    render,
-    room_bounds,
-    scale_stops,
-    view_cameras,
-)
+from su3d_bench.reports.pictures import canvas
 from su3d_bench.reports.pictures.items import OUTLINE, draw_outline
 
 PALE_GREY = 232
@@ -50,27 +30,30 @@ class MapView:
     Of it the part ``box`` (x0, y0, x1, y1 in pixels of the picture) is shown.
     """
 
-    camera: Camera
-    view: View
+    camera: canvas.Camera
+    view: canvas.View
     box: tuple[int, int, int, int]
 
     @cached_property
-    def shown(self) -> View:
+    def shown(self) -> canvas.View:
         """The part of ``view`` that is shown."""
-        x0, y0, x1, y1 = (OVERSAMPLING * side for side in self.box)
+        x0, y0, x1, y1 = (canvas.OVERSAMPLING * side for side in self.box)
         part = slice(y0, y1), slice(x0, x1)
-        return View(np.ascontiguousarray(self.view.point[part]), np.ascontiguousarray(self.view.shade[part]))
+        return canvas.View(np.ascontiguousarray(self.view.point[part]), np.ascontiguousarray(self.view.shade[part]))
 
     def shows(self, is_member: BoolArray) -> BoolArray:
         """Where the view shows a point of those that ``is_member`` marks: (h, w) of the picture."""
         point, known = self.shown.point, np.append(is_member, False)
-        seen: BoolArray = known[point[::OVERSAMPLING, ::OVERSAMPLING]] | known[point[1::OVERSAMPLING, 1::OVERSAMPLING]]
+        seen: BoolArray = (
+            known[point[:: canvas.OVERSAMPLING, :: canvas.OVERSAMPLING]]
+            | known[point[1 :: canvas.OVERSAMPLING, 1 :: canvas.OVERSAMPLING]]
+        )
         return seen
 
     def project(self, points: Float64Array) -> Float64Array:
         """Columns and rows (N, 2) of world points as shares of the width and height that are shown."""
         x0, y0, x1, y1 = self.box
-        shares: Float64Array = (project(self.camera, points) - np.array([x0, y0])) / np.array([x1 - x0, y1 - y0])
+        shares: Float64Array = (canvas.project(self.camera, points) - np.array([x0, y0])) / np.array([x1 - x0, y1 - y0])
         return shares
 
 
@@ -90,32 +73,32 @@ class DrawnMap:
         members: BoolArray = is_member[self.rows]
         return members
 
-    def view(self, camera: Camera) -> MapView:
+    def view(self, camera: canvas.Camera) -> MapView:
         return view_of(self.instances.points[self.rows], camera)
 
-    def cameras(self, width: int, height: int) -> tuple[Camera, Camera, Camera]:
+    def cameras(self, width: int, height: int) -> tuple[canvas.Camera, canvas.Camera, canvas.Camera]:
         """From above and from two opposite corners, for views of the shape of this size and at least as large."""
         return cameras_of(self.instances.points, width, height)
 
     def paint(self, view: MapView, colours: UInt8Array) -> UInt8Array:
         """The picture of a view, instance k in ``colours[k]``."""
-        palette = np.concatenate([colours.reshape(-1, 3), np.array([NO_INSTANCE], np.uint8)])
+        palette = np.concatenate([colours.reshape(-1, 3), np.array([canvas.NO_INSTANCE], np.uint8)])
         return self.paint_points(view, palette[self.owner])
 
     def paint_points(self, view: MapView, colours: UInt8Array) -> UInt8Array:
         """The picture of a view, each drawn point in a colour (N, 3) of its own."""
-        return colour(view.shown, colours)
+        return canvas.colour(view.shown, colours)
 
 
-def view_of(points: Float32Array, camera: Camera) -> MapView:
+def view_of(points: Float32Array, camera: canvas.Camera) -> MapView:
     """What a camera shows of ``points``."""
-    view = render(points, SQUARE_M, camera)
+    view = canvas.render(points, SQUARE_M, camera)
     return MapView(camera, view, _filled_part(view, camera.width / camera.height))
 
 
-def cameras_of(points: Float32Array, width: int, height: int) -> tuple[Camera, Camera, Camera]:
+def cameras_of(points: Float32Array, width: int, height: int) -> tuple[canvas.Camera, canvas.Camera, canvas.Camera]:
     """From above and from two opposite corners, for views of the shape of this size and at least as large."""
-    return view_cameras(room_bounds(points), round(RENDERED * width), round(RENDERED * height))
+    return canvas.view_cameras(canvas.room_bounds(points), round(RENDERED * width), round(RENDERED * height))
 
 
 def drawn_map(instances: Instances) -> DrawnMap:
@@ -124,14 +107,14 @@ def drawn_map(instances: Instances) -> DrawnMap:
     return DrawnMap(instances, rows, map_cloud(instances).owner[rows])
 
 
-def _filled_part(view: View, aspect: float) -> tuple[int, int, int, int]:
+def _filled_part(view: canvas.View, aspect: float) -> tuple[int, int, int, int]:
     """The smallest part of a view of that shape, width by height, that holds all that is drawn."""
-    height, width = (side // OVERSAMPLING for side in view.point.shape)
+    height, width = (side // canvas.OVERSAMPLING for side in view.point.shape)
     rows, columns = np.nonzero(view.point >= 0)
     if not len(rows):
         return 0, 0, width, height
-    left, right = columns.min() / OVERSAMPLING - BORDER, columns.max() / OVERSAMPLING + BORDER
-    upper, lower = rows.min() / OVERSAMPLING - BORDER, rows.max() / OVERSAMPLING + BORDER
+    left, right = columns.min() / canvas.OVERSAMPLING - BORDER, columns.max() / canvas.OVERSAMPLING + BORDER
+    upper, lower = rows.min() / canvas.OVERSAMPLING - BORDER, rows.max() / canvas.OVERSAMPLING + BORDER
     tall = min(max(lower - upper, (right - left) / aspect), float(height), width / aspect)
     wide = tall * aspect
     x0 = int(np.clip((left + right - wide) / 2, 0, width - wide))
@@ -164,14 +147,6 @@ class Cloud:
     owner: Int32Array
 
 
-@dataclass(frozen=True)
-class Row:
-    """A row of a picture: three views of one cloud in one colouring."""
-
-    title: str
-    pictures: tuple[UInt8Array, ...]
-
-
 def draw_scene(prediction: Prediction, truth: GroundTruth | None, folder: Path, title: str) -> list[Path]:
     """Write ``instances.png`` and, where the map has names, ``classes.png`` with the truth below; their paths.
 
@@ -183,10 +158,10 @@ def draw_scene(prediction: Prediction, truth: GroundTruth | None, folder: Path, 
     cloud = thinned(map_cloud(prediction))
     cameras = _cameras(cloud.points if truth is None else truth.points)
     views = _views(cloud, cameras)
-    names = _names_of(prediction)
-    row_colours = instance_colours(names)
+    names = names_of(prediction)
+    row_colours = canvas.instance_colours(names)
     instances = folder / "instances.png"
-    _write_picture(instances, f"{title}: {len(names)} instances", [Row("", _paint(views, cloud, row_colours))], {})
+    _write_picture(instances, f"{title}: {len(names)} instances", [("", _paint(views, cloud, row_colours))], {})
     if not any(names):
         return [instances]
     classes = folder / "classes.png"
@@ -194,14 +169,14 @@ def draw_scene(prediction: Prediction, truth: GroundTruth | None, folder: Path, 
     truth_names = () if truth is None else truth.labels.names
     used = [] if truth_cloud is None else _by_size(truth_cloud, truth_names)
     used += [name for name in _by_size(cloud, names) if name not in used]
-    palette = class_colours([*used, *names])
-    rows = [Row("map", _paint(views, cloud, [palette[name] for name in names]))]
+    palette = canvas.class_colours([*used, *names])
+    rows = [("map", _paint(views, cloud, [palette[name] for name in names]))]
     if truth_cloud is not None:
-        colours = [palette.get(name, NO_INSTANCE) for name in truth_names]
-        rows.append(Row("ground truth", _paint(_views(truth_cloud, cameras), truth_cloud, colours)))
+        colours = [palette.get(name, canvas.NO_INSTANCE) for name in truth_names]
+        rows.append(("ground truth", _paint(_views(truth_cloud, cameras), truth_cloud, colours)))
     legend = {name or "without a name": palette[name] for name in used}
     if (cloud.owner < 0).any():
-        legend["of no instance"] = NO_INSTANCE
+        legend["of no instance"] = canvas.NO_INSTANCE
     _write_picture(classes, f"{title}: classes", rows, legend)
     return [instances, classes]
 
@@ -214,23 +189,25 @@ def draw_heat_map(instances: Instances, similarity: Float64Array, path: Path, ti
     cloud = thinned(map_cloud(instances))
     views = _views(cloud, _cameras(cloud.points))
     order = np.argsort(-similarity, kind="stable")[: len(top)]
-    pictures = _paint(views, cloud, heat_colours(similarity))
+    pictures = _paint(views, cloud, canvas.heat_colours(similarity))
     seen = [_owners_seen(view, cloud) for view in views]
     for picture, owners in zip(pictures, seen, strict=True):
         for best in order[:1]:
             draw_outline(picture, owners == best, 3)
     header = 46
-    page = Canvas(3 * VIEW_WIDTH + HEAT_WIDTH, header + VIEW_HEIGHT)
+    page = canvas.Canvas(3 * VIEW_WIDTH + HEAT_WIDTH, header + VIEW_HEIGHT)
     page.text(14, 16, printable(title, 110), 14, fontweight="bold")
-    for axes, owners in zip(_place_views(page, header, Row("", pictures)), seen, strict=True):
+    for axes, owners in zip(_place_views(page, header, "", pictures), seen, strict=True):
         _write_ranks(axes, owners, order[:MOST_RANKS])
     _write_ranking(page, 3 * VIEW_WIDTH + 14, header, similarity, top)
     page.write(path)
 
 
-def _owners_seen(view: View, cloud: Cloud) -> Int32Array:
+def _owners_seen(view: canvas.View, cloud: Cloud) -> Int32Array:
     """Whose point each pixel (h, w) of the picture shows, -1 for nobody's."""
-    owners: Int32Array = np.append(cloud.owner, np.int32(-1))[view.point[::OVERSAMPLING, ::OVERSAMPLING]]
+    owners: Int32Array = np.append(cloud.owner, np.int32(-1))[
+        view.point[:: canvas.OVERSAMPLING, :: canvas.OVERSAMPLING]
+    ]
     return owners
 
 
@@ -246,10 +223,10 @@ def _write_ranks(axes: Any, owners: Int32Array, order: Int64Array) -> None:
         at = _free_place(middle, taken, is_beside=len(places) < SMALL_PIXELS)
         taken.append(at)
         if not np.array_equal(at, middle):
-            axes.plot(*np.stack([middle, at]).T, color=DARK, linewidth=0.8)
-        shade = hex_of(OUTLINE) if rank == 1 else DARK
-        axes.text(*at, str(rank), fontsize=8.5, color=DARK, ha="center", va="center", fontweight="bold",
-                  bbox=paper(shade, 0.25, 0.92, linewidth=1.6 if rank == 1 else 0.6))  # fmt: skip
+            axes.plot(*np.stack([middle, at]).T, color=canvas.DARK, linewidth=0.8)
+        shade = canvas.hex_of(OUTLINE) if rank == 1 else canvas.DARK
+        axes.text(*at, str(rank), fontsize=8.5, color=canvas.DARK, ha="center", va="center", fontweight="bold",
+                  bbox=canvas.paper(shade, 0.25, 0.92, linewidth=1.6 if rank == 1 else 0.6))  # fmt: skip
 
 
 def _free_place(wanted: Float64Array, taken: Sequence[Float64Array], *, is_beside: bool) -> Float64Array:
@@ -267,36 +244,40 @@ def _free_place(wanted: Float64Array, taken: Sequence[Float64Array], *, is_besid
     return wanted
 
 
-def _write_ranking(page: Canvas, left: float, top: float, similarity: Float64Array, lines: Sequence[str]) -> None:
+def _write_ranking(
+    page: canvas.Canvas, left: float, top: float, similarity: Float64Array, lines: Sequence[str]
+) -> None:
     """The scale of similarity with its least and greatest value, and the most similar instances below it."""
     wide = HEAT_WIDTH - 40
-    page.text(left, top, "similarity to the text (cosine)", 10, colour=GREY)
+    page.text(left, top, "similarity to the text (cosine)", 10, colour=canvas.GREY)
     if len(similarity):
         low, high = float(similarity.min()), float(similarity.max())
         is_one = high == low
-        colours = np.array(heat_colours(similarity[:1]), np.uint8) if is_one else scale_stops("paper")
+        colours = np.array(canvas.heat_colours(similarity[:1]), np.uint8) if is_one else canvas.scale_stops("paper")
         page.axes(left, top + 22, wide, BAR_HEIGHT).imshow(colours[None], aspect="auto")
         numbers = top + 26 + BAR_HEIGHT
         page.text(left, numbers, f"{low:.3f}", 10)
         if not is_one:
             page.text(left + wide / 2, numbers, f"{(low + high) / 2:.3f}", 10, ha="center")
             page.text(left + wide, numbers, f"{high:.3f}", 10, ha="right")
-    page.text(left, top + 62, "grey: of no instance", 9, colour=GREY)
+    page.text(left, top + 62, "grey: of no instance", 9, colour=canvas.GREY)
     first = top + 90
     room = int((VIEW_HEIGHT - 118) / LEGEND_STEP)
     for k, line in enumerate(lines[:room]):
         weight = "bold" if k == 0 else "normal"
         page.text(left, first + LEGEND_STEP * k, printable(line, 36), 10, fontweight=weight)
     note = f"and {len(lines) - room} more; " if len(lines) > room else ""
-    page.text(left, first + LEGEND_STEP * min(len(lines), room) + 8, f"{note}the best is outlined", 10, colour=GREY)
+    page.text(
+        left, first + LEGEND_STEP * min(len(lines), room) + 8, f"{note}the best is outlined", 10, colour=canvas.GREY
+    )
 
 
-def _names_of(prediction: Prediction) -> tuple[str, ...]:
+def names_of(prediction: Prediction) -> tuple[str, ...]:
+    """What a person reads of each instance: the label that the method decided, else the name that perception gave."""
     if isinstance(prediction, Instances):
         labels = prediction.labels or prediction.names
         return tuple(label or name for label, name in zip(labels, prediction.names, strict=True))
-    assert not isinstance(prediction, DenseFeatures)
-    return ("",) * len(prediction.features)
+    return () if isinstance(prediction, DenseFeatures) else ("",) * len(prediction.features)
 
 
 def map_cloud(prediction: Prediction) -> Cloud:
@@ -335,17 +316,17 @@ def thinned_rows(points: Float32Array) -> Int64Array:
     return first
 
 
-def _cameras(points: Float32Array) -> tuple[Camera, ...]:
-    return view_cameras(room_bounds(points), VIEW_WIDTH, VIEW_HEIGHT)
+def _cameras(points: Float32Array) -> tuple[canvas.Camera, ...]:
+    return canvas.view_cameras(canvas.room_bounds(points), VIEW_WIDTH, VIEW_HEIGHT)
 
 
-def _views(cloud: Cloud, cameras: Sequence[Camera]) -> tuple[View, ...]:
-    return tuple(render(cloud.points, SQUARE_M, camera) for camera in cameras)
+def _views(cloud: Cloud, cameras: Sequence[canvas.Camera]) -> tuple[canvas.View, ...]:
+    return tuple(canvas.render(cloud.points, SQUARE_M, camera) for camera in cameras)
 
 
-def _paint(views: Sequence[View], cloud: Cloud, row_colours: Sequence[Colour]) -> tuple[UInt8Array, ...]:
-    palette = np.array([*row_colours, NO_INSTANCE], np.uint8)
-    return tuple(colour(view, palette[cloud.owner]) for view in views)
+def _paint(views: Sequence[canvas.View], cloud: Cloud, row_colours: Sequence[canvas.Colour]) -> tuple[UInt8Array, ...]:
+    palette = np.array([*row_colours, canvas.NO_INSTANCE], np.uint8)
+    return tuple(canvas.colour(view, palette[cloud.owner]) for view in views)
 
 
 def _by_size(cloud: Cloud, names: Sequence[str]) -> list[str]:
@@ -357,34 +338,36 @@ def _by_size(cloud: Cloud, names: Sequence[str]) -> list[str]:
     return sorted((name for name in totals if totals[name] > 0), key=lambda name: (-totals[name], name))
 
 
-def _write_picture(path: Path, title: str, rows: Sequence[Row], legend: Mapping[str, Colour]) -> None:
+def _write_picture(
+    path: Path, title: str, rows: Sequence[tuple[str, tuple[UInt8Array, ...]]], legend: Mapping[str, canvas.Colour]
+) -> None:
     """Compose views and legend into a PNG; the legend has as many columns as it needs."""
     header = 46
     height = len(rows) * VIEW_HEIGHT + header
     a_column = (height - header) // LEGEND_STEP
     n_columns = min(MOST_COLUMNS, -(-len(legend) // a_column))
-    page = Canvas(3 * VIEW_WIDTH + n_columns * COLUMN_WIDTH, height)
+    page = canvas.Canvas(3 * VIEW_WIDTH + n_columns * COLUMN_WIDTH, height)
     page.text(14, 16, printable(title, 150), 14, fontweight="bold")
-    for r, row in enumerate(rows):
-        _place_views(page, header + r * VIEW_HEIGHT, row)
+    for r, (name, pictures) in enumerate(rows):
+        _place_views(page, header + r * VIEW_HEIGHT, name, pictures)
     shown = list(legend.items())
     most = n_columns * a_column
     if len(shown) > most:
-        shown = [*shown[: most - 1], (f"and {len(shown) - most + 1} more", NO_INSTANCE)]
+        shown = [*shown[: most - 1], (f"and {len(shown) - most + 1} more", canvas.NO_INSTANCE)]
     for k, (name, rgb) in enumerate(shown):
         column, row_of = divmod(k, a_column)
         left, middle = 3 * VIEW_WIDTH + column * COLUMN_WIDTH, header + LEGEND_STEP * row_of + 12
-        page.text(left + 8, middle, "\u25a0", 15, colour=hex_of(rgb), va="center")
+        page.text(left + 8, middle, "\u25a0", 15, colour=canvas.hex_of(rgb), va="center")
         page.text(left + 30, middle, printable(name, MOST_NAME), 10, va="center")
     page.write(path)
 
 
-def _place_views(page: Canvas, top: float, row: Row) -> list[Any]:
+def _place_views(page: canvas.Canvas, top: float, name: str, pictures: Sequence[UInt8Array]) -> list[Any]:
     """The axes of the three views of a row, with their words."""
     placed = []
-    for c, picture in enumerate(row.pictures):
+    for c, picture in enumerate(pictures):
         axes = page.picture(c * VIEW_WIDTH, top, VIEW_WIDTH, VIEW_HEIGHT, picture)
-        label = f"{row.title} {VIEW_TITLES[c]}".strip()
-        axes.text(14, VIEW_HEIGHT - 14, label, fontsize=10, color=PALE, va="bottom", bbox=paper())
+        label = f"{name} {VIEW_TITLES[c]}".strip()
+        axes.text(14, VIEW_HEIGHT - 14, label, fontsize=10, color=PALE, va="bottom", bbox=canvas.paper())
         placed.append(axes)
     return placed

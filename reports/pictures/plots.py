@@ -59,7 +59,10 @@ def draw_timing(
     }
     if _curves(anytime):
         figures["anytime"] = _anytime(anytime)
-    return [_save(figure, folder / f"{name}.{kind}") for name, figure in figures.items() for kind in ("png", "pdf")]
+    paths = {folder / f"{name}.{kind}": figure for name, figure in figures.items() for kind in ("png", "pdf")}
+    for path, figure in paths.items():
+        write_bytes(path, figure_bytes(figure, path.suffix[1:], DPI))
+    return list(paths)
 
 
 def _figure(width: float, height: float, n_axes: int = 1) -> tuple[Figure, list[Axes]]:
@@ -84,11 +87,6 @@ def _style(index: int) -> dict[str, Any]:
 def draw_update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, kind: str) -> bytes:
     """The cost of an update against the points of the map, as a ``png`` or ``pdf`` file."""
     return figure_bytes(_update_cost(times, warm_up, POINTS), kind, DPI)
-
-
-def _save(figure: Figure, path: Path) -> Path:
-    write_bytes(path, figure_bytes(figure, path.suffix[1:], DPI))
-    return path
 
 
 def _label(method: str, run: str, several_runs: bool) -> str:
@@ -127,7 +125,10 @@ def _update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, against: 
         if growth is not None:
             found.setdefault(growth.words, []).append(label)
             label += f": exponent {growth.exponent:z.2f} [{growth.low:z.2f}, {growth.high:z.2f}], {growth.words}"
-        _draw_cost(axes, sizes[usable], costs[usable], index, label)
+        sizes, costs, style = sizes[usable], costs[usable], _style(index)
+        step = 1 + len(sizes) // MAX_DRAWN
+        axes.plot(sizes[::step], costs[::step], ".", markersize=2, color=style["color"], alpha=0.4)
+        _draw_medians(axes, sizes, costs, 5.5, label, style)
     axes.set(xscale="log", yscale="log", xlabel=against, ylabel="ms per update, without perception")
     _entitle(figure, axes, cost_sentence(found, against))
     _number_by_1_2_5(axes.xaxis)
@@ -178,12 +179,13 @@ def _number_by_1_2_5(axis: Axis) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _draw_cost(axes: Axes, sizes: Float64Array, costs: Float64Array, index: int, label: str) -> None:
-    style = _style(index)
-    step = 1 + len(sizes) // MAX_DRAWN
-    axes.plot(sizes[::step], costs[::step], ".", markersize=2, color=style["color"], alpha=0.4)
-    x, y = medians_by_size(sizes, costs)
-    axes.plot(x, y, linewidth=1.2, markersize=5.5, markerfacecolor="white", label=label, **style)
+def _draw_medians(
+    axes: Axes, sizes: Float64Array, values: Float64Array, marker: float, label: str, style: Mapping[str, Any]
+) -> float:
+    """Draw a method's line through the medians of about one size; the largest of them."""
+    x, y = medians_by_size(sizes, values)
+    axes.plot(x, y, linewidth=1.2, markersize=marker, markerfacecolor="white", label=label, **style)
+    return float(y.max())
 
 
 def medians_by_size(sizes: Float64Array, costs: Float64Array) -> tuple[Float64Array, Float64Array]:
@@ -267,9 +269,7 @@ def _memory(times: Sequence[Sequence[UpdateTimes]]) -> Figure:
             values = np.concatenate([scene.columns[column] for scene, _ in sized] or [np.zeros(0)])
             if not (sizes > 0).any():
                 continue
-            x, y = medians_by_size(sizes[sizes > 0], values[sizes > 0] / MIB)
-            most[label] = float(y.max())
-            axes.plot(x, y, linewidth=1.2, markersize=4.5, markerfacecolor="white", label=label, **_style(index))
+            most[label] = _draw_medians(axes, sizes[sizes > 0], values[sizes > 0] / MIB, 4.5, label, _style(index))
         what = "the map" if column == "map_bytes" else "the process"
         axes.margins(y=0.12)  # the markers at the top stand whole
         axes.set(xscale="log", xlabel=against, ylabel=f"MiB of {what}")
@@ -413,7 +413,11 @@ def _draw_panel(axes: Any, protocol: Mapping[str, Any], metric: str, *, has_name
     most = f", the costliest kind: {worst}" if worst is not None and gains[worst] > 0 else ""
     title = drawable(f"{protocol['protocol']}: {metric} {value:.1f}{most}")
     axes.set_title(title, fontsize=10.5, loc="left", parse_math=False)
-    axes.set_xlabel("value with this alone corrected", fontsize=8.5, color="#444444")
+    _without_frame(axes, "value with this alone corrected")
+
+
+def _without_frame(axes: Any, title: str) -> None:
+    axes.set_xlabel(title, fontsize=8.5, color="#444444")
     axes.tick_params(axis="y", length=0)
     axes.tick_params(axis="x", labelsize=8.5)
     for side in ("top", "right", "left"):
@@ -470,8 +474,4 @@ def _draw_shift_panel(axes: Any, apart: Mapping[str, Any], name: str, *, has_nam
     shown = [drawable(text if len(text) <= MOST_OF_A_NAME else text[: MOST_OF_A_NAME - 3] + "...") for text in labels]
     axes.set_yticks(range(len(labels)), shown if has_names else [""] * len(labels), fontsize=9, parse_math=False)
     axes.set_title(f"{name}: {end - start:+.1f} points", fontsize=10.5, loc="left", parse_math=False)
-    axes.set_xlabel("per cent", fontsize=8.5, color="#444444")
-    axes.tick_params(axis="y", length=0)
-    axes.tick_params(axis="x", labelsize=8.5)
-    for side in ("top", "right", "left"):
-        axes.spines[side].set_visible(False)
+    _without_frame(axes, "per cent")

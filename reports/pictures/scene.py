@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,24 +23,7 @@ from su3d_bench.core.types import (
     UInt8Array,
     WorldUp,
 )
-from su3d_bench.reports.pictures.canvas import (
-    DARK,
-    GREY,
-    NO_INSTANCE,
-    OVERSAMPLING,
-    Camera,
-    Canvas,
-    Colour,
-    class_colours,
-    colour,
-    hex_of,
-    instance_colours,
-    paper,
-    project,
-    render,
-    room_bounds,
-    view_cameras,
-)
+from su3d_bench.reports.pictures import canvas
 from su3d_bench.reports.pictures.maps import thinned_rows, truth_owner
 
 CAMERAS = 48  # enough for the shape of a walk
@@ -86,16 +70,20 @@ def look_at(
 
     A frame or a truth that is damaged is a ``DataError``; a truth that is not there is no fault, nor are frames.
     """
+    frames: Sequence[Frame] = ()
+    n_frames = 0
+    truth, reason = _truth(dataset, scene)
     try:
-        frames = dataset.frames(scene, stride or 1)
-        n_frames = dataset.info(scene, 1).n_frames
-    except FramesMissing:
-        return _without_frames(dataset, scene)
-    if not len(frames):
-        raise DataError(f"{dataset.name}/{scene}: has no frames to show")
+        frames, n_frames = dataset.frames(scene, stride or 1), dataset.info(scene, 1).n_frames
+        if not len(frames):
+            raise DataError(f"{dataset.name}/{scene}: has no frames to show")
+    except FramesMissing as error:
+        if truth is None:
+            raise DataError(reason) from error
     positions = range(len(frames)) if stride else evenly(len(frames), CAMERAS)
     is_shown = set(evenly(len(positions), SHOWN_FRAMES))
-    poses, shown, points, colours, ranges = [], [], [], [], []
+    poses, shown, ranges = list[Float64Array](), list[Frame](), list[float]()
+    points, colours = [np.zeros((0, 3), np.float32)], [np.zeros((0, 3), np.uint8)]
     for k, position in enumerate(positions):
         progress(k, len(positions))
         frame = frames[position]
@@ -108,42 +96,14 @@ def look_at(
         depth = frame.depth_m[pixels]
         ranges += list(np.percentile(depth, PERCENTILES)) if len(depth) else []
     progress(len(positions), len(positions))
-    truth, reason = _truth(dataset, scene)
-    up = dataset.up(scene) if isinstance(dataset, SaysUp) else None
+    up = dataset.up(scene) if len(frames) and isinstance(dataset, SaysUp) else None
     turn = np.eye(3) if up is None or up.axis is None or up.is_turned else turn_to_z(up.axis)
-    drawn = np.array(poses)
+    drawn = np.array(poses).reshape(-1, 4, 4)
     drawn[:, :3] = turn @ drawn[:, :3]
-    return SceneLook(
-        scene=f"{dataset.name}/{scene}",
-        n_frames=n_frames,
-        poses=drawn,
-        seen=(np.concatenate(points) @ turn.T).astype(np.float32),
-        seen_rgb=np.concatenate(colours),
-        shown=tuple(shown),
-        depth_m=(float(min(ranges, default=0.0)), float(max(ranges, default=0.0))),
-        truth=truth,
-        no_truth=reason,
-        up=up,
-    )
-
-
-def _without_frames(dataset: Dataset, scene: str) -> SceneLook:
-    """A look at the truth alone; where there is none either, ``DataError``."""
-    truth, reason = _truth(dataset, scene)
-    if truth is None:
-        raise DataError(reason)
-    none = np.zeros((0, 3))
-    return SceneLook(
-        scene=f"{dataset.name}/{scene}",
-        n_frames=0,
-        poses=np.zeros((0, 4, 4)),
-        seen=none.astype(np.float32),
-        seen_rgb=none.astype(np.uint8),
-        shown=(),
-        depth_m=(0.0, 0.0),
-        truth=truth,
-        no_truth="",
-    )
+    seen = (np.concatenate(points) @ turn.T).astype(np.float32)
+    depth_m = (float(min(ranges, default=0.0)), float(max(ranges, default=0.0)))
+    about = (f"{dataset.name}/{scene}", n_frames, drawn, seen, np.concatenate(colours), tuple(shown), depth_m)
+    return SceneLook(*about, truth, reason, up)
 
 
 def evenly(n: int, most: int) -> Sequence[int]:
@@ -216,36 +176,36 @@ WALK, START, END = "#d6246e", "#1a9850", "#111111"
 MOST_BEYOND_M = 10.0
 
 
-@dataclass(frozen=True)
-class Panel:
-    """One view of the scene: its caption and pixels, and the camera of a view from above, for what is drawn on it."""
-
-    caption: str
-    pixels: UInt8Array
-    camera: Camera | None = None
+Panel = tuple[str, UInt8Array, canvas.Camera | None]  # caption, pixels, and the camera of a view from above
 
 
 def draw_scene_picture(look: SceneLook, path: Path) -> None:
     """Write the picture of ``look`` as a PNG of ``WIDTH`` pixels."""
-    frame_height = _frame_height(look)
+    frame_height = 0
+    if look.shown:
+        rows, columns = look.shown[0].rgb.shape[:2]
+        frame_height = int(np.clip(round((FRAME_WIDTH - 4) * rows / columns), 60, 420))
     legend_top = HEADER + CAPTION + PANEL_HEIGHT + MARGIN
-    below = legend_top + _legend_height(look) + MARGIN
+    n_rows = REASON_LINES if look.truth is None else 1 + _legend_rows(len(_classes(look.truth)))
+    below = legend_top + LEGEND_STEP * n_rows + MARGIN
     height = below + (2 * (CAPTION + frame_height) + MARGIN if look.shown else 0)
-    page = Canvas(WIDTH, height)
+    page = canvas.Canvas(WIDTH, height)
     page.text(MARGIN, 14, _shortened(look.scene, 90), size=17, weight="bold")
-    page.text(MARGIN, 46, facts_line(look), size=11, colour=GREY)
-    for column, panel in enumerate(_panels(look)):
+    page.text(MARGIN, 46, facts_line(look), size=11, colour=canvas.GREY)
+    for column, (caption, pixels, camera) in enumerate(_panels(look)):
         left = MARGIN + column * (PANEL_WIDTH + MARGIN)
-        page.text(left, HEADER, panel.caption, size=11)
-        axes = page.picture(left, HEADER + CAPTION, PANEL_WIDTH, PANEL_HEIGHT, panel.pixels)
-        if panel.camera is not None:
-            _draw_scale(axes, panel.camera)
+        page.text(left, HEADER, caption, size=11)
+        axes = page.picture(left, HEADER + CAPTION, PANEL_WIDTH, PANEL_HEIGHT, pixels)
+        if camera is not None:
+            _draw_scale(axes, camera)
             if column == 0 and look.shown:
-                _draw_walk(axes, panel.camera, look.poses)
+                _draw_walk(axes, camera, look.poses)
     if look.truth is not None:
         _draw_legend(page, look.truth, legend_top)
     else:
-        _draw_reason(page, look.no_truth, legend_top)
+        page.text(MARGIN, legend_top, "no ground truth", size=11)
+        for k, line in enumerate(textwrap.wrap(printable(look.no_truth), 190)[: REASON_LINES - 1]):
+            page.text(MARGIN, legend_top + CAPTION + 18 * k, line, size=10, colour=canvas.GREY)
     if look.shown:
         _draw_frames(page, look, below, frame_height)
     page.write(path)
@@ -275,35 +235,35 @@ def _panels(look: SceneLook) -> tuple[Panel, ...]:
     if look.truth is None:
         points = look.seen if len(look.seen) else look.poses[:, :3, 3].astype(np.float32)
         colours = look.seen_rgb if len(look.seen) else np.full((len(points), 3), UNSEEN, np.uint8)
-        corners = view_cameras(room_bounds(points), PANEL_WIDTH, PANEL_HEIGHT)[1:]
+        corners = canvas.view_cameras(canvas.room_bounds(points), PANEL_WIDTH, PANEL_HEIGHT)[1:]
         cameras = (_camera_above(look, points), *corners)
         size_m = _drawn_size(points)
-        pictures = [colour(render(points, size_m, camera), colours) for camera in cameras]
+        pictures = [canvas.colour(canvas.render(points, size_m, camera), colours) for camera in cameras]
         return (
-            Panel(f"walk, over what {len(look.poses)} frames see, from above", pictures[0], cameras[0]),
-            Panel("the same points, from one corner", pictures[1]),
-            Panel("from the other corner", pictures[2]),
+            (f"walk, over what {len(look.poses)} frames see, from above", pictures[0], cameras[0]),
+            ("the same points, from one corner", pictures[1], None),
+            ("from the other corner", pictures[2], None),
         )
     rows = thinned_rows(look.truth.points)
     points, above = look.truth.points[rows], _camera_above(look, look.truth.points)
-    view = render(points, _drawn_size(points), above)
+    view = canvas.render(points, _drawn_size(points), above)
     by_class, by_instance = _class_palette(look.truth)[rows], _instance_palette(look.truth)[rows]
     return (
-        Panel(WALK_TITLE if look.shown else NO_WALK_TITLE, colour(view, _seen_colours(look, points)), above),
-        Panel("ground truth by class", colour(view, by_class), above),
-        Panel("ground truth by instance", colour(view, by_instance), above),
+        (WALK_TITLE if look.shown else NO_WALK_TITLE, canvas.colour(view, _seen_colours(look, points)), above),
+        ("ground truth by class", canvas.colour(view, by_class), above),
+        ("ground truth by instance", canvas.colour(view, by_instance), above),
     )
 
 
-def _camera_above(look: SceneLook, points: Float32Array) -> Camera:
+def _camera_above(look: SceneLook, points: Float32Array) -> canvas.Camera:
     """The view from above that holds the points and the walk, as far as it stays near."""
-    bounds = room_bounds(points)
+    bounds = canvas.room_bounds(points)
     if not len(look.poses):
-        return view_cameras(bounds, PANEL_WIDTH, PANEL_HEIGHT)[0]
+        return canvas.view_cameras(bounds, PANEL_WIDTH, PANEL_HEIGHT)[0]
     places = look.poses[:, :2, 3]
     bounds[0, :2] = np.maximum(np.minimum(bounds[0, :2], places.min(axis=0)), bounds[0, :2] - MOST_BEYOND_M)
     bounds[1, :2] = np.minimum(np.maximum(bounds[1, :2], places.max(axis=0)), bounds[1, :2] + MOST_BEYOND_M)
-    return view_cameras(bounds, PANEL_WIDTH, PANEL_HEIGHT)[0]
+    return canvas.view_cameras(bounds, PANEL_WIDTH, PANEL_HEIGHT)[0]
 
 
 def _drawn_size(points: Float32Array) -> float:
@@ -330,9 +290,9 @@ def _seen_colours(look: SceneLook, points: Float32Array) -> UInt8Array:
 
 def _class_palette(truth: GroundTruth) -> UInt8Array:
     """Colour of each point by its class."""
-    palette = class_colours([name for name, _, _ in _classes(truth)])
+    palette = canvas.class_colours([name for name, _, _ in _classes(truth)])
     names = truth.labels.names
-    colours = np.array([*(palette.get(name, NO_INSTANCE) for name in names), NO_INSTANCE], np.uint8)
+    colours = np.array([*(palette.get(name, canvas.NO_INSTANCE) for name in names), canvas.NO_INSTANCE], np.uint8)
     return colours[truth_owner(truth)]
 
 
@@ -344,8 +304,8 @@ def _instance_palette(truth: GroundTruth) -> UInt8Array:
     owner = truth_owner(truth)[first]
     order = [int(row) for row in np.argsort(-n_points, kind="stable") if ids[row] != 0]
     names = [truth.labels.names[owner[row]] if owner[row] >= 0 else "" for row in order]
-    colours = np.full((len(ids), 3), NO_INSTANCE, np.uint8)
-    colours[order] = np.array(instance_colours(names), np.uint8).reshape(-1, 3)
+    colours = np.full((len(ids), 3), canvas.NO_INSTANCE, np.uint8)
+    colours[order] = np.array(canvas.instance_colours(names), np.uint8).reshape(-1, 3)
     return colours[inverse.reshape(-1)]
 
 
@@ -363,43 +323,30 @@ def _legend_rows(n_classes: int) -> int:
     return -(-min(n_classes, MOST_CLASSES) // LEGEND_COLUMNS)
 
 
-def _legend_height(look: SceneLook) -> int:
-    rows = REASON_LINES if look.truth is None else 1 + _legend_rows(len(_classes(look.truth)))
-    return LEGEND_STEP * rows
-
-
-def _draw_legend(page: Canvas, truth: GroundTruth, top: float) -> None:
+def _draw_legend(page: canvas.Canvas, truth: GroundTruth, top: float) -> None:
     """Every class with its numbers of objects and points, column after column, the largest first."""
     classes = _classes(truth)
     n_rows = _legend_rows(len(classes))
-    palette: dict[str, Colour] = class_colours([name for name, _, _ in classes])
+    palette: dict[str, canvas.Colour] = canvas.class_colours([name for name, _, _ in classes])
     for k, (name, n_objects, n_points) in enumerate(classes[:MOST_CLASSES]):
         column, row = divmod(k, n_rows)
         left = MARGIN + column * LEGEND_WIDTH
         objects, points = left + LEGEND_WIDTH - 84, left + LEGEND_WIDTH - 24
         if row == 0:
-            page.text(left, top, "class", size=10, colour=GREY)
-            page.text(objects, top, "objects", size=10, colour=GREY, ha="right")
-            page.text(points, top, "points", size=10, colour=GREY, ha="right")
+            page.text(left, top, "class", size=10, colour=canvas.GREY)
+            page.text(objects, top, "objects", size=10, colour=canvas.GREY, ha="right")
+            page.text(points, top, "points", size=10, colour=canvas.GREY, ha="right")
         y = top + LEGEND_STEP * (row + 1.5)
-        page.text(left, y, "\u25a0", size=15, colour=hex_of(palette[name]), va="center")
+        page.text(left, y, "\u25a0", size=15, colour=canvas.hex_of(palette[name]), va="center")
         page.text(left + 23, y, _shortened(name, 21), size=10, va="center")
         page.text(objects, y, f"{n_objects}", size=10, va="center", ha="right")
         page.text(points, y, _thousands(n_points), size=10, va="center", ha="right")
 
 
-def _draw_reason(page: Canvas, reason: str, top: float) -> None:
-    import textwrap
-
-    page.text(MARGIN, top, "no ground truth", size=11)
-    for k, line in enumerate(textwrap.wrap(printable(reason), 190)[: REASON_LINES - 1]):
-        page.text(MARGIN, top + CAPTION + 18 * k, line, size=10, colour=GREY)
-
-
-def _draw_walk(axes: Any, camera: Camera, poses: Float64Array) -> None:
+def _draw_walk(axes: Any, camera: canvas.Camera, poses: Float64Array) -> None:
     """The way of the cameras, short strokes where they look, start and end."""
-    x, y = project(camera, poses[:, :3, 3]).T
-    ahead_x, ahead_y = project(camera, poses[:, :3, 3] + 0.25 * poses[:, :3, 2]).T
+    x, y = canvas.project(camera, poses[:, :3, 3]).T
+    ahead_x, ahead_y = canvas.project(camera, poses[:, :3, 3] + 0.25 * poses[:, :3, 2]).T
     axes.plot(x, y, color="white", linewidth=4.0, solid_capstyle="round")
     axes.plot(np.stack([x, ahead_x]), np.stack([y, ahead_y]), color=WALK, linewidth=1.3)
     axes.plot(x, y, color=WALK, linewidth=2.0, solid_capstyle="round")
@@ -416,28 +363,23 @@ def _draw_walk(axes: Any, camera: Camera, poses: Float64Array) -> None:
             fontsize=10,
             color=shade,
             fontweight="bold",
-            bbox=paper(),
+            bbox=canvas.paper(),
         )
 
 
-def _draw_scale(axes: Any, camera: Camera) -> None:
+def _draw_scale(axes: Any, camera: canvas.Camera) -> None:
     """A bar of a round length in the lower left corner."""
-    pixels_a_metre = camera.focal / OVERSAMPLING
+    pixels_a_metre = camera.focal / canvas.OVERSAMPLING
     length_m = max((length for length in SCALE_LENGTHS_M if length * pixels_a_metre < 0.3 * PANEL_WIDTH), default=0.1)
     left, row = 14, PANEL_HEIGHT - 12
     axes.plot([left, left + length_m * pixels_a_metre], [row, row], color="white", linewidth=6, solid_capstyle="butt")
-    axes.plot([left, left + length_m * pixels_a_metre], [row, row], color=DARK, linewidth=3, solid_capstyle="butt")
-    axes.text(left, row - 8, f"{length_m:g} m", fontsize=10, color=DARK, va="bottom", bbox=paper())
+    axes.plot(
+        [left, left + length_m * pixels_a_metre], [row, row], color=canvas.DARK, linewidth=3, solid_capstyle="butt"
+    )
+    axes.text(left, row - 8, f"{length_m:g} m", fontsize=10, color=canvas.DARK, va="bottom", bbox=canvas.paper())
 
 
-def _frame_height(look: SceneLook) -> int:
-    if not look.shown:
-        return 0
-    height, width = look.shown[0].rgb.shape[:2]
-    return int(np.clip(round((FRAME_WIDTH - 4) * height / width), 60, 420))
-
-
-def _draw_frames(page: Canvas, look: SceneLook, top: int, height: int) -> None:
+def _draw_frames(page: canvas.Canvas, look: SceneLook, top: int, height: int) -> None:
     """Colour above depth, the scale of depth at the right."""
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable

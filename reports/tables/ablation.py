@@ -10,24 +10,11 @@ import numpy as np
 from su3d_bench.core.errors import ConfigError, counted
 from su3d_bench.formats.tables.table import Cell, Table, TableRow, signed
 from su3d_bench.numerics.statistics import holm, sign_flip_test
+from su3d_bench.reports.tables import paper
 from su3d_bench.reports.tables.model import Measured
-from su3d_bench.reports.tables.paper import (
-    LAYOUTS,
-    LEVEL,
-    Layout,
-    Shown,
-    cells_of,
-    figures_of,
-    nothing_can_be_marked,
-    of_scenes,
-    other_setup,
-    reported_rows,
-    run_notes,
-    units,
-)
 
 # Table I: all of it in OpenMask3D's set-up, as the paper's text has it.
-SIDES = (Layout(LAYOUTS["II"].metrics, "replica-openmask3d-semantic"), LAYOUTS["III"])
+SIDES = (paper.Layout(paper.LAYOUTS["II"].metrics, "replica-openmask3d-semantic"), paper.LAYOUTS["III"])
 METRICS = tuple(name for side in SIDES for name in side.metrics)
 
 
@@ -45,7 +32,7 @@ class SweepRow:
 
 
 def ablation_table(
-    measured: Sequence[Measured], sweep: Sequence[SweepRow], shown: Shown, *, with_published: bool
+    measured: Sequence[Measured], sweep: Sequence[SweepRow], shown: paper.Shown, *, with_published: bool
 ) -> Table:
     """A row for each of ``sweep``, with its difference from the method's own row beside each number.
 
@@ -65,21 +52,21 @@ def ablation_table(
     used = [[side[name] for name in dict.fromkeys(row.method for row in sweep)] for side in sides]
     notes: dict[str, None] = {}
     for own, look in zip(used, looks, strict=True):
-        notes[f"{', '.join(look.metrics)}: {units(own[0], look)}"] = None
+        notes[f"{', '.join(look.metrics)}: {paper.units(own[0], look)}"] = None
         labels = [row.method if row.is_whole else f"{row.method} ({row.scenes_text} scenes)" for row in own]
-        notes |= dict.fromkeys(run_notes(own, labels))
+        notes |= dict.fromkeys(paper.run_notes(own, labels))
     notes |= dict.fromkeys(note for half in halves for note in half.notes)
     is_papers = with_published and sweep[0].method.partition("@")[0] == "opensu3d"
-    figures = figures_of(is_wanted=is_papers, table="I")
-    reported, sources = reported_rows(figures, METRICS, len(METRICS))
+    figures = paper.figures_of(is_wanted=is_papers, table="I")
+    reported, sources = paper.reported_rows(figures, METRICS, len(METRICS))
     protocols = dict.fromkeys(rows_of[0].protocol for rows_of in used)
     is_its_protocol = tuple(protocols) == tuple(side.protocol for side in SIDES)
-    setup = other_setup([row for rows_of in used for row in rows_of], is_its_protocol=is_its_protocol)
+    setup = paper.other_setup([row for rows_of in used for row in rows_of], is_its_protocol=is_its_protocol)
     caption = f"Ablation of single parameters on {used[0][0].datasets}, {' and '.join(protocols)}{setup}."
     return Table("I", caption, "parameter", METRICS, (*rows, *map(_named, reported)), (*notes, *sources))
 
 
-def _of_protocol(measured: Sequence[Measured], side: Layout) -> dict[str, Measured]:
+def _of_protocol(measured: Sequence[Measured], side: paper.Layout) -> dict[str, Measured]:
     """Method -> its numbers under the protocol of that side's set-up, or the first that has its metrics."""
     fitting = [row for row in measured if all(name in row.metrics for name in side.metrics)]
     if not fitting:
@@ -93,7 +80,7 @@ def _of_protocol(measured: Sequence[Measured], side: Layout) -> dict[str, Measur
     return members
 
 
-def _refuse_missing(sweep: Sequence[SweepRow], members: Mapping[str, Measured], side: Layout) -> None:
+def _refuse_missing(sweep: Sequence[SweepRow], members: Mapping[str, Measured], side: paper.Layout) -> None:
     for entry in sweep:
         if entry.method not in members:
             raise ConfigError(
@@ -110,34 +97,33 @@ class _Half:
     notes: tuple[str, ...]
 
 
-def _half(sweep: Sequence[SweepRow], members: Mapping[str, Measured], shown: Shown) -> _Half:
+def _half(sweep: Sequence[SweepRow], members: Mapping[str, Measured], shown: paper.Shown) -> _Half:
     own_name = next((row.method for row in sweep if row.is_default), None)
     if own_name is None:
         note = "No row has the method's own values, so that none is compared or marked."
-        return _Half([cells_of(members[row.method], shown, set()) for row in sweep], (note,))
+        return _Half([paper.cells_of(members[row.method], shown, set()) for row in sweep], (note,))
     own = members[own_name]
     others = [members[name] for name in dict.fromkeys(row.method for row in sweep) if name != own_name]
     if any((row.scenes, row.limit) != (own.scenes, own.limit) for row in others):
         note = "The rows are of different scenes or frames, so that none is compared or marked."
-        return _Half([cells_of(members[row.method], shown, set()) for row in sweep], (note,))
+        return _Half([paper.cells_of(members[row.method], shown, set()) for row in sweep], (note,))
     compared = {name: _compared(own, others, name) for name in shown.metrics}
     cells = []
     for entry in sweep:
         row = members[entry.method]
         group = [members[member.method] for member in sweep if member.parameter == entry.parameter]
         best = {name for name in shown.metrics if _is_best(row, own, group, name, compared[name])}
-        own_cells = zip(cells_of(row, shown, best), shown.metrics, strict=True)
+        own_cells = zip(paper.cells_of(row, shown, best), shown.metrics, strict=True)
         cells.append([_beside(cell, compared, name, row) for cell, name in own_cells])
     smallest = min((one.smallest_p for of_metric in compared.values() for one in of_metric.values()), default=1.0)
     difference = (
         f"In parentheses: the mean difference to {own_name} over scenes, in points, and its p (two-sided sign-flip "
         f"test, Holm's correction over the {counted(len(others), 'other row')} of the sweep, each metric by itself)"
     )
-    if smallest >= LEVEL:
-        return _Half(cells, (f"{difference}.", nothing_can_be_marked("scenes", smallest)))
-    bold = (
-        f"Bold: the highest of its parameter where p < {LEVEL}; of {own_name} where all others of the parameter differ"
-    )
+    if smallest >= paper.LEVEL:
+        return _Half(cells, (f"{difference}.", paper.nothing_can_be_marked("scenes", smallest)))
+    bold = f"Bold: the highest of its parameter where p < {paper.LEVEL}"
+    bold += f"; of {own_name} where all others of the parameter differ"
     return _Half(cells, (f"{difference}. {bold}.",))
 
 
@@ -152,7 +138,7 @@ class _Difference:
 
 def _compared(own: Measured, others: Sequence[Measured], metric: str) -> dict[str, _Difference]:
     """Method -> its difference from ``own``, of the others that have a scene in common with it."""
-    changes = {row.method: of_scenes(row, metric) - of_scenes(own, metric) for row in others}
+    changes = {row.method: paper.of_scenes(row, metric) - paper.of_scenes(own, metric) for row in others}
     tests = {method: test for method, change in changes.items() if (test := sign_flip_test(change)) is not None}
     adjusted = [p for p in holm([test.p for test in tests.values()]) if p is not None]
     return {
@@ -172,7 +158,7 @@ def _is_best(
     rivals = [row] if row is not own else [member for member in group if member is not own]
     ahead = 1 if row is not own else -1
     return all(
-        (found := compared.get(member.method)) is not None and found.p < LEVEL and ahead * found.mean > 0
+        (found := compared.get(member.method)) is not None and found.p < paper.LEVEL and ahead * found.mean > 0
         for member in rivals
     )
 

@@ -12,30 +12,17 @@ import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from itertools import zip_longest
+from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.errors import printable
+from su3d_bench.core.system.files import file_text
 from su3d_bench.formats.tables.table import MOST_OF_A_CELL, Cell, Prose, Table, blocks_of, csv_lines
 from su3d_bench.reports.tables.latex import latex
 
 CSV_COLUMNS = (
-    "table",
-    "kind",
-    "row",
-    "column",
-    "text",
-    "is_best",
-    "value",
-    "low",
-    "high",
-    "what",
-    "run",
-    "method",
-    "protocol",
-    "version",
-    "metric",
-    "unit",
-    "mark",
+    *("table", "kind", "row", "column", "text", "is_best", "value", "low", "high"),
+    *("what", "run", "method", "protocol", "version", "metric", "unit", "mark"),
 )
 # What CommonMark takes for markup wherever it stands; links need two of the brackets beside each other, and of names
 # with underscores only the outer ones are emphasis.
@@ -47,16 +34,6 @@ _BLOCK = re.compile(r"^(?:[-+](?=\s)|[#>]|\d{1,9}(?=[.)](?:\s|$)))")
 TITLE = "su3d-bench tables"
 MOST_ON_A_LINE = 28  # characters of a cell
 MOST_OF_A_NOTE = 7_000  # characters: it may name every scene of a data set
-STYLE = (
-    ":root{color-scheme:light dark}body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:70rem;"
-    "padding:0 1rem}h1{font-size:1.3rem}"
-    "table{border-collapse:collapse;margin:1rem 0}caption{text-align:left;padding:.3rem 0}"
-    "th,td{padding:.2rem .7rem;text-align:right}th:first-child,td:first-child{text-align:left}"
-    "thead{border-top:2px solid;border-bottom:1px solid}tbody{border-bottom:1px solid}tbody:last-of-type{border-bottom:"
-    "2px solid}.reported{font-style:italic}.wide{overflow-x:auto}.short{white-space:nowrap}"
-    "caption span{display:inline-block;position:sticky;left:0;max-width:calc(100vw - 2rem)}"
-    "@media print{.wide{overflow:visible}tr{break-inside:avoid}}"
-)
 
 
 def markdown(parts: Sequence[Table | Prose]) -> str:
@@ -182,11 +159,12 @@ def _note_rows(table: str, lines: Sequence[str]) -> Iterator[Mapping[str, Any]]:
 
 def html_page(parts: Sequence[Table | Prose]) -> str:
     """A page of its own without scripts, for light and dark."""
+    style = file_text(Path(__file__).parent / "tables.css").replace("\n", "")
     return (
         '<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{TITLE}</title>\n"
-        f"<style>{STYLE}</style>\n<main>\n<h1>{TITLE}</h1>\n{html_tables(parts)}\n</main>\n</html>\n"
+        f"<style>{style}</style>\n<main>\n<h1>{TITLE}</h1>\n{html_tables(parts)}\n</main>\n</html>\n"
     )
 
 

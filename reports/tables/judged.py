@@ -10,17 +10,8 @@ from su3d_bench.core.errors import ConfigError, counted, printable
 from su3d_bench.formats.tables.table import NOT_MEASURED, Cell, Table, TableRow, bracketed, percent, signed, text_table
 from su3d_bench.metrics.questions.score import ANSWERED_BY, REFINED_BY, said_by
 from su3d_bench.numerics.statistics import ALPHA, holm
+from su3d_bench.reports.tables import paper
 from su3d_bench.reports.tables.model import BY_PEOPLE, Measured
-from su3d_bench.reports.tables.paper import (
-    PAPER_SCENES,
-    Figure,
-    PaperTable,
-    Shown,
-    figures_of,
-    other_setup,
-    protocol_table,
-    reported_rows,
-)
 
 REFINED = "refined label (n')"
 PAPER_MODEL = "gpt-4-1106-preview"  # that of labels n' and of reasoning
@@ -38,7 +29,7 @@ class JudgedLayout:
 
 
 KINDS = ("instance", "affordance", "property", "relative")
-JUDGED: Mapping[PaperTable, JudgedLayout] = {
+JUDGED: Mapping[paper.PaperTable, JudgedLayout] = {
     "IV": JudgedLayout("retrieval", "Retrieval by text", KINDS, {"": {}}),
     "V": JudgedLayout(
         "annotation",
@@ -55,7 +46,9 @@ JUDGED: Mapping[PaperTable, JudgedLayout] = {
 }
 
 
-def judged_table(number: PaperTable, results: Sequence[Measured], shown: Shown, *, with_published: bool) -> Table:
+def judged_table(
+    number: paper.PaperTable, results: Sequence[Measured], shown: paper.Shown, *, with_published: bool
+) -> Table:
     """Such a table with the columns of each dataset: what people judged, what the truth judged, what papers report."""
     layout = JUDGED[number]
     rows = [row for row in results if row.kind == layout.kind]
@@ -74,12 +67,12 @@ def judged_table(number: PaperTable, results: Sequence[Measured], shown: Shown, 
         for name in names
     }
     columns = [column if len(names) == 1 else f"{name} {column}" for name in names for column in parts[name].columns]
-    reported, sources = _reported(figures_of(is_wanted=with_published, table=number), names, shown, parts)
+    reported, sources = _reported(paper.figures_of(is_wanted=with_published, table=number), names, shown, parts)
     # people judge the retrieval and labels of the paper, and its reasoning
     judges = [] if all(row.is_by_people for row in rows) else ["judges"]
     made_by = [who for row in rows for start in WHO_DID.values() for who in said_by(row.warnings, start)]
     models = [] if all(PAPER_MODEL in who for who in made_by) else ["language model"]
-    setup = other_setup(rows, is_its_protocol=True, datasets=tuple(PAPER_SCENES), more=(*models, *judges))
+    setup = paper.other_setup(rows, is_its_protocol=True, datasets=tuple(paper.PAPER_SCENES), more=(*models, *judges))
     return Table(
         name=f"{number}-{'-'.join(names)}",
         caption=f"{layout.subject} on {', '.join(names)}{setup}.",
@@ -100,7 +93,7 @@ def _joined_notes(parts: Mapping[str, Table]) -> list[str]:
     return [f"{', '.join(where)}: {note}" for note, where in places.items()]
 
 
-def _of_dataset(layout: JudgedLayout, measured: Sequence[Measured], shown: Shown) -> Table:
+def _of_dataset(layout: JudgedLayout, measured: Sequence[Measured], shown: paper.Shown) -> Table:
     """The part of a table that is of one dataset."""
     body: list[TableRow] = []
     notes: list[str] = []
@@ -110,7 +103,7 @@ def _of_dataset(layout: JudgedLayout, measured: Sequence[Measured], shown: Shown
         if not any(row.per_scene for row in rows):
             continue
         parts = [_part(row, name, layout) for row in rows for name in layout.parts]
-        table = protocol_table(parts, shown, [])
+        table = paper.protocol_table(parts, shown, [])
         judge = "people" if rows[0].is_by_people else "ground truth"
         scored = [part for part in parts if part.per_scene or part.failed]
         body += [_named(*both, judge, layout) for both in zip(table.rows, scored, strict=True)]
@@ -137,16 +130,16 @@ def _side_by_side(cells: Sequence[Sequence[Cell]], parts: Sequence[Table]) -> tu
 
 
 def _reported(
-    figures: Sequence[Figure], names: Sequence[str], shown: Shown, parts: Mapping[str, Table]
+    figures: Sequence[paper.Figure], names: Sequence[str], shown: paper.Shown, parts: Mapping[str, Table]
 ) -> tuple[list[TableRow], list[str]]:
     """The paper's rows beneath, with the digits that it prints: each dataset's under its own columns.
 
     All of them stand under those of other data alone.
     """
     if not any(figure.dataset in names for figure in figures):
-        return reported_rows(figures, shown.metrics, len(parts[names[0]].columns), as_fractions=True)
+        return paper.reported_rows(figures, shown.metrics, len(parts[names[0]].columns), as_fractions=True)
     kept = [figure for figure in figures if figure.dataset in names and set(shown.metrics) & set(figure.values)]
-    rows, sources = reported_rows(kept, shown.metrics, len(shown.metrics), as_fractions=True)
+    rows, sources = paper.reported_rows(kept, shown.metrics, len(shown.metrics), as_fractions=True)
     of_label: dict[str, dict[str, TableRow]] = {}
     for figure, row in zip(kept, rows, strict=True):
         of_label.setdefault(row.label, {})[figure.dataset] = row

@@ -40,14 +40,22 @@ def confidence_notes(confidences: Mapping[str, str | None]) -> list[str]:
     >>> confidence_notes({"a": "computed", "b": "1 for all", "c": "1 for all"})
     ['MIXED CONFIDENCES: computed (a); 1 for all (b, c): these average precisions do not compare']
     """
-    whose: dict[str, list[str]] = {}
-    for label, what in confidences.items():
-        if what is not None:
-            whose.setdefault(what, []).append(label)
+    whose = _rows_by(confidences)
     if len(whose) < 2:
         return [f"confidences: {what}" for what in whose]
-    told = "; ".join(f"{what} ({', '.join(labels)})" for what, labels in whose.items())
-    return [f"MIXED CONFIDENCES: {told}: these average precisions do not compare"]
+    return [f"MIXED CONFIDENCES: {_told(whose)}: these average precisions do not compare"]
+
+
+def _rows_by(said: Mapping[str, str | None]) -> dict[str, list[str]]:
+    whose: dict[str, list[str]] = {}
+    for row, what in said.items():
+        if what is not None:
+            whose.setdefault(what, []).append(row)
+    return whose
+
+
+def _told(whose: Mapping[str, Iterable[str]]) -> str:
+    return "; ".join(f"{what} ({', '.join(rows)})" for what, rows in whose.items())
 
 
 def is_ceiling(method: str, caveat: str | None) -> bool:
@@ -61,12 +69,8 @@ def label_count_notes(labels: Mapping[str, str | None]) -> list[str]:
     >>> label_count_notes({"a": "one label", "b": "the top 5 labels", "c": None})
     ['MIXED LABELS: one label (a); the top 5 labels (b): these numbers do not compare']
     """
-    whose: dict[str, list[str]] = {}
-    for row, what in labels.items():
-        if what is not None:
-            whose.setdefault(what, []).append(row)
-    told = "; ".join(f"{what} ({', '.join(rows)})" for what, rows in whose.items())
-    return [f"MIXED LABELS: {told}: these numbers do not compare"] if len(whose) > 1 else []
+    whose = _rows_by(labels)
+    return [f"MIXED LABELS: {_told(whose)}: these numbers do not compare"] if len(whose) > 1 else []
 
 
 @dataclass(frozen=True, kw_only=True)

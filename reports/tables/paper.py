@@ -257,7 +257,8 @@ def protocol_table(measured: Sequence[Measured], shown: Shown, figures: Sequence
         if name not in rows[0].metrics:
             known = suggest(name, rows[0].metrics, "it has")
             raise ConfigError(f"{rows[0].protocol}: has no metric '{printable(name, 60)}'{known}")
-    shown = replace(shown, metrics=metrics, scenes_count=shown.scenes_count or not _are_alike(rows))
+    are_alike = all(row.is_whole and row.scenes == rows[0].scenes for row in rows)
+    shown = replace(shown, metrics=metrics, scenes_count=shown.scenes_count or not are_alike)
     best, why = best_rows(rows, shown)
     labels = labels_of(rows)
     body = [
@@ -296,11 +297,6 @@ def units(row: Measured, shown: Shown) -> str:
     return (
         f"Protocol {row.protocol}, version {row.version}, on {row.datasets} ({scenes}); {unit}{interval}{ceiling}{n}."
     )
-
-
-def _are_alike(rows: Sequence[Measured]) -> bool:
-    """Whether all rows are of the same whole scenes, so that their number need not be shown."""
-    return all(row.is_whole and row.scenes == rows[0].scenes for row in rows)
 
 
 def labels_of(rows: Sequence[Measured]) -> list[str]:
@@ -373,8 +369,7 @@ def best_rows(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int
             continue
         best = {k for k in competing if percent(rows[k].metrics.get(name)) == percent(float(values[order[0]]))}
         if shown.only_significant:
-            tests[name] = _paired_test(rows[order[0]], rows[order[1]], name)
-            is_contradicted[name] = _is_contradicted(rows[order[0]], rows[order[1]], name)
+            tests[name], is_contradicted[name] = _paired_test(rows[order[0]], rows[order[1]], name)
         if len(best) < len(competing):
             marked[name] = best
     if not shown.only_significant:
@@ -399,19 +394,16 @@ def nothing_can_be_marked(over: str, smallest: float) -> str:
     return f"No best is marked: with so few {over} no difference can have p < {LEVEL} (the least is {smallest:.2g})."
 
 
-def _paired_test(row: Measured, other: Measured, metric: str) -> SignFlipTest | None:
-    """People's over the same items where they judged, else over the scenes that both have a value for."""
-    if row.is_by_people and (row.tests or other.tests):
-        return row.tests.get((metric, other.method))
-    return sign_flip_test(of_scenes(row, metric) - of_scenes(other, metric))
+def _paired_test(row: Measured, other: Measured, metric: str) -> tuple[SignFlipTest | None, bool]:
+    """People's over the same items where they judged, else over the scenes that both have a value for.
 
-
-def _is_contradicted(row: Measured, other: Measured, metric: str) -> bool:
-    """Whether ``row``, the higher over all scenes together, is the lower of the two in the mean over scenes, which is
-    what a test over scenes is of."""
+    And whether ``row``, the higher over all scenes together, is the lower of the two in the mean over scenes, which is
+    what a test over scenes is of.
+    """
     if row.is_by_people and (row.tests or other.tests):
-        return False
-    return bool(np.nansum(of_scenes(row, metric) - of_scenes(other, metric)) < 0)
+        return row.tests.get((metric, other.method)), False
+    change = of_scenes(row, metric) - of_scenes(other, metric)
+    return sign_flip_test(change), bool(np.nansum(change) < 0)
 
 
 def of_scenes(row: Measured, metric: str) -> np.ndarray:
@@ -424,21 +416,17 @@ def run_notes(rows: Sequence[Measured], labels: Sequence[str]) -> list[str]:
     """What must be known of measured rows: missing scenes, partial runs, where masks come from, who names."""
     notes: dict[str, list[str]] = {}
     for row, label in zip(rows, labels, strict=True):
-        if row.limit:
-            notes.setdefault(f"PARTIAL: only the first {counted(row.limit, 'frame')} of each scene", []).append(label)
-        if row.changed:
-            notes.setdefault(f"with {some(row.changed, 8)}", []).append(label)
-        if row.failed:
-            notes.setdefault(f"INCOMPLETE: failed on {some(row.failed, 4)}", []).append(label)
-        if row.unscored:
-            notes.setdefault(f"unscored on {some(row.unscored, 4)}", []).append(label)
-        if row.caveat:
-            notes.setdefault(row.caveat, []).append(label)
-        if row.profile:
-            encoder = f", encoder {row.encoder}" if row.encoder else ""
-            notes.setdefault(f"perception {row.profile}{encoder}", []).append(label)
-        for said in said_by(row.warnings, RELATIVE):
-            notes.setdefault(f"{RELATIVE}{said}", []).append(label)
+        said = [
+            f"PARTIAL: only the first {counted(row.limit, 'frame')} of each scene" if row.limit else "",
+            f"with {some(row.changed, 8)}" if row.changed else "",
+            f"INCOMPLETE: failed on {some(row.failed, 4)}" if row.failed else "",
+            f"unscored on {some(row.unscored, 4)}" if row.unscored else "",
+            row.caveat or "",
+            f"perception {row.profile}{f', encoder {row.encoder}' if row.encoder else ''}" if row.profile else "",
+            *(f"{RELATIVE}{one}" for one in said_by(row.warnings, RELATIVE)),
+        ]
+        for what in filter(None, said):
+            notes.setdefault(what, []).append(label)
     everyone = len(rows)
     return [
         *(

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import io
+import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
 from typing import Any, Literal
 
 from su3d_bench.core.errors import ModelMissing, counted
+from su3d_bench.core.system.files import file_text
 from su3d_bench.formats.tables.table import Prose, Table, csv_lines, percent, signed, text_table
 
 Kind = Literal["text", "whole number", "number", "yes or no"]
@@ -21,60 +24,35 @@ _KINDS: Mapping[str, Kind] = {
 }
 
 
-def _column(meaning: str) -> Any:
-    return field(metadata={"meaning": meaning})
-
-
 @dataclass(frozen=True)
 class Sample:
-    """An instance of a map or of the truth under one protocol; the fields are the columns, in their order."""
+    """An instance of a map or of the truth under one protocol: the columns of ``samples.toml``, in their order."""
 
-    run: str = _column("folder of the run")
-    scene: str = _column("address of the scene, such as rooms/living0")
-    method: str = _column("whose map")
-    protocol: str = _column("under whose rules; of kind instance or semantic")
-    kind: str = _column(
-        "predicted: a mask of the map, under kind semantic what it calls by one name; true: an instance of the truth "
-        "that takes part in the score"
-    )
-    instance: int | None = _column(
-        "predicted: the number by which query and the page call it; true: its number among those of its class and "
-        "scene; none under kind semantic for all points of a class that belong to no instance"
-    )
-    row: int | None = _column("predicted: its place in the prediction, from 0; true: none")
-    class_name: str = _column(
-        "the class that it is called or has; empty for none of the protocol's; object where the protocol has no classes"
-    )
-    name: str = _column("predicted: what the method or perception calls it; true: empty")
-    score: float | None = _column("predicted: the confidence that counts under kind instance; true: none")
-    n_points: int = _column(
-        "points of the truth that it has; under kind semantic of those that are counted, predicted those that it names"
-    )
-    n_right: int | None = _column("of these points those that are called their class, under kind semantic; else none")
-    is_counted: bool = _column(
-        "whether it takes part: of a scored class and, under kind instance, of the protocol's minimum size"
-    )
-    best_iou: float = _column(
-        "highest IoU with any of the other kind, whatever its class, 0 to 1; of the truth those that take part"
-    )
-    matched: int | None = _column("the instance of the other kind with that IoU; none where it is 0 or has no number")
-    matched_class: str = _column("the class of that one; empty where there is none")
-    is_hit_25: bool = _column(
-        "predicted: a true positive above IoU 0.25, under kind semantic of the class of what it has that IoU with; "
-        "true: met by one"
-    )
-    is_hit_50: bool = _column("the same above IoU 0.5")
-    error: str = _column(
-        "the kind of its error as attribute counts it, empty for none: of a mask merged, duplicate, mislabelled or "
-        "background, of an instance of the truth split or missed; under kind semantic the cause of most of its wrong "
-        "points: geometry, background, association or label"
-    )
-    centre_x_m: float | None = _column("centre of the box along the axes around its points, m; none without places")
-    centre_y_m: float | None = _column("the same, y")
-    centre_z_m: float | None = _column("the same, z; up in most datasets")
-    size_x_m: float | None = _column("size of that box along x, m")
-    size_y_m: float | None = _column("the same, y")
-    size_z_m: float | None = _column("the same, z")
+    run: str
+    scene: str
+    method: str
+    protocol: str
+    kind: str
+    instance: int | None
+    row: int | None
+    class_name: str
+    name: str
+    score: float | None
+    n_points: int
+    n_right: int | None
+    is_counted: bool
+    best_iou: float
+    matched: int | None
+    matched_class: str
+    is_hit_25: bool
+    is_hit_50: bool
+    error: str
+    centre_x_m: float | None
+    centre_y_m: float | None
+    centre_z_m: float | None
+    size_x_m: float | None
+    size_y_m: float | None
+    size_z_m: float | None
 
 
 @dataclass(frozen=True)
@@ -87,8 +65,9 @@ class Column:
     meaning: str
 
 
+TEXTS: Mapping[str, Any] = tomllib.loads(file_text(Path(__file__).resolve().parent / "samples.toml"))
 COLUMNS = tuple(
-    Column(each.name, _KINDS[str(each.type)], "None" in str(each.type), each.metadata["meaning"])
+    Column(each.name, _KINDS[str(each.type)], "None" in str(each.type), TEXTS["columns"][each.name])
     for each in fields(Sample)
 )
 
@@ -140,36 +119,12 @@ def parquet_of(samples: Sequence[Sample]) -> bytes:
     return stream.getvalue()
 
 
-MEANINGS: dict[str, dict[str, str]] = {
-    "instance": {
-        "merged": "one mask holds several objects",
-        "split": "one object lies in several masks",
-        "duplicate": "a mask repeats another one's object",
-        "mislabelled": "the right mask, another class",
-        "background": "a mask that belongs to no object",
-        "missed": "an object that no mask is of",
-    },
-    "semantic": {
-        "geometry": "no point of the map within 5 cm",
-        "background": "the map is there, but no mask",
-        "association": "a mask that belongs to another object",
-        "label": "the object's own mask, another class",
-    },
-}
-REST: dict[str, str] = {
-    "instance": "masks that fit badly; mask and label wrong at once",
-    "semantic": "classes that no correction of points reaches",
-}
 LEFT = {"overlap": "several together", "rest": "none of these"}  # what the two remainders are called
 SUM = (
     "a gain is in percentage points, with this kind of error alone corrected; the value, all gains, 'several together' "
     "and 'none of these' add up to 100"
 )
 OVERLAP = "correcting all of them, beyond the sum of the gains"
-STAGES: dict[str, str] = {
-    "labels": "every mask named by the truth",
-    "2D masks": "masks and names of each image from the truth",
-}
 
 
 def attribution_tables(attribution: Mapping[str, Any]) -> list[Table | Prose]:
@@ -183,16 +138,17 @@ def attribution_tables(attribution: Mapping[str, Any]) -> list[Table | Prose]:
 
 def _protocol_table(protocol: Mapping[str, Any]) -> Table:
     names, n_scored = list(protocol["values"]), protocol["n_scored"]
+    meanings = TEXTS["errors"][protocol["kind"]]
     title = f"{protocol['protocol']} (version {protocol['version']}): {counted(len(protocol['scenes']), 'scene')}"
     header = ["", "errors" if n_scored is None else "points", *names, "what it is"]
     rows = [["as it is", "", *(percent(protocol["values"][name]) for name in names), ""]]
     for kind, cause in protocol["causes"].items():
         gains = [signed(cause["gains"][name]) for name in names]
-        rows.append([kind, n_text(cause["n"], n_scored), *gains, MEANINGS[protocol["kind"]][kind]])
+        rows.append([kind, n_text(cause["n"], n_scored), *gains, meanings[kind]])
     rows.append([LEFT["overlap"], "", *(signed(protocol["overlap"][name]) for name in names), OVERLAP])
-    rows.append([LEFT["rest"], "", *(signed(protocol["rest"][name]) for name in names), REST[protocol["kind"]]])
+    rows.append([LEFT["rest"], "", *(signed(protocol["rest"][name]) for name in names), meanings["rest"]])
     for stage, values in protocol["stages"].items():
-        rows.append([f"with true {stage}", "", *(percent(values[name]) for name in names), STAGES[stage]])
+        rows.append([f"with true {stage}", "", *(percent(values[name]) for name in names), TEXTS["stages"][stage]])
     return text_table(protocol["protocol"], [header, *rows], heading=title)
 
 

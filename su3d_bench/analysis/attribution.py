@@ -7,9 +7,8 @@ from those stored in the run are refused. ``report samples`` and the galleries o
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, fields
 from functools import cache, cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -279,16 +278,15 @@ def attribute(
 def attribution_of(explained: Explained, mended: Mapping[str, MendedJob], other: Side | None = None) -> RunAttribution:
     """What the errors of all scenes cost; ``other`` is the side with perfect 2D masks."""
     side = Side(explained.run, explained.method)
-    gathered = {name: _Gathered(explained.rules(name)) for name in explained.protocols}
-    for scene, of_scene in mended.items():
-        for name, counts in of_scene.items():
-            gathered[name].add(scene, counts)
-    scored = [counted for counted in gathered.values() if counted.scenes]
-    formed = tuple(counted.form(_oracle_values(counted.rules, side, other, counted.scenes)) for counted in scored)
+    formed = []
+    for name in explained.protocols:
+        rules, of_scenes = explained.rules(name), {scene: one[name] for scene, one in mended.items() if name in one}
+        if of_scenes:
+            formed.append(_form(rules, of_scenes, _oracle_values(rules, side, other, list(of_scenes))))
     if not formed:
         raise ConfigError(f"{side.name}: no scene is scored under {', '.join(explained.protocols)}; nothing to explain")
     remarks = (*explained.remarks, *run_remarks(explained.run))
-    return RunAttribution(explained.run.name, explained.method, remarks, formed)
+    return RunAttribution(explained.run.name, explained.method, remarks, tuple(formed))
 
 
 def _oracle_run(path: Path) -> FinishedRun:
@@ -315,53 +313,35 @@ def _oracle_values(rules: ProtocolRules, side: Side, other: Side | None, scenes:
     return _values(rules, [scores[scene].counts for scene in scenes])
 
 
-@dataclass
-class _Gathered:
-    """The counts of scene after scene under one protocol: as they are, mended, with the truth's labels."""
-
-    rules: ProtocolRules
-    scenes: list[str] = field(default_factory=list)
-    as_is: list[Counts] = field(default_factory=list)
-    all: list[Counts] = field(default_factory=list)
-    alone: dict[str, list[Counts]] = field(default_factory=dict)
-    labelled: list[Counts | None] = field(default_factory=list)
-    n: Counter[str] = field(default_factory=Counter)
-    n_scored: int | None = None
-
-    def add(self, scene: str, mended: MendedScene) -> None:
-        if mended.n_scored is not None:
-            self.n_scored = (self.n_scored or 0) + mended.n_scored
-        self.scenes.append(scene)
-        self.as_is.append(mended.as_is)
-        self.all.append(mended.all)
-        self.labelled.append(mended.with_true_labels)
-        self.n.update(mended.n)
-        for kind, counts in mended.alone.items():
-            self.alone.setdefault(kind, []).append(counts)
-
-    def form(self, with_true_masks: Values | None) -> ProtocolAttribution:
-        values, mended = _values(self.rules, self.as_is), _values(self.rules, self.all)
-        causes = {}
-        for kind in EXPLAINED[self.rules.kind][0]:
-            after = _values(self.rules, self.alone[kind])
-            causes[kind] = Cause(self.n[kind], {name: after[name] - values[name] for name in values})
-        labelled = [counts for counts in self.labelled if counts is not None]
-        stages = {} if len(labelled) < len(self.labelled) else {"labels": _values(self.rules, labelled)}
-        if with_true_masks is not None:
-            stages["2D masks"] = dict(with_true_masks)
-        total = {name: sum(cause.gains[name] for cause in causes.values()) for name in values}
-        return ProtocolAttribution(
-            protocol=self.rules.name,
-            version=self.rules.version,
-            kind=self.rules.kind,
-            scenes=tuple(self.scenes),
-            values=values,
-            causes=causes,
-            overlap={name: mended[name] - values[name] - total[name] for name in values},
-            rest={name: 1.0 - mended[name] for name in values},
-            stages=stages,
-            n_scored=self.n_scored,
-        )
+def _form(
+    rules: ProtocolRules, of_scenes: Mapping[str, MendedScene], with_true_masks: Values | None
+) -> ProtocolAttribution:
+    """What the errors of the scenes cost under one protocol."""
+    every = list(of_scenes.values())
+    values, mended = _values(rules, [one.as_is for one in every]), _values(rules, [one.all for one in every])
+    causes = {}
+    for kind in EXPLAINED[rules.kind][0]:
+        after = _values(rules, [one.alone[kind] for one in every])
+        n = sum(one.n.get(kind, 0) for one in every)
+        causes[kind] = Cause(n, {name: after[name] - values[name] for name in values})
+    labelled = [one.with_true_labels for one in every if one.with_true_labels is not None]
+    stages = {} if len(labelled) < len(every) else {"labels": _values(rules, labelled)}
+    if with_true_masks is not None:
+        stages["2D masks"] = dict(with_true_masks)
+    total = {name: sum(cause.gains[name] for cause in causes.values()) for name in values}
+    n_scored = [one.n_scored for one in every if one.n_scored is not None]
+    return ProtocolAttribution(
+        protocol=rules.name,
+        version=rules.version,
+        kind=rules.kind,
+        scenes=tuple(of_scenes),
+        values=values,
+        causes=causes,
+        overlap={name: mended[name] - values[name] - total[name] for name in values},
+        rest={name: 1.0 - mended[name] for name in values},
+        stages=stages,
+        n_scored=sum(n_scored) if n_scored else None,
+    )
 
 
 def _values(rules: ProtocolRules, counts: Sequence[Counts]) -> dict[str, float]:

@@ -14,43 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.analysis.sides import (
-    Numbers,
-    OverScenes,
-    Side,
-    SideNumbers,
-    class_numbers,
-    headline_numbers,
-    pair_methods,
-    parse_side,
-    protocols_in_both,
-    refuse_other_requests,
-    settings_that_differ,
-)
-from su3d_bench.core.errors import ConfigError, counted, printable
+from su3d_bench.analysis import sides
+from su3d_bench.core.errors import ConfigError, counted, printable, some
 from su3d_bench.core.types import BoolArray, Float64Array, Interval
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.score import ANSWERED_BY, REFINED_BY, RELATIVE, said_by
 from su3d_bench.metrics.scoring import plain_json
-from su3d_bench.numerics.statistics import (
-    ALPHA,
-    DIFFERENCE,
-    NO_SPREAD,
-    POWER,
-    SignFlipTest,
-    Variance,
-    crossed_interval,
-    has_part,
-    holm,
-    jackknife_interval,
-    pseudo_values,
-    scenes_needed,
-    sign_flip_test,
-    variance_of,
-    variance_range,
-)
-from su3d_bench.runs.finished import FinishedRun, read_run
+from su3d_bench.numerics import statistics
+from su3d_bench.runs.finished import read_run
 
 SCHEMA = 2
 
@@ -71,7 +43,7 @@ class Difference:
     interval: Interval | None
     per_scene: Mapping[str, float]
     mean_of_scenes: float
-    test: SignFlipTest | None
+    test: statistics.SignFlipTest | None
     p_of_all: float | None = None
     deviations_of_seeds: tuple[float | None, float | None] = (None, None)
 
@@ -86,21 +58,21 @@ class Difference:
         if self.interval is None or self.test is None:
             return None
         leaves_out_zero = self.interval[0] > 0 or self.interval[1] < 0
-        if leaves_out_zero and self.test.p < ALPHA:
+        if leaves_out_zero and self.test.p < statistics.ALPHA:
             if (self.interval[0] > 0) == (self.mean_of_scenes > 0):
                 return None
             return (
                 f"B - A and the mean over scenes have opposite signs, and neither is chance (p {self.test.p:.2g}): the "
                 "test is of the mean over scenes, the interval of B - A, in which scenes count by what they hold"
             )
-        if leaves_out_zero == (self.test.p < ALPHA):
+        if leaves_out_zero == (self.test.p < statistics.ALPHA):
             return None
         if not leaves_out_zero:
             return (
                 f"the test finds a difference (p {self.test.p:.2g}) of the mean over scenes, though the interval of "
                 "B - A holds 0: the interval takes the scenes' differences for normal, the test does not"
             )
-        if self.test.smallest_p >= ALPHA:
+        if self.test.smallest_p >= statistics.ALPHA:
             return (
                 f"the interval leaves 0 out, but {counted(self.test.n_pairs, 'scene')} can give no p below "
                 f"{self.test.smallest_p:.3g}: no difference is shown"
@@ -136,19 +108,12 @@ class Comparison:
     left: str
     right: str
     seeds: tuple[tuple[int, ...], tuple[int, ...]]
-    protocols: tuple[ProtocolComparison, ...]
     remarks: tuple[str, ...]
+    protocols: tuple[ProtocolComparison, ...]
 
     def to_json(self) -> dict[str, Any]:
         """Plain values in full precision, null where undefined."""
-        return {
-            "schema": SCHEMA,
-            "left": self.left,
-            "right": self.right,
-            "seeds": [list(of_side) for of_side in self.seeds],
-            "remarks": list(self.remarks),
-            "protocols": [plain_json(_protocol_json(protocol)) for protocol in self.protocols],
-        }
+        return {"schema": SCHEMA, **plain_json({**vars(self), "protocols": list(map(_protocol_json, self.protocols))})}
 
 
 def compare(
@@ -158,7 +123,7 @@ def compare(
     method: str | None = None,
     protocols: Sequence[str] = (),
     per_class: bool = False,
-    numbers: SideNumbers | None = None,
+    numbers: sides.SideNumbers | None = None,
 ) -> Comparison:
     """What ``right`` changes over ``left``, each the folder of a run or ``FOLDER:METHOD``.
 
@@ -166,27 +131,27 @@ def compare(
     Without methods those of one name are compared, or the only ones; ``numbers`` are shared by calls on the same runs.
     Raises ``ConfigError`` where the two cannot be compared, naming the first field that differs.
     """
-    pairs = pair_methods(parse_side(left, method), parse_side(right, method))
+    pairs = sides.pair_methods(sides.parse_side(left, method), sides.parse_side(right, method))
     first, second = pairs[0]
     compared: list[ProtocolComparison] = []
     for pair in pairs:
-        compared += _compare_methods(*pair, protocols, per_class, numbers or SideNumbers())
+        compared += _compare_methods(*pair, protocols, per_class, numbers or sides.SideNumbers())
     of_all = _of_all([protocol.metrics for protocol in compared])
     compared = [replace(protocol, metrics=metrics) for protocol, metrics in zip(compared, of_all, strict=True)]
-    sides = [side for pair in pairs for side in pair]
-    remarks = _remarks(first, second, {side.method for side in sides})
-    remarks += [line for side in sides for of_run in side.each for line in _caveats(of_run)]
+    every = [side for pair in pairs for side in pair]
+    remarks = _remarks(first, second, {side.method for side in every})
+    remarks += [line for side in every for of_run in side.each for line in _caveats(of_run)]
     left_name, right_name = (", ".join(run.name for run in side.runs) for side in (first, second))
     left_seeds, right_seeds = (tuple(run.record.seed or 0 for run in side.runs) for side in (first, second))
-    return Comparison(left_name, right_name, (left_seeds, right_seeds), tuple(compared), tuple(dict.fromkeys(remarks)))
+    return Comparison(left_name, right_name, (left_seeds, right_seeds), tuple(dict.fromkeys(remarks)), tuple(compared))
 
 
 def _compare_methods(
-    left: Side, right: Side, wanted: Sequence[str], per_class: bool, numbers: SideNumbers
+    left: sides.Side, right: sides.Side, wanted: Sequence[str], per_class: bool, numbers: sides.SideNumbers
 ) -> list[ProtocolComparison]:
     every = [*left.each, *right.each]
     compared = []
-    for name in protocols_in_both(left, right, wanted):
+    for name in sides.protocols_in_both(left, right, wanted):
         over_scenes = numbers.over_common(name, every)
         if not over_scenes:
             raise ConfigError(
@@ -194,43 +159,24 @@ def _compare_methods(
                 "same scenes"
             )
         rules, common = left.run.rules(name), over_scenes[0].result.scenes
-        remarks = [line for of_run in every for line in _scene_remarks(of_run, numbers.scores(of_run)[name], common)]
-        remarks += _own_remarks(every, name)
+        remarks = _remarks_of_scenes(every, name, [numbers.scores(side)[name] for side in every], common)
         halves = over_scenes[: len(left.runs)], over_scenes[len(left.runs) :]
-        compared.append(_compare_protocol(rules, left.method, right.method, halves, remarks, per_class))
+        metrics = {
+            metric: difference_of(*(sides.headline_numbers(half, metric) for half in halves), common)
+            for metric in rules.headline
+        }
+        classes = _compare_classes(rules, halves, common) if per_class else {}
+        about = (rules.name, rules.version, rules.aggregate, left.method, right.method, common)
+        compared.append(ProtocolComparison(*about, metrics, classes, tuple(remarks)))
     return compared
 
 
-def _compare_protocol(
-    rules: ProtocolRules,
-    left: str,
-    right: str,
-    sides: tuple[Sequence[OverScenes], Sequence[OverScenes]],
-    remarks: Sequence[str],
-    per_class: bool,
-) -> ProtocolComparison:
-    scenes = sides[0][0].result.scenes
-    metrics = {
-        name: difference_of(headline_numbers(sides[0], name), headline_numbers(sides[1], name), scenes)
-        for name in rules.headline
-    }
-    return ProtocolComparison(
-        protocol=rules.name,
-        version=rules.version,
-        aggregate=rules.aggregate,
-        left=left,
-        right=right,
-        scenes=scenes,
-        metrics=metrics,
-        classes=_compare_classes(rules, sides, scenes) if per_class else {},
-        remarks=tuple(remarks),
-    )
-
-
 def _compare_classes(
-    rules: ProtocolRules, sides: tuple[Sequence[OverScenes], Sequence[OverScenes]], scenes: Sequence[str]
+    rules: ProtocolRules,
+    halves: tuple[Sequence[sides.OverScenes], Sequence[sides.OverScenes]],
+    scenes: Sequence[str],
 ) -> dict[str, dict[str, Difference]]:
-    left, right = (class_numbers(rules, side) for side in sides)
+    left, right = (sides.class_numbers(rules, half) for half in halves)
     classes: dict[str, dict[str, Difference]] = {}
     for (name, column), own in left.items():
         if (name, column) in right:
@@ -246,64 +192,50 @@ def _of_all(tables: Sequence[Mapping[str, Difference]]) -> list[dict[str, Differ
     """
     every = [difference for table in tables for difference in table.values()]
     tested = [d.test.p if d.test is not None and any(d.per_scene.values()) else None for d in every]
-    corrected = iter(holm(tested))
+    corrected = iter(statistics.holm(tested))
     return [{name: replace(value, p_of_all=next(corrected)) for name, value in table.items()} for table in tables]
 
 
-def form_difference(
-    values: tuple[float, float],
-    scenes: Sequence[str],
-    left_of_scene: Float64Array,
-    right_of_scene: Float64Array,
-    without_each: Float64Array,
-) -> Difference:
-    """The difference of one value; ``without_each`` (1 + G,) holds it over all scenes, then without each in turn."""
-    differences: Float64Array = right_of_scene - left_of_scene
-    numbers = differences[~np.isnan(differences)]
-    return Difference(
-        left=values[0],
-        right=values[1],
-        difference=values[1] - values[0],
-        interval=jackknife_interval(without_each, ~np.isnan(differences), bounds=DIFFERENCE),
-        per_scene={s: float(d) for s, d in zip(scenes, differences, strict=True) if not np.isnan(d)},
-        mean_of_scenes=float(numbers.mean()) if len(numbers) else float("nan"),
-        test=sign_flip_test(differences),
-    )
-
-
-def difference_of(left: Numbers, right: Numbers, scenes: Sequence[str]) -> Difference:
+def difference_of(left: sides.Numbers, right: sides.Numbers, scenes: Sequence[str]) -> Difference:
     """The difference of a value of two sides."""
-    found = form_difference(
-        (left.value, right.value),
-        scenes,
-        left.of_scenes,
-        right.of_scenes,
-        right.without_each - left.without_each,
+    differences: Float64Array = right.of_scenes - left.of_scenes
+    is_known = ~np.isnan(differences)
+    without_each = right.without_each - left.without_each
+    return Difference(
+        left=left.value,
+        right=right.value,
+        difference=right.value - left.value,
+        interval=statistics.jackknife_interval(without_each, is_known, bounds=statistics.DIFFERENCE),
+        per_scene={scene: float(d) for scene, d in zip(scenes, differences, strict=True) if not np.isnan(d)},
+        mean_of_scenes=float(differences[is_known].mean()) if is_known.any() else float("nan"),
+        test=statistics.sign_flip_test(differences),
+        deviations_of_seeds=(left.deviation_of_seeds, right.deviation_of_seeds),
     )
-    return replace(found, deviations_of_seeds=(left.deviation_of_seeds, right.deviation_of_seeds))
 
 
-def _scene_remarks(side: Side, own: Mapping[str, SceneScore], common: Sequence[str]) -> list[str]:
-    """Which scenes of one run not all have."""
-    alone = [scene for scene in own if scene not in common]
-    return [f"only the scenes in common are compared; {side.name} alone has {_some(alone)}"] if alone else []
-
-
-def _own_remarks(sides: Sequence[Side], protocol: str) -> list[str]:
+def _remarks_of_scenes(
+    every: Sequence[sides.Side], protocol: str, scores: Sequence[Mapping[str, SceneScore]], common: Sequence[str]
+) -> list[str]:
+    """Which scenes of one run not all have, which failed, and who answered or named."""
     lines = []
-    for side in sides:
+    for side, own in zip(every, scores, strict=True):
+        if alone := [printable(scene, 80) for scene in own if scene not in common]:
+            lines.append(f"only the scenes in common are compared; {side.name} alone has {some(alone, 3)}")
+    for side in every:
         record = side.run.results.get((side.method, protocol))
         if record is not None and record.failed:
-            lines.append(f"INCOMPLETE: {side.name} failed on {_some(record.failed)}")
+            lines.append(
+                f"INCOMPLETE: {side.name} failed on {some([printable(scene, 80) for scene in record.failed], 3)}"
+            )
         warnings = () if record is None or record.result is None else record.result.warnings
         for start in (RELATIVE, ANSWERED_BY, REFINED_BY):
             lines += [f"{side.name}: {start}{printable(said, 200)}" for said in said_by(warnings, start)]
-    if sides[0].run.rules(protocol).digest != sides[0].run.protocols[protocol].digest:
+    if every[0].run.rules(protocol).digest != every[0].run.protocols[protocol].digest:
         lines.append(f"the rules of {protocol} here are not to the letter those that scored both runs (same version)")
     return lines
 
 
-def _caveats(side: Side) -> list[str]:
+def _caveats(side: sides.Side) -> list[str]:
     """What must be known of a side's perception, and that the truth is one."""
     if side.method not in side.run.methods:
         return [f"{side.name} is the truth itself, no system"]
@@ -311,7 +243,7 @@ def _caveats(side: Side) -> list[str]:
     return [f"{side.name}: {printable(caveat)}" for caveat in caveats if caveat]
 
 
-def _remarks(left: Side, right: Side, methods: Set[str]) -> list[str]:
+def _remarks(left: sides.Side, right: sides.Side, methods: Set[str]) -> list[str]:
     """What must be said of the runs of which ``methods`` are compared."""
     lines = []
     for run in {run.name: run for side in (left, right) for run in side.runs}.values():
@@ -320,30 +252,24 @@ def _remarks(left: Side, right: Side, methods: Set[str]) -> list[str]:
         if run.is_incomplete:
             lines.append(f"INCOMPLETE: {run.name} lacks scenes that failed")
     aside = ("seed",) if left.others or right.others else ()
-    if changed := settings_that_differ(left.run, right.run, methods, aside):
-        lines.append("settings that differ: " + "; ".join(changed[:6]) + _more(len(changed) - 6))
+    if changed := sides.settings_that_differ(left.run, right.run, methods, aside):
+        lines.append(
+            "settings that differ: "
+            + "; ".join(changed[:6])
+            + (f" and {len(changed) - 6} more" if len(changed) > 6 else "")
+        )
     if len({run.record.code for side in (left, right) for run in side.runs}) > 1:
         lines.append("the runs were made by different versions of the code")
     return lines
 
 
-def _some(names: Sequence[str]) -> str:
-    return ", ".join(printable(name, 80) for name in names[:3]) + _more(len(names) - 3)
-
-
-def _more(n: int) -> str:
-    return f" and {n} more" if n > 0 else ""
-
-
 def _protocol_json(protocol: ProtocolComparison) -> dict[str, Any]:
-    return {
-        **asdict(protocol),
-        "metrics": {name: _difference_json(value) for name, value in protocol.metrics.items()},
-        "classes": {
-            name: {column: _difference_json(value) for column, value in columns.items()}
-            for name, columns in protocol.classes.items()
-        },
+    metrics = {name: _difference_json(value) for name, value in protocol.metrics.items()}
+    classes = {
+        name: {column: _difference_json(value) for column, value in columns.items()}
+        for name, columns in protocol.classes.items()
     }
+    return {**vars(protocol), "metrics": metrics, "classes": classes}
 
 
 def _difference_json(difference: Difference) -> dict[str, Any]:
@@ -379,7 +305,7 @@ class MetricPlan:
 
     difference: float
     interval: Interval | None
-    variance: Variance | None
+    variance: statistics.Variance | None
     needs: tuple[Need, ...]
 
 
@@ -407,24 +333,41 @@ def plan(
     *,
     points: Sequence[float],
     protocols: Sequence[str] = (),
-    power: float = POWER,
+    power: float = statistics.POWER,
 ) -> Plan:
     """What shows differences of ``points`` per cent between two methods, from ``runs`` that differ in their seed alone.
 
     Without ``methods`` the runs' only two. Raises ``ConfigError`` where the runs do not belong together, hold one seed
     twice, or too little to tell how differences vary.
     """
-    _check_request(points, power)
+    for value in points:
+        if not 0 < value <= 100:
+            raise ConfigError(f"--points {value:g}: expected per cent above 0 and at most 100")
+    if not 0.05 < power < 1:
+        raise ConfigError(f"--power {power:g}: expected a probability above 0.05 and below 1, such as 0.8")
     read = [read_run(path) for path in dict.fromkeys(runs)]
-    pair = _two_methods(read[0], methods)
-    sides = [(Side(run, pair[0]), Side(run, pair[1])) for run in read]
-    refuse_other_requests(read, set(pair))
-    numbers = SideNumbers()
+    first = read[0]
+    pair = tuple(methods) or first.methods
+    if len(pair) != 2 or pair[0] == pair[1]:
+        known = ", ".join(printable(name, 80) for name in first.methods)
+        raise ConfigError(
+            f"{first.name}: a difference is of two methods; name them with --methods A B (it has {known})"
+        )
+    every = [sides.Side(run, method) for run in read for method in pair]
+    sides.refuse_other_requests(read, set(pair))
+    numbers = sides.SideNumbers()
     plans: dict[str, dict[str, MetricPlan]] = {}
     scenes: dict[str, None] = {}
-    for name in protocols_in_both(*sides[0], protocols):
-        over_scenes = _over_common_scenes(name, sides, numbers)
-        scenes |= dict.fromkeys(over_scenes[0][0].result.scenes)
+    for name in sides.protocols_in_both(*every[:2], protocols):
+        found = numbers.over_common(name, every)
+        n_scenes = len(found[0].result.scenes) if found else 0
+        if n_scenes < 2:
+            raise ConfigError(
+                f"{first.name}: {counted(n_scenes, 'scene')} {'is' if n_scenes == 1 else 'are'} scored under {name} "
+                "for both methods in every run; at least two tell how a difference varies"
+            )
+        over_scenes = list(zip(found[::2], found[1::2], strict=True))
+        scenes |= dict.fromkeys(found[0].result.scenes)
         plans[name] = {
             metric: _plan_metric(
                 np.array([right.without_each[metric] - left.without_each[metric] for left, right in over_scenes]),
@@ -432,41 +375,11 @@ def plan(
                 points,
                 power,
             )
-            for metric in sides[0][0].run.rules(name).headline
+            for metric in first.rules(name).headline
         }
     seeds = tuple(run.record.seed or 0 for run in read)
     remarks = tuple(dict.fromkeys(line for run in read for line in run.elsewhere_lines()))
-    return Plan(*pair, tuple(run.name for run in read), seeds, tuple(scenes), power, plans, remarks)
-
-
-def _over_common_scenes(
-    protocol: str, sides: Sequence[tuple[Side, Side]], numbers: SideNumbers
-) -> list[tuple[OverScenes, OverScenes]]:
-    """What the two methods of each run come to over the scenes that all have."""
-    found = numbers.over_common(protocol, [side for of_run in sides for side in of_run])
-    n_scenes = len(found[0].result.scenes) if found else 0
-    if n_scenes < 2:
-        raise ConfigError(
-            f"{sides[0][0].run.name}: {counted(n_scenes, 'scene')} {'is' if n_scenes == 1 else 'are'} scored under "
-            f"{protocol} for both methods in every run; at least two tell how a difference varies"
-        )
-    return list(zip(found[::2], found[1::2], strict=True))
-
-
-def _check_request(points: Sequence[float], power: float) -> None:
-    for value in points:
-        if not 0 < value <= 100:
-            raise ConfigError(f"--points {value:g}: expected per cent above 0 and at most 100")
-    if not 0.05 < power < 1:
-        raise ConfigError(f"--power {power:g}: expected a probability above 0.05 and below 1, such as 0.8")
-
-
-def _two_methods(run: FinishedRun, methods: Sequence[str]) -> tuple[str, str]:
-    chosen = list(methods) or list(run.methods)
-    if len(chosen) != 2 or chosen[0] == chosen[1]:
-        known = ", ".join(printable(name, 80) for name in run.methods)
-        raise ConfigError(f"{run.name}: a difference is of two methods; name them with --methods A B (it has {known})")
-    return chosen[0], chosen[1]
+    return Plan(pair[0], pair[1], tuple(run.name for run in read), seeds, tuple(scenes), power, plans, remarks)
 
 
 def _plan_metric(
@@ -474,19 +387,23 @@ def _plan_metric(
 ) -> MetricPlan:
     """``without_each`` (R, 1 + G) of each run's difference, ``of_scenes`` (R, S) that of each scene alone."""
     rows = list(zip(without_each, ~np.isnan(of_scenes), strict=True))
-    is_part: BoolArray = np.asarray(np.any([has_part(*row) for row in rows], axis=0))
-    pseudo = np.array([pseudo_values(values, is_part) for values, _ in rows])
+    is_part: BoolArray = np.asarray(np.any([statistics.has_part(*row) for row in rows], axis=0))
+    pseudo = np.array([statistics.pseudo_values(values, is_part) for values, _ in rows])
     difference = float(without_each[:, 0].mean())
     if pseudo.shape[1] < 2 or not np.isfinite(pseudo).all():
         return MetricPlan(difference, None, None, ())
-    variance = variance_of(pseudo)
-    if variance.error(*pseudo.shape[::-1])[0] <= NO_SPREAD:
+    variance = statistics.variance_of(pseudo)
+    if variance.error(*pseudo.shape[::-1])[0] <= statistics.NO_SPREAD:
         return MetricPlan(difference, None, None, ())
     seeds = (1,) if variance.of_seeds is None else SEEDS
-    least, most = variance_range(variance)
+    least, most = statistics.variance_range(variance)
     needs = tuple(
-        Need(value, n_seeds, *(scenes_needed(one, value / 100.0, n_seeds, power) for one in (variance, least, most)))
+        Need(
+            value,
+            n_seeds,
+            *(statistics.scenes_needed(one, value / 100.0, n_seeds, power) for one in (variance, least, most)),
+        )
         for n_seeds in seeds
         for value in points
     )
-    return MetricPlan(difference, crossed_interval(difference, variance), variance, needs)
+    return MetricPlan(difference, statistics.crossed_interval(difference, variance), variance, needs)

@@ -11,10 +11,10 @@ import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from su3d_bench.core.config import MOVES_NO_NUMBER
 from su3d_bench.core.english import plural
@@ -25,7 +25,7 @@ from su3d_bench.metrics.protocols.kinds import GroundingRules, PanopticRules, Pr
 from su3d_bench.reports.gate import SCENES, Compared, Finding, Verdict
 from su3d_bench.runs.finished import FinishedRun, read_update_times
 from su3d_bench.runs.verify import wrong_files
-from su3d_bench.store.records import ROUNDING, NumbersRecord, ResultRecord, impossible_value
+from su3d_bench.store.records import ROUNDING, NumbersRecord, ResultRecord
 
 # Where the calibrating work itself takes so many times the reference's on the same kind of processor, others used it,
 # or what is checked slows it: which of them, nobody can tell from inside, so that it excuses a method so far only.
@@ -117,44 +117,30 @@ def calibration_of(run: FinishedRun) -> float | None:
     return float(np.median(known)) if known else None
 
 
-def cost_findings(
-    run: FinishedRun, costs: Mapping[str, Cost], calibration_ms: float | None, limit: float, *, is_judged: bool
-) -> Iterator[Finding]:
-    """What costs more than ``limit`` times the reference's ``costs``; of each method whether the run measured it."""
+def compare_costs(
+    run: FinishedRun, costs: Mapping[str, Cost], calibration_ms: float | None, limit: float
+) -> tuple[list[Finding], list[Compared]]:
+    """What costs more than ``limit`` times the reference's ``costs`` or was not measured, and each part beside it."""
+    findings, numbers = list[Finding](), list[Compared]()
+    most = np.inf if calibration_ms is None else MOST_EXCUSED * calibration_ms
     for method, before in costs.items():
         where = f"{printable(method, 80)} / cost"
         if method not in run.methods:
-            yield Finding("missing", where, "the run does not have this method")
+            findings.append(Finding("missing", where, "the run does not have this method"))
             continue
         if (reason := why_no_cost(run, method)) is not None:
-            yield Finding("missing", where, f"the run did not measure it: it {reason}")
+            findings.append(Finding("missing", where, f"the run did not measure it: it {reason}"))
             continue
-        now = method_cost(run, method, np.inf if calibration_ms is None else MOST_EXCUSED * calibration_ms)
-        if is_judged and now is not None:
-            yield from _dearer(where, before, now, limit)
-
-
-def cost_numbers(
-    run: FinishedRun, costs: Mapping[str, Cost], calibration_ms: float | None, limit: float
-) -> Iterator[Compared]:
-    """Each part of the cost of every method that the run measured, beside the reference's."""
-    most = np.inf if calibration_ms is None else MOST_EXCUSED * calibration_ms
-    for method, before in costs.items():
-        now = method_cost(run, method, most) if method in run.methods else None
-        if now is not None:
-            where = f"{printable(method, 80)} / cost"
-            for part, shown in SHOWN.items():
-                yield Compared(where, shown, getattr(before, part), getattr(now, part), times=limit)
-
-
-def _dearer(where: str, before: Cost, now: Cost, limit: float) -> Iterator[Finding]:
-    for part, shown in SHOWN.items():
-        was, cost = getattr(before, part), getattr(now, part)
-        least = LEAST if part == "whole" else max(LEAST, LEAST_SHARE * before.whole)
-        if cost > limit * was and cost - was > least:
-            times = f"{cost / was:.2f} times" if was else "what was nothing in"
-            text = f"costs {times} the reference; {limit:g} times are allowed"
-            yield Finding("cost", f"{where} of {shown}", text, was, cost)
+        now = method_cost(run, method, most)
+        for part, shown in SHOWN.items():
+            was, cost = getattr(before, part), getattr(now, part)
+            numbers.append(Compared(where, shown, was, cost, times=limit))
+            least = LEAST if part == "whole" else max(LEAST, LEAST_SHARE * before.whole)
+            if cost > limit * was and cost - was > least:
+                times = f"{cost / was:.2f} times" if was else "what was nothing in"
+                text = f"costs {times} the reference; {limit:g} times are allowed"
+                findings.append(Finding("cost", f"{where} of {shown}", text, was, cost))
+    return findings, numbers
 
 
 def busy_remark(run: FinishedRun, calibration_ms: float | None) -> str | None:
@@ -207,20 +193,6 @@ class MethodResult(_Model):
     scenes: dict[str, dict[str, Value]] = Field(min_length=1)
     classes: dict[str, dict[str, Value]]
 
-    @model_validator(mode="after")
-    def _holds_possible_values(self) -> Self:
-        for row in (self.metrics, *self.scenes.values(), *self.classes.values()):
-            for name, value in row.items():
-                if value.value is not None and (fault := impossible_value(name, value.value)) is not None:
-                    raise ValueError(fault)
-        if all(value.value is None for value in self.metrics.values()):
-            raise ValueError(f"{self.method} under {self.protocol} has no value")
-        if any(row.keys() != self.metrics.keys() for row in self.scenes.values()):
-            raise ValueError(
-                f"a scene of {self.method} under {self.protocol} has other values than all scenes together"
-            )
-        return self
-
 
 class Reference(_Model):
     """What a run is held against; ``costs``: of each method, over the calibrating piece of work.
@@ -242,20 +214,6 @@ class Reference(_Model):
     results: tuple[MethodResult, ...] = Field(min_length=1)
     costs: dict[str, Cost]
     calibration_ms: float | None = Field(default=None, gt=0, allow_inf_nan=False)
-
-    @model_validator(mode="after")
-    def _agrees_with_itself(self) -> Self:
-        keys = [(result.method, result.protocol) for result in self.results]
-        if len(set(keys)) < len(keys):
-            raise ValueError("a method stands twice under one protocol")
-        for result in self.results:
-            if result.protocol not in self.protocols:
-                raise ValueError(f"protocols lacks {result.protocol}")
-            if unknown := next((scene for scene in result.scenes if scene not in self.data_digests), None):
-                raise ValueError(f"data_digests lacks {unknown}")
-        if self.costs and self.calibration_ms is None:
-            raise ValueError("costs without calibration_ms")
-        return self
 
 
 def read_reference(path: Path) -> Reference:
@@ -298,6 +256,8 @@ def learn(
     tables = [run.results for run in runs]
     if any(set(table) != set(tables[0]) for table in tables):
         raise ConfigError(f"{first.name}: the runs hold different methods or protocols; learn from repeats of one run")
+    known = {method: [cost for run in runs if (cost := method_cost(run, method))] for method in first.methods}
+    calibrations = [milliseconds for run in runs if (milliseconds := calibration_of(run)) is not None]
     return Reference(
         schema_version=SCHEMA,
         hardware=first.record.hardware,
@@ -310,17 +270,9 @@ def learn(
         data_digests=dict(first.record.data_digests),
         protocols={name: ProtocolKey(version=key.version, digest=key.digest) for name, key in first.protocols.items()},
         results=tuple(_learn_result([table[key] for table in tables]) for key in tables[0]),
-        **_learn_costs(runs),
+        costs={method: Cost.middle(costs) for method, costs in known.items() if costs},
+        calibration_ms=float(np.median(calibrations)) if calibrations else None,
     )
-
-
-def _learn_costs(runs: Sequence[FinishedRun]) -> dict[str, Any]:
-    known = {method: [cost for run in runs if (cost := method_cost(run, method))] for method in runs[0].methods}
-    calibrations = [milliseconds for run in runs if (milliseconds := calibration_of(run)) is not None]
-    return {
-        "costs": {method: Cost.middle(costs) for method, costs in known.items() if costs},
-        "calibration_ms": float(np.median(calibrations)) if calibrations else None,
-    }
 
 
 def _learn_result(repeats: Sequence[ResultRecord]) -> MethodResult:
@@ -351,15 +303,13 @@ def _only(row: Mapping[str, float | None], names: Sequence[str]) -> dict[str, fl
 
 
 def _learn_values(repeats: Sequence[Mapping[str, float | None]]) -> dict[str, Value]:
-    return {name: _learn_value([repeat.get(name) for repeat in repeats]) for name in repeats[0]}
-
-
-def _learn_value(repeats: Sequence[float | None]) -> Value:
-    known = [value for value in repeats if value is not None]
-    if not known:
-        return Value(value=None, tolerance=0.0)
-    spread = max(known) - min(known)
-    return Value(value=known[0] if spread == 0 else math.fsum(known) / len(known), tolerance=SPREADS * spread)
+    values = {}
+    for name in repeats[0]:
+        known = [value for repeat in repeats if (value := repeat.get(name)) is not None]
+        spread = max(known) - min(known) if known else 0.0
+        middle = None if not known else known[0] if spread == 0 else math.fsum(known) / len(known)
+        values[name] = Value(value=middle, tolerance=SPREADS * spread)
+    return values
 
 
 def settings_of(run: FinishedRun) -> dict[str, str]:
@@ -391,10 +341,6 @@ HIGHER_IS_BETTER = frozenset(
 )  # fmt: skip
 
 
-def _is_better_higher(name: str) -> bool:
-    return re.sub(r"^top-\d+ ", "", name) in HIGHER_IS_BETTER
-
-
 def check(run: FinishedRun, reference: Reference) -> Verdict:
     """Everything in which ``run`` differs from ``reference``, failures and improvements."""
     is_same_machine = run.record.processor == reference.processor
@@ -420,18 +366,31 @@ def check(run: FinishedRun, reference: Reference) -> Verdict:
             for name, value in expected.metrics.items()
         ]
     costs, limit = reference.costs, reference.cost_limit
-    findings += cost_findings(run, costs, reference.calibration_ms, limit, is_judged=is_same_machine)
-    findings += _costs_not_learnt(run, reference)
-    n_values = len(numbers)
-    if is_same_machine:
-        numbers += cost_numbers(run, costs, reference.calibration_ms, limit)
-    return Verdict(run.name, tuple(findings), n_values, tuple(_remarks(run, reference)), tuple(numbers))
+    dearer, of_costs = compare_costs(run, costs, reference.calibration_ms, limit)
+    findings += [one for one in dearer if is_same_machine or one.kind != "cost"]
+    remarks, methods = [*_remarks(run, reference)], {result.method for result in reference.results}
+    for method in run.methods:
+        if method in methods and method not in costs:
+            if (reason := why_no_cost(run, method)) is not None:
+                remarks.append(f"{printable(method, 80)}: no cost is judged: it {reason}")
+            else:
+                text = "the reference holds none and the run measured it; learn a new reference"
+                findings.append(Finding("missing", f"{printable(method, 80)} / cost", text))
+    shown = (*numbers, *of_costs) if is_same_machine else tuple(numbers)
+    return Verdict(run.name, tuple(findings), len(numbers), tuple(remarks), shown)
 
 
 def _remarks(run: FinishedRun, reference: Reference) -> Iterator[str]:
     """What was not judged, and why."""
     if run.record.processor != reference.processor:
-        yield _other_machine(run, reference)
+        here, there = (printable(hardware, 120) for hardware in (run.record.hardware, reference.hardware))
+        which = f"another processor ({here}) than the reference's ({there})"
+        if here == there:
+            which = f"another processor of the same name as the reference's ({here}), with other instruction sets"
+        yield (
+            f"{which}: headline values are compared within "
+            f"{100 * reference.across_machines:g} points, scenes and classes by presence, costs are not judged"
+        )
     elif (busy := busy_remark(run, reference.calibration_ms)) is not None:
         yield busy
     yield from run.elsewhere_lines()
@@ -440,17 +399,6 @@ def _remarks(run: FinishedRun, reference: Reference) -> Iterator[str]:
     others += [name for name in run.protocols if name not in reference.protocols]
     if others:
         yield f"the reference does not know, so that nothing holds: {', '.join(printable(name, 80) for name in others)}"
-    for method in run.methods:
-        if method in known and method not in reference.costs and (reason := why_no_cost(run, method)):
-            yield f"{printable(method, 80)}: no cost is judged: it {reason}"
-
-
-def _costs_not_learnt(run: FinishedRun, reference: Reference) -> Iterator[Finding]:
-    known = {result.method for result in reference.results}
-    for method in run.methods:
-        if method in known and method not in reference.costs and why_no_cost(run, method) is None:
-            text = "the reference holds none and the run measured it; learn a new reference"
-            yield Finding("missing", f"{printable(method, 80)} / cost", text)
 
 
 def _unknown(where: str, kind: str, known: Collection[str], measured: Collection[str]) -> Iterator[Finding]:
@@ -459,22 +407,7 @@ def _unknown(where: str, kind: str, known: Collection[str], measured: Collection
         if name not in known:
             text = f"the reference does not have this {kind}; learn a new one"
             here = f"{where} / {kind} {printable(name, 80)}"
-            yield Finding("changed", here, text, group=_several(where, kind))
-
-
-def _several(where: str, kind: str) -> str:
-    return f"{where} / {plural(kind)}"
-
-
-def _other_machine(run: FinishedRun, reference: Reference) -> str:
-    here, there = (printable(hardware, 120) for hardware in (run.record.hardware, reference.hardware))
-    which = f"another processor ({here}) than the reference's ({there})"
-    if here == there:
-        which = f"another processor of the same name as the reference's ({here}), with other instruction sets"
-    return (
-        f"{which}: headline values are compared within "
-        f"{100 * reference.across_machines:g} points, scenes and classes by presence, costs are not judged"
-    )
+            yield Finding("changed", here, text, group=f"{where} / {plural(kind)}")
 
 
 def _identity(run: FinishedRun, reference: Reference) -> Iterator[Finding]:
@@ -541,7 +474,7 @@ def _rows(
             found = [Finding("missing", here, f"the run does not have this {kind}")]
         elif across is None:
             found = _compare(here, values, row, None)
-        yield from (replace(finding, group=_several(where, kind)) for finding in found)
+        yield from (replace(finding, group=f"{where} / {plural(kind)}") for finding in found)
 
 
 def _tolerance(value: Value, across: float | None) -> float:
@@ -555,17 +488,12 @@ def _compare(where: str, expected: Values, row: Mapping[str, float | None], acro
         if measured == value.value:
             continue
         if measured is None or value.value is None:
-            yield Finding(
-                "regression",
-                f"{where} / {printable(name, 80)}",
-                "is undefined in one of the two",
-                value.value,
-                measured,
-            )
+            text = "is undefined in one of the two"
+            yield Finding("regression", f"{where} / {printable(name, 80)}", text, value.value, measured)
         elif abs(measured - value.value) > tolerance:
-            is_better = _is_better_higher(name) and measured > value.value
-            text = "is better than the reference" if is_better else "is worse than the reference"
-            if not _is_better_higher(name):
-                text = "differs from the reference"
+            has_direction = re.sub(r"^top-\d+ ", "", name) in HIGHER_IS_BETTER
+            is_better = has_direction and measured > value.value
+            text = f"is {'better' if is_better else 'worse'} than" if has_direction else "differs from"
             kind: Literal["better", "regression"] = "better" if is_better else "regression"
-            yield Finding(kind, f"{where} / {printable(name, 80)}", text, value.value, measured, tolerance)
+            here = f"{where} / {printable(name, 80)}"
+            yield Finding(kind, here, f"{text} the reference", value.value, measured, tolerance)

@@ -118,10 +118,7 @@ def leaderboard(folder: Path, protocols: Sequence[str] = (), *, with_ranks: bool
         )
     boards: list[tuple[RankingRow, ...]] = []
     for key in dict.fromkeys(entry.ranking for entry in entries):
-        ranked_together = [entry for entry in entries if entry.ranking == key]
-        alike, others = _of_same_data(ranked_together)
-        alike, unlike = _of_as_many_labels(alike)
-        others += unlike
+        alike, others = _alike([entry for entry in entries if entry.ranking == key])
         board = in_order(alike)
         boards.append(ranked(board) if with_ranks else board)
         refused += others
@@ -197,35 +194,29 @@ def _why_not(run: FinishedRun, protocol: str, failed: Sequence[str]) -> str | No
     return "its protocol is none of those installed here"  # a file that somebody else's run names is not looked for
 
 
-def _of_same_data(entries: Sequence[RankingRow]) -> tuple[list[RankingRow], list[Refused]]:
-    """The entries whose scenes have the data that most have, the first seen of equals, and the others."""
+def _alike(entries: Sequence[RankingRow]) -> tuple[list[RankingRow], list[Refused]]:
+    """The entries that may stand in one ranking, and why the others may not.
+
+    Their scenes have the data that most have, the first seen of equals, and they give as many labels as most do, but
+    for the ceilings.
+    """
+    refused = []
     common, _ = Counter(entry.data for entry in entries).most_common(1)[0]
     alike = [entry for entry in entries if entry.data == common]
-    others = []
     for entry in entries:
         if entry.data != common:
             scene = next(scene for (scene, mine), (_, other) in zip(entry.data, common, strict=True) if mine != other)
             reason = f"other data of {printable(scene, 80)} than {len(alike)} of {len(entries)} entries have"
-            others.append(Refused(entry.run, f"{entry.method} / {entry.protocol}", reason))
-    return alike, others
-
-
-def _of_as_many_labels(entries: Sequence[RankingRow]) -> tuple[list[RankingRow], list[Refused]]:
-    """The entries that give as many labels as most do, the first seen of equals, with the ceilings, and the others."""
-    rivals = [entry for entry in entries if not entry.is_ceiling]
-    if not rivals:
-        return list(entries), []
-    (common, n), *_ = Counter(entry.labels for entry in rivals).most_common(1)
-    others = [
-        Refused(
-            entry.run,
-            f"{entry.method} / {entry.protocol}",
-            f"is of {printable(str(entry.labels), 80)}, {n} of {len(rivals)} entries are of {common}",
-        )
-        for entry in rivals
-        if entry.labels != common
-    ]
-    return [entry for entry in entries if entry.is_ceiling or entry.labels == common], others
+            refused.append(Refused(entry.run, f"{entry.method} / {entry.protocol}", reason))
+    rivals = [entry for entry in alike if not entry.is_ceiling]
+    if rivals:
+        (labels, n), *_ = Counter(entry.labels for entry in rivals).most_common(1)
+        for entry in rivals:
+            if entry.labels != labels:
+                reason = f"is of {printable(str(entry.labels), 80)}, {n} of {len(rivals)} entries are of {labels}"
+                refused.append(Refused(entry.run, f"{entry.method} / {entry.protocol}", reason))
+        alike = [entry for entry in alike if entry.is_ceiling or entry.labels == labels]
+    return alike, refused
 
 
 def in_order(rows: Sequence[AnyRow]) -> tuple[AnyRow, ...]:
@@ -280,8 +271,10 @@ def _table(board: Sequence[RankingRow], index: int, intervals: bool) -> Table:
     rows = []
     for entry in board:
         cells = [_cell(entry, k, best[k], intervals) for k in range(len(first.headline))]
-        ranks = [Cell(_ranks_text(entry))] if has_ranks else []
-        about = (*cells, *ranks, Cell(entry.profile), Cell(entry.run))
+        if has_ranks:
+            ranks = " to ".join(map(str, dict.fromkeys(entry.ranks or ())))
+            cells.append(Cell(ranks or NOT_MEASURED))
+        about = (*cells, Cell(entry.profile), Cell(entry.run))
         rows.append(TableRow(entry.method, about, group=str(entry.is_ceiling)))
     scenes = counted(len(first.scenes), "scene")
     notes = [f"Scenes: {', '.join(first.scenes)}."]
@@ -298,21 +291,9 @@ def _table(board: Sequence[RankingRow], index: int, intervals: bool) -> Table:
         notes.append(f"No ranks: {len(rivals)} rows are more than the {MOST_RANKED} whose pairs are all tested.")
     if intervals and (rough := few_scenes(len(first.scenes))):
         notes.append(f"{rough[:1].upper()}{rough[1:]}.")
-    return Table(
-        name=f"leaderboard-{index + 1}",
-        caption=f"{first.protocol}, version {first.version}, {scenes}; per cent.",
-        head="method",
-        columns=(*first.headline, *(["rank"] if has_ranks else []), "profile", "run"),
-        rows=tuple(rows),
-        notes=tuple(notes),
-    )
-
-
-def _ranks_text(entry: RankingRow) -> str:
-    if entry.ranks is None:
-        return NOT_MEASURED
-    best, worst = entry.ranks
-    return str(best) if best == worst else f"{best} to {worst}"
+    caption = f"{first.protocol}, version {first.version}, {scenes}; per cent."
+    columns = (*first.headline, *(["rank"] if has_ranks else []), "profile", "run")
+    return Table(f"leaderboard-{index + 1}", caption, "method", columns, tuple(rows), tuple(notes))
 
 
 def _cell(entry: RankingRow, k: int, best: str, intervals: bool) -> Cell:
@@ -366,17 +347,24 @@ def run_entry(path: Path, name: str | None = None) -> RunEntry:
             record = read_record(RunRecord, path / "run.json", shown(path))
     except StoreError:
         is_damaged = True
-    metrics = None
+    metrics, headlines = None, list[Headline]()
     if is_file(path / "metrics.json"):
         with suppress(StoreError):
             metrics = read_record(MetricsRecord, path / "metrics.json", shown(path))
+    for one in () if metrics is None else metrics.results:
+        if one.headline:
+            first = one.headline[0]
+            value = None if one.result is None else one.result.metrics.get(first)
+            headlines.append(
+                Headline(printable(one.method, 80), printable(one.protocol, 80), printable(first, 40), value)
+            )
     return RunEntry(
         name=printable(name or str(path), 200),
         when=datetime.fromtimestamp(_written(path)).isoformat(" ", "minutes"),
         state=DAMAGED if is_damaged else _state(path, record, metrics),
         scenes=tuple(printable(scene, 120) for scene in record.scenes),
         methods=tuple(printable(method, 80) for method in record.methods),
-        headlines=() if metrics is None else tuple(_headlines(metrics)),
+        headlines=tuple(headlines),
     )
 
 
@@ -393,19 +381,6 @@ def _state(path: Path, record: RunRecord, metrics: MetricsRecord | None) -> str:
         limit = metrics.limit if metrics is not None else 0
         return f"{how_far}, first {counted(limit, 'frame')} only" if limit else how_far
     return "not finished"  # a run that was killed still says that it is running
-
-
-def _headlines(metrics: MetricsRecord) -> list[Headline]:
-    return [
-        Headline(
-            printable(one.method, 80),
-            printable(one.protocol, 80),
-            printable(one.headline[0], 40),
-            None if one.result is None else one.result.metrics.get(one.headline[0]),
-        )
-        for one in metrics.results
-        if one.headline
-    ]
 
 
 def runs_table(entries: Sequence[RunEntry]) -> Table:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -108,7 +108,10 @@ class Walker:
             raise ConfigError(f"{printable(prediction, 200)}: names several runs; give one")
         (run,) = runs
         method = method_of(run, named)
-        return cls(mixtures, run, method, _scenes(run, method))
+        lacking = [scene for scene in run.scenes if not run.folder.job(scene, method).prediction.is_file()]
+        if lacking:  # numbers of other scenes would mislead
+            raise ConfigError(f"{run.name}: has no map by {printable(method, 80)} of {some(lacking, 3)}; run it again")
+        return cls(mixtures, run, method, run.scenes)
 
     def walk(self, jobs: int = 1, report: Report = lambda event: None) -> Walk:
         """Score every choice of rules, ``jobs`` scenes side by side.
@@ -128,7 +131,7 @@ class Walker:
 
         @cache
         def values(bits: int) -> Mapping[str, float]:
-            rules = _rules(mixtures, inputs, bits)
+            rules = inputs.rules(mixtures.of(_chosen(bits, n)))
             scores = {scene: unpack_scores(of_scene[scene][bits])[rules.name] for scene in self.scenes}
             found = combined_metrics(rules, scores)
             undefined = [name for name in mixtures.values if not math.isfinite(found[name])]
@@ -138,7 +141,7 @@ class Walker:
                 )
             return found
 
-        adds = {name: shares(n, partial(_value, values, name)) for name in mixtures.values}
+        adds = {name: shares(n, lambda bits, name=name: values(bits)[name]) for name in mixtures.values}
         return Walk(
             run=self.run.name,
             method=printable(self.method, 80),
@@ -153,20 +156,8 @@ class Walker:
         )
 
 
-def _value(values: Callable[[int], Mapping[str, float]], name: str, bits: int) -> float:
-    return values(bits)[name]
-
-
-def _scenes(run: FinishedRun, method: str) -> tuple[str, ...]:
-    """The scenes with a map of ``method``; ``ConfigError`` where one lacks it, for numbers of other scenes mislead."""
-    lacking = [scene for scene in run.scenes if not run.folder.job(scene, method).prediction.is_file()]
-    if lacking:
-        raise ConfigError(f"{run.name}: has no map by {printable(method, 80)} of {some(lacking, 3)}; run it again")
-    return run.scenes
-
-
-def _rules(mixtures: Mixtures, inputs: Inputs, bits: int) -> ProtocolRules:
-    return inputs.rules(mixtures.of([k for k in range(len(mixtures.groups)) if bits >> k & 1]))
+def _chosen(bits: int, n: int) -> list[int]:
+    return [k for k in range(n) if bits >> k & 1]
 
 
 def _score(unit: _Unit, report: Report) -> tuple[str, Scores]:
@@ -177,7 +168,7 @@ def _score(unit: _Unit, report: Report) -> tuple[str, Scores]:
     with remembering():
         for k, bits in enumerate(unit.choices):
             report(Event(unit.scene, "scoring", k, len(unit.choices)))
-            rules = _rules(unit.mixtures, inputs, bits)
+            rules = inputs.rules(unit.mixtures.of(_chosen(bits, len(unit.mixtures.groups))))
             truth, prediction = inputs.of_scene(unit.scene, rules, truth_of)
             if (reason := why_not_scorable(rules, prediction)) is not None:
                 raise PredictionError(f"{printable(unit.scene, 120)}: under {rules.name}: {reason}")

@@ -27,6 +27,7 @@ from su3d_bench.metrics.matching.nearest import Points
 from su3d_bench.metrics.metric import n_predictions
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic import confusion
+from su3d_bench.reports.pictures.maps import names_of
 from su3d_bench.reports.tables.samples import Sample
 from su3d_bench.runs.executors import SCENE_DONE, Event, Report
 from su3d_bench.runs.finished import FinishedRun, read_run
@@ -139,10 +140,10 @@ def _rows(
     class_of = _class_names(rules)
     called = [class_of.get(int(one), "") for one in masks.class_ids]
     true_classes = [class_of[int(one)] for one in overlaps.class_of_instance]
-    for k, name in enumerate(_names(prediction, len(masks.masks))):
+    for k, name in enumerate(names_of(prediction)):
         met, iou = _best(overlaps.iou[k])
         yield Sample(
-            *where, "predicted", ids[k], k, called[k], name, float(masks.scores[k]),
+            *where, "predicted", ids[k], k, called[k], printable(name, MOST_OF_A_NAME), float(masks.scores[k]),
             len(masks.masks.mask(k)), None, bool(overlaps.is_counted[k]), iou,
             None if met is None else number_of[met], "" if met is None else true_classes[met],
             bool(at_25.is_hit[k]), bool(at_50.is_hit[k]), errors.of_mask[k], *_box(points, masks.masks.mask(k)),
@@ -192,7 +193,7 @@ class _OfPoints:
         self._names: list[str] = []
         if not isinstance(prediction, DenseFeatures):
             self._ids = _ids(prediction, n_predictions(prediction))
-            self._names = _names(prediction, n_predictions(prediction))
+            self._names = [printable(name, MOST_OF_A_NAME) for name in names_of(prediction)]
 
     def rows(self, where: tuple[str, str, str, str]) -> Iterator[Sample]:
         """What is named, and then what is there."""
@@ -261,15 +262,6 @@ def _class_names(rules: ProtocolRules) -> dict[int, str]:
 def _ids(prediction: Instances | Partition, n: int) -> list[int]:
     ids = prediction.ids if isinstance(prediction, Instances) else ()
     return [int(one) for one in ids] if len(ids) == n else list(range(n))
-
-
-def _names(prediction: Instances | Partition, n: int) -> list[str]:
-    """What a person reads of each instance: the label that the method decided, else the name that perception gave."""
-    if not isinstance(prediction, Instances):
-        return [""] * n
-    labels = prediction.labels or prediction.names
-    pairs = zip(labels, prediction.names, strict=True)
-    return [printable(label or name, MOST_OF_A_NAME) for label, name in pairs]
 
 
 def _best(iou: Float64Array) -> tuple[int | None, float]:

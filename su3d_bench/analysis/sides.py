@@ -66,25 +66,16 @@ def _folders(text: str) -> list[Path]:
     return folders if all(folder.is_dir() for folder in folders) else []
 
 
-def pair_methods(
-    left: tuple[Sequence[FinishedRun], str | None], right: tuple[Sequence[FinishedRun], str | None]
-) -> list[tuple[Side, Side]]:
+Named = tuple[Sequence[FinishedRun], str | None]  # the runs of a side and the method, where one is named
+
+
+def pair_methods(left: Named, right: Named) -> list[tuple[Side, Side]]:
     """The methods that are compared with each other: those named, else those of one name, else the only ones.
 
     A ``ConfigError`` where the runs of a side differ in more than their seed.
     """
-    pairs = _pairs(left, right)
-    for runs, methods in zip(
-        (left[0], right[0]), zip(*((a.method, b.method) for a, b in pairs), strict=True), strict=True
-    ):
-        refuse_other_requests(runs, set(methods))
-    return pairs
-
-
-def _pairs(
-    left: tuple[Sequence[FinishedRun], str | None], right: tuple[Sequence[FinishedRun], str | None]
-) -> list[tuple[Side, Side]]:
-    ((run, *more), name), ((other, *more_others), other_name) = left, right
+    (run, *more), name = left
+    (other, *more_others), other_name = right
     folders = [{each.folder.path.resolve() for each in runs} for runs, _ in (left, right)]
     is_one_run = not folders[0].isdisjoint(folders[1])
     if is_one_run and name == other_name:
@@ -92,24 +83,23 @@ def _pairs(
         raise ConfigError(
             f"{shown}: both sides are the same; name two runs, or two methods of one as {run.name}:METHOD"
         )
-    if name is None and other_name is None:
-        common = [each for each in run.methods if each in other.methods]
-        if not common and len(run.methods) == len(other.methods) == 1:
-            name, other_name = run.methods[0], other.methods[0]
-        elif not common:
-            raise ConfigError(
-                f"{run.name} has {', '.join(run.methods)} and {other.name} {', '.join(other.methods)}: no method in "
-                f"common; name one of each, such as {run.name}:{run.methods[0]}"
-            )
-        else:
-            return [(Side(run, each, tuple(more)), Side(other, each, tuple(more_others))) for each in common]
-    name = name or _same_or_only(run, str(other_name))
-    other_name = other_name or _same_or_only(other, name)
-    run.check_method(name)
-    other.check_method(other_name)
-    if is_one_run and name == other_name:
-        raise ConfigError(f"{run.name}:{name}: both sides are the same; name two methods of the run")
-    return [(Side(run, name, tuple(more)), Side(other, other_name, tuple(more_others)))]
+    methods = [(each, each) for each in run.methods if each in other.methods]
+    if name is not None or other_name is not None or (not methods and len(run.methods) == len(other.methods) == 1):
+        name = name or _same_or_only(run, other_name or run.methods[0])
+        other_name = other_name or _same_or_only(other, name)
+        run.check_method(name)
+        other.check_method(other_name)
+        methods = [(name, other_name)]
+        if is_one_run and name == other_name:
+            raise ConfigError(f"{run.name}:{name}: both sides are the same; name two methods of the run")
+    if not methods:
+        raise ConfigError(
+            f"{run.name} has {', '.join(run.methods)} and {other.name} {', '.join(other.methods)}: no method in "
+            f"common; name one of each, such as {run.name}:{run.methods[0]}"
+        )
+    for (runs, _), names in zip((left, right), zip(*methods, strict=True), strict=True):
+        refuse_other_requests(runs, set(names))
+    return [(Side(run, one, tuple(more)), Side(other, two, tuple(more_others))) for one, two in methods]
 
 
 def _same_or_only(run: FinishedRun, name: str) -> str:
@@ -211,12 +201,6 @@ def _short(value: int | str | None) -> str:
     return printable(str(value)[:12]) if value is not None else "not recorded"
 
 
-def check_shapes(rules: ProtocolRules, side: Side, scores: Mapping[str, SceneScore]) -> None:
-    """A ``DataError`` where counts are of other classes than the rules here have."""
-    for scene, score in scores.items():
-        metric_of(rules).check(f"{side.name}: {printable(scene, 100)}", score.counts)
-
-
 class SideNumbers:
     """What sides give, made once for all pairs that they are in."""
 
@@ -234,7 +218,8 @@ class SideNumbers:
     def over_common(self, protocol: str, sides: Sequence[Side]) -> list[OverScenes]:
         """Of each of ``sides`` the numbers over the scenes that all have.
 
-        None for no scene; a ``ConfigError`` where one cannot be compared with the first.
+        None for no scene; a ``ConfigError`` where one cannot be compared with the first, a ``DataError`` where counts
+        are of other classes than the rules here have.
         """
         scores = [self.scores(side).get(protocol, {}) for side in sides]
         common = [scene for scene in scores[0] if all(scene in of_side for of_side in scores)]
@@ -243,23 +228,21 @@ class SideNumbers:
         if not common:
             return []
         rules = sides[0].run.rules(protocol)
+        metric = metric_of(rules)
         found = []
         for side, of_side in zip(sides, scores, strict=True):
             own = {scene: of_side[scene] for scene in common}
-            check_shapes(rules, side, own)
-            found.append(self.over_scenes(rules, side, own))
+            for scene, score in own.items():
+                metric.check(f"{side.name}: {printable(scene, 100)}", score.counts)
+            key = side.run.folder.path, side.method, protocol, tuple(common)
+            if key not in self._over_scenes:
+                result = combine(rules, own, with_intervals=False)
+                counts = [own[scene].counts for scene in result.scenes]
+                rows = [result.per_scene[scene] for scene in result.scenes]
+                without_each = metric.resampled_headline(counts, rows, leave_one_out(len(rows)))
+                self._over_scenes[key] = OverScenes(result, counts, without_each)
+            found.append(self._over_scenes[key])
         return found
-
-    def over_scenes(self, rules: ProtocolRules, side: Side, scores: Mapping[str, SceneScore]) -> OverScenes:
-        """The numbers over the scenes of ``scores``, and without each of them."""
-        key = side.run.folder.path, side.method, rules.name, tuple(scores)
-        if key not in self._over_scenes:
-            result = combine(rules, scores, with_intervals=False)
-            counts = [scores[scene].counts for scene in result.scenes]
-            rows = [result.per_scene[scene] for scene in result.scenes]
-            without_each = metric_of(rules).resampled_headline(counts, rows, leave_one_out(len(rows)))
-            self._over_scenes[key] = OverScenes(result, counts, without_each)
-        return self._over_scenes[key]
 
 
 @dataclass(frozen=True)

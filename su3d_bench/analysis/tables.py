@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -145,18 +145,13 @@ def _who_judged(scores: Scores, cells: Sequence[ScoreCell]) -> str:
 
 
 def _results_of(name: str, run: FinishedRun) -> list[Measured]:
-    names: dict[str, list[str]] = {}
-    for result in run.results.values():
-        if result.result is not None:
-            names.setdefault(result.protocol, list(result.result.metrics))
-    return [
-        _measured(name, run, result, dict.fromkeys(names.get(result.protocol, result.headline)))
-        for result in run.results.values()
-    ]
+    names = {one.protocol: one.result.metrics for one in run.results.values() if one.result is not None}
+    return [_measured(name, run, one, names.get(one.protocol, one.headline)) for one in run.results.values()]
 
 
-def _measured(name: str, run: FinishedRun, record: ResultRecord, nothing: Mapping[str, None]) -> Measured:
-    """``nothing``: the protocol's metrics without a value, for a method that has none."""
+def _measured(name: str, run: FinishedRun, record: ResultRecord, names: Iterable[str]) -> Measured:
+    """``names``: the protocol's metrics, which are without a value of a method that has none."""
+    nothing = dict.fromkeys(names)
     numbers = record.result or NumbersRecord(scenes=(), metrics=nothing, intervals={}, per_scene={}, per_class={})
     return Measured(
         run=name,
@@ -195,16 +190,13 @@ def anytime_points(runs: Sequence[FinishedRun], times: Sequence[UpdateTimes]) ->
         if any(len(of_scene.maps) != len(maps) for of_scene in times):
             continue  # the record of a scene's maps is damaged
         for index, (share, metrics) in enumerate(maps):
-            seconds = sum(_seconds_until(of_scene, index) for of_scene in times)
+            seconds = 0.0  # of the updates before the map, and of its own making
+            for of_scene in times:
+                made = of_scene.maps[index]
+                seconds += float(of_scene.ms("total")[: made.n_updates].sum() + made.finish_ms) / 1e3
             headline = {metric: metrics.get(metric) for metric in record.headline}
             points.append(AnytimePoint(run.name, method, protocol, share, seconds, headline))
     return points
-
-
-def _seconds_until(times: UpdateTimes, index: int) -> float:
-    """Seconds of the updates before map ``index`` and of its own making."""
-    made = times.maps[index]
-    return float(times.ms("total")[: made.n_updates].sum() + made.finish_ms) / 1e3
 
 
 def choose(

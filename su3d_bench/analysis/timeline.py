@@ -1,50 +1,35 @@
-"""Frames, masks, maps and truth of a scene of a run as they came one after another, on one timeline."""
+"""Frames, masks, maps and truth of a scene of a run as they came one after another, on one timeline.
+
+It is a recording of rerun's viewer (``.rrd``), made without a viewer, a display or a network.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import IO, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from su3d_bench.analysis.page.maps import Spaces, shown_classes, shown_rules
 from su3d_bench.analysis.page.scene import SceneData, SceneReader, fed_frames, frames_of
-from su3d_bench.core.errors import StoreError, counted, printable
+from su3d_bench.core.errors import ModelMissing, StoreError, counted, printable
 from su3d_bench.core.geometry import back_project, valid_depth
 from su3d_bench.core.interfaces import HasSketches
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, GroundTruth, Int64Array
+from su3d_bench.formats.images import depth_in_units, jpeg_bytes, png_bytes
 from su3d_bench.metrics.matching.labelling import class_index_of_ids
 from su3d_bench.metrics.matching.nearest import nearest
 from su3d_bench.metrics.metric import n_predictions
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.reports.page.maps import Cloud, point_owners, thinned
-from su3d_bench.reports.pictures.canvas import (
-    CUT_BELOW_TOP_M,
-    ROOM_HEIGHT_M,
-    Colour,
-    class_colours,
-    instance_colours,
-    room_bounds,
-)
+from su3d_bench.reports.pictures import canvas
+from su3d_bench.reports.pictures.maps import names_of
 from su3d_bench.reports.pictures.scene import evenly
-from su3d_bench.reports.timeline import (
-    BOXES,
-    CLASSES,
-    CURVES,
-    GROWTH,
-    INSTANCES,
-    MAP,
-    MASKS,
-    ROOM,
-    TOP,
-    TRUE_MASKS,
-    TRUTH,
-    Name,
-    Recording,
-    UInt16Array,
-)
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.records import read_updates
@@ -56,8 +41,133 @@ NEAR_SPACINGS = 3.0  # a pixel is the instance's whose point lies within so many
 EVERY_PIXEL = 2  # of both axes is asked whose it is
 SEEN_M = 0.05  # between a point and what the camera saw there
 MOST_IDS = 0xFFFF  # rerun's ids have 16 bits, of which 0 says nobody's
+UInt16Array = NDArray[np.uint16]
+# A place is a path through these; names of methods stand below them and so can take no other's place.
+CAMERA = ("world", "camera")
+MASKS, TRUE_MASKS = (*CAMERA, "masks"), (*CAMERA, "truth")
+MAP, TRUTH, GROWTH, ABOUT = ("world", "map"), ("world", "truth"), ("growth",), ("about",)
+INSTANCES, CLASSES, BOXES = "instances", "classes", "boxes"
+ROOM, TOP = "room", "ceiling"  # parts of a cloud: what is below the ceiling, and the rest
+CURVES = ("instances", "points", "milliseconds an update")
+APPLICATION = "su3d-bench"
+LEAST_VERSION = (0, 41)  # the first that the project was tried with
+UNITS_PER_METRE = 1000.0  # of depth: 16 bits reach 65 m
+JPEG_QUALITY = 80
+CAMERA_M = 0.4  # how far before the camera its picture stands in the room
+INSTALL = "pip install 'su3d-bench[rerun]'"
 COLUMNS = dict(zip(("n_instances", "n_points", "total_ms"), CURVES, strict=True))  # of updates, and their curves
 Tell = Callable[[int, int], None]
+
+
+def rerun_sdk() -> Any:
+    """The module of rerun; a ``ModelMissing`` where it is not installed, too old, or switched off."""
+    try:
+        import rerun
+    except ImportError as error:
+        raise ModelMissing(f"report rerun needs the rerun extra: {INSTALL}") from error
+    version = str(getattr(rerun, "__version__", ""))
+    numbers = re.match(r"(\d+)\.(\d+)", version)
+    if numbers is None or (int(numbers[1]), int(numbers[2])) < LEAST_VERSION:
+        least = ".".join(map(str, LEAST_VERSION))
+        raise ModelMissing(f"report rerun needs rerun-sdk {least} or later, here is {version or 'another'}: {INSTALL}")
+    if not rerun.RecordingStream(APPLICATION, send_properties=False).is_enabled():
+        raise ModelMissing("RERUN in the environment switches rerun off, and nothing would be written; unset RERUN")
+    return rerun
+
+
+class Recording:
+    """The recording of one scene, which goes piece by piece into ``stream``; ``sdk`` is ``rerun_sdk()``.
+
+    A place is a path of names. What is logged holds from the frame of the last ``at`` on, and always before the first.
+    """
+
+    def __init__(self, sdk: Any, scene: str, methods: Sequence[str], stream: IO[bytes]) -> None:
+        self.sdk, self._stream, self._is_static = sdk, stream, True
+        self._recording = sdk.RecordingStream(APPLICATION, recording_id=printable(scene, 200), send_properties=False)
+        self._recording.set_log_time_enabled(False)
+        self._recording.set_log_tick_enabled(False)
+        self._sink = self._recording.binary_stream()
+        self._recording.send_recording_name(printable(scene, 200))
+        self._recording.send_blueprint(_panels(sdk, methods), make_active=True, make_default=True)
+        self.log(CAMERA[:1], sdk.ViewCoordinates.RIGHT_HAND_Z_UP)
+
+    def at(self, frame: int, seconds: float) -> None:
+        """Go to a moment: a frame's index at full rate, and seconds since the first that is shown."""
+        self._recording.set_time("frame", sequence=frame)
+        self._recording.set_time("seconds", duration=seconds)
+        self._is_static = False
+
+    def photo(self, frame: Frame) -> None:
+        """Where the camera is, what it saw and how far that was."""
+        height, width = frame.depth_m.shape
+        pose = frame.camera_to_world
+        pinhole = self.sdk.Pinhole(
+            image_from_camera=frame.intrinsics,
+            width=width,
+            height=height,
+            camera_xyz=self.sdk.ViewCoordinates.RDF,
+            image_plane_distance=CAMERA_M,
+        )
+        self.log(CAMERA, self.sdk.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]), pinhole)
+        colour = self.sdk.EncodedImage(contents=jpeg_bytes(frame.rgb, JPEG_QUALITY), media_type="image/jpeg")
+        self.log((*CAMERA, "colour"), colour)
+        packed = png_bytes(depth_in_units(frame.depth_m, UNITS_PER_METRE))
+        depth = self.sdk.EncodedDepthImage(packed, media_type="image/png", meter=UNITS_PER_METRE)
+        self.log((*CAMERA, "depth"), depth)
+
+    def close(self, about: str) -> None:
+        """End the recording with plain words about all of it."""
+        made_with = f"Made with rerun {self.sdk.__version__}; other versions may not read this file."
+        self._is_static = True
+        self.log(ABOUT, self.sdk.TextDocument(f"{about}\n\n{made_with}", media_type="text/plain"))
+        self._recording.disconnect()
+        self._stream.write(self._sink.read(flush=True) or b"")
+
+    def log(self, place: Sequence[str], *contents: Any) -> None:
+        """Log ``contents``, objects of ``sdk``, at a place."""
+        for content in contents:
+            self._recording.log(_path(place), content, static=self._is_static)
+        self._stream.write(self._sink.read(flush=True) or b"")
+
+
+def _path(place: Sequence[str]) -> list[str]:
+    """A place as rerun takes it, which escapes each part itself."""
+    return [printable(part, 100) for part in place]
+
+
+def _panels(sdk: Any, methods: Sequence[str]) -> Any:
+    """The photo with its masks above the curves, the maps by instance and by class, the truth."""
+    rrb = sdk.blueprint
+
+    def at(*parts: str) -> str:
+        return str(sdk.new_entity_path(_path(parts)))
+
+    def room(name: str, *shown: str) -> Any:
+        camera = [at(*CAMERA), at(*CAMERA, "colour")]
+        return rrb.Spatial3DView(origin=at("world"), contents=[*camera, *shown], name=printable(name, 100))
+
+    def photo(name: str, *shown: str) -> Any:
+        return rrb.Spatial2DView(origin=at(*CAMERA), contents=[at(*CAMERA, "colour"), *shown], name=name)
+
+    photos = [photo(f"masks of {printable(method, 80)}", at(*MASKS, method)) for method in methods]
+    depth = rrb.Spatial2DView(origin=at(*CAMERA), contents=[at(*CAMERA, "depth")], name="depth")
+    rooms = []
+    for method in methods:
+        boxes = at(*MAP, method, BOXES)
+        rooms.append(room(f"{method}: instances", f"{at(*MAP, method, INSTANCES, ROOM)}/**", boxes))
+        rooms.append(room(f"{method}: classes", f"{at(*MAP, method, CLASSES, ROOM)}/**"))
+    truths = [room(f"truth: {kind}", f"{at(*TRUTH, kind, ROOM)}/**") for kind in (CLASSES, INSTANCES)]
+    left = rrb.Vertical(
+        rrb.Tabs(*photos, photo("masks of the truth", at(*TRUE_MASKS)), depth),
+        rrb.Tabs(
+            *(rrb.TimeSeriesView(origin=at(*GROWTH, curve), name=curve) for curve in CURVES),
+            rrb.TextDocumentView(origin=at(*ABOUT), name="what this is"),
+        ),
+    )
+    right = rrb.Vertical(rrb.Tabs(*rooms), rrb.Tabs(*truths))
+    panels = rrb.Horizontal(left, right, column_shares=[2, 3])
+    time = rrb.TimePanel(state="collapsed", timeline="frame")
+    return rrb.Blueprint(panels, time, rrb.SelectionPanel(state="collapsed"))
 
 
 @dataclass(frozen=True)
@@ -75,16 +185,12 @@ class Owned:
     labels: tuple[str, ...]
 
     @property
-    def colours(self) -> list[Colour]:
-        return instance_colours(self.names)
+    def colours(self) -> list[canvas.Colour]:
+        return canvas.instance_colours(self.names)
 
-    @cached_property
-    def near_m(self) -> float:
-        return NEAR_SPACINGS * self.cloud.spacing_m
-
-    def named(self) -> list[tuple[str, Sequence[Name], Int64Array]]:
-        """Of instances and of classes: the place, what its ids mean, and whose each point is."""
-        tints = class_colours(self.labels)
+    def named(self) -> list[tuple[str, Sequence[tuple[int, str, canvas.Colour]], Int64Array]]:
+        """Of instances and of classes: the place, what its ids mean and their colours, and whose each point is."""
+        tints = canvas.class_colours(self.labels)
         instances = [(k + 1, f"{name or 'without a name'} #{k}", self.colours[k]) for k, name in enumerate(self.names)]
         classes = [(k + 1, name, tints[name]) for k, name in enumerate(self.labels)]
         return [
@@ -93,10 +199,18 @@ class Owned:
         ]
 
     def log_names(self, recording: Recording, place: tuple[str, ...], masks: tuple[str, ...]) -> None:
-        """What ids mean below ``place`` of the map and at ``masks``."""
-        for kind, names, _ in self.named():
-            recording.names((*place, kind), names, is_nobody_seen=True)
-        recording.names(masks, self.named()[0][1], is_nobody_seen=False)
+        """What ids mean below ``place`` of the map, where id 0 is grey, and at ``masks``, where it cannot be seen."""
+        places = [((*place, kind), entries, canvas.NO_INSTANCE) for kind, entries, _ in self.named()]
+        for where, entries, nobody in (*places, (masks, places[0][1], (0, 0, 0, 0))):
+            infos = [
+                recording.sdk.AnnotationInfo(number, printable(name, 80), tint)
+                for number, name, tint in ((0, "", nobody), *entries)
+            ]
+            recording.log(where, recording.sdk.AnnotationContext(infos))
+
+    def log_masks(self, recording: Recording, place: tuple[str, ...], frame: Frame) -> None:
+        """Whose each pixel of ``frame`` is, by ids."""
+        recording.log(place, recording.sdk.SegmentationImage(self.masks(frame), opacity=0.6))
 
     def masks(self, frame: Frame) -> UInt16Array:
         """Whose each pixel of ``frame`` is: the instance's whose point is nearest to what the camera saw there."""
@@ -105,25 +219,19 @@ class Owned:
         is_asked[::EVERY_PIXEL, ::EVERY_PIXEL] = True
         is_asked &= valid_depth(frame.depth_m, 0.0, np.inf)
         places = back_project(frame.depth_m, frame.intrinsics, frame.camera_to_world, is_asked)
-        _, row = nearest(self.cloud.points, places, self.near_m)
+        _, row = nearest(self.cloud.points, places, NEAR_SPACINGS * self.cloud.spacing_m)
         ids = np.zeros((height, width), np.uint16)
         ids[is_asked] = ids_of(np.where(row >= 0, np.append(self.instance, -1)[row], -1))
         few = ids[::EVERY_PIXEL, ::EVERY_PIXEL]
         return few.repeat(EVERY_PIXEL, axis=0).repeat(EVERY_PIXEL, axis=1)[:height, :width]
-
-    def log_all(self, recording: Recording, place: tuple[str, ...]) -> None:
-        """All of it at once."""
-        everything = np.ones(len(self.instance), np.bool_)
-        self.log_points(recording, place, everything, "all")
-        self.log_boxes(recording, place, np.ones(len(self.names), np.bool_))
 
     @cached_property
     def is_top(self) -> BoolArray:
         """Which points are of the ceiling or hang from it, as in the pictures, which look into the room from above."""
         if not len(self.cloud.points):
             return np.zeros(0, np.bool_)
-        low, high = room_bounds(self.cloud.points)[:, 2]
-        cut = CUT_BELOW_TOP_M if high - low >= ROOM_HEIGHT_M else 0.0
+        low, high = canvas.room_bounds(self.cloud.points)[:, 2]
+        cut = canvas.CUT_BELOW_TOP_M if high - low >= canvas.ROOM_HEIGHT_M else 0.0
         is_top: BoolArray = self.cloud.points[:, 2] > high - cut
         return is_top
 
@@ -132,15 +240,17 @@ class Owned:
         for kind, _, owner in self.named():
             for part, is_there in ((ROOM, shown & ~self.is_top), (TOP, shown & self.is_top)):
                 if is_there.any():
-                    where = (*place, kind, part, own)
-                    recording.points(
-                        where, self.cloud.points[is_there], ids_of(owner[is_there]), self.cloud.spacing_m / 2
-                    )
+                    points, ids = self.cloud.points[is_there], ids_of(owner[is_there])
+                    cloud = recording.sdk.Points3D(points, class_ids=ids, radii=self.cloud.spacing_m / 2)
+                    recording.log((*place, kind, part, own), cloud)
 
     def log_boxes(self, recording: Recording, place: tuple[str, ...], shown: BoolArray) -> None:
         rows = np.flatnonzero(shown)
-        labels, tints = [self.names[k] for k in rows], [self.colours[k] for k in rows]
-        recording.boxes((*place, BOXES), self.corners[rows], labels, tints)
+        low, high = self.corners[rows].swapaxes(0, 1)
+        labels = [printable(self.names[k], 80) for k in rows]
+        shades = np.array([self.colours[k] for k in rows], np.uint8).reshape(-1, 3)
+        boxes = recording.sdk.Boxes3D(mins=low, sizes=high - low, labels=labels, colors=shades)
+        recording.log((*place, BOXES), boxes)
 
 
 class Growth:
@@ -197,7 +307,8 @@ class SceneTimeline:
         self.n_maps = len(maps)
         if shown_truth is not None:
             shown_truth.log_names(recording, TRUTH, TRUE_MASKS)
-            shown_truth.log_all(recording, TRUTH)
+            shown_truth.log_points(recording, TRUTH, np.ones(len(shown_truth.instance), np.bool_), "all")
+            shown_truth.log_boxes(recording, TRUTH, np.ones(len(shown_truth.names), np.bool_))
         for method, (owned, _) in maps.items():
             owned.log_names(recording, (*MAP, method), (*MASKS, method))
         growing = {method: Growth(recording, (*MAP, method), owned, first) for method, (owned, first) in maps.items()}
@@ -213,13 +324,13 @@ class SceneTimeline:
             recording.at(frame.index, frame.timestamp_s - first_s)
             recording.photo(frame)
             if shown_truth is not None:
-                recording.masks(TRUE_MASKS, shown_truth.masks(frame))
+                shown_truth.log_masks(recording, TRUE_MASKS, frame)
             for method, growth in growing.items():
                 if maps[method][0].names:
-                    recording.masks((*MASKS, method), maps[method][0].masks(frame))
+                    maps[method][0].log_masks(recording, (*MASKS, method), frame)
                 growth.step(frame)
                 for curve, value in curves[method].get(index, {}).items():
-                    recording.number((*GROWTH, curve, method), value)
+                    recording.log((*GROWTH, curve, method), recording.sdk.Scalars(value))
         for growth in growing.values():
             growth.end()
         recording.close(self._about())
@@ -272,7 +383,7 @@ class SceneTimeline:
             if classes is not None:
                 labels = tuple(entry.name for entry in rules.classes)
                 label = classes if is_dense else np.append(classes, -1)[instance]
-        return Owned(cloud, instance, label, _names_of(prediction), _corners_of(prediction), labels)
+        return Owned(cloud, instance, label, names_of(prediction), _corners_of(prediction), labels)
 
     def _curves(self, method: str) -> dict[int, dict[str, float]]:
         """Frame -> curve -> value, of what the updates of a method say."""
@@ -369,15 +480,6 @@ def _corners(points: Float32Array, owner: Int64Array, n: int) -> Float32Array:
     np.minimum.at(low, owner, points)
     np.maximum.at(high, owner, points)
     return np.stack([low, high], axis=1)[:-1]
-
-
-def _names_of(prediction: Prediction) -> tuple[str, ...]:
-    if isinstance(prediction, DenseFeatures):
-        return ()
-    if not isinstance(prediction, Instances):
-        return ("",) * n_predictions(prediction)
-    labels = prediction.labels or prediction.names
-    return tuple(label or name for label, name in zip(labels, prediction.names, strict=True))
 
 
 def _corners_of(prediction: Prediction) -> Float32Array:

@@ -91,9 +91,8 @@ def call_rerun(arguments: argparse.Namespace) -> None:
     su3d-bench report rerun runs/my-run --scenes rooms/office0 --methods opensu3d --stride 2 --out office.rrd
     """
     from su3d_bench.analysis.page.maps import Spaces
-    from su3d_bench.analysis.timeline import SceneTimeline, refuse_nothing
+    from su3d_bench.analysis.timeline import Recording, SceneTimeline, refuse_nothing, rerun_sdk
     from su3d_bench.core.files.atomic import make_folder, replacing
-    from su3d_bench.reports.timeline import Recording, rerun_sdk
     from su3d_bench.runs.executors import Event
     from su3d_bench.runs.finished import read_run
     from su3d_bench.sheets.sources import chosen_of

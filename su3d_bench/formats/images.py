@@ -164,11 +164,11 @@ JPEG_QUALITY = 95
 PNG_COMPRESSION = 3
 
 
-def jpeg_bytes(rgb: UInt8Array) -> bytes:
+def jpeg_bytes(rgb: UInt8Array, quality: int = JPEG_QUALITY) -> bytes:
     import cv2
 
     bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
-    return bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
+    return bytes(cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])[1])
 
 
 def png_bytes(image: UInt8Array | UInt16Array) -> bytes:

@@ -248,13 +248,6 @@ def test_other_counts_than_the_run_s_are_refused() -> None:
         attributed("mixed")
 
 
-ERRORS = [
-    ({"method": "colector"}, "whole: holds no scores of the method 'colector'; did you mean 'collector'?"),
-    ({"method": "x"}, "whole: holds no scores of the method 'x'; it has collector, oracle"),
-    ({"protocols": ["rooms-instanse"]}, "whole: was not scored under 'rooms-instanse'; did you mean 'rooms-instance'?"),
-]
-
-
 def test_the_command_prints_a_table_and_draws_the_plot(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["report", "attribution", "dropped", "--oracle", "oracle", "--out", "plots/errors.png"]) == 0
     text = capsys.readouterr().out

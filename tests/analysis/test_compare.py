@@ -15,7 +15,8 @@ from painted import colour_perception
 from places import SCENES
 from scored_room import noisy_scores
 
-from su3d_bench.analysis.comparison import Difference, compare, form_difference
+from su3d_bench.analysis.comparison import Difference, compare, difference_of
+from su3d_bench.analysis.sides import Numbers
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.types import Float64Array
@@ -142,11 +143,11 @@ def test_p_of_all_is_corrected_for_every_metric_of_the_comparison_that_differs()
     assert classes["sofa"]["AP"].p_of_all is None
 
 
-def difference_of(changes: list[float], interval: tuple[float, float] | None) -> Difference:
+def changed_by(changes: list[float], interval: tuple[float, float] | None) -> Difference:
     each: Float64Array = np.array(changes)
     values = np.zeros(len(each) + 1)
-    found = form_difference((0.5, 0.6), [f"s/{k}" for k in range(len(each))], 0 * each, each, values)
-    return replace(found, interval=interval)
+    left, right = Numbers(0.5, 0 * each, values, None), Numbers(0.6, each, values, None)
+    return replace(difference_of(left, right, [f"s/{k}" for k in range(len(each))]), interval=interval)
 
 
 DISAGREEMENTS: list[tuple[list[float], tuple[float, float] | None, str | None]] = [
@@ -163,7 +164,7 @@ DISAGREEMENTS: list[tuple[list[float], tuple[float, float] | None, str | None]] 
 def test_an_interval_that_contradicts_the_test_is_never_without_a_word(
     changes: list[float], interval: tuple[float, float] | None, words: str | None
 ) -> None:
-    found = difference_of(changes, interval).disagreement
+    found = changed_by(changes, interval).disagreement
     assert (found is None) == (words is None)
     assert words is None or words in (found or "")
 

@@ -10,27 +10,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from painted import colour_perception
-from places import SCENES
+from painted_runs import COLLECTOR, painted_run
 
 import su3d_bench.analysis.leaderboard
 from su3d_bench.analysis.leaderboard import leaderboard, ranked
 from su3d_bench.cli.main import main
 from su3d_bench.metrics.scoring import pack_scores, unpack_scores
-from su3d_bench.runs import scene as scene_run
-
-PAINTED = f"{SCENES}/painted.py"
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("board")
-    words = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--no-pictures", "--jobs", "1"]
-    words += ["--protocols", "rooms-semantic", "rooms-instance"]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
-        for name, method in (("ann/first", "Collector@drop=1"), ("bob", "Collector")):
-            assert main([*words, "--methods", f"{PAINTED}:{method}", "--out", str(folder / name)]) == 0
+    for name, method in (("ann/first", f"{COLLECTOR}@drop=1"), ("bob", COLLECTOR)):
+        painted_run(folder / name, methods=(method,))
     return folder
 
 

@@ -9,18 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from painted import WordEncoder, colour_perception
-from places import SCENES
+from painted import WordEncoder
+from painted_runs import COLLECTOR, painted_run
 
 from su3d_bench.analysis.leaderboard import leaderboard
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names, read_rules
 from su3d_bench.runs import finished
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run
-
-PAINTED = f"{SCENES}/painted.py"
 
 
 @pytest.fixture(scope="module")
@@ -32,12 +29,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         rules.append(folder / f"mine-{name}.toml")
         lines = [f'extends = "rooms-{name}"', f'name = "mine-{name}"', "version = 4", 'prompt = "my {}"']
         rules[-1].write_text("\n".join(lines))
-    words = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--no-pictures", "--jobs", "1"]
-    words += ["--methods", f"{PAINTED}:Collector", f"{PAINTED}:Collector@drop=1", "--protocols", *map(str, rules)]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
-        for name in ("first", "second"):
-            assert main([*words, "--out", str(folder / "runs" / name)]) == 0
+    for name in ("first", "second"):
+        methods = (COLLECTOR, f"{COLLECTOR}@drop=1")
+        painted_run(folder / "runs" / name, "--protocols", *map(str, rules), methods=methods)
     for file in rules:
         file.unlink()
     return folder / "runs"

@@ -100,18 +100,8 @@ def test_what_is_needed_follows_from_the_pseudo_values_of_the_runs(n_seeds: int)
 
 
 def test_the_command_prints_a_table_or_json(capsys: pytest.CaptureFixture[str]) -> None:
-    words = [
-        "report",
-        "power",
-        "seed-0",
-        "seed-1",
-        "--methods",
-        *METHODS,
-        "--points",
-        "10",
-        "--protocol",
-        "rooms-instance",
-    ]
+    words = ["report", "power", "seed-0", "seed-1", "--methods", *METHODS, "--points", "10"]
+    words += ["--protocol", "rooms-instance"]
     assert main(words) == 0
     text = capsys.readouterr().out
     assert "| AP " in text and "10 points" in text and "seed 0, 1" in text
@@ -121,19 +111,6 @@ def test_the_command_prints_a_table_or_json(capsys: pytest.CaptureFixture[str]) 
     assert list(json.loads(capsys.readouterr().out)["protocols"]) == ["rooms-instance"]
     assert main(["report", "power", "seed-0"]) == 0
     assert "how much seeds move the difference is not known" in capsys.readouterr().out
-
-
-REFUSED = {
-    "one method": (["seed-0", "--methods", "collector", "collector"], "a difference is of two methods"),
-    "an unknown method": (["seed-0", "--methods", "collector", "colector"], "did you mean 'collector'"),
-    "no points": (["seed-0", "--points", "0"], "--points 0: expected per cent above 0"),
-    "no power": (["seed-0", "--power", "1"], "--power 1: expected a probability"),
-    "other data": (["seed-0", "other-data"], "differs from seed-0 in dataset.painted.n_frames"),
-    "other frames": (["seed-0", "partial"], "has other frames than seed-0"),
-    "a repeat": (["seed-0", "copied"], "has the seed 0, as seed-0 has; a repeat tells nothing of other seeds"),
-    "an unknown protocol": (["seed-0", "--protocol", "rooms-instanse"], "did you mean 'rooms-instance'"),
-    "no run": (["nowhere"], "holds no run.json"),
-}
 
 
 # comparisons of several seeds

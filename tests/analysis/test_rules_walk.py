@@ -8,17 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from painted import WordEncoder, colour_perception
-from places import SCENES
+from painted import WordEncoder
+from painted_runs import COLLECTOR, painted_run
 
 from su3d_bench.analysis.rules_walk import Walker
 from su3d_bench.cli.main import main
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.runs import finished
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run
 
-PAINTED = f"{SCENES}/painted.py"
 SEMANTIC = ("rooms-semantic", "replica-mesh-ex6", "replica-openmask3d-semantic")
 INSTANCE = ("rooms-instance", "replica-openmask3d")
 
@@ -26,14 +24,8 @@ INSTANCE = ("rooms-instance", "replica-openmask3d")
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of two methods whose maps are not perfect, scored under every protocol that is held against another."""
-    out = tmp_path_factory.mktemp("walk") / "run"
-    words = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--no-pictures", "--jobs", "1"]
-    words += ["--methods", f"{PAINTED}:Collector", f"{PAINTED}:Collector@drop=1", "oracle"]
-    words += ["--protocols", *SEMANTIC, *INSTANCE]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
-        assert main([*words, "--out", str(out)]) == 0
-    return out
+    methods = (COLLECTOR, f"{COLLECTOR}@drop=1", "oracle")
+    return painted_run(tmp_path_factory.mktemp("walk") / "run", "--protocols", *SEMANTIC, *INSTANCE, methods=methods)
 
 
 @pytest.fixture(autouse=True)
@@ -84,11 +76,3 @@ def test_the_command_prints_draws_and_answers_in_json(
     assert {rule for step in value["walk"]["steps"] for rule in step["rules"]} <= {
         one["rule"] for one in value["differing"]
     }
-
-
-REFUSED = [
-    (["rooms-semantic", "rooms-instance"], "is of kind 'semantic'"),
-    (["rooms-semantic", "replica-mesh-ex6", "--prediction", "nowhere"], "there is no such folder"),
-    (["rooms-semantic", "replica-mesh-ex6", "--prediction", "{run}:nobody"], "no scores of the method 'nobody'"),
-    (["rooms-retrieval", "replica-retrieval", "--prediction", "{run}:collector"], "--prediction takes protocols of"),
-]

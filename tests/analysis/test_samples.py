@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from painted import WordEncoder, colour_perception
-from places import SCENES
+from painted import WordEncoder
+from painted_runs import COLLECTOR, painted_run
 from scored_room import ENCODER, noisy
 
 import su3d_bench.metrics.instance.average_precision
@@ -31,22 +31,15 @@ from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
 from su3d_bench.reports.tables.samples import Sample
 from su3d_bench.runs import finished as finished_run
-from su3d_bench.runs import scene as scene_run
-
-PAINTED = f"{SCENES}/painted.py"
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Two methods over two painted scenes; one loses an object of each."""
-    folder = tmp_path_factory.mktemp("samples") / "run"
-    words = ["run", f"{PAINTED}:Painted/[ab]", "--methods", f"{PAINTED}:Collector", "oracle", "--jobs", "1", "--quiet"]
-    words += ["--protocols", "rooms-semantic", "rooms-instance", "--set", "collector.drop=1", "--no-pictures"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
         patch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
-        assert main([*words, "--out", str(folder)]) == 0
-        yield folder
+        folder, methods = tmp_path_factory.mktemp("samples") / "run", (COLLECTOR, "oracle")
+        yield painted_run(folder, "--quiet", "--set", "collector.drop=1", methods=methods)
 
 
 def test_the_examples_hold() -> None:
@@ -135,20 +128,8 @@ def scored_by_hand(mask: list[int], *, has_masks: bool = True) -> list[Sample]:
 
 def test_points_are_told_by_what_names_them_and_by_what_they_are() -> None:
     rows = scored_by_hand([0] * 4 + [0, 1, 1, -1, 0, 0])
-    told = [
-        (
-            row.kind,
-            row.instance,
-            row.row,
-            row.class_name,
-            row.name,
-            row.n_points,
-            row.n_right,
-            row.matched,
-            row.is_hit_50,
-        )
-        for row in rows
-    ]
+    names = ("kind", "instance", "row", "class_name", "name", "n_points", "n_right", "matched", "is_hit_50")
+    told = [tuple(getattr(row, name) for name in names) for row in rows]
     assert told == [
         ("predicted", 70, 0, "chair", "a", 4, 4, 4, True),
         ("predicted", 70, 0, "lamp", "a", 1, 0, 4, False),

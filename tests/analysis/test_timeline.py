@@ -17,12 +17,11 @@ import pytest
 from painted import WordEncoder
 from painted_runs import painted_run
 
+from su3d_bench.analysis import timeline as places
 from su3d_bench.analysis.page.maps import Spaces
-from su3d_bench.analysis.timeline import MOST_POINTS, SEEN_M, SceneTimeline, in_view
+from su3d_bench.analysis.timeline import MOST_POINTS, SEEN_M, Recording, SceneTimeline, in_view
 from su3d_bench.cli.main import main
 from su3d_bench.core.types import Frame
-from su3d_bench.reports import timeline as places
-from su3d_bench.reports.timeline import Recording
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs.finished import read_run
 from su3d_bench.store.records import read_updates
@@ -42,26 +41,41 @@ def _words_are_known(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @dataclass(frozen=True)
 class Logged:
-    """A call of a recording: its name, its arguments, and the frame from which it holds."""
+    """What a recording was told: its kind, the place and the values, and the frame from which it holds."""
 
     kind: str
     values: tuple[Any, ...]
     frame: int | None
 
 
+class Kinds:
+    """Stands for the library of the viewer, whose objects are their kind and values here."""
+
+    def __getattr__(self, kind: str) -> Any:
+        return lambda *values, **named: (kind, (*values, *named.values()))
+
+
 class Notes:
     """Stands for a recording and notes what is logged."""
+
+    sdk = Kinds()
 
     def __init__(self) -> None:
         self.logged: list[Logged] = []
         self._frame: int | None = None
 
-    def __getattr__(self, kind: str) -> Any:
-        def note(*values: Any, **_: Any) -> None:
-            self._frame = values[0] if kind == "at" else self._frame
-            self.logged.append(Logged(kind, values, self._frame))
+    def at(self, frame: int, seconds: float) -> None:
+        self._frame = frame
+        self.log(frame, ("at", (seconds,)))
 
-        return note
+    def photo(self, frame: Frame) -> None:
+        self.log(frame, ("photo", ()))
+
+    def log(self, place: Any, *contents: tuple[str, tuple[Any, ...]]) -> None:
+        self.logged += [Logged(kind, (place, *values), self._frame) for kind, values in contents]
+
+    def close(self, about: str) -> None:
+        self.about = about
 
     def of(self, kind: str) -> list[Logged]:
         return [one for one in self.logged if one.kind == kind]
@@ -90,7 +104,7 @@ def test_every_frame_that_a_method_was_given_stands_at_its_index_and_second(run:
     assert [seconds for _, seconds in moments] == sorted(seconds for _, seconds in moments)
     assert (one.n_frames, one.n_maps, one.remarks) == (len(given), 1, [])
     place = (*places.GROWTH, places.CURVES[2], "collector")
-    curve = [logged.values[1] for logged in notes.of("number") if logged.values[0] == place]
+    curve = [logged.values[1] for logged in notes.of("Scalars") if logged.values[0] == place]
     assert curve == updates["total_ms"].tolist()
     assert len(written(timeline(run, 2)).of("photo")) == -(-len(given) // 2)
 
@@ -100,23 +114,26 @@ def test_every_frame_that_a_method_was_given_stands_at_its_index_and_second(run:
 def test_the_map_grows_and_each_point_of_it_comes_once(run: Path, kind: str) -> None:
     notes = written(timeline(run))
     own = (*places.MAP, "collector", kind)
-    grown = [logged for logged in notes.of("points") if logged.values[0][:4] == own]
+    grown = [logged for logged in notes.of("Points3D") if logged.values[0][:4] == own]
     assert len({logged.values[0] for logged in grown}) == len(grown), "what comes later hides nothing"
     assert all(logged.frame is not None for logged in grown)
     points = np.concatenate([logged.values[1] for logged in grown])
     assert 0 < len(points) <= MOST_POINTS
     assert len(np.unique(points, axis=0)) == len(points)
-    (names,) = [logged.values[1] for logged in notes.of("names") if logged.values[0] == own]
+    (names,) = [logged.values[1] for logged in notes.of("AnnotationContext") if logged.values[0] == own]
     used = {int(number) for logged in grown for number in logged.values[2]} - {0}
-    assert used and used <= {number for number, _, _ in names}
+    assert used and used <= {values[0] for _, values in names}
 
 
 @pytest.mark.usefixtures("_words_are_known")
 def test_masks_are_of_the_size_of_their_photo_and_name_what_stands_there(run: Path) -> None:
     notes = written(timeline(run))
     sizes = {logged.values[0].rgb.shape[:2] for logged in notes.of("photo")}
-    assert {logged.values[0] for logged in notes.of("masks")} == {(*places.MASKS, "collector"), places.TRUE_MASKS}
-    assert all({logged.values[1].shape} == sizes and logged.values[1].any() for logged in notes.of("masks"))
+    assert {logged.values[0] for logged in notes.of("SegmentationImage")} == {
+        (*places.MASKS, "collector"),
+        places.TRUE_MASKS,
+    }
+    assert all({logged.values[1].shape} == sizes and logged.values[1].any() for logged in notes.of("SegmentationImage"))
 
 
 def frame(depth_m: float = 2.0, size: tuple[int, int] = (40, 60)) -> Frame:
@@ -134,10 +151,10 @@ def test_what_is_logged_reaches_the_viewers_library_at_its_place_and_moment() ->
     logged_at = sdk.RecordingStream.return_value
     logged_at.binary_stream.return_value.read.return_value = b"part"
     recording = Recording(sdk, HOSTILE, [HOSTILE], stream)
-    recording.names(("world", HOSTILE), [(1, HOSTILE, (1, 2, 3))], is_nobody_seen=True)
+    recording.log(("world", HOSTILE), sdk.AnnotationContext([]))
     recording.at(40, 1.5)
     recording.photo(frame())
-    recording.boxes(("world", HOSTILE), np.zeros((1, 2, 3), np.float32), [HOSTILE], [(1, 2, 3)])
+    recording.log(("world", HOSTILE), sdk.Boxes3D())
     recording.close("so")
     logged = [(call.args[0], call.kwargs["static"]) for call in logged_at.log.call_args_list]
     assert [is_static for _, is_static in logged] == [True] * 2 + [False] * 5 + [True]

@@ -66,20 +66,8 @@ def test_places_read_back_within_half_a_step_at_every_size(scale: float) -> None
 
 
 def test_of_masks_that_overlap_the_smaller_one_is_seen() -> None:
-    prediction = Instances(
-        points=np.zeros((4, 3), np.float32),
-        indptr=np.array([0, 3, 4]),
-        indices=np.array([0, 1, 2, 1], np.int32),
-        scores=np.ones(2),
-        features=None,
-        labels=None,
-        names=("large", "small"),
-        captions=("", ""),
-        boxes=np.zeros((2, 2, 3), np.float32),
-        centroids=np.zeros((2, 3), np.float32),
-        view_indptr=np.zeros(3, np.int64),
-        views=np.zeros((0, 2), np.int32),
-    )
+    masks = [np.array([0, 1, 2]), np.array([1])]
+    prediction = Instances.of(np.zeros((4, 3), np.float32), masks, names=["large", "small"])
     assert point_owners(prediction, np.arange(4)).tolist() == [0, 1, 0, -1]
 
 

@@ -10,29 +10,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from painted import colour_perception
-from places import SCENES
+from painted_runs import painted_run
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.costs import UpdateTimes, summarise
 from su3d_bench.numerics.statistics import growth_exponent
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run, read_update_times
 from su3d_bench.store.records import MapCost
-
-PAINTED = f"{SCENES}/painted.py"
-WORDS = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--methods", f"{PAINTED}:Collector"]
-WORDS += ["--protocols", "rooms-semantic", "rooms-instance", "--no-pictures", "--jobs", "1", "--anytime", "0.5", "0.1"]
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("timing") / "run"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
-        assert main([*WORDS, "--out", str(folder)]) == 0
-    return folder
+    return painted_run(tmp_path_factory.mktemp("timing") / "run", "--anytime", "0.5", "0.1")
 
 
 def times(total_ms: Float64Array, **columns: Float64Array) -> UpdateTimes:

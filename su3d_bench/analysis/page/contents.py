@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cache, partial
@@ -15,31 +15,20 @@ import numpy as np
 
 from su3d_bench.analysis.attribution import Explained, explained_of
 from su3d_bench.analysis.comparison import compare
+from su3d_bench.analysis.page import kept
 from su3d_bench.analysis.page.gallery import GalleryOfScene, SceneGallery, photos_of_each
-from su3d_bench.analysis.page.kept import (
-    Job,
-    Made,
-    Piece,
-    errors_of,
-    load_scene,
-    piece,
-    save_scene,
-    state_of_counts,
-    state_of_scene,
-)
+from su3d_bench.analysis.page.kept import Job, Made
 from su3d_bench.analysis.page.maps import MapOfRun, PageMap, PageScene, Spaces, page_scene, points_of_each
 from su3d_bench.analysis.page.scene import SceneData
 from su3d_bench.analysis.sides import Side, SideNumbers
-from su3d_bench.core.config import KeyPath
 from su3d_bench.core.errors import ConfigError, DataError, Su3dError, printable, printable_json
 from su3d_bench.core.files.atomic import is_file
 from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.metrics.attribution.arrays import LookedAt
-from su3d_bench.metrics.costs import MAP, TOTAL, MethodSummary, StageSummary, UpdateTimes, summarise
+from su3d_bench.metrics.costs import MAP, TOTAL, MethodSummary, UpdateTimes, summarise
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, concatenate
-from su3d_bench.numerics.statistics import Growth
-from su3d_bench.reports.tables.run import Found, Unscored, not_scored_lines
+from su3d_bench.reports.tables.run import Unscored, not_scored_lines
 from su3d_bench.runs.executors import SCENE_DONE, Event, Report, run_inline, run_processes
 from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
 from su3d_bench.runs.summary import found_in, without_score
@@ -65,18 +54,17 @@ def confusion_cells(confusion: Int64Array) -> list[list[int]]:
 def series_of(times: UpdateTimes) -> dict[str, Any]:
     """The course of a scene's updates as means of ``per`` updates each, in ms, with the map's points where known."""
     per = max(1, -(-len(times) // MOST_BINS))
+    starts = np.arange(0, len(times), per)
+
+    def binned(values: Float64Array) -> list[float]:
+        sums = np.add.reduceat(values, starts) if len(values) else values
+        return [short(value) for value in sums / np.diff(np.append(starts, len(values)))]
+
     series: dict[str, Any] = {"per": per, "n": len(times)}
-    series |= {stage: _binned(times.ms(stage), per) for stage in (TOTAL, MAP)}
+    series |= {stage: binned(times.ms(stage)) for stage in (TOTAL, MAP)}
     if "n_points" in times.columns:
-        series["points"] = [int(value) for value in _binned(times.columns["n_points"], per)]
+        series["points"] = [int(value) for value in binned(times.columns["n_points"])]
     return series
-
-
-def _binned(values: Float64Array, per: int) -> list[float]:
-    starts = np.arange(0, len(values), per)
-    sums = np.add.reduceat(values, starts) if len(values) else values
-    sizes = np.diff(np.append(starts, len(values)))
-    return [short(value) for value in sums / sizes]
 
 
 def short(value: float) -> float:
@@ -92,22 +80,13 @@ def summary_data(summary: MethodSummary) -> dict[str, Any]:
     """A method's costs; times in ms, null where nothing was measured."""
     shown = {name: value for name, value in vars(summary).items() if name not in ("run", "frames_per_s")}
     numbers = {name: _number(value) if isinstance(value, float) else value for name, value in shown.items()}
-    return numbers | {"stages": [_stage_data(stage) for stage in summary.stages]}
-
-
-def _stage_data(stage: StageSummary) -> dict[str, Any]:
-    numbers: Mapping[str, float] = {"first": stage.first, "p50": stage.p50, "p95": stage.p95, "max": stage.worst}
-    return {
-        "name": stage.name,
-        **{name: _number(value) for name, value in numbers.items()},
-        "share": _number(stage.share),
-        "by_points": _growth_data(stage.against_points),
-        "by_updates": _growth_data(stage.against_frames),
-    }
-
-
-def _growth_data(growth: Growth | None) -> dict[str, Any] | None:
-    return None if growth is None else {**asdict(growth), "words": growth.words}
+    stages = []
+    for stage in summary.stages:
+        times = {"first": stage.first, "p50": stage.p50, "p95": stage.p95, "max": stage.worst, "share": stage.share}
+        growths = {"by_points": stage.against_points, "by_updates": stage.against_frames}
+        told = {name: growth and {**asdict(growth), "words": growth.words} for name, growth in growths.items()}
+        stages.append({"name": stage.name, **{name: _number(value) for name, value in times.items()}, **told})
+    return numbers | {"stages": stages}
 
 
 def _number(value: float | None) -> float | None:
@@ -133,7 +112,7 @@ def page_numbers(runs: Sequence[FinishedRun], errors: Sequence[Mapping[str, Any]
 
     Of more than ``MOST_JOBS`` jobs the page shows what the runs' own records say, and ``left_out`` says what it lacks.
     """
-    n_jobs, reads_all = _n_jobs(runs), are_all_read(runs)
+    reads_all = are_all_read(runs)
     results: list[dict[str, Any]] = []
     confusions: list[dict[str, Any]] = []
     timing: list[dict[str, Any]] = []
@@ -144,17 +123,21 @@ def page_numbers(runs: Sequence[FinishedRun], errors: Sequence[Mapping[str, Any]
             confusions += [{"run": index, **one} for method in run.methods for one in _confusions(run, method)]
     told = {result["protocol"] for result in results if result["result"] is not None or result["failed"]}
     numbers = {
-        "left_out": None if reads_all else f"{n_jobs} jobs, more than {MOST_JOBS}: {LEFT_OUT}",
+        "left_out": None if reads_all else f"{_n_jobs(runs)} jobs, more than {MOST_JOBS}: {LEFT_OUT}",
         "runs": [_about(run) for run in runs],
         "results": [result for result in results if result["protocol"] in told],
-        "found": [{"run": index, **asdict(one)} for index, run in enumerate(runs) for one in _found(run, reads_all)],
+        "found": [
+            {"run": index, **asdict(one)}
+            for index, run in enumerate(runs)
+            for one in found_in(run.folder, without_score(run) if reads_all else ())
+        ],
         "confusions": confusions,
         "errors": errors,
         "timing": timing,
         "comparisons": _comparisons(runs) if reads_all and any(map(is_scored, runs)) else [],
     }
-    plain: dict[str, Any] = printable_json(numbers)
-    return plain
+    shown: dict[str, Any] = printable_json(numbers)
+    return shown
 
 
 def are_all_read(runs: Sequence[FinishedRun]) -> bool:
@@ -186,19 +169,11 @@ def _about(run: FinishedRun) -> dict[str, Any]:
         "methods": run.methods,
         **{key: of_record[key] for key in shared},
         "protocols": [{key: rules[key] for key in ("name", "version", "digest")} for rules in of_record["protocols"]],
-        "settings": [{"key": _dotted(path), "value": value} for path, value in run.settings.items()],
+        "settings": [{"key": ".".join(path), "value": value} for path, value in run.settings.items()],
         "failed": [f"{failure.scene} {failure.method} {failure.error}" for failure in record.failed],
         "warnings": list(record.warnings),
         "unscored": not_scored_lines(Unscored(*vars(one).values()) for one in record.unscored),
     }
-
-
-def _found(run: FinishedRun, reads_all: bool) -> Iterator[Found]:
-    return found_in(run.folder, without_score(run) if reads_all else ())
-
-
-def _dotted(path: KeyPath) -> str:
-    return ".".join(path)
 
 
 def _confusions(run: FinishedRun, method: str) -> list[dict[str, Any]]:
@@ -221,9 +196,7 @@ def _confusions(run: FinishedRun, method: str) -> list[dict[str, Any]]:
 
 
 def _times(run: FinishedRun, method: str) -> dict[str, Any] | None:
-    if not run.has_scores(method):
-        return None
-    times = read_update_times(run, method)
+    times = read_update_times(run, method) if run.has_scores(method) else []
     if not times:
         return None
     return {**summary_data(summarise(times)), "series": {of_scene.scene: series_of(of_scene) for of_scene in times}}
@@ -236,18 +209,17 @@ def _comparisons(runs: Sequence[FinishedRun]) -> list[dict[str, Any]]:
         pairs += [(Side(left, method), Side(right, method)) for method in left.methods if method in right.methods]
     for run in runs:
         pairs += itertools.combinations((Side(run, method) for method in run.methods), 2)
-    numbers = SideNumbers()
-    return [_compared(runs, numbers, *pair) for pair in pairs[:MOST_PAIRS]]
-
-
-def _compared(runs: Sequence[FinishedRun], numbers: SideNumbers, left: Side, right: Side) -> dict[str, Any]:
-    sides = {"left": [runs.index(left.run), left.method], "right": [runs.index(right.run), right.method]}
-    try:
-        addresses = (f"{side.run.folder.path}:{side.method}" for side in (left, right))
-        comparison = compare(*addresses, numbers=numbers).to_json()
-    except Su3dError as error:
-        return {**sides, "protocols": [], "remarks": [], "reason": str(error)}
-    return {**sides, "protocols": comparison["protocols"], "remarks": comparison["remarks"], "reason": None}
+    numbers, compared = SideNumbers(), []
+    for pair in pairs[:MOST_PAIRS]:
+        left, right = ([runs.index(side.run), side.method] for side in pair)
+        found: dict[str, Any] = {"left": left, "right": right, "protocols": [], "remarks": [], "reason": None}
+        try:
+            comparison = compare(*(f"{side.run.folder.path}:{side.method}" for side in pair), numbers=numbers).to_json()
+            found |= {name: comparison[name] for name in ("protocols", "remarks")}
+        except Su3dError as error:
+            found["reason"] = str(error)
+        compared.append(found)
+    return compared
 
 
 def _n_jobs(runs: Sequence[FinishedRun]) -> int:
@@ -318,7 +290,7 @@ class Asked:
     scene: str
     maps: tuple[Job, ...]
     explained: tuple[Job, ...]
-    place: Piece
+    place: kept.Piece
 
     @property
     def n_steps(self) -> int:
@@ -330,10 +302,9 @@ class Batch:
     """The scenes that one process makes."""
 
     folders: tuple[Path, ...]
-    queries: tuple[str, ...]
+    wishes: Wishes
     most_points: int
     most_photos: int
-    with_gallery: bool
     scenes: tuple[Asked, ...]
 
 
@@ -357,17 +328,17 @@ def page_contents(
     told = [job for job, one in explained.items() if isinstance(one, Explained)]
     most_photos = photos_of_each(len({scene for index, _ in told for scene in runs[index].scenes}), len(told))
     wanted = _wanted(runs, maps, told, [wishes.queries, most_points, most_photos, wishes.with_gallery])
-    made = {one.scene: kept for one in wanted if (kept := load_scene(one.place, one.scene, runs)) is not None}
+    made = {one.scene: found for one in wanted if (found := one.place.load(runs)) is not None}
     asked = [one for one in wanted if one.scene not in made]
     begin(sum(one.n_steps for one in asked))
-    batch = Batch(folders, wishes.queries, most_points, most_photos, wishes.with_gallery, tuple(asked))
-    made |= {one.scene: one for one in _all_made(batch, wishes.jobs, report)}
+    batch = Batch(folders, wishes, most_points, most_photos, tuple(asked))
+    made |= {one.scene: one for one in _all_made(batch, report)}
     made = {one.scene: made[one.scene] for one in wanted}
     errors = []
     for (index, method), one in explained.items():
         job = index, method
         of_scenes = {scene: made[scene].errors[job] for scene in made if job in made[scene].errors}
-        errors.append({**errors_of(one, method, of_scenes), "run": index})  # which has the name of the run
+        errors.append({**kept.errors_of(one, method, of_scenes), "run": index})  # which has the name of the run
     shown = tuple(one.page for one in made.values() if one.page is not None)
     galleries = tuple(one.gallery for one in made.values() if one.gallery is not None and one.gallery.of_methods)
     return Contents(page_numbers(runs, errors), shown, galleries, most_points)
@@ -402,16 +373,16 @@ def _wanted(
         of_maps, of_errors = shown.get(scene, []), counted_jobs.get(scene, [])
         jobs = dict.fromkeys([*of_maps, *of_errors])
         # what an error costs depends on the counts of every scene
-        counts = [state_of_counts(runs[index], method) for index, method in of_errors]
-        states = [[index, *state_of_scene(runs[index], scene, method)] for index, method in jobs]
-        place = piece(runs[next(iter(jobs))[0]], scene, [of_maps, of_errors, states, counts, *wishes])
+        counts = [kept.state_of_counts(runs[index], method) for index, method in of_errors]
+        states = [[index, *kept.state_of_scene(runs[index], scene, method)] for index, method in jobs]
+        place = kept.piece(runs[next(iter(jobs))[0]], scene, [of_maps, of_errors, states, counts, *wishes])
         asked.append(Asked(scene, tuple(of_maps), tuple(of_errors), place))
     return asked
 
 
-def _all_made(batch: Batch, jobs: int, report: Report) -> list[Made]:
+def _all_made(batch: Batch, report: Report) -> list[Made]:
     """The scenes of ``batch``, dealt out to processes where there is more than one."""
-    n_workers = min(jobs or os.cpu_count() or 1, len(batch.scenes))
+    n_workers = min(batch.wishes.jobs or os.cpu_count() or 1, len(batch.scenes))
     dealt = [replace(batch, scenes=batch.scenes[k::n_workers]) for k in range(n_workers)]
     if n_workers > 1:
         outcomes = run_processes(_make, dealt, report, jobs=n_workers, lost=_lost)
@@ -428,7 +399,7 @@ def _lost(batch: Batch, cause: str) -> list[Made]:
 def _make(batch: Batch, report: Report) -> list[Made]:
     """The scenes of ``batch``, each kept as soon as it is made."""
     runs = [read_run(folder) for folder in batch.folders]
-    spaces = Spaces(batch.queries)
+    spaces = Spaces(batch.wishes.queries)
     explained = cache(lambda index, method: explained_of(runs[index], method))
     return [_make_scene(asked, runs, spaces, explained, batch, report) for asked in batch.scenes]
 
@@ -458,26 +429,22 @@ def _make_scene(
             looked_at = {one.rules.name: one.looked_at for one in found}
             seen[index, method] = looked_at
             made.errors[index, method] = of_job.mended(asked.scene, looked_at)
-            if batch.with_gallery:
+            if batch.wishes.with_gallery:
                 gallery.add(index, of_job, looked_at)
         except Su3dError as error:
             made.errors[index, method] = str(error)
-            gallery.lack()
-    if asked.explained and batch.with_gallery:
+            gallery.lacks = True
+    if asked.explained and batch.wishes.with_gallery:
         tell("photos of errors")
-        made.gallery = gallery.finish(_dataset_of(runs[asked.explained[0][0]], asked.scene), data)
+        try:
+            dataset = runs[asked.explained[0][0]].dataset(asked.scene)
+        except Su3dError as error:
+            dataset = str(error)
+        made.gallery = gallery.finish(dataset, data)
     if asked.maps:
         maps = [(index, runs[index], asked.scene, method) for index, method in asked.maps]
         made.page = page_scene(asked.scene, maps, spaces, data, batch.most_points, tell, seen)
     if made.is_whole:
-        save_scene(asked.place, made, runs)
+        asked.place.save(made, runs)
     report(Event(asked.scene, SCENE_DONE, asked.n_steps, asked.n_steps))
     return made
-
-
-def _dataset_of(run: FinishedRun, scene: str) -> Any:
-    """The dataset of a run, or why it cannot be had."""
-    try:
-        return run.dataset(scene)
-    except Su3dError as error:
-        return str(error)

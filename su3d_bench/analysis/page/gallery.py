@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -16,7 +15,7 @@ from su3d_bench.core.errors import Su3dError, printable
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, UInt8Array
 from su3d_bench.metrics.attribution.arrays import LookedAt, SingleError
 from su3d_bench.metrics.matching.nearest import Points
-from su3d_bench.reports.page.maps import frame_cover
+from su3d_bench.reports.page.maps import frame_cover, jpeg_text
 from su3d_bench.reports.pictures.items import PIXEL_STEP, best_view, draw_outline, fitted, seen_in, window_around
 
 PHOTO = (256, 192)  # width and height
@@ -92,14 +91,6 @@ def _spacing(points: np.ndarray) -> float:
     return float(np.median(np.sqrt(np.partition(squared, 1, axis=1)[:, 1])))
 
 
-def photo_text(photo: UInt8Array) -> str:
-    """A photo as a JPEG in base64."""
-    import cv2
-
-    _, encoded = cv2.imencode(".jpg", photo[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return base64.b64encode(encoded.tobytes()).decode("ascii")
-
-
 MOST_ERRORS = 40  # of a scene under a method and a protocol that are told one by one
 MOST_PHOTOS = 64  # of a page, dealt out to its scenes, each of which has at least one for every method
 CANDIDATES = 24  # frames of a scene in which objects are looked for
@@ -164,18 +155,7 @@ class SceneGallery:
 
     def to_json(self) -> dict[str, Any]:
         """Plain values for a page."""
-        values = asdict(self)
-        del values["is_whole"]
-        return values
-
-
-@dataclass(frozen=True)
-class _Shown:
-    """Where the card of an error stands, and what is to be seen."""
-
-    of: int
-    card: int
-    seen: SeenError
+        return {name: value for name, value in asdict(self).items() if name != "is_whole"}
 
 
 def told_of(galleries: Sequence[SceneGallery]) -> list[dict[str, Any]]:
@@ -212,52 +192,47 @@ class GalleryOfScene:
 
     def __init__(self, scene: str, most_photos: int) -> None:
         self._scene, self._most_photos = scene, most_photos
-        self._cards: list[Cards] = []
-        self._shown: list[list[_Shown]] = []
+        self._cards: list[tuple[Cards, list[SeenError]]] = []
         self._fed: list[int] = []
-        self._lacks = False
+        self.lacks = False  # whether a method's errors, or frames, could not be had
 
     def add(self, index: int, explained: Explained, looked_at: Mapping[str, LookedAt]) -> None:
         """The errors of the method of ``explained``, which is one of run ``index``, under each protocol."""
         self._fed += fed_frames(explained.run, self._scene, explained.method)
+        ids, method = explained.instance_ids(self._scene), printable(explained.method, 200)
         for protocol, scene in looked_at.items():
             n, errors = explained.errors(self._scene, protocol, scene, MOST_ERRORS)
-            metrics = tuple(explained.rules(protocol).headline)
-            ids = explained.instance_ids(self._scene)
+            rules, metrics = explained.run.rules(protocol), tuple(explained.rules(protocol).headline)
             cards = tuple(_card(error, scene, metrics, ids) for error in errors)
-            rules, method = explained.run.rules(protocol), printable(explained.method, 200)
-            of = len(self._cards)
-            self._cards.append(Cards(index, method, protocol, rules.kind, rules.ground_truth, metrics, n, cards))
             points = scene.points
-            self._shown.append(
-                [
-                    _Shown(of, k, SeenError(_places(points, error.predicted), _places(points, error.truth)))
-                    for k, error in enumerate(errors[: self._most_photos])
-                ]
-            )
-
-    def lack(self) -> None:
-        """Say that a method's errors could not be had."""
-        self._lacks = True
+            seen = [
+                SeenError(_places(points, one.predicted), _places(points, one.truth))
+                for one in errors[: self._most_photos]
+            ]
+            told = Cards(index, method, protocol, rules.kind, rules.ground_truth, metrics, n, cards)
+            self._cards.append((told, seen))
 
     def finish(self, dataset: Any, data: SceneData) -> SceneGallery:
         """The gallery with photos of the worst errors; ``dataset`` is a text where there is none, the reason."""
-        chosen = list(_in_turn(self._shown))[: self._most_photos]
-        cards = [list(one.cards) for one in self._cards]
-        photos: list[str] = []
-        photographer = _Photographer(dataset, data, self._fed)
-        taken = photographer.take([one.seen for one in chosen])
-        for shown, photo in zip(chosen, taken, strict=True):
-            card = cards[shown.of][shown.card]
+        # the first error of every method, then the second of each, and so on
+        places = sorted((k, of) for of, (_, seen) in enumerate(self._cards) for k in range(len(seen)))
+        places = places[: self._most_photos]
+        taken: Sequence[tuple[int, str] | str] = [str(dataset)] * len(places)
+        self.lacks |= isinstance(dataset, str)
+        if places and not isinstance(dataset, str):
+            try:
+                taken = _photos([self._cards[of][1][k] for k, of in places], dataset, data, self._fed)
+            except Su3dError as error:
+                self.lacks, taken = True, [str(error)] * len(places)
+        cards, photos = [list(told.cards) for told, _ in self._cards], list[str]()
+        for (k, of), photo in zip(places, taken, strict=True):
             if isinstance(photo, str):
-                cards[shown.of][shown.card] = replace(card, why=printable(photo, 200))
+                cards[of][k] = replace(cards[of][k], why=printable(photo, 200))
             else:
-                cards[shown.of][shown.card] = replace(card, photo=len(photos), frame=photo[0], why=None)
+                cards[of][k] = replace(cards[of][k], photo=len(photos), frame=photo[0], why=None)
                 photos.append(photo[1])
-        of_methods = tuple(replace(one, cards=tuple(own)) for one, own in zip(self._cards, cards, strict=True))
-        return SceneGallery(
-            printable(self._scene, 200), of_methods, tuple(photos), not (self._lacks or photographer.lacks)
-        )
+        of_methods = tuple(replace(told, cards=tuple(own)) for (told, _), own in zip(self._cards, cards, strict=True))
+        return SceneGallery(printable(self._scene, 200), of_methods, tuple(photos), not self.lacks)
 
 
 def _card(error: SingleError, scene: LookedAt, metrics: Sequence[str], ids: Sequence[int]) -> Card:
@@ -285,55 +260,28 @@ def _places(points: Points, sets: Sequence[NDArray[np.integer[Any]]]) -> tuple[F
     return tuple(points[one].astype(np.float32) for one in sets)
 
 
-def _in_turn(lists: Sequence[Sequence[_Shown]]) -> Iterator[_Shown]:
-    """The first of every list, then the second of every list, and so on."""
-    for k in range(max(map(len, lists), default=0)):
-        yield from (one[k] for one in lists if k < len(one))
+def _photos(
+    things: Sequence[SeenError], dataset: Any, data: SceneData, fed: Sequence[int]
+) -> list[tuple[int, str] | str]:
+    """Of each thing the index of the frame that shows it best and its photo, or why there is none."""
+    places = sorted(data.in_turn(dataset, fed)[:CANDIDATES])
+    looks = np.zeros((len(things), len(places)))
+    for column, place in enumerate(places):
+        frame = data.frame(dataset, place, SKETCH_WIDTH)
+        for row, thing in enumerate(things):
+            view = best_view([frame], thing.points)
+            looks[row, column] = 0.0 if view is None else view.score
+    good = [[places[k] for k in np.flatnonzero((row >= AS_GOOD * row.max()) & (row > 0))] for row in looks]
+    frames = {place: data.frame(dataset, place, PHOTO_WIDTH) for place in frame_cover(good, MOST_FRAMES)}
+    return [_photo(thing, row, places, frames) for thing, row in zip(things, looks, strict=True)]
 
 
-class _Photographer:
-    """Finds the frames of a scene in which things are seen best."""
-
-    def __init__(self, dataset: Any, data: SceneData, fed: Sequence[int]) -> None:
-        self._dataset, self._data, self._fed = dataset, data, fed
-        self.lacks = isinstance(dataset, str)  # whether frames could not be had, which may be another time
-
-    def take(self, things: Sequence[SeenError]) -> list[tuple[int, str] | str]:
-        """Of each thing the index of a frame and its photo, or why there is none."""
-        if isinstance(self._dataset, str):
-            return [self._dataset] * len(things)
-        if not things:
-            return []
-        try:
-            return self._taken(things)
-        except Su3dError as error:
-            self.lacks = True
-            return [str(error)] * len(things)
-
-    def _taken(self, things: Sequence[SeenError]) -> list[tuple[int, str] | str]:
-        places = sorted(self._data.in_turn(self._dataset, self._fed)[:CANDIDATES])
-        looks = np.zeros((len(things), len(places)))
-        for column, place in enumerate(places):
-            frame = self._data.frame(self._dataset, place, SKETCH_WIDTH)
-            for row, thing in enumerate(things):
-                view = best_view([frame], thing.points)
-                looks[row, column] = 0.0 if view is None else view.score
-        good = [[places[k] for k in np.flatnonzero((row >= AS_GOOD * row.max()) & (row > 0))] for row in looks]
-        chosen = frame_cover(good, MOST_FRAMES)
-        frames = {place: self._data.frame(self._dataset, place, PHOTO_WIDTH) for place in chosen}
-        return [self._photo(thing, row, places, frames) for thing, row in zip(things, looks, strict=True)]
-
-    def _photo(
-        self,
-        thing: SeenError,
-        look: np.ndarray,
-        places: Sequence[int],
-        frames: Mapping[int, Frame],
-    ) -> tuple[int, str] | str:
-        for column in np.argsort(-look, kind="stable").tolist():
-            if look[column] > 0 and places[column] in frames:
-                frame = frames[places[column]]
-                photo = error_photo(frame, thing)
-                if photo is not None:
-                    return frame.index, photo_text(photo)
-        return "no frame that was looked at shows it"
+def _photo(
+    thing: SeenError, look: np.ndarray, places: Sequence[int], frames: Mapping[int, Frame]
+) -> tuple[int, str] | str:
+    for column in np.argsort(-look, kind="stable").tolist():
+        if look[column] > 0 and places[column] in frames:
+            frame = frames[places[column]]
+            if (photo := error_photo(frame, thing)) is not None:
+                return frame.index, jpeg_text(photo, JPEG_QUALITY)
+    return "no frame that was looked at shows it"

@@ -1,15 +1,12 @@
 """Scenes of a page that were made before, kept in the folder of their run under a key of all that they were made from.
 
-A piece lies in ``RUN/.cache/page`` as a SHA-256 of its key and its content, a line end and the content. One that is
-damaged, or was made from anything else, counts as absent; a folder that takes no files only means that the next page
-makes its pieces again.
+The piece of a scene lies in ``RUN/.cache/page`` as a SHA-256 of its key and its content, a line end and the content.
+One that is damaged, or was made from anything else, counts as absent; a folder that takes no files only means that the
+next page makes its pieces again.
 """
 
 from __future__ import annotations
 
-import base64
-import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -18,29 +15,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import TypeAdapter
+from pydantic import ConfigDict, TypeAdapter
 
 from su3d_bench.analysis.attribution import Explained, MendedJob, attribution_of
 from su3d_bench.analysis.page.gallery import SceneGallery
 from su3d_bench.analysis.page.maps import PageScene
-from su3d_bench.core.digests import (
-    NUMERIC_PACKAGES,
-    code_digest,
-    digest_bytes,
-    digest_file,
-    digest_json,
-    package_digest,
-    package_versions,
-)
+from su3d_bench.core import digests
 from su3d_bench.core.errors import StoreError, Su3dError
 from su3d_bench.core.files.atomic import filling
-from su3d_bench.core.files.locks import is_unfinished
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.metrics.attribution.arrays import EXPLAINED, MendedScene
 from su3d_bench.metrics.attribution.masks import Mended
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.matching.nearest import COVERAGE_RADII_M
-from su3d_bench.metrics.metric import Counts, SceneScore
+from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import metric_of, pack_scores, unpack_scores
 from su3d_bench.runs.finished import FinishedRun
@@ -49,59 +37,80 @@ from su3d_bench.store.run_folder import refuse_links
 
 FOLDER = Path(".cache", "page")
 MOST_BYTES = 1 << 28  # of a piece; one of a scene under fifty methods has a tenth of it
-MOST_OF_EACH = 3  # of one scene, made from different things, such as other --queries
-FORMAT = 4  # moves every key: raise it when the form of a piece changes
+FORMAT = 5  # moves every key: raise it when the form of a piece changes
+
+Job = tuple[int, str]  # index of the run, method
+RulesOf = Callable[[str], ProtocolRules]
+AS_IS, ALL, LABELLED = "as it is", "all mended", "true labels"  # beside the kinds of errors, each mended alone
+_FORM: TypeAdapter[tuple[list[tuple[int, str, bytes]], PageScene | None, SceneGallery | None]] = TypeAdapter(
+    tuple[list[tuple[int, str, bytes]], PageScene | None, SceneGallery | None],
+    config=ConfigDict(ser_json_bytes="base64", val_json_bytes="base64"),
+)
+
+
+@dataclass
+class Made:
+    """What was made of one scene; the errors of a job are a text where they cannot be had."""
+
+    scene: str
+    errors: dict[Job, MendedJob | str] = field(default_factory=dict)
+    page: PageScene | None = None
+    gallery: SceneGallery | None = None
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether nothing is missing, so that it would come out the same another time."""
+        has_errors = not any(isinstance(one, str) for one in self.errors.values())
+        return has_errors and all(part is None or part.is_whole for part in (self.page, self.gallery))
 
 
 @dataclass(frozen=True)
 class Piece:
-    """The place of one piece below the folder of a run, ``top``, and the key of what it is made from."""
+    """The place of the piece of ``scene`` below the folder of a run, ``top``, and the key of what it is made from."""
 
     top: Path
-    name: str
+    scene: str
     key: str
 
     @property
     def _place(self) -> Path:
-        return self.top / FOLDER / f"{self.name}-{self.key[:16]}"
+        return self.top / FOLDER / digests.digest_json(self.scene)[:16]
 
-    def load(self) -> bytes | None:
-        """What was kept; None where there is no whole piece of this key."""
-        place = self._place
-        try:
-            refuse_links(self.top, place)
-            if place.stat().st_size > MOST_BYTES:
-                return None
-            seal, _, content = file_bytes(place).partition(b"\n")
-        except (OSError, StoreError):
-            return None
-        if seal != self._seal(content):
-            return None
-        with suppress(OSError):
-            os.utime(place)  # what is asked for stays
-        return content
+    def _seal(self, content: bytes) -> bytes:
+        return digests.digest_bytes(self.key.encode() + content).encode()
 
-    def save(self, content: bytes) -> None:
-        """Keep ``content``, and of the other pieces of this name the youngest, where the folder takes files."""
+    def save(self, made: Made, runs: Sequence[FinishedRun]) -> None:
+        """Keep a whole scene, where the folder takes files."""
+        errors = [
+            (index, method, packed(mended, runs[index].rules))
+            for (index, method), mended in made.errors.items()
+            if not isinstance(mended, str)
+        ]
+        content = _FORM.dump_json((errors, made.page, made.gallery))
         with suppress(OSError, StoreError):
             refuse_links(self.top, self._place)
             with filling(self._place) as stream:
                 stream.write(self._seal(content) + b"\n" + content)
-            self._remove_old()
 
-    def _seal(self, content: bytes) -> bytes:
-        return digest_bytes(self.key.encode() + content).encode()
-
-    def _remove_old(self) -> None:
-        of_name = [place for place in self._place.parent.glob(f"{self.name}-*") if not is_unfinished(place.name)]
-        for place in sorted(of_name, key=lambda place: place.lstat().st_mtime_ns)[:-MOST_OF_EACH]:
-            place.unlink(missing_ok=True)
+    def load(self, runs: Sequence[FinishedRun]) -> Made | None:
+        """The scene that was kept; None where there is no whole piece of this key."""
+        # a run folder comes from anywhere: what another program left under the right key counts as absent, too
+        with suppress(OSError, Su3dError, ValueError, KeyError, TypeError, RecursionError):
+            refuse_links(self.top, self._place)
+            if self._place.stat().st_size <= MOST_BYTES:
+                seal, _, content = file_bytes(self._place).partition(b"\n")
+                if seal == self._seal(content):
+                    kept, page, gallery = _FORM.validate_json(content)
+                    errors = {(index, method): unpacked(one, runs[index].rules) for index, method, one in kept}
+                    return Made(self.scene, {**errors}, page, gallery)
+        return None
 
 
 def piece(run: FinishedRun, scene: str, made_from: Any) -> Piece:
     """The piece of ``scene`` in the folder of ``run``; ``made_from`` is a JSON-like value of all that moves it."""
-    code = [FORMAT, code_digest(), package_digest("analysis", "reports"), package_versions(NUMERIC_PACKAGES)]
-    return Piece(run.folder.path, digest_json(scene)[:16], digest_json([scene, made_from, code]))
+    versions = digests.package_versions(digests.NUMERIC_PACKAGES)
+    code = [FORMAT, digests.code_digest(), digests.package_digest("analysis", "reports"), versions]
+    return Piece(run.folder.path, scene, digests.digest_json([scene, made_from, code]))
 
 
 def state_of_scene(run: FinishedRun, scene: str, method: str) -> list[Any]:
@@ -124,7 +133,7 @@ def state_of_counts(run: FinishedRun, method: str) -> list[str | None]:
 
 def _digest(file: Path) -> str | None:
     with suppress(OSError):
-        return digest_file(file)
+        return digests.digest_file(file)
     return None
 
 
@@ -133,59 +142,6 @@ def _fault(ask: Callable[[], Any]) -> str | None:
         ask()
     except Su3dError as error:
         return str(error)
-    return None
-
-
-# ---- the form of a scene
-
-Job = tuple[int, str]  # index of the run, method
-_SCENES: TypeAdapter[PageScene | None] = TypeAdapter(PageScene | None)
-_GALLERIES: TypeAdapter[SceneGallery | None] = TypeAdapter(SceneGallery | None)
-RulesOf = Callable[[str], ProtocolRules]
-AS_IS, ALL, LABELLED = "as it is", "all mended", "true labels"  # beside the kinds of errors, each mended alone
-
-
-@dataclass
-class Made:
-    """What was made of one scene; the errors of a job are a text where they cannot be had."""
-
-    scene: str
-    errors: dict[Job, MendedJob | str] = field(default_factory=dict)
-    page: PageScene | None = None
-    gallery: SceneGallery | None = None
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether nothing is missing, so that it would come out the same another time."""
-        has_errors = not any(isinstance(one, str) for one in self.errors.values())
-        return has_errors and all(part is None or part.is_whole for part in (self.page, self.gallery))
-
-
-def save_scene(place: Piece, made: Made, runs: Sequence[FinishedRun]) -> None:
-    """Keep a whole scene."""
-    errors = [
-        [index, method, base64.b64encode(packed(mended, runs[index].rules)).decode("ascii")]
-        for (index, method), mended in made.errors.items()
-        if not isinstance(mended, str)
-    ]
-    value = {"errors": errors, "page": _SCENES.dump_python(made.page), "gallery": _GALLERIES.dump_python(made.gallery)}
-    place.save(json.dumps(value).encode())
-
-
-def load_scene(place: Piece, scene: str, runs: Sequence[FinishedRun]) -> Made | None:
-    """The scene that was kept at ``place``; None where there is none."""
-    content = place.load()
-    if content is None:
-        return None
-    # a run folder comes from anywhere: what another program left under the right key counts as absent, too
-    with suppress(Su3dError, ValueError, KeyError, TypeError, RecursionError):
-        value = json.loads(content)
-        errors: dict[Job, MendedJob | str] = {
-            (index, method): unpacked(base64.b64decode(mended), runs[index].rules)
-            for index, method, mended in value["errors"]
-        }
-        page, gallery = _SCENES.validate_python(value["page"]), _GALLERIES.validate_python(value["gallery"])
-        return Made(scene, errors, page, gallery)
     return None
 
 
@@ -204,33 +160,30 @@ def errors_of(explained: Explained | str, method: str, of_scenes: Mapping[str, M
 def packed(mended: MendedJob, rules_of: RulesOf) -> bytes:
     """The counts of a scene under a method as the bytes of an npz file; ``rules_of`` finds a protocol by its name."""
     scores: dict[str, SceneScore] = {}
+    nowhere = np.zeros(len(COVERAGE_RADII_M), np.int64)
     for protocol, of_scene in mended.items():
+        version, n_scored = rules_of(protocol).version, of_scene.n_scored or 0
         parts = {AS_IS: of_scene.as_is, ALL: of_scene.all, LABELLED: of_scene.with_true_labels, **of_scene.alone}
         for part, counts in parts.items():
             if counts is not None:
                 name, n = f"{protocol} {part}", of_scene.n.get(part, 0)
-                version, nowhere = rules_of(protocol).version, np.zeros(len(COVERAGE_RADII_M), np.int64)
-                scores[name] = SceneScore(name, version, counts, n, of_scene.n_scored or 0, nowhere, ())
+                scores[name] = SceneScore(name, version, counts, n, n_scored, nowhere, ())
     return pack_scores(scores)
 
 
 def unpacked(content: bytes, rules_of: RulesOf) -> MendedJob:
     """What ``packed`` packed."""
-    scores = unpack_scores(content)
-    names = dict.fromkeys(name.partition(" ")[0] for name in scores)
-    return {name: _of_protocol(rules_of(name), scores) for name in names}
-
-
-def _of_protocol(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> MendedScene:
-    def counts(part: str) -> Any:
-        found: Counts = scores[f"{rules.name} {part}"].counts
-        metric_of(rules).check(rules.name, found)
-        return found
-
-    as_is, everything = counts(AS_IS), counts(ALL)
-    labelled = counts(LABELLED) if f"{rules.name} {LABELLED}" in scores else None
-    kinds = EXPLAINED[rules.kind][0]
-    alone = {kind: counts(kind) for kind in kinds}
-    n = {kind: scores[f"{rules.name} {kind}"].n_predictions for kind in kinds}
-    n_scored = None if isinstance(as_is, InstanceCounts) else scores[f"{rules.name} {AS_IS}"].n_scored
-    return Mended(as_is, alone, everything, n, labelled, n_scored)
+    mended: dict[str, MendedScene] = {}
+    scores: dict[str, dict[str, SceneScore]] = {}
+    for name, score in unpack_scores(content).items():
+        protocol, _, part = name.partition(" ")
+        metric_of(rules_of(protocol)).check(protocol, score.counts)
+        scores.setdefault(protocol, {})[part] = score
+    for protocol, parts in scores.items():
+        counts: dict[str, Any] = {part: score.counts for part, score in parts.items()}
+        kinds = EXPLAINED[rules_of(protocol).kind][0]
+        alone, n = {kind: counts[kind] for kind in kinds}, {kind: parts[kind].n_predictions for kind in kinds}
+        as_is, everything, labelled = counts[AS_IS], counts[ALL], counts.get(LABELLED)
+        n_scored = None if isinstance(as_is, InstanceCounts) else parts[AS_IS].n_scored
+        mended[protocol] = Mended(as_is, alone, everything, n, labelled, n_scored)
+    return mended

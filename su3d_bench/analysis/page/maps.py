@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -53,6 +52,7 @@ from su3d_bench.reports.page.maps import (
     colour_plane,
     frame_cover,
     index_plane,
+    jpeg_text,
     nearest_classes,
     nearest_colours,
     pack_map,
@@ -91,8 +91,7 @@ class PageMap:
 
     def listed(self) -> dict[str, Any]:
         """What the page's list of maps says of it."""
-        about = {"run": self.run, "scene": self.scene, "method": self.method, "reason": self.reason}
-        return about | {"truth": self.truth}
+        return {name: value for name, value in vars(self).items() if name != "content"}
 
 
 @dataclass(frozen=True)
@@ -115,8 +114,8 @@ class PageScene:
 
     def listed(self) -> dict[str, Any]:
         """The scene as the page holds it, its maps aside."""
-        thumbnails, remarks = dict(self.thumbnails), list(self.remarks)
-        return {"scene": self.scene, "thumbnails": thumbnails, "remarks": remarks, "truths": list(self.truths)}
+        about = {"scene": self.scene, "thumbnails": dict(self.thumbnails)}
+        return about | {"remarks": list(self.remarks), "truths": list(self.truths)}
 
 
 def points_of_each(n_maps: int, most_bytes: int) -> int:
@@ -129,13 +128,13 @@ def points_of_each(n_maps: int, most_bytes: int) -> int:
     return min(MOST_POINTS, max(LEAST_POINTS, share))
 
 
+@dataclass
 class Spaces:
     """The encoders of runs and the features of the queries under each, made once."""
 
-    def __init__(self, queries: tuple[str, ...]) -> None:
-        self.queries = queries
-        self._encoders: dict[Path, Encoder] = {}
-        self._texts: dict[Path, Any] = {}
+    queries: tuple[str, ...]
+    _encoders: dict[Path, Encoder] = field(default_factory=dict)
+    _texts: dict[Path, Any] = field(default_factory=dict)
 
     def encoder(self, run: FinishedRun) -> Encoder:
         path = run.folder.path
@@ -172,28 +171,24 @@ def page_scene(
     return _Scene(scene, maps, spaces, data, looked_at).page(most_points, tell)
 
 
+@dataclass
 class _Scene:
     """One scene under all methods of all runs."""
 
-    def __init__(
-        self,
-        scene: str,
-        maps: Sequence[MapOfRun],
-        spaces: Spaces,
-        data: SceneData,
-        looked_at: Mapping[tuple[int, str], Mapping[str, LookedAt]],
-    ) -> None:
-        self._looked_at = looked_at
-        self._scene = scene
-        self._maps = maps
-        self._spaces = spaces
-        self._data = data
-        self._reader = SceneReader(maps[0][1], scene, data)
-        self._frame_of: dict[int, Frame | None] = {}
-        self._shown_truths = ShownTruths()
+    scene: str
+    maps: Sequence[MapOfRun]
+    spaces: Spaces
+    data: SceneData
+    looked_at: Mapping[tuple[int, str], Mapping[str, LookedAt]]
+    frame_of: dict[int, Frame | None] = field(default_factory=dict)
+    shown_truths: ShownTruths = field(default_factory=ShownTruths)
+
+    @cached_property
+    def reader(self) -> SceneReader:
+        return SceneReader(self.maps[0][1], self.scene, self.data)
 
     def page(self, most_points: int, tell: Callable[[str], None]) -> PageScene:
-        read = {key[:1] + key[3:]: self._read(key) for key in self._maps}
+        read = {key[:1] + key[3:]: self._read(key) for key in self.maps}
         chosen = self._chosen_frames([a_map for a_map in read.values() if isinstance(a_map, Instances)])
         frames = {
             index: frame for index in sorted(chosen) if (frame := self._frame(index, THUMBNAIL_WIDTH)) is not None
@@ -201,21 +196,19 @@ class _Scene:
         clouds = {key: thinned(one.points, most_points) for key, one in read.items() if not isinstance(one, str)}
         seen = self._seen([cloud.points for cloud in clouds.values()])
         made = []
-        for index, run, scene, method in self._maps:
+        for index, run, scene, method in self.maps:
             tell(f"map of {printable(method, 60)}")
-            prediction = read[index, method]
-            reason = prediction if isinstance(prediction, str) else None
-            content, truth = "", None
-            if not isinstance(prediction, str):
-                growth = growth_of(run, scene, method)
-                beside = self._beside((index, method), run, prediction)
-                truth = None if beside is None else beside.variant
-                content = self._pack(run, prediction, clouds[index, method], frames, seen, growth, beside)
-            made.append(PageMap(index, printable(scene, 200), printable(method, 200), content, reason, truth))
-        thumbnails = tuple((index, _jpeg(frame)) for index, frame in frames.items())
-        remarks = tuple(self._reader.remarks)
-        truths = tuple(self._shown_truths.packed(most_points, seen))
-        return PageScene(printable(self._scene, 200), thumbnails, tuple(made), truths, remarks)
+            prediction, about = read[index, method], (index, printable(scene, 200), printable(method, 200))
+            if isinstance(prediction, str):
+                made.append(PageMap(*about, "", prediction))
+                continue
+            growth = growth_of(run, scene, method)
+            beside = self._beside((index, method), run, prediction)
+            content = self._pack(run, prediction, clouds[index, method], frames, seen, growth, beside)
+            made.append(PageMap(*about, content, None, None if beside is None else beside.variant))
+        thumbnails = tuple((index, _thumbnail(frame)) for index, frame in frames.items())
+        truths = tuple(self.shown_truths.packed(most_points, seen))
+        return PageScene(printable(self.scene, 200), thumbnails, tuple(made), truths, tuple(self.reader.remarks))
 
     def _read(self, key: MapOfRun) -> Prediction | str:
         _, run, scene, method = key
@@ -226,26 +219,26 @@ class _Scene:
 
     def _frame(self, index: int, width: int) -> Frame | None:
         """Frame ``index`` of the full sequence, read once; None where it is not there. ``width`` pixels are enough."""
-        if index not in self._frame_of:
+        if index not in self.frame_of:
             frame = None
-            if 0 <= index < len(self._reader.sequence):
-                frame = self._reader.had("no views", lambda: self._data.frame(self._reader.dataset, index, width))
-            self._frame_of[index] = frame if frame is not None and frame.index == index else None
-        return self._frame_of[index]
+            if 0 <= index < len(self.reader.sequence):
+                frame = self.reader.had("no views", lambda: self.data.frame(self.reader.dataset, index, width))
+            self.frame_of[index] = frame if frame is not None and frame.index == index else None
+        return self.frame_of[index]
 
     def _seen(self, clouds: Sequence[Float32Array]) -> Seen | None:
         """What the methods saw: in the frames shown, and in as many more as show nearly all of ``clouds``."""
-        fed = [index for _, run, scene, method in self._maps for index in fed_frames(run, scene, method)]
-        places = self._data.in_turn(self._reader.dataset, fed) if len(self._reader.sequence) else []
+        fed = [index for _, run, scene, method in self.maps for index in fed_frames(run, scene, method)]
+        places = self.data.in_turn(self.reader.dataset, fed) if len(self.reader.sequence) else []
         unseen = np.concatenate([np.zeros((0, 3), np.float32), *(points[::EVERY] for points in clouds)])
         few = GREY_SHARE * len(unseen)
-        unseen = _not_near([frame for frame in self._frame_of.values() if frame is not None], unseen)
+        unseen = _not_near([frame for frame in self.frame_of.values() if frame is not None], unseen)
         for start in range(0, len(places), FRAMES_AT_ONCE):
             if len(unseen) <= few:
                 break
             more = (self._frame(index, SKETCH_WIDTH) for index in places[start : start + FRAMES_AT_ONCE])
             unseen = _not_near([frame for frame in more if frame is not None], unseen)
-        read = [frame for frame in self._frame_of.values() if frame is not None]
+        read = [frame for frame in self.frame_of.values() if frame is not None]
         if not read:
             return None
         points, colours = seen_points(read, SEEN_POINTS)
@@ -263,10 +256,10 @@ class _Scene:
         fitting = (run.rules(name) for name in run.protocols if not why_not_shown(run, name, prediction))
         judging = next(fitting, None)
         rules = shown_rules(run) if judging is None else judging
-        truth = None if rules is None else self._reader.truth(rules)
+        truth = None if rules is None else self.reader.truth(rules)
         if rules is None or truth is None or not len(truth.points):
             return None
-        about = {"truth": self._shown_truths.place(truth), "objects": len(instances_of(truth))}
+        about = {"truth": self.shown_truths.place(truth), "objects": len(instances_of(truth))}
         variant = rules.ground_truth
         if judging is None:
             if isinstance(prediction, DenseFeatures):
@@ -276,14 +269,14 @@ class _Scene:
             return Beside(variant, about, same_objects(truth, moved))
 
         def judged_by(rules: ProtocolRules) -> tuple[dict[str, Any], Mapping[int, Mapping[str, Any]]]:
-            seen = self._looked_at.get(job, {}).get(rules.name)
+            seen = self.looked_at.get(job, {}).get(rules.name)
             if not isinstance(seen, SceneOfMasks):
                 rules = Inputs(run, job[1]).rules(rules)
-                seen = SceneOfMasks(rules, truth, prediction, self._spaces.naming(run, prediction))
+                seen = SceneOfMasks(rules, truth, prediction, self.spaces.naming(run, prediction))
             same = same_objects(truth, seen.overlaps.predicted.masks)
             return {"protocol": rules.name, **judged_objects(truth, seen.overlaps)}, same
 
-        judged, same = self._reader.had("no missed objects", partial(judged_by, judging)) or ({}, {})
+        judged, same = self.reader.had("no missed objects", partial(judged_by, judging)) or ({}, {})
         return Beside(variant, about | judged, same)
 
     def _pack(
@@ -297,7 +290,7 @@ class _Scene:
         beside: Beside | None,
     ) -> str:
         rules = shown_rules(run)
-        truth = None if rules is None else self._reader.truth(rules)
+        truth = None if rules is None else self.reader.truth(rules)
         planes: dict[str, Any] = {"owner": index_plane(point_owners(prediction, cloud.rows))}
         colours = None if seen is None else nearest_colours(cloud.points, *seen)
         if colours is not None:
@@ -312,16 +305,16 @@ class _Scene:
             of_truth = None if truth is None else class_index_of_ids(rules, truth.semantic)
             if truth is not None and of_truth is not None:
                 of_truth = np.where((of_truth >= 0) & scored_classes(rules)[of_truth], of_truth, -1)
-                planes["truth"] = nearest_classes(cloud.points, self._data.candidates(truth), of_truth).astype(
-                    np.uint16
-                )
-            classes = self._classes(run, rules, prediction, of_truth, cloud)
+                planes["truth"] = nearest_classes(cloud.points, self.data.candidates(truth), of_truth).astype(np.uint16)
+            classes = self.reader.had(
+                "no classes", lambda: shown_classes(run, rules, prediction, of_truth, cloud, self.spaces)
+            )
         if isinstance(prediction, DenseFeatures):
             if classes is not None:
                 planes["class"] = index_plane(classes)
         else:
             similarity = self._similarity(run, prediction)
-            about["queries"] = [] if similarity is None else list(self._spaces.queries)
+            about["queries"] = [] if similarity is None else list(self.spaces.queries)
             about["instances"] = [
                 instance_data(prediction, k, classes, similarity, frames) for k in range(n_predictions(prediction))
             ]
@@ -333,17 +326,12 @@ class _Scene:
                     one["born"] = growth.step_of(frames_of(prediction, k))
         return pack_map(cloud, planes, printable_json(about))
 
-    def _classes(
-        self, run: FinishedRun, rules: ProtocolRules, prediction: Prediction, truth: Int64Array | None, cloud: Cloud
-    ) -> Int64Array | None:
-        return self._reader.had("no classes", lambda: shown_classes(run, rules, prediction, truth, cloud, self._spaces))
-
     def _similarity(self, run: FinishedRun, prediction: Prediction) -> Any:
         """The cosine (K, Q) of each instance with each query; None where the map has no features."""
         features = prediction.features
-        if features is None or not len(features) or not self._spaces.queries:
+        if features is None or not len(features) or not self.spaces.queries:
             return None
-        texts = self._reader.had("no similarities", lambda: self._spaces.texts(run))
+        texts = self.reader.had("no similarities", lambda: self.spaces.texts(run))
         return cosines(features, texts) if texts is not None and texts.shape[1] == features.shape[1] else None
 
 
@@ -378,11 +366,10 @@ def _not_near(frames: Sequence[Frame], points: Float32Array) -> Float32Array:
     return points[nearest(seen, points, COLOUR_NEAR_M)[1] < 0]
 
 
-def _jpeg(frame: Frame) -> str:
+def _thumbnail(frame: Frame) -> str:
+    """A frame as a small JPEG in base64."""
     import cv2
 
     height, width = frame.depth_m.shape
     size = (THUMBNAIL_WIDTH, max(1, round(THUMBNAIL_WIDTH * height / width)))
-    small = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)
-    _, encoded = cv2.imencode(".jpg", small[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    return base64.b64encode(encoded.tobytes()).decode("ascii")
+    return jpeg_text(np.asarray(cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA), np.uint8), JPEG_QUALITY)

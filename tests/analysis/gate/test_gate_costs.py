@@ -14,12 +14,11 @@ from su3d_bench.analysis.gate import (
     Cost,
     Reference,
     check,
-    cost_findings,
+    compare_costs,
     learn,
 )
 from su3d_bench.cli.main import main
 from su3d_bench.core.system.timing import MethodClock
-from su3d_bench.reports.gate import Finding
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run, read_update_times
 
@@ -102,7 +101,7 @@ def dearer(limit: float = 1.5, **parts: float) -> list[str]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("su3d_bench.analysis.gate.why_no_cost", lambda run, method: None)
         patch.setattr("su3d_bench.analysis.gate.method_cost", lambda *_: COST.model_copy(update=parts))
-        found: list[Finding] = list(cost_findings(Run(), {"m": COST}, 1.0, limit, is_judged=True))  # type: ignore[arg-type]
+        found, _ = compare_costs(Run(), {"m": COST}, 1.0, limit)  # type: ignore[arg-type]
     return [one.where.partition("cost of ")[2] for one in found]
 
 

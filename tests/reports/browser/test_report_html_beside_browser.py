@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-import base64
 import json
 from collections.abc import Iterator
 from pathlib import Path
 
-import chromium
 import pytest
+import runs_page
 from chromium import Chromium, find_chromium
-from painted import WordEncoder, colour_perception
-from places import SCENES
+from looks import WHOLE, complaints
+from made_pages import browser_for_pages
+from painted_runs import COLLECTOR, painted_page, painted_run
 
-from su3d_bench.cli.main import main
 from su3d_bench.core.maps import Instances
-from su3d_bench.runs import finished as finished_run
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.predictions import read_prediction, write_prediction
 
 pytestmark = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
-PAINTED = f"{SCENES}/painted.py"
-# WebGL without a graphics card.
-SOFTWARE_GL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
-WHOLE = "!document.querySelector('#main[aria-busy]')"
 FIELD = (
     "[...document.querySelectorAll('#maps .toolbar .field')].find((one) => one.textContent.trim().startsWith({label}))"
     ".querySelector('select, input')"
@@ -38,47 +31,28 @@ READ = (
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two methods on two scenes; of the first map of scene a the chair is missed."""
     folder = tmp_path_factory.mktemp("maps")
-    scenes = [f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b"]
-    methods = [f"{PAINTED}:Collector", f"{PAINTED}:Collector@noise_m=0.3"]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
-        patch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
-        words = ["--scenes", *scenes, "--methods", *methods, "--protocols", "rooms-semantic", "rooms-instance"]
-        assert main(["run", *words, "--jobs", "1", "--no-pictures", "--out", str(folder / "run")]) == 0
-        place = folder / "run" / "scenes" / "painted.a" / "collector" / "prediction.npz"
-        stored = read_prediction(place)
-        assert isinstance(stored, Instances)
-        kept = [k for k in range(len(stored)) if stored.names[k] != "chair"]
-        views = [stored.views[stored.view_indptr[k] : stored.view_indptr[k + 1]].tolist() for k in kept]
-        views[0] = [view for view in views[0] if view[0] >= 3]  # the sofa comes late
-        assert stored.features is not None
-        named = [stored.names[k] for k in kept]
-        masks = [stored.mask(k) for k in kept]
-        write_prediction(
-            place, Instances.of(stored.points, masks, names=named, features=stored.features[kept], views=views)
-        )
-        out = [
-            "--out",
-            str(folder / "page.html"),
-            "--quiet",
-            "--jobs",
-            "1",
-            "--no-errors",
-            "--queries",
-            "chair",
-            "table",
-        ]
-        assert main(["report", "html", str(folder / "run"), *out]) == 0
+    run = painted_run(folder / "run", methods=(COLLECTOR, f"{COLLECTOR}@noise_m=0.3"))
+    place = run / "scenes" / "painted.a" / "collector" / "prediction.npz"
+    stored = read_prediction(place)
+    assert isinstance(stored, Instances)
+    kept = [k for k in range(len(stored)) if stored.names[k] != "chair"]
+    views = [stored.views[stored.view_indptr[k] : stored.view_indptr[k + 1]].tolist() for k in kept]
+    views[0] = [view for view in views[0] if view[0] >= 3]  # the sofa comes late
+    assert stored.features is not None
+    named = [stored.names[k] for k in kept]
+    masks = [stored.mask(k) for k in kept]
+    write_prediction(
+        place, Instances.of(stored.points, masks, names=named, features=stored.features[kept], views=views)
+    )
+    painted_page(run, folder / "page.html", "--no-errors", "--queries", "chair", "table")
     return folder / "page.html"
 
 
 @pytest.fixture(scope="module")
 def browser(page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(chromium, "FLAGS", (*chromium.FLAGS, *SOFTWARE_GL))
-        with Chromium(tmp_path_factory.mktemp("profile")) as found:
-            found.open(page)
-            yield found
+    with browser_for_pages(tmp_path_factory.mktemp("profile")) as found:
+        found.open(page)
+        yield found
 
 
 @pytest.fixture(autouse=True)
@@ -88,7 +62,7 @@ def fresh(browser: Chromium, page: Path) -> Iterator[None]:
     browser.open(page)
     browser.until(WHOLE)
     yield
-    assert [line for line in browser.faults() if "GL Driver Message (OpenGL, Performance" not in line] == []
+    assert complaints(browser) == []
 
 
 def field(label: str) -> str:
@@ -107,30 +81,11 @@ def settled(browser: Chromium) -> None:
 
 
 def choose(browser: Chromium, label: str, text: str) -> None:
-    browser.run(
-        f"{{ const one = {field(label)}; one.value = [...one.options].find((o) => o.text === {json.dumps(text)}).value;"
-        " one.dispatchEvent(new Event('change')); }"
-    )
+    runs_page.choose(browser, "maps", label, text)
 
 
 def slide(browser: Chromium, label: str, value: int) -> None:
     browser.run(f"{{ const one = {field(label)}; one.value = '{value}'; one.dispatchEvent(new Event('input')); }}")
-
-
-def choices(browser: Chromium, label: str) -> list[str]:
-    found: list[str] = browser.run(f"[...{field(label)}.options].map((one) => one.text)")
-    return found
-
-
-def picture(browser: Chromium, k: int = 0) -> bytes:
-    """What the view ``k`` shows, after it was drawn."""
-    browser.run("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(done, 60))))")
-    box = browser.run(
-        f"(() => {{ const c = document.querySelectorAll('#maps canvas')[{k}].getBoundingClientRect(); return {{"
-        " x: c.x + scrollX, y: c.y + scrollY + 40, width: c.width - 140, height: c.height - 100, scale: 1 }; })()"
-    )
-    shot = browser.call("Page.captureScreenshot", {"format": "png", "clip": box, "captureBeyondViewport": False})
-    return base64.b64decode(shot["data"])
 
 
 def press(browser: Chromium, *keys: str, k: int = 0) -> None:
@@ -140,20 +95,20 @@ def press(browser: Chromium, *keys: str, k: int = 0) -> None:
 
 def test_the_truth_or_another_map_stands_beside_and_moves_with_the_first(browser: Chromium) -> None:
     opened(browser)
-    assert choices(browser, "Beside") == ["nothing", "truth", "collector@noise_m=0.3"]
+    assert runs_page.options(browser, "maps", "Beside") == ["nothing", "truth", "collector@noise_m=0.3"]
     assert browser.run("document.querySelectorAll('#maps .pane')[1].hidden")
     for text in ("truth", "collector@noise_m=0.3"):
         choose(browser, "Beside", text)
         browser.until(f"document.querySelectorAll('#maps .title')[1].textContent.includes({json.dumps(text)})")
-        before = [picture(browser, 0), picture(browser, 1)]
+        before = [runs_page.picture(browser, 0), runs_page.picture(browser, 1)]
         assert before[0] != before[1]
         press(browser, "ArrowLeft", "ArrowLeft", k=1)
-        turned = [picture(browser, 0), picture(browser, 1)]
+        turned = [runs_page.picture(browser, 0), runs_page.picture(browser, 1)]
         assert turned[0] != before[0]
         assert turned[1] != before[1]
         press(browser, "ArrowUp", "-", k=0)
-        assert picture(browser, 0) != turned[0]
-        assert picture(browser, 1) != turned[1]
+        assert runs_page.picture(browser, 0) != turned[0]
+        assert runs_page.picture(browser, 1) != turned[1]
     choose(browser, "Beside", "nothing")
     browser.until("document.querySelectorAll('#maps .pane')[1].hidden")
 
@@ -163,15 +118,15 @@ def test_missed_objects_are_ghosts_that_can_be_taken_away(browser: Chromium) -> 
     browser.until(f"{field('Missed objects')}.parentNode.textContent.includes('(1)')")
     assert not browser.run(f"{field('Missed objects')}.disabled")
     assert "rooms-instance" in browser.run(f"{field('Missed objects')}.parentNode.title")
-    ghosts = picture(browser)
+    ghosts = runs_page.picture(browser)
     browser.run(f"{field('Missed objects')}.click()")
-    bare = picture(browser)
+    bare = runs_page.picture(browser)
     assert bare != ghosts
     browser.run(f"{field('Missed objects')}.focus()")
     browser.call("Input.dispatchKeyEvent", {"type": "keyDown", "key": " ", "text": " ", "code": "Space"})
     browser.call("Input.dispatchKeyEvent", {"type": "keyUp", "key": " ", "code": "Space"})
     browser.until(f"{field('Missed objects')}.checked")
-    assert picture(browser) == ghosts
+    assert runs_page.picture(browser) == ghosts
     choose(browser, "Map", "collector@noise_m=0.3")
     browser.until(READ.format(text=json.dumps("noise_m")))
     browser.until(f"!{field('Missed objects')}.parentNode.textContent.includes('not known')")
@@ -182,14 +137,14 @@ def test_growth_shows_the_instances_that_frames_had_shown_by_then(browser: Chrom
     note = "document.querySelector('#maps [role=status].keys').innerText"
     assert browser.run(note).startswith("Update 6 of 6, frame 5: 3 of 3 instances seen; the method held 4.")
     assert "what was merged into others or dropped on the way is not kept" in browser.run(note)
-    whole = picture(browser)
+    whole = runs_page.picture(browser)
     slide(browser, "Grown to", 2)
     assert browser.run(note).startswith("Update 3 of 6, frame 2: 2 of 3 instances seen")
-    early = picture(browser)
+    early = runs_page.picture(browser)
     assert early != whole
     slide(browser, "Grown to", 3)
     assert browser.run(note).startswith("Update 4 of 6, frame 3: 3 of 3 instances seen")
-    assert picture(browser) == whole
+    assert runs_page.picture(browser) == whole
     assert browser.run(f"{field('Grown to')}.getAttribute('aria-valuetext')").startswith("Update 4 of 6")
 
 
@@ -229,11 +184,3 @@ def test_the_address_follows_what_is_changed_and_brings_it_back(browser: Chromiu
     assert address(browser) == link
     press(browser, "Escape")
     assert "instance" not in address(browser)
-
-
-HOSTILE = [
-    "#maps?scene=painted/a&map=collector&camera=1e999_1_1_1_1_1&cut=1e9&instance=-1&frame=x&text=9",
-    "#maps?scene=painted/a&map=collector&beside=map:__proto__&walls=__proto__&missed=toString",
-    "#maps?scene=painted/a&map=collector&text=%3Cscript%3Ewindow.struck=1%3C/script%3E&" + "a" * 5000,
-    "#%00%ff",
-]

@@ -11,16 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 from chromium import Chromium, find_chromium
-from painted import WordEncoder, colour_perception
+from painted_runs import COLLECTOR, painted_page, painted_run
 from places import SCENES
 
 from su3d_bench.analysis.page.gallery import PHOTO, PREDICTED, SeenError, error_photo
-from su3d_bench.cli.main import main
 from su3d_bench.core.types import Frame
-from su3d_bench.runs import finished as finished_run
-from su3d_bench.runs import scene as scene_run
 
-PAINTED = f"{SCENES}/painted.py"
 needs_browser = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
 WHOLE = "!document.querySelector('#main[aria-busy]')"
 FIELD = "[...document.querySelectorAll('#gallery select')].find((one) => one.labels[0].textContent === '{label}')"
@@ -31,26 +27,14 @@ MAPS_FIELD = FIELD.replace("#gallery", "#maps")
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two methods on two scenes, of which the second makes mistakes."""
-    folder = tmp_path_factory.mktemp("gallery") / "run"
-    words = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--jobs", "1", "--no-pictures"]
-    words += ["--methods", f"{PAINTED}:Collector", f"{PAINTED}:Mistaken"]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
-        assert main([*words, "--protocols", "rooms-semantic", "rooms-instance", "--out", str(folder)]) == 0
-    return folder
-
-
-def made(run: Path, page: Path, *words: str) -> str:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
-        assert main(["report", "html", str(run), "--out", str(page), "--quiet", "--jobs", "1", *words]) == 0
-    return page.read_text(encoding="utf-8")
+    methods = (COLLECTOR, f"{SCENES}/painted.py:Mistaken")
+    return painted_run(tmp_path_factory.mktemp("gallery") / "run", methods=methods)
 
 
 @pytest.fixture(scope="module")
 def page(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("gallery") / "page.html"
-    made(run, place)
+    painted_page(run, place)
     return place
 
 

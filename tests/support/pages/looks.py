@@ -63,15 +63,9 @@ def seen_as(browser: Chromium, *, scheme: str = "light", size: tuple[int, int] =
         show("", DESKTOP)
 
 
-def pale_in_light(browser: Chromium) -> list[str]:
+def pale_texts(browser: Chromium, scheme: str) -> list[str]:
     """Texts whose contrast with what is beneath them is below 4.5, 3 for large ones."""
-    with seen_as(browser):
-        found: list[str] = look(browser, "paleTexts()")
-        return found
-
-
-def pale_in_dark(browser: Chromium) -> list[str]:
-    with seen_as(browser, scheme="dark"):
+    with seen_as(browser, scheme=scheme):
         found: list[str] = look(browser, "paleTexts()")
         return found
 
@@ -148,8 +142,8 @@ def by_keyboard(browser: Chromium) -> list[str]:
 
 CHECKS: Mapping[str, Callable[[Chromium], list[str]]] = {
     "is a whole document": structure,
-    "can be read in light": pale_in_light,
-    "can be read in the dark": pale_in_dark,
+    "can be read in light": lambda browser: pale_texts(browser, "light"),
+    "can be read in the dark": lambda browser: pale_texts(browser, "dark"),
     "fits a desktop": on_a_desktop,
     "fits a phone": on_a_phone,
     "can be reached by keyboard": by_keyboard,

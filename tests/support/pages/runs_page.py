@@ -39,12 +39,12 @@ def headers(browser: Chromium, part: str) -> list[str]:
     return found
 
 
-def picture(browser: Chromium) -> bytes:
-    """What the 3D view shows, after it was drawn."""
+def picture(browser: Chromium, k: int = 0) -> bytes:
+    """What the ``k``-th 3D view shows, after it was drawn."""
     browser.run("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(done, 60))))")
     box = browser.run(
-        "(() => { const c = document.querySelector('#maps canvas').getBoundingClientRect();"
-        " return { x: c.x + scrollX, y: c.y + scrollY, width: c.width - 140, height: c.height - 60, scale: 1 }; })()"
+        f"(() => {{ const c = document.querySelectorAll('#maps canvas')[{k}].getBoundingClientRect(); return {{"
+        " x: c.x + scrollX, y: c.y + scrollY + 40, width: c.width - 140, height: c.height - 100, scale: 1 }; })()"
     )
     shot = browser.call("Page.captureScreenshot", {"format": "png", "clip": box, "captureBeyondViewport": False})
     return base64.b64decode(shot["data"])
