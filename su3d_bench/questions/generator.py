@@ -219,7 +219,7 @@ def _relations(objects: SceneMap) -> Iterator[_Asked]:
     for relation in RELATIONS:
         if relation == "near":
             continue
-        held, doubtful = objects.relations.of(relation), objects.doubtful(relation)
+        held, doubtful = objects.relations.of(relation), objects.doubtful[relation]
         if relation == "in":
             held = held & ~objects.relations.on  # a cushion is within the box of a sofa, and on it
         for a, b in np.argwhere(held | doubtful).tolist():

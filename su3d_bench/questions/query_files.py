@@ -163,15 +163,16 @@ def _toml_rows(text: str, where: str) -> Iterator[QueryRow]:
         yield QueryRow(f"{where}: query {number}", **query.model_dump())
 
 
-def _rows(text: str, where: str, separator: str = ",") -> list[list[str]]:
+def csv_rows(text: str, where: str, separators: str = ",") -> list[list[str]]:
+    """The rows of a CSV text, parted by the one of ``separators`` that is most frequent in its first line."""
     try:
-        return separated_rows(text, separator)
+        return separated_rows(text, max(separators, key=text.partition("\n")[0].count))
     except csv.Error as error:
         raise DataError(f"{where}: not CSV ({printable(str(error), 120)})") from error
 
 
 def _csv_rows(text: str, where: str) -> Iterator[QueryRow]:
-    rows = _rows(text, where)
+    rows = csv_rows(text, where)
     header = tuple(word.strip() for word in rows[0]) if rows else ()
     more = header[len(COLUMNS) :]
     if header[: len(COLUMNS)] != COLUMNS or not set(more) <= set(MORE_COLUMNS) or len(set(more)) < len(more):
@@ -312,7 +313,7 @@ def read_left_out(path: Path) -> frozenset[str]:
     """The ids in the column ``question_id``, separated by ``,`` ``;`` or tab, as spreadsheets save it too."""
     where = printable(str(path), 200)
     text = read_text(path, where, "name a CSV file, such as sheets score --disputed writes", MOST_BYTES)
-    rows = _rows(text, where, max(",;\t", key=text.partition("\n")[0].count))
+    rows = csv_rows(text, where, ",;\t")
     header = [word.strip() for word in rows[0]] if rows else []
     if header.count(COLUMN) != 1:
         raise DataError(f"{where}: the first line must name one column {COLUMN}, as sheets score --disputed writes it")

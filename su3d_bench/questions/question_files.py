@@ -28,17 +28,10 @@ from su3d_bench.core.system.files import file_text, opened, parse_toml
 from su3d_bench.formats.arrays import parsed_json, read_text
 from su3d_bench.formats.tables.table import no_formula
 from su3d_bench.metrics.open_vocabulary.score import TextQuery
+from su3d_bench.questions import query_files
 from su3d_bench.questions.beacon3d import chains_of, kind_of_metadata, questions_of_objects, read_metadata
 from su3d_bench.questions.model import ALL_KINDS, KINDS, REASONING, Question, new_question
-from su3d_bench.questions.query_files import (
-    COLUMNS,
-    MORE_COLUMNS,
-    ObjectId,
-    nr3d_groups,
-    only_words,
-    read_query_rows,
-    validated,
-)
+from su3d_bench.questions.query_files import COLUMNS, ObjectId, only_words, validated
 
 PAPER = Path(__file__).parent / "paper_queries.toml"
 PAGE = "opensu3d.github.io"
@@ -55,7 +48,7 @@ def read_questions(path: Path, dataset: str | None = None) -> tuple[Question, ..
     if is_foreign(path):
         return _each_once(read_foreign(path))
     questions: dict[str, Question] = {}
-    for row in read_query_rows(path):
+    for row in query_files.read_query_rows(path):
         kind = row.kind or KINDS[0]
         if kind not in ALL_KINDS:
             raise DataError(f"{row.at}: unknown kind '{printable(kind, 40)}'; known: {', '.join(ALL_KINDS)}")
@@ -144,7 +137,7 @@ def csv_text(questions: Sequence[Question]) -> str:
     """The set as rows."""
     text = io.StringIO(newline="")
     rows = csv.writer(text, lineterminator="\n")
-    rows.writerow((*COLUMNS, *MORE_COLUMNS))
+    rows.writerow((*COLUMNS, *query_files.MORE_COLUMNS))
     for question in questions:
         objects = " ".join(map(str, question.answers or ()))
         rows.writerow(map(no_formula, (question.scene, question.text, objects, question.kind, question.source)))
@@ -270,7 +263,9 @@ def _nr3d(text: str, where: str) -> Iterator[Question]:
         question = new_question(f"{DATASET}/{row.scan_id}", "relative", row.utterance, (row.target_id + 1,), "Nr3D")
         groups: tuple[str, ...] = ()
         if row.stimulus_id is not None:
-            groups = nr3d_groups(row.stimulus_id, row.tokens, row.mentions_target_class, f"{where}: row {number}")
+            groups = query_files.nr3d_groups(
+                row.stimulus_id, row.tokens, row.mentions_target_class, f"{where}: row {number}"
+            )
         yield replace(question, groups=groups)
 
 

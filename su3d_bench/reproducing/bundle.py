@@ -27,19 +27,8 @@ from su3d_bench.core import registry
 from su3d_bench.core.config import MOVES_NO_NUMBER, Setting, Settings
 from su3d_bench.core.digests import digest_bytes, digest_file
 from su3d_bench.core.errors import StoreError, Su3dError, counted, printable, shown
-from su3d_bench.core.files.atomic import (
-    Allowance,
-    TemporaryFolder,
-    UnpackingError,
-    allowance_of,
-    check_member,
-    is_file,
-    make_folder,
-    member_bytes,
-    read_arrays,
-    read_json,
-    replacing,
-)
+from su3d_bench.core.files import atomic
+from su3d_bench.core.files.atomic import TemporaryFolder, is_file, make_folder, replacing
 from su3d_bench.core.printing import escaped_json
 from su3d_bench.core.system.devices import device_for
 from su3d_bench.core.system.files import file_bytes, opened, regular
@@ -203,12 +192,12 @@ def unpack(bundle: Path, into: Path, keep: Callable[[str], bool] = lambda name: 
     try:
         with zipfile.ZipFile(regular(bundle)) as archive:
             members = _members(archive, where)
-            allowance = allowance_of(archive)
-            manifest = _manifest(member_bytes(archive, members[MANIFEST], allowance), where)
+            allowance = atomic.allowance_of(archive)
+            manifest = _manifest(atomic.member_bytes(archive, members[MANIFEST], allowance), where)
             _refuse_others(members, manifest, where)
             for name, entry in manifest.files.items():
                 _unpack_one(archive, members[name], entry, into if keep(name) else None, allowance, where)
-    except (zipfile.BadZipFile, UnpackingError, EOFError, NotImplementedError, zlib.error) as error:
+    except (zipfile.BadZipFile, atomic.UnpackingError, EOFError, NotImplementedError, zlib.error) as error:
         raise StoreError(f"{where}: is no bundle, or damaged: {printable(str(error), 160)}") from error
     except OSError as error:
         raise StoreError(f"{where}: cannot be unpacked: {error.strerror or error}") from error
@@ -276,13 +265,18 @@ def _one(names: Sequence[str]) -> str:
 
 
 def _unpack_one(
-    archive: zipfile.ZipFile, info: zipfile.ZipInfo, entry: Entry, into: Path | None, allowance: Allowance, where: str
+    archive: zipfile.ZipFile,
+    info: zipfile.ZipInfo,
+    entry: Entry,
+    into: Path | None,
+    allowance: atomic.Allowance,
+    where: str,
 ) -> None:
     """``into`` None: the member is held against its entry and not written."""
     if info.file_size != entry.n_bytes:
         said = f"has {info.file_size} bytes, its manifest says {entry.n_bytes}"
         raise StoreError(f"{where}: {printable(info.filename, 120)} {said}")
-    check_member(info, allowance)
+    atomic.check_member(info, allowance)
     if into is None:
         with archive.open(info) as member:
             digest = _copy(member, None)
@@ -353,8 +347,8 @@ def _rescored(run: FinishedRun, found: Verified, folder: Path) -> Iterator[str]:
     anew = _of_predictions(run) if run.record.predictions else _of_maps(run, folder)
     for scene, method, scores in anew:
         counts = run.folder.job(scene, method).counts
-        kept = read_arrays(io.BytesIO(file_bytes(counts)))
-        ours = read_arrays(io.BytesIO(pack_scores(scores)))
+        kept = atomic.read_arrays(io.BytesIO(file_bytes(counts)))
+        ours = atomic.read_arrays(io.BytesIO(pack_scores(scores)))
         found.n_scores += len(scores)
         fault = difference(kept, ours, to_the_bit=is_same_machine)
         found.is_to_the_bit &= difference(kept, ours, to_the_bit=True) is None
@@ -473,7 +467,7 @@ def _cells(unpacked: Unpacked, found: Verified) -> Iterator[str]:
     if not is_file(unpacked.folder / COMPARED):
         return
     recipe = parse_recipe(file_bytes(unpacked.folder / RECIPE), RECIPE)
-    kept = read_json(unpacked.folder / COMPARED)
+    kept = atomic.read_json(unpacked.folder / COMPARED)
     cells = kept.get("cells") if isinstance(kept, dict) else None
     if not isinstance(cells, list) or not all(isinstance(cell, dict) for cell in cells):
         raise StoreError(f"{COMPARED} is not as a reproduction writes it")

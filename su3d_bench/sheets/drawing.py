@@ -21,23 +21,10 @@ from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, 
 from su3d_bench.metrics.questions.score import labels_n
 from su3d_bench.questions.model import rank_all
 from su3d_bench.questions.solver import built_in
+from su3d_bench.reports.pictures import items
 from su3d_bench.reports.pictures.canvas import ROOM_SURFACES, Scale, class_colours, colour, similarity_colours
 from su3d_bench.reports.pictures.figures import Cell, GridRow
-from su3d_bench.reports.pictures.items import (
-    CAP_M,
-    LOW_HEIGHT,
-    PHOTO_WIDTH,
-    ZOOM_WIDTH,
-    ItemParts,
-    Panel,
-    Tag,
-    best_view,
-    compose,
-    mask_in_frame,
-    palette_of,
-    png_bytes,
-    seen_in,
-)
+from su3d_bench.reports.pictures.items import LOW_HEIGHT, PHOTO_WIDTH, ZOOM_WIDTH, ItemParts, Panel, Tag
 from su3d_bench.reports.pictures.maps import DrawnMap, MapView, cameras_of, drawn_map, pale, thinned_rows, view_of
 from su3d_bench.reports.pictures.scene import evenly, seen_points
 from su3d_bench.runs.executors import Event, Report, run_inline, run_processes
@@ -50,7 +37,7 @@ SEEN_POINTS = 1_500_000  # of all frames together, before they are thinned: floo
 ROOM_SHARE, PLACE_SHARE = 0.75, 0.5  # of the room's colours, so that what is judged stands out
 # A map's points may lie 5 cm from what the frames saw, and 5 cm apart. What that reach takes of the neighbours is given
 # back, but for the width of a drawn point, which noise needs.
-REACH_M, BACK_M = CAP_M, 0.035
+REACH_M, BACK_M = items.CAP_M, 0.035
 PALETTE_FRAMES = 8  # from which the colours of all pictures of a scene are chosen
 
 
@@ -96,7 +83,7 @@ class ShownRoom:
             colour(view.shown, pale(self.colours, share))
             for view, share in ((self.above, PLACE_SHARE), *((corner, ROOM_SHARE) for corner in self.corners))
         ]
-        return palette_of([*photos, *views], (ANSWER_COLOUR, OTHER_COLOUR))
+        return items.palette_of([*photos, *views], (ANSWER_COLOUR, OTHER_COLOUR))
 
     def region(self, points: Float32Array) -> Region:
         """Where an instance of these ``points`` (M, 3) lies, however many and in whatever order they are."""
@@ -125,12 +112,12 @@ class ShownRoom:
         """The frame that shows the region best, and where (h, w); None where none shows it."""
         if not region.is_member.any():
             return None
-        view = best_view(self.frames, region.points)
+        view = items.best_view(self.frames, region.points)
         if view is None:
             return None
         frame = self.frames[view.frame]
         bounds = np.stack([region.points.min(axis=0), region.points.max(axis=0)]).astype(np.float64)
-        return frame, at_full_size(mask_in_frame(frame, self.tree, region.is_member, bounds), frame.rgb)
+        return frame, at_full_size(items.mask_in_frame(frame, self.tree, region.is_member, bounds), frame.rgb)
 
 
 def _within(these: Float32Array, of: Float32Array, distance_m: float) -> BoolArray:
@@ -181,11 +168,11 @@ class Artist:
 
     def draw(self, draft: Draft) -> bytes:
         """The PNG of a draft."""
-        return png_bytes(self.picture(draft), palette=self.room(draft.scene).palette)
+        return items.png_bytes(self.picture(draft), palette=self.room(draft.scene).palette)
 
     def picture(self, draft: Draft) -> UInt8Array:
         """The picture (h, 960, 3) of a draft."""
-        return compose(self.parts(draft))
+        return items.compose(self.parts(draft))
 
     def parts(self, draft: Draft) -> ItemParts:
         """What stands in the picture of a draft: of its map the regions of ``rows`` and ``others`` alone."""
@@ -462,7 +449,7 @@ def seen_colours(frames: Sequence[Frame], points: np.ndarray[tuple[int, ...], np
     colours = np.full((len(points), 3), UNSEEN, np.uint8)
     places: Float64Array = points.astype(np.float64)
     for frame in frames:
-        columns, rows, is_seen = seen_in(frame, places)
+        columns, rows, is_seen = items.seen_in(frame, places)
         colours[is_seen] = frame.rgb[rows[is_seen].astype(np.int64), columns[is_seen].astype(np.int64)]
     return colours
 
