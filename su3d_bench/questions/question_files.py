@@ -48,17 +48,17 @@ def read_questions(path: Path, dataset: str | None = None) -> tuple[Question, ..
     if is_foreign(path):
         return _each_once(read_foreign(path))
     questions: dict[str, Question] = {}
-    for row in query_files.read_query_rows(path):
+    for at, row in query_files.read_query_rows(path):
         kind = row.kind or KINDS[0]
         if kind not in ALL_KINDS:
-            raise DataError(f"{row.at}: unknown kind '{printable(kind, 40)}'; known: {', '.join(ALL_KINDS)}")
+            raise DataError(f"{at}: unknown kind '{printable(kind, 40)}'; known: {', '.join(ALL_KINDS)}")
         if "/" not in row.scene and dataset is None:
-            raise DataError(f"{row.at}: of which dataset is scene '{printable(row.scene, 60)}'? write dataset/scene")
+            raise DataError(f"{at}: of which dataset is scene '{printable(row.scene, 60)}'? write dataset/scene")
         scene = f"{dataset}/{row.scene}" if dataset and "/" not in row.scene else row.scene
         source = row.source or printable(path.name, 100)
         question = new_question(scene, kind, row.text, row.objects or None, source)
         if question.id in questions:
-            raise DataError(f"{row.at}: '{printable(row.text, 60)}' stands there twice for {printable(scene, 60)}")
+            raise DataError(f"{at}: '{printable(row.text, 60)}' stands there twice for {printable(scene, 60)}")
         questions[question.id] = question
     return tuple(questions.values())
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
 import os
 import re
 import stat
@@ -25,7 +24,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from su3d_bench.core import registry
 from su3d_bench.core.config import MOVES_NO_NUMBER, Setting, Settings
-from su3d_bench.core.digests import digest_bytes, digest_file
+from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import StoreError, Su3dError, counted, printable, shown
 from su3d_bench.core.files import atomic
 from su3d_bench.core.files.atomic import TemporaryFolder, is_file, make_folder, replacing
@@ -87,10 +86,10 @@ class Manifest(BaseModel):
     trained_on: Annotated[str, Field(max_length=MOST_OF_A_REMARK)] = ""
 
 
-def write_bundle(place: Path, recipe: str, recipe_file: bytes, runs: Sequence[Path], out: Path) -> None:
+def write_bundle(place: Path, recipe: str, recipe_file: Path, runs: Sequence[Path], out: Path) -> None:
     """The archive at ``place`` of the ``runs`` of a recipe and of what ``out`` holds beside them, whole or not."""
     beside = {name: out / name for name in (COMPARED, TABLES) if is_file(out / name)}
-    _write(place, runs, beside, {"recipe": recipe}, recipe_file)
+    _write(place, runs, {**beside, RECIPE: recipe_file}, {"recipe": recipe})
 
 
 def bundle_runs(place: Path, runs: Sequence[Path], trained_on: str = "") -> None:
@@ -107,20 +106,12 @@ def bundle_runs(place: Path, runs: Sequence[Path], trained_on: str = "") -> None
     _write(place, whole, {}, {"recipe": "", **said})
 
 
-def _write(
-    place: Path,
-    runs: Sequence[Path],
-    beside: Mapping[str, Path],
-    about: Mapping[str, str],
-    recipe_file: bytes | None = None,
-) -> None:
+def _write(place: Path, runs: Sequence[Path], beside: Mapping[str, Path], about: Mapping[str, str]) -> None:
     sources = dict(beside)
     names = [f"{RUNS}/{folder.name}" for folder in runs]
     for folder, name in zip(runs, names, strict=True):
         sources |= {f"{name}/{file.relative_to(folder).as_posix()}": file for file in _files_of(folder)}
     entries = {name: {"n_bytes": file.stat().st_size, "sha256": digest_file(file)} for name, file in sources.items()}
-    if recipe_file is not None:
-        entries[RECIPE] = {"n_bytes": len(recipe_file), "sha256": digest_bytes(recipe_file)}
     manifest = {
         "schema": 1,
         "program": f"su3d-bench {__version__}",
@@ -132,10 +123,7 @@ def _write(
     with replacing(place) as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
         archive.writestr(_member(MANIFEST), escaped_json(manifest, indent=1) + "\n")
         for name in sorted(entries):
-            if name == RECIPE and recipe_file is not None:
-                archive.writestr(_member(name), recipe_file)
-            else:
-                _add(archive, name, sources[name], str(entries[name]["sha256"]))
+            _add(archive, name, sources[name], str(entries[name]["sha256"]))
 
 
 def _member(name: str) -> zipfile.ZipInfo:
@@ -146,14 +134,11 @@ def _member(name: str) -> zipfile.ZipInfo:
 
 def _add(archive: zipfile.ZipFile, name: str, file: Path, sha256: str) -> None:
     """A file in pieces; a ``StoreError`` where it changes meanwhile."""
-    digest = hashlib.sha256()
     info = _member(name)
     info.file_size = file.stat().st_size
     with opened(file) as source, archive.open(info, "w") as member:
-        while piece := source.read(PIECE):
-            digest.update(piece)
-            member.write(piece)
-    if digest.hexdigest() != sha256:
+        digest = copy_pieces(source, member)
+    if digest != sha256:
         raise StoreError(f"{shown(file)}: changed while it was packed; pack again when its run has ended")
 
 
@@ -235,33 +220,23 @@ def is_safe(name: str) -> bool:
 
 def _manifest(content: bytes, where: str) -> Manifest:
     try:
-        value = json.loads(content)
-        value = {**value, "runs": tuple(value.get("runs", ()))} if isinstance(value, Mapping) else value
-        return Manifest.model_validate(value)
+        return Manifest.model_validate_json(content)
     except ValidationError as error:
         key = printable(".".join(map(str, error.errors()[0]["loc"])), 120)
         raise StoreError(f"{where}: {MANIFEST}: {key or 'it'} is not as a bundle has it") from error
-    except (ValueError, RecursionError, TypeError) as error:
-        raise StoreError(f"{where}: {MANIFEST} is no JSON of a bundle") from error
 
 
 def _refuse_others(members: Mapping[str, zipfile.ZipInfo], manifest: Manifest, where: str) -> None:
     named = {*manifest.files, MANIFEST}
-    missing = sorted(named - set(members))
-    beside = sorted(set(members) - named)
-    if missing:
-        raise StoreError(f"{where}: {counted(len(missing), 'file')} of its manifest missing, such as {_one(missing)}")
-    if beside:
-        raise StoreError(f"{where}: {counted(len(beside), 'file')} beside its manifest, such as {_one(beside)}")
+    wrong = {"of its manifest missing": named - set(members), "beside its manifest": set(members) - named}
+    for what, names in wrong.items():
+        if names:
+            raise StoreError(f"{where}: {counted(len(names), 'file')} {what}, such as {printable(min(names), 120)}")
     for name in manifest.runs:
         if not is_safe(name) or f"{name}/run.json" not in manifest.files:
             raise StoreError(
                 f"{where}: its manifest names the run '{printable(name, 100)}', of which it holds no record"
             )
-
-
-def _one(names: Sequence[str]) -> str:
-    return printable(names[0], 120)
 
 
 def _unpack_one(
@@ -272,29 +247,27 @@ def _unpack_one(
     allowance: atomic.Allowance,
     where: str,
 ) -> None:
-    """``into`` None: the member is held against its entry and not written."""
+    """``into`` None: the member is compared with its entry and not written."""
     if info.file_size != entry.n_bytes:
         said = f"has {info.file_size} bytes, its manifest says {entry.n_bytes}"
         raise StoreError(f"{where}: {printable(info.filename, 120)} {said}")
     atomic.check_member(info, allowance)
-    if into is None:
-        with archive.open(info) as member:
-            digest = _copy(member, None)
-    else:
+    place = Path(os.devnull)
+    if into is not None:
         place = into / info.filename
         make_folder(place.parent)
-        with archive.open(info) as member, place.open("xb") as out:
-            digest = _copy(member, out)
+    with archive.open(info) as member, place.open("wb" if into is None else "xb") as out:
+        digest = copy_pieces(member, out)
     if digest != entry.sha256:
         raise StoreError(f"{where}: {printable(info.filename, 120)} is not the file of its manifest (other SHA-256)")
 
 
-def _copy(source: IO[bytes], out: IO[bytes] | None) -> str:
+def copy_pieces(source: IO[bytes], out: IO[bytes]) -> str:
+    """Copy a file; the SHA-256 of its content."""
     digest = hashlib.sha256()
     while piece := source.read(PIECE):
         digest.update(piece)
-        if out is not None:
-            out.write(piece)
+        out.write(piece)
     return digest.hexdigest()
 
 
@@ -336,9 +309,7 @@ def verify_bundle(bundle: Path) -> Verified:
 
 def _faults_of(run: FinishedRun, found: Verified, folder: Path) -> Iterator[str]:
     wrong = [f"{where}: {what}" for where, what in wrong_files(run) if not what.startswith("done.json")]
-    yield from wrong
-    if not wrong:
-        yield from _rescored(run, found, folder)
+    yield from wrong or _rescored(run, found, folder)
 
 
 def _rescored(run: FinishedRun, found: Verified, folder: Path) -> Iterator[str]:
@@ -373,12 +344,9 @@ def difference(kept: Mapping[str, NDArray[Any]], ours: Mapping[str, NDArray[Any]
         if before.dtype != now.dtype or before.shape != now.shape:
             forms = f"{before.dtype} of {before.shape}, its map gives {now.dtype} of {now.shape}"
             return f"'{printable(name, 100)}' is {forms}"
-        if before.tobytes() == now.tobytes():
-            continue
-        if (
-            before.dtype.kind == "f"
-            and not to_the_bit
-            and np.allclose(before, now, rtol=0, atol=TOLERANCE, equal_nan=True)
+        is_near = before.dtype.kind == "f" and not to_the_bit
+        if before.tobytes() == now.tobytes() or (
+            is_near and np.allclose(before, now, rtol=0, atol=TOLERANCE, equal_nan=True)
         ):
             continue
         places = np.flatnonzero((before != now).ravel())

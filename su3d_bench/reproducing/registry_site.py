@@ -53,8 +53,7 @@ def write_site(registry: Registry, out: Path, title: str = TITLE, bundles_at: st
         write_text(out / name, text)
     for name in earlier - set(pages):
         remove_file(out / name)
-    if earlier - set(pages):
-        write_json(out / DATA, {"kind": KIND, "schema": SCHEMA, "pages": sorted(pages), **value})
+    write_json(out / DATA, {"kind": KIND, "schema": SCHEMA, "pages": sorted(pages), **value})
     return [out / name for name in (*pages, DATA)]
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, NoReturn, Protocol
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from su3d_bench.reports.pictures.scene import evenly, seen_points
 from su3d_bench.runs.executors import Event, Report, run_inline, run_processes
 from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.items import KINDS_OF_SHEETS
-from su3d_bench.sheets.sources import RunSource, mask_digest
+from su3d_bench.sheets.sources import RunSource, TruthSource, mask_digest
 
 ANSWER_COLOUR, OTHER_COLOUR = (222, 74, 22), (32, 98, 196)  # those of reasoning_picture
 SEEN_POINTS = 1_500_000  # of all frames together, before they are thinned: floors are seen at a low angle
@@ -90,10 +90,8 @@ class ShownRoom:
         is_member = np.zeros(len(self.points), np.bool_)
         if len(points) and len(self.points):
             margin = REACH_M + BACK_M
-            is_near = ((self.points >= points.min(axis=0) - margin) & (self.points <= points.max(axis=0) + margin)).all(
-                1
-            )
-            near = np.flatnonzero(is_near)
+            low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
+            near = np.flatnonzero(((self.points >= low) & (self.points <= high)).all(axis=1))
             reached = _within(points, self.points[near], REACH_M)
             kept = ~_within(self.points[near[~reached]], self.points[near[reached]], BACK_M)
             is_member[near[reached][kept]] = True
@@ -104,9 +102,8 @@ class ShownRoom:
         is_member = np.zeros(len(self.points), np.bool_)
         for region in regions:
             is_member |= region.is_member
-        if is_member.any():
-            return Region(is_member, self.points[is_member])
-        return Region(is_member, np.concatenate([np.zeros((0, 3), np.float32), *(one.points for one in regions)]))
+        points = np.concatenate([np.zeros((0, 3), np.float32), *(one.points for one in regions)])
+        return Region(is_member, self.points[is_member] if is_member.any() else points)
 
     def photo(self, region: Region) -> tuple[Frame, BoolArray] | None:
         """The frame that shows the region best, and where (h, w); None where none shows it."""
@@ -132,11 +129,11 @@ def _within(these: Float32Array, of: Float32Array, distance_m: float) -> BoolArr
     return is_within
 
 
-def at_full_size(mask: BoolArray, rgb: UInt8Array, gap: int = 3) -> BoolArray:
-    """The mask at the size of the colour image ``rgb``, gaps of less than ``gap`` of its pixels closed."""
+def at_full_size(mask: BoolArray, rgb: UInt8Array) -> BoolArray:
+    """The mask at the size of the colour image ``rgb``, gaps of less than 3 of its pixels closed."""
     import cv2
 
-    closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((gap, gap), np.uint8))
+    closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     height, width = rgb.shape[:2]
     full: BoolArray = cv2.resize(closed, (width, height), interpolation=cv2.INTER_NEAREST) > 0
     return full
@@ -145,16 +142,7 @@ def at_full_size(mask: BoolArray, rgb: UInt8Array, gap: int = 3) -> BoolArray:
 ROOM_PHOTOS = 6  # of the room, for answers that name nothing
 
 
-class PictureSource(Protocol):
-    """Maps and frames of scenes; ``opener`` opens the same in another process."""
-
-    @property
-    def opener(self) -> Callable[[], PictureSource]: ...
-
-    @property
-    def instances(self) -> Callable[[str, str], Instances]: ...
-
-    def frames(self, scene: str) -> Sequence[Frame]: ...
+PictureSource = RunSource | TruthSource
 
 
 class Artist:
@@ -168,11 +156,7 @@ class Artist:
 
     def draw(self, draft: Draft) -> bytes:
         """The PNG of a draft."""
-        return items.png_bytes(self.picture(draft), palette=self.room(draft.scene).palette)
-
-    def picture(self, draft: Draft) -> UInt8Array:
-        """The picture (h, 960, 3) of a draft."""
-        return items.compose(self.parts(draft))
+        return items.png_bytes(items.compose(self.parts(draft)), palette=self.room(draft.scene).palette)
 
     def parts(self, draft: Draft) -> ItemParts:
         """What stands in the picture of a draft: of its map the regions of ``rows`` and ``others`` alone."""
@@ -382,8 +366,8 @@ class Figures:
 
     def labels(self) -> tuple[list[str], list[GridRow]]:
         """Titles of the columns, and a row a scene: the map by label n and by label n' of each method."""
-        titles = [*(["the scene"] if self._with_photo else [])]
-        titles += [f"{method}: label {what}" for method in self._source.methods for what in ("n", "n'")]
+        titles = [f"{method}: label {what}" for method in self._source.methods for what in ("n", "n'")]
+        titles = [*(["the scene"] if self._with_photo else []), *titles]
         rows = []
         for scene in self._source.scenes:
             maps = self._maps(scene)
