@@ -111,11 +111,8 @@ class _Drafts:
         hidden = {thing.name for thing in self._all if not thing.is_asked}
         self._things = [thing for thing in self._all if thing.name not in hidden]
         self._n_of = Counter(thing.name for thing in self._things)
-        single = [
-            thing
-            for thing in self._things
-            if self._n_of[thing.name] == 1 and not is_plural(thing.name) and not thing.is_cut
-        ]
+        single = [one for one in self._things if self._n_of[one.name] == 1]
+        single = [one for one in single if not is_plural(one.name) and not one.is_cut]
         self._single = [single[k] for k in sorted(random.permutation(len(single))[:MOST_SINGLE])]
 
     def of_kinds(self) -> Mapping[str, list[_Draft]]:
@@ -326,7 +323,7 @@ def drawn(
     [[('bed', 'lamp')], [('bed', 'pillow')]]
     """
     left = dict.fromkeys(_by_digest(scene, absent))
-    listed = _names_of(rooms)
+    listed = tuple(dict.fromkeys(name for room in rooms for name in room))
     listed_as = {} if sampling == RANDOM else {name: _listed(name, listed) for name in (*there, *absent)}
     often = _often(rooms) if sampling == POPULAR else []
     for name in there:
@@ -340,10 +337,6 @@ def drawn(
 
 def _by_digest(scene: str, names: Iterable[str]) -> list[str]:
     return sorted(names, key=lambda name: hashlib.sha256(f"{scene}\0{name}".encode()).digest())
-
-
-def _names_of(rooms: Rooms) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(name for room in rooms for name in room))
 
 
 def _listed(name: str, listed: Sequence[str]) -> str | None:

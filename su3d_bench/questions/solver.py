@@ -429,20 +429,10 @@ FEW_OBJECTS = 1  # what is always given, however small the model's context
 
 @dataclass(frozen=True)
 class Context:
-    """The objects that the model is given, in the map's order, of ``n_objects``."""
+    """The objects that the model is given, in the map's order; ``note``: what must be said where these are not all."""
 
     objects: tuple[MapObject, ...]
-    n_objects: int
-
-    @property
-    def note(self) -> str:
-        """What must be said where the map was cut; empty where it was not."""
-        if len(self.objects) == self.n_objects:
-            return ""
-        return (
-            f"the map has {self.n_objects} objects, more than the model reads at once; it was given the "
-            f"{len(self.objects)} most relevant to the question"
-        )
+    note: str = ""
 
 
 def answers_digest(config: LanguageConfig) -> str:
@@ -477,13 +467,19 @@ def context_for(scene: SceneMap, question: str, config: LanguageConfig) -> Conte
     room = config.context_tokens - config.max_answer_tokens - n_tokens(system_prompt()) - n_tokens(question) - 100
     costs = {thing.id: n_tokens(object_line(thing)) + 1 for thing in scene.objects}
     if sum(costs.values()) <= room:
-        return Context(scene.objects, len(scene))
+        return Context(scene.objects)
     chosen: set[int] = set()
     for thing in by_relevance(scene, question):
         if costs[thing.id] <= room or len(chosen) < FEW_OBJECTS:
             chosen.add(thing.id)
             room -= costs[thing.id]
-    return Context(tuple(thing for thing in scene.objects if thing.id in chosen), len(scene))
+    note = (
+        f"the map has {len(scene)} objects, more than the model reads at once; it was given the {len(chosen)} most "
+        "relevant to the question"
+    )
+    return Context(
+        tuple(thing for thing in scene.objects if thing.id in chosen), note if len(chosen) < len(scene) else ""
+    )
 
 
 def by_relevance(scene: SceneMap, question: str) -> list[MapObject]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -96,14 +97,10 @@ def audit_json(verdicts: Sequence[Verdict]) -> dict[str, Any]:
 
 
 def _cells(verdicts: Sequence[str]) -> tuple[Cell, ...]:
-    n_wrong = sum(verdict == WRONG for verdict in verdicts)
-    shares = [_share([verdict in wanted for verdict in verdicts]) for wanted in ((RIGHT,), (RIGHT, ARGUABLE))]
-    return (Cell(str(len(verdicts))), *shares, Cell(str(n_wrong)))
-
-
-def _share(is_so: Sequence[bool]) -> Cell:
-    share = sum(is_so) / len(is_so)
-    return Cell(percent(share), bracketed(share_interval(share, len(is_so))))
+    n, n_of = len(verdicts), Counter(verdicts)
+    shares = n_of[RIGHT] / n, (n_of[RIGHT] + n_of[ARGUABLE]) / n
+    cells = (Cell(percent(share), bracketed(share_interval(share, n))) for share in shares)
+    return (Cell(str(n)), *cells, Cell(str(n_of[WRONG])))
 
 
 def make_audit(

@@ -418,11 +418,11 @@ def read_scores(path: Path) -> Scores:
 
 def second_looks_csv(looks: Sequence[SecondLook]) -> str:
     """One line an item and question."""
-    rows = [
-        (one.item_id, one.ask, one.reason, _said(one), one.automatic, one.scene, ", ".join(one.methods), one.text)
-        for one in looks
-    ]
-    return csv_lines([LOOKS_COLUMNS, *((*row, ", ".join(one.pictures)) for row, one in zip(rows, looks, strict=True))])
+    rows = [LOOKS_COLUMNS]
+    for one in looks:
+        listed = ", ".join(one.methods), one.text, ", ".join(one.pictures)
+        rows.append((one.item_id, one.ask, one.reason, _said(one), one.automatic, one.scene, *listed))
+    return csv_lines(rows)
 
 
 def _said(look: SecondLook) -> str:

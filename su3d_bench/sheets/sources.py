@@ -180,15 +180,11 @@ class TruthSource:
         self.run, self.run_digest = run, run_digest
         self.truth = lru_cache(maxsize=1)(self._truth)
         self._map_of = lru_cache(maxsize=1)(self._map)
-        self._frames_of = lru_cache(maxsize=1)(self._frames)
+        self.frames = lru_cache(maxsize=1)(self._frames)
 
     def instances(self, scene: str, method: str = "") -> Instances:
         """Every instance of the truth, whatever the method."""
         return self._map_of(scene)
-
-    def frames(self, scene: str) -> tuple[Frame, ...]:
-        """Those in which it was looked up what can be asked about."""
-        return self._frames_of(scene)
 
     def _truth(self, scene: str) -> GroundTruth:
         return fullest_truth(self.dataset(scene), scene.partition("/")[2])
@@ -201,6 +197,7 @@ class TruthSource:
         return Instances.of(truth.points, list(rows_of.values()), names=names, ids=list(rows_of))
 
     def _frames(self, scene: str) -> tuple[Frame, ...]:
+        """Those in which it was looked up what can be asked about."""
         dataset, name = self.dataset(scene), scene.partition("/")[2]
         return tuple(looked_at(dataset, name))
 

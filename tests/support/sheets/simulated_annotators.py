@@ -49,9 +49,9 @@ def annotation_set(truths: Sequence[tuple[str, str, str]], annotators: Sequence[
     asked = []
     for k, (first, second, merging) in enumerate(truths):
         told = {"n": first, "n'": second}
-        names = (
-            [("n", "n'")] if first == second else [("n",)] if not second else [("n'",), ("n",)][:: 1 if k % 2 else -1]
-        )
+        names = [("n'",), ("n",)] if k % 2 else [("n",), ("n'",)]
+        if second in ("", first):
+            names = [("n", "n'") if second else ("n",)]
         stands_for = {f"label {place}": what for place, what in enumerate(names, 1)}
         automatic = {ask: told[what[0]] for ask, what in stands_for.items()} | {"merging": merging}
         key = KeyItem("", "rooms/a", ("opensu3d",), (k,), "", "", stands_for, automatic)
@@ -79,9 +79,8 @@ def _set(
         for key, (text, _) in zip(keys, asked, strict=True)
     )
     shares = tuple(AnnotatorShare(name, tuple(names)) for name in annotators)
-    return Sheet(set_id, kind, 7, ASKS[kind], items, shares), Key(
-        set_id, kind, "runs/made", "0", methods, "a made truth", keys
-    )
+    key = Key(set_id, kind, "runs/made", "0", methods, "a made truth", keys)
+    return Sheet(set_id, kind, 7, ASKS[kind], items, shares), key
 
 
 def answered(sheet: Sheet, key: Key, error_rates: Mapping[str, float], seed: int = 0) -> list[AnswerRow]:
