@@ -219,9 +219,10 @@ def _called(name: str, objects: SceneMap) -> list[MapObject]:
 
 def _borne(thing: MapObject, it: str, objects: SceneMap) -> Iterator[MadeQuestion]:
     """What an object stands on, where it is one thing."""
-    under = [other for other in objects.objects if other.id != thing.id and objects.holds("on", thing, other)]
-    doubts = [other for other in objects.objects if other.id != thing.id and objects.is_doubtful("on", thing, other)]
-    if len(under) == 1 and not doubts and under[0].is_asked:
+    others = [other for other in objects.objects if other.id != thing.id]
+    under = [other for other in others if objects.holds("on", thing, other)]
+    is_sure = not any(objects.is_doubtful("on", thing, other) for other in others)
+    if len(under) == 1 and is_sure and under[0].is_asked:
         yield MadeQuestion(f"What is {it} on?", under[0].name.capitalize(), "class", under[0].name)
 
 

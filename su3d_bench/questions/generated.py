@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
-from itertools import zip_longest
+from itertools import combinations, zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -153,7 +153,7 @@ class _Drafts:
                 yield _Draft(f"Which object is closest to the {reference.name}{CENTRES}?", share, share)
 
     def _distances(self) -> Iterator[_Draft]:
-        pairs = [(a, b, _away_m(a, b)) for a, b in _pairs(self._single)]
+        pairs = [(a, b, _away_m(a, b)) for a, b in combinations(self._single, 2)]
         every = np.array([away_m for *_, away_m in pairs])
         for a, b, away_m in pairs:
             share = float((np.abs(every - away_m) <= max(DISTANCE_M, DISTANCE_SHARE * away_m)).mean())
@@ -179,13 +179,13 @@ class _Drafts:
 
     def _compared(self) -> Iterator[_Draft]:
         for reference in self._single:
-            for a, b in _pairs([thing for thing in self._single if thing is not reference]):
+            for a, b in combinations([thing for thing in self._single if thing is not reference], 2):
                 if _leads([a, b], reference, 1):
                     text = f"Which is closer to the {reference.name}{CENTRES}, the {a.name} or the {b.name}?"
                     yield _Draft(text, 0.5, 0.5, "first" if _away_m(a, reference) < _away_m(b, reference) else "second")
 
     def _between(self) -> Iterator[_Draft]:
-        for a, b in _pairs(self._single):
+        for a, b in combinations(self._single, 2):
             if _away_m(a, b) > BETWEEN_M or gap_m(a.box, b.box) == 0 or not self._scene.are_in_one_place(a, b):
                 continue
             between = [thing for thing in self._all if self._scene.is_between(thing, a, b)]
@@ -232,17 +232,13 @@ class _Drafts:
         return self._scene.holds(relation, a, b) and not is_also_on
 
     def _sides(self) -> Iterator[_Draft]:
-        for a, b in _pairs(self._single):
+        for a, b in combinations(self._single, 2):
             if _away_m(a, b) < 2.0:
                 yield _Draft(f"Is the {a.name} left of the {b.name}?", 0.5, 0.5)
 
 
 def _is_counted(name: str) -> bool:
     return is_countable(name) and words(name) not in HEAPED
-
-
-def _pairs(objects: Sequence[MapObject]) -> Iterator[tuple[MapObject, MapObject]]:
-    return ((a, b) for k, a in enumerate(objects) for b in objects[k + 1 :])
 
 
 def _away_m(a: MapObject, b: MapObject) -> float:

@@ -235,11 +235,11 @@ def nr3d_groups(stimulus: str, tokens: str | None, mentions: str | None, at: str
     parts = stimulus.split("-", 4)
     others = parts[4].split("-") if len(parts) == 5 else []
     numbers = [*parts[2:4], *(word for word in others if word)]
-    if len(parts) < 4 or not all(word.isascii() and word.isdigit() and len(word) < 10 for word in numbers):
-        raise DataError(f"{at}: 'stimulus_id' must be scan-class-n-target-others; found {printable(stimulus, 60)}")
+    is_sound = len(parts) >= 4 and all(word.isascii() and word.isdigit() and len(word) < 10 for word in numbers)
+    if not is_sound or int(parts[2]) != len(numbers) - 1:
+        fault = "must be scan-class-n-target-others, with n - 1 others"
+        raise DataError(f"{at}: 'stimulus_id' {fault}; found {printable(stimulus, 60)}")
     n = int(parts[2])
-    if n - 1 != len([word for word in others if word]):
-        raise DataError(f"{at}: 'stimulus_id' says {n} objects and names {len(others)} others")
     words = [] if tokens is None else _words(tokens, at)
     if (mentions or "True").strip() not in ("True", "true", "1") or len(words) > MOST_TOKENS or n < 2:
         return (LEFT_OUT,)
@@ -249,8 +249,8 @@ def nr3d_groups(stimulus: str, tokens: str | None, mentions: str | None, at: str
 def _words(text: str, at: str) -> list[str]:
     try:
         words = ast.literal_eval(text.strip())
-    except (ValueError, SyntaxError, MemoryError, RecursionError, TypeError) as error:
-        raise DataError(f"{at}: 'tokens' must be a list of words; found {printable(text, 40)}") from error
+    except (ValueError, SyntaxError, MemoryError, RecursionError, TypeError):
+        words = None
     if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
         raise DataError(f"{at}: 'tokens' must be a list of words; found {printable(text, 40)}")
     return words

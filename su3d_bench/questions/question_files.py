@@ -255,10 +255,8 @@ def _scanrefer(rows: list[Any], where: str) -> Iterator[Question]:
 
 def _nr3d(text: str, where: str) -> Iterator[Question]:
     """The utterances, in the groups of the file where it has such columns."""
-    try:
-        lines = list(csv.DictReader(io.StringIO(text, newline=""), strict=True))
-    except csv.Error as error:
-        raise DataError(f"{where}: not CSV ({printable(str(error), 120)}); {ADVICE}") from error
+    header, *cells = query_files.csv_rows(text, where) or [[]]
+    lines = [dict(zip(header, row, strict=False)) for row in cells if row]
     for number, row in enumerate(_rows(_Nr3D, lines, where, "row", 2), 2):
         question = new_question(f"{DATASET}/{row.scan_id}", "relative", row.utterance, (row.target_id + 1,), "Nr3D")
         groups: tuple[str, ...] = ()

@@ -355,13 +355,10 @@ class Figures:
             for k, text in enumerate(texts):
                 best = [ranking[k].order[:1].tolist() for ranking in ranked]
                 views = self._views(maps, best[0])
-                cells = [
-                    Cell(shown.paint(view, similarity_colours(ranking[k].similarity, scale)))
-                    for shown, view, ranking in zip(maps, views, ranked, strict=True)
-                ]
-                rows.append(
-                    GridRow(f'"{printable(text, 90)}"', scene, (*self._photo(scene, maps[0], views[0]), *cells))
-                )
+                cells = self._photo(scene, maps[0], views[0])
+                for shown, view, ranking in zip(maps, views, ranked, strict=True):
+                    cells.append(Cell(shown.paint(view, similarity_colours(ranking[k].similarity, scale))))
+                rows.append(GridRow(f'"{printable(text, 90)}"', scene, tuple(cells)))
         return rows
 
     def labels(self) -> tuple[list[str], list[GridRow]]:
@@ -372,7 +369,7 @@ class Figures:
         for scene in self._source.scenes:
             maps = self._maps(scene)
             views = self._views(maps, [])
-            cells: list[Cell] = []
+            cells = self._photo(scene, maps[0], views[0])
             for method, shown, view in zip(self._source.methods, maps, views, strict=True):
                 own: Labels = labels_n(shown.instances)
                 refined = self._source.refined(scene, method)
@@ -382,7 +379,7 @@ class Figures:
                 for names in both:
                     colours = np.array([palette[name] for name in names], np.uint8).reshape(-1, 3)
                     cells.append(Cell(shown.paint(view, colours), _name_tags(shown, view, names, colours)))
-            rows.append(GridRow(scene, "", (*self._photo(scene, maps[0], views[0]), *cells)))
+            rows.append(GridRow(scene, "", tuple(cells)))
         return titles, rows
 
     def reasoning(self, questions: Sequence[str], encoder: Encoder | None) -> list[GridRow]:
@@ -401,8 +398,8 @@ class Figures:
                     views[k] = view
                     names = {thing.row: thing.shown for thing in a_map.objects}
                     cells.append(replace(_answer_cell(shown, view, rows_of, names), caption=answer.text))
-                photo = self._photo(scene, maps[0], views[0])
-                rows.append(GridRow(printable(question, 160), scene, (*photo, *cells)))
+                cells = [*self._photo(scene, maps[0], views[0]), *cells]
+                rows.append(GridRow(printable(question, 160), scene, tuple(cells)))
         return rows
 
     def _maps(self, scene: str) -> list[DrawnMap]:
@@ -420,12 +417,12 @@ class Figures:
         chosen = first.view(camera)
         return [chosen, *(MapView(camera, other.view(camera).view, chosen.box) for other in maps[1:])]
 
-    def _photo(self, scene: str, shown: DrawnMap, view: MapView) -> tuple[Cell, ...]:
+    def _photo(self, scene: str, shown: DrawnMap, view: MapView) -> list[Cell]:
         """The map in the colours that the frames saw, where it is asked for."""
         if not self._with_photo:
-            return ()
+            return []
         frames = self._source.frames(scene)
-        return (Cell(shown.paint_points(view, seen_colours(frames, shown.instances.points[shown.rows]))),)
+        return [Cell(shown.paint_points(view, seen_colours(frames, shown.instances.points[shown.rows])))]
 
 
 def seen_colours(frames: Sequence[Frame], points: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> UInt8Array:

@@ -31,20 +31,7 @@ class TwoWords:
 
 def instances_with(features: Float64Array | None) -> Instances:
     n = 0 if features is None else len(features)
-    return Instances(
-        points=np.zeros((0, 3), np.float32),
-        indptr=np.zeros(n + 1, np.int64),
-        indices=np.zeros(0, np.int32),
-        scores=np.ones(n),
-        features=None if features is None else features.astype(np.float32),
-        labels=None,
-        names=("thing",) * n,
-        captions=("",) * n,
-        boxes=np.zeros((n, 2, 3), np.float32),
-        centroids=np.zeros((n, 3), np.float32),
-        view_indptr=np.zeros(n + 1, np.int64),
-        views=np.zeros((0, 2), np.int32),
-    )
+    return Instances.of(np.zeros((n, 3), np.float32), [np.array([k]) for k in range(n)], features=features)
 
 
 def test_retrieval_ranks_by_cosine_whatever_the_length_of_the_features() -> None:

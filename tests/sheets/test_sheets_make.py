@@ -163,9 +163,6 @@ def test_sheets_are_made_from_the_command_line(
         (words, "painted/a: has no ground truth that questions could be made from"),
         ([*words, "--questions", "paper"], "asks nothing of a scene of this run"),
         ([*words, "--methods", "colector"], "has no method 'colector'; did you mean 'collector'?"),
-        ([*words, "--scenes", "painted/x"], "has no scene 'painted/x'"),
-        ([*words, "--per-kind", "0"], "expected an integer of 1 or more"),
-        ([*words, "--seed", "-1"], "argument --seed: -1"),
         (["sheets", "make", "run", "--kind", "annotation", "--questions", "paper", "--out", "o"], "leave it out"),
     ):
         assert main(wrong) == 2
