@@ -149,7 +149,7 @@ def _answer(
     from su3d_bench.core.files.atomic import write_json
     from su3d_bench.reproducing.bundle import write_bundle
     from su3d_bench.reproducing.differences import Results, compared_all, compared_json, draw_queries, result_tables
-    from su3d_bench.reproducing.recipe import recipe_bytes
+    from su3d_bench.reproducing.recipe import recipe_file
 
     results = Results(tuple(folders))
     cells = compared_all(experiments, results)
@@ -165,7 +165,7 @@ def _answer(
     for picture in draw_queries(experiments, results, out / "pictures", arguments.device or "cpu"):
         remark(f"picture: {picture}", quiet=arguments.quiet)
     bundle = arguments.bundle or out / "bundle.zip"
-    write_bundle(bundle, recipe.name, recipe_bytes(arguments.recipe), folders, out)
+    write_bundle(bundle, recipe.name, recipe_file(arguments.recipe), folders, out)
     remark(f"bundle: {bundle}", quiet=arguments.quiet)
     where = f"SU3D_DATA={shlex.quote(os.environ['SU3D_DATA'])} " if arguments.rehearse else ""
     remark(f"next: {where}su3d-bench report verify {shlex.quote(str(bundle))}", quiet=arguments.quiet)

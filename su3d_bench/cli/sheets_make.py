@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from su3d_bench.questions.model import Question
     from su3d_bench.sheets.drafts import Draft
     from su3d_bench.sheets.drawing import PictureSource
-    from su3d_bench.sheets.items import SheetKind
-    from su3d_bench.sheets.sets import Origin
+    from su3d_bench.sheets.items import Key, SheetKind
     from su3d_bench.sheets.sources import RunSource, TruthSource
 
 QUESTIONS: Final = "questions"  # the kind that needs no method, and so no run
@@ -84,7 +83,7 @@ def call(arguments: argparse.Namespace) -> None:
     _check(arguments)
     left_out = frozenset[str]() if arguments.leave_out is None else read_left_out(arguments.leave_out)
     kinds: tuple[SheetKind, ...] = tuple(dict.fromkeys(arguments.kind))
-    origins: dict[SheetKind, Origin] = {}
+    origins: dict[SheetKind, Key] = {}
     drafts: dict[SheetKind, list[Draft]] = {}
     drawn: dict[SheetKind, list[bytes]] = {}
     of_run = [kind for kind in kinds if kind != QUESTIONS]
@@ -159,17 +158,18 @@ def _judgeable(source: RunSource, kind: SheetKind, is_quiet: bool) -> RunSource:
 
 def _questions(
     truth: TruthSource, left_out: Collection[str], arguments: argparse.Namespace
-) -> tuple[dict[SheetKind, list[Draft]], Origin]:
+) -> tuple[dict[SheetKind, list[Draft]], Key]:
     """The questions that people judge, and where they come from; what is counted together stands for methods."""
     from su3d_bench.sheets.drafts import question_drafts
+    from su3d_bench.sheets.items import Key
     from su3d_bench.sheets.scores import OF_ALL_KINDS
-    from su3d_bench.sheets.sets import Origin, check_split
+    from su3d_bench.sheets.sets import check_split
 
     n_most = arguments.per_kind or PER_KIND[QUESTIONS]
     drafts = [draft for scene in truth.scenes for draft in question_drafts(truth, scene, n_most, left_out)]
     check_split(len(drafts), arguments.annotators, arguments.overlap)
     counted_kinds = (*dict.fromkeys(draft.question_kind for draft in drafts), OF_ALL_KINDS)
-    return {QUESTIONS: drafts}, Origin(truth.run, truth.run_digest, counted_kinds, "")
+    return {QUESTIONS: drafts}, Key("", QUESTIONS, truth.run, truth.run_digest, counted_kinds, "", ())
 
 
 def _drafts(
@@ -265,12 +265,15 @@ def _drawn(
     return {kind: list(islice(remaining, len(of_kind))) for kind, of_kind in drafts.items()}
 
 
-def _origin(kind: SheetKind, source: RunSource, made_by: str) -> Origin:
-    from su3d_bench.sheets.sets import Origin
+def _origin(kind: SheetKind, source: RunSource, made_by: str) -> Key:
+    from su3d_bench.sheets.items import Key
 
     rules = {rules.name for scene in source.scenes if (rules := source.rules(scene, kind)) is not None}
     run = source.run
-    return Origin(
+    return Key(
+        sheet_id="",
+        kind=kind,
+        items=(),
         run=run.name,
         run_digest=run.record.code,
         methods=source.methods,
@@ -285,7 +288,7 @@ def _origin(kind: SheetKind, source: RunSource, made_by: str) -> Origin:
 
 
 def _write(
-    origins: Mapping[SheetKind, Origin],
+    origins: Mapping[SheetKind, Key],
     drafts: Mapping[SheetKind, Sequence[Draft]],
     drawn: Mapping[SheetKind, Sequence[bytes]],
     arguments: argparse.Namespace,
@@ -297,10 +300,9 @@ def _write(
     written_sets = []
     for kind, origin in origins.items():
         made = make_sheets(
-            kind,
+            origin,
             drafts[kind],
             drawn[kind],
-            origin,
             seed=arguments.seed,
             annotators=arguments.annotators,
             overlap=arguments.overlap,

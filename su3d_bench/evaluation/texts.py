@@ -180,7 +180,7 @@ def _texts_of_file(path: Path) -> list[str]:
         return list(read_prompts(path, shown(path)))
     if path.suffix.lower() == ".json":
         return [query.text for query in read_queries(path, shown(path))]
-    return [row.text for row in read_query_rows(path)]
+    return [row.text for _, row in read_query_rows(path)]
 
 
 def distinct_texts(named: Mapping[str, Sequence[str]]) -> list[str]:

@@ -74,7 +74,7 @@ def _meaning(object_id: int, questions: Sequence[Question]) -> list[Question]:
     }
     turn = dict[frozenset[str], int]()
     ranked = []
-    for one in sorted(alone.values(), key=lambda one: hashlib.sha256(one.text.encode()).digest()):
+    for one in sorted(alone.values(), key=lambda one: _digest(one.text)):
         tags = _tags(one)
         turn[tags] = turn.get(tags, 0) + 1
         ranked.append((turn[tags], one))
@@ -132,7 +132,9 @@ def metadata_of(scene: str, objects: SceneMap, most_objects: int | None = None) 
         grounding.setdefault(thing.name, {})[key] = {
             f"chain_{number}": [_entry(case) for case in chain] for number, chain in enumerate(chains, 1)
         }
-        rows = [_question(one, is_told=set(words(one.told)) <= known) for one in made]
+        rows: list[dict[str, Any]] = [{"question": one.text, "answer": one.answer, "tag": one.tag} for one in made]
+        for row, one in zip(rows, made, strict=True):
+            row["extra_knowledge"] = int(not set(words(one.told)) <= known)
         asked.setdefault(thing.name, {})[key] = {"grounding_text": texts, "qa": rows}
     return grounding, asked
 
@@ -165,15 +167,11 @@ def _entry(case: ChainedText) -> dict[str, Any]:
     return {"text": case.text, "obj_id": [str(one - 1) for one in case.object_ids], "tag": "-".join(tags)}
 
 
-def _question(one: MadeQuestion, *, is_told: bool) -> dict[str, Any]:
-    return {"question": one.text, "answer": one.answer, "tag": one.tag, "extra_knowledge": int(not is_told)}
-
-
 def _drawn(thing: MapObject, fine: Sequence[ChainedText], objects: SceneMap) -> list[MadeQuestion]:
     """Three questions of different kinds as far as there are, by a digest of their texts; yes as often as no."""
-    every = [
-        one for case in fine for one in questions_about(thing, case.text, objects) if not _gives_away(one, case.text)
-    ]
+    # a text that holds the words on which an answer rests gives it away
+    asked = ((one, case.text) for case in fine for one in questions_about(thing, case.text, objects))
+    every = [one for one, text in asked if not set(words(one.told)) & set(words(text))]
     turn = Counter[str]()
     ranked = []
     unwanted = {tag: ("Yes", "No")[_digest(f"{thing.id} {tag}")[-1] % 2] for tag in {one.tag for one in every}}
@@ -189,11 +187,6 @@ def _drawn(thing: MapObject, fine: Sequence[ChainedText], objects: SceneMap) -> 
 
 def _digest(text: str) -> bytes:
     return hashlib.sha256(text.encode()).digest()
-
-
-def _gives_away(one: MadeQuestion, text: str) -> bool:
-    """Whether the text under which an object is asked about tells the answer."""
-    return bool(set(words(one.told)) & set(words(text)))
 
 
 def questions_about(thing: MapObject, text: str, objects: SceneMap) -> Iterator[MadeQuestion]:
@@ -226,9 +219,10 @@ def _called(name: str, objects: SceneMap) -> list[MapObject]:
 
 def _borne(thing: MapObject, it: str, objects: SceneMap) -> Iterator[MadeQuestion]:
     """What an object stands on, where it is one thing."""
-    under = [other for other in objects.objects if other.id != thing.id and objects.holds("on", thing, other)]
-    doubts = [other for other in objects.objects if other.id != thing.id and objects.is_doubtful("on", thing, other)]
-    if len(under) == 1 and not doubts and under[0].is_asked:
+    others = [other for other in objects.objects if other.id != thing.id]
+    under = [other for other in others if objects.holds("on", thing, other)]
+    is_sure = not any(objects.is_doubtful("on", thing, other) for other in others)
+    if len(under) == 1 and is_sure and under[0].is_asked:
         yield MadeQuestion(f"What is {it} on?", under[0].name.capitalize(), "class", under[0].name)
 
 

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache, partial
-from itertools import zip_longest
+from itertools import combinations, zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -111,11 +111,8 @@ class _Drafts:
         hidden = {thing.name for thing in self._all if not thing.is_asked}
         self._things = [thing for thing in self._all if thing.name not in hidden]
         self._n_of = Counter(thing.name for thing in self._things)
-        single = [
-            thing
-            for thing in self._things
-            if self._n_of[thing.name] == 1 and not is_plural(thing.name) and not thing.is_cut
-        ]
+        single = [one for one in self._things if self._n_of[one.name] == 1]
+        single = [one for one in single if not is_plural(one.name) and not one.is_cut]
         self._single = [single[k] for k in sorted(random.permutation(len(single))[:MOST_SINGLE])]
 
     def of_kinds(self) -> Mapping[str, list[_Draft]]:
@@ -156,7 +153,7 @@ class _Drafts:
                 yield _Draft(f"Which object is closest to the {reference.name}{CENTRES}?", share, share)
 
     def _distances(self) -> Iterator[_Draft]:
-        pairs = [(a, b, _away_m(a, b)) for a, b in _pairs(self._single)]
+        pairs = [(a, b, _away_m(a, b)) for a, b in combinations(self._single, 2)]
         every = np.array([away_m for *_, away_m in pairs])
         for a, b, away_m in pairs:
             share = float((np.abs(every - away_m) <= max(DISTANCE_M, DISTANCE_SHARE * away_m)).mean())
@@ -182,13 +179,13 @@ class _Drafts:
 
     def _compared(self) -> Iterator[_Draft]:
         for reference in self._single:
-            for a, b in _pairs([thing for thing in self._single if thing is not reference]):
+            for a, b in combinations([thing for thing in self._single if thing is not reference], 2):
                 if _leads([a, b], reference, 1):
                     text = f"Which is closer to the {reference.name}{CENTRES}, the {a.name} or the {b.name}?"
                     yield _Draft(text, 0.5, 0.5, "first" if _away_m(a, reference) < _away_m(b, reference) else "second")
 
     def _between(self) -> Iterator[_Draft]:
-        for a, b in _pairs(self._single):
+        for a, b in combinations(self._single, 2):
             if _away_m(a, b) > BETWEEN_M or gap_m(a.box, b.box) == 0 or not self._scene.are_in_one_place(a, b):
                 continue
             between = [thing for thing in self._all if self._scene.is_between(thing, a, b)]
@@ -235,17 +232,13 @@ class _Drafts:
         return self._scene.holds(relation, a, b) and not is_also_on
 
     def _sides(self) -> Iterator[_Draft]:
-        for a, b in _pairs(self._single):
+        for a, b in combinations(self._single, 2):
             if _away_m(a, b) < 2.0:
                 yield _Draft(f"Is the {a.name} left of the {b.name}?", 0.5, 0.5)
 
 
 def _is_counted(name: str) -> bool:
     return is_countable(name) and words(name) not in HEAPED
-
-
-def _pairs(objects: Sequence[MapObject]) -> Iterator[tuple[MapObject, MapObject]]:
-    return ((a, b) for k, a in enumerate(objects) for b in objects[k + 1 :])
 
 
 def _away_m(a: MapObject, b: MapObject) -> float:
@@ -326,7 +319,7 @@ def drawn(
     [[('bed', 'lamp')], [('bed', 'pillow')]]
     """
     left = dict.fromkeys(_by_digest(scene, absent))
-    listed = _names_of(rooms)
+    listed = tuple(dict.fromkeys(name for room in rooms for name in room))
     listed_as = {} if sampling == RANDOM else {name: _listed(name, listed) for name in (*there, *absent)}
     often = _often(rooms) if sampling == POPULAR else []
     for name in there:
@@ -340,10 +333,6 @@ def drawn(
 
 def _by_digest(scene: str, names: Iterable[str]) -> list[str]:
     return sorted(names, key=lambda name: hashlib.sha256(f"{scene}\0{name}".encode()).digest())
-
-
-def _names_of(rooms: Rooms) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(name for room in rooms for name in room))
 
 
 def _listed(name: str, listed: Sequence[str]) -> str | None:

@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -219,7 +220,7 @@ def _relations(objects: SceneMap) -> Iterator[_Asked]:
     for relation in RELATIONS:
         if relation == "near":
             continue
-        held, doubtful = objects.relations.of(relation), objects.doubtful(relation)
+        held, doubtful = objects.relations.of(relation), objects.doubtful[relation]
         if relation == "in":
             held = held & ~objects.relations.on  # a cushion is within the box of a sofa, and on it
         for a, b in np.argwhere(held | doubtful).tolist():
@@ -234,16 +235,15 @@ def _between(objects: SceneMap) -> Iterator[_Asked]:
     """What stands between two things of which the scene has one each, on one level with both."""
     n_of = Counter(thing.name for thing in objects.objects)
     single = [thing for thing in objects.objects if n_of[thing.name] == 1 and thing.is_asked and not thing.is_cut]
-    for k, first in enumerate(single):
-        for second in single[k + 1 :]:
-            if float(np.linalg.norm(first.centroid - second.centroid)) > BETWEEN_M or _touch(objects, first, second):
-                continue
-            for thing in objects.objects:
-                if objects.may_be_between(thing, first, second):
-                    is_sure = objects.is_between(thing, first, second) and not thing.is_cut
-                    is_sure &= objects.are_in_one_place(thing, first, second)
-                    text = f"{thing.name} between the {first.name} and the {second.name}"
-                    yield _Asked("relative", text, (thing.id,) if is_sure else (), thing.name)
+    for first, second in combinations(single, 2):
+        if float(np.linalg.norm(first.centroid - second.centroid)) > BETWEEN_M or _touch(objects, first, second):
+            continue
+        for thing in objects.objects:
+            if objects.may_be_between(thing, first, second):
+                is_sure = objects.is_between(thing, first, second) and not thing.is_cut
+                is_sure &= objects.are_in_one_place(thing, first, second)
+                text = f"{thing.name} between the {first.name} and the {second.name}"
+                yield _Asked("relative", text, (thing.id,) if is_sure else (), thing.name)
 
 
 def _touch(objects: SceneMap, a: MapObject, b: MapObject) -> bool:

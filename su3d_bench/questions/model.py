@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -24,7 +24,6 @@ BY_NAME = {"property": "property by name", "relative": "relative by name"}
 MADE_KINDS = (*KINDS, *BY_NAME.values())
 REASONING = "reasoning"
 ALL_KINDS = (*MADE_KINDS, REASONING)
-_DIGEST_LENGTH = 12
 
 
 def question_id(scene: str, kind: str, text: str) -> str:
@@ -33,7 +32,7 @@ def question_id(scene: str, kind: str, text: str) -> str:
     >>> question_id("rooms/living0", "instance", "chair")
     '3f6958fff541'
     """
-    return hashlib.sha256("\0".join((scene, kind, text)).encode()).hexdigest()[:_DIGEST_LENGTH]
+    return hashlib.sha256("\0".join((scene, kind, text)).encode()).hexdigest()[:12]
 
 
 @dataclass(frozen=True)
@@ -83,31 +82,24 @@ class Answer:
     reference_ids: tuple[int, ...] = ()
     value: float | int | bool | None = None
     kind: str = ""
-    notes: tuple[str, ...] = ()
     is_settled: bool = True
+    notes: tuple[str, ...] = ()
     solver: Literal["built-in", "llm"] = "built-in"
 
     def said(self, like: float | int | bool) -> float | int | bool | None:
         """What it says of the kind of ``like``, read from its words where it gives no value; None for nothing."""
-        if self.value is not None:
-            return self.value
-        if isinstance(like, bool):
+        value = self.value
+        if value is None and isinstance(like, bool):
             word = re.search(r"\b(yes|no)\b", self.text.lower())
             return None if word is None else word[1] == "yes"
-        number = re.search(r"(?<![\w#.])\d+(?:\.\d+)?", self.text)
-        return None if number is None else float(number[0])
+        if value is None and (number := re.search(r"(?<![\w#.])\d+(?:\.\d+)?", self.text)):
+            value = float(number[0])
+        is_count = value is not None and not isinstance(like, float | bool) and value == int(value)
+        return int(value) if is_count and value is not None else value
 
     def to_json(self) -> dict[str, Any]:
-        return {
-            "answer": self.text,
-            "object_ids": list(self.object_ids),
-            "reference_ids": list(self.reference_ids),
-            "value": self.value,
-            "kind": self.kind,
-            "is_settled": self.is_settled,
-            "notes": list(self.notes),
-            "solver": self.solver,
-        }
+        fields = asdict(self)
+        return {"answer": fields.pop("text"), **fields}
 
 
 def unsettled(reason: str, notes: tuple[str, ...] = ()) -> Answer:

@@ -13,7 +13,7 @@ import csv
 import re
 import unicodedata
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -72,7 +72,9 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(kind)
 
 
-class _Query(BaseModel):
+class QueryRow(BaseModel):
+    """One query as a file has it; ``objects`` is empty where nobody knows them."""
+
     model_config = ConfigDict(extra="forbid")
 
     scene: Words
@@ -85,29 +87,17 @@ class _Query(BaseModel):
 class _Queries(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
-    query: list[_Query]
+    query: list[QueryRow]
 
 
-@dataclass(frozen=True)
-class QueryRow:
-    """One query as the file has it; ``at`` says where it stands, for messages."""
-
-    at: str
-    scene: str
-    text: str
-    objects: tuple[int, ...]
-    kind: str = ""
-    source: str = ""
-
-
-def read_query_rows(path: Path) -> list[QueryRow]:
-    """Every query of a file in its order; ``objects`` is empty where nobody knows them."""
+def read_query_rows(path: Path) -> list[tuple[str, QueryRow]]:
+    """Every query of a file in its order, with where it stands, for messages."""
     where = printable(str(path), 200)
     text = read_text(path, where, ADVICE, MOST_BYTES)
     rows = list(_csv_rows(text, where) if path.suffix.lower() == ".csv" else _toml_rows(text, where))
-    for row in rows:
+    for at, row in rows:
         if len(set(row.objects)) != len(row.objects):
-            raise DataError(f"{row.at}: an object stands there twice; name each once")
+            raise DataError(f"{at}: an object stands there twice; name each once")
     if not rows:
         raise DataError(f"{where}: holds no query; expected {', '.join(COLUMNS)}")
     return rows
@@ -116,14 +106,12 @@ def read_query_rows(path: Path) -> list[QueryRow]:
 def read_query_file(path: Path) -> dict[str, tuple[TextQuery, ...]]:
     """The queries of each scene, in the order of the file; scenes are called without the dataset."""
     queries_of_scene: dict[str, list[TextQuery]] = {}
-    for row in read_query_rows(path):
+    for at, row in read_query_rows(path):
         if not row.objects:
-            raise DataError(f"{row.at}: 'objects' must name at least one instance id above 0")
+            raise DataError(f"{at}: 'objects' must name at least one instance id above 0")
         queries = queries_of_scene.setdefault(row.scene.rpartition("/")[2], [])
         if any(query.text == row.text for query in queries):
-            raise DataError(
-                f"{row.at}: the query '{printable(row.text, 60)}' stands there twice for {printable(row.scene, 60)}"
-            )
+            raise DataError(f"{at}: '{printable(row.text, 60)}' stands there twice for {printable(row.scene, 60)}")
         queries.append(TextQuery(row.text, row.objects))
     return {scene: tuple(queries) for scene, queries in queries_of_scene.items()}
 
@@ -154,24 +142,25 @@ def query_truth(
     return QueryTruth(truth.points, owner, grouped_by_truth(named, truth), VARIANT, source, alignment=alignment)
 
 
-def _toml_rows(text: str, where: str) -> Iterator[QueryRow]:
+def _toml_rows(text: str, where: str) -> Iterator[tuple[str, QueryRow]]:
     try:
         content = parse_toml(text)
     except ValueError as error:
         raise DataError(f"{where}: not TOML ({printable(str(error), 120)})") from error
     for number, query in enumerate(validated(_Queries, content, where).query, 1):
-        yield QueryRow(f"{where}: query {number}", **query.model_dump())
+        yield f"{where}: query {number}", query
 
 
-def _rows(text: str, where: str, separator: str = ",") -> list[list[str]]:
+def csv_rows(text: str, where: str, separators: str = ",") -> list[list[str]]:
+    """The rows of a CSV text, parted by the one of ``separators`` that is most frequent in its first line."""
     try:
-        return separated_rows(text, separator)
+        return separated_rows(text, max(separators, key=text.partition("\n")[0].count))
     except csv.Error as error:
         raise DataError(f"{where}: not CSV ({printable(str(error), 120)})") from error
 
 
-def _csv_rows(text: str, where: str) -> Iterator[QueryRow]:
-    rows = _rows(text, where)
+def _csv_rows(text: str, where: str) -> Iterator[tuple[str, QueryRow]]:
+    rows = csv_rows(text, where)
     header = tuple(word.strip() for word in rows[0]) if rows else ()
     more = header[len(COLUMNS) :]
     if header[: len(COLUMNS)] != COLUMNS or not set(more) <= set(MORE_COLUMNS) or len(set(more)) < len(more):
@@ -182,8 +171,7 @@ def _csv_rows(text: str, where: str) -> Iterator[QueryRow]:
             raise DataError(f"{at}: has {len(row)} columns; expected {','.join(header)}")
         if row:
             cells: dict[str, Any] = dict(zip(header, map(meant, row), strict=True))
-            query = validated(_Query, {**cells, "objects": [*map(_number, cells["objects"].split())]}, at)
-            yield QueryRow(at, **query.model_dump())
+            yield at, validated(QueryRow, {**cells, "objects": [*map(_number, cells["objects"].split())]}, at)
 
 
 def _number(word: str) -> int | str:
@@ -196,12 +184,10 @@ BY_VIEW, BY_ANY_VIEW = "view-dependent", "view-independent"
 LEFT_OUT = "left out"  # of the evaluation of Nr3D with its candidates
 PAIRS = ((UNIQUE, MULTIPLE), (EASY, HARD), (BY_VIEW, BY_ANY_VIEW))
 # ``type2class`` of data/scannet/model_util_scannet.py: what the table calls otherwise is one class, others.
-CLASSES = frozenset(
-    (
-        *("cabinet", "bed", "chair", "sofa", "table", "door", "window", "bookshelf", "picture", "counter", "desk"),
-        *("curtain", "refrigerator", "shower curtain", "toilet", "sink", "bathtub"),
-    )
-)
+CLASSES = frozenset((
+    "cabinet", "bed", "chair", "sofa", "table", "door", "window", "bookshelf", "picture", "counter", "desk", "curtain",
+    "refrigerator", "shower curtain", "toilet", "sink", "bathtub",
+))  # fmt: skip
 OTHERS = "others"
 # ``is_explicitly_view_dependent``
 VIEW_WORDS = frozenset(
@@ -249,11 +235,11 @@ def nr3d_groups(stimulus: str, tokens: str | None, mentions: str | None, at: str
     parts = stimulus.split("-", 4)
     others = parts[4].split("-") if len(parts) == 5 else []
     numbers = [*parts[2:4], *(word for word in others if word)]
-    if len(parts) < 4 or not all(word.isascii() and word.isdigit() and len(word) < 10 for word in numbers):
-        raise DataError(f"{at}: 'stimulus_id' must be scan-class-n-target-others; found {printable(stimulus, 60)}")
+    is_sound = len(parts) >= 4 and all(word.isascii() and word.isdigit() and len(word) < 10 for word in numbers)
+    if not is_sound or int(parts[2]) != len(numbers) - 1:
+        fault = "must be scan-class-n-target-others, with n - 1 others"
+        raise DataError(f"{at}: 'stimulus_id' {fault}; found {printable(stimulus, 60)}")
     n = int(parts[2])
-    if n - 1 != len([word for word in others if word]):
-        raise DataError(f"{at}: 'stimulus_id' says {n} objects and names {len(others)} others")
     words = [] if tokens is None else _words(tokens, at)
     if (mentions or "True").strip() not in ("True", "true", "1") or len(words) > MOST_TOKENS or n < 2:
         return (LEFT_OUT,)
@@ -263,8 +249,8 @@ def nr3d_groups(stimulus: str, tokens: str | None, mentions: str | None, at: str
 def _words(text: str, at: str) -> list[str]:
     try:
         words = ast.literal_eval(text.strip())
-    except (ValueError, SyntaxError, MemoryError, RecursionError, TypeError) as error:
-        raise DataError(f"{at}: 'tokens' must be a list of words; found {printable(text, 40)}") from error
+    except (ValueError, SyntaxError, MemoryError, RecursionError, TypeError):
+        words = None
     if not isinstance(words, list) or not all(isinstance(word, str) for word in words):
         raise DataError(f"{at}: 'tokens' must be a list of words; found {printable(text, 40)}")
     return words
@@ -312,19 +298,18 @@ def read_left_out(path: Path) -> frozenset[str]:
     """The ids in the column ``question_id``, separated by ``,`` ``;`` or tab, as spreadsheets save it too."""
     where = printable(str(path), 200)
     text = read_text(path, where, "name a CSV file, such as sheets score --disputed writes", MOST_BYTES)
-    rows = _rows(text, where, max(",;\t", key=text.partition("\n")[0].count))
+    rows = csv_rows(text, where, ",;\t")
     header = [word.strip() for word in rows[0]] if rows else []
     if header.count(COLUMN) != 1:
         raise DataError(f"{where}: the first line must name one column {COLUMN}, as sheets score --disputed writes it")
     place = header.index(COLUMN)
-    found = {}
+    found = set[str]()
     for number, row in enumerate(rows[1:], 2):
-        if any(row):
-            found[(row[place] if place < len(row) else "").strip()] = number
-    for question, number in found.items():
-        if not _ID.fullmatch(question):
+        question = row[place].strip() if place < len(row) else ""
+        if any(row) and not _ID.fullmatch(question):
             raise DataError(
                 f"{where}: row {number}: '{printable(question, 40)}' is no id of a question; give the file as sheets "
                 "score --disputed wrote it"
             )
+        found |= {question} if any(row) else set()
     return frozenset(found)

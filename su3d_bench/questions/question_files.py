@@ -28,17 +28,10 @@ from su3d_bench.core.system.files import file_text, opened, parse_toml
 from su3d_bench.formats.arrays import parsed_json, read_text
 from su3d_bench.formats.tables.table import no_formula
 from su3d_bench.metrics.open_vocabulary.score import TextQuery
+from su3d_bench.questions import query_files
 from su3d_bench.questions.beacon3d import chains_of, kind_of_metadata, questions_of_objects, read_metadata
 from su3d_bench.questions.model import ALL_KINDS, KINDS, REASONING, Question, new_question
-from su3d_bench.questions.query_files import (
-    COLUMNS,
-    MORE_COLUMNS,
-    ObjectId,
-    nr3d_groups,
-    only_words,
-    read_query_rows,
-    validated,
-)
+from su3d_bench.questions.query_files import COLUMNS, ObjectId, only_words, validated
 
 PAPER = Path(__file__).parent / "paper_queries.toml"
 PAGE = "opensu3d.github.io"
@@ -55,17 +48,17 @@ def read_questions(path: Path, dataset: str | None = None) -> tuple[Question, ..
     if is_foreign(path):
         return _each_once(read_foreign(path))
     questions: dict[str, Question] = {}
-    for row in read_query_rows(path):
+    for at, row in query_files.read_query_rows(path):
         kind = row.kind or KINDS[0]
         if kind not in ALL_KINDS:
-            raise DataError(f"{row.at}: unknown kind '{printable(kind, 40)}'; known: {', '.join(ALL_KINDS)}")
+            raise DataError(f"{at}: unknown kind '{printable(kind, 40)}'; known: {', '.join(ALL_KINDS)}")
         if "/" not in row.scene and dataset is None:
-            raise DataError(f"{row.at}: of which dataset is scene '{printable(row.scene, 60)}'? write dataset/scene")
+            raise DataError(f"{at}: of which dataset is scene '{printable(row.scene, 60)}'? write dataset/scene")
         scene = f"{dataset}/{row.scene}" if dataset and "/" not in row.scene else row.scene
         source = row.source or printable(path.name, 100)
         question = new_question(scene, kind, row.text, row.objects or None, source)
         if question.id in questions:
-            raise DataError(f"{row.at}: '{printable(row.text, 60)}' stands there twice for {printable(scene, 60)}")
+            raise DataError(f"{at}: '{printable(row.text, 60)}' stands there twice for {printable(scene, 60)}")
         questions[question.id] = question
     return tuple(questions.values())
 
@@ -144,7 +137,7 @@ def csv_text(questions: Sequence[Question]) -> str:
     """The set as rows."""
     text = io.StringIO(newline="")
     rows = csv.writer(text, lineterminator="\n")
-    rows.writerow((*COLUMNS, *MORE_COLUMNS))
+    rows.writerow((*COLUMNS, *query_files.MORE_COLUMNS))
     for question in questions:
         objects = " ".join(map(str, question.answers or ()))
         rows.writerow(map(no_formula, (question.scene, question.text, objects, question.kind, question.source)))
@@ -262,15 +255,15 @@ def _scanrefer(rows: list[Any], where: str) -> Iterator[Question]:
 
 def _nr3d(text: str, where: str) -> Iterator[Question]:
     """The utterances, in the groups of the file where it has such columns."""
-    try:
-        lines = list(csv.DictReader(io.StringIO(text, newline=""), strict=True))
-    except csv.Error as error:
-        raise DataError(f"{where}: not CSV ({printable(str(error), 120)}); {ADVICE}") from error
+    header, *cells = query_files.csv_rows(text, where) or [[]]
+    lines = [dict(zip(header, row, strict=False)) for row in cells if row]
     for number, row in enumerate(_rows(_Nr3D, lines, where, "row", 2), 2):
         question = new_question(f"{DATASET}/{row.scan_id}", "relative", row.utterance, (row.target_id + 1,), "Nr3D")
         groups: tuple[str, ...] = ()
         if row.stimulus_id is not None:
-            groups = nr3d_groups(row.stimulus_id, row.tokens, row.mentions_target_class, f"{where}: row {number}")
+            groups = query_files.nr3d_groups(
+                row.stimulus_id, row.tokens, row.mentions_target_class, f"{where}: row {number}"
+            )
         yield replace(question, groups=groups)
 
 

@@ -27,7 +27,7 @@ from su3d_bench.metrics.questions.score import RefinedNames
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.perception.detections import is_background
 from su3d_bench.perception.language.captioner import REFINE, REFINE_FORM, list_of_names, reason_of
-from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig
+from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig, Reply
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.perception.language.parsing import chosen_name
 from su3d_bench.store.run_folder import JobFolder
@@ -48,16 +48,15 @@ class FilterConfig(BaseModel):
 
 def undesired(instances: Instances, names: Sequence[str], config: FilterConfig) -> tuple[str, ...]:
     """Why each instance is left out under its label n' in ``names``; '' where it stays."""
-    fractions = _map_fractions(instances)
-    return tuple(_reason(name, float(share), config) for name, share in zip(names, fractions, strict=True))
-
-
-def _reason(name: str, fraction: float, config: FilterConfig) -> str:
-    if is_background(name, config.background_names):
-        return f"'{printable(name, 60)}' is background"
-    if fraction > config.max_map_fraction:
-        return f"its box has {100 * fraction:.0f} % of the map's area from above"
-    return ""
+    reasons = []
+    for name, fraction in zip(names, _map_fractions(instances).tolist(), strict=True):
+        reason = f"its box has {100 * fraction:.0f} % of the map's area from above"
+        if is_background(name, config.background_names):
+            reason = f"'{printable(name, 60)}' is background"
+        elif fraction <= config.max_map_fraction:
+            reason = ""
+        reasons.append(reason)
+    return tuple(reasons)
 
 
 def _map_fractions(instances: Instances) -> Float64Array:
@@ -122,7 +121,7 @@ def vote(top: TopNames) -> RefinedName:
     'couch'
     """
     if not top.names:
-        return RefinedName(top.label, "label", "no view has a name")
+        return _unnamed(top)
     totals: dict[tuple[str, ...], float] = {}
     spelling: dict[tuple[str, ...], str] = {}
     for name, score in zip(top.names, top.scores, strict=True):
@@ -161,18 +160,18 @@ class ModelRefiner:
         """n' of each instance: the model's name where it can be used, else n with the reason."""
         requests = self.requests(tops)
         answers = iter(zip(requests, self._model.ask_all(requests), strict=True))
-        refined = []
-        for top in tops:
-            if not top.names:
-                refined.append(RefinedName(top.label, "label", "no view has a name"))
-                continue
-            request, reply = next(answers)
-            name = None if reply.failure else chosen_name(reply.text, top.names)
-            if name is None:
-                refined.append(RefinedName(top.label, "label", reason_of(reply), request.key))
-            else:
-                refined.append(RefinedName(name, "model", "", request.key))
-        return refined
+        return [_chosen(top, *next(answers)) if top.names else _unnamed(top) for top in tops]
+
+
+def _chosen(top: TopNames, request: ChatRequest, reply: Reply) -> RefinedName:
+    name = None if reply.failure else chosen_name(reply.text, top.names)
+    if name is None:
+        return RefinedName(top.label, "label", reason_of(reply), request.key)
+    return RefinedName(name, "model", "", request.key)
+
+
+def _unnamed(top: TopNames) -> RefinedName:
+    return RefinedName(top.label, "label", "no view has a name")
 
 
 log = logging.getLogger(__name__)
@@ -198,7 +197,7 @@ class NameRecord(BaseModel):
     id: int
     label: str
     refined: str
-    source: Literal["model", "vote", "label"]
+    source: Source
     reason: str
     candidates: tuple[str, ...]
     request: str

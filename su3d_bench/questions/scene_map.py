@@ -18,16 +18,8 @@ from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array, WholeObject
 from su3d_bench.metrics.questions.score import RefinedNames, labels_n
-from su3d_bench.numerics.relations import (
-    BUILT_IN,
-    FIXTURES,
-    RELATIONS,
-    SURFACES,
-    Relation,
-    Relations,
-    is_between,
-    may_be_between,
-)
+from su3d_bench.numerics import relations as geometry
+from su3d_bench.numerics.relations import BUILT_IN, FIXTURES, RELATIONS, SURFACES, Relation, Relations
 from su3d_bench.perception.embedded.lexicon import GROUPS, SYNONYMS, vocabulary
 from su3d_bench.questions.sight import WITHOUT_COLOUR, Looks, Sight, instance_rows, looks_of
 
@@ -79,12 +71,8 @@ class SceneMap:
     def __len__(self) -> int:
         return len(self.objects)
 
-    @cached_property
-    def _by_id(self) -> dict[int, MapObject]:
-        return {thing.id: thing for thing in self.objects}
-
     def by_id(self, object_id: int) -> MapObject:
-        return self._by_id[object_id]
+        return self.objects[self._row_of[object_id]]
 
     @cached_property
     def relations(self) -> Relations:
@@ -102,25 +90,22 @@ class SceneMap:
 
     def is_doubtful(self, relation: Relation, subject: MapObject, other: MapObject) -> bool:
         """Whether a slightly other threshold, another reading or an object that is seen whole may decide otherwise."""
-        return bool(self.doubtful(relation)[self._row_of[subject.id], self._row_of[other.id]])
-
-    def doubtful(self, relation: Relation) -> BoolArray:
-        """The doubtful pairs (K, K) by their rows here."""
-        return self._doubtful[relation]
+        return bool(self.doubtful[relation][self._row_of[subject.id], self._row_of[other.id]])
 
     @cached_property
-    def _doubtful(self) -> dict[Relation, BoolArray]:
+    def doubtful(self) -> dict[Relation, BoolArray]:
+        """The doubtful pairs (K, K) of each relation by their rows here."""
         is_cut = np.array([thing.is_cut for thing in self.objects], bool)
         beside_cut = (is_cut[:, None] | is_cut[None]) & self.relations.near
         return {relation: self.relations.doubtful(relation) | beside_cut for relation in RELATIONS}
 
     def is_between(self, thing: MapObject, first: MapObject, second: MapObject) -> bool:
         """Whether an object stands between two others; what one of them holds, or stands on, does not."""
-        return is_between(thing.box, first.box, second.box) and not self._is_of(thing, first, second)
+        return geometry.is_between(thing.box, first.box, second.box) and not self._is_of(thing, first, second)
 
     def may_be_between(self, thing: MapObject, first: MapObject, second: MapObject) -> bool:
         """Whether some people would say that an object stands between two others."""
-        return may_be_between(thing.box, first.box, second.box) and not self._is_of(thing, first, second)
+        return geometry.may_be_between(thing.box, first.box, second.box) and not self._is_of(thing, first, second)
 
     def _is_of(self, thing: MapObject, *ends: MapObject) -> bool:
         """Whether an object is one of ``ends``, or holds or is held by one."""
@@ -232,9 +217,8 @@ def meant_by(noun: str, scene: SceneMap, nearest: NearestName | None = None) -> 
         if held:
             return Meant(held)
     if noun_words[0] in GATHERED and noun_words[1:2] == ("of",):
-        return meant_by(
-            " ".join(noun_words[2:]), scene, nearest
-        )  # of which a map may know the single ones, or one of all
+        # of which a map may know the single ones, or one of all
+        return meant_by(" ".join(noun_words[2:]), scene, nearest)
     if noun_words in _class_of_words():
         return Meant(())  # a word that is known, for a thing that is not there
     return _by_encoder(noun, scene, nearest)

@@ -74,7 +74,9 @@ def sights(dataset: Any, scene: str, truth: GroundTruth, min_vertices: int) -> M
     is_inside = np.zeros(len(points), bool)
     for frame in looked_at(dataset, scene):
         seen, line, column = _seen(frame, points)
-        is_inside[seen] |= _is_off_the_border(frame, line, column)
+        height, width = frame.depth_m.shape
+        from_border = np.minimum.reduce([line, height - 1 - line, column, width - 1 - column])
+        is_inside[seen] |= from_border >= BORDER_SHARE * max(height, width)
         side = max(frame.depth_m.shape) / CELLS_A_SIDE
         n_lines, n_columns = np.ceil(np.array(frame.depth_m.shape) / side).astype(np.int64)
         cell = (line / side).astype(np.int64) * n_columns + (column / side).astype(np.int64)
@@ -95,15 +97,6 @@ def sights(dataset: Any, scene: str, truth: GroundTruth, min_vertices: int) -> M
         is_cut = _is_cut(points[own], is_inside[own])
         found[instance] = Sight(shares[instance], word, is_sure, is_cut, maybe_colours([rgb, *lights]), *tones)
     return found
-
-
-def _is_off_the_border(frame: Frame, line: Int64Array, column: Int64Array) -> BoolArray:
-    height, width = frame.depth_m.shape
-    border = BORDER_SHARE * max(height, width)
-    is_off: BoolArray = (np.minimum(line, height - 1 - line) >= border) & (
-        np.minimum(column, width - 1 - column) >= border
-    )
-    return is_off
 
 
 def _is_cut(points: Float64Array, is_inside: BoolArray) -> bool:
@@ -276,12 +269,12 @@ def _build(name: str, sides: Float64Array) -> tuple[frozenset[str], frozenset[st
     if last_word(name) in SOFT | FIXTURES:
         return frozenset(), frozenset()
     rise, stretch = height / max(length, 1e-6), min(length / max(width, 1e-6), 2 * length / max(height, 1e-6))
-    sure = [
-        *(["tall"] if rise >= TALL and height >= LEAST_BUILD_M else []),
-        *(["long"] if stretch >= LONG and length >= LEAST_BUILD_M else []),
-    ]
-    maybe = [*(["tall"] if rise >= MAYBE_TALL else []), *(["long"] if stretch >= MAYBE_LONG else [])]
-    return frozenset(sure), frozenset(maybe)
+    is_tall, is_long = height >= LEAST_BUILD_M and rise >= TALL, length >= LEAST_BUILD_M and stretch >= LONG
+    return _words(tall=is_tall, long=is_long), _words(tall=rise >= MAYBE_TALL, long=stretch >= MAYBE_LONG)
+
+
+def _words(**holds: bool) -> frozenset[str]:
+    return frozenset(word for word, is_so in holds.items() if is_so)
 
 
 def _shape(points: Float64Array, *, has_top: bool) -> tuple[Float64Array, frozenset[str], frozenset[str]]:
@@ -300,26 +293,23 @@ def _shape(points: Float64Array, *, has_top: bool) -> tuple[Float64Array, frozen
         face = np.stack([along, points[:, 2].astype(np.float32)], axis=1)
     _, (a, b), _ = cv2.minAreaRect(face)
     area, rectangle = float(cv2.contourArea(cv2.convexHull(face))), float(a * b)
-    across = _longest_way(cv2.convexHull(face)[:, 0])
+    corners = cv2.convexHull(face)[:, 0]
+    across = float(np.linalg.norm(corners[:, None] - corners[None], axis=2).max())
     if not rectangle or not min(a, b):
         return sides, frozenset(), SHAPES
     roundness, straightness, ratio = 4 * area / (np.pi * across**2), area / rectangle, max(a, b) / min(a, b)
-    words = [
-        *(["round"] if roundness >= ROUND else []),
-        *(["square"] if straightness >= STRAIGHT and ratio <= SQUARE else []),
-        *(["rectangular"] if straightness >= STRAIGHT and ratio >= MAYBE_SQUARE else []),
-    ]
-    maybe = [
-        *(["round"] if roundness >= MAYBE_ROUND else []),
-        *(["square"] if straightness >= MAYBE_STRAIGHT and ratio <= MAYBE_SQUARE else []),
-        *(["rectangular"] if straightness >= MAYBE_STRAIGHT and ratio >= SQUARE else []),
-    ]
-    return sides, frozenset(words), frozenset(maybe)
-
-
-def _longest_way(corners: np.ndarray) -> float:
-    """The greatest distance between two of the corners (C, 2) of a hull, of which there are few."""
-    return float(np.linalg.norm(corners[:, None] - corners[None], axis=2).max())
+    is_straight, may_be_straight = straightness >= STRAIGHT, straightness >= MAYBE_STRAIGHT
+    words = _words(
+        round=roundness >= ROUND,
+        square=is_straight and ratio <= SQUARE,
+        rectangular=is_straight and ratio >= MAYBE_SQUARE,
+    )
+    maybe = _words(
+        round=roundness >= MAYBE_ROUND,
+        square=may_be_straight and ratio <= MAYBE_SQUARE,
+        rectangular=may_be_straight and ratio >= SQUARE,
+    )
+    return sides, words, maybe
 
 
 # A word for more of a measure, one for less where people have one that says nothing else, and how much more the

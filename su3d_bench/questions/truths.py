@@ -14,16 +14,8 @@ from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.open_vocabulary.score import QueryTruth, TextQuery
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.questions.score import (
-    AnnotationTruth,
-    AskedText,
-    GivenAnswer,
-    PresenceTruth,
-    ReasoningTruth,
-    RefinedNames,
-    RetrievalTruth,
-    TrueAnswer,
-)
+from su3d_bench.metrics.questions import score
+from su3d_bench.metrics.questions.score import AnnotationTruth, GivenAnswer, PresenceTruth, RefinedNames, TrueAnswer
 from su3d_bench.metrics.scoring import QuestionTruth
 from su3d_bench.questions.chains import chain_truth
 from su3d_bench.questions.generated import counted_rooms, generate_questions, presence_questions
@@ -91,7 +83,7 @@ def question_truth(
         questions = generate(f"{dataset.name}/{scene}", objects, rules.per_kind)
     if rules.kind == "queries":
         return _query_truth(questions, truth)
-    return RetrievalTruth(truth, tuple(_asked(question, objects) for question in questions))
+    return score.RetrievalTruth(truth, tuple(_asked(question, objects) for question in questions))
 
 
 def _query_truth(questions: Sequence[Question], truth: GroundTruth) -> QueryTruth:
@@ -104,10 +96,10 @@ def _query_truth(questions: Sequence[Question], truth: GroundTruth) -> QueryTrut
     return QueryTruth(truth.points, owner, queries, truth.variant, truth.source, truth.labels.space)
 
 
-def _asked(question: Question, objects: SceneMap) -> AskedText:
+def _asked(question: Question, objects: SceneMap) -> score.AskedText:
     answers = question.answers or ()
     by_chance = len(answers) / max(1, len(objects))
-    return AskedText(question.kind, question.text, answers, by_chance, right_by_name(question, objects))
+    return score.AskedText(question.kind, question.text, answers, by_chance, right_by_name(question, objects))
 
 
 def scene_objects(dataset: Any, scene: str, truth: GroundTruth, min_vertices: int) -> SceneMap:
@@ -137,7 +129,7 @@ def _annotation_truth(min_vertices: int, truth: GroundTruth, refine: Refine) -> 
 
 def _reasoning_truth(
     rules: ProtocolRules, truth: GroundTruth, objects: SceneMap, refine: Refine, solver: MapSolver | None
-) -> ReasoningTruth:
+) -> score.ReasoningTruth:
     questions = generate_questions(objects, n_each=rules.per_kind or len(objects) ** 2)
     known = {thing.id for thing in objects.objects}
     true = [
@@ -153,7 +145,7 @@ def _reasoning_truth(
         answers = (solver.ask if solver else built_in(encoder))(scene, [question.text for question in true])
         return [given_answer(*both, scene) for both in zip(true, answers, strict=True)]
 
-    return ReasoningTruth(truth, tuple(true), solve, solver.name if solver else BUILT_IN)
+    return score.ReasoningTruth(truth, tuple(true), solve, solver.name if solver else BUILT_IN)
 
 
 def questions_of(dataset: Any, scene: str, *, per_kind: int | None = None, own: bool = True) -> tuple[Question, ...]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import json
 import os
 import re
 import stat
@@ -25,21 +24,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from su3d_bench.core import registry
 from su3d_bench.core.config import MOVES_NO_NUMBER, Setting, Settings
-from su3d_bench.core.digests import digest_bytes, digest_file
+from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import StoreError, Su3dError, counted, printable, shown
-from su3d_bench.core.files.atomic import (
-    Allowance,
-    TemporaryFolder,
-    UnpackingError,
-    allowance_of,
-    check_member,
-    is_file,
-    make_folder,
-    member_bytes,
-    read_arrays,
-    read_json,
-    replacing,
-)
+from su3d_bench.core.files import atomic
+from su3d_bench.core.files.atomic import TemporaryFolder, is_file, make_folder, replacing
 from su3d_bench.core.printing import escaped_json
 from su3d_bench.core.system.devices import device_for
 from su3d_bench.core.system.files import file_bytes, opened, regular
@@ -98,10 +86,10 @@ class Manifest(BaseModel):
     trained_on: Annotated[str, Field(max_length=MOST_OF_A_REMARK)] = ""
 
 
-def write_bundle(place: Path, recipe: str, recipe_file: bytes, runs: Sequence[Path], out: Path) -> None:
+def write_bundle(place: Path, recipe: str, recipe_file: Path, runs: Sequence[Path], out: Path) -> None:
     """The archive at ``place`` of the ``runs`` of a recipe and of what ``out`` holds beside them, whole or not."""
     beside = {name: out / name for name in (COMPARED, TABLES) if is_file(out / name)}
-    _write(place, runs, beside, {"recipe": recipe}, recipe_file)
+    _write(place, runs, {**beside, RECIPE: recipe_file}, {"recipe": recipe})
 
 
 def bundle_runs(place: Path, runs: Sequence[Path], trained_on: str = "") -> None:
@@ -118,20 +106,12 @@ def bundle_runs(place: Path, runs: Sequence[Path], trained_on: str = "") -> None
     _write(place, whole, {}, {"recipe": "", **said})
 
 
-def _write(
-    place: Path,
-    runs: Sequence[Path],
-    beside: Mapping[str, Path],
-    about: Mapping[str, str],
-    recipe_file: bytes | None = None,
-) -> None:
+def _write(place: Path, runs: Sequence[Path], beside: Mapping[str, Path], about: Mapping[str, str]) -> None:
     sources = dict(beside)
     names = [f"{RUNS}/{folder.name}" for folder in runs]
     for folder, name in zip(runs, names, strict=True):
         sources |= {f"{name}/{file.relative_to(folder).as_posix()}": file for file in _files_of(folder)}
     entries = {name: {"n_bytes": file.stat().st_size, "sha256": digest_file(file)} for name, file in sources.items()}
-    if recipe_file is not None:
-        entries[RECIPE] = {"n_bytes": len(recipe_file), "sha256": digest_bytes(recipe_file)}
     manifest = {
         "schema": 1,
         "program": f"su3d-bench {__version__}",
@@ -143,10 +123,7 @@ def _write(
     with replacing(place) as stream, zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
         archive.writestr(_member(MANIFEST), escaped_json(manifest, indent=1) + "\n")
         for name in sorted(entries):
-            if name == RECIPE and recipe_file is not None:
-                archive.writestr(_member(name), recipe_file)
-            else:
-                _add(archive, name, sources[name], str(entries[name]["sha256"]))
+            _add(archive, name, sources[name], str(entries[name]["sha256"]))
 
 
 def _member(name: str) -> zipfile.ZipInfo:
@@ -157,14 +134,11 @@ def _member(name: str) -> zipfile.ZipInfo:
 
 def _add(archive: zipfile.ZipFile, name: str, file: Path, sha256: str) -> None:
     """A file in pieces; a ``StoreError`` where it changes meanwhile."""
-    digest = hashlib.sha256()
     info = _member(name)
     info.file_size = file.stat().st_size
     with opened(file) as source, archive.open(info, "w") as member:
-        while piece := source.read(PIECE):
-            digest.update(piece)
-            member.write(piece)
-    if digest.hexdigest() != sha256:
+        digest = copy_pieces(source, member)
+    if digest != sha256:
         raise StoreError(f"{shown(file)}: changed while it was packed; pack again when its run has ended")
 
 
@@ -203,12 +177,12 @@ def unpack(bundle: Path, into: Path, keep: Callable[[str], bool] = lambda name: 
     try:
         with zipfile.ZipFile(regular(bundle)) as archive:
             members = _members(archive, where)
-            allowance = allowance_of(archive)
-            manifest = _manifest(member_bytes(archive, members[MANIFEST], allowance), where)
+            allowance = atomic.allowance_of(archive)
+            manifest = _manifest(atomic.member_bytes(archive, members[MANIFEST], allowance), where)
             _refuse_others(members, manifest, where)
             for name, entry in manifest.files.items():
                 _unpack_one(archive, members[name], entry, into if keep(name) else None, allowance, where)
-    except (zipfile.BadZipFile, UnpackingError, EOFError, NotImplementedError, zlib.error) as error:
+    except (zipfile.BadZipFile, atomic.UnpackingError, EOFError, NotImplementedError, zlib.error) as error:
         raise StoreError(f"{where}: is no bundle, or damaged: {printable(str(error), 160)}") from error
     except OSError as error:
         raise StoreError(f"{where}: cannot be unpacked: {error.strerror or error}") from error
@@ -246,24 +220,18 @@ def is_safe(name: str) -> bool:
 
 def _manifest(content: bytes, where: str) -> Manifest:
     try:
-        value = json.loads(content)
-        value = {**value, "runs": tuple(value.get("runs", ()))} if isinstance(value, Mapping) else value
-        return Manifest.model_validate(value)
+        return Manifest.model_validate_json(content)
     except ValidationError as error:
         key = printable(".".join(map(str, error.errors()[0]["loc"])), 120)
         raise StoreError(f"{where}: {MANIFEST}: {key or 'it'} is not as a bundle has it") from error
-    except (ValueError, RecursionError, TypeError) as error:
-        raise StoreError(f"{where}: {MANIFEST} is no JSON of a bundle") from error
 
 
 def _refuse_others(members: Mapping[str, zipfile.ZipInfo], manifest: Manifest, where: str) -> None:
     named = {*manifest.files, MANIFEST}
-    missing = sorted(named - set(members))
-    beside = sorted(set(members) - named)
-    if missing:
-        raise StoreError(f"{where}: {counted(len(missing), 'file')} of its manifest missing, such as {_one(missing)}")
-    if beside:
-        raise StoreError(f"{where}: {counted(len(beside), 'file')} beside its manifest, such as {_one(beside)}")
+    wrong = {"of its manifest missing": named - set(members), "beside its manifest": set(members) - named}
+    for what, names in wrong.items():
+        if names:
+            raise StoreError(f"{where}: {counted(len(names), 'file')} {what}, such as {printable(min(names), 120)}")
     for name in manifest.runs:
         if not is_safe(name) or f"{name}/run.json" not in manifest.files:
             raise StoreError(
@@ -271,36 +239,35 @@ def _refuse_others(members: Mapping[str, zipfile.ZipInfo], manifest: Manifest, w
             )
 
 
-def _one(names: Sequence[str]) -> str:
-    return printable(names[0], 120)
-
-
 def _unpack_one(
-    archive: zipfile.ZipFile, info: zipfile.ZipInfo, entry: Entry, into: Path | None, allowance: Allowance, where: str
+    archive: zipfile.ZipFile,
+    info: zipfile.ZipInfo,
+    entry: Entry,
+    into: Path | None,
+    allowance: atomic.Allowance,
+    where: str,
 ) -> None:
-    """``into`` None: the member is held against its entry and not written."""
+    """``into`` None: the member is compared with its entry and not written."""
     if info.file_size != entry.n_bytes:
         said = f"has {info.file_size} bytes, its manifest says {entry.n_bytes}"
         raise StoreError(f"{where}: {printable(info.filename, 120)} {said}")
-    check_member(info, allowance)
-    if into is None:
-        with archive.open(info) as member:
-            digest = _copy(member, None)
-    else:
+    atomic.check_member(info, allowance)
+    place = Path(os.devnull)
+    if into is not None:
         place = into / info.filename
         make_folder(place.parent)
-        with archive.open(info) as member, place.open("xb") as out:
-            digest = _copy(member, out)
+    with archive.open(info) as member, place.open("wb" if into is None else "xb") as out:
+        digest = copy_pieces(member, out)
     if digest != entry.sha256:
         raise StoreError(f"{where}: {printable(info.filename, 120)} is not the file of its manifest (other SHA-256)")
 
 
-def _copy(source: IO[bytes], out: IO[bytes] | None) -> str:
+def copy_pieces(source: IO[bytes], out: IO[bytes]) -> str:
+    """Copy a file; the SHA-256 of its content."""
     digest = hashlib.sha256()
     while piece := source.read(PIECE):
         digest.update(piece)
-        if out is not None:
-            out.write(piece)
+        out.write(piece)
     return digest.hexdigest()
 
 
@@ -342,9 +309,7 @@ def verify_bundle(bundle: Path) -> Verified:
 
 def _faults_of(run: FinishedRun, found: Verified, folder: Path) -> Iterator[str]:
     wrong = [f"{where}: {what}" for where, what in wrong_files(run) if not what.startswith("done.json")]
-    yield from wrong
-    if not wrong:
-        yield from _rescored(run, found, folder)
+    yield from wrong or _rescored(run, found, folder)
 
 
 def _rescored(run: FinishedRun, found: Verified, folder: Path) -> Iterator[str]:
@@ -353,8 +318,8 @@ def _rescored(run: FinishedRun, found: Verified, folder: Path) -> Iterator[str]:
     anew = _of_predictions(run) if run.record.predictions else _of_maps(run, folder)
     for scene, method, scores in anew:
         counts = run.folder.job(scene, method).counts
-        kept = read_arrays(io.BytesIO(file_bytes(counts)))
-        ours = read_arrays(io.BytesIO(pack_scores(scores)))
+        kept = atomic.read_arrays(io.BytesIO(file_bytes(counts)))
+        ours = atomic.read_arrays(io.BytesIO(pack_scores(scores)))
         found.n_scores += len(scores)
         fault = difference(kept, ours, to_the_bit=is_same_machine)
         found.is_to_the_bit &= difference(kept, ours, to_the_bit=True) is None
@@ -379,12 +344,9 @@ def difference(kept: Mapping[str, NDArray[Any]], ours: Mapping[str, NDArray[Any]
         if before.dtype != now.dtype or before.shape != now.shape:
             forms = f"{before.dtype} of {before.shape}, its map gives {now.dtype} of {now.shape}"
             return f"'{printable(name, 100)}' is {forms}"
-        if before.tobytes() == now.tobytes():
-            continue
-        if (
-            before.dtype.kind == "f"
-            and not to_the_bit
-            and np.allclose(before, now, rtol=0, atol=TOLERANCE, equal_nan=True)
+        is_near = before.dtype.kind == "f" and not to_the_bit
+        if before.tobytes() == now.tobytes() or (
+            is_near and np.allclose(before, now, rtol=0, atol=TOLERANCE, equal_nan=True)
         ):
             continue
         places = np.flatnonzero((before != now).ravel())
@@ -473,7 +435,7 @@ def _cells(unpacked: Unpacked, found: Verified) -> Iterator[str]:
     if not is_file(unpacked.folder / COMPARED):
         return
     recipe = parse_recipe(file_bytes(unpacked.folder / RECIPE), RECIPE)
-    kept = read_json(unpacked.folder / COMPARED)
+    kept = atomic.read_json(unpacked.folder / COMPARED)
     cells = kept.get("cells") if isinstance(kept, dict) else None
     if not isinstance(cells, list) or not all(isinstance(cell, dict) for cell in cells):
         raise StoreError(f"{COMPARED} is not as a reproduction writes it")

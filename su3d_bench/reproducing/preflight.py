@@ -56,7 +56,7 @@ class Preflight:
         return tuple(need for need in self.needs if not need.is_here and need.is_required)
 
     def to_json(self) -> dict[str, Any]:
-        return {"needs": [asdict(need) for need in self.needs]}
+        return asdict(self)
 
 
 def preflight(runs: Sequence[AskedRun]) -> Preflight:

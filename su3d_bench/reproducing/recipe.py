@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import fnmatch
+import json
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -149,20 +151,20 @@ def recipe_names() -> tuple[str, ...]:
 
 def load_recipe(name: str) -> Recipe:
     """The recipe of this name, or the one in this file of somebody's own; ``ConfigError`` where it is none."""
-    return parse_recipe(recipe_bytes(name), printable(Path(name).name if name.endswith(".toml") else name, 100))
-
-
-def recipe_bytes(name: str) -> bytes:
-    """The file of a recipe, of the program's own or by path."""
-    if not name.endswith(".toml") and name not in recipe_names():
-        hint = suggest(name, recipe_names())
-        raise ConfigError(f"no recipe is called '{printable(name, 80)}'{hint}; or name a file of your own, mine.toml")
-    path = Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
+    path = recipe_file(name)
     with reading(printable(str(path), 200), ConfigError):
         content = file_bytes(path)
     if len(content) > MOST_BYTES:
         raise ConfigError(f"{printable(path.name, 100)}: has {len(content)} bytes; expected at most {MOST_BYTES}")
-    return content
+    return parse_recipe(content, printable(path.name if name.endswith(".toml") else name, 100))
+
+
+def recipe_file(name: str) -> Path:
+    """The file of a recipe, of the program's own or by path."""
+    if not name.endswith(".toml") and name not in recipe_names():
+        hint = suggest(name, recipe_names())
+        raise ConfigError(f"no recipe is called '{printable(name, 80)}'{hint}; or name a file of your own, mine.toml")
+    return Path(name) if name.endswith(".toml") else FOLDER / f"{name}.toml"
 
 
 def parse_recipe(content: bytes, shown: str) -> Recipe:
@@ -172,7 +174,7 @@ def parse_recipe(content: bytes, shown: str) -> Recipe:
     except ValueError as error:
         raise ConfigError(f"{shown}: is no TOML: {printable(str(error), 200)}") from error
     try:
-        recipe = Recipe.model_validate(_tuples(table))
+        recipe = Recipe.model_validate_json(json.dumps(table, default=str))  # JSON has lists where tuples are meant
         for experiment in recipe.experiments:
             experiment.printed()
     except ValidationError as error:
@@ -180,13 +182,6 @@ def parse_recipe(content: bytes, shown: str) -> Recipe:
     except ConfigError as error:
         raise ConfigError(f"{shown}: {error}") from error
     return recipe
-
-
-def _tuples(value: object) -> object:
-    """``value`` with tuples for lists: a strict model takes no list for a tuple."""
-    if isinstance(value, Mapping):
-        return {key: _tuples(item) for key, item in value.items()}
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 def _explained(error: ValidationError) -> str:
@@ -268,47 +263,38 @@ def asked_runs(recipe: Recipe, experiments: Sequence[Experiment], asked: Asked) 
 
     A ``ConfigError`` for a method, protocol or dataset that is not known.
     """
-    found: dict[tuple[str, str, int], AskedRun] = {}
+    parts: dict[tuple[str, str, int], list[tuple[Experiment, tuple[str, ...]]]] = {}
     for experiment in experiments:
-        methods = methods_of(experiment)
-        for method in methods:
+        for method in methods_of(experiment):
             named_method(method)
         encoder = asked.encoder or experiment.encoder or recipe.encoder
         for dataset, scenes in _by_dataset(experiment, asked).items():
-            key = dataset, encoder, experiment.stride
-            run = found.get(key) or AskedRun(
-                name="",
-                dataset=dataset,
-                profile=asked.profile or recipe.profile,
-                encoder=encoder,
-                stride=experiment.stride,
-                scenes=(),
-                methods=(),
-                protocols=(),
-                settings=(*recipe.settings, f"perception.models.encoder={encoder}", *asked.assignments),
-                experiments=(),
-                device=asked.device,
-                values=dict(asked.values),
-            )
-            found[key] = replace(
-                run,
-                scenes=_joined(run.scenes, scenes),
-                methods=_joined(run.methods, methods),
-                protocols=_joined(run.protocols, _fitting(experiment, dataset)),
-                experiments=_joined(run.experiments, (experiment.name,)),
-                rows=_joined(run.rows, sweep_rows(experiment)),
-            )
+            parts.setdefault((dataset, encoder, experiment.stride), []).append((experiment, scenes))
     usual = asked.encoder or recipe.encoder
-    return tuple(replace(run, name=_name(run, usual)) for run in found.values() if run.methods)
+    runs = []
+    for (dataset, encoder, stride), mine in parts.items():
+        named = dataset, encoder if encoder != usual else "", f"stride{stride}" if stride else ""
+        run = AskedRun(
+            name="-".join(filter(None, named)),
+            dataset=dataset,
+            profile=asked.profile or recipe.profile,
+            encoder=encoder,
+            stride=stride,
+            scenes=_joined(scenes for _, scenes in mine),
+            methods=_joined(methods_of(one) for one, _ in mine),
+            protocols=_joined(_fitting(one, dataset) for one, _ in mine),
+            settings=(*recipe.settings, f"perception.models.encoder={encoder}", *asked.assignments),
+            experiments=tuple(one.name for one, _ in mine),
+            rows=_joined(sweep_rows(one) for one, _ in mine),
+            device=asked.device,
+            values=dict(asked.values),
+        )
+        runs += [run] if run.methods else []
+    return tuple(runs)
 
 
-def _joined(first: Sequence[Any], second: Sequence[Any]) -> tuple[Any, ...]:
-    return tuple(dict.fromkeys([*first, *second]))
-
-
-def _name(run: AskedRun, usual: str) -> str:
-    stride = f"stride{run.stride}" if run.stride else ""
-    return "-".join(filter(None, (run.dataset, run.encoder if run.encoder != usual else "", stride)))
+def _joined(parts: Iterable[Sequence[Any]]) -> tuple[Any, ...]:
+    return tuple(dict.fromkeys(chain.from_iterable(parts)))
 
 
 def _by_dataset(experiment: Experiment, asked: Asked) -> dict[str, tuple[str, ...]]:
@@ -408,21 +394,13 @@ def named_predictions(
 ) -> dict[str, Given]:
     """What ``METHOD=DIR`` and ``METHOD=FILE`` give, by printed method.
 
-    Raises ``ConfigError`` for a method of which no experiment takes predictions or that is named twice, for what is
-    not there, and for one folder under two names.
+    Raises ``ConfigError`` for a method of which no experiment takes predictions or that is named twice, and for what is
+    not there.
     """
     places = _named(
         "--predictions", "DIR", dict.fromkeys(name for one in experiments for name in one.predictions), texts
     )
     features = _named("--text-features", "FILE", places, text_features)
-    methods: dict[Path, str] = {}
-    for method, place in places.items():
-        other = methods.setdefault(place.resolve(), method)
-        if other != method:
-            raise ConfigError(
-                f"--predictions {printable(method, 60)}: {printable(str(place), 200)} was given for "
-                f"{printable(other, 60)}; each method has a folder of its own"
-            )
     return {method: Given(place, features.get(method)) for method, place in places.items()}
 
 

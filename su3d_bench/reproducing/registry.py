@@ -20,7 +20,7 @@ from su3d_bench.metrics.costs import MAP, TOTAL, WARM_UP, summarise
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.perception.models.catalogue import MODELS, encoder_known_as
-from su3d_bench.reproducing.bundle import MANIFEST, PIECE, RUNS, Unpacked, unpack, verify_bundle
+from su3d_bench.reproducing.bundle import MANIFEST, RUNS, Unpacked, copy_pieces, unpack, verify_bundle
 from su3d_bench.runs.existing import existing_run
 from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
 from su3d_bench.store.run_folder import JOBS, RECORDS
@@ -145,7 +145,9 @@ def rows_of_bundle(file: Path) -> tuple[list[Row], list[Refused]]:
 
     A ``StoreError`` where it is no bundle, a ``DataError`` where only a link or a pointer of Git LFS is here.
     """
-    _refuse_pointer(file)
+    with reading(shown(file), StoreError), opened(file) as stream:
+        if stream.read(len(LFS_POINTER)) == LFS_POINTER:
+            raise DataError(f"{shown(file)}: is a pointer of Git LFS, not the bundle itself; get it with: git lfs pull")
     if file.is_symlink():
         raise DataError(f"{shown(file)}: is a link; name or copy the bundle itself")
     with TemporaryFolder("su3d-bundle-") as folder:
@@ -162,17 +164,7 @@ def rows_of_bundle(file: Path) -> tuple[list[Row], list[Refused]]:
         refused: list[Refused] = []
         for each in _rows(unpacked, facts):
             (rows if isinstance(each, Row) else refused).append(each)  # type: ignore[arg-type]
-        return rows, [_without(folder, one) for one in refused]
-
-
-def _refuse_pointer(file: Path) -> None:
-    with reading(shown(file), StoreError), opened(file) as stream:
-        if stream.read(len(LFS_POINTER)) == LFS_POINTER:
-            raise DataError(f"{shown(file)}: is a pointer of Git LFS, not the bundle itself; get it with: git lfs pull")
-
-
-def _without(folder: Path, one: Refused) -> Refused:
-    return Refused(one.run, one.what, one.reason.replace(f"{folder}/", ""))
+        return rows, [replace(one, reason=one.reason.replace(f"{folder}/", "")) for one in refused]
 
 
 def _is_of_a_row(name: str) -> bool:
@@ -265,58 +257,43 @@ N_DIGITS = 12  # of a digest, in a message
 
 def why_not_beside(row: Row, held: Sequence[Row]) -> str | None:
     """Why ``row`` cannot stand in a registry that holds the rows ``held``, with what to do; None where it can."""
-    for other in held:
-        fault = (
-            _rules(row, other) or _data(row, other) or _encoder(row, other) or _name(row, other) or _labels(row, other)
+    return next((f"{row.what}: {fault}" for other in held for fault in _faults_beside(row, other)), None)
+
+
+def _faults_beside(row: Row, other: Row) -> Iterator[str]:
+    where = f"{other.method} in {other.bundle.name}{SUFFIX}"
+    is_of_protocol, is_of_ranking = row.protocol == other.protocol, row.ranking == other.ranking
+    if is_of_protocol and (row.version, row.digest) != (other.version, other.digest):
+        yield (
+            f"its protocol is version {row.version}, digest {row.digest[:N_DIGITS]}, that of {where} is version "
+            f"{other.version}, digest {other.digest[:N_DIGITS]}; score it again by those rules, or begin another "
+            "registry"
         )
-        if fault is not None:
-            return f"{row.what}: {fault}"
-    return None
-
-
-def _rules(row: Row, other: Row) -> str | None:
-    if row.protocol != other.protocol or (row.version, row.digest) == (other.version, other.digest):
-        return None
-    return (
-        f"its protocol is version {row.version}, digest {row.digest[:N_DIGITS]}, that of {_where(other)} is version "
-        f"{other.version}, digest {other.digest[:N_DIGITS]}; score it again by those rules, or begin another registry"
-    )
-
-
-def _data(row: Row, other: Row) -> str | None:
     theirs = dict(other.data)
     for scene, digest in row.data:
         if theirs.get(scene, digest) != digest:
-            return (
-                f"its data of {scene} have the digest {digest[:N_DIGITS]}, those of {_where(other)} "
+            yield (
+                f"its data of {scene} have the digest {digest[:N_DIGITS]}, those of {where} "
                 f"{theirs[scene][:N_DIGITS]}; run it on the same data, settings of the dataset included"
             )
-    return None
-
-
-def _encoder(row: Row, other: Row) -> str | None:
-    """Features are compared with those of texts: under a protocol that names an encoder, of one encoder alone."""
-    if row.protocol != other.protocol or None in (row.encoder, other.encoder):
-        return None
-    if not _names_encoder(row.protocol):
-        return None
-    if row.encoder != other.encoder:
-        return (
-            f"its features are of the encoder {row.encoder}, those of {_where(other)} of {other.encoder}, and the "
-            "protocol is of one encoder; run it with that one"
+    # features are compared with those of texts: under a protocol that names an encoder, of one encoder alone
+    if is_of_protocol and None not in (row.encoder, other.encoder) and _names_encoder(row.protocol):
+        if row.encoder != other.encoder:
+            yield (
+                f"its features are of the encoder {row.encoder}, those of {where} of {other.encoder}, and the "
+                "protocol is of one encoder; run it with that one"
+            )
+        mine, known = ({one.model: one.files for one in each.weights if one.files} for each in (row, other))
+        for model in mine.keys() & known.keys() & MODELS.keys():
+            if MODELS[model].kind == "encoder" and mine[model] != known[model]:
+                yield f"its weights of {model} are not those of {where} (other SHA-256); run it with the same file"
+    if is_of_ranking and row.method.casefold() == other.method.casefold():
+        yield (
+            f"that name is taken by {where} over the same scenes; give the variant its own name, such as "
+            f"{row.method.partition('@')[0]}@KEY=VALUE, or remove the other bundle first"
         )
-    mine, theirs = ({one.model: one.files for one in each.weights if one.files} for each in (row, other))
-    for model in mine.keys() & theirs.keys():
-        if model_is_encoder(model) and mine[model] != theirs[model]:
-            return f"its weights of {model} are not those of {_where(other)} (other SHA-256); run it with the same file"
-    return None
-
-
-def model_is_encoder(model: str) -> bool:
-    """Whether a model of the catalogue encodes crops and texts."""
-    from su3d_bench.perception.models.catalogue import MODELS
-
-    return model in MODELS and MODELS[model].kind == "encoder"
+    if is_of_ranking and not (row.is_ceiling or other.is_ceiling) and row.labels != other.labels:
+        yield f"is of {row.labels}, {where} of {other.labels}; score it with as many labels"
 
 
 def _names_encoder(protocol: str) -> bool:
@@ -324,25 +301,6 @@ def _names_encoder(protocol: str) -> bool:
         return protocol in protocol_names() and load_protocol(protocol).encoder is not None
     except ConfigError:  # somebody's own rules, which their run keeps
         return False
-
-
-def _name(row: Row, other: Row) -> str | None:
-    if row.ranking != other.ranking or row.method.casefold() != other.method.casefold():
-        return None
-    return (
-        f"that name is taken by {_where(other)} over the same scenes; give the variant its own name, such as "
-        f"{row.method.partition('@')[0]}@KEY=VALUE, or remove the other bundle first"
-    )
-
-
-def _labels(row: Row, other: Row) -> str | None:
-    if row.ranking != other.ranking or row.is_ceiling or other.is_ceiling or row.labels == other.labels:
-        return None
-    return f"is of {row.labels}, {_where(other)} of {other.labels}; score it with as many labels"
-
-
-def _where(row: Row) -> str:
-    return f"{row.method} in {row.bundle.name}.zip"
 
 
 BUNDLES = "bundles"
@@ -487,8 +445,7 @@ def _beside(rows: Sequence[Row], others: Sequence[Path], digest: str) -> Iterato
             return
         held += mine
     for row in rows:
-        reason = why_not_beside(row, held)
-        if reason is not None:
+        if reason := why_not_beside(row, held):
             yield reason
         held.append(row)
 
@@ -525,9 +482,8 @@ def _copy(file: Path, place: Path, digest: str) -> None:
     """The file at ``place``, whole or not at all; a ``StoreError`` where it is not the one that was scored."""
     make_folder(place.absolute().parent)
     with reading(shown(file), StoreError), opened(file) as source, replacing(place) as out:
-        while piece := source.read(PIECE):
-            out.write(piece)
-    if _digest(place) != digest:
+        copied = copy_pieces(source, out)
+    if copied != digest:
         place.unlink(missing_ok=True)
         raise StoreError(f"{shown(file)}: changed while it was scored; add it again")
 

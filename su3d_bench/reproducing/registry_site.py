@@ -39,12 +39,9 @@ def write_site(registry: Registry, out: Path, title: str = TITLE, bundles_at: st
     address = _checked_address(bundles_at)
     value = _value(registry, title, address)
     pages = {INDEX: registry_page_html("index", title, _index(value), [_plain_tables(registry)])}
-    for method in value["methods"]:
-        data = _method_page(value, method["name"])
-        pages[method["page"]] = registry_page_html("method", method["name"], {**data, "registry": title})
-    for scene in value["scenes"]:
-        data = _scene_page(value, scene)
-        pages[scene["page"]] = registry_page_html("scene", scene["name"], {**data, "registry": title})
+    for kind, make in (("method", _method_page), ("scene", _scene_page)):
+        for one in value[f"{kind}s"]:
+            pages[one["page"]] = registry_page_html(kind, one["name"], {**make(value, one), "registry": title})
     for folder in ("", METHODS, SCENES):
         make_folder(out / folder)
     # first of all, so that the site is known for one however this ends
@@ -53,8 +50,7 @@ def write_site(registry: Registry, out: Path, title: str = TITLE, bundles_at: st
         write_text(out / name, text)
     for name in earlier - set(pages):
         remove_file(out / name)
-    if earlier - set(pages):
-        write_json(out / DATA, {"kind": KIND, "schema": SCHEMA, "pages": sorted(pages), **value})
+    write_json(out / DATA, {"kind": KIND, "schema": SCHEMA, "pages": sorted(pages), **value})
     return [out / name for name in (*pages, DATA)]
 
 
@@ -170,17 +166,17 @@ def _index(value: Mapping[str, Any]) -> dict[str, Any]:
     return {**value, "boards": boards}
 
 
-def _method_page(value: Mapping[str, Any], method: str) -> dict[str, Any]:
+def _method_page(value: Mapping[str, Any], method: Mapping[str, Any]) -> dict[str, Any]:
     boards = [
         {
             **board,
             "n_ranked": sum(row["ranks"] is not None for row in board["rows"]),
-            "rows": [row for row in board["rows"] if row["method"] == method],
+            "rows": [row for row in board["rows"] if row["method"] == method["name"]],
         }
         for board in value["boards"]
     ]
     pages = {scene["name"]: scene["page"] for scene in value["scenes"]}
-    return {"name": method, "boards": [board for board in boards if board["rows"]], "scene_pages": pages}
+    return {"name": method["name"], "boards": [board for board in boards if board["rows"]], "scene_pages": pages}
 
 
 def _scene_page(value: Mapping[str, Any], scene: Mapping[str, Any]) -> dict[str, Any]:

@@ -5,9 +5,8 @@ Formulas are never evaluated: one that stands in the place of an answer is read 
 
 from __future__ import annotations
 
-import csv
 import unicodedata
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -16,19 +15,18 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError, nearest, printable, some, suggest
 from su3d_bench.core.types import Float64Array, Int64Array, Interval
+from su3d_bench.formats.arrays import read_text
 from su3d_bench.formats.images import read_bytes
-from su3d_bench.formats.tables.table import meant, read_workbook, separated_rows
+from su3d_bench.formats.tables.table import meant, read_workbook
 from su3d_bench.numerics.statistics import DIFFERENCE, LEAST_ITEMS, jackknife_interval, leave_one_out
+from su3d_bench.questions.query_files import csv_rows
 from su3d_bench.sheets.items import ANSWER_COLUMNS, Key, Sheet, SheetItem
 
 MOST_BYTES = 256 << 20  # of one file: a workbook holds its pictures
 MOST_TEXT_BYTES = 32 << 20  # of a CSV file: some hundred thousand answers
-ADVICE = "give the files that annotators sent back"
+ADVICE = "give the files that annotators sent back, tables as 'CSV UTF-8'"
 MOST_CHARACTERS = 1000  # of one cell that is read
 HEADER_WITHIN = 30  # rows of a worksheet above its header, which may hold instructions
-
-
-Row = tuple[int, Sequence[str | None]]  # its number from 1 on, and its cells
 
 
 @dataclass(frozen=True)
@@ -46,77 +44,47 @@ class AnswerRow:
 
 def read_answers(path: Path) -> list[AnswerRow]:
     """Every row of a CSV file or XLSX workbook in its order; ``DataError`` where it is no file of answers."""
-    where, suffix = printable(str(path), 200), path.suffix.lower()
-    if suffix not in (".csv", ".xlsx"):
+    told = [name for name in ANSWER_COLUMNS if name != "annotator"]
+    rows = rows_of_file(path, ANSWER_COLUMNS)
+    return [AnswerRow(at, **cells) for at, cells in rows if any(cells[name] for name in told)]
+
+
+def rows_of_file(path: Path, columns: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
+    """Place and texts of each row that is not empty, of a CSV file or of every worksheet that has the ``columns``."""
+    where = printable(str(path), 200)
+    pages: list[tuple[str, Iterable[tuple[int, Sequence[str | None]]]]]
+    if path.suffix.lower() == ".csv":
+        text = read_text(path, where, ADVICE, MOST_TEXT_BYTES)
+        pages = [(where, enumerate(csv_rows(text, where, ",;\t"), 1))]
+    elif path.suffix.lower() == ".xlsx":
+        book = read_workbook(read_bytes(path, where, ADVICE, MOST_BYTES), where)
+        pages = [(f"{where}: {printable(page.name, 60)}", page.rows) for page in book]
+    else:
         raise DataError(f"{where}: is neither .csv nor .xlsx; export a CSV from the page or save an .xlsx workbook")
-    if suffix == ".csv":
-        return parse_csv(read_bytes(path, where, ADVICE, MOST_TEXT_BYTES), where)
-    return parse_workbook(read_bytes(path, where, ADVICE, MOST_BYTES), where)
-
-
-def csv_rows(content: bytes, where: str) -> list[list[str]]:
-    """The rows of a CSV file: UTF-8, with or without the mark that Excel writes, separated by ``,`` ``;`` or tab."""
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{where}: is not UTF-8; save it as 'CSV UTF-8'") from error
-    first = text.partition("\n")[0]
-    separator = max(",;\t", key=first.count)
-    try:
-        return separated_rows(text, separator)
-    except csv.Error as error:
-        raise DataError(f"{where}: is no CSV ({printable(str(error), 120)}); export it again") from error
-
-
-def parse_csv(content: bytes, where: str) -> list[AnswerRow]:
-    """The answers of a CSV file."""
-    return _of_pages([(where, list(enumerate(csv_rows(content, where), 1)))], where)
-
-
-def parse_workbook(content: bytes, where: str) -> list[AnswerRow]:
-    """The answers of every worksheet of an XLSX workbook that has their columns."""
-    pages = read_workbook(content, where)
-    return _of_pages([(f"{where}: {printable(page.name, 60)}", page.rows) for page in pages], where)
-
-
-def _of_pages(pages: Iterable[tuple[str, Iterable[Row]]], where: str) -> list[AnswerRow]:
-    """The answers of tables, each with its place; a table's header may stand below instructions."""
-    answers: list[AnswerRow] = []
-    has_columns = False
-    for at, page in pages:
+    found, has_columns = [], False
+    for place, page in pages:
         rows = iter(page)
-        columns = next((found for number, row in rows if number <= HEADER_WITHIN and (found := _columns(row))), None)
-        if columns is not None:
-            has_columns = True
-            answers += _rows(rows, columns, at)
+        header = next((known for n, row in rows if n <= HEADER_WITHIN and (known := _places(row, columns))), None)
+        has_columns |= header is not None
+        for number, row in rows if header else ():
+            at = f"{place}: row {number}"
+            cells = {name: _text(row[k] if k < len(row) else None, name, at) for name, k in (header or {}).items()}
+            if any(cells.values()):
+                found.append((at, cells))
     if not has_columns:
-        raise DataError(f"{where}: lacks the columns {', '.join(ANSWER_COLUMNS)}, once each; put their names back")
-    return answers
+        raise DataError(f"{where}: lacks the columns {', '.join(columns)}, once each; put their names back")
+    return found
 
 
-def _columns(row: Sequence[str | None]) -> dict[str, int] | None:
+def _places(row: Sequence[str | None], columns: Sequence[str]) -> dict[str, int] | None:
     """Where each column stands; None where the row is not their header."""
     names = [(cell or "").strip().lower() for cell in row]
-    if any(names.count(name) != 1 for name in ANSWER_COLUMNS):
-        return None
-    return {name: names.index(name) for name in ANSWER_COLUMNS}
+    return {name: names.index(name) for name in columns} if all(names.count(name) == 1 for name in columns) else None
 
 
-def _rows(rows: Iterable[tuple[int, Sequence[str | None]]], columns: dict[str, int], where: str) -> Iterator[AnswerRow]:
-    for number, row in rows:
-        if all(cell is None or cell == "" for cell in row):
-            continue
-        at = f"{where}: row {number}"
-        cells = {name: cell_text(row[k] if k < len(row) else None, name, at) for name, k in columns.items()}
-        if any(cells[name] for name in ANSWER_COLUMNS if name != "annotator"):
-            yield AnswerRow(at, **cells)
-
-
-def cell_text(value: str | None, name: str, at: str) -> str:
+def _text(value: str | None, name: str, at: str) -> str:
     """The text of a cell, without the mark that keeps a text from being a formula."""
-    text = (value or "").strip()
-    # as files that a spreadsheet is to open have it before text that would be taken for a formula
-    text = meant(text)
+    text = meant((value or "").strip())
     if len(text) > MOST_CHARACTERS or any(unicodedata.category(character) in ("Cc", "Cs") for character in text):
         raise DataError(f"{at}: '{name}' is too long or holds control characters: '{printable(text, 40)}'")
     return text

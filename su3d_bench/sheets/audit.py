@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -9,13 +10,12 @@ from typing import Any
 
 from su3d_bench.core.errors import DataError, StoreError, printable, suggest
 from su3d_bench.core.files.atomic import make_folder, write_bytes, write_text
-from su3d_bench.formats.images import read_bytes
 from su3d_bench.formats.tables.table import Cell, Table, TableRow, bracketed, csv_lines, percent
 from su3d_bench.numerics.statistics import share_interval
 from su3d_bench.questions.audit import AuditedQuestion
 from su3d_bench.reports.sheet.page import Entry, list_page
-from su3d_bench.sheets.answers import MOST_CHARACTERS, MOST_TEXT_BYTES, cell_text, csv_rows
-from su3d_bench.sheets.drafts import Draft
+from su3d_bench.sheets.answers import MOST_CHARACTERS, rows_of_file
+from su3d_bench.sheets.drafts import Draft, with_answer
 from su3d_bench.sheets.drawing import Artist
 from su3d_bench.sheets.items import ARGUABLE, PICTURES, RIGHT, VERDICTS, WRONG
 from su3d_bench.sheets.sources import TruthSource
@@ -46,28 +46,15 @@ class Verdict:
 
 def read_verdicts(path: Path) -> list[Verdict]:
     """Every question of the file in its order; ``DataError`` for a missing column or an unknown verdict."""
-    where = printable(str(path), 200)
-    rows = csv_rows(read_bytes(path, where, "name the audit.csv of questions audit", MOST_TEXT_BYTES), where)
-    header = [name.strip().lower() for name in rows[0]] if rows else []
-    missing = [name for name in COLUMNS if header.count(name) != 1]
-    if missing:
-        raise DataError(
-            f"{where}: the first line lacks the column {', '.join(missing)}, or has it twice; expected "
-            f"{','.join(COLUMNS)}"
-        )
     verdicts = []
-    for number, row in enumerate(rows[1:], 2):
-        at = f"{where}: row {number}"
-        cells = {name: cell_text(value, name, at) for name, value in zip(header, row, strict=False) if name in COLUMNS}
-        if not any(cells.values()):
-            continue
-        one = Verdict(**dict.fromkeys(COLUMNS, "") | cells | {"verdict": cells.get("verdict", "").lower()})
+    for at, cells in rows_of_file(path, COLUMNS):
+        one = Verdict(**cells | {"verdict": cells["verdict"].lower()})
         if one.verdict and one.verdict not in VERDICTS:
             hint = suggest(one.verdict, VERDICTS, "write nothing, or one of")
             raise DataError(f"{at}: unknown verdict '{printable(one.verdict, 40)}'{hint}")
         verdicts.append(one)
     if not verdicts:
-        raise DataError(f"{where}: holds no question")
+        raise DataError(f"{printable(str(path), 200)}: holds no question")
     return verdicts
 
 
@@ -110,14 +97,10 @@ def audit_json(verdicts: Sequence[Verdict]) -> dict[str, Any]:
 
 
 def _cells(verdicts: Sequence[str]) -> tuple[Cell, ...]:
-    n_wrong = sum(verdict == WRONG for verdict in verdicts)
-    shares = [_share([verdict in wanted for verdict in verdicts]) for wanted in ((RIGHT,), (RIGHT, ARGUABLE))]
-    return (Cell(str(len(verdicts))), *shares, Cell(str(n_wrong)))
-
-
-def _share(is_so: Sequence[bool]) -> Cell:
-    share = sum(is_so) / len(is_so)
-    return Cell(percent(share), bracketed(share_interval(share, len(is_so))))
+    n, n_of = len(verdicts), Counter(verdicts)
+    shares = n_of[RIGHT] / n, (n_of[RIGHT] + n_of[ARGUABLE]) / n
+    cells = (Cell(percent(share), bracketed(share_interval(share, n))) for share in shares)
+    return (Cell(str(n)), *cells, Cell(str(n_of[WRONG])))
 
 
 def make_audit(
@@ -157,25 +140,10 @@ def make_audit(
 def _draft(question: AuditedQuestion, source: TruthSource) -> Draft:
     """What is drawn of a question: its answer and what that was compared with, by their ids."""
     row_of = {instance: row for row, instance in enumerate(source.instances(question.scene).ids.tolist())}
-    names = [""] * len(row_of)
-    for thing in (*question.right, *question.held):
-        if thing.id in row_of:
-            names[row_of[thing.id]] = f"#{thing.id}"
-    rows, others = (
-        tuple(row_of[thing.id] for thing in things if thing.id in row_of) for things in (question.right, question.held)
-    )
-    return Draft(
-        kind="questions",
-        scene=question.scene,
-        methods=("",),
-        instance_ids=(-1,),
-        rows=rows,
-        title=(question.text, f"Answer: {question.answer}"),
-        text="",
-        asks=(),
-        others=others,
-        names=tuple(names),
-    )
+    draft = Draft(kind="questions", scene=question.scene, methods=("",), instance_ids=(-1,))
+    right, held = ([thing.id for thing in things] for things in (question.right, question.held))
+    names = {number: f"#{number}" for number in (*right, *held)}
+    return with_answer(draft, question.text, question.answer, (right, held), names, row_of)
 
 
 def _lines(question: AuditedQuestion) -> tuple[str, ...]:

@@ -19,36 +19,18 @@ from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
 from su3d_bench.core.types import Float32Array, GroundTruth
 from su3d_bench.metrics.instance.score import Covered
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.questions.score import (
-    AskedText,
-    GivenAnswer,
-    ReasoningTruth,
-    TrueAnswer,
-    are_objects_right,
-    is_answer_right,
-    judge_merging,
-    judge_retrieval,
-    labels_n,
-)
+from su3d_bench.metrics.questions import score
+from su3d_bench.metrics.questions.score import TrueAnswer
 from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig
 from su3d_bench.perception.language.client import LanguageModel
+from su3d_bench.questions import model, truths
 from su3d_bench.questions.audit import held_against
 from su3d_bench.questions.generated import generate_questions
 from su3d_bench.questions.generator import chosen, generate
-from su3d_bench.questions.model import (
-    KINDS,
-    REASONING,
-    Answer,
-    Question,
-    points_found,
-    question_id,
-    rank_all,
-    unsettled,
-)
+from su3d_bench.questions.model import REASONING, Answer, Question, question_id
 from su3d_bench.questions.scene_map import MapObject, SceneMap
 from su3d_bench.questions.solver import AskMap, LanguageSolver, given_answer
-from su3d_bench.questions.truths import MIN_VERTICES, own_questions, question_truth, scene_objects
-from su3d_bench.questions.truths import questions_of as questions_of_scene
+from su3d_bench.sheets.answers import LABELS
 from su3d_bench.sheets.items import ASKS, RIGHT, WRONG, SheetKind
 from su3d_bench.sheets.scores import OF_ALL_KINDS
 from su3d_bench.sheets.sources import RunSource, TruthSource, mask_digest
@@ -122,10 +104,10 @@ class Draft:
     scene: str
     methods: tuple[str, ...]
     instance_ids: tuple[int, ...]
-    rows: tuple[int, ...]
-    title: tuple[str, ...]
-    text: str
-    asks: tuple[str, ...]
+    rows: tuple[int, ...] = ()
+    title: tuple[str, ...] = ()
+    text: str = ""
+    asks: tuple[str, ...] = ()
     question_id: str = ""
     question_kind: str = ""
     stands_for: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
@@ -151,21 +133,27 @@ def questions_of(
     Those whose ids are ``left_out`` make room for others.
     """
     if given is None:
-        rules = source.rules(scene, "retrieval")
-        truth = source.truth(scene, rules)
-        if rules is None or truth is None:
-            raise ConfigError(
-                f"{printable(scene, 100)}: has no ground truth that questions could be made from; name a file with "
-                "--questions FILE, or --questions paper"
-            )
+        rules, truth = _known_truth(source, scene, "retrieval")
         dataset, name = source.run.dataset(scene), scene.partition("/")[2]
         if rules.questions == "dataset":
-            given = own_questions(dataset, name)
+            given = truths.own_questions(dataset, name)
         else:
             assert rules.min_region_size is not None
-            given = generate(scene, scene_objects(dataset, name, truth, rules.min_region_size))
-    mine = [question for question in given if question.scene == scene and question.id not in left_out]
-    return [question for kind in KINDS for question in chosen([each for each in mine if each.kind == kind], per_kind)]
+            given = generate(scene, truths.scene_objects(dataset, name, truth, rules.min_region_size))
+    mine = [one for one in given if one.scene == scene and one.kind in model.KINDS and one.id not in left_out]
+    return list(chosen(mine, per_kind))
+
+
+def _known_truth(source: RunSource, scene: str, kind: str) -> tuple[ProtocolRules, GroundTruth]:
+    """The ground truth that questions of a kind are made from, and its rules."""
+    rules = source.rules(scene, kind)
+    truth = source.truth(scene, rules)
+    if rules is None or truth is None:
+        raise ConfigError(
+            f"{printable(scene, 100)}: has no ground truth that questions could be made from; name a file of "
+            "questions with --questions FILE, or --questions paper"
+        )
+    return rules, truth
 
 
 def retrieval_drafts(source: RunSource, scene: str, questions: Sequence[Question], encoder: Encoder) -> list[Draft]:
@@ -188,8 +176,8 @@ def retrieval_drafts(source: RunSource, scene: str, questions: Sequence[Question
             row = first.rows[place]
             automatic = {}
             if covered is not None and question.is_known:
-                query = AskedText(question.kind, question.text, question.answers or ())
-                is_right = judge_retrieval(covered.main_object, np.array([row]), [query])
+                query = score.AskedText(question.kind, question.text, question.answers or ())
+                is_right = score.judge_retrieval(covered.main_object, np.array([row]), [query])
                 automatic = {"retrieval": judged(bool(is_right[0]))}
             drafts.append(
                 Draft(
@@ -228,11 +216,11 @@ def _firsts(prediction: Prediction, texts: Sequence[str], encoder: Encoder) -> _
     if not len(prediction.points):
         return None
     if isinstance(prediction, DenseFeatures):
-        return _Firsts(points_found(prediction, texts, encoder), tuple(range(len(texts))), True)
+        return _Firsts(model.points_found(prediction, texts, encoder), tuple(range(len(texts))), True)
     assert isinstance(prediction, Instances)
     if not len(prediction):
         return None
-    ranked = rank_all(prediction, texts, encoder)
+    ranked = model.rank_all(prediction, texts, encoder)
     return _Firsts(prediction, tuple(int(ranking.order[0]) for ranking in ranked), False)
 
 
@@ -247,7 +235,7 @@ def annotation_drafts(source: RunSource, scene: str, n_most: int, random: np.ran
     for method in source.methods:
         instances = source.instances(scene, method)
         judge = _annotation_judge(source, scene, rules, truth, instances)
-        own, refined = labels_n(instances), source.refined(scene, method)
+        own, refined = score.labels_n(instances), source.refined(scene, method)
         for row in range(len(instances)):
             labels = [own[row], *([refined.names[row]] if refined is not None and refined.is_kept[row] else [])]
             names = [printable(label, MOST_TEXT) or NO_LABEL for label in labels]
@@ -262,8 +250,6 @@ def annotation_drafts(source: RunSource, scene: str, n_most: int, random: np.ran
                     instance_ids=(id_of(instances, row),),
                     rows=(row,),
                     title=tuple(names),
-                    text="",
-                    asks=(),
                     automatic=judge(row, names),
                 )
     drafts = list(draft_of.values())
@@ -287,7 +273,7 @@ def _in_turn(drafts: Sequence[Draft], methods: Sequence[str], order: Sequence[in
 def _with_labels_shuffled(draft: Draft, random: np.random.Generator) -> Draft:
     """The draft with label n and label n' as labels 1 and 2 in drawn order; as one where they are equal."""
     meant: dict[str, list[str]] = {}
-    for name, what in zip(draft.title, ("n", "n'"), strict=False):
+    for name, what in zip(draft.title, LABELS, strict=False):
         meant.setdefault(name, []).append(what)
     order = random.permutation(len(meant))
     names = [list(meant)[k] for k in order]
@@ -296,9 +282,8 @@ def _with_labels_shuffled(draft: Draft, random: np.random.Generator) -> Draft:
     if "merging" in draft.automatic:
         automatic["merging"] = draft.automatic["merging"]
     lines = tuple(f"Label {k + 1}: {name}" for k, name in enumerate(names))
-    asks = (*stands_for, "merging")
-    text = "\n".join(lines)
-    return replace(draft, title=lines, text=text, asks=asks, stands_for=stands_for, automatic=automatic)
+    draft = replace(draft, title=lines, text="\n".join(lines), asks=(*stands_for, "merging"))
+    return replace(draft, stands_for=stands_for, automatic=automatic)
 
 
 Judge = Callable[[int, Sequence[str]], Mapping[str, str]]
@@ -311,15 +296,14 @@ def _annotation_judge(
     covered = source.covered(scene, rules, instances)
     if covered is None or rules is None or truth is None or rules.merging is None:
         return lambda row, names: {}
-    known: Any = question_truth(rules, source.run.dataset(scene), scene.partition("/")[2], truth)
-    merges, main = judge_merging(rules.merging, covered), covered.main_object
+    known: Any = truths.question_truth(rules, source.run.dataset(scene), scene.partition("/")[2], truth)
+    merges, main = score.judge_merging(rules.merging, covered), covered.main_object
 
     def judge(row: int, names: Sequence[str]) -> Mapping[str, str]:
         if int(main[row]) not in known.object_ids:
             return {}
-        labels = {
-            what: judged(known.is_called(name, int(main[row]))) for what, name in zip(("n", "n'"), names, strict=False)
-        }
+        said = zip(LABELS, names, strict=False)
+        labels = {what: judged(known.is_called(name, int(main[row]))) for what, name in said}
         return {**labels, "merging": merges[row]}
 
     return judge
@@ -336,13 +320,13 @@ def id_of(instances: Instances, row: int) -> int:
     return int(instances.ids[row]) if len(instances.ids) else row
 
 
-def requests_into(requests: list[ChatRequest], model: LanguageModel, config: LanguageConfig) -> AskMap:
-    """Puts what a language model would be asked into ``found`` and asks nobody."""
+def requests_into(requests: list[ChatRequest], client: LanguageModel, config: LanguageConfig) -> AskMap:
+    """Puts what a language model would be asked into ``requests`` and asks nobody."""
 
     def ask(scene: SceneMap, questions: Sequence[str]) -> Sequence[Answer]:
-        solver = LanguageSolver(scene, model, config)
+        solver = LanguageSolver(scene, client, config)
         requests.extend(solver.request(question) for question in questions)
-        return [unsettled("not asked")] * len(questions)
+        return [model.unsettled("not asked")] * len(questions)
 
     return ask
 
@@ -361,50 +345,76 @@ def reasoning_drafts(
     ground truth; without those whose ids are ``left_out``.
     """
 
-    def is_asked(text: str) -> bool:
-        return question_id(scene, REASONING, text) not in left_out
-
     rules = source.rules(scene, "reasoning")
-    known = (
-        [] if given is not None else [true for true in _known(source, scene, rules, per_kind) if is_asked(true.text)]
+    every: Sequence[Question | TrueAnswer] = (
+        _known(source, scene, per_kind)
+        if given is None
+        else [question for question in given if question.scene == scene and question.kind == REASONING]
     )
-    texts = [answer.text for answer in known]
-    if given is not None:
-        mine = [question.text for question in given if question.scene == scene and question.kind == REASONING]
-        texts = [text for text in mine if is_asked(text)]
+    asked = [one for one in every if question_id(scene, REASONING, one.text) not in left_out]
     groups: dict[bytes, Draft] = {}
     for method in source.methods:
-        instances = source.instances(scene, method)
-        a_map = source.scene_map(scene, method)
-        covered = source.covered(scene, rules, instances) if known else None
-        shown = _ShownMap(scene, method, instances, a_map)
-        for place, (text, answer) in enumerate(zip(texts, ask(a_map, texts), strict=True)):
-            rows, (text_told, names) = shown.rows(answer.object_ids), shown.told(answer)
-            key = text.encode() + b"\0" + text_told.encode() + mask_digest(instances, rows)
+        instances, a_map = source.instances(scene, method), source.scene_map(scene, method)
+        covered = source.covered(scene, rules, instances) if given is None else None
+        row_of = {thing.id: thing.row for thing in a_map.objects}
+        for one, answer in zip(asked, ask(a_map, [one.text for one in asked]), strict=True):
+            rows = [row_of[object_id] for object_id in answer.object_ids]
+            instance_id = id_of(instances, rows[0]) if len(rows) == 1 else -1
+            shown, names = without_ids(told(answer), a_map, (*answer.object_ids, *answer.reference_ids))
+            key = one.text.encode() + b"\0" + shown.encode() + mask_digest(instances, rows)
             if key in groups:
-                groups[key] = also(groups[key], method, shown.instance_id(rows))
+                groups[key] = also(groups[key], method, instance_id)
                 continue
-            automatic = {}
-            if covered is not None and rules is not None:
-                true = known[place]
-                automatic = _judged_answer(rules, true, given_answer(true, answer, a_map), covered)
-            kind = known[place].kind if known else REASONING
-            groups[key] = shown.draft(text, kind, answer, text_told, names, automatic)
+            asks = ("answer", "objects") if rows else ("answer",)
+            automatic: Mapping[str, str] = {}
+            if covered is not None and rules is not None and isinstance(one, TrueAnswer):
+                automatic = _judged_answer(rules, one, given_answer(one, answer, a_map), covered)
+            draft = Draft(
+                kind="reasoning",
+                scene=scene,
+                methods=(method,),
+                instance_ids=(instance_id,),
+                text=f"{printable(one.text, MOST_TEXT)}\nAnswer: {printable(shown, MOST_TEXT)}",
+                asks=asks,
+                question_id=question_id(scene, REASONING, one.text),
+                question_kind=one.kind,
+                automatic={ask: value for ask, value in automatic.items() if ask in asks},
+            )
+            ids = answer.object_ids, answer.reference_ids
+            groups[key] = with_answer(draft, one.text, shown, ids, names, row_of)
     return list(groups.values())
 
 
-def _known(source: RunSource, scene: str, rules: ProtocolRules | None, per_kind: int) -> Sequence[TrueAnswer]:
+def _known(source: RunSource, scene: str, per_kind: int) -> Sequence[TrueAnswer]:
     """Questions made from the ground truth of a scene, with their answers."""
-    truth = source.truth(scene, rules)
-    if rules is None or truth is None:
-        raise ConfigError(
-            f"{printable(scene, 100)}: has no ground truth that questions could be made from; name a file of "
-            "questions of kind reasoning with --questions FILE"
-        )
+    rules, truth = _known_truth(source, scene, "reasoning")
     with_fewer = rules.model_copy(update={"per_kind": per_kind})
-    made: Any = question_truth(with_fewer, source.run.dataset(scene), scene.partition("/")[2], truth)
-    assert isinstance(made, ReasoningTruth)
+    made: Any = truths.question_truth(with_fewer, source.run.dataset(scene), scene.partition("/")[2], truth)
+    assert isinstance(made, score.ReasoningTruth)
     return made.asked
+
+
+def with_answer(
+    draft: Draft,
+    question: str,
+    answer: str,
+    ids: tuple[Sequence[int], Sequence[int]],
+    names: Mapping[int, str],
+    row_of: Mapping[int, int],
+) -> Draft:
+    """The draft with a question and its answer as title, and what they speak of outlined and named.
+
+    ``ids`` of the objects that answer and of those that they were compared with, as ``names`` and ``row_of`` have them.
+    """
+    rows, others = (tuple(row_of[one] for one in of_part if one in row_of) for of_part in ids)
+    name_of = {row_of[one]: name for one, name in names.items() if one in row_of}
+    return replace(
+        draft,
+        title=(question, f"Answer: {answer}"),
+        rows=rows,
+        others=tuple(row for row in others if row not in rows),
+        names=tuple(name_of.get(row, "") for row in range(max(row_of.values(), default=-1) + 1)),
+    )
 
 
 def told(answer: Answer) -> str:
@@ -416,65 +426,14 @@ def told(answer: Answer) -> str:
     return NO_ANSWER if is_without else HINT.sub("", answer.text)
 
 
-class _ShownMap:
-    """A map of a method whose answers become drafts."""
-
-    def __init__(self, scene: str, method: str, instances: Instances, a_map: SceneMap) -> None:
-        self._scene, self._method, self._instances = scene, method, instances
-        self._map = a_map
-        self._row_of = {thing.id: thing.row for thing in a_map.objects}
-
-    def told(self, answer: Answer) -> tuple[str, dict[int, str]]:
-        """The answer as people see it, and how it calls the objects that it rests on, by their ids."""
-        return without_ids(told(answer), self._map, (*answer.object_ids, *answer.reference_ids))
-
-    def rows(self, ids: Sequence[int]) -> tuple[int, ...]:
-        return tuple(self._row_of[object_id] for object_id in ids)
-
-    def instance_id(self, rows: Sequence[int]) -> int:
-        """That of the only instance; -1 of several or none."""
-        return id_of(self._instances, rows[0]) if len(rows) == 1 else -1
-
-    def draft(
-        self,
-        question: str,
-        kind: str,
-        answer: Answer,
-        text: str,
-        names: Mapping[int, str],
-        automatic: Mapping[str, str],
-    ) -> Draft:
-        rows = self.rows(answer.object_ids)
-        asks = ("answer", "objects") if rows else ("answer",)
-        return Draft(
-            kind="reasoning",
-            scene=self._scene,
-            methods=(self._method,),
-            instance_ids=(self.instance_id(rows),),
-            rows=rows,
-            title=(question, f"Answer: {text}"),
-            text=f"{printable(question, MOST_TEXT)}\nAnswer: {printable(text, MOST_TEXT)}",
-            asks=asks,
-            question_id=question_id(self._scene, REASONING, question),
-            question_kind=kind,
-            automatic={ask: value for ask, value in automatic.items() if ask in asks},
-            others=self.rows(answer.reference_ids),
-            names=names_of_rows(names, self._row_of, len(self._instances)),
-        )
-
-
-def names_of_rows(names: Mapping[int, str], row_of: Mapping[int, int], n_rows: int) -> tuple[str, ...]:
-    """The names of ids by the rows of a map; '' for the rest."""
-    of_row = {row_of[number]: name for number, name in names.items() if number in row_of}
-    return tuple(of_row.get(row, "") for row in range(n_rows))
-
-
-def _judged_answer(rules: ProtocolRules, true: TrueAnswer, given: GivenAnswer, covered: Covered) -> dict[str, str]:
+def _judged_answer(
+    rules: ProtocolRules, true: TrueAnswer, given: score.GivenAnswer, covered: Covered
+) -> dict[str, str]:
     assert rules.answers is not None
     main = covered.main_object
-    judgements = {"answer": judged(is_answer_right(rules.answers, true, given, main))}
+    judgements = {"answer": judged(score.is_answer_right(rules.answers, true, given, main))}
     if true.object_ids:
-        judgements["objects"] = judged(are_objects_right(true, given, main))
+        judgements["objects"] = judged(score.are_objects_right(true, given, main))
     return judgements
 
 
@@ -484,53 +443,31 @@ def question_drafts(source: TruthSource, scene: str, per_kind: int, left_out: Co
     Of a template nothing takes the place of what is left out.
     """
     dataset, name = source.dataset(scene), scene.partition("/")[2]
-    objects = scene_objects(dataset, name, source.truth(scene), MIN_VERTICES)
-    found = [question for question in questions_of_scene(dataset, name) if question.id not in left_out]
-    shown = _ShownQuestions(source, scene, objects)
+    objects = truths.scene_objects(dataset, name, source.truth(scene), truths.MIN_VERTICES)
+    row_of = {instance: row for row, instance in enumerate(source.instances(scene).ids.tolist())}
+    found = [question for question in truths.questions_of(dataset, name) if question.id not in left_out]
     drafts = []
+
+    def add(asked: str, told: str, made_id: str, kind: str, answers: Sequence[int], held: Sequence[int] = ()) -> None:
+        told, names = without_ids(told, objects, [number for number in (*answers, *held) if number in objects.ids])
+        draft = Draft(
+            kind="questions",
+            scene=scene,
+            methods=(kind, OF_ALL_KINDS),  # no method answers: what is counted together is a kind
+            instance_ids=(answers[0] if len(answers) == 1 else -1,) * 2,
+            text="\n".join(printable(line, MOST_TEXT) for line in (asked, f"Answer: {told}")),
+            asks=tuple(ask.name for ask in ASKS["questions"]),
+            question_id=made_id,
+            question_kind=kind,
+        )
+        drafts.append(with_answer(draft, asked, told, (answers, held), names, row_of))
+
     for question in chosen(found, per_kind):
         told = ", ".join(objects.by_id(k).shown for k in question.answers or () if k in objects.ids)
-        drafts.append(shown.draft(f"Find: {question.text}", told, question.id, question.kind, question.answers or ()))
+        add(f"Find: {question.text}", told, question.id, question.kind, question.answers or ())
     for made in generate_questions(objects, n_each=per_kind):
         made_id, answer = question_id(scene, REASONING, made.text), made.answer
         if made_id not in left_out:
             held = [thing.id for thing in held_against(made, objects)]
-            told = "no" if answer.value is False else answer.text
-            drafts.append(shown.draft(made.text, told, made_id, made.kind, answer.object_ids, held))
+            add(made.text, "no" if answer.value is False else answer.text, made_id, made.kind, answer.object_ids, held)
     return drafts
-
-
-class _ShownQuestions:
-    """A scene whose questions become drafts."""
-
-    def __init__(self, source: TruthSource, scene: str, objects: SceneMap) -> None:
-        self._scene = scene
-        ids = source.instances(scene).ids.tolist()
-        self._row_of = {instance: row for row, instance in enumerate(ids)}
-        self._objects = objects
-
-    def draft(
-        self, asked: str, told: str, made_id: str, kind: str, answers: Sequence[int], references: Sequence[int] = ()
-    ) -> Draft:
-        spoken_of = [number for number in (*answers, *references) if number in self._objects.ids]
-        told, names = without_ids(told, self._objects, spoken_of)
-        lines = asked, f"Answer: {told}"
-        rows = self._rows(answers)
-        methods = kind, OF_ALL_KINDS  # no method answers: what is counted together is a kind
-        return Draft(
-            kind="questions",
-            scene=self._scene,
-            methods=methods,
-            instance_ids=(answers[0] if len(answers) == 1 else -1,) * len(methods),
-            rows=rows,
-            title=lines,
-            text="\n".join(printable(line, MOST_TEXT) for line in lines),
-            asks=tuple(ask.name for ask in ASKS["questions"]),
-            question_id=made_id,
-            question_kind=kind,
-            others=tuple(row for row in self._rows(references) if row not in rows),
-            names=names_of_rows(names, self._row_of, len(self._row_of)),
-        )
-
-    def _rows(self, ids: Sequence[int]) -> tuple[int, ...]:
-        return tuple(self._row_of[instance] for instance in ids if instance in self._row_of)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, NoReturn, Protocol
+from typing import Any, Literal, NoReturn
 
 import numpy as np
 
@@ -21,36 +21,23 @@ from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, 
 from su3d_bench.metrics.questions.score import labels_n
 from su3d_bench.questions.model import rank_all
 from su3d_bench.questions.solver import built_in
+from su3d_bench.reports.pictures import items
 from su3d_bench.reports.pictures.canvas import ROOM_SURFACES, Scale, class_colours, colour, similarity_colours
 from su3d_bench.reports.pictures.figures import Cell, GridRow
-from su3d_bench.reports.pictures.items import (
-    CAP_M,
-    LOW_HEIGHT,
-    PHOTO_WIDTH,
-    ZOOM_WIDTH,
-    ItemParts,
-    Panel,
-    Tag,
-    best_view,
-    compose,
-    mask_in_frame,
-    palette_of,
-    png_bytes,
-    seen_in,
-)
+from su3d_bench.reports.pictures.items import LOW_HEIGHT, PHOTO_WIDTH, ZOOM_WIDTH, ItemParts, Panel, Tag
 from su3d_bench.reports.pictures.maps import DrawnMap, MapView, cameras_of, drawn_map, pale, thinned_rows, view_of
 from su3d_bench.reports.pictures.scene import evenly, seen_points
 from su3d_bench.runs.executors import Event, Report, run_inline, run_processes
 from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.items import KINDS_OF_SHEETS
-from su3d_bench.sheets.sources import RunSource, mask_digest
+from su3d_bench.sheets.sources import RunSource, TruthSource, mask_digest
 
 ANSWER_COLOUR, OTHER_COLOUR = (222, 74, 22), (32, 98, 196)  # those of reasoning_picture
 SEEN_POINTS = 1_500_000  # of all frames together, before they are thinned: floors are seen at a low angle
 ROOM_SHARE, PLACE_SHARE = 0.75, 0.5  # of the room's colours, so that what is judged stands out
 # A map's points may lie 5 cm from what the frames saw, and 5 cm apart. What that reach takes of the neighbours is given
 # back, but for the width of a drawn point, which noise needs.
-REACH_M, BACK_M = CAP_M, 0.035
+REACH_M, BACK_M = items.CAP_M, 0.035
 PALETTE_FRAMES = 8  # from which the colours of all pictures of a scene are chosen
 
 
@@ -96,17 +83,15 @@ class ShownRoom:
             colour(view.shown, pale(self.colours, share))
             for view, share in ((self.above, PLACE_SHARE), *((corner, ROOM_SHARE) for corner in self.corners))
         ]
-        return palette_of([*photos, *views], (ANSWER_COLOUR, OTHER_COLOUR))
+        return items.palette_of([*photos, *views], (ANSWER_COLOUR, OTHER_COLOUR))
 
     def region(self, points: Float32Array) -> Region:
         """Where an instance of these ``points`` (M, 3) lies, however many and in whatever order they are."""
         is_member = np.zeros(len(self.points), np.bool_)
         if len(points) and len(self.points):
             margin = REACH_M + BACK_M
-            is_near = ((self.points >= points.min(axis=0) - margin) & (self.points <= points.max(axis=0) + margin)).all(
-                1
-            )
-            near = np.flatnonzero(is_near)
+            low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
+            near = np.flatnonzero(((self.points >= low) & (self.points <= high)).all(axis=1))
             reached = _within(points, self.points[near], REACH_M)
             kept = ~_within(self.points[near[~reached]], self.points[near[reached]], BACK_M)
             is_member[near[reached][kept]] = True
@@ -117,20 +102,19 @@ class ShownRoom:
         is_member = np.zeros(len(self.points), np.bool_)
         for region in regions:
             is_member |= region.is_member
-        if is_member.any():
-            return Region(is_member, self.points[is_member])
-        return Region(is_member, np.concatenate([np.zeros((0, 3), np.float32), *(one.points for one in regions)]))
+        points = np.concatenate([np.zeros((0, 3), np.float32), *(one.points for one in regions)])
+        return Region(is_member, self.points[is_member] if is_member.any() else points)
 
     def photo(self, region: Region) -> tuple[Frame, BoolArray] | None:
         """The frame that shows the region best, and where (h, w); None where none shows it."""
         if not region.is_member.any():
             return None
-        view = best_view(self.frames, region.points)
+        view = items.best_view(self.frames, region.points)
         if view is None:
             return None
         frame = self.frames[view.frame]
         bounds = np.stack([region.points.min(axis=0), region.points.max(axis=0)]).astype(np.float64)
-        return frame, at_full_size(mask_in_frame(frame, self.tree, region.is_member, bounds), frame.rgb)
+        return frame, at_full_size(items.mask_in_frame(frame, self.tree, region.is_member, bounds), frame.rgb)
 
 
 def _within(these: Float32Array, of: Float32Array, distance_m: float) -> BoolArray:
@@ -145,11 +129,11 @@ def _within(these: Float32Array, of: Float32Array, distance_m: float) -> BoolArr
     return is_within
 
 
-def at_full_size(mask: BoolArray, rgb: UInt8Array, gap: int = 3) -> BoolArray:
-    """The mask at the size of the colour image ``rgb``, gaps of less than ``gap`` of its pixels closed."""
+def at_full_size(mask: BoolArray, rgb: UInt8Array) -> BoolArray:
+    """The mask at the size of the colour image ``rgb``, gaps of less than 3 of its pixels closed."""
     import cv2
 
-    closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((gap, gap), np.uint8))
+    closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
     height, width = rgb.shape[:2]
     full: BoolArray = cv2.resize(closed, (width, height), interpolation=cv2.INTER_NEAREST) > 0
     return full
@@ -158,16 +142,7 @@ def at_full_size(mask: BoolArray, rgb: UInt8Array, gap: int = 3) -> BoolArray:
 ROOM_PHOTOS = 6  # of the room, for answers that name nothing
 
 
-class PictureSource(Protocol):
-    """Maps and frames of scenes; ``opener`` opens the same in another process."""
-
-    @property
-    def opener(self) -> Callable[[], PictureSource]: ...
-
-    @property
-    def instances(self) -> Callable[[str, str], Instances]: ...
-
-    def frames(self, scene: str) -> Sequence[Frame]: ...
+PictureSource = RunSource | TruthSource
 
 
 class Artist:
@@ -181,11 +156,7 @@ class Artist:
 
     def draw(self, draft: Draft) -> bytes:
         """The PNG of a draft."""
-        return png_bytes(self.picture(draft), palette=self.room(draft.scene).palette)
-
-    def picture(self, draft: Draft) -> UInt8Array:
-        """The picture (h, 960, 3) of a draft."""
-        return compose(self.parts(draft))
+        return items.png_bytes(items.compose(self.parts(draft)), palette=self.room(draft.scene).palette)
 
     def parts(self, draft: Draft) -> ItemParts:
         """What stands in the picture of a draft: of its map the regions of ``rows`` and ``others`` alone."""
@@ -384,24 +355,21 @@ class Figures:
             for k, text in enumerate(texts):
                 best = [ranking[k].order[:1].tolist() for ranking in ranked]
                 views = self._views(maps, best[0])
-                cells = [
-                    Cell(shown.paint(view, similarity_colours(ranking[k].similarity, scale)))
-                    for shown, view, ranking in zip(maps, views, ranked, strict=True)
-                ]
-                rows.append(
-                    GridRow(f'"{printable(text, 90)}"', scene, (*self._photo(scene, maps[0], views[0]), *cells))
-                )
+                cells = self._photo(scene, maps[0], views[0])
+                for shown, view, ranking in zip(maps, views, ranked, strict=True):
+                    cells.append(Cell(shown.paint(view, similarity_colours(ranking[k].similarity, scale))))
+                rows.append(GridRow(f'"{printable(text, 90)}"', scene, tuple(cells)))
         return rows
 
     def labels(self) -> tuple[list[str], list[GridRow]]:
         """Titles of the columns, and a row a scene: the map by label n and by label n' of each method."""
-        titles = [*(["the scene"] if self._with_photo else [])]
-        titles += [f"{method}: label {what}" for method in self._source.methods for what in ("n", "n'")]
+        titles = [f"{method}: label {what}" for method in self._source.methods for what in ("n", "n'")]
+        titles = [*(["the scene"] if self._with_photo else []), *titles]
         rows = []
         for scene in self._source.scenes:
             maps = self._maps(scene)
             views = self._views(maps, [])
-            cells: list[Cell] = []
+            cells = self._photo(scene, maps[0], views[0])
             for method, shown, view in zip(self._source.methods, maps, views, strict=True):
                 own: Labels = labels_n(shown.instances)
                 refined = self._source.refined(scene, method)
@@ -411,7 +379,7 @@ class Figures:
                 for names in both:
                     colours = np.array([palette[name] for name in names], np.uint8).reshape(-1, 3)
                     cells.append(Cell(shown.paint(view, colours), _name_tags(shown, view, names, colours)))
-            rows.append(GridRow(scene, "", (*self._photo(scene, maps[0], views[0]), *cells)))
+            rows.append(GridRow(scene, "", tuple(cells)))
         return titles, rows
 
     def reasoning(self, questions: Sequence[str], encoder: Encoder | None) -> list[GridRow]:
@@ -430,8 +398,8 @@ class Figures:
                     views[k] = view
                     names = {thing.row: thing.shown for thing in a_map.objects}
                     cells.append(replace(_answer_cell(shown, view, rows_of, names), caption=answer.text))
-                photo = self._photo(scene, maps[0], views[0])
-                rows.append(GridRow(printable(question, 160), scene, (*photo, *cells)))
+                cells = [*self._photo(scene, maps[0], views[0]), *cells]
+                rows.append(GridRow(printable(question, 160), scene, tuple(cells)))
         return rows
 
     def _maps(self, scene: str) -> list[DrawnMap]:
@@ -449,12 +417,12 @@ class Figures:
         chosen = first.view(camera)
         return [chosen, *(MapView(camera, other.view(camera).view, chosen.box) for other in maps[1:])]
 
-    def _photo(self, scene: str, shown: DrawnMap, view: MapView) -> tuple[Cell, ...]:
+    def _photo(self, scene: str, shown: DrawnMap, view: MapView) -> list[Cell]:
         """The map in the colours that the frames saw, where it is asked for."""
         if not self._with_photo:
-            return ()
+            return []
         frames = self._source.frames(scene)
-        return (Cell(shown.paint_points(view, seen_colours(frames, shown.instances.points[shown.rows]))),)
+        return [Cell(shown.paint_points(view, seen_colours(frames, shown.instances.points[shown.rows])))]
 
 
 def seen_colours(frames: Sequence[Frame], points: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> UInt8Array:
@@ -462,7 +430,7 @@ def seen_colours(frames: Sequence[Frame], points: np.ndarray[tuple[int, ...], np
     colours = np.full((len(points), 3), UNSEEN, np.uint8)
     places: Float64Array = points.astype(np.float64)
     for frame in frames:
-        columns, rows, is_seen = seen_in(frame, places)
+        columns, rows, is_seen = items.seen_in(frame, places)
         colours[is_seen] = frame.rgb[rows[is_seen].astype(np.int64), columns[is_seen].astype(np.int64)]
     return colours
 

@@ -178,19 +178,13 @@ class Key(JudgedRun, _Strict):
 def new_item(
     set_id: str, item_id: str, text: str, asks: Sequence[str], pictures: Sequence[str], digests: Sequence[str]
 ) -> SheetItem:
-    """An item with the check that its contents give it."""
-    check = item_check(set_id, item_id, text, asks, digests)
-    return SheetItem(item_id, text, tuple(asks), tuple(pictures), tuple(digests), check)
+    """An item with the check that its contents give it, a short key of all that an annotator sees of it.
 
-
-def item_check(set_id: str, item_id: str, text: str, asks: Sequence[str], digests: Sequence[str]) -> str:
-    """A short key of what an annotator saw of an item.
-
-    >>> item_check("retrieval-1", "item-0001", "chair", ["retrieval"], []) == item_check(
-    ...     "retrieval-1", "item-0001", "table", ["retrieval"], [])
+    >>> new_item("a-1", "item-1", "chair", [], [], []).check == new_item("a-1", "item-1", "table", [], [], []).check
     False
     """
-    return "c" + digest_json([set_id, item_id, text, list(asks), list(digests)])[:_DIGITS]
+    check = "c" + digest_json([set_id, item_id, text, list(asks), list(digests)])[:_DIGITS]
+    return SheetItem(item_id, text, tuple(asks), tuple(pictures), tuple(digests), check)
 
 
 def sheet_id_of(kind: SheetKind, seed: int, contents: Any) -> str:
@@ -198,24 +192,14 @@ def sheet_id_of(kind: SheetKind, seed: int, contents: Any) -> str:
     return f"{kind}-" + digest_json([SCHEMA, kind, seed, contents])[:_DIGITS]
 
 
-def write_sheet(folder: Path, sheet: Sheet) -> Path:
-    """Write ``sheet.json`` into ``folder``; its path."""
-    return write_record(folder / SHEET_FILE, sheet)
-
-
-def write_key(folder: Path, key: Key) -> Path:
-    """Write ``key.json`` into ``folder``; its path."""
-    return write_record(folder / KEY_FILE, key)
-
-
 def read_sheet(path: Path) -> Sheet:
     """The set in a ``sheet.json``; a ``DataError`` where the file is not as ``sheets make`` writes it."""
-    return read_record(path, Sheet, "sheets make")
+    return read_record(path, Sheet)
 
 
 def read_key(path: Path) -> Key:
     """The key in a ``key.json``; a ``DataError`` where the file is not as ``sheets make`` writes it."""
-    return read_record(path, Key, "sheets make")
+    return read_record(path, Key)
 
 
 Record = TypeVar("Record", bound="DataclassInstance")
@@ -228,7 +212,7 @@ def write_record(path: Path, record: DataclassInstance) -> Path:
     return path
 
 
-def read_record(path: Path, kind: type[Record], maker: str) -> Record:
+def read_record(path: Path, kind: type[Record], maker: str = "sheets make") -> Record:
     """The record of a JSON file as the verb ``maker`` writes it; ``DataError`` where it is another, or was changed."""
     where = printable(str(path), 200)
     content = parsed_json(read_bytes(path, where, f"give what su3d-bench {maker} wrote", MOST_BYTES), where)
@@ -242,11 +226,8 @@ def read_record(path: Path, kind: type[Record], maker: str) -> Record:
     try:
         return TypeAdapter(kind).validate_json(json.dumps(content), strict=True)
     except ValidationError as error:
-        raise DataError(f"{where}: is no such file as su3d-bench {maker} writes ({_place(error)})") from error
-
-
-def _place(error: ValidationError) -> str:
-    return printable(".".join(map(str, error.errors()[0]["loc"])), 120)
+        place = printable(".".join(map(str, error.errors()[0]["loc"])), 120)
+        raise DataError(f"{where}: is no such file as su3d-bench {maker} writes ({place})") from error
 
 
 GUIDE = "how to judge"

@@ -20,24 +20,11 @@ from su3d_bench.numerics.statistics import DIFFERENCE, LEAST_ITEMS, mean_interva
 from su3d_bench.questions.model import ALL_KINDS
 from su3d_bench.questions.query_files import COLUMN
 from su3d_bench.reports.sheet.page import Entry, list_page
+from su3d_bench.sheets import items
 from su3d_bench.sheets.answers import LABELS, Agreement, Judgement, agreement, cohen_kappa
-from su3d_bench.sheets.items import (
-    ARGUABLE,
-    CANNOT_TELL,
-    MERGES,
-    RIGHT,
-    VERDICTS,
-    JudgedRun,
-    Key,
-    KeyItem,
-    Sheet,
-    SheetKind,
-    read_record,
-    write_record,
-)
+from su3d_bench.sheets.items import ARGUABLE, CANNOT_TELL, MERGES, RIGHT, Key, KeyItem, Sheet
 
 if TYPE_CHECKING:
-    pass
     import pandas
 
 
@@ -52,7 +39,7 @@ def whole_verdicts(judgements: Iterable[Judgement]) -> Iterator[Judgement]:
     for judgement in judgements:
         given[judgement.item_id, judgement.annotator].append(judgement.answer)
     for (item_id, annotator), answers in given.items():
-        yield Judgement(item_id, annotator, WHOLE, max(answers, key=VERDICTS.index))
+        yield Judgement(item_id, annotator, WHOLE, max(answers, key=items.VERDICTS.index))
 
 
 Judge = Literal["people", "automatic"]
@@ -153,7 +140,7 @@ class SecondLook:
 
 
 @dataclass(frozen=True)
-class Scores(JudgedRun):
+class Scores(items.JudgedRun):
     """All that is known of a set; ``annotators``: name -> number of judgements, ``silent`` those without any."""
 
     sheet_id: str
@@ -199,7 +186,7 @@ def score(sheet: Sheet, key: Key, judgements: Sequence[Judgement], silent: Seque
         n_judged=len({judgement.item_id for judgement in judgements}),
         cells=(*_cells("people", key.methods, by_people), *_cells("automatic", key.methods, _shares(truth))),
         tests=tuple(test for test in _tests(sheet, key, clear) if test.n_items),
-        agreements=tuple(AskAgreement(what, agreement(items)) for what, items in ratings.items()),
+        agreements=tuple(AskAgreement(what, agreement(of_ask)) for what, of_ask in ratings.items()),
         confusions=tuple(confusion for what in ratings if (confusion := _confusion(sheet, what, given)) is not None),
         second_looks=tuple(_second_looks(sheet, keys, judgements)),
         **key.how_it_was_made(),
@@ -407,7 +394,7 @@ def _second_looks(sheet: Sheet, keys: Mapping[str, KeyItem], judgements: Iterabl
     return looks
 
 
-def _reason(kind: SheetKind, answers: Sequence[str], automatic: str) -> Reason | None:
+def _reason(kind: items.SheetKind, answers: Sequence[str], automatic: str) -> Reason | None:
     if len(set(answers)) > 1:
         return "annotators disagree"
     if kind == "questions" and answers:
@@ -421,21 +408,21 @@ FILE = "scores.json"
 
 def write_scores(folder: Path, scores: Scores) -> Path:
     """Write ``scores.json`` into ``folder``; its path."""
-    return write_record(folder / FILE, scores)
+    return items.write_record(folder / FILE, scores)
 
 
 def read_scores(path: Path) -> Scores:
     """The scores of a file or of the folder that holds it; ``DataError`` where it is not as ``sheets score`` writes."""
-    return read_record(path / FILE if path.is_dir() else path, Scores, "sheets score")
+    return items.read_record(path / FILE if path.is_dir() else path, Scores, "sheets score")
 
 
 def second_looks_csv(looks: Sequence[SecondLook]) -> str:
     """One line an item and question."""
-    rows = [
-        (one.item_id, one.ask, one.reason, _said(one), one.automatic, one.scene, ", ".join(one.methods), one.text)
-        for one in looks
-    ]
-    return csv_lines([LOOKS_COLUMNS, *((*row, ", ".join(one.pictures)) for row, one in zip(rows, looks, strict=True))])
+    rows = [LOOKS_COLUMNS]
+    for one in looks:
+        listed = ", ".join(one.methods), one.text, ", ".join(one.pictures)
+        rows.append((one.item_id, one.ask, one.reason, _said(one), one.automatic, one.scene, *listed))
+    return csv_lines(rows)
 
 
 def _said(look: SecondLook) -> str:

@@ -7,7 +7,7 @@ import io
 import re
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -16,37 +16,18 @@ import numpy as np
 
 from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.errors import ConfigError, ModelMissing, printable
-from su3d_bench.core.files.atomic import is_file, make_folder, write_bytes, write_text
+from su3d_bench.core.files.atomic import is_file, make_folder, write_bytes
 from su3d_bench.core.system.files import file_bytes
 from su3d_bench.formats.tables.table import csv_lines
 from su3d_bench.reports.sheet.page import page_html
+from su3d_bench.sheets import items
 from su3d_bench.sheets.drafts import Draft
-from su3d_bench.sheets.items import (
-    ANSWER_COLUMNS,
-    ASKS,
-    GUIDE,
-    KEY_FILE,
-    KINDS_OF_SHEETS,
-    PICTURES,
-    SHEET_FILE,
-    AnnotatorShare,
-    JudgedRun,
-    Key,
-    KeyItem,
-    Sheet,
-    SheetKind,
-    guide_of,
-    new_item,
-    read_key,
-    read_sheet,
-    sheet_id_of,
-    write_key,
-    write_sheet,
-)
+from su3d_bench.sheets.items import PICTURES, AnnotatorShare, Key, KeyItem, Sheet
 
 # The columns of an answers file stand among these; what nobody needs to see is hidden.
 COLUMNS = ("item_id", "picture", "text", "asked", "answer", "question", "sheet_id", "annotator", "check")
 HIDDEN = ("question", "sheet_id", "annotator", "check")
+LETTERS = dict(zip(COLUMNS, "ABCDEFGHI", strict=True))
 WIDTHS = {"item_id": 11, "picture": 88, "text": 34, "asked": 30, "answer": 17}  # in characters
 HEADER_ROW = 3
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)  # the date of every file in a workbook
@@ -69,7 +50,7 @@ def workbook_bytes(sheet: Sheet, share: AnnotatorShare, pictures: Mapping[str, b
     last = _write_rows(page, sheet, share, pictures)
     _write_head(page, title, last)
     _dress(page, last)
-    _write_guide(book.create_sheet(GUIDE), sheet, title)
+    _write_guide(book.create_sheet(items.GUIDE), sheet, title)
     buffer = io.BytesIO()
     book.save(buffer)
     return _without_time(buffer.getvalue())
@@ -130,7 +111,7 @@ def _put_picture(page: Any, first: int, last: int, content: bytes) -> None:
     height = PICTURE_WIDTH * picture.height / picture.width
     shrink = min(1.0, n_rows * MOST_ROW_POINTS / (height * POINTS_A_PIXEL))
     picture.width, picture.height = round(PICTURE_WIDTH * shrink), round(height * shrink)
-    picture.anchor = f"{'ABCDEFGHI'[COLUMNS.index('picture')]}{first}"
+    picture.anchor = f"{LETTERS['picture']}{first}"
     page.add_image(picture)
     for row in range(first, last + 1):
         page.row_dimensions[row].height = (picture.height * POINTS_A_PIXEL + 6) / n_rows
@@ -141,8 +122,7 @@ def _write_head(page: Any, title: str, last: int) -> None:
     from openpyxl.styles import Alignment, Font, PatternFill
 
     text_cell(page, 1, 2, title).font = Font(name=FONT, bold=True, size=15)
-    letter = "ABCDEFGHI"[COLUMNS.index("answer")]
-    cells = f"{letter}{HEADER_ROW + 1}:{letter}{last}"
+    cells = _answer_cells(last)
     page.cell(2, 2).value = f'=COUNTA({cells})&" of "&ROWS({cells})&" answered"'
     page.cell(2, 2).font = Font(name=FONT, bold=True, color=HEAD_FILL)
     text_cell(page, 2, 3, "Choose from the list in the column 'answer', save, and send the file back.")
@@ -154,21 +134,21 @@ def _write_head(page: Any, title: str, last: int) -> None:
     page.freeze_panes = page.cell(HEADER_ROW + 1, 2)
 
 
+def _answer_cells(last: int) -> str:
+    return f"{LETTERS['answer']}{HEADER_ROW + 1}:{LETTERS['answer']}{last}"
+
+
 def _dress(page: Any, last: int) -> None:
     """Widths, hidden columns, a colour for what is open, and a lock on all but the answers."""
     from openpyxl.formatting.rule import FormulaRule
     from openpyxl.styles import PatternFill
 
-    for column, name in enumerate(COLUMNS):
-        dimension = page.column_dimensions["ABCDEFGHI"[column]]
-        dimension.width = WIDTHS.get(name, 12)
-        dimension.hidden = name in HIDDEN
-    letter = "ABCDEFGHI"[COLUMNS.index("answer")]
-    is_open = FormulaRule(
-        formula=[f"ISBLANK({letter}{HEADER_ROW + 1})"],
-        fill=PatternFill("solid", start_color=OPEN_FILL, bgColor=OPEN_FILL),
-    )
-    page.conditional_formatting.add(f"{letter}{HEADER_ROW + 1}:{letter}{last}", is_open)
+    for name, letter in LETTERS.items():
+        page.column_dimensions[letter].width = WIDTHS.get(name, 12)
+        page.column_dimensions[letter].hidden = name in HIDDEN
+    fill = PatternFill("solid", start_color=OPEN_FILL, bgColor=OPEN_FILL)
+    is_open = FormulaRule(formula=[f"ISBLANK({LETTERS['answer']}{HEADER_ROW + 1})"], fill=fill)
+    page.conditional_formatting.add(_answer_cells(last), is_open)
     page.protection.sheet = True  # without a password: it keeps from slips, not from intent
     page.protection.formatColumns = page.protection.formatRows = False
 
@@ -179,7 +159,7 @@ def _write_guide(page: Any, sheet: Sheet, title: str) -> None:
 
     text_cell(page, 1, 1, title).font = Font(name=FONT, bold=True, size=15)
     row = 2
-    for sentence in guide_of(sheet):
+    for sentence in items.guide_of(sheet):
         row += 1
         text_cell(page, row, 1, sentence)
     row += 1
@@ -214,16 +194,6 @@ PAGE, WORKBOOK, TABLE = "sheet.html", "sheet.xlsx", "sheet.csv"
 
 
 @dataclass(frozen=True)
-class Origin(JudgedRun):
-    """Where the drafts come from, for the key."""
-
-    run: str
-    run_digest: str
-    methods: tuple[str, ...]
-    automatic_rule: str
-
-
-@dataclass(frozen=True)
 class MadeSheets:
     """A set as it was made; ``pictures`` by file name."""
 
@@ -233,18 +203,11 @@ class MadeSheets:
 
 
 def make_sheets(
-    kind: SheetKind,
-    drafts: Sequence[Draft],
-    drawn: Sequence[bytes],
-    origin: Origin,
-    *,
-    seed: int = 0,
-    annotators: int = 1,
-    overlap: float = 1.0,
+    origin: Key, drafts: Sequence[Draft], drawn: Sequence[bytes], *, seed: int, annotators: int, overlap: float
 ) -> MadeSheets:
     """The set of all ``drafts``, dealt evenly to ``annotators``; a share ``overlap`` of it goes to each of them.
 
-    ``drawn``: the picture of each draft, a PNG.
+    ``origin``: the key without an id and items; ``drawn``: the picture of each draft, a PNG.
     """
     check_split(len(drafts), annotators, overlap)
     random = np.random.default_rng(seed)
@@ -255,13 +218,15 @@ def make_sheets(
     digests = [digest_bytes(content) for content in pictures.values()]
     shown = list(zip(ids, chosen, pictures, digests, strict=True))
     contents = [[item_id, draft.text, list(draft.asks), digest] for item_id, draft, _, digest in shown]
-    set_id = sheet_id_of(kind, seed, contents)
-    items = tuple(
-        new_item(set_id, item_id, draft.text, draft.asks, (name,), (digest,)) for item_id, draft, name, digest in shown
+    set_id = items.sheet_id_of(origin.kind, seed, contents)
+    asked = tuple(
+        items.new_item(set_id, item_id, draft.text, draft.asks, (name,), (digest,))
+        for item_id, draft, name, digest in shown
     )
-    sheet = Sheet(set_id, kind, seed, ASKS[kind], items, dealt(ids, annotators, overlap, random))
+    shares = dealt(ids, annotators, overlap, random)
+    sheet = Sheet(set_id, origin.kind, seed, items.ASKS[origin.kind], asked, shares)
     key_items = tuple(_key_item(item_id, draft) for item_id, draft, *_ in shown)
-    return MadeSheets(sheet, Key(sheet_id=set_id, kind=kind, items=key_items, **asdict(origin)), pictures)
+    return MadeSheets(sheet, replace(origin, sheet_id=set_id, items=key_items), pictures)
 
 
 def check_split(n_items: int, annotators: int, overlap: float) -> None:
@@ -295,16 +260,7 @@ def dealt(
 
 
 def _key_item(item_id: str, draft: Draft) -> KeyItem:
-    return KeyItem(
-        id=item_id,
-        scene=draft.scene,
-        methods=draft.methods,
-        instance_ids=draft.instance_ids,
-        question_id=draft.question_id,
-        question_kind=draft.question_kind,
-        stands_for=dict(draft.stands_for),
-        automatic=dict(draft.automatic),
-    )
+    return KeyItem(item_id, **{one.name: getattr(draft, one.name) for one in fields(KeyItem) if one.name != "id"})
 
 
 def write_sheets(made: MadeSheets, folder: Path, key_folder: Path) -> list[Path]:
@@ -314,42 +270,38 @@ def write_sheets(made: MadeSheets, folder: Path, key_folder: Path) -> list[Path]
     """
     if key_folder.resolve() == folder.resolve() or folder.resolve() in key_folder.resolve().parents:
         raise ConfigError(f"--key {printable(str(key_folder), 200)}: lies where the sheets are; keep the key apart")
-    tables: dict[Path, bytes] = {}
+    title = items.KINDS_OF_SHEETS[made.sheet.kind].title
+    files: dict[Path, bytes] = {}
     for share in made.sheet.annotators:
-        tables[folder / share.name / WORKBOOK] = workbook_bytes(
-            made.sheet, share, made.pictures, KINDS_OF_SHEETS[made.sheet.kind].title
-        )
-        tables[folder / share.name / TABLE] = table_csv(made.sheet, share).encode()
-    _refuse_other_sheets(made.sheet.id, folder, key_folder, tables)
+        own = folder / share.name
+        files[own / PAGE] = page_html(title, page_data(made, share)).encode()
+        files[own / WORKBOOK] = workbook_bytes(made.sheet, share, made.pictures, title)
+        files[own / TABLE] = table_csv(made.sheet, share).encode()
+    _refuse_other_sheets(made.sheet.id, folder, key_folder, files)
     for path in (folder, key_folder, folder / PICTURES):
         make_folder(path)
     for name, content in made.pictures.items():  # in the order of their numbers, which is drawn
         write_bytes(folder / PICTURES / name, content)
-    written = []
-    for share in made.sheet.annotators:
-        own = folder / share.name
-        make_folder(own)
-        write_text(own / PAGE, page_html(KINDS_OF_SHEETS[made.sheet.kind].title, page_data(made, share)))
-        for path in (own / WORKBOOK, own / TABLE):
-            write_bytes(path, tables[path])
-        written += [own / PAGE, own / WORKBOOK, own / TABLE]
-    write_sheet(folder, made.sheet)
-    write_key(key_folder, made.key)
-    return written
+    for path, content in files.items():
+        make_folder(path.parent)
+        write_bytes(path, content)
+    items.write_record(folder / items.SHEET_FILE, made.sheet)
+    items.write_record(key_folder / items.KEY_FILE, made.key)
+    return list(files)
 
 
-def _refuse_other_sheets(sheet_id: str, folder: Path, key_folder: Path, tables: Mapping[Path, bytes]) -> None:
+def _refuse_other_sheets(sheet_id: str, folder: Path, key_folder: Path, files: Mapping[Path, bytes]) -> None:
     """Answers belong to one set and its key: neither gives way to another, and no answer to an empty table."""
-    held = {}
-    if is_file(folder / SHEET_FILE):
-        held["--out"] = read_sheet(folder / SHEET_FILE).id
-    if is_file(key_folder / KEY_FILE):
-        held["--key"] = read_key(key_folder / KEY_FILE).sheet_id
-    for flag, other in held.items():
+    sheet, key = folder / items.SHEET_FILE, key_folder / items.KEY_FILE
+    known = {
+        "--out": items.read_sheet(sheet).id if is_file(sheet) else sheet_id,
+        "--key": items.read_key(key).sheet_id if is_file(key) else sheet_id,
+    }
+    for flag, other in known.items():
         if other != sheet_id:
             raise ConfigError(f"{flag}: holds the sheets {printable(other)}; name another folder")
-    for path, content in tables.items():
-        if is_file(path) and file_bytes(path) != content:
+    for path, content in files.items():
+        if path.name != PAGE and is_file(path) and file_bytes(path) != content:
             where = printable(str(path), 200)
             raise ConfigError(f"--out: {where} holds answers, or another set; name another folder")
 
@@ -359,8 +311,8 @@ def page_data(made: MadeSheets, share: AnnotatorShare) -> dict[str, Any]:
     return {
         "id": made.sheet.id,
         "annotator": share.name,
-        "columns": list(ANSWER_COLUMNS),
-        "guide": list(guide_of(made.sheet)),
+        "columns": list(items.ANSWER_COLUMNS),
+        "guide": list(items.guide_of(made.sheet)),
         "asks": [asdict(ask) for ask in made.sheet.asks],
         "items": [
             {
@@ -377,7 +329,7 @@ def page_data(made: MadeSheets, share: AnnotatorShare) -> dict[str, Any]:
 
 def table_csv(sheet: Sheet, share: AnnotatorShare) -> str:
     """The table of one annotator, answers to be filled in; text that a spreadsheet would compute begins with ``'``."""
-    rows: list[tuple[str, ...]] = [(*ANSWER_COLUMNS, "picture", "text", "asked", "choices")]
+    rows: list[tuple[str, ...]] = [(*items.ANSWER_COLUMNS, "picture", "text", "asked", "choices")]
     for item in sheet.items_of(share):
         for name in item.asks:
             ask = sheet.ask(name)

@@ -11,15 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from su3d_bench.core import errors
 from su3d_bench.core.config import read_assignments
-from su3d_bench.core.errors import (
-    ConfigError,
-    GroundTruthMissing,
-    PredictionError,
-    StoreError,
-    printable,
-    suggest,
-)
+from su3d_bench.core.errors import ConfigError, GroundTruthMissing, printable
 from su3d_bench.core.maps import DenseFeatures, Instances, Prediction
 from su3d_bench.core.types import Frame, GroundTruth
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
@@ -43,7 +37,7 @@ def chosen_of(run: FinishedRun, what: str, wanted: Sequence[str], known: tuple[s
     """Those that are ``wanted``, which the run must have; all without any."""
     for name in wanted:
         if name not in known:
-            hint = suggest(name, known, "it has")
+            hint = errors.suggest(name, known, "it has")
             raise ConfigError(f"{run.name}: has no {what} '{printable(name, 80)}'{hint}")
     return tuple(dict.fromkeys(wanted)) or known
 
@@ -86,7 +80,7 @@ class RunSource:
         """The map of a scene; a ``PredictionError`` where it has no instances."""
         prediction = self.prediction(scene, method)
         if not isinstance(prediction, Instances):
-            raise PredictionError(
+            raise errors.PredictionError(
                 f"{printable(str(self.run.folder.job(scene, method).prediction), 200)}: holds no instances that people "
                 f"could judge; leave {printable(method, 80)} out with --methods"
             )
@@ -95,7 +89,7 @@ class RunSource:
     def _prediction(self, scene: str, method: str) -> Prediction:
         job = self.run.folder.job(scene, method)
         if not job.prediction.is_file():
-            raise StoreError(
+            raise errors.StoreError(
                 f"{self.run.name}: holds no map of {printable(scene, 100)} by {printable(method, 80)}; run it, or "
                 "leave it out with --methods or --scenes"
             )
@@ -186,15 +180,11 @@ class TruthSource:
         self.run, self.run_digest = run, run_digest
         self.truth = lru_cache(maxsize=1)(self._truth)
         self._map_of = lru_cache(maxsize=1)(self._map)
-        self._frames_of = lru_cache(maxsize=1)(self._frames)
+        self.frames = lru_cache(maxsize=1)(self._frames)
 
     def instances(self, scene: str, method: str = "") -> Instances:
         """Every instance of the truth, whatever the method."""
         return self._map_of(scene)
-
-    def frames(self, scene: str) -> tuple[Frame, ...]:
-        """Those in which it was looked up what can be asked about."""
-        return self._frames_of(scene)
 
     def _truth(self, scene: str) -> GroundTruth:
         return fullest_truth(self.dataset(scene), scene.partition("/")[2])
@@ -207,6 +197,7 @@ class TruthSource:
         return Instances.of(truth.points, list(rows_of.values()), names=names, ids=list(rows_of))
 
     def _frames(self, scene: str) -> tuple[Frame, ...]:
+        """Those in which it was looked up what can be asked about."""
         dataset, name = self.dataset(scene), scene.partition("/")[2]
         return tuple(looked_at(dataset, name))
 

@@ -11,8 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
+from bedroom_map import placed
 from painted import Painted
 from places import SCENES
 
@@ -27,22 +27,17 @@ PAINTED = f"{SCENES}/painted.py:Painted"
 HOSTILE = '<script>alert("x")</script>\x1b[2J'
 
 
-def thing(one: int, name: str, low: tuple[float, float, float], size: tuple[float, float, float]) -> MapObject:
-    box = np.array([low, np.add(low, size)], np.float64)
-    return MapObject(one, name, "", box.mean(axis=0), box)
-
-
 # Two tables, a vase on each and one on the floor far away, a coffee table with a lamp, a desk with a cup.
 ROOM = SceneMap(
     (
-        thing(1, "table", (0.0, 0.0, 0.0), (1.0, 1.0, 0.7)),
-        thing(2, "table", (6.0, 0.0, 0.0), (1.0, 1.0, 0.7)),
-        thing(3, "vase", (0.4, 0.4, 0.7), (0.2, 0.2, 0.3)),
-        thing(4, "vase", (9.0, 9.0, 0.0), (0.2, 0.2, 0.3)),
-        thing(5, "coffee table", (3.0, 3.0, 0.0), (1.0, 0.5, 0.4)),
-        thing(6, "lamp", (3.2, 3.2, 0.4), (0.2, 0.2, 0.4)),
-        thing(7, "desk", (9.0, 0.0, 0.0), (1.0, 0.5, 0.7)),
-        thing(8, "cup", (9.4, 0.2, 0.7), (0.1, 0.1, 0.1)),
+        placed(1, "table", (0.0, 0.0, 0.0), (1.0, 1.0, 0.7)),
+        placed(2, "table", (6.0, 0.0, 0.0), (1.0, 1.0, 0.7)),
+        placed(3, "vase", (0.4, 0.4, 0.7), (0.2, 0.2, 0.3)),
+        placed(4, "vase", (9.0, 9.0, 0.0), (0.2, 0.2, 0.3)),
+        placed(5, "coffee table", (3.0, 3.0, 0.0), (1.0, 0.5, 0.4)),
+        placed(6, "lamp", (3.2, 3.2, 0.4), (0.2, 0.2, 0.4)),
+        placed(7, "desk", (9.0, 0.0, 0.0), (1.0, 0.5, 0.7)),
+        placed(8, "cup", (9.4, 0.2, 0.7), (0.1, 0.1, 0.1)),
     )
 )
 
@@ -101,19 +96,7 @@ def test_the_draw_is_even_over_kinds_and_scenes_and_the_same_for_a_seed() -> Non
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An audit of two painted scenes."""
     out = tmp_path_factory.mktemp("audit") / "audit"
-    words = [
-        "query",
-        "audit",
-        "--scenes",
-        f"{PAINTED}/a",
-        f"{PAINTED}/b",
-        "--n",
-        "14",
-        "--out",
-        str(out),
-        "--quiet",
-    ]
-    assert main(words) == 0
+    assert main(["query", "audit", "--scenes", f"{PAINTED}/a", f"{PAINTED}/b", "--n", "14", "--out", str(out)]) == 0
     return out
 
 
@@ -173,8 +156,7 @@ def test_verdicts_add_up_by_kind_and_the_wrong_ones_are_listed(
     assert sum(count["right"] for count in counts["kinds"].values()) == 10
 
 
-@pytest.mark.parametrize("verdict", ["rigth", "5"])
-def test_an_unknown_verdict_is_refused_with_its_row(verdict: str, tmp_path: Path) -> None:
-    (tmp_path / "audit.csv").write_text(f"{','.join(COLUMNS)}\n1,a,count,x,0,{verdict},\n", encoding="utf-8")
+def test_an_unknown_verdict_is_refused_with_its_row(tmp_path: Path) -> None:
+    (tmp_path / "audit.csv").write_text(f"{','.join(COLUMNS)}\n1,a,count,x,0,rigth,\n", encoding="utf-8")
     with pytest.raises(DataError, match="row 2: unknown verdict"):
         read_verdicts(tmp_path / "audit.csv")

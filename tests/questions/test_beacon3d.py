@@ -15,10 +15,7 @@ from places import CASES
 
 from su3d_bench.metrics.questions import grounding as counting
 from su3d_bench.metrics.questions.grounding import ChainedText, Place
-from su3d_bench.questions import beacon3d as answer_matching
-from su3d_bench.questions import beacon3d as answered
-from su3d_bench.questions import beacon3d as beacon3d_files
-from su3d_bench.questions import chains as made
+from su3d_bench.questions import beacon3d, chains
 from su3d_bench.questions.beacon3d import Number, answered_file
 from su3d_bench.questions.question_files import read_foreign_queries, read_questions
 
@@ -101,5 +98,5 @@ def test_damaged_files_are_read_or_refused_in_one_line(asked: object, answers: o
 
 
 def test_the_examples_hold() -> None:
-    for module in (counting, answer_matching, answered, beacon3d_files, made):
+    for module in (counting, beacon3d, chains):
         assert not doctest.testmod(module).failed

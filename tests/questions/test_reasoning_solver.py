@@ -17,20 +17,14 @@ from su3d_bench.core.errors import PredictionError
 from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.score import RefinedNames, TrueAnswer, are_objects_right, is_answer_right
+from su3d_bench.perception.language.captioner import STRATEGY
 from su3d_bench.perception.language.chat import ChatRequest, LanguageConfig, Reply
+from su3d_bench.questions import solver as solving
 from su3d_bench.questions.generated import generate_questions
 from su3d_bench.questions.model import Answer
 from su3d_bench.questions.question_files import paper_queries
 from su3d_bench.questions.scene_map import MapObject, SceneMap, map_of
-from su3d_bench.questions.solver import (
-    LanguageSolver,
-    Solver,
-    by_language_model,
-    by_relevance,
-    context_for,
-    given_answer,
-    system_prompt,
-)
+from su3d_bench.questions.solver import LanguageSolver, Solver, by_language_model, context_for, given_answer
 
 
 @pytest.fixture(scope="module")
@@ -43,46 +37,33 @@ def solver() -> Solver:
     [
         # Centroids: bed (1, 0.8), sinks (0.25, 4.25, 0.9) and (6.25, 0.25, 0.9): 3.59 m and 5.32 m away.
         ("Which sink is closer to bed?", (9,), None),
-        ("Which sink is farther from the bed?", (10,), None),
         ("which is closer to the bed, the table or the basket?", (6,), None),
         ("Is the table or the basket nearest to the bed?", (6,), None),
         ("Which sink is closer to bed, kitchen sink or bathroom sink?", (9,), None),
         ("Is the table closer to the bed than the basket?", (6, 13), True),
         ("Is the basket closer to the bed than the table?", (13, 6), False),
         ("What is the nearest object to the nightstand?", (3,), None),
-        ("What's closest to the nightstand?", (3,), None),
         ("find the lamp farthest from the bed", (4,), None),
-        ("How many cups are there in the room?", (7, 8), 2),
         ("How many cups are on the table?", (7, 8), 2),
         ("Count the lamps", (3, 4), 2),
         ("How many pianos are there?", (), 0),
         ("Is there a piano?", (), False),
         ("Is there a cup on the table?", (7, 8), True),
-        ("Is there a lamp on the table?", (), False),
         ("Is the lamp on the nightstand?", (3,), True),
         ("What is on the nightstand?", (3,), None),
-        ("What is on the shelf?", (12,), None),
-        ("What is in the basket?", (14,), None),
         ("What is under the table?", (5,), None),
         ("What is above the bed?", (15,), None),
         ("What is next to the bed?", (2,), None),
         ("How many piles of cups are there?", (7, 8), 2),
-        ("Is the nightstand beside the bed?", (2,), True),
         ("Is there a paper towel near, sink?", (17,), True),
         ("which lamp is on the nightstand next to the bed?", (3,), None),
         ("What is between the bed and the basket?", (6,), None),
         ("Which lamp is the tallest?", (4,), None),
         ("What is the largest object?", (1,), None),
-        ("What is the smallest thing on the table?", (7,), None),
         ("Where is the red lamp?", (3,), None),
         ("Please tell me, how many white lamps are there?", (4,), 1),
-        ("How many towels are there?", (18,), 1),
         ("Is there a fridge?", (), False),
-        ("Where is the carpet?", (5,), None),
-        ("Is there a bookshelf?", (11,), True),
         ("How many bed side tables do you see?", (), 0),
-        ("How many seats are there?", (), 0),
-        ("How many pieces of furniture are there?", (), 0),
         ("how many furniture are there", (1, 2, 6, 11), 4),
     ],
 )
@@ -99,12 +80,9 @@ def test_questions_that_geometry_settles(
     [
         ("I am feeling cold, what should I do?", "none of those that geometry settles"),
         ("", "none of those"),
-        ("?" * 1000, "none of those"),
         ("Which chair is closer to the bed?", "the map has no 'chair'"),
-        ("Where is the piano?", "the map has no 'piano'"),
         ("What is between the bed?", "'between' needs two things"),
         ("How far is the bed from the bed?", "one thing in the map"),
-        ("Is the sofa prettier than the bed?", "none of those"),
     ],
 )
 def test_what_cannot_be_settled_says_so(solver: Solver, question: str, reason: str) -> None:
@@ -211,15 +189,7 @@ class Said:
 
 
 def test_the_prompt_holds_the_paper_s_six_rules_and_every_object() -> None:
-    for rule in (
-        "Use `Name' & `Description' to understand object.",
-        "Use `ID' to refer object.",
-        "Use `Cartesian Coordinates'.",
-        "Get `Centroid' & `Bounding Box' information.",
-        "Compute `Euclidean Distance' if necessary.",
-        "Assume `Tolerance' if necessary.",
-    ):
-        assert rule in system_prompt()
+    assert len(STRATEGY) == 6 and all(rule in solving.system_prompt() for rule in STRATEGY)
     model = Said('{"reasoning": "3.59 < 5.32", "answer": "the kitchen sink", "object_ids": [9, 999]}')
     found = LanguageSolver(bedroom(), model, LanguageConfig()).answer("Which sink is closer to bed?")
     assert (found.text, found.object_ids, found.solver) == ("the kitchen sink", (9,), "llm")
@@ -243,13 +213,14 @@ def test_a_map_larger_than_the_context_is_cut_by_relevance_and_it_is_said() -> N
     assert found.notes[0].startswith(
         f"the map has 318 objects, more than the model reads at once; it was given the {len(context.objects)} "
     )
-    assert {one.id for one in by_relevance(scene, "Which sink is closer to bed?")[:3]} == {1, 9, 10}
+    assert {one.id for one in solving.by_relevance(scene, "Which sink is closer to bed?")[:3]} == {1, 9, 10}
     assert context_for(bedroom(), "x", LanguageConfig()).note == ""
 
 
-@pytest.mark.parametrize("text", ["I'm sorry, I can't help with that.", ""])
-def test_a_model_that_refuses_leaves_the_question_unsettled(text: str) -> None:
-    found = LanguageSolver(bedroom(), Said(text), LanguageConfig()).answer("Which sink is closer to bed?")
+def test_a_model_that_refuses_leaves_the_question_unsettled() -> None:
+    found = LanguageSolver(bedroom(), Said("I'm sorry, I can't help with that."), LanguageConfig()).answer(
+        "Which sink is closer to bed?"
+    )
     assert not found.is_settled
     assert found.text.startswith("I cannot settle this: gpt-4-1106-preview: ")
 
@@ -278,17 +249,10 @@ def objects_of_rows(scene: SceneMap) -> np.ndarray[tuple[int, ...], np.dtype[np.
     return np.array(scene.ids, np.int64)
 
 
-class PageModel:
+def page_model(case: Any) -> Said:
     """A language model that says what the page shows."""
-
-    def __init__(self, case: Any) -> None:
-        self.case = case
-        self.requests: list[ChatRequest] = []
-
-    def ask_all(self, requests: Sequence[ChatRequest]) -> list[Reply]:
-        self.requests += requests
-        told = {name: self.case[name] for name in ("object_ids", "reference_ids")}
-        return [Reply(json.dumps({"reasoning": "as shown", "answer": self.case["told"], **told}), "stop")]
+    ids = {name: case[name] for name in ("object_ids", "reference_ids")}
+    return Said(json.dumps({"reasoning": "as shown", "answer": case["told"], **ids}))
 
 
 def test_there_are_seven_and_they_are_asked_of_the_paper_s_scenes() -> None:
@@ -310,7 +274,7 @@ def test_the_built_in_solver_gives_the_page_s_answer_or_says_that_it_cannot(case
 
 @each_case
 def test_the_page_s_answer_in_a_model_s_words_is_right_and_another_is_wrong(case: Any) -> None:
-    scene, model = shown_map(case), PageModel(case)
+    scene, model = shown_map(case), page_model(case)
     solver = by_language_model(model, LanguageConfig())
     (found,) = solver.ask(scene, [case["question"]])
     given, true = given_answer(truth_of(case), found, scene), truth_of(case)
@@ -319,5 +283,5 @@ def test_the_page_s_answer_in_a_model_s_words_is_right_and_another_is_wrong(case
     assert list(found.reference_ids) == case["reference_ids"]
     assert all(f'"ID": {one["id"]}' in model.requests[0].text for one in case["objects"])
     wrong = {**case, "told": "No, 77 of them", "object_ids": [one["id"] for one in case["objects"]][:1]}
-    (found,) = by_language_model(PageModel(wrong), LanguageConfig()).ask(scene, [case["question"]])
+    (found,) = by_language_model(page_model(wrong), LanguageConfig()).ask(scene, [case["question"]])
     assert not is_answer_right(RULES, true, given_answer(true, found, scene), objects_of_rows(scene))

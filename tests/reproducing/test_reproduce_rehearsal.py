@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
-import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from registry_bundles import Files, edit_record, read_bundle, rewrite_bundle
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.digests import digest_bytes
 
 TABLES = ["V", "reasoning"]
 ROOM = ["--rooms", "bedroom0", "--room-settings", "n_frames=80", "width=160", "height=120", "mesh_spacing_m=0.1"]
@@ -60,18 +59,10 @@ def test_in_another_folder_the_bundle_is_scored_to_the_same_bits(
     assert (found["n_scores"], found["n_cells"]) == (2 * 2, 10)
 
 
-Files = dict[str, bytes]
-
-
 def raise_a_cell(files: Files) -> None:
     record = json.loads(files["compared.json"])
     record["cells"][0]["measured"] = 98.7
     files["compared.json"] = json.dumps(record).encode()
-
-
-def bring_code(files: Files) -> None:
-    text = files["runs/replica/run.toml"].decode().replace("scenes = [", 'scenes = ["evil.py:Data/a", ', 1)
-    files["runs/replica/run.toml"] = text.encode()
 
 
 # A flipped label is refused in the tests of the registry: in a random network's map it moves no count.
@@ -79,32 +70,17 @@ def bring_code(files: Files) -> None:
     ("tamper", "says"),
     [
         (raise_a_cell, "measured is 98.7, the runs give"),
-        (bring_code, "names somebody's own 'evil.py:Data/a', which a bundle does not bring"),
+        (
+            lambda files: edit_record(files, "runs/replica/run.toml", "scenes = [", 'scenes = ["evil.py:Data/a", '),
+            "names somebody's own 'evil.py:Data/a', which a bundle does not bring",
+        ),
     ],
 )
 def test_a_tampered_bundle_is_refused_with_its_reason_though_all_its_digests_are_right(
-    rehearsed: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    tamper: Callable[[Files], None],
-    says: str,
+    rehearsed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], tamper: Callable[[Files], None], says: str
 ) -> None:
-    files, manifest = _read(rehearsed / "bundle.zip")
+    files, manifest = read_bundle(rehearsed / "bundle.zip")
     tamper(files)
-    _write(tmp_path / "t.zip", files, manifest)
+    rewrite_bundle(tmp_path / "t.zip", files, manifest)
     assert main(["report", "verify", str(tmp_path / "t.zip")]) == 1
     assert says in capsys.readouterr().out
-
-
-def _read(bundle: Path) -> tuple[Files, dict[str, object]]:
-    with zipfile.ZipFile(bundle) as archive:
-        files = {name: archive.read(name) for name in archive.namelist()}
-    return files, json.loads(files.pop("manifest.json"))
-
-
-def _write(place: Path, files: Files, manifest: dict[str, object]) -> None:
-    entries = {name: {"n_bytes": len(content), "sha256": digest_bytes(content)} for name, content in files.items()}
-    with zipfile.ZipFile(place, "w") as archive:
-        archive.writestr("manifest.json", json.dumps({**manifest, "files": entries}))
-        for name, content in files.items():
-            archive.writestr(name, content)

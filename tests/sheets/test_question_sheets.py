@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 from collections import Counter
@@ -21,21 +20,7 @@ from su3d_bench.questions.model import MADE_KINDS, REASONING, question_id
 from su3d_bench.questions.truths import fullest_truth, scene_objects
 from su3d_bench.sheets.answers import Judgement, check_key
 from su3d_bench.sheets.drafts import question_drafts
-from su3d_bench.sheets.items import (
-    ARGUABLE,
-    ASKS,
-    RIGHT,
-    WRONG,
-    AnnotatorShare,
-    Key,
-    KeyItem,
-    Sheet,
-    new_item,
-    read_key,
-    read_sheet,
-    write_key,
-    write_sheet,
-)
+from su3d_bench.sheets.items import ARGUABLE, ASKS, RIGHT, WRONG, Key, KeyItem, Sheet, new_item, read_key, read_sheet
 from su3d_bench.sheets.scores import OF_ALL_KINDS, WHOLE, Scores, score, whole_verdicts
 from su3d_bench.sheets.sources import TruthSource, truth_of_addresses
 
@@ -108,7 +93,7 @@ def test_sheets_of_questions_need_no_run(capsys: pytest.CaptureFixture[str]) -> 
 # Scored
 
 
-def question_set(kinds: Sequence[str], annotators: Sequence[str]) -> tuple[Sheet, Key]:
+def question_set(kinds: Sequence[str]) -> tuple[Sheet, Key]:
     set_id = "questions" + SET_ID
     items, keys = [], []
     for k, kind in enumerate(kinds):
@@ -116,8 +101,7 @@ def question_set(kinds: Sequence[str], annotators: Sequence[str]) -> tuple[Sheet
         items.append(new_item(set_id, name, f"{HOSTILE} {k}", PARTS, [f"{name}.png"], ["ab"]))
         made_id = question_id("rooms/a", kind, f"{k}")
         keys.append(KeyItem(name, "rooms/a", (kind, OF_ALL_KINDS), (k, k), made_id, kind, {}, {}))
-    shares = tuple(AnnotatorShare(name, tuple(one.id for one in items)) for name in annotators)
-    sheet = Sheet(set_id, "questions", 7, ASKS["questions"], tuple(items), shares)
+    sheet = Sheet(set_id, "questions", 7, ASKS["questions"], tuple(items), ())
     return sheet, Key(set_id, "questions", "", "", (*dict.fromkeys(kinds), OF_ALL_KINDS), "", tuple(keys))
 
 
@@ -137,13 +121,13 @@ def judgements(sheet: Sheet, **said: Sequence[tuple[str, str, str]]) -> list[Jud
 
 
 def scored() -> tuple[Sheet, Key, Scores]:
-    sheet, key = question_set(KINDS_ASKED, ("ann", "bob"))
+    sheet, key = question_set(KINDS_ASKED)
     check_key(sheet, key)
     return sheet, key, score(sheet, key, judgements(sheet, ann=ANN, bob=BOB))
 
 
 def test_a_question_is_as_right_as_the_worst_of_its_parts() -> None:
-    sheet, _ = question_set(KINDS_ASKED, ("ann",))
+    sheet, _ = question_set(KINDS_ASKED)
     whole = [one.answer for one in whole_verdicts(judgements(sheet, ann=BOB))]
     assert whole == [RIGHT, ARGUABLE, WRONG, WRONG]
 
@@ -162,21 +146,3 @@ def test_shares_of_right_are_counted_by_kind_of_question() -> None:
     }  # fmt: skip
     assert [shares["closer", part] for part in PARTS] == [0.75, 1.0, 0.25]
     assert [shares["instance", part] for part in PARTS] == [1.0, 0.5, 1.0]
-
-
-@pytest.fixture
-def answered(tmp_path: Path) -> tuple[Key, list[str]]:
-    """The files of two annotators, and the words that score them."""
-    sheet, key = question_set(KINDS_ASKED, ("ann", "bob"))
-    (tmp_path / "key").mkdir()
-    (tmp_path / "sheet").mkdir()
-    write_sheet(tmp_path / "sheet", sheet)
-    write_key(tmp_path / "key", key)
-    checks = {item.id: item.check for item in sheet.items}
-    for name, said in (("ann", ANN), ("bob", BOB)):
-        with (tmp_path / f"{name}.csv").open("w", newline="") as stream:
-            rows = csv.writer(stream)
-            rows.writerow(("sheet_id", "item_id", "annotator", "question", "answer", "check"))
-            for one in judgements(sheet, **{name: said}):
-                rows.writerow((sheet.id, one.item_id, name, one.ask, one.answer, checks[one.item_id]))
-    return key, ["sheets", "score", "ann.csv", "bob.csv", "--key", "key"]

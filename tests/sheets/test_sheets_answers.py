@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import io
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from counted_sheets import both, workbook
-from simulated_annotators import as_csv, retrieval_set
+from simulated_annotators import as_csv, both, retrieval_set, workbook
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.sheets.answers import check_answers, check_key, parse_csv, read_answers
+from su3d_bench.sheets.answers import check_answers, check_key, read_answers
 from su3d_bench.sheets.items import ANSWER_COLUMNS, Key, Sheet
 
 
@@ -28,14 +29,7 @@ def test_answered_twice_names_both_places(small: tuple[Sheet, Key]) -> None:
     assert fault == "again.csv: row 9: is answered a second time, first at ann.csv: row 2; keep one of the two"
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"sheet_id": "retrieval-other"},
-        {"kind": "annotation"},
-        {"items": ()},
-    ],
-)
+@pytest.mark.parametrize("change", [{"sheet_id": "retrieval-other"}, {"kind": "annotation"}, {"items": ()}])
 def test_a_key_of_another_set_is_refused(small: tuple[Sheet, Key], change: dict[str, object]) -> None:
     with pytest.raises(DataError, match=r"^key: "):
         check_key(small[0], replace(small[1], **change))  # type: ignore[arg-type]
@@ -44,13 +38,15 @@ def test_a_key_of_another_set_is_refused(small: tuple[Sheet, Key], change: dict[
 # Files
 
 
-@pytest.mark.parametrize("separator", [",", ";", "\t"])
-@pytest.mark.parametrize("mark", ["", "\ufeff"])
-def test_csv_is_read_as_pages_and_spreadsheets_write_it(small: tuple[Sheet, Key], separator: str, mark: str) -> None:
-    content = (mark + as_csv(both(small), separator)).encode()
-    found = parse_csv(content, "ann.csv")
+@pytest.mark.parametrize(("separator", "mark"), [(",", ""), (";", ""), ("\t", "\ufeff")])
+def test_csv_is_read_as_pages_and_spreadsheets_write_it(
+    small: tuple[Sheet, Key], separator: str, mark: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "ann.csv"
+    file.write_text(mark + as_csv(both(small), separator), encoding="utf-8", newline="")
+    found = read_answers(file)
     assert [replace(one, at="") for one in found] == [replace(one, at="") for one in both(small)]
-    assert found[0].at == "ann.csv: row 2"
+    assert found[0].at == f"{file}: row 2"
 
 
 def test_a_workbook_gives_the_same_rows_as_a_csv(small: tuple[Sheet, Key], tmp_path: Path) -> None:
@@ -81,10 +77,45 @@ def test_each_fault_names_its_file_and_row(small: tuple[Sheet, Key], change: dic
     assert not any("\n" in fault for fault in faults)
 
 
-@pytest.mark.parametrize(
-    "content",
-    [b"", b"sheet_id,item_id\n", b"\xff\xfes\x00", ",".join(ANSWER_COLUMNS).encode() + b"\na,b,\x1b[2J,d,e,f\n"],
-)
-def test_a_csv_that_is_none_is_refused(content: bytes) -> None:
-    with pytest.raises(DataError, match=r"^a\.csv"):
-        parse_csv(content, "a.csv")
+NO_WORDS = ",".join(ANSWER_COLUMNS).encode() + b"\na,b,\x1b[2J,d,e,f\n"
+
+
+@pytest.mark.parametrize("content", [b"", b"sheet_id,item_id\n", b"\xff\xfes\x00", NO_WORDS])
+def test_a_csv_that_is_none_is_refused(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes(content)
+    with pytest.raises(DataError, match=r"a\.csv"):
+        read_answers(tmp_path / "a.csv")
+
+
+# Workbooks that are made to harm who scores them
+
+PAGE = "xl/worksheets/sheet1.xml"
+ENTITY = b'<?xml version="1.0"?><!DOCTYPE worksheet [<!ENTITY a "right">]><worksheet>&a;</worksheet>'
+
+
+def with_page(content: bytes, page: bytes) -> bytes:
+    """A workbook with other bytes in the place of its first worksheet."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as new:
+        for name in old.namelist():
+            new.writestr(name, page if name == PAGE else old.read(name))
+    return stream.getvalue()
+
+
+def test_a_part_that_swells_a_document_type_and_a_cut_file_are_refused(
+    small: tuple[Sheet, Key], tmp_path: Path
+) -> None:
+    book = workbook(both(small))
+    with zipfile.ZipFile(io.BytesIO(book)) as archive:
+        swollen = archive.read(PAGE).replace(b"</worksheet>", b" " * (300 << 20) + b"</worksheet>")
+    for content in (with_page(book, swollen), with_page(book, ENTITY), book[: len(book) // 2], b""):
+        (tmp_path / "a.xlsx").write_bytes(content)
+        with pytest.raises(DataError, match=r"a\.xlsx"):
+            read_answers(tmp_path / "a.xlsx")
+
+
+def test_a_formula_is_no_answer(small: tuple[Sheet, Key], tmp_path: Path) -> None:
+    rows = both(small)
+    rows[0] = replace(rows[0], answer='=IF(1,"right","wrong")')
+    (tmp_path / "a.xlsx").write_bytes(workbook(rows))
+    assert len(check_answers(small[0], read_answers(tmp_path / "a.xlsx")).faults) == 1

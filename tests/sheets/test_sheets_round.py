@@ -17,7 +17,7 @@ import pytest
 from su3d_bench.cli.main import main
 from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.items import CANNOT_TELL, Key, Sheet, SheetKind
-from su3d_bench.sheets.sets import TABLE, WORKBOOK, Origin, make_sheets, write_sheets
+from su3d_bench.sheets.sets import TABLE, WORKBOOK, make_sheets, write_sheets
 
 HOSTILE = '=HYPERLINK("x") <script>alert(1)</script> \u202eabc " , ; \U0001f600'
 
@@ -77,8 +77,8 @@ def test_what_people_fill_in_comes_back_as_scores(
     kind: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     png = cv2.imencode(".png", np.zeros((4, 4, 3), np.uint8))[1].tobytes()
-    origin = Origin("runs/made", "0", ("opensu3d",), "a made truth")
-    made = make_sheets(kind, drafts(kind, 30), [png] * 30, origin, seed=5, annotators=3, overlap=0.4)
+    origin = Key("", kind, "runs/made", "0", ("opensu3d",), "a made truth", ())
+    made = make_sheets(origin, drafts(kind, 30), [png] * 30, seed=5, annotators=3, overlap=0.4)
     folder, apart = tmp_path / "sheets" / kind, tmp_path / "sheets" / f"{kind}-key"
     write_sheets(made, folder, apart)
     rates = {"annotator-1": 0.0, "annotator-2": 0.0, "annotator-3": 0.8}

@@ -3,29 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from counted_sheets import both, scored, workbook
-from simulated_annotators import RATES, annotation_set, answered, as_csv, retrieval_set
+from simulated_annotators import RATES, annotation_set, answered, retrieval_set, scored
 
 from su3d_bench.core.types import Float64Array
 from su3d_bench.numerics.statistics import sign_flip_test
 from su3d_bench.questions.model import KINDS
 from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
 from su3d_bench.reports.tables.judged import sheet_tables
-from su3d_bench.sheets.items import Key, Sheet, write_key, write_sheet
+from su3d_bench.sheets.items import Key, Sheet
 from su3d_bench.sheets.scores import ScoreCell, Scores, paired_p, second_looks_csv, second_looks_page
 
 
 def cells_of(scores: Scores, judge: str = "people") -> dict[tuple[str, str], ScoreCell]:
     return {(one.method, one.metric): one for one in scores.cells if one.judge == judge}
-
-
-def value(cell: ScoreCell) -> float:
-    assert cell.value is not None
-    return cell.value
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +57,7 @@ def test_known_error_rates_give_the_known_accuracies_and_agreement() -> None:
         # an error turns a right into a wrong and the reverse; the mean of two people of n items each
         expected = sum(rate * (1 - e) + (1 - rate) * e for e in (first, second)) / 2
         variance = sum(e * (1 - e) for e in (first, second)) / 4 / 800
-        assert value(people[scheme, "all"]) == pytest.approx(expected, abs=4 * variance**0.5)
+        assert people[scheme, "all"].value == pytest.approx(expected, abs=4 * variance**0.5)
     n = len(sheet.items)
     share = np.mean([one.automatic["retrieval"] == "right" for one in key.items])
     equal = (1 - first) * (1 - second) + first * second
@@ -150,18 +143,3 @@ def test_hostile_texts_do_no_harm_in_tables_and_lists(small: tuple[Sheet, Key]) 
     assert "x.png" not in page and "a%22.png" in page
     assert ",'=HYPERLINK(1)," in listed
     assert not any(line.startswith(("=", "+", "@")) for line in csv_text(sheet_tables(content)).splitlines())
-
-
-# The verb
-
-
-@pytest.fixture
-def folder(tmp_path: Path, small: tuple[Sheet, Key]) -> Path:
-    for name in ("sheet", "key", "answers"):
-        (tmp_path / name).mkdir()
-    write_sheet(tmp_path / "sheet", small[0])
-    write_key(tmp_path / "key", small[1])
-    rows = both(small)
-    (tmp_path / "answers" / "ann.csv").write_text(as_csv([one for one in rows if one.annotator == "ann"]))
-    (tmp_path / "answers" / "bob.xlsx").write_bytes(workbook([one for one in rows if one.annotator == "bob"]))
-    return tmp_path

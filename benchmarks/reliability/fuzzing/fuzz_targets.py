@@ -309,8 +309,7 @@ def _bundle(folder: Path) -> Read:
 
 def _answers(name: str) -> Make:
     def make(folder: Path) -> Read:
-        from counted_sheets import workbook
-        from simulated_annotators import answered, as_csv, retrieval_set
+        from simulated_annotators import answered, as_csv, retrieval_set, workbook
 
         from su3d_bench.sheets.answers import check_answers, read_answers
 

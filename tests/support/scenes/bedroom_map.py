@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from su3d_bench.core.types import Float64Array
@@ -15,6 +17,11 @@ def box(x: float, y: float, z: float, dx: float, dy: float, dz: float) -> Float6
 
 def thing(object_id: int, name: str, bounds: Float64Array, caption: str = "") -> MapObject:
     return MapObject(object_id, name, caption, bounds.mean(axis=0), bounds)
+
+
+def placed(number: int, name: str, low: Sequence[float], sizes: Sequence[float], caption: str = "") -> MapObject:
+    """A thing by its lowest corner and its sizes."""
+    return thing(number, name, np.array([low, np.add(low, sizes)], np.float64), caption)
 
 
 def bedroom() -> SceneMap:

@@ -9,10 +9,11 @@ from dataclasses import replace
 import numpy as np
 from places import SCENES
 
+from su3d_bench.core.errors import printable
 from su3d_bench.reports.pictures.items import png_bytes
 from su3d_bench.sheets.drafts import Draft
-from su3d_bench.sheets.items import ASKS, SheetKind
-from su3d_bench.sheets.sets import MadeSheets, Origin, make_sheets
+from su3d_bench.sheets.items import ASKS, Key, SheetKind
+from su3d_bench.sheets.sets import MadeSheets, make_sheets
 
 PAINTED = f"{SCENES}/painted.py:Painted"
 COLLECTOR = f"{SCENES}/painted.py:Collector"
@@ -66,9 +67,8 @@ def made(
     kind: SheetKind, texts: Sequence[str], *, seed: int = 0, annotators: int = 1, overlap: float = 0.5
 ) -> MadeSheets:
     """A set of sheets of one item a text."""
-    from su3d_bench.core.errors import printable
-
     safe = [replace(one, text=printable(one.text, 1000)) for one in drafts_of(kind, texts)]
-    origin = Origin("runs/secret-run", "secret-code", ("opensu3d@scheme1", "opensu3d@scheme4"), "secret-rule")
+    methods = ("opensu3d@scheme1", "opensu3d@scheme4")
+    origin = Key("", kind, "runs/secret-run", "secret-code", methods, "secret-rule", ())
     drawn = [painted_png(one) for one in safe]
-    return make_sheets(kind, safe, drawn, origin, seed=seed, annotators=annotators, overlap=overlap)
+    return make_sheets(origin, safe, drawn, seed=seed, annotators=annotators, overlap=overlap)

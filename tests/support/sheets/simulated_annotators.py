@@ -1,27 +1,20 @@
-"""Sets of sheets with a known truth, and people who answer them with known error rates."""
+"""Sets of sheets with a known truth, people who answer them with known error rates, and the files they send back."""
 
 from __future__ import annotations
 
 import csv
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import openpyxl
 
 from su3d_bench.questions.model import KINDS
-from su3d_bench.sheets.answers import AnswerRow
-from su3d_bench.sheets.items import (
-    ANSWER_COLUMNS,
-    ASKS,
-    CANNOT_TELL,
-    AnnotatorShare,
-    Key,
-    KeyItem,
-    Sheet,
-    SheetItem,
-    SheetKind,
-    new_item,
-)
+from su3d_bench.sheets.answers import AnswerRow, check_answers, check_key
+from su3d_bench.sheets.items import ANSWER_COLUMNS, ASKS, CANNOT_TELL, AnnotatorShare, Key, KeyItem, Sheet, new_item
+from su3d_bench.sheets.scores import Scores, score
 
 SCHEMES = tuple(f"opensu3d@scheme{k}" for k in range(1, 5))
 RATES = {SCHEMES[0]: 0.5, SCHEMES[1]: 0.6, SCHEMES[2]: 0.7, SCHEMES[3]: 0.9}  # how often each is right, in truth
@@ -35,18 +28,17 @@ def retrieval_set(
 
     All schemes that are right retrieve the same instance, which is one item; so do all that are wrong.
     """
-    items: list[SheetItem] = []
-    keys: list[KeyItem] = []
+    asked: list[tuple[str, KeyItem]] = []
     for k in range(n_questions):
         kind, scene = KINDS[k % len(KINDS)], scenes[k % len(scenes)]
         place = (k // len(KINDS) + 0.5) / (n_questions // len(KINDS))  # the same shares in each kind
         for choice in ("right", "wrong"):
             methods = tuple(one for one in SCHEMES if (place < RATES[one]) == (choice == "right"))
             if methods:
-                items.append(_item("retrieval", len(items), f"{kind} {k}", ("retrieval",)))
-                told = (scene, methods, (k,) * len(methods), f"q{k}", kind)
-                keys.append(KeyItem(items[-1].id, *told, {}, {"retrieval": choice}))
-    return _set("retrieval", items, keys, SCHEMES, annotators)
+                ids = (k,) * len(methods)
+                key = KeyItem("", scene, methods, ids, f"q{k}", kind, {}, {"retrieval": choice})
+                asked.append((f"{kind} {k}", key))
+    return _set("retrieval", asked, SCHEMES, annotators)
 
 
 def annotation_set(truths: Sequence[tuple[str, str, str]], annotators: Sequence[str] = ("ann",)) -> tuple[Sheet, Key]:
@@ -54,50 +46,41 @@ def annotation_set(truths: Sequence[tuple[str, str, str]], annotators: Sequence[
 
     Where they are not, label 1 is n' in every other item. An empty label n': these labels leave the instance out.
     """
-    items: list[SheetItem] = []
-    keys: list[KeyItem] = []
+    asked = []
     for k, (first, second, merging) in enumerate(truths):
+        told = {"n": first, "n'": second}
+        names = [("n'",), ("n",)] if k % 2 else [("n",), ("n'",)]
         if second in ("", first):
-            stands_for: dict[str, tuple[str, ...]] = {"label 1": ("n", "n'") if second else ("n",)}
-            automatic = {"label 1": first, "merging": merging}
-        elif k % 2:
-            stands_for = {"label 1": ("n'",), "label 2": ("n",)}
-            automatic = {"label 1": second, "label 2": first, "merging": merging}
-        else:
-            stands_for = {"label 1": ("n",), "label 2": ("n'",)}
-            automatic = {"label 1": first, "label 2": second, "merging": merging}
-        items.append(_item("annotation", k, f"labels of {k}", tuple(automatic)))
-        keys.append(KeyItem(items[-1].id, "rooms/a", ("opensu3d",), (k,), "", "", stands_for, automatic))
-    return _set("annotation", items, keys, ("opensu3d",), annotators)
+            names = [("n", "n'") if second else ("n",)]
+        stands_for = {f"label {place}": what for place, what in enumerate(names, 1)}
+        automatic = {ask: told[what[0]] for ask, what in stands_for.items()} | {"merging": merging}
+        key = KeyItem("", "rooms/a", ("opensu3d",), (k,), "", "", stands_for, automatic)
+        asked.append((f"labels of {k}", key))
+    return _set("annotation", asked, ("opensu3d",), annotators)
 
 
 def reasoning_set(truths: Sequence[tuple[str, str]], annotators: Sequence[str] = ("ann",)) -> tuple[Sheet, Key]:
     """One question for each (answer, objects) of the truth."""
-    items = [_item("reasoning", k, f"question {k}", ("answer", "objects")) for k in range(len(truths))]
-    keys = [
-        KeyItem(
-            item.id, "rooms/a", ("opensu3d",), (-1,), f"q{k}", "reasoning", {}, dict(zip(item.asks, truth, strict=True))
-        )
-        for k, (item, truth) in enumerate(zip(items, truths, strict=True))
-    ]
-    return _set("reasoning", items, keys, ("opensu3d",), annotators)
-
-
-def _item(kind: SheetKind, number: int, text: str, asks: tuple[str, ...]) -> SheetItem:
-    name = f"item-{number:04d}"
-    return new_item(kind + SET_ID, name, text, asks, [f"{name}.png"], ["ab"])
+    asked = []
+    for k, (answer, objects) in enumerate(truths):
+        truth = {"answer": answer, "objects": objects}
+        asked.append((f"question {k}", KeyItem("", "rooms/a", ("opensu3d",), (-1,), f"q{k}", "reasoning", {}, truth)))
+    return _set("reasoning", asked, ("opensu3d",), annotators)
 
 
 def _set(
-    kind: SheetKind,
-    items: Sequence[SheetItem],
-    keys: Sequence[KeyItem],
-    methods: tuple[str, ...],
-    annotators: Sequence[str],
+    kind: Any, asked: Sequence[tuple[str, KeyItem]], methods: tuple[str, ...], annotators: Sequence[str]
 ) -> tuple[Sheet, Key]:
-    shares = tuple(AnnotatorShare(name, tuple(one.id for one in items)) for name in annotators)
-    sheet = Sheet(kind + SET_ID, kind, 7, ASKS[kind], tuple(items), shares)
-    return sheet, Key(sheet.id, kind, "runs/made", "0", methods, "a made truth", tuple(keys))
+    """A set of texts that are asked, each with its key, which says what is asked and gets its number here."""
+    set_id, names = kind + SET_ID, [f"item-{number:04d}" for number in range(len(asked))]
+    keys = tuple(replace(key, id=name) for name, (_, key) in zip(names, asked, strict=True))
+    items = tuple(
+        new_item(set_id, key.id, text, tuple(key.automatic), [f"{key.id}.png"], ["ab"])
+        for key, (text, _) in zip(keys, asked, strict=True)
+    )
+    shares = tuple(AnnotatorShare(name, tuple(names)) for name in annotators)
+    key = Key(set_id, kind, "runs/made", "0", methods, "a made truth", keys)
+    return Sheet(set_id, kind, 7, ASKS[kind], items, shares), key
 
 
 def answered(sheet: Sheet, key: Key, error_rates: Mapping[str, float], seed: int = 0) -> list[AnswerRow]:
@@ -123,3 +106,26 @@ def as_csv(rows: Sequence[AnswerRow], separator: str = ",") -> str:
     writer.writerow(ANSWER_COLUMNS)
     writer.writerows([[getattr(one, name) for name in ANSWER_COLUMNS] for one in rows])
     return text.getvalue()
+
+
+def workbook(rows: Sequence[AnswerRow], header_at: int = 1) -> bytes:
+    """The rows as a workbook, which may have instructions above its header."""
+    book = openpyxl.Workbook()
+    for k, name in enumerate(ANSWER_COLUMNS, 1):
+        for number, value in enumerate((name, *(getattr(row, name) for row in rows)), header_at):
+            book.active.cell(number, k).value = value
+    stream = io.BytesIO()
+    book.save(stream)
+    return stream.getvalue()
+
+
+def both(small: tuple[Sheet, Key]) -> list[AnswerRow]:
+    """The answers of two people without an error."""
+    return answered(*small, {"ann": 0.0, "bob": 0.0})
+
+
+def scored(sheet: Sheet, key: Key, rows: Sequence[AnswerRow]) -> Scores:
+    check_key(sheet, key)
+    checked = check_answers(sheet, rows)
+    assert checked.faults == ()
+    return score(sheet, key, checked.judgements, checked.silent)
