@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 from places import CASES
-from replica_scene import QUADS, TWO_OBJECTS, write_original, write_render, write_scene_graphs
+from recording_files import write_files
+from replica_scene import QUADS, TWO_OBJECTS, write_original, write_render
 from scored_room import ENCODER, nothing, room, truth_as_prediction
 
 from su3d_bench.baselines.oracle import Oracle
@@ -132,6 +133,21 @@ def test_the_first_relation_of_a_pair_counts_and_a_doubtful_one_is_not_true() ->
     assert GEOMETRIC == RELATIONS
 
 
+def write_scene_graphs(root: Path, objects: list[tuple[int, str]], relations: list[tuple[int, int, str]]) -> Path:
+    """ReplicaSSG's annotation of room_0, and of another scan, with the classes of its protocol."""
+    rules = load_protocol("replica-relations")
+    rows = [{"label": label, "id": str(number)} for number, label in objects]
+    triples = [[subject, other, rules.predicates.index(name), name] for subject, other, name in relations]
+    files: dict[str, Any] = {
+        f"{key}.json": {"scans": [{"scan": "apartment_0", key: []}, {"scan": "room_0", key: content}]}
+        for key, content in {"objects": rows, "relationships": triples}.items()
+    }
+    meant = {"chair": "chair", "sofa": "chair", "table": "table", "wall": "unknown"}
+    classes = {"Replica2VisualGenome": meant, "VisualGenome_list": [entry.name for entry in rules.classes]}
+    write_files(root / "ReplicaSSG", files | {"replica_to_visual_genome.json": classes})
+    return root / "ReplicaSSG"
+
+
 def written(folder: Path) -> Replica:
     write_render(folder)
     write_original(folder, QUADS, [0, 0, 5, 5], TWO_OBJECTS)
@@ -155,12 +171,12 @@ def test_the_annotation_of_replicassg_lies_on_the_centres_of_faces(tmp_path: Pat
 @pytest.mark.parametrize(
     ("name", "old", "new", "message"),
     [
-        ("objects.json", '"scan": "room_0"', '"scan": "room_1"', "has 0 entries of room_0 with a list 'objects'"),
-        ("objects.json", '"id": "5"', '"id": "five"', "expected an id and a label"),
+        ("objects.json", '"scan": "room_0"', '"scan": "room_1"', "has 0 entries of room_0; expected one"),
+        ("objects.json", '"id": "5"', '"id": "five"', "objects: 1.id: Input should be a valid integer"),
         ("objects.json", '"chair"', '"wall"', "a relation names object 1, which is none of the graph"),
-        ("relationships.json", '"near"', "3", "expected subject, object, number, name"),
-        ("relationships.json", '"scans"', '"scan"', "has no list 'scans'"),
-        ("replica_to_visual_genome.json", "VisualGenome_list", "list", "has no list 'VisualGenome_list' of names"),
+        ("relationships.json", '"near"', "3", "relationships: 0.3: Input should be a valid string"),
+        ("relationships.json", '"scans"', '"scan"', "scans: Field required"),
+        ("replica_to_visual_genome.json", "VisualGenome_list", "list", "VisualGenome_list: Field required"),
         ("replica_to_visual_genome.json", "{", "[", "not JSON"),
     ],
 )
