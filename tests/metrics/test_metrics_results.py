@@ -44,18 +44,6 @@ def test_pooled_values_differ_from_the_mean_of_the_scenes(name: str) -> None:
     assert result.metrics == result.pooled
 
 
-@pytest.mark.parametrize("name", [*SEMANTIC, *INSTANCE])
-def test_the_interval_surrounds_the_value_and_is_the_same_every_time(name: str) -> None:
-    rules = load_protocol(name)
-    first, second = combine(rules, noisy_scores(name, 5)), combine(rules, noisy_scores(name, 5))
-    assert first.intervals == second.intervals
-    for key in rules.headline:
-        interval = first.intervals[key]
-        assert interval is not None
-        assert interval[0] <= first.metrics[key] <= interval[1]
-        assert interval[0] < interval[1]
-
-
 @pytest.mark.parametrize("aggregate", ["pooled", "scene-mean"])
 @pytest.mark.parametrize("name", [*SEMANTIC, *INSTANCE])
 def test_the_interval_is_student_s_on_the_values_without_each_scene(name: str, aggregate: str) -> None:
@@ -74,15 +62,6 @@ def test_a_single_scene_has_no_interval_and_two_have_one() -> None:
     assert combine(ROOM, noisy_scores("rooms-semantic", 1)).intervals == {"mAcc": None, "F-mIoU": None}
     assert all(combine(ROOM, noisy_scores("rooms-semantic", 2)).intervals.values())
     assert not any(combine(ROOM, noisy_scores("rooms-semantic", 2), with_intervals=False).intervals.values())
-
-
-def test_a_protocol_may_report_the_mean_of_the_scenes() -> None:
-    rules = ROOM.model_copy(update={"aggregate": "scene-mean"})
-    result = combine(rules, noisy_scores("rooms-semantic", 5))
-    interval = result.intervals["mAcc"]
-    assert result.metrics == result.scene_mean
-    assert interval is not None
-    assert interval[0] < result.metrics["mAcc"] < interval[1]
 
 
 @pytest.mark.parametrize("aggregate", ["pooled", "scene-mean"])
@@ -184,11 +163,6 @@ def test_coverage_is_the_share_of_scored_points_without_a_predicted_point_that_n
     coverage = combine(rules, {"a": score_scene(rules, truth, prediction, None)}).coverage
     n_scored = 6 if name == "replica-mesh-ex6" else 7
     assert coverage == {"0.025": 1 / n_scored, "0.05": 1 / n_scored, "0.1": 1 / n_scored}
-
-
-def test_the_number_of_predictions_is_reported() -> None:
-    result = combine(ROOM, noisy_scores("rooms-semantic", 2))
-    assert result.n_predictions == {"rooms/0": 8, "rooms/1": 8}
 
 
 # ---- bytes
