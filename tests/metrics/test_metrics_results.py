@@ -105,10 +105,6 @@ def test_constant_confidences_are_told() -> None:
 def test_duplicates_are_told() -> None:
     truth = room()
     chairs = np.flatnonzero(truth.instance == 2)
-    told = warnings_of("rooms-instance", instances(truth.points, [chairs, chairs[5:]], ["chair", "table"]))
-    assert told == (
-        "rooms/a: 1 pair of predictions overlaps with IoU above 0.9 (first 0 and 1); duplicates can raise or lower AP"
-    )
     small = [chairs[:99], chairs[50:], chairs[50:], chairs[:99]]  # of 100 points two, and two that do not count
     told = warnings_of("rooms-instance", instances(truth.points, small, ["chair"] * 4))
     assert told.startswith("rooms/a: 1 pair of predictions overlaps with IoU above 0.9 (first 1 and 2); ")

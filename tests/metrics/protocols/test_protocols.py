@@ -21,7 +21,6 @@ from su3d_bench.metrics.fitness import (
     list_of_ids,
     n_feature_dimensions,
     why_not_content,
-    why_not_map,
     why_not_numbers,
     why_not_truth,
 )
@@ -155,19 +154,6 @@ def test_every_kind_has_rules_and_a_metric_and_every_metric_belongs_to_a_kind() 
     assert set(RULES_OF_KIND) == set(METRICS) == set(get_args(Kind))
     names = [name for rules in RULES_OF_KIND.values() for name in rules.values_of_metric]
     assert set(names) == set(get_args(MetricName))
-
-
-@pytest.mark.parametrize(
-    ("content", "reason"),
-    [
-        (ContentFacts("instances", 2, has_names=True), None),
-        (ContentFacts("instances", 2, 512), "needs names, and the method gives its instances none"),
-        (ContentFacts("instances", 0), None),
-        (ContentFacts("partition", 2, 512), "needs instances with names, and the method gives a partition"),
-    ],
-)
-def test_where_names_are_judged_instances_must_have_them(content: ContentFacts, reason: str | None) -> None:
-    assert why_not_map(load_protocol("rooms-annotation"), content) == reason
 
 
 def test_a_single_name_or_class_is_enough_to_be_judged_by() -> None:
