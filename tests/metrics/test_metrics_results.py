@@ -214,15 +214,11 @@ def test_a_result_has_no_nan_in_its_json() -> None:
 # ---- what cannot be scored
 
 
-def test_a_prediction_without_labels_and_features_is_refused() -> None:
-    prediction = replace(truth_as_prediction(room(), with_labels=True), labels=None)
-    with pytest.raises(PredictionError, match="neither labels nor features"):
-        score_scene(ROOM, room(), prediction, ENCODER)
-
-
-def test_features_without_an_encoder_are_refused() -> None:
-    with pytest.raises(PredictionError, match="no encoder"):
-        score_scene(ROOM, room(), truth_as_prediction(room(), with_labels=False), None)
+def test_a_prediction_needs_labels_or_features_and_an_encoder_that_names_them() -> None:
+    without = replace(truth_as_prediction(room(), with_labels=True), labels=None)
+    for prediction, encoder in ((without, ENCODER), (truth_as_prediction(room(), with_labels=False), None)):
+        with pytest.raises(PredictionError, match="needs features and an encoder, or labels"):
+            score_scene(ROOM, room(), prediction, encoder)
 
 
 def test_features_of_another_encoder_are_refused() -> None:

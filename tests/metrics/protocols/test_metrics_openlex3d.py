@@ -334,7 +334,7 @@ def test_a_prediction_without_features_cannot_be_ranked() -> None:
     assert reason == "openlex3d-ranking: needs features to compare with texts, and the prediction has none"
     with pytest.raises(PredictionError, match="needs features"):
         score_scene(RANKING, truth, named, ENCODER)
-    with pytest.raises(PredictionError, match="there is no encoder"):
+    with pytest.raises(PredictionError, match="needs features and an encoder"):
         score_scene(RANKING, truth, perfect(truth), None)
 
 
