@@ -38,13 +38,14 @@ MOST_SURVIVE = 0.05
 LONGEST = 10.0  # times what the tests of the module take as they are: beyond it a mutant runs for ever, and is noticed
 LEAST_S = 60.0
 
+_EVERY = ("test_every_protocol", "test_counts")
 _CURVES = ("test_metrics_instance", "test_metrics_kernels", "test_metrics_class_agnostic", "test_metrics_undefined")
-_SCORES = ("test_metrics_scoring", "test_metrics_results", "numerics/test_statistics")
+_SCORES = ("test_metrics_scoring", "test_metrics_results", *_EVERY, "numerics/test_statistics")
 _TRANSFER = ("test_metrics_transfer", "test_metrics_neighbours", *_SCORES)
-_TEXTS = ("test_metrics_queries", "test_metrics_openlex3d", "test_openlex3d_original")
+_TEXTS = ("test_metrics_queries", "test_metrics_openlex3d", *_EVERY, "test_openlex3d_original")
 _QUESTIONS = (
     "test_annotation_protocol", "test_retrieval_protocol", "test_presence_protocol", "test_grounding_protocol",
-    "questions/test_reasoning_solver",
+    "test_counts", "questions/test_reasoning_solver",
 )  # fmt: skip
 _PROTOCOLS = ("test_protocols", "test_protocol_files", "test_metrics_scoring", "evaluation/test_evaluate")
 _COMPARE = tuple(f"analysis/test_compare{name}" for name in ("_pairs", ""))
@@ -52,12 +53,12 @@ _GATE = tuple(f"analysis/gate/test_gate{name}" for name in ("", "_costs"))
 # Of each module, or of all in a folder, the tests that must notice: the quick ones first. Names without a folder stand
 # in tests/metrics or below.
 GUARDS: dict[str, tuple[str, ...]] = {
-    "metrics/graphs.py": ("test_hovsg_graphs",),
+    "metrics/graphs.py": ("test_hovsg_graphs", "test_counts"),
     "metrics/instance/": (*_CURVES, *_SCORES),
     "metrics/semantic/": ("test_metrics_semantic", "test_metrics_undefined", "test_metrics_hovsg", *_SCORES),
-    "metrics/semantic/panoptic.py": ("test_panoptic_protocol", "test_panoptic_labelled_points"),
-    "metrics/semantic/top_k.py": ("test_metrics_scannetpp",),
-    "metrics/relations.py": ("test_relation_protocol",),
+    "metrics/semantic/panoptic.py": ("test_panoptic_protocol", "test_panoptic_labelled_points", *_EVERY),
+    "metrics/semantic/top_k.py": ("test_metrics_scannetpp", *_EVERY),
+    "metrics/relations.py": ("test_relation_protocol", *_EVERY),
     "metrics/matching/nearest.py": ("analysis/test_rules_walk", "analysis/test_walks_of_every_pair"),
     "metrics/protocols/loading.py": ("test_originals",),
     "metrics/matching/checks.py": (*_SCORES, "evaluation/test_evaluate_checks", "evaluation/test_evaluate"),

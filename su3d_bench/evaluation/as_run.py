@@ -210,8 +210,7 @@ def _scenes(kept: Sequence[_Kept], evaluations: Mapping[str, Evaluation]) -> tup
     """The scenes that any method has a score of, in the order of the truth."""
     scored = {scene for one in evaluations.values() for protocol in one.protocols for scene in protocol.scores}
     truths = kept[0].truths
-    known = dict.fromkeys(scene for one in kept for scene in one.truths.scenes)
-    return tuple(truths.address(scene) for scene in known if scene in scored)
+    return tuple(truths.address(scene) for scene in _names(kept) if scene in scored)
 
 
 def _result(kept: _Kept, evaluation: Evaluation, rules: ProtocolRules) -> records.ResultRecord:

@@ -136,16 +136,13 @@ class _Pool:
 
     def __init__(self, times: Sequence[UpdateTimes], warm_up: int) -> None:
         self._times = times
-        self.total_ms = self._ms(TOTAL)
+        self.total_ms = pooled(times, TOTAL, 0)
         self._number = np.concatenate([np.arange(1.0, len(updates) + 1) for updates in times])
         self._points = np.concatenate([updates.columns.get("n_points", np.zeros(len(updates))) for updates in times])
         self._is_steady = self._number > warm_up
 
-    def _ms(self, stage: str) -> Float64Array:
-        return np.concatenate([updates.ms(stage) for updates in self._times])
-
     def stage(self, name: str) -> StageSummary:
-        ms = self._ms(name)
+        ms = pooled(self._times, name, 0)
         first, steady = ms[~self._is_steady], ms[self._is_steady]
         total = float(self.total_ms.sum())
         middle, high, worst = np.percentile(steady, [50, 95, 100]) if len(steady) else (float("nan"),) * 3

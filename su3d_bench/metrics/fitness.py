@@ -190,8 +190,12 @@ def why_not_content(rules: ProtocolRules, content: ContentFacts, *, has_points: 
     """Why such a prediction cannot be scored under a protocol; ``has_points``: those of the truth have coordinates."""
     if rules.needs_own_points and not has_points:
         return f"needs ground truth of the form '{rules.ground_truth}', which neither a dataset nor such texts give"
-    if (reason := _why_not_lines(rules, content)) is not None:
-        return reason
+    has_ids = content.class_ids is not None and len(content.class_ids) > 0
+    if rules.class_numbers != "ids" and rules.class_agnostic is None and has_ids:
+        return (
+            "its files number the classes by their place in the list from 0, these are read as class ids; name the "
+            "format that counts so with --format"
+        )
     if rules.needs_own_points and not content.has_own_points:
         return "needs a map with points of its own, the prediction is over the points of another truth"
     if content.has_own_points:
@@ -206,18 +210,6 @@ def why_not_content(rules: ProtocolRules, content: ContentFacts, *, has_points: 
     if rules.names_points and not has_points:
         return "needs a class for every point, the prediction has masks; name a --dataset to make them a map"
     return _why_not_named(rules, content)
-
-
-def _why_not_lines(rules: ProtocolRules, content: ContentFacts) -> str | None:
-    """Why classes cannot be read as ids where a protocol's files hold places in its list of classes."""
-    if rules.class_numbers == "ids" or rules.class_agnostic is not None or content.class_ids is None:
-        return None
-    if not len(content.class_ids):
-        return None
-    return (
-        "its files number the classes by their place in the list from 0, these are read as class ids; name the format "
-        "that counts so with --format"
-    )
 
 
 def why_not_scorable(rules: ProtocolRules, prediction: Prediction) -> str | None:

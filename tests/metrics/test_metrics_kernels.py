@@ -113,16 +113,6 @@ def test_products_of_many_stretches_add_up_as_those_of_each_alone() -> None:
     assert dots(left, right, starts, lengths).tolist() == expected
 
 
-@pytest.mark.parametrize("scale", [1.0, 1e-8, 1e-17])
-def test_a_sum_is_rounded_once(scale: float) -> None:
-    rng = np.random.default_rng(1)
-    few_bits = rng.integers(-(1 << 53), 1 << 53, 20_000) * 2.0 ** -rng.integers(20, 80, 20_000)  # with ties in plenty
-    for total in (rng.standard_normal(20_000), few_bits):
-        product, error = curves._exact_products(rng.random(20_000), rng.standard_normal(20_000) * scale)
-        expected = list(map(math.fsum, zip(product.tolist(), error.tolist(), total.tolist(), strict=True)))
-        assert curves._rounded_once(product, error, total).tolist() == expected
-
-
 @pytest.mark.parametrize("levels", [1, 6])
 def test_resampled_curves_above_the_limit_are_those_of_the_scenes_drawn(levels: int) -> None:
     rng = np.random.default_rng(8)

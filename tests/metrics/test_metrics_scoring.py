@@ -156,13 +156,6 @@ def test_classes_outside_the_protocol_are_void_in_the_truth_and_dropped_in_the_p
     assert result.metrics["AP"] == 1.0
 
 
-def test_points_of_another_cloud_are_labelled_by_their_nearest_truth_point() -> None:
-    rules = load_protocol("replica-conceptgraphs-ex6")
-    truth = replace(room(), variant="conceptgraphs", evaluation_points=room().points + np.float32(0.001))
-    score = score_scene(rules, truth, truth_as_prediction(room(), with_labels=True), None)
-    assert combine(rules, {"room": score}).metrics == {**combine(rules, {"room": score}).metrics, "mAcc": 1.0}
-
-
 def test_points_of_another_cloud_may_take_their_class_from_the_first_point_of_the_truth() -> None:
     rules = load_protocol("replica-conceptgraphs-ex6")
     chairs = np.flatnonzero(room().semantic == ID["chair"])

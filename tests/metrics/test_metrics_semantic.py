@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from places import CASES
-from scored_room import instances
 
-from su3d_bench.core.maps import DenseFeatures, Partition
 from su3d_bench.metrics.semantic.confusion import (
     SemanticCounts,
     SemanticMetrics,
@@ -20,7 +18,6 @@ from su3d_bench.metrics.semantic.confusion import (
     resampled_semantic,
     scannet_metrics,
 )
-from su3d_bench.metrics.semantic.score import _one_a_voxel, _point_owners
 
 GOLDEN = json.loads((CASES / "conceptgraphs_golden.json").read_text())
 POOLING = GOLDEN["cg_pooling"]
@@ -154,35 +151,6 @@ def test_classes_are_counted_above_a_level_and_not_at_it() -> None:
     metrics = scannet_metrics(np.column_stack([np.diag(n_hit), 20 - n_hit]))
     assert metrics.iou.tolist() == [0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.75, 0.9]
     assert metrics.n_classes_above == (8, 6, 3, 1)
-
-
-def test_a_point_belongs_to_the_first_instance_that_takes_part_and_else_to_none() -> None:
-    points = np.zeros((5, 3), np.float32)
-    features = np.ones((3, 2), np.float32)
-    overlapping = instances(points, [np.array([0, 1]), np.array([1, 2]), np.array([2, 3])], None)
-    for takes_part, expected in (
-        ([True, True, True], [0, 0, 1, 2, -1]),
-        ([False, True, True], [-1, 1, 1, 2, -1]),
-        ([False, False, False], [-1] * 5),
-    ):
-        owner, rank = _point_owners(overlapping, np.array(takes_part))
-        assert owner.tolist() == rank.tolist() == expected
-    partition = Partition(points, np.array([0, 2, -1, 1, 1], np.int32), features)
-    owner, rank = _point_owners(partition, np.array([True, False, True]))
-    assert owner.tolist() == rank.tolist() == [0, 2, -1, -1, -1]
-    owner, rank = _point_owners(partition, np.array([False, True, True]))
-    assert owner.tolist() == rank.tolist() == [-1, 2, -1, 1, 1]
-    dense = DenseFeatures(points[:4], np.array([[1, 0], [0, 0], [0, 2], [1, 1]], np.float16))
-    owner, rank = _point_owners(dense, np.array([True, True, True, False]))
-    assert (owner.tolist(), rank.tolist()) == ([0, 1, 2, 3], [0, -1, 0, -1])
-
-
-def test_each_object_keeps_its_first_point_of_every_voxel() -> None:
-    x = np.array([0.31, 0.01, 0.02, 0.03, 0.32, 0.04, 0.33])  # voxels of 0.1: 3 0 0 0 3 0 3
-    owner = np.array([1, 0, 0, 1, 1, -1, 0])
-    kept = _one_a_voxel(np.stack([x, x, x], axis=1), owner, owner, 0.1)
-    assert kept.tolist() == [1, 0, -1, 1, -1, -1, 0]
-    assert _one_a_voxel(np.zeros((2, 3)), np.full(2, -1), np.full(2, -1), 0.1).tolist() == [-1, -1]
 
 
 def test_points_of_a_class_that_the_scene_does_not_score_are_left_out() -> None:

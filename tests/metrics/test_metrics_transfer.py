@@ -79,20 +79,6 @@ def test_the_lowest_index_wins_whichever_of_two_equally_near_places_is_searched_
     assert (index.tolist(), distance.tolist()) == ([0, 0], [1.0, 1.0])
 
 
-def test_large_clouds_are_walked_along_a_z_curve_of_32_cells_a_side(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transfer, "WORTH_ORDERING", 8)
-    # the key of a cell has a bit of x, of y and of z in turn: 1 2 4 for cells at 1, 8 16 32 at 2, 4096 for x at 16
-    cells = np.array([[32, 8, 4], [2, 0, 0], [0, 0, 1], [16, 0, 0], [0, 2, 0], [1, 0, 0], [0, 0, 0], [0, 1.5, 0]])
-    asking = np.array([[99, 0, 0], [0, 0, 99], [-9, -9, -9], [0, 99, 0], [0.5, 0.5, 1.5]])  # outside: at the ends
-    low_m, cell_m = np.array([-20.0, -30.0, -40.0]), 0.5
-    candidates, queries = low_m + cell_m * cells, low_m + cell_m * asking
-    held = transfer.Candidates(candidates)
-    assert held._along_curve(candidates).tolist() == [6, 5, 7, 2, 1, 4, 3, 0]
-    assert held._along_curve(queries).tolist() == [2, 4, 0, 3, 1]
-    few = transfer.Candidates(candidates[:7])
-    assert few._along_curve(queries).tolist() == [0, 1, 2, 3, 4]
-
-
 def test_a_neighbour_at_the_cap_counts_and_one_beyond_it_does_not() -> None:
     candidates = np.array([[0.0, 0, 0], [0.5, 0, 0]])
     queries = np.array([[1.0, 0, 0], [1.0 + 1e-9, 0, 0]])

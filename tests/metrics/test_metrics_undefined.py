@@ -255,17 +255,6 @@ def test_values_over_drawn_scenes_slice_away_what_the_pooled_rows_do() -> None:
             )
 
 
-def test_a_value_lies_in_its_own_interval_where_points_are_sliced_away() -> None:
-    rng = np.random.default_rng(3)
-    scored = {
-        f"s{k}": score(ROOM, confusion({A: {A: 20, C: 20}, B: {B: int(rng.integers(15, 20)), N: 2}}, present=[C]))
-        for k in range(6)
-    }
-    result = combine(ROOM, scored)
-    low, high = result.intervals["mAcc"] or (NAN, NAN)
-    assert low < result.metrics["mAcc"] < high
-
-
 def test_what_is_called_a_class_that_no_scene_has_stays_wrong() -> None:
     result = combine(ROOM, {"a": score(ROOM, confusion({A: {A: 4, C: 6}}))})
     assert result.pooled["mAcc"] == result.per_scene["a"]["mAcc"] == 0.4

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Generic, Protocol
+from typing import Any, Generic
 
 import numpy as np
 
@@ -294,30 +294,11 @@ MendedScene = corrections.Mended[InstanceCounts] | corrections.Mended[SemanticCo
 Errors = tuple[int, Sequence[SingleError]]
 
 
-class LookedAt(Protocol):
-    """A scene as a protocol's evaluator sees it.
-
-    ``points`` (N, 3) are those that errors are told of, ``instance`` (N,) the truth's at each, 0 for none;
-    ``class_name`` says what a class of an error is called.
-    """
-
-    points: transfer.Points
-    instance: Int64Array
-
-    def mended(self) -> MendedScene: ...
-
-    def errors(self, rules: ProtocolRules, counts: Any, others: Sequence[Any], most: int) -> Errors:
-        """How many errors the scene has, and the ``most`` that cost most, the dearest first.
-
-        ``counts`` of the protocol's kind are its own as they are, ``others`` those of the other scenes.
-        """
-        ...
-
-    def class_name(self, number: int) -> str: ...
-
-
 class SceneOfMasks:
-    """A scene as an evaluator of masks sees it; ``evaluated``: the truth's values, the masks and the rules."""
+    """A scene as an evaluator of masks sees it; ``evaluated``: the truth's values, the masks and the rules.
+
+    ``points`` (N, 3) are those that errors are told of, ``instance`` (N,) the truth's at each, 0 for none.
+    """
 
     def __init__(
         self, rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
@@ -342,12 +323,17 @@ class SceneOfMasks:
         return replace(mended, with_true_labels=corrections.count_masks(self._values, relabelled, self._scoring))
 
     def errors(self, rules: ProtocolRules, counts: Any, others: Sequence[Any], most: int) -> Errors:
+        """How many errors the scene has, and the ``most`` that cost most, the dearest first.
+
+        ``counts`` of the protocol's kind are its own as they are, ``others`` those of the other scenes.
+        """
         pool = Pool[InstanceCounts](InstanceMetric(rules), counts, others)
         found = single_mask_errors(self._values, self.overlaps, self._scoring, pool)
         first = rules.headline[0]
         return len(found), sorted(found, key=lambda error: -error.gains[first])[:most]
 
     def class_name(self, number: int) -> str:
+        """What a class of an error is called."""
         return self._names.get(number, NO_CLASS) if self._has_classes else "object"
 
 
@@ -376,6 +362,7 @@ class SceneOfPoints:
         return self._names[number] if number >= 0 else NO_CLASS
 
 
+LookedAt = SceneOfMasks | SceneOfPoints
 # Of each kind the causes of its errors, and what looks at a scene.
 Look = Callable[[ProtocolRules, GroundTruth, Prediction, Encoder | None], LookedAt]
 EXPLAINED: dict[str, tuple[tuple[str, ...], Look]] = {

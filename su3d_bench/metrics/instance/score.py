@@ -17,7 +17,7 @@ from su3d_bench.metrics.instance.average_precision import InstanceAP, InstanceCo
 from su3d_bench.metrics.matching import labelling
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.checks import duplicate_pairs
-from su3d_bench.metrics.metric import C, Metric, Pooled, SceneScore, Values, n_predictions, present
+from su3d_bench.metrics.metric import C, Metric, Pooled, SceneScore, Values, present
 from su3d_bench.metrics.protocols.kinds import AP_NAMES
 from su3d_bench.metrics.protocols.model import ProtocolRules, TransferRules
 
@@ -123,7 +123,12 @@ def masks_on_truth(
 ) -> ScoredMasks:
     """The masks of a prediction as a protocol of kind ``instance`` scores them."""
     values, moved, scores = without_labels(rules, truth, prediction)
-    class_ids, labels = _labels(rules, truth, prediction, encoder)
+    class_ids, labels = [OBJECT], np.full(len(moved), OBJECT)
+    if rules.class_agnostic is None:
+        class_ids, labels = (
+            [entry.id for entry in rules.scored],
+            named_classes(rules, truth.semantic, prediction, encoder),
+        )
     return ScoredMasks(values, class_ids, moved, labels, np.ones(len(moved)) if rules.confidence == "ones" else scores)
 
 
@@ -160,15 +165,6 @@ def encode_truth(rules: ProtocolRules, semantic: IntArray, instance: IntArray) -
     if rules.class_agnostic is not None:
         return encode_without_classes(rules, semantic, instance)
     return instance_ap.encode_ground_truth(semantic, instance)
-
-
-def _labels(
-    rules: ProtocolRules, truth: GroundTruth, prediction: Instances | Partition, encoder: Encoder | None
-) -> tuple[list[int], Int64Array]:
-    """The labels that are scored, and the label (K,) of each prediction."""
-    if rules.class_agnostic is not None:
-        return [OBJECT], np.full(n_predictions(prediction), OBJECT)
-    return [entry.id for entry in rules.scored], named_classes(rules, truth.semantic, prediction, encoder)
 
 
 def named_classes(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -194,12 +194,12 @@ def most_similar(features: np.ndarray, text: np.ndarray, device: str = CPU) -> I
     [1, 0, 0]
     """
     directions = _normalised(np.asarray(text, np.float64))
-    sure = _sure_on(device, text)
+    there = None if device == CPU else _directions_on(device, text)
     best = np.empty(len(features), np.int64)
     # one thread and blocks of one size: the last bit of a cosine may not depend on the machine's number of cores
     with threadpool_limits(1, user_api="blas"):
         for rows, block in row_blocks(features, _BLOCK_ROWS):
-            chosen = sure(block)
+            chosen = None if there is None else _sure_most_similar(_directions_on(device, block), there)
             if chosen is None:
                 chosen = (_normalised(np.asarray(block, np.float64)) @ directions.T).argmax(axis=1)
             best[rows] = chosen
@@ -222,14 +222,6 @@ def most_similar_each(features: np.ndarray, text: np.ndarray, k: int) -> Int64Ar
             cosine = _normalised(np.asarray(block, np.float64)) @ directions.T
             best[rows] = np.argsort(-cosine, axis=1, kind="stable")[:, : best.shape[1]]
     return best
-
-
-def _sure_on(device: str, text: np.ndarray) -> Callable[[np.ndarray], Int64Array | None]:
-    """What finds the row of ``text`` most similar to each row of a block; it gives None where it cannot be sure."""
-    if device == CPU:
-        return lambda _: None
-    directions = _directions_on(device, text)
-    return lambda block: _sure_most_similar(_directions_on(device, block), directions)
 
 
 def _directions_on(device: str, rows: NDArray[Any]) -> Tensor:

@@ -84,7 +84,6 @@ class BoxRules(ProtocolRules):
     needs_own_points = True
     needs_boxes = True
     transfers = False
-    takes_voxels = False
     confidences = ("ones", "prediction")
     allowed: ClassVar[Allowed] = {
         "confidence": confidences, "thresholds": ((0.25, 0.5),), "box_axes": ("truth", "world")
@@ -139,7 +138,6 @@ class GroundingRules(ProtocolRules):
     }
     needs_own_points = True
     transfers = False
-    takes_voxels = False
     text_metrics = ("scanrefer", "referit3d")
     needs = ("box_axes",)
     allowed: ClassVar[Allowed] = {"box_axes": ("world", "aligned")}
@@ -170,7 +168,6 @@ class _GraphRules(ProtocolRules):
 
     needs_own_points = True
     transfers = False
-    takes_voxels = False
 
 
 class ObjectRules(_GraphRules):
@@ -250,7 +247,6 @@ class PresenceQuestionRules(ProtocolRules):
     is_judged = True
     needs_own_points = True
     transfers = False
-    takes_voxels = False
     values_of_metric: ClassVar[ValuesOfMetric] = {
         "pope": tuple(
             f"{measure} {sampling}"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Self
 
@@ -79,14 +79,6 @@ class Original(BaseModel):
         return "; ".join(parts)
 
     @property
-    def in_short(self) -> str:
-        """Everything in one sentence, for lists."""
-        if self.none is not None:
-            return f"no original: {self.none}; data: {self.data}"
-        of_code = f"{self.code} at {str(self.commit)[:7]}, {', '.join(self.files)}"
-        return f"original: {of_code}; code: {self.licence}; data: {self.data}; compared: {self.held_together}"
-
-    @property
     def facts(self) -> dict[str, str]:
         """Everything by what it is called where it is shown, in order, without what is not said."""
         said = {
@@ -105,12 +97,6 @@ class Stated:
 
     original: Original
     base: str | None
-
-    @property
-    def in_short(self) -> str:
-        """As that of the original."""
-        told = self.original.in_short
-        return told if self.base is None else f"of {self.base}, which these rules extend, {told}"
 
     @property
     def facts(self) -> dict[str, str]:
@@ -348,7 +334,7 @@ def load_protocol(name: str) -> ProtocolRules:
     if name in known:
         return _built_in(name)
     if name.endswith(".toml"):
-        rules = _own(Path(name).absolute(), Path(name), _state(Path(name)))
+        rules = read_protocol(Path(name))
         if rules.name in known:
             raise ConfigError(f"{name}: the protocol name '{rules.name}' is built in; choose another name")
         return rules
@@ -358,20 +344,6 @@ def load_protocol(name: str) -> ProtocolRules:
 @cache
 def _built_in(name: str) -> ProtocolRules:
     return read_protocol(rules_file(name))
-
-
-@lru_cache(maxsize=64)
-def _own(place: Path, shown: Path, state: tuple[int, int] | None) -> ProtocolRules:
-    """The rules in a file, read once for each ``place`` and ``state`` of it; errors name it as ``shown``."""
-    return read_protocol(shown)
-
-
-def _state(path: Path) -> tuple[int, int] | None:
-    try:
-        found = path.stat()
-    except OSError:
-        return None
-    return found.st_mtime_ns, found.st_size
 
 
 def read_protocol(path: Path) -> ProtocolRules:

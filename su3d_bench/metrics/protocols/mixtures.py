@@ -6,7 +6,7 @@ names in ``ignore``.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -115,7 +115,7 @@ class Mixtures:
 
     def _inseparable(self, groups: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]] | None:
         """Two groups of which one alone makes no protocol; None where every choice makes one."""
-        for chosen in _choices(groups):
+        for chosen in (list(some) for n in range(1, len(groups)) for some in combinations(groups, n)):
             if self._is_protocol(chosen):
                 continue
             rest = [group for group in groups if group not in chosen]
@@ -133,11 +133,6 @@ class Mixtures:
         except ValidationError:
             return False
         return True
-
-
-def _choices(groups: Sequence[tuple[str, ...]]) -> Iterator[list[tuple[str, ...]]]:
-    for n in range(1, len(groups)):
-        yield from map(list, combinations(groups, n))
 
 
 def _merged(groups: Sequence[tuple[str, ...]], together: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:

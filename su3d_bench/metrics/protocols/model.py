@@ -261,7 +261,8 @@ class ProtocolRules(_Strict):
             raise ValueError(f"transfer.cap_m: {kind} needs one, with {transfer.candidates}")
         if transfer.cap_m is not None and not self.transfers:
             raise ValueError(f"transfer.cap_m: {kind} transfers nothing")
-        if transfer.evaluation_voxel_m > 0 and (not self.takes_voxels or is_each or transfer.neighbours > 1):
+        keeps_all = not self.transfers or not self.takes_voxels or is_each or transfer.neighbours > 1
+        if transfer.evaluation_voxel_m > 0 and keeps_all:
             raise ValueError(f"transfer.evaluation_voxel_m: {kind} leaves no point out here; set it to 0")
         if transfer.neighbours > 1 and not self.takes_votes:
             raise ValueError("transfer.neighbours: belongs to kind 'semantic'")

@@ -71,13 +71,8 @@ def _of_sampling(counts: PresenceCounts, place: int) -> PresenceCounts:
 
 
 def _shares(rows: Sequence[PresenceCounts], weights: Int64Array) -> dict[str, Float64Array]:
-    def total(kept: list[BoolArray]) -> Float64Array:
-        return (weights @ np.array([int(one.sum()) for one in kept], np.int64)).astype(np.float64)
-
-    true_yes = total([row.is_there & row.says_yes for row in rows])
-    false_yes = total([~row.is_there & row.says_yes for row in rows])
-    true_no = total([~row.is_there & ~row.says_yes for row in rows])
-    false_no = total([row.is_there & ~row.says_yes for row in rows])
+    each = [np.bincount(2 * row.is_there + row.says_yes, minlength=4) for row in rows]
+    true_no, false_yes, false_no, true_yes = (weights @ np.stack(each)).astype(np.float64).T
     n = true_yes + false_yes + true_no + false_no
     precision, recall = ratio(true_yes, true_yes + false_yes), ratio(true_yes, true_yes + false_no)
     f1 = np.where(true_yes > 0, ratio(2 * precision * recall, precision + recall), 0.0)

@@ -167,20 +167,23 @@ def call_points(
         targets = truth.evaluation_points
         _, source = transfer.nearest(truth.points, targets)
         true_class = np.where(source >= 0, class_of_label[source], -1)
-    is_counted = _counted_classes(rules, is_scored, is_present)
+    # those that the scene contains for ConceptGraphs, all scored ones for ScanNet, and for HOV-SG the ignored ones too,
+    # because what is predicted there is a false positive
+    is_counted = is_present if rules.metric == "conceptgraphs" else is_scored | (rules.metric == "hovsg")
     is_wanted = (true_class >= 0) & is_counted[true_class]
     classes = with_unnamed(rules, labelling.classes_of_prediction(rules, prediction, encoder, is_present))
     votes_for_masks = rules.transfer.votes == "masks" and not isinstance(prediction, DenseFeatures)
+    mask: Int64Array | None = None
     if votes_for_masks and not transfer.are_same_points(prediction.points, targets):
         mask, distance_m = transfer_votes(rules, prediction, classes, targets, is_wanted, of_masks=True)
-        predicted = np.where(mask >= 0, classes[mask], -1) if len(classes) else mask
     elif rules.transfer.neighbours > 1 and not votes_for_masks:
-        mask = None
         predicted, distance_m = transfer_votes(rules, prediction, classes, targets, is_wanted)
     else:
-        takes_part = _taking_part(rules, classes, is_scored)
+        # ConceptGraphs does not load objects that it calls background; HOV-SG has all
+        takes_part = (classes < 0) | is_scored[classes] | (rules.metric == "hovsg")
         mask, distance_m = owners_at(rules, prediction, takes_part, targets, is_wanted)
-        predicted = np.where(mask >= 0, classes[mask], -1) if len(classes) else mask
+    if mask is not None:
+        predicted = np.append(classes, -1)[mask]
     if len(classes):
         predicted = with_unnamed(rules, predicted)
     return CalledPoints(
@@ -252,17 +255,6 @@ def transfer_votes(
     return neighbours.transfer_votes(points, values, targets, wanted, rules.transfer.neighbours, cap_m)
 
 
-def _counted_classes(rules: ProtocolRules, is_scored: BoolArray, is_present: BoolArray) -> BoolArray:
-    """The classes whose points enter the confusion matrix.
-
-    Those that the scene contains for ConceptGraphs, all scored ones for ScanNet, and for HOV-SG the ignored ones too,
-    because what is predicted there is a false positive.
-    """
-    if rules.metric == "hovsg":
-        return np.ones(len(is_scored), bool)
-    return is_present if rules.metric == "conceptgraphs" else is_scored
-
-
 def _points_and_owners(prediction: Prediction) -> tuple[Int64Array, Int64Array]:
     """The points of all objects, one object after another, and the object (or row of features) of each."""
     if isinstance(prediction, DenseFeatures):
@@ -272,14 +264,6 @@ def _points_and_owners(prediction: Prediction) -> tuple[Int64Array, Int64Array]:
         point = np.flatnonzero(prediction.instance >= 0)
         return point, prediction.instance[point].astype(np.int64)
     return prediction.indices.astype(np.int64), prediction.owners
-
-
-def _taking_part(rules: ProtocolRules, classes: Int64Array, is_scored: BoolArray) -> BoolArray:
-    """Which objects take part: what was named as an ignored class is left out, as ConceptGraphs does not load its
-    background objects; HOV-SG has all."""
-    if rules.metric == "hovsg":
-        return np.ones(len(classes), bool)
-    return (classes < 0) | is_scored[classes]
 
 
 def _point_owners(prediction: Prediction, takes_part: BoolArray) -> tuple[Int64Array, Int64Array]:

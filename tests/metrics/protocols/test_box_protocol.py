@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ import pytest
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float64Array, GroundTruth, LabelSet, ObjectBoxes, OrientedBox
 from su3d_bench.datasets.replica.checks import box_truth
-from su3d_bench.metrics.fitness import ContentFacts, TruthFacts, why_not_content, why_not_truth
 from su3d_bench.metrics.instance.boxes import BoxCounts, box_iou, count_boxes, shared_volume, smallest_box
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
@@ -288,14 +286,3 @@ def test_labels_outside_the_classes_and_an_empty_map_are_scored() -> None:
     for prediction in (map_of(("unicorn", CHAIR, 1.0)), map_of()):
         metrics = combine(RULES, {"a": score_of(truth, prediction)}).metrics
         assert (metrics["AP25"], metrics["centroid"]) == (0.0, 0.0)
-
-
-def test_boxes_are_scored_against_datasets_that_have_them_and_by_maps_with_classes() -> None:
-    replica = TruthFacts("replica", "replica", ("mesh-vertices", "boxes"))
-    assert why_not_truth(RULES, replica) is None
-    assert why_not_truth(RULES, replace(replica, variants=("mesh-vertices",)))
-    assert "name one with --dataset" in str(why_not_truth(RULES, replace(replica, has_points=False)))
-    assert "points of its own" in str(why_not_content(RULES, ContentFacts("vertex-masks", 1, has_labels=True)))
-    assert "needs classes" in str(why_not_content(RULES, ContentFacts("instances", 1)))
-    assert "one feature a point" in str(why_not_content(RULES, ContentFacts("dense", 1, 8)))
-    assert why_not_content(RULES, ContentFacts("instances", 1, 8)) is None

@@ -30,7 +30,7 @@ from su3d_bench.metrics.graphs import (
 )
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ClassEntry
-from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, score_scene, unpack_scores
+from su3d_bench.metrics.scoring import combine, pack_scores, score_scene, unpack_scores
 from su3d_bench.predictions.formats import READERS
 
 OBJECT_RULES, PLACE_RULES = load_protocol("hm3dsem-objects"), load_protocol("hm3dsem-places")
@@ -198,15 +198,6 @@ def test_voxels_are_those_of_open3d() -> None:
     theirs = np.asarray(cloud.voxel_down_sample(0.05).points)
     ours = voxel_means(points, voxel_ids(points, 0.05))
     np.testing.assert_allclose(ours[np.lexsort(ours.T)], theirs[np.lexsort(theirs.T)], rtol=0, atol=1e-15)
-
-
-def test_the_kinds_take_no_transfer_and_fix_the_length_of_their_counts() -> None:
-    assert metric_of(OBJECT_RULES).sizes == {"thresholds": 11, "ranks": 1625, "sides": 2}
-    assert metric_of(PLACE_RULES).sizes == {"thresholds": 11, "sides": 2, "numbers": 1}
-    for rules in (OBJECT_RULES, PLACE_RULES):
-        content = rules.model_dump(exclude_defaults=True) | {"transfer": {"candidates": "map-points", "cap_m": 0.1}}
-        with pytest.raises(ValueError, match="transfers nothing"):
-            type(rules).model_validate_json(json.dumps(content))
 
 
 def test_the_names_of_the_walk_are_categories_of_the_list() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -89,18 +88,6 @@ def test_both_forms_of_ground_truth_give_maskclustering_the_same_counts(is_own_w
     assert theirs.n_truth.tolist()[0] == ours.n_truth.tolist()[0]  # type: ignore[attr-defined]
     assert theirs.n_missed.tolist()[0] == ours.n_missed.tolist()[0]  # type: ignore[attr-defined]
     assert theirs.is_true.tolist() == ours.is_true.tolist()  # type: ignore[attr-defined]
-
-
-def test_results_name_the_one_class_object_and_no_group() -> None:
-    rules = load_protocol(NAMES[1])
-    result = combine(rules, {"a": score_scene(rules, scan(), masks(scan(), 1), None)})
-    assert list(result.per_class) == ["object"]
-    assert result.groups == {}
-    whole = scan()
-    few = slice(50)
-    small = replace(whole, points=whole.points[few], semantic=whole.semantic[few], instance=whole.instance[few])
-    told = combine(rules, {"a": score_scene(rules, small, masks(small), None)}).warnings
-    assert told == ("not scored, because no scene has an instance of 100 points: 'object'",)
 
 
 def test_an_instance_id_or_more_objects_than_the_encoding_can_hold_are_refused() -> None:

@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from places import CASES
-from scored_room import ENCODER, ID, LABELS, OneHotEncoder, instances, noisy, nothing, room, truth_as_prediction
+from scored_room import ENCODER, ID, LABELS, OneHotEncoder, instances, nothing, room, truth_as_prediction
 
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
-from su3d_bench.core.types import Float32Array, GroundTruth, LabelSet, UInt8Array
+from su3d_bench.core.types import Float32Array, GroundTruth, LabelSet
 from su3d_bench.evaluation.scoring import score_on_vertices
 from su3d_bench.evaluation.truth import VertexTruth
 from su3d_bench.metrics.matching.labelling import text_features
@@ -66,24 +66,6 @@ def test_the_substring_rule_leaves_out_the_classes_that_the_original_does() -> N
     assert ignored == {0, 31, 37, 40, 44, 93, 94, 95, 97}
     assert {entry.id for entry in EXACT.classes if EXACT.is_ignored(entry.name)} == {0, 31, 37, 40, 93, 97}
     assert (len(HOVSG.classes), len(OVO.classes)) == (102, 51)
-
-
-def test_the_classifier_takes_the_mean_of_both_prompts() -> None:
-    asked: list[str] = []
-
-    class Listening(OneHotEncoder):
-        def encode_texts(self, texts: Sequence[str]) -> Float32Array:
-            asked.extend(texts)
-            return super().encode_texts(texts)
-
-        def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:
-            raise AssertionError
-
-    truth = fitting(HOVSG, room())
-    score_scene(HOVSG, truth, truth_as_prediction(room(), with_labels=False), Listening())
-    assert asked[:4] == ["background", "There is the background in the scene.", "backpack",
-                         "There is the backpack in the scene."]  # fmt: skip
-    assert len(asked) == 2 * 102
 
 
 def test_the_mean_of_the_prompts_is_that_of_their_directions() -> None:
@@ -207,17 +189,6 @@ def test_objects_of_the_first_class_vote_as_all_others() -> None:
     scene = replace(fitting(OVO, truth), semantic=semantic)
     score = score_scene(OVO, scene, instances(truth.points, [own], [first.name]), None)
     assert combine(OVO, {"a": score}).per_class[first.name]["recall"] == 1.0
-
-
-def test_hovsg_reports_the_mean_of_the_scenes_and_its_interval() -> None:
-    scores = {f"s{seed}": score_scene(HOVSG, fitting(HOVSG, noisy(seed)[0]), noisy(seed)[1], None) for seed in range(4)}
-    result = combine(HOVSG, scores)
-    interval = result.intervals["mIoU"]
-    assert result.metrics == result.scene_mean
-    assert result.metrics["mIoU"] == pytest.approx(np.mean([row["mIoU"] for row in result.per_scene.values()]))
-    assert 0 < result.metrics["pAcc"] < 1
-    assert interval is not None
-    assert interval[0] < result.metrics["mIoU"] < interval[1]
 
 
 # ---- ScanNet

@@ -49,16 +49,6 @@ def test_a_made_problem_of_labelled_points_has_the_answer_of_panopticapi(name: s
     assert our_qualities(load_protocol(name), problem["scenes"]).tolist() == problem["answer"]
 
 
-def test_the_splits_are_those_that_are_stated() -> None:
-    things = {entry.name for entry in load_protocol("scannetpp-instance").scored}
-    rules = load_protocol("scannetpp-panoptic")
-    assert {entry.name for entry in rules.scored} == things | {"wall", "floor", "ceiling"}
-    assert (len(things), len(rules.classes), len(rules.ignore)) == (84, 100, 13)
-    walks = load_protocol("hm3dsem-panoptic")
-    assert rules.stuff == walks.stuff == ("wall", "floor", "ceiling")
-    assert (len(walks.classes), len(walks.scored)) == (1624, 1622)
-
-
 def open_walls() -> GroundTruth:
     truth = room()
     return replace(truth, instance=np.where(truth.semantic == ID["wall"], 0, truth.instance).astype(np.int32))

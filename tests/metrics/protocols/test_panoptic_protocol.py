@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 from places import CASES
-from scored_room import ID, instances, room
+from scored_room import ID
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.maps import Masks
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.metrics.scoring import metric_of, score_scene
+from su3d_bench.metrics.scoring import metric_of
 from su3d_bench.metrics.semantic import panoptic
 from su3d_bench.metrics.semantic.panoptic import PanopticCounts, Rule, Segments, count_segments
 
@@ -99,34 +99,11 @@ def test_a_point_in_several_masks_is_that_of_the_greatest_confidence_and_the_fir
     assert without.n_matched[place["chair"]] == 1  # a mask without a class hides nothing
 
 
-def test_a_reader_is_told_how_many_points_several_masks_claim() -> None:
-    truth = room()
-    twice = np.flatnonzero(truth.instance == 2)
-    prediction = instances(truth.points, [twice, twice[:75]], ["chair", "chair"], scores=[0.5, 0.5])
-    assert score_scene(RULES, truth, prediction, None).warnings == (
-        "50.0 % of the points that masks cover are in several; each counts for that of equal confidence the first",
-    )
-
-
 def test_groups_of_classes_have_means_of_their_own() -> None:
     rules = load_protocol("scannet200-panoptic")
     none, one_each = np.zeros(200, np.int64), np.ones(200, np.int64)
     whole = metric_of(rules).pooled([PanopticCounts(none, none, one_each, np.zeros(200))])
     assert whole.groups == {name: {"PQ": 0.0, "SQ": 0.0, "RQ": 0.0} for name in ("head", "common", "tail")}
-
-
-def test_the_splits_are_those_that_are_named() -> None:
-    splits = {
-        name: (sum(entry.name not in rules.stuff for entry in rules.scored), rules.stuff)
-        for name in ("rooms", "replica", "scannet", "scannet200")
-        for rules in (load_protocol(f"{name}-panoptic"),)
-    }
-    surfaces = ("wall", "floor", "ceiling")
-    assert splits == {
-        "rooms": (66, surfaces), "replica": (48, surfaces), "scannet": (18, surfaces[:2]),
-        "scannet200": (198, surfaces[:2]),
-    }  # fmt: skip
-    assert (KITTI.metric, KITTI.min_region_size) == ("semantic-kitti", 1)
 
 
 def test_text_files_of_masks_are_scored_against_text_files_of_truth(

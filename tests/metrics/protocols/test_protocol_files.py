@@ -192,13 +192,3 @@ def test_what_a_file_extends_is_a_name_or_a_path(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text('extends = 3\nname = "mine"\n')
     with pytest.raises(ConfigError, match=r"extends must be a protocol's name or the path of a \.toml file, not 3"):
         load_protocol(str(tmp_path / "mine.toml"))
-
-
-def test_show_prints_the_rules_that_a_file_extends_with_their_sources(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["protocols", "show", "replica-conceptgraphs-ex4"]) == 0
-    text = capsys.readouterr().out
-    assert "extends replica-conceptgraphs-ex6:" in text
-    assert "[U] conceptgraph/utils/eval.py" in text
-    assert "    [C], n_exclude = 4" in text
-    assert "[C], n_exclude = 6" not in text
-    assert "    [E], raw hyphenated names" in text

@@ -17,7 +17,7 @@ from scored_room import ENCODER, nothing, room, truth_as_prediction
 
 from su3d_bench.baselines.oracle import Oracle
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import DataError, GroundTruthMissing, PredictionError
+from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.maps import Instances, Prediction
 from su3d_bench.core.types import GroundTruth, LabelSet, TrueGraph
 from su3d_bench.datasets.replica.dataset import Replica
@@ -187,13 +187,6 @@ def test_each_fault_of_the_annotation_is_one_line(tmp_path: Path, name: str, old
     with pytest.raises(DataError, match=message) as caught:
         dataset.ground_truth("room0", "replicassg")
     assert str(caught.value).startswith("replica/room0: ") and "\n" not in str(caught.value)
-
-
-def test_without_the_annotation_the_message_says_where_it_belongs(tmp_path: Path) -> None:
-    write_render(tmp_path)
-    write_original(tmp_path, QUADS, [0, 0, 5, 5], TWO_OBJECTS)
-    with pytest.raises(GroundTruthMissing, match=r"expected ReplicaSSG/relationships\.json"):
-        Replica(tmp_path).ground_truth("room0", "replicassg")
 
 
 def graph(names: tuple[str, ...] = ("chair", "table")) -> dict[str, Any]:

@@ -30,7 +30,6 @@ from su3d_bench.metrics.questions.score import (
     is_answer_right,
 )
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, plain_json, score_scene, unpack_scores
-from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.predictions.base import vertex_masks
 from su3d_bench.questions import truths
 from su3d_bench.questions.sight import Sight
@@ -146,16 +145,6 @@ def test_scenes_pool_by_their_questions_and_counts_survive_the_file() -> None:
     assert result.intervals["all"] == (0.0, 1.0)  # of 4/6 and 1/1: two scenes tell nothing
 
 
-@pytest.mark.parametrize("text", ["<script>", '=HYPERLINK("x")', "\u202e", "\U0001f600", "x" * 10_000])
-def test_hostile_texts_are_asked_as_they_are(text: str) -> None:
-    asked = RetrievalTruth(TRUTH, (AskedText("instance", text, (2,)),))
-    embedded = EmbeddedEncoder()
-    features = embedded.encode_texts(list(NAMES))
-    prediction = replace(PERFECT, features=features)
-    score = score_scene(RULES, asked, prediction, embedded)
-    assert metric_of(RULES).combine([score.counts])["n_instance"] == 1
-
-
 def test_a_map_without_features_is_told_why() -> None:
     labelled = truth_as_prediction(TRUTH, with_labels=True)
     assert "needs features" in str(why_not_scorable(RULES, labelled))
@@ -212,15 +201,6 @@ def test_objects_are_right_where_the_instances_stand_for_exactly_them() -> None:
     true = TrueAnswer("which?", "nearest", None, (4,))
     for rows, is_right in (([0], True), ([0, 1], True), ([0, 2], False), ([], False)):
         assert are_objects_right(true, GivenAnswer(None, np.array(rows, np.int64), True), main_object) is is_right
-
-
-@pytest.mark.parametrize("is_settled", [True, False])
-def test_it_is_told_where_questions_could_not_be_settled(is_settled: bool) -> None:
-    given = GivenAnswer(2, np.zeros(0, np.int64), is_settled)
-    asked = (TrueAnswer("how many chairs?", "count", 2, ()),)
-    truth = ReasoningTruth(TRUTH, asked, lambda prediction, encoder: [given], "a solver")
-    told = score_scene(REASONING, truth, truth_as_prediction(TRUTH, with_labels=True), None).warnings
-    assert ("questions that the solver could not settle count as wrong" in told) == (not is_settled)
 
 
 def test_the_truth_answers_its_own_questions(all_is_seen: None) -> None:
