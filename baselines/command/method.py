@@ -280,6 +280,7 @@ class Command:
             id_file=None if container is None else id_file,
             # `docker run` may end before its container does: ending the client is not enough.
             afterwards=() if container is None else ("docker", "kill", container),
+            scratch=folders["frames"].parent,
         )
         self._record(done)
         last = _last_line(done.stderr)

@@ -17,7 +17,7 @@ from threading import Thread
 from typing import IO, Any
 
 from su3d_bench.baselines.command import supervisor
-from su3d_bench.baselines.command.supervisor import AFTERWARDS_S, STOP
+from su3d_bench.baselines.command.supervisor import AFTERWARDS_S, DONE, STOP
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.system.files import file_text
 
@@ -138,11 +138,17 @@ class _Tail(Thread):
 class _Supervised:
     """A program under its supervisor, ``supervisor.py``, which ends it when this process does, however that comes.
 
-    ``afterwards`` is run wherever the program is ended and does not end by itself.
+    ``afterwards`` is run wherever the program is ended and does not end by itself; ``scratch`` is removed where this
+    process is gone and cannot do it.
     """
 
     def __init__(
-        self, words: Sequence[str], folder: Path, environment: Mapping[str, str], afterwards: Sequence[str]
+        self,
+        words: Sequence[str],
+        folder: Path,
+        environment: Mapping[str, str],
+        afterwards: Sequence[str],
+        scratch: Path | None,
     ) -> None:
         self.exit_code: int | None = None
         self._said = b""
@@ -161,8 +167,9 @@ class _Supervised:
         assert process.stdin is not None and process.stdout is not None and process.stderr is not None
         self._process, self._orders, self.streams = process, process.stdin, (process.stdout, process.stderr)
         order = {"words": list(words), "folder": str(folder), "environment": dict(environment)}
+        order |= {"afterwards": list(afterwards), "scratch": str(scratch or "")}
         try:
-            self._order(json.dumps(order | {"afterwards": list(afterwards)}).encode() + b"\n")
+            self._order(json.dumps(order).encode() + b"\n")
             answer = self._answer(None) or {"error": "its supervisor was ended"}
             if "error" in answer:
                 raise ConfigError(f"'{words[0]}' cannot be started: {answer['error']}")
@@ -184,8 +191,7 @@ class _Supervised:
 
     def end(self) -> None:
         """End the program and all that it started."""
-        with suppress(BrokenPipeError):
-            self._orders.close()
+        self._order(DONE)
         self.has_ended(ENDING_S)
 
     def close(self) -> None:
@@ -224,14 +230,16 @@ def run_program(
     timeout_s: float,
     id_file: Path | None = None,
     afterwards: Sequence[str] = (),
+    scratch: Path | None = None,
 ) -> Finished:
     """Run ``words`` in ``folder`` until it ends or ``timeout_s`` is over; nothing that it started outlives the call.
 
-    Nor this process, however that ends. into ``id_file`` docker writes the id of a container; ``afterwards`` is
-    run where the program is ended and does not end by itself. A program that cannot be started is a ``ConfigError``.
+    Nor this process, however that ends: ``afterwards`` is run where the program does not end by itself, and ``scratch``
+    is removed where this process is gone and cannot do it. Into ``id_file`` docker writes the id of a container. A
+    program that cannot be started is a ``ConfigError``.
     """
     start = time.perf_counter()
-    with closing(_Supervised(words, folder, environment, afterwards)) as program:
+    with closing(_Supervised(words, folder, environment, afterwards, scratch)) as program:
         tails = [_Tail(stream) for stream in program.streams]
         for tail in tails:
             tail.start()

@@ -4,9 +4,9 @@ A script, started with ``python -I -S``: it imports nothing of the harness, and 
 memory. It stands between a run and somebody's program because a process that is killed can do nothing any more, but the
 system closes its pipes, and that can be waited for.
 
-It is told through its standard input, first one line of JSON, then ``STOP``; the end of that pipe, which comes with
-the end of whoever held it, ends the program. It answers through a second pipe, a line of JSON each: the program's
-process id or why it cannot be started, then its exit code.
+It is told through its standard input, first one line of JSON, then ``STOP`` or ``DONE``; the end of that pipe, which
+comes with the end of whoever held it, ends the program and removes its folders. It answers through a second pipe, a
+line of JSON each: the program's process id or why it cannot be started, then its exit code.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import ctypes
 import json
 import os
 import select
+import shutil
 import signal
 import subprocess
 import sys
@@ -23,7 +24,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-STOP = b"S"  # asks the program to stop
+STOP, DONE = b"S", b"D"  # ask the program to stop; end it, whoever asks takes care of its folders
 ENDING_S = 5.0  # for processes that were killed to be gone; what waits for a dead disk stays
 AFTERWARDS_S = 60.0  # for `docker kill`
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36  # linux/prctl.h
@@ -57,12 +58,14 @@ def main(answers: int) -> None:
     for stream in (1, 2):  # the program's streams end with the program
         os.dup2(nowhere, stream)
     _answer(answers, {"pid": program})
-    exit_code, has_ended_itself = _wait(program, woken)
+    exit_code, last = _wait(program, woken)
     ended = _end_all(program)
-    if not has_ended_itself:
+    if last is not None:  # it did not end by itself
         _run_afterwards(order)
     exit_code = ended if exit_code is None else exit_code
     _answer(answers, {"exit_code": -signal.SIGKILL if exit_code is None else exit_code})
+    if last != DONE and os.read(0, 1) != DONE:  # whoever asked is gone
+        shutil.rmtree(order["scratch"], ignore_errors=True)
 
 
 def _start(order: dict[str, Any]) -> int:
@@ -88,9 +91,9 @@ def _answer(answers: int, content: dict[str, object]) -> None:
         os.write(answers, json.dumps(content).encode() + b"\n")
 
 
-def _wait(program: int, woken: int) -> tuple[int | None, bool]:
-    """The program's exit code once it has ended, None where it is to be ended, and whether it was left to itself."""
-    is_left_alone = True
+def _wait(program: int, woken: int) -> tuple[int | None, bytes | None]:
+    """The program's exit code once it has ended, and the last order, empty at the end of the pipe, None without one."""
+    last = None
     while True:
         ready, _, _ = select.select([0, woken], [], [])
         if woken in ready:
@@ -98,11 +101,11 @@ def _wait(program: int, woken: int) -> tuple[int | None, bool]:
                 os.read(woken, 65536)
         exit_code = _reap(program)
         if exit_code is not None:
-            return exit_code, is_left_alone
+            return exit_code, last
         if 0 in ready:
-            is_left_alone = False
-            if os.read(0, 1) != STOP:
-                return None, False
+            last = os.read(0, 1)
+            if last != STOP:
+                return None, last
             _signal_group(program, signal.SIGTERM)
 
 

@@ -57,7 +57,7 @@ def stored_prediction(place: Path, scene: str) -> Parsed:
 
 
 def write_content(path: Path, content: Content) -> None:
-    """Store what a reader gave at ``path``, so that ``OwnRuns`` reads the same."""
+    """Store what a reader gave at ``path``, so that ``OWN_RUNS`` reads the same."""
     if isinstance(content, VertexLabels):
         labels = {"kind": np.array("VertexLabels"), "class_ids": content.class_ids, "further": content.further}
         numbering = np.array(content.numbering) if content.numbering != "id" else None

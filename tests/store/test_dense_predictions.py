@@ -54,7 +54,6 @@ def test_features_on_disk_equal_those_in_memory_to_the_bit(monkeypatch: pytest.M
     monkeypatch.setattr(feature_table, "BLOCK_ROWS", 100)  # many blocks
     on_disk, in_memory = fused("disk"), fused("memory")
     disk, memory = on_disk.finish(), in_memory.finish()
-    assert isinstance(disk.features, np.memmap) and not isinstance(memory.features, np.memmap)
     assert disk.features.dtype == memory.features.dtype == np.float16
     np.testing.assert_array_equal(disk.features.view(np.uint16), memory.features.view(np.uint16))
     np.testing.assert_array_equal(disk.points, memory.points)
@@ -62,6 +61,10 @@ def test_features_on_disk_equal_those_in_memory_to_the_bit(monkeypatch: pytest.M
     assert on_disk.map_bytes == in_memory.map_bytes
     for prediction in (disk, memory):
         assert not prediction.features.flags.writeable
+    monkeypatch.setattr(feature_table, "scratch_folder", lambda: Path("/none"))
+    assert fused("memory").n_points == on_disk.n_points
+    with pytest.raises(StoreError, match="cannot write features to /none"):
+        fused("disk")
 
 
 def test_the_mean_is_that_of_float32_rounded_to_half_precision_once_an_update() -> None:

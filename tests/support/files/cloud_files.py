@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import pickle
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -23,27 +24,23 @@ NAMES = ["couch", "lamp", "wall"]
 
 
 def an_object(n_points: int, class_ids: list[int], **more: Any) -> dict[str, Any]:
-    """An object of ConceptGraphs with every key that its map has."""
+    """An object of ConceptGraphs with keys of every kind that its map has."""
     n = len(class_ids)
+    feature = RNG.normal(size=16)
     return {
         "image_idx": list(range(n)),
-        "mask_idx": list(range(n)),
         "color_path": [f"/home/author/Replica/room0/results/frame{k:06d}.jpg" for k in range(n)],
         "class_name": [NAMES[one % 3] for one in class_ids],
         "class_id": list(class_ids),
-        "num_detections": n,
         "mask": [RNG.random((60, 80)) < 0.5 for _ in range(n)],
         "xyxy": [RNG.random(4) for _ in range(n)],
         "conf": [np.float32(0.5)] * n,
-        "n_points": [n_points] * n,
         "pixel_area": [np.int64(7)] * n,
         "contain_number": [None] * n,
-        "inst_color": RNG.random(3),
         "is_background": False,
-        "clip_ft": (lambda f: f / np.linalg.norm(f))(RNG.normal(size=16)).astype(np.float32),
+        "clip_ft": (feature / np.linalg.norm(feature)).astype(np.float32),
         "text_ft": np.ones(16, np.float32),
         "pcd_np": RNG.normal(size=(n_points, 3)),
-        "bbox_np": RNG.normal(size=(8, 3)),
         "pcd_color_np": RNG.random((n_points, 3)),
         **more,
     }
@@ -158,28 +155,21 @@ def write_onlineanyseg(folder: Path, points: Any, masks: Any, features: Any = No
 def write_small(folder: Path, format: str) -> Path:
     """The scene room0 in ``format``, small; the folder that holds the scene's folder."""
     scene = folder / "room0"
-    points = RNG.normal(size=(6, 3)).astype(np.float32)
-    if format == "conceptgraphs":
-        write_map(scene / "pcd_saves/full_pcd_none_x.pkl.gz", a_map())
-    elif format == "gradslam":
-        write_gradslam(scene / "saved-map/pointclouds", points, RNG.normal(size=(6, 8)).astype(np.float16))
-    elif format == "hovsg":
-        write_hovsg(scene, {0: points[:4], 1: points[4:]}, RNG.normal(size=(2, 8)).astype(np.float32))
-    elif format == "hovsg-graph":
-        write_graph(scene / "graph")
-    elif format == "ovo":
-        write_ovo(scene, points, [5, -1, 5, 0, 0, 5], {5: np.ones(8, np.float32), 0: np.ones((1, 8), np.float32)})
-    elif format == "rayfronts":
-        write_rayfronts(scene / "map.pt", {"feats_xyz": points, "feats_feats": np.ones((6, 8), np.float32)})
-    elif format == "esam":
-        write_esam(scene, points.reshape(3, 2, 3), [0, 0, 1, -1, 1, 0])
-    elif format == "onlineanyseg":
-        masks = [np.arange(6) < 3, np.arange(6) > 2]
-        write_onlineanyseg(scene, points, masks, list(np.ones((2, 8), np.float32)))
-    elif format == "fross":
-        write_fross(scene / "predictions_gaussian_test.pkl", [points[:4], points[4:]])
-    else:
-        write_openlex(scene, points, np.array([0, 0, 1, 1, 0, 1]), RNG.normal(size=(2, 8)))
+    points, rows = RNG.normal(size=(6, 3)).astype(np.float32), np.ones((6, 8), np.float32)
+    ovo = {5: rows[0], 0: rows[:1]}
+    writers: dict[str, Callable[[], object]] = {
+        "conceptgraphs": lambda: write_map(scene / "pcd_saves/full_pcd_none_x.pkl.gz", a_map()),
+        "gradslam": lambda: write_gradslam(scene / "saved-map/pointclouds", points, rows.astype(np.float16)),
+        "hovsg": lambda: write_hovsg(scene, {0: points[:4], 1: points[4:]}, rows[:2]),
+        "hovsg-graph": lambda: write_graph(scene / "graph"),
+        "openlex3d": lambda: write_openlex(scene, points, np.array([0, 0, 1, 1, 0, 1]), rows[:2]),
+        "ovo": lambda: write_ovo(scene, points, [5, -1, 5, 0, 0, 5], ovo),
+        "rayfronts": lambda: write_rayfronts(scene / "map.pt", {"feats_xyz": points, "feats_feats": rows}),
+        "esam": lambda: write_esam(scene, points.reshape(3, 2, 3), [0, 0, 1, -1, 1, 0]),
+        "onlineanyseg": lambda: write_onlineanyseg(scene, points, [np.arange(6) < 3, np.arange(6) > 2], list(rows[:2])),
+        "fross": lambda: write_fross(scene / "predictions_gaussian_test.pkl", [points[:4], points[4:]]),
+    }
+    writers[format]()
     return folder
 
 

@@ -132,7 +132,7 @@ class TorchPickler(pickle._Pickler):
         if isinstance(value, Tensor):
             array = np.require(value.array, requirements="C")
             strides = tuple(stride // array.itemsize for stride in array.strides)
-            parts = memoryview(array.reshape(-1)), 0, array.shape, strides, False, OrderedDict()
+            parts: Any = memoryview(array.reshape(-1)), 0, array.shape, strides, False, OrderedDict()
             return TorchName("torch._utils _rebuild_tensor_v2"), parts
         if isinstance(value, Sparse):
             parts = Tensor(value.indices), Tensor(np.ones(value.indices.shape[1], np.float32)), value.shape, True
