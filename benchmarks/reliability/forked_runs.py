@@ -109,7 +109,7 @@ def outcome(folder: Path) -> dict[str, Any]:
 
 def program_of(ready: Path) -> str:
     """The setting by which the method ``command`` starts another program's other program and leaves ``ready``."""
-    words = [sys.executable, str(SCENES.parent / "programs" / "kill_program.py"), "{output}", str(ready)]
+    words = [sys.executable, str(Path(__file__).with_name("kill_program.py")), "{output}", str(ready)]
     return f"command.command={json.dumps(words)}"
 
 

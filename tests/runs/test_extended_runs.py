@@ -64,6 +64,7 @@ CANNOT_JOIN = {
     "--stride 2": "stride was 1, now 2",
     "--set collector.drop=1": "method.collector.drop was 0, now 1",
     "--set painted.n_frames=3": "dataset.painted.n_frames was 6, now 3",
+    "--set perception.naming.temperature=0.5": "perception.naming.temperature was 0.05, now 0.5",
     "--profile oracle": 'profile was "auto", now "oracle"',
     "--anytime 0.5": "anytime was [], now [0.5]",
 }

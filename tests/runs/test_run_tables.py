@@ -45,14 +45,6 @@ def test_a_row_shows_value_interval_ceiling_scenes_and_coverage() -> None:
     assert cells == ["opensu3d", "40.8 [38.9, 42.6]", "31.2", "97.1 / 100.0", "8", "99.1 / 99.8 / 100.0"]
 
 
-def test_missing_scenes_are_counted_and_named() -> None:
-    few = result()["result"] | {"n_scenes": 7}
-    text = table(result(result=few, failed=["rooms/c"], caveat="labels mean little here"))
-    assert "| 7/8 " in text
-    assert "- INCOMPLETE: opensu3d failed on rooms/c" in text
-    assert "- opensu3d: labels mean little here" in text
-
-
 def test_made_rooms_in_anothers_layout_are_said_to_be_such() -> None:
     method: Any = SimpleNamespace(needs=PerceptionNeeds(masks="grounded"), caveat=None)
     perception: Any = SimpleNamespace(caveat=None, encoder=SimpleNamespace(name="embedded"))

@@ -1,4 +1,4 @@
-"""Runs that are refused before any work: another key, another folder, two things of one name, wrong variants."""
+"""Runs that are refused before any work: folders of others, two things of one name, wrong variants."""
 
 from __future__ import annotations
 
@@ -13,17 +13,6 @@ from su3d_bench.core.errors import ConfigError
 from su3d_bench.runs.plan import named_method
 
 pytestmark = pytest.mark.usefixtures("painted_place")
-
-
-def test_another_request_for_the_same_folder_is_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(scenes="a") == 0
-    before = Path("out/metrics.json").read_bytes()
-    capsys.readouterr()
-    assert run("--seed", "5", "--set", "perception.naming.temperature=0.5", scenes="a") == 2
-    error = capsys.readouterr().err
-    assert "out: holds another run (" in error and error.count("\n") == 1
-    assert "seed was 0, now 5" in error and "perception.naming.temperature was 0.05, now 0.5" in error
-    assert Path("out/metrics.json").read_bytes() == before
 
 
 def test_a_folder_of_somebody_else_is_refused_and_left_alone(capsys: pytest.CaptureFixture[str]) -> None:

@@ -68,6 +68,6 @@ def kept_perception(*_: Any, cache_root: Path, **__: Any) -> KeptPerception:
     return KeptPerception(cache_root)
 
 
-scene_run.build_perception = kept_perception  # type: ignore[attr-defined]
+scene_run.build_perception = kept_perception  # type: ignore[attr-defined, assignment]
 
 __all__ = ["Dense", "Painted"]

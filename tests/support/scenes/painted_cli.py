@@ -15,7 +15,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.runs import finished, scene
 
 if "pytest" not in sys.modules:  # a test patches, and unpatches, its own process
-    scene.build_perception = colour_perception  # type: ignore[attr-defined]
+    scene.build_perception = colour_perception  # type: ignore[attr-defined, assignment]
     finished.encoder_of = lambda run, device="cpu": WordEncoder()
 
 __all__ = ["Collector", "Painted"]
