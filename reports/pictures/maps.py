@@ -190,7 +190,8 @@ def draw_heat_map(instances: Instances, similarity: Float64Array, path: Path, ti
     views = _views(cloud, _cameras(cloud.points))
     order = np.argsort(-similarity, kind="stable")[: len(top)]
     pictures = _paint(views, cloud, canvas.heat_colours(similarity))
-    seen = [_owners_seen(view, cloud) for view in views]
+    owner_of = np.append(cloud.owner, np.int32(-1))  # whose point each pixel (h, w) shows, -1 for nobody's
+    seen: list[Int32Array] = [owner_of[view.point[:: canvas.OVERSAMPLING, :: canvas.OVERSAMPLING]] for view in views]
     for picture, owners in zip(pictures, seen, strict=True):
         for best in order[:1]:
             draw_outline(picture, owners == best, 3)
@@ -201,14 +202,6 @@ def draw_heat_map(instances: Instances, similarity: Float64Array, path: Path, ti
         _write_ranks(axes, owners, order[:MOST_RANKS])
     _write_ranking(page, 3 * VIEW_WIDTH + 14, header, similarity, top)
     page.write(path)
-
-
-def _owners_seen(view: canvas.View, cloud: Cloud) -> Int32Array:
-    """Whose point each pixel (h, w) of the picture shows, -1 for nobody's."""
-    owners: Int32Array = np.append(cloud.owner, np.int32(-1))[
-        view.point[:: canvas.OVERSAMPLING, :: canvas.OVERSAMPLING]
-    ]
-    return owners
 
 
 def _write_ranks(axes: Any, owners: Int32Array, order: Int64Array) -> None:

@@ -42,7 +42,11 @@ def ablation_table(
     sweep = [row for parameter in parameters for row in sweep if row.parameter == parameter]
     sides = [_of_protocol(measured, side) for side in SIDES]
     for side, members in zip(SIDES, sides, strict=True):
-        _refuse_missing(sweep, members, side)
+        if missing := [entry.method for entry in sweep if entry.method not in members]:
+            raise ConfigError(
+                f"Table I: no scores of {missing[0]} for {', '.join(side.metrics)}; run the sweep again, it goes on "
+                "where it stopped"
+            )
     looks = [replace(shown, metrics=side.metrics, ceilings=False, scenes_count=False) for side in SIDES]
     halves = [_half(sweep, members, look) for members, look in zip(sides, looks, strict=True)]
     rows = [
@@ -78,15 +82,6 @@ def _of_protocol(measured: Sequence[Measured], side: paper.Layout) -> dict[str, 
         if row.protocol == chosen and members.setdefault(row.method, row) is not row:
             raise ConfigError(f"Table I: {row.method} is in {members[row.method].run} and {row.run}; name one of them")
     return members
-
-
-def _refuse_missing(sweep: Sequence[SweepRow], members: Mapping[str, Measured], side: paper.Layout) -> None:
-    for entry in sweep:
-        if entry.method not in members:
-            raise ConfigError(
-                f"Table I: no scores of {entry.method} for {', '.join(side.metrics)}; run the sweep again, it goes on "
-                "where it stopped"
-            )
 
 
 @dataclass(frozen=True)

@@ -130,24 +130,21 @@ def _protocol_table(protocol: str, metrics: Mapping[str, Any], title: str) -> Ta
         difference = f"{signed(plan['difference'])} {bracketed(plan['interval'], signed)}".rstrip()
         is_one_seed = variance is None or variance["of_seeds"] is None
         known = ("of_scenes", "", "") if is_one_seed else ("of_scenes", "of_seeds", "of_rest")
-        parts = [_deviation(variance and variance.get(key)) for key in known]
+        parts = [
+            NOT_MEASURED if not variance or variance.get(key) is None else f"{100 * variance[key] ** 0.5:.1f}"
+            for key in known
+        ]
         seeds = list(dict.fromkeys(need["n_seeds"] for need in plan["needs"]))
         for n_seeds in seeds:
-            needs = [_need(need) for need in plan["needs"] if need["n_seeds"] == n_seeds]
+            needs = []
+            for need in (need for need in plan["needs"] if need["n_seeds"] == n_seeds):
+                n, *ends = (NOT_MEASURED if need[k] is None else str(need[k]) for k in ("n_scenes", "low", "high"))
+                needs.append(n if need["n_scenes"] is None else f"{n} [{', '.join(ends)}]")
             first = [name, difference, *parts] if n_seeds == seeds[0] else [""] * 5
             rows.append([*first, str(n_seeds), *needs])
         if not seeds:
             rows.append([name, difference, *parts, *[NOT_MEASURED] * (1 + len(asked))])
     return text_table(protocol, rows, heading=protocol, caption=f": {title}")
-
-
-def _deviation(variance: float | None) -> str:
-    return NOT_MEASURED if variance is None else f"{100 * variance**0.5:.1f}"
-
-
-def _need(need: Mapping[str, Any]) -> str:
-    low, high = (NOT_MEASURED if need[end] is None else str(need[end]) for end in ("low", "high"))
-    return NOT_MEASURED if need["n_scenes"] is None else f"{need['n_scenes']} [{low}, {high}]"
 
 
 MOST_OF_A_RULE = 60  # characters

@@ -59,7 +59,9 @@ def _block(part: Table | Prose, shown: Callable[[str, int], str], width: int | N
         return "\n".join(_folded(shown(line, MOST_OF_A_NOTE), width, begin) for line in part.lines)
     head = [shown(text, MOST_OF_A_CELL) for text in (part.head, *part.columns)]
     rows = [[shown(row.title, MOST_OF_A_CELL), *(_marked(cell, shown) for cell in row.cells)] for row in part.rows]
-    lines = _fitted([head, *rows], width) if rows else []
+    lines = aligned([head, *rows]) if rows else []
+    if width is not None and lines and len(lines[0]) > width:
+        lines = _on_its_side([head, *rows], width)
     heading = f"**{shown(part.heading, MOST_OF_A_CELL)}**" if part.heading else ""
     gap = " " if heading and part.caption.startswith(" ") else ""
     caption = _folded(f"{heading}{gap}{shown(part.caption, MOST_OF_A_CELL)}", width)
@@ -91,12 +93,6 @@ def _wrapped(text: str, width: int, begin: str = "") -> list[str]:
         break_long_words=False,  # names, paths and numbers stay whole
         break_on_hyphens=False,
     ) or [begin]
-
-
-def _fitted(rows: Sequence[Sequence[str]], width: int | None) -> list[str]:
-    """``aligned``; of a table that is wider than ``width`` a list of its rows."""
-    lines = aligned(rows)
-    return lines if width is None or len(lines[0]) <= width else _on_its_side(rows, width)
 
 
 def _on_its_side(rows: Sequence[Sequence[str]], width: int) -> list[str]:

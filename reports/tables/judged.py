@@ -54,9 +54,9 @@ def judged_table(
     rows = [row for row in results if row.kind == layout.kind]
     if not any(row.per_scene for row in rows):
         have = ", ".join(dict.fromkeys(row.protocol for row in results))
+        wanted = " or ".join(f"{dataset}-{layout.kind}" for dataset in ("rooms", "replica", "scannet"))
         raise ConfigError(
-            f"Table {number}: needs {_protocols(layout.kind)}, or scores of sheets of kind {layout.kind}; there are "
-            f"{have}"
+            f"Table {number}: needs protocol {wanted}, or scores of sheets of kind {layout.kind}; there are {have}"
         )
     shown = replace(
         shown, metrics=shown.metrics or layout.columns, only_significant=True, n_judged=True, unit="fraction"
@@ -73,14 +73,9 @@ def judged_table(
     made_by = [who for row in rows for start in WHO_DID.values() for who in said_by(row.warnings, start)]
     models = [] if all(PAPER_MODEL in who for who in made_by) else ["language model"]
     setup = paper.other_setup(rows, is_its_protocol=True, datasets=tuple(paper.PAPER_SCENES), more=(*models, *judges))
-    return Table(
-        name=f"{number}-{'-'.join(names)}",
-        caption=f"{layout.subject} on {', '.join(names)}{setup}.",
-        head="method, judge",
-        columns=tuple(columns),
-        rows=(*_joined(list(parts.values())), *reported),
-        notes=(*_joined_notes(parts), *sources),
-    )
+    caption = f"{layout.subject} on {', '.join(names)}{setup}."
+    rows_of_all, notes = (*_joined(list(parts.values())), *reported), (*_joined_notes(parts), *sources)
+    return Table(f"{number}-{'-'.join(names)}", caption, "method, judge", tuple(columns), rows_of_all, notes)
 
 
 def _joined_notes(parts: Mapping[str, Table]) -> list[str]:
@@ -149,11 +144,6 @@ def _reported(
         marks = ", ".join(dict.fromkeys(row.mark for row in by_dataset.values()))
         joined.append(TableRow(label, _side_by_side(own, list(parts.values())), is_reported=True, mark=marks))
     return joined, sources
-
-
-def _protocols(kind: str) -> str:
-    names = [f"{dataset}-{kind}" for dataset in ("rooms", "replica", "scannet")]
-    return f"protocol {' or '.join(names)}"
 
 
 def _part(row: Measured, part: str, layout: JudgedLayout) -> Measured:

@@ -80,12 +80,13 @@ def _letter(character: str) -> str:
 
 def latex(parts: Sequence[Table | Prose]) -> str:
     """All tables as floats of their own, notes beneath in small type."""
-    blocks = [HEADER, *(_paragraphs(part.lines) if isinstance(part, Prose) else _float(part) for part in parts)]
+    blocks = [HEADER]
+    for part in parts:
+        if isinstance(part, Prose):
+            blocks.append("\n".join(f"\\noindent {escape(line)}\\par" for line in part.lines))
+        else:
+            blocks.append(_float(part))
     return "\n\n".join(blocks) + "\n"
-
-
-def _paragraphs(lines: Sequence[str]) -> str:
-    return "\n".join(f"\\noindent {escape(line)}\\par" for line in lines)
 
 
 @dataclass(frozen=True)

@@ -310,10 +310,11 @@ def _beneath(scored: Mapping[str, Any]) -> Iterable[str]:
     counts = list(scored["n_predictions"].values())
     if counts and scored["confidences"] is not None:
         spread = f" ({min(counts)} to {max(counts)})" if min(counts) < max(counts) else ""
-        twice = scored["duplicates"]
+        twice, of = scored["duplicates"], scored["confidences"]
+        said = f"all {of['min']:g}" if of["constant"] else f"{of['min']:g} to {of['max']:g}"
         yield (
             f"predictions a scene: {sum(counts) / len(counts):.1f}{spread}; near-duplicate pairs {twice['near']}, "
-            f"identical ones {twice['identical']}; confidences {_confidences(scored)}"
+            f"identical ones {twice['identical']}; confidences {said}"
         )
     if scored["labels"] is not None:
         yield f"of each mask or point counts: {scored['labels']}"
@@ -333,15 +334,6 @@ def _beneath(scored: Mapping[str, Any]) -> Iterable[str]:
     yield from (f"WARNING: {printable(line)}" for line in warnings[:MOST_NOTES])
     if len(warnings) > MOST_NOTES:
         yield f"and {len(warnings) - MOST_NOTES} more warnings, all in the --json file"
-
-
-def _confidences(scored: Mapping[str, Any]) -> str:
-    confidences = scored["confidences"]
-    return (
-        f"all {confidences['min']:g}"
-        if confidences["constant"]
-        else f"{confidences['min']:g} to {confidences['max']:g}"
-    )
 
 
 def _classes(protocol: str, scored: Mapping[str, Any]) -> list[Table | Prose]:

@@ -8,7 +8,7 @@ from typing import Any
 
 from su3d_bench.core.errors import counted
 from su3d_bench.formats.tables.table import NOT_MEASURED, Prose, Table, csv_lines, percent, text_table
-from su3d_bench.metrics.costs import MethodSummary, StageSummary
+from su3d_bench.metrics.costs import MethodSummary
 from su3d_bench.numerics.statistics import Growth
 
 MIB = 2**20
@@ -35,11 +35,8 @@ def timing_tables(
     parts: list[Table | Prose] = [Prose((f"{run}: {hardware[run]}",)) for run in runs]
     parts.append(text_table("timing", list(_methods_table(summaries, camera_rate))))
     if any(stage.name == CACHE and stage.share > 0 for summary in summaries for stage in summary.stages):
-        parts.append(
-            Prose(
-                (f"Stage {CACHE}: what perception found was read from disk there; the speeds are those of the rest.",)
-            )
-        )
+        line = f"Stage {CACHE}: what perception found was read from disk there; the speeds are those of the rest."
+        parts.append(Prose((line,)))
     for summary in summaries:
         updates = f"{counted(summary.n_updates, 'update')} of {counted(len(summary.scenes), 'scene')}"
         caption = f", ms per update ({updates})"
@@ -58,7 +55,9 @@ def csv_text(summaries: Sequence[MethodSummary], hardware: Mapping[str, str]) ->
     for cost in summaries:
         for stage in cost.stages:
             numbers = [stage.n, stage.first, stage.p50, stage.p95, stage.worst, stage.share]
-            grown = [cell for each in (stage.against_points, stage.against_frames) for cell in _growth_cells(each)]
+            grown: list[Any] = []
+            for each in (stage.against_points, stage.against_frames):
+                grown += [""] * 4 if each is None else [each.exponent, each.low, each.high, each.words]
             scenes = len(cost.scenes)
             rows.append([cost.run, hardware[cost.run], cost.method, scenes, stage.name, *numbers, *grown])
     return csv_lines(rows)
@@ -74,10 +73,6 @@ def methods_csv(summaries: Sequence[MethodSummary], hardware: Mapping[str, str],
         values = [getattr(cost, name) for name in sizes]
         rows.append([cost.run, hardware[cost.run], cost.method, len(cost.scenes), cost.n_updates, *speed, *values])
     return csv_lines(rows)
-
-
-def _growth_cells(growth: Growth | None) -> list[float | str]:
-    return ["", "", "", ""] if growth is None else [growth.exponent, growth.low, growth.high, growth.words]
 
 
 def _methods_table(summaries: Sequence[MethodSummary], camera_rate: float) -> Iterator[list[str]]:
@@ -105,16 +100,12 @@ def _stages_table(summary: MethodSummary) -> Iterator[list[str]]:
         "with a larger map",
     ]
     for stage in summary.stages:
+        growth = stage.against_points or stage.against_frames
         yield [
             *(stage.name, _ms(stage.p50), _ms(stage.p95), _ms(stage.worst), _ms(stage.first), percent(stage.share)),
             *(_growth(stage.against_points), _growth(stage.against_frames)),
-            _words(stage),
+            "too few updates to tell" if growth is None else growth.words,
         ]
-
-
-def _words(stage: StageSummary) -> str:
-    growth = stage.against_points or stage.against_frames
-    return "too few updates to tell" if growth is None else growth.words
 
 
 def _growth(growth: Growth | None) -> str:

@@ -267,8 +267,14 @@ def attribute(
     """
     run = read_run(path)
     explained = explained_of(run, method_of(run, method), protocols)
-    other = None if oracle is None else Side(_oracle_run(oracle), explained.method)
-    if other is not None:
+    other = None
+    if oracle is not None:
+        other = Side(read_run(oracle), explained.method)
+        if other.run.record.profile != "oracle":
+            raise ConfigError(
+                f"{other.run.name}: has the profile '{printable(str(other.run.record.profile), 60)}'; --oracle takes a "
+                "run made with --profile oracle"
+            )
         other.run.check_method(other.method)
     walk = matched_instances(run, [explained], run.scenes)
     mended = {scene: explained.mended(scene, {one.rules.name: one.looked_at for one in found}) for scene, found in walk}
@@ -287,16 +293,6 @@ def attribution_of(explained: Explained, mended: Mapping[str, MendedJob], other:
         raise ConfigError(f"{side.name}: no scene is scored under {', '.join(explained.protocols)}; nothing to explain")
     remarks = (*explained.remarks, *run_remarks(explained.run))
     return RunAttribution(explained.run.name, explained.method, remarks, tuple(formed))
-
-
-def _oracle_run(path: Path) -> FinishedRun:
-    run = read_run(path)
-    if run.record.profile != "oracle":
-        raise ConfigError(
-            f"{run.name}: has the profile '{printable(str(run.record.profile), 60)}'; --oracle takes a run made with "
-            "--profile oracle"
-        )
-    return run
 
 
 def _oracle_values(rules: ProtocolRules, side: Side, other: Side | None, scenes: Sequence[str]) -> Values | None:
