@@ -15,6 +15,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -50,21 +51,23 @@ def chains_of(
 
     Of several texts that mean an object those count that come first by a digest, one of each sort in turn.
     """
-    name_of = {question.text: question for question in questions if question.kind == INSTANCE}
     cases: dict[str, ChainedText] = {}
-    n_objects = 0
+    for number, (_, chains) in enumerate(islice(_chains(questions, objects), most_objects)):
+        for k, chain in enumerate(chains):
+            for step, one in enumerate(chain):
+                known = cases.get(one.text) or ChainedText(one.text, one.answers or (), tags=_tags(one))
+                cases[one.text] = replace(known, places=(*known.places, Place(number, k, step)))
+    return tuple(cases.values())
+
+
+def _chains(questions: Sequence[Question], objects: SceneMap) -> Iterator[tuple[MapObject, list[list[Question]]]]:
+    """Each object that has three chains, and these, each with its finest text first."""
+    name_of = {question.text: question for question in questions if question.kind == INSTANCE}
     for thing in objects.objects:
         coarse = name_of.get(thing.name)
         fine = [] if coarse is None else _meaning(thing.id, questions)
-        if coarse is None or len(fine) < CHAINS_EACH or n_objects == most_objects:
-            continue
-        for number, question in enumerate(fine[:CHAINS_EACH]):
-            for step, one in enumerate((question, coarse)):
-                known = cases.get(one.text) or ChainedText(one.text, one.answers or (), tags=_tags(one))
-                places = (*known.places, Place(n_objects, number, step))
-                cases[one.text] = replace(known, places=places)
-        n_objects += 1
-    return tuple(cases.values())
+        if coarse is not None and len(fine) >= CHAINS_EACH:
+            yield thing, [[one, coarse] for one in fine[:CHAINS_EACH]]
 
 
 def _meaning(object_id: int, questions: Sequence[Question]) -> list[Question]:
@@ -117,20 +120,18 @@ def metadata_of(scene: str, objects: SceneMap, most_objects: int | None = None) 
 
     Ids are one less than here, as in ScanNet. Objects of which fewer than three questions can be asked are in neither.
     """
-    cases = chains_of(generate(scene, objects), objects)
     grounding: dict[str, Any] = {}
     asked: dict[str, Any] = {}
-    for chains in _chains_of_objects(cases):
-        fine = [chain[0] for chain in chains]
-        (object_id,) = fine[0].object_ids
-        thing, key = objects.by_id(object_id), str(object_id - 1)
-        made = _drawn(thing, fine, objects)
+    questions = generate(scene, objects)
+    cases = {case.text: case for case in chains_of(questions, objects)}
+    for thing, chains in _chains(questions, objects):
+        texts, key = [chain[0].text for chain in chains], str(thing.id - 1)
+        made = _drawn(thing, texts, objects)
         if len(made) < CHAINS_EACH or (most_objects is not None and sum(map(len, asked.values())) == most_objects):
             continue
-        texts = [case.text for case in fine]
         known = {word for text in texts for word in words(text)}
         grounding.setdefault(thing.name, {})[key] = {
-            f"chain_{number}": [_entry(case) for case in chain] for number, chain in enumerate(chains, 1)
+            f"chain_{number}": [_entry(cases[one.text]) for one in chain] for number, chain in enumerate(chains, 1)
         }
         rows: list[dict[str, Any]] = [{"question": one.text, "answer": one.answer, "tag": one.tag} for one in made]
         for row, one in zip(rows, made, strict=True):
@@ -152,25 +153,15 @@ def made_files(scenes: Mapping[str, SceneMap], per_scene: int | None = None) -> 
     return grounding, asked
 
 
-def _chains_of_objects(cases: Sequence[ChainedText]) -> Iterator[list[list[ChainedText]]]:
-    """The three chains of each object, each with its finest text first."""
-    chains: dict[int, dict[int, dict[int, ChainedText]]] = {}
-    for case in cases:
-        for place in case.places:
-            chains.setdefault(place.object, {}).setdefault(place.chain, {})[place.step] = case
-    for _, of_object in sorted(chains.items()):
-        yield [[chain[step] for step in sorted(chain)] for _, chain in sorted(of_object.items())]
-
-
 def _entry(case: ChainedText) -> dict[str, Any]:
     tags = sorted(case.tags, key=lambda tag: (tag != "class", tag))
     return {"text": case.text, "obj_id": [str(one - 1) for one in case.object_ids], "tag": "-".join(tags)}
 
 
-def _drawn(thing: MapObject, fine: Sequence[ChainedText], objects: SceneMap) -> list[MadeQuestion]:
+def _drawn(thing: MapObject, texts: Sequence[str], objects: SceneMap) -> list[MadeQuestion]:
     """Three questions of different kinds as far as there are, by a digest of their texts; yes as often as no."""
     # a text that holds the words on which an answer rests gives it away
-    asked = ((one, case.text) for case in fine for one in questions_about(thing, case.text, objects))
+    asked = ((one, text) for text in texts for one in questions_about(thing, text, objects))
     every = [one for one, text in asked if not set(words(one.told)) & set(words(text))]
     turn = Counter[str]()
     ranked = []

@@ -9,13 +9,12 @@ from typing import Any
 
 import pytest
 from chat_server import KEY, Answered, ChatServer
-from made_sheets import METHODS, RUN
+from made_sheets import METHODS
 from painted import colour_perception
 
 from su3d_bench.cli.main import main
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.runs import finished as finished_run
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.sheets.items import read_key, read_sheet
 from su3d_bench.sheets.sources import RunSource
 
@@ -23,24 +22,13 @@ QUESTION = "How many chairs are there?"
 ANSWER = '{"reasoning": "one is in the list", "answer": "There is 1 chair.", "object_ids": [0]}'
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("command")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
-        patch.setenv("SU3D_DATA", str(path / "data"))
-        patch.chdir(path)
-        assert main(RUN) == 0
-    (path / "asked.csv").write_text(f"scene,text,objects,kind\npainted/a,{QUESTION},,reasoning\n")
-    return path
-
-
 @pytest.fixture
-def folder(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(painted_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A copy of the run, judged by the rules of the built-in rooms."""
-    shutil.copytree(made / "run", tmp_path / "run")
+    shutil.copytree(painted_folder / "run", tmp_path / "run")
+    (tmp_path / "asked.csv").write_text(f"scene,text,objects,kind\npainted/a,{QUESTION},,reasoning\n")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("SU3D_DATA", str(made / "data"))
+    monkeypatch.setenv("SU3D_DATA", str(painted_folder / "data"))
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
     monkeypatch.setattr(RunSource, "rules", lambda self, scene, kind: load_protocol(f"rooms-{kind}"))
     monkeypatch.setattr(finished_run, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
@@ -60,10 +48,9 @@ def told(capsys: pytest.CaptureFixture[str], *words: str) -> list[dict[str, Any]
     return found
 
 
-def asked(made: Path, server: ChatServer, *more: str) -> list[str]:
-    quick = ["perception.language.max_retries=0"]
-    words = ["--kind", "reasoning", "--questions", str(made / "asked.csv"), "--out", "out", "--solver", "llm"]
-    return [*words, "--model", "tiny", "--base-url", server.url, *more, "--set", *quick]
+def asked(server: ChatServer, *more: str) -> list[str]:
+    words = ["--kind", "reasoning", "--questions", "asked.csv", "--out", "out", "--solver", "llm", "--model", "tiny"]
+    return [*words, "--base-url", server.url, *more, "--set", "perception.language.max_retries=0"]
 
 
 def test_several_kinds_give_a_folder_each_and_what_one_kind_alone_gives(
@@ -82,14 +69,14 @@ def test_several_kinds_give_a_folder_each_and_what_one_kind_alone_gives(
 
 
 def test_a_language_model_answers_reasoning_sheets_and_its_replies_stay(
-    folder: Path, made: Path, server: ChatServer, capsys: pytest.CaptureFixture[str]
+    folder: Path, server: ChatServer, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (first,) = told(capsys, *asked(made, server))
+    (first,) = told(capsys, *asked(server))
     sheet, key = read_sheet(folder / "out" / "sheet.json"), read_key(folder / "out-key" / "key.json")
     assert {one.text for one in sheet.items} == {f"{QUESTION}\nAnswer: There is 1 chair."}
     assert key.answered_by == "tiny" and "tiny" not in (folder / "out" / "annotator-1" / "sheet.html").read_text()
     assert sorted(name for one in key.items for name in one.methods) == sorted(METHODS)
     n_asked = server.n_asked
     assert 1 <= n_asked <= len(METHODS)  # equal maps are asked about once
-    (again,) = told(capsys, *asked(made, server, "--offline"))
+    (again,) = told(capsys, *asked(server, "--offline"))
     assert again["sheet_id"] == first["sheet_id"] and server.n_asked == n_asked

@@ -49,7 +49,7 @@ def annotation_set(truths: Sequence[tuple[str, str, str]], annotators: Sequence[
     asked = []
     for k, (first, second, merging) in enumerate(truths):
         told = {"n": first, "n'": second}
-        names = [("n'",), ("n",)] if k % 2 else [("n",), ("n'",)]
+        names: list[tuple[str, ...]] = [("n'",), ("n",)] if k % 2 else [("n",), ("n'",)]
         if second in ("", first):
             names = [("n", "n'") if second else ("n",)]
         stands_for = {f"label {place}": what for place, what in enumerate(names, 1)}
