@@ -141,7 +141,10 @@ class Walker:
                 )
             return found
 
-        adds = {name: shares(n, lambda bits, name=name: values(bits)[name]) for name in mixtures.values}
+        def value(name: str, bits: int) -> float:
+            return values(bits)[name]
+
+        adds = {name: shares(n, partial(value, name)) for name in mixtures.values}
         return Walk(
             run=self.run.name,
             method=printable(self.method, 80),

@@ -80,7 +80,6 @@ def call_show(arguments: argparse.Namespace) -> None:
     """
     from su3d_bench.core import registry
     from su3d_bench.core.config import flatten, write_toml
-    from su3d_bench.core.interfaces import HasPresets
     from su3d_bench.reports.tables.paper import figures_of
     from su3d_bench.runs.catalogue import about_method
 
@@ -88,9 +87,7 @@ def call_show(arguments: argparse.Namespace) -> None:
     defaults = method.Config().model_dump(mode="json")
     row = about_method(method.name, method)
     figures = figures_of(method=method.name)
-    presets = (
-        {name: dict(settings) for name, settings in method.presets.items()} if isinstance(method, HasPresets) else {}
-    )
+    presets = {name: dict(settings) for name, settings in getattr(method, "presets", {}).items()}
     published = [figure.model_dump(mode="json", exclude_none=True) for figure in figures]
     if answer_json(arguments, {**row, "settings": defaults, "presets": presets, "published": published}):
         return

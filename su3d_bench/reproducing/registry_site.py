@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from su3d_bench.core.files.atomic import is_file, make_folder, read_json, remove
 from su3d_bench.core.files.locks import is_unfinished
 from su3d_bench.formats.tables.table import NOT_MEASURED, Cell, Prose, Table, TableRow, is_count, with_interval
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
-from su3d_bench.reports.page.page import PAGE, page_name, registry_page_html
+from su3d_bench.reports.page.page import PAGE, Kind, page_name, registry_page_html
 from su3d_bench.reports.tables.model import confidence_notes, few_scenes
 from su3d_bench.reproducing.registry import SUFFIX, Registry, Row
 
@@ -39,7 +39,8 @@ def write_site(registry: Registry, out: Path, title: str = TITLE, bundles_at: st
     address = _checked_address(bundles_at)
     value = _value(registry, title, address)
     pages = {INDEX: registry_page_html("index", title, _index(value), [_plain_tables(registry)])}
-    for kind, make in (("method", _method_page), ("scene", _scene_page)):
+    makers: tuple[tuple[Kind, Callable[..., dict[str, Any]]], ...] = (("method", _method_page), ("scene", _scene_page))
+    for kind, make in makers:
         for one in value[f"{kind}s"]:
             pages[one["page"]] = registry_page_html(kind, one["name"], {**make(value, one), "registry": title})
     for folder in ("", METHODS, SCENES):

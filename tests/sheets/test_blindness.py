@@ -73,7 +73,7 @@ def n_astray(artist: Artist, draft: drafts.Draft) -> int:
     assert photo is None or any(np.array_equal(photo.picture, frame.rgb) for frame in room.frames)
     answer = room.union([artist._region(draft, row) for row in draft.rows]).is_member
     other = room.union([artist._region(draft, row) for row in draft.others]).is_member
-    corner = next(view for view in room.corners if np.array_equal(view.shows(answer), parts.room_view.mask))
+    corner = next(view for view in room.corners if np.array_equal(view.shows(answer), np.asarray(parts.room_view.mask)))
     n = 0
     for panel, view, share in ((parts.room_view, corner, ROOM_SHARE), (parts.place, room.above, PLACE_SHARE)):
         is_other = differs(panel.picture, colour(view.shown, pale(room.colours, share)))

@@ -27,7 +27,7 @@ from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.metrics.attribution.arrays import LookedAt
 from su3d_bench.metrics.costs import MAP, TOTAL, MethodSummary, UpdateTimes, summarise
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.semantic.confusion import SemanticCounts, concatenate
+from su3d_bench.metrics.semantic.confusion import SemanticCounts
 from su3d_bench.reports.tables.run import Unscored, not_scored_lines
 from su3d_bench.runs.executors import SCENE_DONE, Event, Report, run_inline, run_processes
 from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
@@ -191,7 +191,9 @@ def _confusions(run: FinishedRun, method: str) -> list[dict[str, Any]]:
             confusions.append(confusion | {"reason": f"the rules of {name} here are not those that scored the run"})
             continue
         names = [entry.name for entry in rules.classes]
-        confusions.append(confusion | {"names": names, "cells": confusion_cells(concatenate(counts).confusion)})
+        confusions.append(
+            confusion | {"names": names, "cells": confusion_cells(SemanticCounts.joined(counts).confusion)}
+        )
     return confusions
 
 
@@ -205,8 +207,8 @@ def _times(run: FinishedRun, method: str) -> dict[str, Any] | None:
 def _comparisons(runs: Sequence[FinishedRun]) -> list[dict[str, Any]]:
     """The first ``MOST_PAIRS`` pairs: methods of one name in two runs, then methods within a run."""
     pairs: list[tuple[Side, Side]] = []
-    for left, right in itertools.combinations(runs, 2):
-        pairs += [(Side(left, method), Side(right, method)) for method in left.methods if method in right.methods]
+    for first, second in itertools.combinations(runs, 2):
+        pairs += [(Side(first, method), Side(second, method)) for method in first.methods if method in second.methods]
     for run in runs:
         pairs += itertools.combinations((Side(run, method) for method in run.methods), 2)
     numbers, compared = SideNumbers(), []

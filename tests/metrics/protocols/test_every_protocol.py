@@ -40,7 +40,7 @@ def truth_of(name: str, seed: int) -> Any:
     semantic, instance = (np.where(is_known, array, 0).astype(np.int32) for array in (truth.semantic, truth.instance))
     points = truth.points.copy()
     if rules.kind == "relations":  # the lamp on the table, or nothing is related
-        points[truth.instance == 5] += np.float32([-1, 0, 0.81])
+        points[truth.instance == 5] += np.array([-1, 0, 0.81], np.float32)
     return replace(truth, points=points, semantic=semantic, instance=instance, variant=rules.ground_truth)
 
 
