@@ -8,17 +8,18 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, FramesMissing
-from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int64Array, UInt8Array
+from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int64Array
 from su3d_bench.datasets.recordings.recorded_frames import (
     StoredDepth,
+    colour_at,
     depth_m_of_values,
     left_out,
+    nearest_at,
     numbers,
     pinhole,
     reading,
@@ -81,15 +82,6 @@ def _camera_to_world(rows: Float64Array) -> Float64Array:
     poses[:, :3, :3] = turned
     poses[:, :3, 3] = -np.einsum("nij,nj->ni", turned, rows[:, 3:])
     return poses
-
-
-def trajectory_line(time: str, camera_to_world: Float64Array) -> str:
-    """The line of a pose (4, 4) as ``read_trajectory`` reads it, ``time`` in seconds."""
-    from scipy.spatial.transform import Rotation
-
-    to_camera = np.linalg.inv(camera_to_world)
-    turn = Rotation.from_matrix(to_camera[:3, :3]).as_rotvec()
-    return " ".join((time, *(repr(float(value)) for value in (*turn, *to_camera[:3, 3])))) + "\n"
 
 
 Images = Literal["lowres", "wide"]
@@ -247,7 +239,7 @@ class PhoneFrames(Sequence[Frame]):
         return Frame(
             index=index,
             timestamp_s=image.time_ms / 1000,
-            rgb=_colour_at(rgb, size),
+            rgb=colour_at(rgb, size),
             depth_m=self._depth_m(image, full, size),
             camera_to_world=self._recording.trajectory.poses[self._recording.rows[index]],
             intrinsics=intrinsics,
@@ -266,9 +258,9 @@ class PhoneFrames(Sequence[Frame]):
             self._check_shape(confidence.shape[1::-1], full, image.confidence, image.colour)
             if confidence.max(initial=0) > MOST_CONFIDENCE:
                 raise DataError(f"{self._at(image.confidence)}: has values to {confidence.max()}; expected 0, 1 and 2")
-            confidence = _nearest_at(confidence, values.shape[1::-1])
+            confidence = nearest_at(confidence, (values.shape[1], values.shape[0]))
             depth_m = np.where(confidence >= self._least, depth_m, np.float32(0))
-        return _nearest_at(depth_m, size)
+        return nearest_at(depth_m, size)
 
     def _check_shape(self, actual: tuple[int, ...], full: Size, name: str, colour: str) -> None:
         """Depth may be coarser than colour; both must show the same field of view."""
@@ -283,20 +275,3 @@ class PhoneFrames(Sequence[Frame]):
 
     def _content(self, name: str) -> bytes:
         return read_bytes(self._recording.folder / name, self._at(name), ADVICE)
-
-
-def _colour_at(colour: UInt8Array, size: Size) -> UInt8Array:
-    import cv2
-
-    if (colour.shape[1], colour.shape[0]) == size:
-        return colour
-    return np.asarray(cv2.resize(colour, size, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def _nearest_at(image: NDArray[Any], size: tuple[int, ...]) -> NDArray[Any]:
-    import cv2
-
-    if (image.shape[1], image.shape[0]) == tuple(size):
-        return image
-    wanted = (int(size[0]), int(size[1]))
-    return np.asarray(cv2.resize(image, wanted, interpolation=cv2.INTER_NEAREST_EXACT), image.dtype)

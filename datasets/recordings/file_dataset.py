@@ -23,6 +23,7 @@ from su3d_bench.datasets.recordings.recorded_frames import RecordedFrames, Recor
 
 logger = logging.getLogger(__name__)
 MARKER = "rooms.json"  # in a folder of scenes: those that `datasets make` rendered
+MAX_LINES = 20  # on faults of one kind
 DatasetT = TypeVar("DatasetT")
 OptionsT = TypeVar("OptionsT", bound=BaseModel)
 Answer = TypeVar("Answer")
@@ -117,6 +118,14 @@ def faults_of(questions: Iterable[Callable[[], object]]) -> Iterator[str]:
             if str(error) not in seen:
                 yield str(error)
             seen.add(str(error))
+
+
+def shortened(lines: Iterable[str], where: str) -> Iterator[str]:
+    """The first lines on faults of one kind, and how many more there are."""
+    found = list(lines)
+    yield from found[:MAX_LINES]
+    if len(found) > MAX_LINES:
+        yield f"{where}: {len(found) - MAX_LINES} more faults of this kind"
 
 
 class FileDataset(ABC, Generic[OptionsT]):

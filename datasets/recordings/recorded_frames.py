@@ -11,13 +11,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from threading import Lock
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, UInt8Array
-from su3d_bench.formats.images import UInt16Array, decode_colour, decode_depth, read_bytes
+from su3d_bench.formats.images import Size, UInt16Array, decode_colour, decode_depth, read_bytes
 
 MAX_NAME_LENGTH = 255  # of one part of a path, in every file system of today
 N_DEPTH_VALUES = 1 << 16
@@ -148,7 +150,7 @@ class Recording:
     intrinsics: Float64Array
     metres: Float32Array
     files: tuple[Path, ...]
-    image_size: tuple[int, int] | None = None
+    image_size: Size | None = None
     missing: tuple[str, ...] = ()
 
     def images(self) -> list[Path]:
@@ -222,6 +224,22 @@ class RecordedFrames(Sequence[Frame]):
     def _read(self, name: str) -> tuple[str, bytes]:
         where = f"{self._recording.where}: {name}"
         return where, read_bytes(self._recording.folder.path / name, where, self.advice)
+
+
+def colour_at(colour: UInt8Array, size: Size) -> UInt8Array:
+    """The image averaged to the width and height ``size``."""
+    import cv2
+
+    is_same = colour.shape[1::-1] == size
+    return colour if is_same else np.asarray(cv2.resize(colour, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def nearest_at(image: NDArray[Any], size: Size) -> NDArray[Any]:
+    """The image at the width and height ``size``, each pixel the nearest one of the original."""
+    import cv2
+
+    is_same = image.shape[1::-1] == size
+    return image if is_same else np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST_EXACT), image.dtype)
 
 
 def left_out(where: str, names: Sequence[str], what: str, n_used: int) -> str:

@@ -19,7 +19,7 @@ from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.geometry import rotations_of
 from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import Float64Array, GroundTruth, ObjectBoxes, OrientedBox
-from su3d_bench.datasets.recordings.file_dataset import faults_of
+from su3d_bench.datasets.recordings.file_dataset import faults_of, shortened
 from su3d_bench.datasets.recordings.recorded_frames import reading
 from su3d_bench.datasets.replica.folders import replica_label_set
 from su3d_bench.datasets.replica.frames import (
@@ -142,7 +142,6 @@ def objects_outside_boxes(mesh: AnnotatedMesh, boxes: Mapping[int, OrientedBox])
     return outside
 
 
-MOST_LINES = 20  # of one kind of fault; the rest is counted
 PNG_HEAD_BYTES = 64  # signature, and the chunk with the size
 PNG_TAIL_BYTES = 1024  # the end of the pixels, and what little writers put behind it
 
@@ -152,24 +151,9 @@ def render_problems(tree: Path, scene: str, where: str) -> Iterator[str]:
     lines: list[str] = []
     yield from faults_of([lambda: read_camera(tree / "cam_params.json", where),
                           lambda: lines.extend(trajectory_lines(tree / scene / "traj.txt", where))])  # fmt: skip
-    yield from _shortened(_pose_problems(lines, where), f"{where}: traj.txt")
+    reads = [partial(poses_of_lines, [line], f"{where}: traj.txt", number) for number, line in enumerate(lines, 1)]
+    yield from shortened(faults_of(reads), f"{where}: traj.txt")
     yield from faults_of([lambda: check_frames_complete(tree / scene, len(lines), where)])
-
-
-def _shortened(problems: Iterator[str], where: str) -> Iterator[str]:
-    n_more = 0
-    for n, line in enumerate(problems):
-        if n < MOST_LINES:
-            yield line
-        else:
-            n_more += 1
-    if n_more:
-        yield f"{where}: {n_more} more faults of this kind"
-
-
-def _pose_problems(lines: list[str], where: str) -> Iterator[str]:
-    for number, line in enumerate(lines, 1):
-        yield from faults_of([partial(poses_of_lines, [line], f"{where}: traj.txt", number)])
 
 
 def original_problems(original: Path | None, where: str) -> Iterator[str]:
@@ -192,7 +176,7 @@ def original_problems(original: Path | None, where: str) -> Iterator[str]:
         f"{SLACK_M} m; the boxes are of another mesh"
         for object_id, beyond_m in outside.items()
     )
-    yield from _shortened(lines, f"{where}: {INFO_NAME}")
+    yield from shortened(lines, f"{where}: {INFO_NAME}")
 
 
 def digest_of(files: Sequence[Path], images: Sequence[Path], where: str) -> str:

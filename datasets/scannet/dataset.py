@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +13,10 @@ from pydantic import BaseModel, ConfigDict
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.types import Float64Array, Frame, GroundTruth, InstanceMesh, Surface
 from su3d_bench.datasets import openscan
-from su3d_bench.datasets.recordings.file_dataset import FileDataset, keeps_last
+from su3d_bench.datasets.recordings.file_dataset import FileDataset, faults_of, keeps_last, shortened
 from su3d_bench.datasets.recordings.source import Grid, RgbdSource, make_registration
 from su3d_bench.datasets.scannet import folders, recordings, truth
 from su3d_bench.formats.ply import read_ply
-
-MOST_POSES = 20  # named one by one; the rest is counted
 
 
 def recording_problems(open_source: Callable[[], RgbdSource], grid: Grid, where: str) -> Iterator[str]:
@@ -30,12 +28,9 @@ def recording_problems(open_source: Callable[[], RgbdSource], grid: Grid, where:
         yield str(error)
         return
     numbers = walk.numbers[np.flatnonzero(is_faulty)]
-    yield from (recordings.faulty_pose(where, int(number)) for number in numbers[:MOST_POSES])
-    if len(numbers) > MOST_POSES:
-        yield f"{where}: {len(numbers) - MOST_POSES} more poses are not rigid motions"
-    if len(numbers) == 0:
-        yield from _fault(recordings.read_walk, source)
-    yield from _fault(make_registration, source.camera, grid, where)
+    yield from shortened((recordings.faulty_pose(where, int(number)) for number in numbers), where)
+    reads = [] if len(numbers) else [partial(recordings.read_walk, source)]
+    yield from faults_of([*reads, partial(make_registration, source.camera, grid, where)])
 
 
 def annotation_problems(files: Mapping[str, Path], scan: str, where: str) -> Iterator[str]:
@@ -50,19 +45,10 @@ def annotation_problems(files: Mapping[str, Path], scan: str, where: str) -> Ite
         truth.mesh_name(scan): lambda path: read_ply(path, f"{where}: {path.name}"),
         truth.labels_name(scan): lambda path: read_ply(path, f"{where}: {path.name}"),
     }
-    faults = [line for name, read in readers.items() if name in files for line in _fault(read, files[name])]
-    yield from faults
+    reads = [partial(read, files[name]) for name, read in readers.items() if name in files]
     if set(truth.truth_names(scan)) <= set(files):
-        yield from (line for line in _fault(truth.read_annotated_scan, files, scan, where) if line not in faults)
-
-
-def _fault(read: Callable[..., object], *arguments: object) -> list[str]:
-    """The line that ``read`` fails with; none where it does not."""
-    try:
-        read(*arguments)
-    except DataError as error:
-        return [str(error)]
-    return []
+        reads.append(partial(truth.read_annotated_scan, files, scan, where))
+    yield from faults_of(reads)
 
 
 class ScannetOptions(BaseModel):

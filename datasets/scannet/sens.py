@@ -157,6 +157,7 @@ class SensFile:
         with _opened(path, self.place) as handle:
             n_bytes = os.fstat(handle).st_size
             self.header, n_frames, at = parse_header(os.pread(handle, MAX_HEADER_BYTES, 0), self.place)
+            self.camera = self.header.camera(self.place)
             if n_frames > MAX_FRAMES or n_frames * FRAME_RECORD.itemsize > n_bytes - at:
                 raise DataError(
                     f"{self.place}: the header promises {n_frames} frames of {FRAME_RECORD.itemsize} or more bytes, "
@@ -164,7 +165,6 @@ class SensFile:
                 )
             self._records, self._starts, at = _read_records(handle, n_bytes, n_frames, at, self.header, self.place)
             _check_end(handle, n_bytes, at, self.place)
-        self.camera = self.header.camera(self.place)
         self.numbers = np.arange(n_frames)
         stamps = self._records["colour_timestamp"]
         self._has_times = len(stamps) > 1 and bool((stamps[1:] > stamps[:-1]).all())

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Literal
 
@@ -18,27 +18,9 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError, counted
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, UInt8Array
-from su3d_bench.datasets.recordings.recorded_frames import StoredDepth, depth_m_of_values
+from su3d_bench.datasets.recordings.recorded_frames import StoredDepth, colour_at, depth_m_of_values, nearest_at
 from su3d_bench.datasets.recordings.source import list_folder, read_size
-from su3d_bench.datasets.scannetpp.images import (
-    DEPTH_NAME,
-    DEPTH_SIZE,
-    UNITS_PER_METRE,
-    VIDEO_NAME,
-    DepthFile,
-    VideoFile,
-    video_size,
-)
-from su3d_bench.datasets.scannetpp.poses import (
-    COLMAP,
-    FRAME_NAME,
-    IMAGES_NAME,
-    TRACKING_NAME,
-    PosedFrames,
-    n_registered,
-    read_colmap,
-    read_tracking,
-)
+from su3d_bench.datasets.scannetpp import images, poses
 from su3d_bench.formats.images import Size, UInt16Array, decode_colour, decode_depth, read_bytes, sized
 
 PoseSource = Literal["auto", "colmap", "tracking"]
@@ -46,7 +28,7 @@ COLOUR_FOLDER, DEPTH_FOLDER = "rgb", "depth"
 COLOUR_ENDINGS, DEPTH_ENDINGS = (".jpg", ".png"), (".png",)
 FRAMES_PER_SECOND = 60.0  # of the iPhone's video
 EXTRACT_AGAIN = "extract the frames again with the official toolkit"
-DEPTH_M_OF_VALUE = depth_m_of_values(UNITS_PER_METRE)
+DEPTH_M_OF_VALUE = depth_m_of_values(images.UNITS_PER_METRE)
 DEPTH_SIZE_REASON = "the size of the iPhone's depth"
 
 
@@ -54,18 +36,22 @@ def pose_source(folder: Path, kind: PoseSource) -> PoseSource:
     """Which poses are read of the iPhone's ``folder``; those of COLMAP where both are there."""
     if kind != "auto":
         return kind
-    return "colmap" if (folder / COLMAP / IMAGES_NAME).exists() or not (folder / TRACKING_NAME).exists() else "tracking"
+    return (
+        "colmap"
+        if (folder / poses.COLMAP / poses.IMAGES_NAME).exists() or not (folder / poses.TRACKING_NAME).exists()
+        else "tracking"
+    )
 
 
 def describe_recording(folder: Path, kind: PoseSource) -> str:
     """A word on the frames from a quick look at the iPhone's ``folder``."""
     source = pose_source(folder, kind)
-    path = folder / COLMAP / IMAGES_NAME if source == "colmap" else folder / TRACKING_NAME
+    path = folder / poses.COLMAP / poses.IMAGES_NAME if source == "colmap" else folder / poses.TRACKING_NAME
     if not path.is_file():
         return "no frames of the iPhone"
     if source == "tracking":
         return "frames with the poses of the phone"
-    n = n_registered(path)
+    n = poses.n_registered(path)
     return "frames with the poses of COLMAP" if n is None else counted(n, "frame")
 
 
@@ -76,7 +62,7 @@ class IphoneRecording:
 
     folder: Path
     where: str
-    posed: PosedFrames
+    posed: poses.PosedFrames
     colour_of: Mapping[int, str] | None
     depth_of: Mapping[int, str] | None
 
@@ -97,7 +83,7 @@ class IphoneRecording:
     def files(self) -> list[Path]:
         numbers = [int(self.posed.numbers[row]) for row in self.usable]
         paths = list(self.posed.files)
-        for name, file_of in ((VIDEO_NAME, self.colour_of), (DEPTH_NAME, self.depth_of)):
+        for name, file_of in ((images.VIDEO_NAME, self.colour_of), (images.DEPTH_NAME, self.depth_of)):
             paths += [self.folder / name] if file_of is None else [self.folder / file_of[n] for n in numbers]
         return paths
 
@@ -108,12 +94,12 @@ def open_recording(folder: Path, where: str, kind: PoseSource = "auto") -> Iphon
         raise DataError(
             f"{where}: no iphone/ folder; the iPhone's frames are read, the DSLR's have no depth and are left out"
         )
-    colour_of = _extracted(folder, COLOUR_FOLDER, COLOUR_ENDINGS, VIDEO_NAME, where)
-    depth_of = _extracted(folder, DEPTH_FOLDER, DEPTH_ENDINGS, DEPTH_NAME, where)
+    colour_of = _extracted(folder, COLOUR_FOLDER, COLOUR_ENDINGS, images.VIDEO_NAME, where)
+    depth_of = _extracted(folder, DEPTH_FOLDER, DEPTH_ENDINGS, images.DEPTH_NAME, where)
     if pose_source(folder, kind) == "colmap":
-        posed = read_colmap(folder / COLMAP, where)
+        posed = poses.read_colmap(folder / poses.COLMAP, where)
     else:
-        posed = read_tracking(folder / TRACKING_NAME, where, _colour_size(folder, colour_of, where))
+        posed = poses.read_tracking(folder / poses.TRACKING_NAME, where, _colour_size(folder, colour_of, where))
     recording = IphoneRecording(folder, where, posed, colour_of, depth_of)
     numbers = [int(posed.numbers[row]) for row in recording.usable]
     for name, ending, file_of in (
@@ -130,7 +116,7 @@ def open_recording(folder: Path, where: str, kind: PoseSource = "auto") -> Iphon
 def _colour_size(folder: Path, colour_of: Mapping[int, str] | None, where: str) -> Size:
     """The size of the colour images, told from the first of them."""
     if colour_of is None:
-        return video_size(folder / VIDEO_NAME, where)
+        return images.video_size(folder / images.VIDEO_NAME, where)
     if not colour_of:
         raise DataError(f"{where}: {COLOUR_FOLDER}/ holds no frame; {EXTRACT_AGAIN}")
     return read_size(folder, colour_of[min(colour_of)], where)
@@ -144,7 +130,7 @@ def _extracted(folder: Path, name: str, endings: Sequence[str], packed: str, whe
         return None
     file_of: dict[int, str] = {}
     for file in list_folder(folder, name, where):
-        match = FRAME_NAME.fullmatch(file)
+        match = poses.FRAME_NAME.fullmatch(file)
         if match is not None and file.endswith(tuple(endings)):
             file_of.setdefault(int(match[1]), f"{name}/{file}")
     return file_of
@@ -159,8 +145,7 @@ class IphoneFrames(Sequence[Frame]):
         self.size: Size = min(width, full_width), max(1, round(full_height * min(width, full_width) / full_width))
         self._depth = StoredDepth(recording.where, DEPTH_M_OF_VALUE)
         wanted = frozenset(int(recording.posed.numbers[row]) for row in rows)
-        self._colour_values = self._colour_reader(wanted)
-        self._depth_values = self._depth_reader(wanted)
+        self._colour_values, self._depth_values = self._readers(wanted)
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -185,29 +170,31 @@ class IphoneFrames(Sequence[Frame]):
         matrix[:2, 2] -= 0.5
         return matrix
 
-    def _colour_reader(self, wanted: frozenset[int]) -> Callable[[int], UInt8Array]:
+    def _readers(self, wanted: frozenset[int]) -> tuple[Callable[[int], UInt8Array], Callable[[int], UInt16Array]]:
+        """What gives the colour image, at the frames' size, and the depth image of a number."""
         recording, size = self._recording, self._recording.posed.size
-        if (file_of := recording.colour_of) is None:
-            return VideoFile(recording.folder / VIDEO_NAME, recording.where, size, wanted, self._colour_at_size).image
 
-        def read(number: int) -> UInt8Array:
+        def content_of(file_of: Mapping[int, str], number: int) -> tuple[str, bytes]:
             where = f"{recording.where}: {file_of[number]}"
-            content = read_bytes(recording.folder / file_of[number], where, EXTRACT_AGAIN)
+            return where, read_bytes(recording.folder / file_of[number], where, EXTRACT_AGAIN)
+
+        def colour(file_of: Mapping[int, str], number: int) -> UInt8Array:
+            where, content = content_of(file_of, number)
             return self._colour_at_size(sized(decode_colour, content, size, where, "as the camera says"))
 
-        return read
+        def depth(file_of: Mapping[int, str], number: int) -> UInt16Array:
+            where, content = content_of(file_of, number)
+            return sized(decode_depth, content, images.DEPTH_SIZE, where, DEPTH_SIZE_REASON)
 
-    def _depth_reader(self, wanted: frozenset[int]) -> Callable[[int], UInt16Array]:
-        recording = self._recording
-        if (file_of := recording.depth_of) is None:
-            return DepthFile(recording.folder / DEPTH_NAME, recording.where, wanted).values
-
-        def read(number: int) -> UInt16Array:
-            where = f"{recording.where}: {file_of[number]}"
-            content = read_bytes(recording.folder / file_of[number], where, EXTRACT_AGAIN)
-            return sized(decode_depth, content, DEPTH_SIZE, where, DEPTH_SIZE_REASON)
-
-        return read
+        video, packed = recording.folder / images.VIDEO_NAME, recording.folder / images.DEPTH_NAME
+        return (
+            images.VideoFile(video, recording.where, size, wanted, self._colour_at_size).image
+            if recording.colour_of is None
+            else partial(colour, recording.colour_of),
+            images.DepthFile(packed, recording.where, wanted).values
+            if recording.depth_of is None
+            else partial(depth, recording.depth_of),
+        )
 
     @cached_property
     def _straightening(self) -> tuple[Float32Array, Float32Array] | None:
@@ -227,8 +214,7 @@ class IphoneFrames(Sequence[Frame]):
     def _colour_at_size(self, colour: UInt8Array) -> UInt8Array:
         import cv2
 
-        if (colour.shape[1], colour.shape[0]) != self.size:
-            colour = np.asarray(cv2.resize(colour, self.size, interpolation=cv2.INTER_AREA), np.uint8)
+        colour = colour_at(colour, self.size)
         if self._straightening is None:
             return colour
         border = cv2.BORDER_REPLICATE
@@ -237,8 +223,7 @@ class IphoneFrames(Sequence[Frame]):
     def _at_size(self, depth_m: Float32Array) -> Float32Array:
         import cv2
 
-        if (depth_m.shape[1], depth_m.shape[0]) != self.size:
-            depth_m = np.asarray(cv2.resize(depth_m, self.size, interpolation=cv2.INTER_NEAREST_EXACT), np.float32)
+        depth_m = nearest_at(depth_m, self.size)
         if self._straightening is None:
             return depth_m
         return np.asarray(cv2.remap(depth_m, *self._straightening, cv2.INTER_NEAREST), np.float32)
