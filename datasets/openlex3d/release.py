@@ -1,41 +1,188 @@
-"""OpenLex3D's ground truth: the labels and queries of its release with the points of the base data."""
+"""OpenLex3D's ground truth: the labels and queries of its release with the points of the base data.
+
+The release (``gt_openlex3d.zip``) has ``<dataset>/prompt_list.txt`` and in ``<dataset>/<scene>/`` two files of
+categories, ``gt_categories.json`` by object and ``gt_categories_query_to_object_mapping_<level>.json`` by text, and
+where only a part of the scene was seen ``gt_visible_cloud.pcd``; which point belongs to which object comes from the
+base data. Source: openlex3d at commit 3dbad2b.
+"""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field, Strict
 
 from su3d_bench.core.digests import digest_file, digest_json
-from su3d_bench.core.errors import DataError, GroundTruthMissing, PredictionError, converted
+from su3d_bench.core.errors import DataError, GroundTruthMissing, PredictionError, converted, printable
 from su3d_bench.core.types import Float32Array, Int64Array
-from su3d_bench.datasets.openlex3d.labels import (
-    CATEGORIES_NAME,
-    PROMPTS_NAME,
-    QUERY_LEVEL,
-    VISIBLE_NAME,
-    Level,
-    OpenLexFiles,
-    queries_name,
-)
 from su3d_bench.datasets.recordings.meshes import vertex_positions
 from su3d_bench.datasets.replica.folders import find_original_scene, original_name
 from su3d_bench.datasets.replica.truth import MESH_NAME, AnnotatedMesh, read_annotated_mesh
 from su3d_bench.datasets.scannetpp.truth import BASES as SCANNETPP_BASES
-from su3d_bench.formats.arrays import MOST_POINTS, checked_points, kind_of
-from su3d_bench.formats.json_models import FileModel, read_json
+from su3d_bench.formats.arrays import MOST_POINTS, checked_points, kind_of, parsed_json, read_text
+from su3d_bench.formats.json_models import FileModel, checked_json, read_json
+from su3d_bench.formats.pcd import read_pcd_points
 from su3d_bench.formats.ply import read_ply
 from su3d_bench.formats.torch_files import read_torch
 from su3d_bench.metrics.matching.nearest import nearest
 from su3d_bench.metrics.open_vocabulary.openlex3d import SPACE as LABELS
-from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
+from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels, OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.score import SPACE as QUERIES
-from su3d_bench.metrics.open_vocabulary.score import QueryTruth
+from su3d_bench.metrics.open_vocabulary.score import QueryTruth, TextQuery
+
+PROMPTS_NAME = "prompt_list.txt"
+CATEGORIES_NAME = "gt_categories.json"
+VISIBLE_NAME = "gt_visible_cloud.pcd"
+MAX_ID = 2**31 - 1
+Content = TypeVar("Content")
+
+Level = Literal["l0", "l1", "all"]
+LEVELS: tuple[Level, ...] = ("l0", "l1", "all")  # synonyms, what depicts them, both
+QUERY_LEVEL: Level = "l0"  # the level that the release evaluates unless another is asked for
+
+
+def _whole_characters(text: str) -> str:
+    """JSON can write halves of characters, which no encoder takes."""
+    text.encode("utf-8")
+    return text
+
+
+def queries_name(level: Level) -> str:
+    return f"gt_categories_query_to_object_mapping_{level}.json"
+
+
+@dataclass(frozen=True)
+class OpenLexFiles:
+    """The files of one scene below ``root``; each message begins with ``<dataset>/<scene>``."""
+
+    root: Path
+    dataset: str
+    scene: str
+
+    def __post_init__(self) -> None:
+        for name in (self.dataset, self.scene):
+            if name in ("", ".", "..") or any(character in name for character in "/\\\0"):
+                raise DataError(f"openlex3d: '{printable(name, 60)}' is no name of a dataset or scene")
+
+    @property
+    def where(self) -> str:
+        return f"{self.dataset}/{self.scene}"
+
+    def prompts(self) -> tuple[str, ...]:
+        """The labels among which a method may choose, in the order of the list."""
+        where = f"{self.where}: {PROMPTS_NAME}"
+        return read_prompts(self.root / self.dataset / PROMPTS_NAME, where)
+
+    def objects(self) -> dict[int, ObjectLabels]:
+        """The labels of each object by its id."""
+        return read_categories(self._of_scene(CATEGORIES_NAME), f"{self.where}: {CATEGORIES_NAME}")
+
+    def queries(self, level: Level) -> tuple[TextQuery, ...]:
+        """The texts of ``level`` and the objects that each speaks of."""
+        return read_queries(self._of_scene(queries_name(level)), f"{self.where}: {queries_name(level)}")
+
+    @property
+    def has_visible_points(self) -> bool:
+        """Whether the release says which part of the scene its images show."""
+        return os.path.exists(self._of_scene(VISIBLE_NAME))
+
+    def visible_points(self) -> Float32Array:
+        """The points (N, 3) in m that the scene's images show."""
+        where, path = f"{self.where}: {VISIBLE_NAME}", self._of_scene(VISIBLE_NAME)
+        if not self.has_visible_points:
+            raise _missing(path, where)
+        with np.errstate(over="ignore"):
+            points = read_pcd_points(path, where).astype(np.float32)
+        if not np.isfinite(points).all():
+            row = int(np.argmin(np.isfinite(points).all(axis=1)))
+            raise DataError(f"{where}: point {row} is at {points[row].tolist()}; expected finite metres")
+        return points
+
+    def _of_scene(self, name: str) -> Path:
+        return self.root / self.dataset / self.scene / name
+
+
+def read_prompts(path: Path, where: str) -> tuple[str, ...]:
+    """One prompt a line, without the white space around it."""
+    text = _read_text(path, where)
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").removesuffix("\n").split("\n")
+    prompts = tuple(line.strip() for line in lines)
+    if not any(prompts):
+        raise DataError(f"{where}: has no prompt; expected one a line")
+    return prompts
+
+
+ObjectIds = list[Annotated[int, Strict(False), Field(ge=-MAX_ID, le=MAX_ID)]]
+Text = Annotated[str, AfterValidator(_whole_characters)]
+
+
+class Attributes(FileModel):
+    synonyms: list[Text]
+    depictions: list[Text]
+    vis_sim: list[Text]
+    clutter: ObjectIds | None = None
+
+
+class Labels(FileModel):
+    image_attributes: Attributes
+
+
+class Sample(FileModel):
+    object_id: Annotated[int, Field(ge=-MAX_ID, le=MAX_ID)]
+    labels: Labels
+
+
+class Samples(FileModel):
+    samples: list[Sample]
+
+
+class Categories(FileModel):
+    """``gt_categories.json``."""
+
+    dataset: Samples
+
+
+def read_categories(path: Path, where: str) -> dict[int, ObjectLabels]:
+    """Object id -> labels, from ``dataset.samples`` of a ``gt_categories.json``."""
+    labels_of: dict[int, ObjectLabels] = {}
+    for sample in _read_json(path, where, Categories).dataset.samples:
+        found = sample.labels.image_attributes
+        tiers = tuple(found.synonyms), tuple(found.depictions), tuple(found.vis_sim)
+        labels = ObjectLabels(*tiers, tuple(found.clutter or ()))
+        if labels_of.setdefault(sample.object_id, labels) != labels:
+            raise DataError(f"{where}: object {sample.object_id} stands there twice with other labels; keep one")
+    return labels_of
+
+
+def read_queries(path: Path, where: str) -> tuple[TextQuery, ...]:
+    """The queries of all levels of the file, in its order: level -> text -> object ids."""
+    levels = _read_json(path, where, dict[str, dict[Text, ObjectIds]])
+    queries = tuple(TextQuery(text, tuple(ids)) for level in levels.values() for text, ids in level.items())
+    for query in queries:
+        if len(set(query.object_ids)) != len(query.object_ids):
+            raise DataError(f"{where}: query '{printable(query.text, 60)}': an object stands there twice")
+    return queries
+
+
+def _read_json(path: Path, where: str, kind: type[Content]) -> Content:
+    return checked_json(parsed_json(_read_text(path, where), where), where, kind)
+
+
+def _read_text(path: Path, where: str) -> str:
+    if not os.path.exists(path):  # False, too, where the system refuses to look
+        raise _missing(path, where)
+    return read_text(path, where)
+
+
+def _missing(path: Path, where: str) -> GroundTruthMissing:
+    return GroundTruthMissing(f"{where}: is not there; expected {printable(str(path), 200)}")
+
 
 SAMPLED_DATASET = "scannetpp"
 SAMPLED_FOLDER = "prepared_semantics"  # beside data/ of ScanNet++
@@ -66,9 +213,6 @@ def points_of(dataset: str, data_root: Path, scene: str) -> LabelledPoints:
     return {"replica": _of_replica, "scannetpp": _of_scannetpp, "hm3d": _of_hm3d}[dataset](data_root, scene)
 
 
-# ---- Replica
-
-
 def _of_replica(data_root: Path, scene: str) -> LabelledPoints:
     where = f"replica/{scene}"
     original = find_original_scene(data_root, scene)
@@ -90,9 +234,6 @@ def face_corners_of(mesh: AnnotatedMesh) -> LabelledPoints:
         np.repeat(mesh.object_of_face, mesh.corners.lengths).astype(np.int64),
         f"the faces of {MESH_NAME}",
     )
-
-
-# ---- ScanNet++
 
 
 def sampled_points_file(data_root: Path, scene: str) -> Path | None:
@@ -127,9 +268,6 @@ def read_sampled_points(path: Path, where: str) -> LabelledPoints:
     if not len(points):
         raise DataError(f"{where}: has no points; {HOW_TO_SAMPLE}")
     return LabelledPoints(points, np.maximum(objects.astype(np.int64), -1), f"the sampled points in {SAMPLED_FOLDER}")
-
-
-# ---- HM3D
 
 
 def _of_hm3d(data_root: Path, scene: str) -> LabelledPoints:

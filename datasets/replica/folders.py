@@ -18,32 +18,15 @@ from su3d_bench.core.types import LabelSet
 
 LABEL_SPACE = "replica"
 OFFICIAL_SCENES = ("room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4")
-RENDER_FOLDERS = ("Replica", "replica", ".")
-ORIGINAL_FOLDERS = (
-    "replica_v1",
-    "Replica_v1",
-    "Replica-Dataset/replica_v1",
-    "Replica-Dataset",
-    "Replica_Dataset",
-    "replica_dataset",
-    "Replica",
-    "replica",
-    ".",
-)
+RENDER_FOLDERS, RENDER_PARTS = ("Replica", "replica", "."), ("traj.txt", "results")
+DATASET_FOLDERS = ("Replica-Dataset", "Replica_Dataset", "replica_dataset", "Replica", "replica", ".")
+ORIGINAL_FOLDERS = ("replica_v1", "Replica_v1", "Replica-Dataset/replica_v1", *DATASET_FOLDERS)
 ORIGINAL_FILES = ("info_semantic.json", "mesh_semantic.ply")  # in the folder habitat of a scene
 # Names that users give the folder of ConceptGraphs' ground truth, whose scenes are room_0/Sequence_1/...
 SEMANTIC_FOLDERS = (
-    "Replica-semantic",
-    "Replica_semantic",
-    "replica-semantic",
-    "replica_semantic",
+    *(f"{name}{mark}semantic" for mark in "-_" for name in ("Replica", "replica")),
     "Replica_Semantic",
-    "Replica_Dataset",
-    "Replica-Dataset",
-    "replica_dataset",
-    "Replica",
-    "replica",
-    ".",
+    *DATASET_FOLDERS,
 )
 FUSED_CLOUD = "saved-maps-gt/pointclouds"  # in Sequence_1
 REFERENCE_CLOUD = "rgb_cloud/pointclouds/pc_points.h5"  # in the scene of the render tree
@@ -73,8 +56,8 @@ def find_render_tree(root: Path) -> RenderTree | None:
     for name in RENDER_FOLDERS:
         folder = root / name
         # The data root itself holds other datasets too, whose folders are not scenes of this one.
-        parts = ("traj.txt", "results") if name == "." else ()
-        scenes = [child.name for child in _folders(folder) if _is_scene(child, parts)]
+        is_scene = all if name == "." else any
+        scenes = [one.name for one in _folders(folder) if is_scene((one / part).exists() for part in RENDER_PARTS)]
         if scenes:
             official = [scene for scene in OFFICIAL_SCENES if scene in scenes]
             others = sorted(set(scenes) - set(official), key=_natural_order)
@@ -87,12 +70,6 @@ def _folders(folder: Path) -> list[Path]:
         return [child for child in folder.iterdir() if child.is_dir() and not child.name.startswith(".")]
     except OSError:
         return []
-
-
-def _is_scene(folder: Path, required: tuple[str, ...]) -> bool:
-    if required:
-        return all((folder / part).exists() for part in required)
-    return (folder / "traj.txt").exists() or (folder / "results").exists()
 
 
 def _natural_order(scene: str) -> tuple[str, int, str]:

@@ -8,9 +8,9 @@ averaged, of depth the nearest value is taken, as the toolkit's authors advise (
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
@@ -29,7 +29,6 @@ COLOUR_ENDINGS, DEPTH_ENDINGS = (".jpg", ".png"), (".png",)
 FRAMES_PER_SECOND = 60.0  # of the iPhone's video
 EXTRACT_AGAIN = "extract the frames again with the official toolkit"
 DEPTH_M_OF_VALUE = depth_m_of_values(images.UNITS_PER_METRE)
-DEPTH_SIZE_REASON = "the size of the iPhone's depth"
 
 
 def pose_source(folder: Path, kind: PoseSource) -> PoseSource:
@@ -145,7 +144,12 @@ class IphoneFrames(Sequence[Frame]):
         self.size: Size = min(width, full_width), max(1, round(full_height * min(width, full_width) / full_width))
         self._depth = StoredDepth(recording.where, DEPTH_M_OF_VALUE)
         wanted = frozenset(int(recording.posed.numbers[row]) for row in rows)
-        self._colour_values, self._depth_values = self._readers(wanted)
+        folder, where = recording.folder, recording.where
+        if recording.colour_of is None:
+            video = folder / images.VIDEO_NAME
+            self._video = images.VideoFile(video, where, recording.posed.size, wanted, self._colour_at_size)
+        if recording.depth_of is None:
+            self._packed = images.DepthFile(folder / images.DEPTH_NAME, where, wanted)
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -156,7 +160,7 @@ class IphoneFrames(Sequence[Frame]):
         return Frame(
             index=number,
             timestamp_s=number / FRAMES_PER_SECOND,
-            rgb=self._colour_values(number),
+            rgb=self._colour(number),
             depth_m=self._at_size(self._depth.depth_m(self._depth_values(number))),
             camera_to_world=posed.poses[row],
             intrinsics=self.intrinsics(row),
@@ -170,31 +174,22 @@ class IphoneFrames(Sequence[Frame]):
         matrix[:2, 2] -= 0.5
         return matrix
 
-    def _readers(self, wanted: frozenset[int]) -> tuple[Callable[[int], UInt8Array], Callable[[int], UInt16Array]]:
-        """What gives the colour image, at the frames' size, and the depth image of a number."""
-        recording, size = self._recording, self._recording.posed.size
+    def _colour(self, number: int) -> UInt8Array:
+        if self._recording.colour_of is None:
+            return self._video.image(number)
+        where, content = self._content(self._recording.colour_of[number])
+        size = self._recording.posed.size
+        return self._colour_at_size(sized(decode_colour, content, size, where, "as the camera says"))
 
-        def content_of(file_of: Mapping[int, str], number: int) -> tuple[str, bytes]:
-            where = f"{recording.where}: {file_of[number]}"
-            return where, read_bytes(recording.folder / file_of[number], where, EXTRACT_AGAIN)
+    def _depth_values(self, number: int) -> UInt16Array:
+        if self._recording.depth_of is None:
+            return self._packed.values(number)
+        where, content = self._content(self._recording.depth_of[number])
+        return sized(decode_depth, content, images.DEPTH_SIZE, where, "the size of the iPhone's depth")
 
-        def colour(file_of: Mapping[int, str], number: int) -> UInt8Array:
-            where, content = content_of(file_of, number)
-            return self._colour_at_size(sized(decode_colour, content, size, where, "as the camera says"))
-
-        def depth(file_of: Mapping[int, str], number: int) -> UInt16Array:
-            where, content = content_of(file_of, number)
-            return sized(decode_depth, content, images.DEPTH_SIZE, where, DEPTH_SIZE_REASON)
-
-        video, packed = recording.folder / images.VIDEO_NAME, recording.folder / images.DEPTH_NAME
-        return (
-            images.VideoFile(video, recording.where, size, wanted, self._colour_at_size).image
-            if recording.colour_of is None
-            else partial(colour, recording.colour_of),
-            images.DepthFile(packed, recording.where, wanted).values
-            if recording.depth_of is None
-            else partial(depth, recording.depth_of),
-        )
+    def _content(self, name: str) -> tuple[str, bytes]:
+        where = f"{self._recording.where}: {name}"
+        return where, read_bytes(self._recording.folder / name, where, EXTRACT_AGAIN)
 
     @cached_property
     def _straightening(self) -> tuple[Float32Array, Float32Array] | None:

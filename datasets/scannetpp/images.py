@@ -15,7 +15,6 @@ import os
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from threading import Lock
@@ -131,14 +130,6 @@ MOST_FRAMES = 1 << 20  # of five hours at 60 a second
 PIECE_BYTES = 1 << 16
 
 
-@dataclass(frozen=True)
-class Packed:
-    """Where an image lies in the file."""
-
-    start: int
-    n_bytes: int
-
-
 class DepthFile:
     """The images of a file by their numbers; ``where`` begins each message, ``wanted`` are those that will be read."""
 
@@ -156,13 +147,13 @@ class DepthFile:
             raise DataError(f"{self._where}: has {have}, frame {number} is not among them; copy the file again")
         return found
 
-    def _packed_values(self, index: list[Packed], number: int) -> UInt16Array | None:
+    def _packed_values(self, index: list[tuple[int, int]], number: int) -> UInt16Array | None:
         if number >= len(index):
             return None
-        place = index[number]
+        start, n_bytes = index[number]
         with reading(self._where), opened(self.path) as stream:
-            stream.seek(place.start)
-            content = stream.read(place.n_bytes)
+            stream.seek(start)
+            content = stream.read(n_bytes)
         try:
             values = np.frombuffer(unpacked_block(content, 2 * N_PIXELS), "<u2")
         except NotLz4:
@@ -214,20 +205,9 @@ def millimetres(depth_m: Float32Array) -> UInt16Array:
         return np.where((values >= 0) & (values < N_DEPTH_VALUES), values, 0).astype(np.uint16)
 
 
-def packed_metres(values: UInt16Array) -> bytes:
-    """An image with its length before it, as the toolkit unpacks it to these millimetres."""
-    depth_m = values.astype(np.float32) / np.float32(UNITS_PER_METRE)
-    for _ in range(2):  # a division may end just below the millimetre, which would be cut off
-        is_short = millimetres(depth_m) < values
-        depth_m = np.where(is_short, np.nextafter(depth_m, np.float32(np.inf)), depth_m)
-    pack = zlib.compressobj(wbits=RAW)
-    content = pack.compress(depth_m.astype("<f4").tobytes()) + pack.flush()
-    return len(content).to_bytes(LENGTH_BYTES, "little") + content
-
-
-def _index(path: Path) -> list[Packed] | None:
-    """Where the images are in a file whose lengths lead from one to the next up to its end; None for one stream."""
-    index: list[Packed] = []
+def _index(path: Path) -> list[tuple[int, int]] | None:
+    """Start and length of each image where lengths lead from one to the next up to the end; None for one stream."""
+    index: list[tuple[int, int]] = []
     with opened(path) as stream:
         n_bytes = stream.seek(0, 2)
         at = 0
@@ -237,7 +217,7 @@ def _index(path: Path) -> list[Packed] | None:
             at += LENGTH_BYTES
             if not 0 < length <= MOST_PACKED_BYTES or at + length > n_bytes or len(index) == MOST_FRAMES:
                 return None
-            index.append(Packed(at, length))
+            index.append((at, length))
             at += length
     return index
 

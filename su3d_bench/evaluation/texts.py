@@ -176,7 +176,7 @@ def named_texts(rules: ProtocolRules, queries: Path | None) -> dict[str, tuple[s
 
 def _texts_of_file(path: Path) -> list[str]:
     """Every text of a file of queries, whatever it says of their objects, or of a list with one text a line."""
-    from su3d_bench.datasets.openlex3d.labels import read_prompts, read_queries
+    from su3d_bench.datasets.openlex3d.release import read_prompts, read_queries
     from su3d_bench.questions.query_files import read_query_rows
 
     if path.suffix.lower() == ".txt":

@@ -14,7 +14,7 @@ from test_openlex3d_original import SAMPLED, metres, of_dataset, write_labels, w
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, PredictionError
-from su3d_bench.datasets.openlex3d.labels import VISIBLE_NAME
+from su3d_bench.datasets.openlex3d.release import VISIBLE_NAME
 from su3d_bench.evaluation.evaluate import evaluate
 from su3d_bench.evaluation.result import Request
 from su3d_bench.formats.ply import PlyElement, write_ply

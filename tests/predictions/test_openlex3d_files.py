@@ -13,8 +13,16 @@ from open_scene import ENCODER, OBJECTS, PROMPTS, instances_with
 from test_openlex3d_original import write_visible
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.datasets.openlex3d.labels import OpenLexFiles, read_categories, read_prompts, read_queries
-from su3d_bench.datasets.openlex3d.release import LabelledPoints, categories_truth, face_corners_of, queries_truth
+from su3d_bench.datasets.openlex3d.release import (
+    LabelledPoints,
+    OpenLexFiles,
+    categories_truth,
+    face_corners_of,
+    queries_truth,
+    read_categories,
+    read_prompts,
+    read_queries,
+)
 from su3d_bench.datasets.replica.truth import AnnotatedMesh
 from su3d_bench.formats.ply import ListColumn
 from su3d_bench.metrics.open_vocabulary.score import TextQuery

@@ -19,9 +19,9 @@ from places import CASES
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.maps import Partition
 from su3d_bench.core.types import Float32Array, UInt8Array
-from su3d_bench.datasets.openlex3d.labels import OpenLexFiles
 from su3d_bench.datasets.openlex3d.release import (
     LabelledPoints,
+    OpenLexFiles,
     OpenLexRelease,
     categories_truth,
     points_of,
