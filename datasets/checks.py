@@ -29,7 +29,7 @@ from su3d_bench.core.errors import (
 )
 from su3d_bench.core.interfaces import Dataset, HasProblems, SaysUp
 from su3d_bench.core.system.files import opened
-from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, WorldUp
+from su3d_bench.core.types import Frame, GroundTruth, WorldUp
 from su3d_bench.datasets.checks_of_frames import (
     Finding,
     FrameFacts,
@@ -111,36 +111,30 @@ def inspect(
     All frames are read, from ``n_threads`` threads, or ``SAMPLED_FRAMES`` evenly spaced ones where ``is_quick`` or
     where the scene is made on demand and has no file that could be damaged.
     """
-    findings = _Findings(f"{dataset.name}/{scene}")
+    started, findings = time.perf_counter(), _Findings(f"{dataset.name}/{scene}")
     with _warnings_as_findings(findings):
-        return _inspect(dataset, scene, findings, is_quick, n_threads, progress)
-
-
-def _inspect(
-    dataset: Dataset, scene: str, findings: _Findings, is_quick: bool, n_threads: int, progress: Progress
-) -> Inspection:
-    started = time.perf_counter()
-    n_problems = _ask_for_problems(dataset, scene, findings)
-    listed = findings.attempt("file", lambda: tuple(dataset.files(scene)))
-    files, is_made_on_demand = listed or (), listed == () and not n_problems
-    frames = _counted_frames(dataset, scene, findings)
-    facts: list[FrameFacts] = []
-    if frames is not None:
-        positions = _positions(len(frames), is_quick or is_made_on_demand)
-        facts, broken = _read_frames(frames, positions, findings, 1 if is_made_on_demand else n_threads, progress)
-    _look_at_files(files, findings, decode=frames is None)
-    findings.add(*check_frames(facts))
-    if frames is not None and not is_made_on_demand:
-        _look_at_convention(dataset, scene, _Readable(frames, broken), facts, findings)
-    up = None
-    if facts and frames is not None:
-        up = _look_at_up(dataset, scene, facts, _Readable(frames, broken), findings)
-    truth, known = _look_at_truth(dataset, scene, findings)
-    meeting = None
-    if known is not None and facts:
-        meeting, meeting_findings = check_truth(facts, known.points, known.boxes)
-        findings.add(*meeting_findings)
-    digest = findings.attempt("digest", lambda: dataset.digest(scene))
+        n_problems = _ask_for_problems(dataset, scene, findings)
+        listed = findings.attempt("file", lambda: tuple(dataset.files(scene)))
+        files, is_made_on_demand = listed or (), listed == () and not n_problems
+        frames = _counted_frames(dataset, scene, findings)
+        facts: list[FrameFacts] = []
+        if frames is not None:
+            positions = _positions(len(frames), is_quick or is_made_on_demand)
+            facts = _read_frames(frames, positions, findings, 1 if is_made_on_demand else n_threads, progress)
+        _look_at_files(files, findings, decode=frames is None)
+        findings.add(*check_frames(facts))
+        up = None
+        if frames is not None and facts:
+            is_whole = len(facts) == len(positions)
+            if is_whole and not is_made_on_demand:
+                _look_at_convention(dataset, scene, frames, findings)
+            up = _look_at_up(dataset, scene, facts, frames if is_whole else (), findings)
+        truth, known = _look_at_truth(dataset, scene, findings)
+        meeting = None
+        if known is not None and facts:
+            meeting, meeting_findings = check_truth(facts, known.points, known.boxes)
+            findings.add(*meeting_findings)
+        digest = findings.attempt("digest", lambda: dataset.digest(scene))
     return Inspection(
         scene=findings.scene,
         n_frames=None if frames is None else len(frames),
@@ -187,9 +181,11 @@ class _Findings:
             self.add(Finding("error", check, where, text))
 
     def attempt(self, check: str, work: Callable[[], Any]) -> Any:
-        """What ``work`` gives; None where it fails, which is a finding."""
+        """What ``work`` gives; None where it fails, which is a finding unless only ground truth is missing."""
         try:
             return work()
+        except GroundTruthMissing:
+            return None
         except PlugInError:  # the code is at fault, not the data
             raise
         except (Su3dError, OSError) as error:
@@ -253,8 +249,8 @@ def _positions(n_frames: int, is_sampled: bool) -> Sequence[int]:
 
 def _read_frames(
     frames: Sequence[Frame], positions: Sequence[int], findings: _Findings, n_threads: int, progress: Progress
-) -> tuple[list[FrameFacts], set[int]]:
-    """Facts of the frames that can be read, and the positions of those that cannot; each of these is named."""
+) -> list[FrameFacts]:
+    """Facts of the frames that can be read; each of the others is named."""
 
     def read(position: int) -> FrameFacts | Exception:
         try:
@@ -262,7 +258,7 @@ def _read_frames(
         except Exception as error:  # noqa: BLE001 - a plug-in may raise anything; every broken frame is named
             return error
 
-    facts, broken = [], set()
+    facts = []
     pool = ThreadPoolExecutor(n_threads)
     try:
         progress(0, len(positions))
@@ -270,12 +266,11 @@ def _read_frames(
             if isinstance(outcome, FrameFacts):
                 facts.append(outcome)
             else:
-                broken.add(position)
                 findings.add_fault("frame", f"frame {position}", outcome)
             progress(n_done, len(positions))
     finally:
         pool.shutdown(cancel_futures=True)
-    return facts, broken
+    return facts
 
 
 def _ask_for_problems(dataset: Dataset, scene: str, findings: _Findings) -> int:
@@ -289,25 +284,9 @@ def _ask_for_problems(dataset: Dataset, scene: str, findings: _Findings) -> int:
     return findings.n
 
 
-class _Readable(Sequence[Frame]):
-    """Frames without those that are known to be broken."""
-
-    def __init__(self, frames: Sequence[Frame], broken: Container[int]) -> None:
-        self._frames = frames
-        self._positions = [position for position in range(len(frames)) if position not in broken]
-
-    def __len__(self) -> int:
-        return len(self._positions)
-
-    def __getitem__(self, position: int) -> Frame:  # type: ignore[override]
-        return self._frames[self._positions[position]]
-
-
-def _look_at_convention(
-    dataset: Dataset, scene: str, frames: Sequence[Frame], facts: Sequence[FrameFacts], findings: _Findings
-) -> None:
+def _look_at_convention(dataset: Dataset, scene: str, frames: Sequence[Frame], findings: _Findings) -> None:
     """Whether depth and poses agree between frames; asked only where each of them is usable by itself."""
-    if not facts or findings.has_error(("pose", "intrinsics", "size")):
+    if findings.has_error(("pose", "intrinsics", "size")):
         return
     verdict = findings.attempt("convention", lambda: judge_scene(dataset, scene, frames))
     if verdict is not None:
@@ -371,16 +350,8 @@ def _look_at_truth(
         n_objects, n_classes = (len(np.unique(ids[ids > 0])) for ids in (truth.instance, truth.semantic))
         rows.append(TruthVariant(variant, None, len(truth.points), n_objects, n_classes))
     if known is not None:
-        findings.attempt("truth", lambda: _instance_mesh(dataset, scene))
+        findings.attempt("truth", lambda: dataset.instance_mesh(scene))
     return tuple(rows), known
-
-
-def _instance_mesh(dataset: Dataset, scene: str) -> InstanceMesh | None:
-    """The mesh, which is read for its faults; None where the truth is no mesh."""
-    try:
-        return dataset.instance_mesh(scene)
-    except GroundTruthMissing:
-        return None
 
 
 def _depth_statistics(facts: Sequence[FrameFacts]) -> DepthStatistics | None:

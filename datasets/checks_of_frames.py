@@ -10,6 +10,7 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -118,8 +119,13 @@ def check_frames(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
     """Findings of the frames by themselves: poses, sizes, intrinsics, depth, colour, motion."""
     if not frames:
         return
-    yield from _poses(frames)
-    yield from _sizes(frames)
+    size = Counter((frame.width, frame.height) for frame in frames).most_common(1)[0][0]
+    for check in (_pose, partial(_size, common=size), _intrinsics):
+        for frame in frames:
+            yield from (Finding("error", kind, f"frame {frame.index}", text) for kind, text in check(frame))
+    n_odd = sum(not np.allclose(frame.intrinsics, frames[0].intrinsics) for frame in frames)
+    if n_odd:
+        yield Finding("note", "intrinsics", "", f"{n_odd} of {len(frames)} frames have intrinsics of their own")
     yield from _depth(frames)
     for frame in frames:
         if frame.is_black:
@@ -127,13 +133,11 @@ def check_frames(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
     yield from _motion(frames)
 
 
-def _poses(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
-    for frame in frames:
-        if not np.isfinite(frame.camera_to_world).all():
-            yield Finding("error", "pose", f"frame {frame.index}", "the pose is not finite; mend the trajectory")
-        elif (reason := _why_not_rigid(frame.camera_to_world)) is not None:
-            text = f"the pose is no rigid motion: {reason}; expected camera-to-world with last row 0 0 0 1"
-            yield Finding("error", "pose", f"frame {frame.index}", text)
+def _pose(frame: FrameFacts) -> Iterator[tuple[str, str]]:
+    if not np.isfinite(frame.camera_to_world).all():
+        yield "pose", "the pose is not finite; fix the trajectory"
+    elif (reason := _why_not_rigid(frame.camera_to_world)) is not None:
+        yield "pose", f"the pose is no rigid motion: {reason}; expected camera-to-world with last row 0 0 0 1"
 
 
 def _why_not_rigid(pose: Float64Array) -> str | None:
@@ -149,28 +153,19 @@ def _why_not_rigid(pose: Float64Array) -> str | None:
     return None
 
 
-def _sizes(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
-    (common, _), *others = Counter((frame.width, frame.height) for frame in frames).most_common()
-    for frame in frames if others else ():
-        if (frame.width, frame.height) != common:
-            text = f"is {frame.width}x{frame.height}, most frames are {common[0]}x{common[1]}; all must have one size"
-            yield Finding("error", "size", f"frame {frame.index}", text)
-    yield from _intrinsics(frames)
+def _size(frame: FrameFacts, common: tuple[int, int]) -> Iterator[tuple[str, str]]:
+    if (frame.width, frame.height) != common:
+        sizes = f"{frame.width}x{frame.height}, most frames are {common[0]}x{common[1]}"
+        yield "size", f"is {sizes}; all must have one size"
 
 
-def _intrinsics(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
-    for frame in frames:
-        fx, fy, cx, cy = frame.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]]
-        where = f"frame {frame.index}"
-        if not (fx > 0 and fy > 0):
-            text = f"the focal lengths are {fx:g} and {fy:g} pixels; they must be above 0"
-            yield Finding("error", "intrinsics", where, text)
-        elif not (0 <= cx <= frame.width and 0 <= cy <= frame.height):
-            text = f"the principal point ({cx:g}, {cy:g}) lies outside the image of {frame.width}x{frame.height}"
-            yield Finding("error", "intrinsics", where, text)
-    n_odd = sum(not np.allclose(frame.intrinsics, frames[0].intrinsics) for frame in frames)
-    if n_odd:
-        yield Finding("note", "intrinsics", "", f"{n_odd} of {len(frames)} frames have intrinsics of their own")
+def _intrinsics(frame: FrameFacts) -> Iterator[tuple[str, str]]:
+    fx, fy, cx, cy = frame.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]]
+    if not (fx > 0 and fy > 0):
+        yield "intrinsics", f"the focal lengths are {fx:g} and {fy:g} pixels; they must be above 0"
+    elif not (0 <= cx <= frame.width and 0 <= cy <= frame.height):
+        outside = f"({cx:g}, {cy:g}) lies outside the image of {frame.width}x{frame.height}"
+        yield "intrinsics", f"the principal point {outside}"
 
 
 def _depth(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
@@ -275,34 +270,29 @@ def _apart(frames: Sequence[FrameFacts], truth_points: Float32Array) -> str:
     return f" (the clouds do not overlap: the frames see {_box_text(seen.min(axis=0), seen.max(axis=0))})"
 
 
-@dataclass(frozen=True)
-class _Nearness:
-    """Which points (N, 3) are within ``distance_m`` of a truth."""
-
-    distance_m: float
-    is_near: Callable[[Float64Array], BoolArray]
+Nearness = tuple[float, Callable[[Float64Array], BoolArray]]  # a distance (m), and which points are within it
 
 
-def _nearness_to_points(truth_points: Float32Array) -> _Nearness:
+def _nearness_to_points(truth_points: Float32Array) -> Nearness:
     from scipy.spatial import KDTree
 
     step = -(-len(truth_points) // SEARCHED_TRUTH_POINTS)
     tree = KDTree(truth_points[::step])
     distance_m = max(MEETING_DISTANCE_M, _spacing(tree))
-    return _Nearness(distance_m, lambda points: np.isfinite(tree.query(points, distance_upper_bound=distance_m)[0]))
+    return distance_m, lambda points: np.isfinite(tree.query(points, distance_upper_bound=distance_m)[0])
 
 
-def _nearness_to_boxes(boxes: ObjectBoxes) -> _Nearness:
-    return _Nearness(MEETING_DISTANCE_M, lambda points: boxes.instance_at(points, MEETING_DISTANCE_M) > 0)
+def _nearness_to_boxes(boxes: ObjectBoxes) -> Nearness:
+    return MEETING_DISTANCE_M, lambda points: boxes.instance_at(points, MEETING_DISTANCE_M) > 0
 
 
-def _meeting(frames: Sequence[FrameFacts], truth: _Nearness) -> Meeting | None:
+def _meeting(frames: Sequence[FrameFacts], truth: Nearness) -> Meeting | None:
     if not frames:
         return None
-    distance_m = truth.distance_m
+    distance_m, is_near = truth
 
     def share(pose_of: Any, factors: Float64Array) -> float:
-        return float(truth.is_near(_placed(frames, pose_of, factors)).mean())
+        return float(is_near(_placed(frames, pose_of, factors)).mean())
 
     as_given = share(lambda facts: facts.camera_to_world, np.ones(3))
     hint = "" if as_given >= POINTS_MEETING[0] else _hint(share, as_given)

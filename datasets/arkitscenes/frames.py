@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -14,16 +13,7 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError, FramesMissing
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int64Array
-from su3d_bench.datasets.recordings.recorded_frames import (
-    StoredDepth,
-    colour_at,
-    depth_m_of_values,
-    left_out,
-    nearest_at,
-    numbers,
-    pinhole,
-    reading,
-)
+from su3d_bench.datasets.recordings import recorded_frames
 from su3d_bench.formats.arrays import read_text
 from su3d_bench.formats.images import Size, decode_colour, decode_depth, read_bytes, sized
 
@@ -61,7 +51,7 @@ def read_trajectory(path: Path, where: str) -> Trajectory:
         at = f"{where} line {number}"
         if len(words) != N_COLUMNS:
             raise DataError(f"{at}: has {len(words)} values; expected time, axis-angle and translation, {N_COLUMNS}")
-        time_s, *rest = numbers(words, at)
+        time_s, *rest = recorded_frames.numbers(words, at)
         is_usual = 0 <= time_s < 1e12 and max(map(abs, rest[:3])) < MOST_ROTATION and max(map(abs, rest[3:])) < 1e6
         if not is_usual:  # of values that are not finite, too
             shown = " ".join(f"{value:g}" for value in (time_s, *rest))
@@ -89,14 +79,13 @@ TRAJECTORY_NAME = "lowres_wide.traj"
 LOWRES, WIDE, DEPTH, FINE_DEPTH, CONFIDENCE = "lowres_wide", "wide", "lowres_depth", "highres_depth", "confidence"
 COLOUR_FOLDER: Mapping[Images, str] = {"lowres": LOWRES, "wide": WIDE}
 UNITS_PER_METRE = 1000.0  # DATA.md of apple/ARKitScenes at 7283761: millimetres
-DEPTH_M_OF_VALUE = depth_m_of_values(UNITS_PER_METRE)
+DEPTH_M_OF_VALUE = recorded_frames.depth_m_of_values(UNITS_PER_METRE)
 MOST_CONFIDENCE = 2
 # The readers of Apple and of the challenge look for a camera file of the time itself, then 1 ms before and after.
 NEIGHBOURS_MS = (0, -1, 1)
 MOST_DEPTH_AWAY_MS = 5  # of a wide image's depth, which has the time of its own frame: half of a sixtieth of a second
 LARGEST_SIDE = 16384
 ADVICE = "download the scene again"
-logger = logging.getLogger(__name__)
 
 
 def camera_folder(colour: str) -> str:
@@ -151,7 +140,7 @@ def times_in(folder: Path, scene: str, suffix: str) -> dict[int, str]:
 def open_recording(folder: Path, scene: str, images: Images, least_confidence: int, where: str) -> PhoneRecording:
     """The recording of a scene; ``FramesMissing`` where it has no images, ``DataError`` where none can be used."""
     colour_folder = COLOUR_FOLDER[images]
-    with reading(where):
+    with recorded_frames.reading(where):
         colours = times_in(folder / colour_folder, scene, ".png")
         depths = times_in(folder / DEPTH, scene, ".png")
         fine = times_in(folder / FINE_DEPTH, scene, ".png") if images == "wide" else {}
@@ -183,13 +172,11 @@ def open_recording(folder: Path, scene: str, images: Images, least_confidence: i
             found.append(Image(time_ms, colour, depth, f"{camera_folder(colour_folder)}/{camera}", confidence))
             rows.append(row)
     what = "images lack another image or a camera file of their time"
-    remarks = [left_out(where, lacking, what, len(found))] if lacking else []
+    remarks = recorded_frames.left_out(where, lacking, what, len(found))
     no_pose = f"images have no pose nearer than 0.3 s in {TRAJECTORY_NAME}"
-    remarks += [left_out(where, unposed, no_pose, len(found))] if unposed else []
+    remarks += recorded_frames.left_out(where, unposed, no_pose, len(found))
     if not found:
         raise DataError(remarks[0] if remarks else f"{where}: has no images in {colour_folder}; {ADVICE}")
-    for line in remarks:
-        logger.warning("%s", line)
     return PhoneRecording(where, folder, tuple(found), tuple(rows), trajectory, tuple(remarks))
 
 
@@ -207,10 +194,10 @@ def read_camera(path: Path, where: str) -> tuple[Size, Float64Array]:
     words = read_text(path, where, ADVICE).split()
     if len(words) != 6:
         raise DataError(f"{where}: has {len(words)} values; expected one line width height fx fy cx cy")
-    width, height, fx, fy, cx, cy = numbers(words, where)
+    width, height, fx, fy, cx, cy = recorded_frames.numbers(words, where)
     if not all(1 <= side <= LARGEST_SIDE and side == int(side) for side in (width, height)):
         raise DataError(f"{where}: the image has {width:g}x{height:g} pixels; {ADVICE}")
-    return (int(width), int(height)), pinhole(fx, fy, cx, cy, where)
+    return (int(width), int(height)), recorded_frames.pinhole(fx, fy, cx, cy, where)
 
 
 class PhoneFrames(Sequence[Frame]):
@@ -222,7 +209,7 @@ class PhoneFrames(Sequence[Frame]):
     def __init__(self, recording: PhoneRecording, stride: int, width: int, least_confidence: int) -> None:
         self._recording, self._stride = recording, stride
         self._width, self._least = width, least_confidence
-        self._depth = StoredDepth(recording.where, DEPTH_M_OF_VALUE)
+        self._depth = recorded_frames.StoredDepth(recording.where, DEPTH_M_OF_VALUE)
 
     def __len__(self) -> int:
         return len(self._recording.images[:: self._stride])
@@ -239,7 +226,7 @@ class PhoneFrames(Sequence[Frame]):
         return Frame(
             index=index,
             timestamp_s=image.time_ms / 1000,
-            rgb=colour_at(rgb, size),
+            rgb=recorded_frames.colour_at(rgb, size),
             depth_m=self._depth_m(image, full, size),
             camera_to_world=self._recording.trajectory.poses[self._recording.rows[index]],
             intrinsics=intrinsics,
@@ -258,9 +245,9 @@ class PhoneFrames(Sequence[Frame]):
             self._check_shape(confidence.shape[1::-1], full, image.confidence, image.colour)
             if confidence.max(initial=0) > MOST_CONFIDENCE:
                 raise DataError(f"{self._at(image.confidence)}: has values to {confidence.max()}; expected 0, 1 and 2")
-            confidence = nearest_at(confidence, (values.shape[1], values.shape[0]))
+            confidence = recorded_frames.nearest_at(confidence, (values.shape[1], values.shape[0]))
             depth_m = np.where(confidence >= self._least, depth_m, np.float32(0))
-        return nearest_at(depth_m, size)
+        return recorded_frames.nearest_at(depth_m, size)
 
     def _check_shape(self, actual: tuple[int, ...], full: Size, name: str, colour: str) -> None:
         """Depth may be coarser than colour; both must show the same field of view."""

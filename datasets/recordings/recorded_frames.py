@@ -242,9 +242,14 @@ def nearest_at(image: NDArray[Any], size: Size) -> NDArray[Any]:
     return image if is_same else np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST_EXACT), image.dtype)
 
 
-def left_out(where: str, names: Sequence[str], what: str, n_used: int) -> str:
-    """The line that says what was left out: how many and the first."""
-    return f"{where}: {len(names)} {what} (the first: {names[0][:80]}); left out, {n_used} frames are used"
+def left_out(where: str, names: Sequence[str], what: str, n_used: int) -> list[str]:
+    """The line, if any, that says how many were left out and the first; logged where frames are used without them."""
+    if not names:
+        return []
+    line = f"{where}: {len(names)} {what} (the first: {names[0][:80]}); left out, {n_used} frames are used"
+    if n_used:
+        logger.warning("%s", line)
+    return [line]
 
 
 def pinhole(fx: float, fy: float, cx: float, cy: float, where: str) -> Float64Array:

@@ -21,17 +21,8 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.geometry import are_rigid
 from su3d_bench.core.types import Float32Array, Float64Array, Int64Array, UInt8Array
 from su3d_bench.datasets.recordings.recorded_frames import square
+from su3d_bench.formats import images
 from su3d_bench.formats.arrays import read_text
-from su3d_bench.formats.images import (
-    MAX_PIXELS,
-    Size,
-    UInt16Array,
-    decode_colour,
-    decode_depth,
-    image_size,
-    read_bytes,
-    sized,
-)
 
 
 @dataclass(frozen=True)
@@ -43,8 +34,8 @@ class SensorPair:
     ``where`` begins the message of what does not fit.
     """
 
-    colour_size: Size
-    depth_size: Size
+    colour_size: images.Size
+    depth_size: images.Size
     colour_intrinsics: Float64Array
     depth_intrinsics: Float64Array
     colour_extrinsic: Float64Array
@@ -54,8 +45,8 @@ class SensorPair:
 
     def __post_init__(self, where: str) -> None:
         for name, (width, height) in (("colour", self.colour_size), ("depth", self.depth_size)):
-            if width < 1 or height < 1 or width * height > MAX_PIXELS:
-                raise DataError(f"{where}: {name} images of {width}x{height}; expected 1 to {MAX_PIXELS} pixels")
+            if width < 1 or height < 1 or width * height > images.MAX_PIXELS:
+                raise DataError(f"{where}: {name} images of {width}x{height}; expected 1 to {images.MAX_PIXELS} pixels")
         for name, matrix in (("colour", self.colour_intrinsics), ("depth", self.depth_intrinsics)):
             assert matrix.shape == (3, 3), matrix.shape
             if not np.isfinite(matrix).all() or not (matrix[0, 0] > 0 and matrix[1, 1] > 0):
@@ -95,7 +86,7 @@ class RgbdSource(Protocol):
         """Image (H, W, 3) RGB in the colour size of ``camera``."""
         ...
 
-    def depth(self, i: int) -> UInt16Array:
+    def depth(self, i: int) -> images.UInt16Array:
         """Values (H, W) as stored, 0 where invalid, in the depth size of ``camera``."""
         ...
 
@@ -296,11 +287,11 @@ class ExportedFrames:
 
     def colour(self, i: int) -> UInt8Array:
         where, content = self._read(self.frames[i].colour)
-        return sized(decode_colour, content, self.camera.colour_size, where, self.size_reason)
+        return images.sized(images.decode_colour, content, self.camera.colour_size, where, self.size_reason)
 
-    def depth(self, i: int) -> UInt16Array:
+    def depth(self, i: int) -> images.UInt16Array:
         where, content = self._read(self.frames[i].depth)
-        return sized(decode_depth, content, self.camera.depth_size, where, self.size_reason)
+        return images.sized(images.decode_depth, content, self.camera.depth_size, where, self.size_reason)
 
     def files(self) -> Sequence[Path]:
         images = (name for frame in self.frames for name in (frame.colour, frame.depth, frame.pose))
@@ -308,7 +299,7 @@ class ExportedFrames:
 
     def _read(self, name: str) -> tuple[str, bytes]:
         where = f"{self.where}: {name}"
-        return where, read_bytes(self.folder / name, where, EXPORT_AGAIN)
+        return where, images.read_bytes(self.folder / name, where, EXPORT_AGAIN)
 
 
 def read_matrix(folder: Path, name: str, where: str, sides: Sequence[int] = (4,)) -> Float64Array:
@@ -317,9 +308,9 @@ def read_matrix(folder: Path, name: str, where: str, sides: Sequence[int] = (4,)
     return square(read_text(folder / name, where, EXPORT_AGAIN).split(), where, sides)
 
 
-def read_size(folder: Path, name: str, where: str) -> Size:
+def read_size(folder: Path, name: str, where: str) -> images.Size:
     """Width and height of an image file by its header."""
-    size = image_size(read_bytes(folder / name, f"{where}: {name}", EXPORT_AGAIN))
+    size = images.image_size(images.read_bytes(folder / name, f"{where}: {name}", EXPORT_AGAIN))
     if size is None:
         raise DataError(f"{where}: {name}: not a readable image; {EXPORT_AGAIN}")
     return size

@@ -16,13 +16,7 @@ from pydantic import Field, model_validator
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array
-from su3d_bench.datasets.recordings.recorded_frames import (
-    Folder,
-    RecordedFrame,
-    RecordedFrames,
-    Recording,
-    depth_m_of_values,
-)
+from su3d_bench.datasets.recordings import recorded_frames
 from su3d_bench.datasets.recordings.source import check_complete, list_folder
 from su3d_bench.formats.arrays import read_text
 from su3d_bench.formats.images import UInt16Array
@@ -105,17 +99,22 @@ def depth_name(index: int) -> str:
     return f"results/depth{index:06d}.png"
 
 
-class ReplicaFrames(RecordedFrames):
+class ReplicaFrames(recorded_frames.RecordedFrames):
     """The frames at ``indices``, each read when it is asked for; a file that cannot be used is a ``DataError``."""
 
     advice = "copy results/ again"
 
     def __init__(self, folder: Path, where: str, camera: Camera, poses: Float64Array, indices: range) -> None:
         frames = tuple(
-            RecordedFrame(i, i / FRAMES_PER_SECOND, colour_name(i), depth_name(i), poses[i]) for i in indices
+            recorded_frames.RecordedFrame(i, i / FRAMES_PER_SECOND, colour_name(i), depth_name(i), poses[i])
+            for i in indices
         )
-        metres, size = depth_m_of_values(camera.scale), (camera.w, camera.h)
-        super().__init__(Recording(where, Folder(folder), frames, camera.intrinsics, metres, (), size))
+        metres, size = recorded_frames.depth_m_of_values(camera.scale), (camera.w, camera.h)
+        super().__init__(
+            recorded_frames.Recording(
+                where, recorded_frames.Folder(folder), frames, camera.intrinsics, metres, (), size
+            )
+        )
 
     def check_depth(self, values: UInt16Array, where: str) -> None:
         if not values.any():

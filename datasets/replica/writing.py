@@ -15,14 +15,7 @@ from su3d_bench.datasets.replica.folders import original_name, replica_label_set
 from su3d_bench.datasets.replica.frames import colour_name, depth_name
 from su3d_bench.datasets.replica.truth import INFO_NAME, MESH_NAME
 from su3d_bench.datasets.writing import Layout, SceneTarget, write_shared_text
-from su3d_bench.formats.images import (
-    JPEG_QUALITY,
-    depth_in_units,
-    jpeg_bytes,
-    list_column,
-    png_bytes,
-    triangles_of,
-)
+from su3d_bench.formats import images
 from su3d_bench.formats.ply import Column, PlyElement, write_ply
 
 if TYPE_CHECKING:
@@ -41,7 +34,7 @@ class ReplicaLayout(Layout):
 
     name = "replica"
     reader = "replica"
-    settings = (LAYOUT_VERSION, DEPTH_SCALE, JPEG_QUALITY)
+    settings = (LAYOUT_VERSION, DEPTH_SCALE, images.JPEG_QUALITY)
 
     def scenes_folder(self, out: Path) -> Path:
         return out / RENDER_FOLDER
@@ -65,7 +58,7 @@ class ReplicaLayout(Layout):
         return colour_name(index), depth_name(index)
 
     def frame_files(self, frame: Frame) -> Sequence[bytes]:
-        return jpeg_bytes(frame.rgb), png_bytes(depth_in_units(frame.depth_m, DEPTH_SCALE))
+        return images.jpeg_bytes(frame.rgb), images.png_bytes(images.depth_in_units(frame.depth_m, DEPTH_SCALE))
 
     def write_truth(self, dataset: Rooms, target: SceneTarget) -> None:
         """Trajectory, annotated mesh, table of objects and plain mesh."""
@@ -93,7 +86,7 @@ def _annotated_mesh(scan: RoomScan) -> list[PlyElement]:
     if scan.object_id.max(initial=0) > np.iinfo(np.uint16).max or scan.object_id.min(initial=0) < 0:
         raise DataError(f"object ids go to {scan.object_id.max()}; the layout has 16 bits, 0 to 65535")
     faces: dict[str, Column] = {
-        "vertex_indices": list_column(scan.faces),
+        "vertex_indices": images.list_column(scan.faces),
         "object_id": scan.object_id.astype(np.uint16),
     }
     return [_vertex_element(scan), PlyElement("face", len(scan.faces), faces)]
@@ -101,8 +94,11 @@ def _annotated_mesh(scan: RoomScan) -> list[PlyElement]:
 
 def _plain_mesh(scan: RoomScan) -> list[PlyElement]:
     """The same surface as triangles, without labels."""
-    triangles = triangles_of(scan.faces)
-    return [_vertex_element(scan), PlyElement("face", len(triangles), {"vertex_indices": list_column(triangles)})]
+    triangles = images.triangles_of(scan.faces)
+    return [
+        _vertex_element(scan),
+        PlyElement("face", len(triangles), {"vertex_indices": images.list_column(triangles)}),
+    ]
 
 
 def _info(objects: Sequence[RoomObject]) -> dict[str, Any]:

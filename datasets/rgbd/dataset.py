@@ -23,31 +23,11 @@ from su3d_bench.core.types import (
     Surface,
     WorldUp,
 )
+from su3d_bench.datasets.recordings import recorded_frames
 from su3d_bench.datasets.recordings.file_dataset import RecordedDataset, SceneTree, keeps_last
 from su3d_bench.datasets.recordings.meshes import read_surface
 from su3d_bench.datasets.recordings.pose_convention import ROTATED, Finding, guess_up
-from su3d_bench.datasets.recordings.recorded_frames import (
-    N_DEPTH_VALUES,
-    Folder,
-    RecordedFrame,
-    RecordedFrames,
-    Recording,
-    left_out,
-    pinhole,
-)
-from su3d_bench.datasets.rgbd.files import (
-    FILE_NAME,
-    INDEX,
-    Pose,
-    RgbdDescription,
-    camera_to_world,
-    direction_in,
-    files_of,
-    read_description,
-    read_intrinsics,
-    read_pose,
-    read_trajectory_file,
-)
+from su3d_bench.datasets.rgbd import files
 
 logger = logging.getLogger(__name__)
 OTHER = {"camera_to_world": "world_to_camera", "world_to_camera": "camera_to_world"}
@@ -78,8 +58,8 @@ class Rgbd(RecordedDataset[RgbdOptions]):
     reader_version = 3
     places_of_scenes = ("rgbd",)
     how_to_get = (
-        f"/rgbd (a scene is a folder with {FILE_NAME}); describe a folder of images in such a file there, or name the "
-        "file: --set rgbd.files=path/to/rgbd.toml"
+        f"/rgbd (a scene is a folder with {files.FILE_NAME}); describe a folder of images in such a file there, or "
+        "name the file: --set rgbd.files=path/to/rgbd.toml"
     )
     label_space = "none"
     no_mesh = "folders of images have none"
@@ -87,11 +67,11 @@ class Rgbd(RecordedDataset[RgbdOptions]):
 
     def find_tree(self) -> SceneTree:
         place = self.root / "rgbd"
-        below = [folder / FILE_NAME for folder in (sorted(place.iterdir()) if place.is_dir() else ())]
-        named = [path / FILE_NAME if path.is_dir() else path for path in self.options.files]
+        below = [folder / files.FILE_NAME for folder in (sorted(place.iterdir()) if place.is_dir() else ())]
+        named = [path / files.FILE_NAME if path.is_dir() else path for path in self.options.files]
         path_of: dict[str, Path] = {}
         for path in (*named, *(path for path in below if path.is_file())):
-            name = path.resolve().parent.name if path.name == FILE_NAME else path.stem
+            name = path.resolve().parent.name if path.name == files.FILE_NAME else path.stem
             if name in path_of and path_of[name] != path:
                 raise DataError(f"rgbd: scene '{name}' is described twice, in {path_of[name]} and {path}; rename one")
             path_of[name] = path
@@ -132,29 +112,32 @@ class Rgbd(RecordedDataset[RgbdOptions]):
         name = self.folder(scene).name
         if description.up is not None:
             return WorldUp(description.up, True, f"{name} says so")
-        guess = guess_up(np.array([frame.pose for frame in recording.frames]), RecordedFrames(recording, is_quiet=True))
+        guess = guess_up(
+            np.array([frame.pose for frame in recording.frames]),
+            recorded_frames.RecordedFrames(recording, is_quiet=True),
+        )
         return replace(guess, remedy=f'set up = "{guess.axis}" in {name}, or up = "z"')
 
-    def recording(self, scene: str) -> Recording:
+    def recording(self, scene: str) -> recorded_frames.Recording:
         return self._open(scene)[1]
 
     @keeps_last
-    def _open(self, scene: str) -> tuple[RgbdDescription, Recording]:
+    def _open(self, scene: str) -> tuple[files.RgbdDescription, recorded_frames.Recording]:
         path, where = self.folder(scene), self.where(scene)
-        description = read_description(path, where)
+        description = files.read_description(path, where)
         return description, open_recording(path, description, where)
 
 
-def open_recording(path: Path, description: RgbdDescription, where: str) -> Recording:
+def open_recording(path: Path, description: files.RgbdDescription, where: str) -> recorded_frames.Recording:
     """The usable frames of what the TOML file ``path`` describes; what is missing is said once, as a warning."""
     place = f"{where}: {path.name}"
     folder = _folder(path, description, place)
-    colours, depths = (files_of(folder, name, place) for name in (description.colour, description.depth))
+    colours, depths = (files.files_of(folder, name, place) for name in (description.colour, description.depth))
     poses = _poses(folder, description, sorted(colours.keys() | depths.keys()), where, place)
-    if INDEX not in description.colour and not len(colours) == len(depths) == len(poses.of_number):
+    if files.INDEX not in description.colour and not len(colours) == len(depths) == len(poses.of_number):
         raise DataError(
             f"{place}: {len(colours)} colour files, {len(depths)} depth files and {len(poses.of_number)} poses match; "
-            f"files pair up in order only where there are as many of each, otherwise by {INDEX}"
+            f"files pair up in order only where there are as many of each, otherwise by {files.INDEX}"
         )
     frames, missing = [], []
     for number in sorted(colours.keys() | depths.keys() | poses.of_number.keys()):
@@ -164,22 +147,23 @@ def open_recording(path: Path, description: RgbdDescription, where: str) -> Reco
             missing.append(f"frame {number}, no {' and no '.join(name for name, part in parts if part is None)}")
         else:
             time_s = poses.times_s.get(number, number / description.frames_per_second)
-            frames.append(RecordedFrame(number, time_s, colour, depth, pose))
+            frames.append(recorded_frames.RecordedFrame(number, time_s, colour, depth, pose))
     if not frames:
         raise DataError(f"{place}: no frame has colour, depth and a pose (the first: {missing[0]})")
-    remarks = [left_out(where, missing, "frames lack an image or a usable pose", len(frames))] if missing else []
-    for line in remarks:
-        logger.warning("%s", line)
+    what = "frames lack an image or a usable pose"
+    remarks = recorded_frames.left_out(where, missing, what, len(frames))
     intrinsics, size, camera_files = _intrinsics(folder, description, where, place)
     mesh = () if description.mesh is None else (folder.file(description.mesh, place),)
-    files = (path, *camera_files, *poses.files, *mesh)
-    return Recording(where, folder, tuple(frames), intrinsics, depth_table(description), files, size, tuple(remarks))
+    sources = (path, *camera_files, *poses.files, *mesh)
+    return recorded_frames.Recording(
+        where, folder, tuple(frames), intrinsics, depth_table(description), sources, size, tuple(remarks)
+    )
 
 
-def _folder(path: Path, description: RgbdDescription, place: str) -> Folder:
+def _folder(path: Path, description: files.RgbdDescription, place: str) -> recorded_frames.Folder:
     try:
         if (path.parent / description.folder).is_dir():
-            return Folder(path.parent / description.folder)
+            return recorded_frames.Folder(path.parent / description.folder)
     except OSError:  # a name too long for the file system
         pass
     raise DataError(f"{place}: folder = {description.folder[:80]!r}: there is no such folder beside {path.name}")
@@ -189,19 +173,21 @@ def _folder(path: Path, description: RgbdDescription, place: str) -> Folder:
 class _Poses:
     """Poses and, where they have them, times in seconds by the number of the frame, and the files they came from."""
 
-    of_number: dict[int, Pose]
+    of_number: dict[int, files.Pose]
     times_s: dict[int, float]
     files: tuple[Path, ...]
 
 
-def _poses(folder: Folder, description: RgbdDescription, images: list[int], where: str, place: str) -> _Poses:
+def _poses(
+    folder: recorded_frames.Folder, description: files.RgbdDescription, images: list[int], where: str, place: str
+) -> _Poses:
     if description.pose is not None:
         pose_of, contradicting = {}, []
-        names = files_of(folder, description.pose, place)
+        names = files.files_of(folder, description.pose, place)
         for number, name in names.items():
-            matrix, header = read_pose(folder.path, name, where)
-            pose_of[number] = camera_to_world(matrix, description, f"{where}: {name}")
-            if direction_in(header) not in (None, description.pose_direction):
+            matrix, header = files.read_pose(folder.path, name, where)
+            pose_of[number] = files.camera_to_world(matrix, description, f"{where}: {name}")
+            if files.direction_in(header) not in (None, description.pose_direction):
                 contradicting.append(f"{name} begins with {printable(header, 40)!r}")
         if contradicting:
             logger.warning(
@@ -212,7 +198,7 @@ def _poses(folder: Folder, description: RgbdDescription, images: list[int], wher
         return _Poses(pose_of, {}, tuple(folder.path / name for name in names.values()))
     assert description.trajectory is not None
     path, where = folder.file(description.trajectory, place), f"{where}: {description.trajectory}"
-    matrices, times_s = read_trajectory_file(path, description.trajectory_format, where)
+    matrices, times_s = files.read_trajectory_file(path, description.trajectory_format, where)
     numbers = images if len(matrices) == len(images) else range(images[0], images[-1] + 1)
     if len(matrices) != len(numbers):
         raise DataError(
@@ -224,25 +210,27 @@ def _poses(folder: Folder, description: RgbdDescription, images: list[int], wher
             )
         )
     rows = zip(numbers, matrices, strict=True)
-    pose_of = {n: camera_to_world(matrix, description, f"{where}, pose {k}") for k, (n, matrix) in enumerate(rows)}
+    pose_of = {
+        n: files.camera_to_world(matrix, description, f"{where}, pose {k}") for k, (n, matrix) in enumerate(rows)
+    }
     return _Poses(pose_of, dict(zip(numbers, times_s or (), strict=False)), (path,))
 
 
 def _intrinsics(
-    folder: Folder, description: RgbdDescription, where: str, place: str
+    folder: recorded_frames.Folder, description: files.RgbdDescription, where: str, place: str
 ) -> tuple[Float64Array, tuple[int, int] | None, tuple[Path, ...]]:
     """Intrinsics, the image size where a file says it, and that file."""
     if description.intrinsics is not None:
-        return pinhole(*description.intrinsics, where=place), None, ()
+        return recorded_frames.pinhole(*description.intrinsics, where=place), None, ()
     assert description.intrinsics_file is not None
     path = folder.file(description.intrinsics_file, place)
-    return *read_intrinsics(path, f"{where}: {description.intrinsics_file}"), (path,)
+    return *files.read_intrinsics(path, f"{where}: {description.intrinsics_file}"), (path,)
 
 
 @lru_cache(maxsize=8)
-def depth_table(description: RgbdDescription) -> Float32Array:
+def depth_table(description: files.RgbdDescription) -> Float32Array:
     """Metres (65536,) of every value that a depth image can hold, 0 where it means that there is no depth."""
-    stored = np.arange(N_DEPTH_VALUES, dtype=np.uint32)
+    stored = np.arange(recorded_frames.N_DEPTH_VALUES, dtype=np.uint32)
     bits = description.depth_rotated_bits
     values = ((stored >> bits) | (stored << (16 - bits))) & 0xFFFF
     depth_m = (values * description.depth_unit_m).astype(np.float32)

@@ -23,21 +23,8 @@ from su3d_bench.core.errors import DataError, counted
 from su3d_bench.core.geometry import are_rigid
 from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import BoolArray, Float64Array, Frame, Int64Array
+from su3d_bench.datasets.recordings import source as sensors
 from su3d_bench.datasets.recordings.recorded_frames import StoredDepth, depth_m_of_values, numbers, reading, square
-from su3d_bench.datasets.recordings.source import (
-    EXPORT_AGAIN,
-    ExportedFrames,
-    FrameFiles,
-    Registration,
-    RgbdSource,
-    SensorPair,
-    by_number,
-    check_complete,
-    every_kth,
-    list_folder,
-    read_matrix,
-    read_size,
-)
 from su3d_bench.datasets.scannet.sens import MAX_HEADER_BYTES, SensFile, header_bytes, parse_header
 from su3d_bench.formats.arrays import read_text
 from su3d_bench.formats.images import Size
@@ -71,7 +58,7 @@ PYTHON_LAYOUTS = (
 )
 
 
-def find_source(folder: Path, scene: str, where: str, kind: SourceKind = "auto") -> RgbdSource:
+def find_source(folder: Path, scene: str, where: str, kind: SourceKind = "auto") -> sensors.RgbdSource:
     """The recording in a scan's folder; where there are several the ``.sens`` file, else that of the Python reader.
 
     Exports may lie in the folder itself, in ``exported/`` or in a folder with the name of the scene. ``DataError``
@@ -119,11 +106,13 @@ def python_layout(folder: Path) -> PythonLayout | None:
     return next(iter(with_cameras or layouts), None)
 
 
-def open_python_export(folder: Path, where: str) -> ExportedFrames:
+def open_python_export(folder: Path, where: str) -> sensors.ExportedFrames:
     """The export of ScanNet's Python reader in ``folder``, or one that OpenMask3D prepared."""
     layout = python_layout(folder) or PYTHON_LAYOUTS[0]
     kinds = {
-        f"{name}/{{}}{ending}": by_number(list_folder(folder, name, where), pattern, f"{where}: {name}/")
+        f"{name}/{{}}{ending}": sensors.by_number(
+            sensors.list_folder(folder, name, where), pattern, f"{where}: {name}/"
+        )
         for name, ending, pattern in (
             (layout.colour, ".jpg", r"(\d{1,9})\.(?:jpg|png)"),
             (layout.depth, ".png", r"(\d{1,9})\.png"),
@@ -132,41 +121,50 @@ def open_python_export(folder: Path, where: str) -> ExportedFrames:
     }
     known = set().union(*kinds.values())
     if not known:
-        raise DataError(f"{where}: {layout.colour}/, {layout.depth}/ and {layout.pose}/ hold no frames; {EXPORT_AGAIN}")
-    expected = every_kth(known)
-    check_complete(kinds, expected, where)
+        raise DataError(
+            f"{where}: {layout.colour}/, {layout.depth}/ and {layout.pose}/ hold no frames; {sensors.EXPORT_AGAIN}"
+        )
+    expected = sensors.every_kth(known)
+    sensors.check_complete(kinds, expected, where)
     colours, depths, poses = kinds.values()
     frames = [
-        FrameFiles(n, f"{layout.colour}/{colours[n]}", f"{layout.depth}/{depths[n]}", f"{layout.pose}/{poses[n]}")
+        sensors.FrameFiles(
+            n, f"{layout.colour}/{colours[n]}", f"{layout.depth}/{depths[n]}", f"{layout.pose}/{poses[n]}"
+        )
         for n in expected
     ]
     camera, camera_files = _python_camera(folder, layout, frames[0], where)
-    return ExportedFrames(folder, where, camera, frames, camera_files, "as the first frame")
+    return sensors.ExportedFrames(folder, where, camera, frames, camera_files, "as the first frame")
 
 
-def _python_camera(folder: Path, layout: PythonLayout, first: FrameFiles, where: str) -> tuple[SensorPair, list[str]]:
+def _python_camera(
+    folder: Path, layout: PythonLayout, first: sensors.FrameFiles, where: str
+) -> tuple[sensors.SensorPair, list[str]]:
     """The cameras, and the names of the files that describe them."""
-    colour_size, depth_size = read_size(folder, first.colour, where), read_size(folder, first.depth, where)
+    colour_size, depth_size = (
+        sensors.read_size(folder, first.colour, where),
+        sensors.read_size(folder, first.depth, where),
+    )
     names = [
         f"{layout.cameras}/{kind}_{camera}.txt" for kind in ("intrinsic", "extrinsic") for camera in ("color", "depth")
     ]
     colour_name, depth_name = names[:2]
     there = [name for name in names if (folder / name).exists()]
     if colour_name not in there:
-        raise DataError(f"{where}: {colour_name} is missing; {EXPORT_AGAIN}")
+        raise DataError(f"{where}: {colour_name} is missing; {sensors.EXPORT_AGAIN}")
     if depth_name not in there and depth_size != colour_size:
         raise DataError(
             f"{where}: {depth_name} is missing, and depth images of {depth_size[0]}x{depth_size[1]} cannot take the "
-            f"intrinsics of colour images of {colour_size[0]}x{colour_size[1]}; {EXPORT_AGAIN}"
+            f"intrinsics of colour images of {colour_size[0]}x{colour_size[1]}; {sensors.EXPORT_AGAIN}"
         )
     colour_intrinsics = _fitted_intrinsics(folder, colour_name, where, colour_size, COLOUR_SIZE)
     depth_intrinsics = colour_intrinsics
     if depth_name in there:
         depth_intrinsics = _fitted_intrinsics(folder, depth_name, where, depth_size, DEPTH_SIZE)
     colour_extrinsic, depth_extrinsic = (
-        read_matrix(folder, name, where) if name in there else np.eye(4) for name in names[2:]
+        sensors.read_matrix(folder, name, where) if name in there else np.eye(4) for name in names[2:]
     )
-    camera = SensorPair(
+    camera = sensors.SensorPair(
         colour_size=colour_size,
         depth_size=depth_size,
         colour_intrinsics=colour_intrinsics,
@@ -184,7 +182,7 @@ def _fitted_intrinsics(folder: Path, name: str, where: str, size: Size, full_siz
 
     OpenMask3D's layouts and the Python reader's resizing leave the file as it was for images of ``full_size``.
     """
-    matrix = read_matrix(folder, name, where, (4, 3))[:3, :3]
+    matrix = sensors.read_matrix(folder, name, where, (4, 3))[:3, :3]
     centre, sizes, full_sizes = matrix[:2, 2] + 0.5, np.array(size), np.array(full_size)
     if (np.abs(centre / sizes - 0.5) <= OFF_CENTRE).all():
         return matrix
@@ -202,40 +200,40 @@ def _fitted_intrinsics(folder: Path, name: str, where: str, size: Size, full_siz
     )
 
 
-def open_cpp_export(folder: Path, where: str) -> ExportedFrames:
+def open_cpp_export(folder: Path, where: str) -> sensors.ExportedFrames:
     """The export of ScanNet's C++ reader in ``folder``."""
     camera, n_frames = read_info(folder / INFO, where)
     names: dict[str, list[str]] = {"color": [], "depth": [], "pose": []}
-    for name in list_folder(folder, ".", where):
+    for name in sensors.list_folder(folder, ".", where):
         if name.startswith("frame-"):
             names.get(name.partition(".")[2].partition(".")[0], names["color"]).append(name)
     kinds = {
-        f"frame-{{:06d}}.{kind}.{ending.split('|')[0]}": by_number(
+        f"frame-{{:06d}}.{kind}.{ending.split('|')[0]}": sensors.by_number(
             names[kind], rf"frame-(\d{{6,9}})\.{kind}\.(?:{ending})", f"{where}: the export"
         )
         for kind, ending in (("color", "jpg|png"), ("depth", "pgm"), ("pose", "txt"))
     }
     expected = range(n_frames)
-    check_complete(kinds, expected, where)
+    sensors.check_complete(kinds, expected, where)
     colours, depths, poses = kinds.values()
-    frames = [FrameFiles(n, colours[n], depths[n], poses[n]) for n in expected]
-    return ExportedFrames(folder, where, camera, frames, [INFO], f"as {INFO} says")
+    frames = [sensors.FrameFiles(n, colours[n], depths[n], poses[n]) for n in expected]
+    return sensors.ExportedFrames(folder, where, camera, frames, [INFO], f"as {INFO} says")
 
 
-def read_info(path: Path, where: str) -> tuple[SensorPair, int]:
+def read_info(path: Path, where: str) -> tuple[sensors.SensorPair, int]:
     """The cameras and the number of frames in the ``_info.txt`` of the C++ reader's export."""
     where = f"{where}: {path.name}"
-    parts = [line.partition("=") for line in read_text(path, where, EXPORT_AGAIN).splitlines()]
+    parts = [line.partition("=") for line in read_text(path, where, sensors.EXPORT_AGAIN).splitlines()]
     table = {key.strip(): value.split() for key, _, value in parts}
     for key in (*SIZE_KEYS, SHIFT_KEY, *MATRIX_KEYS, COUNT_KEY):
         if key not in table:
-            raise DataError(f"{where}: has no '{key}'; {EXPORT_AGAIN}")
+            raise DataError(f"{where}: has no '{key}'; {sensors.EXPORT_AGAIN}")
     colour_width, colour_height, depth_width, depth_height = (_count(table[key], key, where) for key in SIZE_KEYS)
     shift = numbers(table[SHIFT_KEY], f"{where}: '{SHIFT_KEY}'")
     if len(shift) != 1:
         raise DataError(f"{where}: '{SHIFT_KEY}' has {len(shift)} values; expected 1")
     colour, colour_extrinsic, depth, depth_extrinsic = (square(table[key], f"{where}: '{key}'") for key in MATRIX_KEYS)
-    camera = SensorPair(
+    camera = sensors.SensorPair(
         colour_size=(colour_width, colour_height),
         depth_size=(depth_width, depth_height),
         colour_intrinsics=colour[:3, :3],
@@ -277,7 +275,7 @@ def describe_recording(folder: Path, scene: str, where: str, kind: SourceKind) -
         return f"{sum(name.endswith(TEXT) for name in os.listdir(path))} exported frames"
 
 
-def digest_recording(source: RgbdSource, poses: Float64Array) -> str:
+def digest_recording(source: sensors.RgbdSource, poses: Float64Array) -> str:
     """A key of a recording's cameras, poses and time stamps, of the sizes of all images, and of the first and last."""
     total = hashlib.sha256()
     if isinstance(source, SensFile):
@@ -320,7 +318,7 @@ class Walk:
         return f"{where}: frames without a pose, left out: {n_lost} of {len(self.numbers)} (the first: {first})"
 
 
-def read_walk(source: RgbdSource) -> Walk:
+def read_walk(source: sensors.RgbdSource) -> Walk:
     """Which records can be used.
 
     A pose that is not finite was lost. ScanNet's own reader also takes 0 in the first element for lost, but an exact
@@ -335,7 +333,7 @@ def read_walk(source: RgbdSource) -> Walk:
     return walk
 
 
-def classify_poses(source: RgbdSource) -> tuple[Walk, BoolArray]:
+def classify_poses(source: sensors.RgbdSource) -> tuple[Walk, BoolArray]:
     """The records as ``read_walk`` has them, and which of them (n,) have a pose that is neither lost nor right."""
     poses = source.poses()
     is_finite = np.isfinite(poses).all(axis=(1, 2))
@@ -356,8 +354,8 @@ class ScannetFrames(Sequence[Frame]):
 
     def __init__(
         self,
-        source: RgbdSource,
-        registration: Registration,
+        source: sensors.RgbdSource,
+        registration: sensors.Registration,
         walk: Walk,
         records: Int64Array,
         motion: Float64Array | None,

@@ -22,14 +22,7 @@ from su3d_bench.core.files.atomic import replacing
 from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import Float64Array, Int64Array, UInt8Array
 from su3d_bench.datasets.recordings.source import SensorPair
-from su3d_bench.formats.images import (
-    JPEG_START,
-    PNG_SIGNATURE,
-    UInt16Array,
-    decode_colour,
-    image_size,
-    sized,
-)
+from su3d_bench.formats import images
 
 ColourCompression = Literal["raw", "png", "jpeg"]
 DepthCompression = Literal["raw", "zlib"]
@@ -203,12 +196,12 @@ class SensFile:
         if header.colour_compression == "raw":
             _check_length(content, 3 * size[0] * size[1], where)
             return np.frombuffer(content, np.uint8).reshape(size[1], size[0], 3)
-        signature = PNG_SIGNATURE if header.colour_compression == "png" else JPEG_START
-        if not content.startswith(signature) or image_size(content) is None:
+        signature = images.PNG_SIGNATURE if header.colour_compression == "png" else images.JPEG_START
+        if not content.startswith(signature) or images.image_size(content) is None:
             raise DataError(f"{where}: not a {header.colour_compression.upper()} image; copy the file again")
-        return sized(decode_colour, content, size, where, "as the header says")
+        return images.sized(images.decode_colour, content, size, where, "as the header says")
 
-    def depth(self, i: int) -> UInt16Array:
+    def depth(self, i: int) -> images.UInt16Array:
         """The depth image (H, W) of frame ``i`` in raw units, 0 where invalid."""
         content, header = self.depth_bytes(i), self.header
         where = f"{self._place(i, self._depth_span(i)[0])}: depth"

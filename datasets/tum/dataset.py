@@ -14,7 +14,6 @@ There is no ground truth of objects.
 
 from __future__ import annotations
 
-import logging
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,21 +25,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.geometry import rotations_of
 from su3d_bench.core.types import Float64Array
+from su3d_bench.datasets.recordings import recorded_frames
 from su3d_bench.datasets.recordings.file_dataset import RecordedDataset, keeps_last
-from su3d_bench.datasets.recordings.recorded_frames import (
-    Folder,
-    RecordedFrame,
-    Recording,
-    depth_m_of_values,
-    left_out,
-    numbers,
-    pinhole,
-)
 from su3d_bench.formats.arrays import read_text
 
-logger = logging.getLogger(__name__)
 UNITS_PER_METRE = 5000.0  # the benchmark's page "file formats"
-DEPTH_M_OF_VALUE = depth_m_of_values(UNITS_PER_METRE)
+DEPTH_M_OF_VALUE = recorded_frames.depth_m_of_values(UNITS_PER_METRE)
 MAX_CANDIDATES = 2_000_000  # pairs of images near in time; a recording has about two an image
 # fx fy cx cy of the colour cameras: the benchmark's page "file formats", section "intrinsic camera calibration".
 CAMERAS = {
@@ -86,12 +76,12 @@ class Tum(RecordedDataset[TumOptions]):
         return not folder.name.startswith(".") and all((folder / name).is_file() for name in ("rgb.txt", "depth.txt"))
 
     @keeps_last
-    def recording(self, scene: str) -> Recording:
+    def recording(self, scene: str) -> recorded_frames.Recording:
         return self._open(self.folder(scene), self.where(scene))
 
-    def _open(self, path: Path, where: str) -> Recording:
+    def _open(self, path: Path, where: str) -> recorded_frames.Recording:
         """The frames whose images and pose are there; what is missing is said once, as a warning."""
-        folder, limit_s = Folder(path), self.options.max_difference_s
+        folder, limit_s = recorded_frames.Folder(path), self.options.max_difference_s
         has_pairs = (path / "associate.txt").exists()
         pairs = read_pairs(path, where) if has_pairs else associate(path, where, limit_s)
         lists = ("associate.txt",) if has_pairs else ("rgb.txt", "depth.txt")
@@ -109,31 +99,31 @@ class Tum(RecordedDataset[TumOptions]):
             if pose is None:
                 unposed.append(colour)
             else:
-                frames.append(RecordedFrame(index, colour_s, colour, depth, pose))
+                frames.append(recorded_frames.RecordedFrame(index, colour_s, colour, depth, pose))
         no_pose = f"colour images have no pose within {limit_s:g} s in groundtruth.txt"
-        remarks = [left_out(named, missing, "images named there are missing", len(frames))] if missing else []
-        remarks += [left_out(where, unposed, no_pose, len(frames))] if unposed else []
+        remarks = recorded_frames.left_out(named, missing, "images named there are missing", len(frames))
+        remarks += recorded_frames.left_out(where, unposed, no_pose, len(frames))
         if not frames:
             raise DataError(remarks[0] if remarks else f"{named}: no two images within {limit_s:g} s")
-        for line in remarks:
-            logger.warning("%s", line)
         camera = ("camera.txt",) if (path / "camera.txt").exists() else ()
         files = tuple(path / name for name in (*lists, *camera, "groundtruth.txt"))
         intrinsics = self._intrinsics(path, where)
-        return Recording(where, folder, tuple(frames), intrinsics, DEPTH_M_OF_VALUE, files, missing=tuple(remarks))
+        return recorded_frames.Recording(
+            where, folder, tuple(frames), intrinsics, DEPTH_M_OF_VALUE, files, missing=tuple(remarks)
+        )
 
     def _intrinsics(self, path: Path, where: str) -> Float64Array:
         if self.options.intrinsics is not None:
-            return pinhole(*self.options.intrinsics, where=f"{where}: option intrinsics")
+            return recorded_frames.pinhole(*self.options.intrinsics, where=f"{where}: option intrinsics")
         if (path / "camera.txt").exists():
             where = f"{where}: camera.txt"
             words = read_text(path / "camera.txt", where).split()
             if len(words) != 4:
                 raise DataError(f"{where}: has {len(words)} values; expected one line fx fy cx cy")
-            fx, fy, cx, cy = numbers(words, where)
-            return pinhole(fx, fy, cx, cy, where)
+            fx, fy, cx, cy = recorded_frames.numbers(words, where)
+            return recorded_frames.pinhole(fx, fy, cx, cy, where)
         camera = re.search(r"(?:freiburg|fr)([123])", path.name)
-        return pinhole(*CAMERAS[camera[1] if camera else ""], where=where)
+        return recorded_frames.pinhole(*CAMERAS[camera[1] if camera else ""], where=where)
 
 
 def read_pairs(folder: Path, where: str) -> list[tuple[Stamped, Stamped]]:
@@ -185,7 +175,7 @@ def rows_of(path: Path, where: str, n_words: int, form: str) -> list[tuple[int, 
 
 
 def seconds(word: str, where: str) -> float:
-    (time_s,) = numbers([word], where)
+    (time_s,) = recorded_frames.numbers([word], where)
     if not abs(time_s) < 1e12:
         raise DataError(f"{where}: the time is {time_s:g}; expected seconds")
     return time_s
@@ -196,7 +186,7 @@ def read_trajectory(path: Path, where: str) -> tuple[Float64Array, Float64Array]
     rows = {}
     for number, words in rows_of(path, where, 8, "'time tx ty tz qx qy qz qw'"):
         place = f"{where} line {number}"
-        tx, ty, tz, *quaternion = numbers(words[1:], place)
+        tx, ty, tz, *quaternion = recorded_frames.numbers(words[1:], place)
         if not max(abs(tx), abs(ty), abs(tz)) < 1e6:
             raise DataError(f"{place}: the camera is at {tx:g} {ty:g} {tz:g}; expected metres")
         rows[seconds(words[0], place)] = [tx, ty, tz, *unit_quaternion(quaternion, place)]
