@@ -163,11 +163,10 @@ def read_categories(path: Path, where: str) -> dict[int, ObjectLabels]:
 def read_queries(path: Path, where: str) -> tuple[TextQuery, ...]:
     """The queries of all levels of the file, in its order: level -> text -> object ids."""
     levels = _read_json(path, where, dict[str, dict[Text, ObjectIds]])
-    queries = tuple(TextQuery(text, tuple(ids)) for level in levels.values() for text, ids in level.items())
-    for query in queries:
-        if len(set(query.object_ids)) != len(query.object_ids):
-            raise DataError(f"{where}: query '{printable(query.text, 60)}': an object stands there twice")
-    return queries
+    try:
+        return tuple(TextQuery(text, tuple(ids)) for level in levels.values() for text, ids in level.items())
+    except DataError as error:
+        raise DataError(f"{where}: {error}") from error
 
 
 def _read_json(path: Path, where: str, kind: type[Content]) -> Content:

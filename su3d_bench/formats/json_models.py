@@ -35,7 +35,7 @@ def checked_json(content: Any, where: str, kind: type[Content], advice: str = "c
         fault = error.errors(include_url=False)[0]
         place = printable(".".join(map(str, fault["loc"])), 120)
         found = printable(repr(fault["input"])[:200], 40)
-        reason = fault["msg"].removeprefix("Value error, ")
+        reason = "expected an object" if fault["type"] == "model_type" else fault["msg"].removeprefix("Value error, ")
         raise DataError(f"{where}: {f'{place}: ' if place else ''}{reason}; found {found}; {advice}") from error
     return value
 

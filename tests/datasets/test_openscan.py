@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scannet_scan import SCAN, write_floor_truth
-from scannet_scans import dataset, write_scan
+from scannet_scan import SCAN, dataset, write_floor_truth, write_scan
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.datasets.openscan import KEYS, RAW_NAME, attribute_id, attribute_ids, label_set, read_attributes
@@ -103,7 +102,7 @@ def test_a_missing_file_or_scan_says_how_to_get_it(scan: Path, tmp_path: Path) -
     ("records", "line"),
     [
         ("{", "not JSON"),
-        ({}, "holds no list of 1 to 1000000 records; download it again"),
+        ({}, "Input should be a valid list; found {}; download it again"),
         ([RECORD, RECORD], "record 2: object 0 of scene0000_00 has a record already"),
         ([RECORD | {"material": "woood"}], "object 0 has the material 'woood', which is none of the 10 of OpenScan"),
     ],

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recording_files import grid
 from replica_scene import QUADS, TWO_OBJECTS, write_original, write_render
 from rgbd_scene import write_scene
-from scannet_scan import SCAN, grid, write_recording
+from scannet_scan import SCAN, write_recording
 from scannet_scan import write_truth as write_scan_truth
 
 from su3d_bench.core.errors import DataError

@@ -13,8 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
-from su3d_bench.datasets.tum.dataset import Tum, TumOptions, associate
-from su3d_bench.datasets.tum.timed_poses import pose_at, quaternion_poses, read_trajectory
+from su3d_bench.datasets.tum.dataset import Tum, TumOptions, associate, pose_at, quaternion_poses, read_trajectory
 
 WIDTH, HEIGHT = 12, 8
 CAMERA = "6.0 6.5 5.5 3.5\n"

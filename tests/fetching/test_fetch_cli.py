@@ -13,7 +13,7 @@ import pytest
 from box_room import write_box_room
 from file_server import FileServer, Served, file_server
 from published import entry, serve_file, serve_model, serve_replica, write_table
-from scannet_scans import write_scan
+from scannet_scan import write_scan
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.files.locks import hold_folder

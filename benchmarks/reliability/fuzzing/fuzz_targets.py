@@ -201,8 +201,8 @@ def _used_up(dataset: Any, question: str, scene: str) -> object:
 
 
 def _replica(folder: Path) -> Read:
+    from recording_files import grid, write_mesh
     from replica_scene import QUADS, TWO_OBJECTS, write_original, write_render
-    from scannet_scan import grid, write_mesh
 
     write_render(folder, n_frames=2)
     write_original(folder, QUADS, [0, 0, 5, 5], TWO_OBJECTS)
@@ -211,8 +211,7 @@ def _replica(folder: Path) -> Read:
 
 
 def _scannet(folder: Path) -> Read:
-    from scannet_scan import write_floor_truth
-    from scannet_scans import write_scan
+    from scannet_scan import write_floor_truth, write_scan
 
     write_floor_truth(write_scan(folder, n_frames=2), spacing_m=0.5)
     return _whole_dataset("scannet", folder, "scene0000_00")
@@ -240,8 +239,8 @@ def _hm3dsem(folder: Path) -> Read:
 
 
 def _rgbd(folder: Path) -> Read:
+    from recording_files import grid, write_mesh
     from rgbd_scene import write_scene
-    from scannet_scan import grid, write_mesh
 
     write_mesh(write_scene(folder, n_frames=2, mesh="mesh.ply") / "data/mesh.ply", *grid(3, 2))
     return _whole_dataset("rgbd", folder, "desk")

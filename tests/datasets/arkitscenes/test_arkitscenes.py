@@ -8,19 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 from arkitscenes_scene import (
-    HEIGHT_M,
-    N_FRAMES,
+    POSES,
     QUERIES,
     QUERY,
     SCENE,
     SIZE,
+    TIMES,
     TRUTH,
     WHERE,
-    poses,
-    time_of,
     write_images,
     write_scene,
 )
+from recording_files import HEIGHT_M
 
 from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing, ScenesMissing
 from su3d_bench.datasets.arkitscenes.challenge import DEVELOPMENT_SCENES
@@ -40,8 +39,8 @@ def test_frames_have_the_pose_the_depth_and_the_camera_of_their_time(is_3dod: bo
     dataset = opened(tmp_path)
     assert dataset.scenes() == (SCENE,)
     frames = list(dataset.frames(SCENE, 1))
-    assert [f"{frame.timestamp_s:.3f}" for frame in frames] == [time_of(k) for k in range(N_FRAMES)]
-    for frame, expected in zip(frames, poses(), strict=True):
+    assert [f"{frame.timestamp_s:.3f}" for frame in frames] == list(TIMES)
+    for frame, expected in zip(frames, POSES, strict=True):
         np.testing.assert_allclose(frame.camera_to_world, expected, atol=1e-12)
         assert frame.rgb.shape[1::-1] == SIZE and frame.intrinsics[0].tolist() == [SIZE[0], 0, SIZE[0] / 2]
         assert frame.depth_m[0, 0] == 0 and set(np.unique(frame.depth_m[1:])) == {np.float32(HEIGHT_M)}
@@ -57,8 +56,8 @@ def test_the_nearest_pose_is_nearer_than_three_tenths_of_a_second_and_the_later_
 
 def test_a_camera_file_may_be_a_millisecond_off_and_images_without_one_are_left_out(tmp_path: Path) -> None:
     cameras = write_scene(tmp_path) / "lowres_wide_intrinsics"
-    (cameras / f"{SCENE}_{time_of(0)}.pincam").rename(cameras / f"{SCENE}_99.999.pincam")
-    (cameras / f"{SCENE}_{time_of(2)}.pincam").rename(cameras / f"{SCENE}_100.205.pincam")
+    (cameras / f"{SCENE}_{TIMES[0]}.pincam").rename(cameras / f"{SCENE}_99.999.pincam")
+    (cameras / f"{SCENE}_{TIMES[2]}.pincam").rename(cameras / f"{SCENE}_100.205.pincam")
     dataset = opened(tmp_path)
     assert [frame.timestamp_s for frame in dataset.frames(SCENE, 1)] == [100.0, 100.1]
     assert list(dataset.problems(SCENE)) == [
@@ -79,12 +78,12 @@ def test_depth_of_less_confidence_is_left_out_where_it_is_asked(tmp_path: Path) 
 
 def test_the_wide_camera_takes_the_scanners_depth_or_the_phones_and_is_made_smaller(tmp_path: Path) -> None:
     folder = write_scene(tmp_path)
-    write_images(folder, "wide", "highres_depth", (128, 96), (128, 96))
-    (folder / "highres_depth" / f"{SCENE}_{time_of(1)}.png").unlink()
+    write_images(folder, "wide", "highres_depth", (128, 96))
+    (folder / "highres_depth" / f"{SCENE}_{TIMES[1]}.png").unlink()
     frames = list(opened(tmp_path, images="wide", width=32).frames(SCENE, 1))
     assert all(frame.rgb.shape == (24, 32, 3) and frame.depth_m.shape == (24, 32) for frame in frames)
     assert frames[1].intrinsics.tolist() == [[32, 0, 15.625], [0, 32, 11.625], [0, 0, 1]]
-    assert len(frames) == N_FRAMES and all(frame.depth_m.max() == np.float32(HEIGHT_M) for frame in frames)
+    assert len(frames) == 3 and all(frame.depth_m.max() == np.float32(HEIGHT_M) for frame in frames)
 
 
 def test_the_query_and_its_objects_are_those_of_the_challenges_files(tmp_path: Path) -> None:
@@ -139,12 +138,12 @@ def test_a_fault_in_the_challenges_files_is_one_line(name: str, content: str, me
         ("lowres_wide.traj", "1 2 3\n", "lowres_wide.traj line 1: has 3 values; expected time, axis-angle and transl"),
         ("lowres_wide.traj", "900 0 0 0 0 0 0\n", "3 images have no pose nearer than 0.3 s in lowres_wide.traj"),
         (
-            f"lowres_wide_intrinsics/{SCENE}_{time_of(0)}.pincam",
+            f"lowres_wide_intrinsics/{SCENE}_{TIMES[0]}.pincam",
             "64 48 60\n",
             "pincam: has 3 values; expected one line",
         ),
         (
-            f"lowres_wide_intrinsics/{SCENE}_{time_of(0)}.pincam",
+            f"lowres_wide_intrinsics/{SCENE}_{TIMES[0]}.pincam",
             "32 24 60 60 1 1\n",
             "is 64x48; expected 32x24, as its",
         ),

@@ -82,10 +82,13 @@ def change(walk: Path, edit: Callable[[Any], object]) -> None:
 @pytest.mark.parametrize(
     ("edit", "words"),
     [
-        (lambda c: c.pop("levels"), "has no list 'levels'"),
-        (lambda c: c["objects"].insert(0, 5), "objects[0] is 5"),
-        (lambda c: c["objects"][1].update(obb_dims=[1, -1, 1]), "are no centre and sides of a box"),
-        (lambda c: c["regions"][0].update(bev_region_points=[[0, 1]]), "has the shape (1, 2)"),
+        (lambda c: c.pop("levels"), "levels: Field required"),
+        (lambda c: c["objects"].insert(0, 5), "objects.0: expected an object; found 5"),
+        (lambda c: c["objects"][1].update(obb_dims=[1, -1, 1]), "objects.1.obb_dims.1: Input should be greater"),
+        (
+            lambda c: c["regions"][0].update(bev_region_points=[[0, 1]]),
+            "bev_region_points.0: List should have at least 3",
+        ),
     ],
 )
 def test_a_damaged_scene_info_is_one_line_that_says_where(

@@ -124,7 +124,7 @@ def test_a_table_without_boxes_is_no_truth_and_one_of_too_many_is_refused(
     info = root / INFO
     table = json.loads(info.read_text())
     with monkeypatch.context() as patch:
-        patch.setattr(checks, "MOST_OBJECTS", 7)
+        patch.setattr(checks, "MAX_OBJECTS", 7)
         with pytest.raises(DataError, match="8 objects have a box; expected at most 7"):
             Replica(root).ground_truth("room0", "boxes")
     for row in table["objects"]:

@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from recording_files import turn as pose
 from replica_scene import (
     CAMERA,
     CHAIR,
@@ -22,7 +23,6 @@ from replica_scene import (
     WIDTH,
     depth_values,
     info_table,
-    pose,
     write_original,
     write_render,
 )
@@ -168,8 +168,8 @@ IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
     [
         (lambda folder: (folder / COLOUR).unlink(), "results/frame000001.jpg is missing; copy results/ again"),
         (rewrite(TRAJECTORY, replace_line(2, "nan" + IDENTITY[1:])), "traj.txt line 2: the pose holds 'nan'; mend"),
-        (image(COLOUR, np.ones((8, 11, 3), np.uint8)), "frame000001.jpg is 11x8 but cam_params.json says 12x8; it"),
-        (camera_with(fy="600"), "cam_params.json: 'fy' is '600'; expected a number"),
+        (image(COLOUR, np.ones((8, 11, 3), np.uint8)), "frame000001.jpg is 11x8, the camera file says 12x8"),
+        (camera_with(fy="600"), "cam_params.json: camera.fy: Input should be a valid number; found '600'"),
     ],
 )
 def test_each_fault_of_the_input_is_one_clear_line(tmp_path: Path, change: Change, message: str) -> None:

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from replica_clouds import CLOUDS, SEQUENCE, first_pose, write_clouds, write_table
-from replica_scene import CHAIR, TABLE, WALL, write_render
+from recording_files import write_files
+from replica_scene import CHAIR, CLOUDS, SEQUENCE, TABLE, WALL, first_pose, write_clouds, write_render
 from scored_room import instances
 
 from su3d_bench.core.errors import DataError
@@ -18,7 +18,6 @@ from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Float32Array
 from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.datasets.replica.truth import N_EMBEDDING
-from su3d_bench.formats.poses import read_first_pose
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 
@@ -49,16 +48,12 @@ def test_labels_are_the_first_maximum_and_a_row_of_zeros_is_other(tmp_path: Path
     table = np.zeros((3, N_EMBEDDING), np.float32)
     table[1, [TABLE, WALL]] = 0.5
     table[2, CHAIR] = 1
-    write_table(tmp_path / CLOUDS / "pc_embeddings.h5", table)
+    write_files(tmp_path, {f"{CLOUDS}/pc_embeddings.h5": table})
     assert Replica(tmp_path).ground_truth("room0", "conceptgraphs").semantic.tolist() == [0, TABLE, CHAIR]
 
 
-def with_table(name: str, table: np.ndarray) -> Change:
-    return lambda root: write_table(root / name, table)
-
-
-def with_text(name: str, text: str | bytes) -> Change:
-    return lambda root: (root / name).write_bytes(text if isinstance(text, bytes) else text.encode())
+def with_table(name: str, table: np.ndarray | str) -> Change:
+    return lambda root: write_files(root, {name: table})
 
 
 NAN_POINT = np.array([[0, 0, 0], [0, np.nan, 0], [0, 0, 0]], np.float32)
@@ -70,7 +65,7 @@ NAN_POINT = np.array([[0, 0, 0], [0, np.nan, 0], [0, 0, 0]], np.float32)
         (with_table(f"{CLOUDS}/pc_points.h5", NAN_POINT), "pointclouds/pc_points.h5: point 1 is at [0.0, nan, 0.0]"),
         (with_table(f"{CLOUDS}/pc_points.h5", np.zeros((2, 3))), "pc_embeddings.h5: has 3 rows, pc_points.h5 has 2"),
         (with_table(f"{CLOUDS}/pc_embeddings.h5", np.zeros((3, 101))), "has the shape (3, 101); expected (N, 102)"),
-        (with_text(f"{SEQUENCE}/traj_w_c.txt", "2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"), "traj_w_c.txt line 1: not a rigid"),
+        (with_table(f"{SEQUENCE}/traj_w_c.txt", "2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"), "traj_w_c.txt line 1: not a rigid"),
     ],
 )
 def test_each_fault_of_the_clouds_is_one_clear_line(tmp_path: Path, change: Change, message: str) -> None:
@@ -184,11 +179,3 @@ def test_scores_from_files_are_those_of_the_original_steps_done_by_brute_force(t
     found = combine(rules, scores).metrics
     assert {key: found[key] for key in expected} == pytest.approx(expected, rel=1e-12)
     assert 0.02 < expected["mAcc"] < 0.9
-
-
-def test_the_first_pose_is_read_in_single_precision(tmp_path: Path) -> None:
-    path = tmp_path / "traj_w_c.txt"
-    path.write_text(f"1 0 0 {1 / 3!r} 0 1 0 0 0 0 1 0 0 0 0 1\nno pose\n")
-    pose = read_first_pose(path, "here")
-    assert pose.dtype == np.float32
-    assert pose[0, 3] == np.float32(1 / 3)

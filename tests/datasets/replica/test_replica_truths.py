@@ -6,8 +6,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from replica_clouds import CLOUDS, REFERENCE, SEQUENCE, write_clouds
-from replica_scene import CHAIR, QUADS, TABLE, TWO_OBJECTS, write_original, write_render
+from replica_scene import (
+    CHAIR,
+    CLOUDS,
+    QUADS,
+    REFERENCE,
+    SEQUENCE,
+    TABLE,
+    TWO_OBJECTS,
+    write_clouds,
+    write_original,
+    write_render,
+)
 from scored_room import instances
 
 from su3d_bench.core.errors import DataError
@@ -34,7 +44,7 @@ def write_labels(root: Path, name: str, values: list[int]) -> Path:
 def test_instances_of_the_file_stand_on_the_vertices_of_the_renders_mesh(tmp_path: Path) -> None:
     write_render(tmp_path)
     write_mesh(tmp_path / "Replica/room0_mesh.ply", 7, at=100)
-    write_original(tmp_path, QUADS, [0, 0, 5, 5], TWO_OBJECTS, n_vertices=9)
+    write_original(tmp_path, QUADS, [0, 0, 5, 5], TWO_OBJECTS)
     write_labels(tmp_path, "Replica/ground_truth/room0.txt", [20066, 80066, 30, 256003, 20000, 0, 20066])
     truth = Replica(tmp_path).ground_truth("room0", "openmask3d")
     assert truth.semantic.tolist() == [CHAIR, TABLE, 0, 0, CHAIR, 0, CHAIR]
@@ -46,7 +56,7 @@ def test_instances_of_the_file_stand_on_the_vertices_of_the_renders_mesh(tmp_pat
 def test_labels_of_the_original_mesh_are_recognised_by_their_number(tmp_path: Path) -> None:
     write_render(tmp_path)
     write_mesh(tmp_path / "Replica/room0_mesh.ply", 7)
-    write_original(tmp_path, QUADS, [0, 0, 5, 5], TWO_OBJECTS, n_vertices=9)
+    write_original(tmp_path, QUADS, [0, 0, 5, 5], TWO_OBJECTS)
     write_labels(tmp_path, "Replica/ground_truth/room_0.txt", [20001] * 9)
     truth = Replica(tmp_path).ground_truth("room0", "openmask3d")
     assert truth.points[5].tolist() == [2, 1, 0]

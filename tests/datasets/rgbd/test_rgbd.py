@@ -9,7 +9,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from rgbd_scene import HEIGHT, WIDTH, depth_values, log_of, open_scene, pose, text_of, write_scene
+from recording_files import text_of
+from recording_files import turn as pose
+from rgbd_scene import HEIGHT, WIDTH, depth_values, log_of, open_scene, write_scene
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError, GroundTruthMissing

@@ -9,7 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from rgbd_scene import CAMERA, NUMBERED, Change, describe, log_of, open_scene, text_of, write_scene
+from recording_files import text_of
+from rgbd_scene import CAMERA, NUMBERED, Change, describe, log_of, open_scene, write_scene
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.recordings.pose_convention import FLIP, judge_scene
@@ -112,7 +113,7 @@ def test_a_wrong_unit_of_depth_is_refused_and_corrected(tmp_path: Path) -> None:
 
 def write_room(root: Path, direction: str, axes: str) -> Path:
     """Eight frames of a room as files, poses stored in the given way."""
-    folder = write_scene(root, n_frames=0)
+    folder = write_scene(root)
     frames = Rooms(root, RoomOptions(width=64, height=48, n_frames=400)).frames("living0", 5)
     for index in range(8):
         frame = frames[index]

@@ -6,34 +6,33 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from recording_files import HEIGHT_M, LEFT, RIGHT, floor_image, pose
 from scannet_scan import (
     COLOUR_SIZE,
     DEPTH_SIZE,
-    HEIGHT_M,
-    LEFT,
     LOST,
-    RIGHT,
     SCAN,
-    floor_image,
+    WHERE,
+    dataset,
+    export,
     header,
-    pose,
     positions,
     write_floor_truth,
     write_recording,
+    write_scan,
 )
-from scannet_scans import WHERE, dataset, export, write_scan
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError, GroundTruthMissing
-from su3d_bench.core.types import Float64Array, UInt8Array
-from su3d_bench.datasets.recordings.source import SensorPair
+from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.scannet.dataset import ScanNet
 from su3d_bench.datasets.scannet.folders import PAPER_SCENES, split_scenes
 from su3d_bench.datasets.scannet.recordings import read_walk
-from su3d_bench.formats.images import UInt16Array
 
 
 @pytest.mark.parametrize(
@@ -113,59 +112,29 @@ def test_the_source_option_chooses_among_recording_and_export(tmp_path: Path) ->
         dataset(tmp_path, source="cpp").frames(SCAN, 1)
 
 
-class Poses:
+def poses_alone(poses: Sequence[np.ndarray], step: int = 1) -> Any:
     """A recording of poses alone."""
-
-    where = WHERE
-    camera = SensorPair((1, 1), (1, 1), np.eye(3), np.eye(3), np.eye(4), np.eye(4), 1.0)
-
-    def __init__(self, poses: Sequence[np.ndarray], step: int = 1) -> None:
-        self._poses, self._step = np.array(poses, float), step
-
-    def __len__(self) -> int:
-        return len(self._poses)
-
-    def poses(self) -> Float64Array:
-        return self._poses
-
-    def pose(self, i: int) -> Float64Array:
-        one: Float64Array = self._poses[i]
-        return one
-
-    def timestamp_s(self, i: int) -> float:
-        return float(i)
-
-    def colour(self, i: int) -> UInt8Array:
-        raise AssertionError
-
-    def depth(self, i: int) -> UInt16Array:
-        raise AssertionError
-
-    def frame_number(self, i: int) -> int:
-        return i * self._step
-
-    def files(self) -> Sequence[Path]:
-        return []
+    return SimpleNamespace(where=WHERE, poses=lambda: np.array(poses), numbers=np.arange(len(poses)) * step)
 
 
 def turned(angle: float) -> Float64Array:
-    matrix = np.eye(4)
-    matrix[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
-    return matrix
+    return np.array(
+        [[math.cos(angle), -math.sin(angle), 0, 0], [math.sin(angle), math.cos(angle), 0, 0], *np.eye(4)[2:]]
+    )
 
 
 def test_which_poses_are_lost() -> None:
     quarter = np.array([[0.0, -1, 0, 3], [1, 0, 0, 4], [0, 0, 1, 5], [0, 0, 0, 1]])
     nan, one_inf, zero = turned(0.1), turned(0.2), np.zeros((4, 4))
     nan[2, 3], one_inf[0, 1] = np.nan, np.inf
-    walk = read_walk(Poses([turned(0.3), LOST, nan, one_inf, zero, quarter]))
+    walk = read_walk(poses_alone([turned(0.3), LOST, nan, one_inf, zero, quarter]))
     assert walk.is_usable.tolist() == [True, False, False, False, False, True]
 
 
 def test_the_stride_counts_at_full_rate_whatever_an_export_left_out() -> None:
-    every_second = read_walk(Poses([turned(0.01 * i) for i in range(40)], step=2))
+    every_second = read_walk(poses_alone([turned(0.01 * i) for i in range(40)], step=2))
     assert every_second.numbers[every_second.every(10)].tolist() == [0, 10, 20, 30, 40, 50, 60, 70]
-    every_fourth = read_walk(Poses([turned(0.01 * i) for i in range(10)], step=4))
+    every_fourth = read_walk(poses_alone([turned(0.01 * i) for i in range(10)], step=4))
     assert every_fourth.numbers[every_fourth.every(10)].tolist() == [0, 12, 20, 32]
     assert every_fourth.every(1).tolist() == list(range(10))
 

@@ -8,13 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scannet_scan import (
-    SCAN,
-    pose,
-    positions,
-    write_recording,
-)
-from scannet_scans import WHERE, write_scan
+from recording_files import pose
+from scannet_scan import SCAN, WHERE, positions, write_recording, write_scan
 
 from su3d_bench.datasets.scannet.dataset import ScanNet
 from su3d_bench.datasets.scannet.truth import TABLE_NAME

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scannet_scan import SCAN, TABLE_ROWS, grid, table_text, write_json, write_mesh, write_truth
+from recording_files import grid, write_files, write_mesh
+from scannet_scan import SCAN, TABLE_ROWS, table_text, write_truth
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.scannet.truth import (
@@ -184,7 +185,7 @@ def test_a_triangle_of_three_instances_belongs_to_none(tmp_path: Path) -> None:
 def change_json(name: str, **values: object) -> Callable[[Path], object]:
     def change(folder: Path) -> None:
         content = json.loads((folder / name).read_text()) | values
-        write_json(folder / name, content)
+        write_files(folder, {name: content})
 
     return change
 
@@ -214,7 +215,7 @@ MESH, LABELS = mesh_name(SCAN), labels_name(SCAN)
     [
         (rewrite(AGGREGATION, "{"), f"{AGGREGATION}: not JSON"),
         (change_json(AGGREGATION, sceneId="scannet.scene0001_00"), "'sceneId' is 'scannet.scene0001_00', not 'scene00"),
-        (change_json(SEGMENT_FILE, segIndices=[-3] * 24), "'segIndices'[0] is -3; expected a segment id"),
+        (change_json(SEGMENT_FILE, segIndices=[-3] * 24), "segIndices.0: Input should be greater than"),
         (write_mesh_file(LABELS, move_m=0.1, label=True), f"{LABELS}: vertex 3 is at [1.6"),
     ],
 )

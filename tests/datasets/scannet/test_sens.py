@@ -8,7 +8,7 @@ import os
 import struct
 import tracemalloc
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -17,13 +17,11 @@ import cv2
 import numpy as np
 import pytest
 from damage import outcomes, truncations
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from places import CASES
 from scannet_scan import colour_content, depth_content
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.datasets.scannet.sens import MOTION_RECORD, SensFile, SensFrame, SensHeader, SensSource, write_sens
+from su3d_bench.datasets.scannet.sens import SensFile, SensFrame, SensHeader, write_sens
 
 TOY, RAW_TOY = CASES / "sens01_toy.sens", CASES / "sens02_toy_raw.sens"
 WHERE = "scannet/scene0000_00"
@@ -68,15 +66,10 @@ def frames(header: SensHeader, n: int) -> Iterator[SensFrame]:
         yield SensFrame(pose, 33_333 * i, 33_333 * i + 7, colour, depth_content(values, header.depth_compression))
 
 
-def stored(frames: Iterable[SensFrame]) -> Iterator[bytes]:
-    return (frame.stored for frame in frames)
-
-
-def stored_frame(file: SensFile, i: int) -> SensFrame:
-    """Frame ``i`` of a recording with its images as stored."""
-    record = file.record(i)
-    times = record.colour_timestamp, record.depth_timestamp
-    return SensFrame(record.camera_to_world, *times, file.colour_bytes(i), file.depth_bytes(i))
+def stored_frame(file: SensFile, i: int) -> bytes:
+    """Frame ``i`` of a recording as stored."""
+    pose, colour_time, depth_time = file.records()[i].tolist()[:3]
+    return SensFrame(np.array(pose), colour_time, depth_time, file.colour_bytes(i), file.depth_bytes(i)).stored
 
 
 # ---------------------------------------------------------------- what the original readers found
@@ -86,10 +79,8 @@ def test_the_toy_recording_is_read_as_the_original_readers_did(expected: dict[st
     file = SensFile(TOY, WHERE)
     assert len(file) == 4
     for i in range(4):
-        np.testing.assert_array_equal(file.record(i).camera_to_world, expected["pose"][i])
         np.testing.assert_array_equal(file.depth(i), expected["depth"][i])
         np.testing.assert_array_equal(file.colour(i), expected["decoded_color_pil"][i])
-    assert np.isneginf(file.record(2).camera_to_world).all()
     np.testing.assert_array_equal(file.poses(), expected["pose"])
     assert file.depth(0).dtype == np.uint16 and file.colour(0).dtype == np.uint8
     for name, key in (("intrinsic", "K"), ("extrinsic", "E")):
@@ -97,14 +88,11 @@ def test_the_toy_recording_is_read_as_the_original_readers_did(expected: dict[st
             np.testing.assert_array_equal(getattr(file.header, f"{name}_{ours}"), expected[f"{key}_{theirs}"])
 
 
-def test_the_toy_recording_has_its_time_stamps_and_motion_data(recorded: dict[str, list[list[int]]]) -> None:
+def test_the_toy_recording_has_its_time_stamps(recorded: dict[str, list[list[int]]]) -> None:
     file = SensFile(TOY, WHERE)
-    stamps = [[file.record(i).colour_timestamp, file.record(i).depth_timestamp] for i in range(4)]
-    assert stamps == recorded["timestamps"]
-    assert (file.n_imu, file.motion()["timestamp"].tolist()) == (2, [1000, 1001])
-    assert file.motion()["rotation_rate"].shape == (2, 3)
-    source = SensSource(TOY, WHERE)
-    assert source.timestamp_s(1) - source.timestamp_s(0) == pytest.approx(0.033333, abs=1e-9)
+    records = file.records()
+    assert [[row["colour_timestamp"], row["depth_timestamp"]] for row in records] == recorded["timestamps"]
+    assert file.timestamp_s(1) - file.timestamp_s(0) == pytest.approx(0.033333, abs=1e-9)
 
 
 @pytest.mark.parametrize("path", [TOY, RAW_TOY], ids=["jpeg", "raw"])
@@ -112,8 +100,8 @@ def test_a_recording_written_again_is_the_same_to_the_byte(
     tmp_path: Path, path: Path, recorded: dict[str, object]
 ) -> None:
     file = SensFile(path, WHERE)
-    motion = file.motion() if file.has_motion else None
-    write_sens(tmp_path / "again.sens", file.header, (stored_frame(file, i).stored for i in range(len(file))), motion)
+    end = path.read_bytes()[N_HEADER + sum(len(stored_frame(file, i)) for i in range(len(file))) :]
+    write_sens(tmp_path / "again.sens", file.header, (stored_frame(file, i) for i in range(len(file))), end)
     content = (tmp_path / "again.sens").read_bytes()
     assert content == path.read_bytes()
     if path == TOY:
@@ -145,23 +133,12 @@ def test_every_compression_gives_the_images_back(tmp_path: Path, colour: str, de
         np.testing.assert_array_equal(file.colour(0), rgb)
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(order=st.permutations(range(12)), n_imu=st.one_of(st.none(), st.integers(0, 3)))
-def test_frames_in_any_order_are_those_in_order(tmp_path: Path, order: list[int], n_imu: int | None) -> None:
-    motion = None if n_imu is None else np.zeros(n_imu, MOTION_RECORD)
-    write_sens(tmp_path / "a.sens", header(), stored(frames(header(), 12)), motion)
-    file = SensFile(tmp_path / "a.sens", WHERE)
-    assert (file.n_imu, file.has_motion, len(file.motion())) == (n_imu or 0, motion is not None, n_imu or 0)
-    in_order = list(frames(header(), 12))
+def test_frames_are_read_in_any_order_from_several_threads(tmp_path: Path) -> None:
+    in_order = [frame.stored for frame in frames(header(), 12)]
+    write_sens(tmp_path / "a.sens", header(), in_order)
+    file, order = SensFile(tmp_path / "a.sens", WHERE), [7, 0, 11, 3, 3, 10, 1, 5]
     with ThreadPoolExecutor(3) as pool:
-        found = list(pool.map(lambda i: stored_frame(file, i), order))
-    for i, one in zip(order, found, strict=True):
-        assert (one.colour, one.depth, one.colour_timestamp) == (
-            in_order[i].colour,
-            in_order[i].depth,
-            in_order[i].colour_timestamp,
-        )
-        np.testing.assert_array_equal(one.camera_to_world, in_order[i].camera_to_world)
+        assert list(pool.map(lambda i: stored_frame(file, i), order)) == [in_order[i] for i in order]
 
 
 # ---------------------------------------------------------------- damage
@@ -177,14 +154,10 @@ def test_each_fault_of_a_header_is_one_line_with_its_value(tmp_path: Path) -> No
     toy = TOY.read_bytes()
     faults = {
         b"": "has 0 bytes, too few for a .sens file",
-        struct.pack("<I", 3) + toy[4:]: "version 3, a .sens file without motion data; export it",
-        struct.pack("<I", 1) + toy[4:]: "version 1, a .sensor file; export it",
-        b"solid" + toy[5:]: "not a .sens file, its version would be 1768714099; expected 4",
+        struct.pack("<I", 3) + toy[4:]: "not a .sens file of version 4, its version would be 3",
         toy[:4] + struct.pack("<Q", 10**15) + toy[12:]: "byte 4: the header with a sensor name of 1000000000000000",
         toy[: N_HEADER - 1]: "byte 4: the header with a sensor name of 15 bytes does not fit into the file",
-        toy[:12] + b"\xff\xfe" + toy[14:]: "byte 12: the sensor's name is not text",
         behind_name(toy, 256, struct.pack("<i", -1)): "colour compression -1; known: 0 (raw), 1 (png), 2 (jpeg)",
-        behind_name(toy, 260, struct.pack("<i", 2)): "depth is compressed with OCCI (code 2)",
         behind_name(toy, 260, struct.pack("<i", 9)): "depth compression 9; known: 0 (raw), 1 (zlib)",
         behind_name(toy, 264, struct.pack("<2I", 2**32 - 1, 2**32 - 1)): "colour images of 4294967295x4294967295",
         behind_name(toy, 272, struct.pack("<I", 0)): "depth images of 0x24",
@@ -192,7 +165,6 @@ def test_each_fault_of_a_header_is_one_line_with_its_value(tmp_path: Path) -> No
         behind_name(toy, 284, struct.pack("<Q", 10**12)): "promises 1000000000000 frames of 96 or more bytes, but only",
         behind_name(toy, 284, struct.pack("<Q", 3)): "the file goes on for 2973 bytes behind the last frame",
         toy + b"\0": "of which 2 records take 264; it is longer than it should be",
-        toy[:-1]: "the file goes on for 263 bytes behind the last frame",
     }
     for content, message in faults.items():
         with pytest.raises(DataError) as caught:
@@ -203,18 +175,14 @@ def test_each_fault_of_a_header_is_one_line_with_its_value(tmp_path: Path) -> No
 
 def with_frame(tmp_path: Path, **changes: bytes) -> SensFile:
     """A recording of three frames of which the second has other images."""
-    all_frames = list(frames(header(), 3))
-    all_frames[1] = replace(all_frames[1], **changes)  # type: ignore[arg-type]
-    write_sens(tmp_path / "bad.sens", header(), stored(all_frames))
+    first, second, third = frames(header(), 3)
+    changed = replace(second, **changes)  # type: ignore[arg-type]
+    write_sens(tmp_path / "bad.sens", header(), [first.stored, changed.stored, third.stored])
     return SensFile(tmp_path / "bad.sens", WHERE)
 
 
 def jpeg(width: int, height: int) -> bytes:
     return colour_content(np.zeros((height, width, 3), np.uint8), "jpeg")
-
-
-def png(width: int, height: int) -> bytes:
-    return colour_content(np.zeros((height, width, 3), np.uint8), "png")
 
 
 @pytest.mark.parametrize(
@@ -258,20 +226,19 @@ def test_a_depth_image_that_is_unfit_is_named_and_never_unpacked_further(
         tracemalloc.stop()
 
 
-@pytest.mark.parametrize("size", [10**15, 2**64 - 1, 2**63])
-@pytest.mark.parametrize("which", [0, 8], ids=["colour", "depth"])
-def test_a_promise_of_an_enormous_image_allocates_nothing(tmp_path: Path, size: int, which: int) -> None:
+@pytest.mark.parametrize(
+    ("at", "number"),
+    [
+        (START_OF_SIZES, 2**64 - 1),  # bytes of a colour image
+        (START_OF_SIZES + 8, 2**63),  # of a depth image
+        (-8, 2**64 - 1),  # frames
+        (-8, 200),
+    ],
+)
+def test_a_promise_of_too_much_allocates_nothing(tmp_path: Path, at: int, number: int) -> None:
     toy = bytearray(TOY.read_bytes())
-    toy[N_HEADER + START_OF_SIZES + which : N_HEADER + START_OF_SIZES + which + 8] = struct.pack("<Q", size)
+    toy[N_HEADER + at : N_HEADER + at + 8] = struct.pack("<Q", number)
     assert refused_within_a_megabyte(lambda: opened(tmp_path / "bad.sens", bytes(toy)))
-    with pytest.raises(DataError, match=rf"frame 0 of 4 at byte {N_HEADER}: its images of .* do not fit"):
-        opened(tmp_path / "bad.sens", bytes(toy))
-
-
-@pytest.mark.parametrize("n_frames", [10**12, 2**64 - 1, 200])
-def test_a_promise_of_too_many_frames_allocates_nothing(tmp_path: Path, n_frames: int) -> None:
-    content = behind_name(TOY.read_bytes(), 284, struct.pack("<Q", n_frames))
-    assert refused_within_a_megabyte(lambda: opened(tmp_path / "bad.sens", content))
 
 
 def refused_within_a_megabyte(read: Callable[[], object]) -> bool:
@@ -285,24 +252,17 @@ def refused_within_a_megabyte(read: Callable[[], object]) -> bool:
 
 
 def test_a_missing_file_a_folder_and_a_pipe_are_data_errors(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"none\.sens is missing; copy the recording"):
-        SensFile(tmp_path / "none.sens", WHERE)
     (tmp_path / "folder.sens").mkdir()
     os.mkfifo(tmp_path / "pipe.sens")
-    for name in ("folder.sens", "pipe.sens"):
-        with pytest.raises(
-            DataError, match=rf"{name}: cannot be read: (Is a directory|a pipe stands where a file should be)"
-        ):
+    for name in ("none.sens", "folder.sens", "pipe.sens"):
+        with pytest.raises(DataError, match=rf"{name}: cannot be read: "):
             SensFile(tmp_path / name, WHERE)
 
 
 @pytest.mark.parametrize("path", [TOY, pytest.param(RAW_TOY, marks=pytest.mark.proof)], ids=["jpeg", "raw"])
 def test_a_recording_cut_short_anywhere_is_refused(tmp_path: Path, path: Path) -> None:
     content = path.read_bytes()
-    whole = SensFile(path, WHERE)
-    end_of_frames = len(content) - (8 + 128 * whole.n_imu)
     n_read, n_refused = outcomes(
         lambda copy: opened(tmp_path / "cut.sens", copy), truncations(content), must_name=f"{WHERE}: cut.sens"
     )
     assert (n_read, n_refused) == (1, len(content) - 1)  # without the block of motion data it is a whole recording
-    assert len(opened(tmp_path / "cut.sens", content[:end_of_frames])) == len(whole)

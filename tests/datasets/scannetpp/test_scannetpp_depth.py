@@ -16,7 +16,6 @@ from su3d_bench.datasets.scannetpp.images import (
     DepthFile,
     NotLz4,
     millimetres,
-    packed_metres,
     unpacked_block,
 )
 
@@ -68,15 +67,6 @@ def test_all_images_in_one_stream_are_read_in_any_order(tmp_path: Path) -> None:
         np.testing.assert_array_equal(depth.values(number), expected)
     with pytest.raises(DataError, match=r"^here: depth.bin: has fewer images, frame 4 is not among them"):
         depth.values(4)
-
-
-def test_what_is_packed_is_unpacked_to_the_same_millimetres() -> None:
-    every = np.arange(65536, dtype=np.uint16)
-    for values in (np.resize(every[:49152], SHAPE), np.resize(every[16384:], SHAPE)):
-        packed = packed_metres(values)
-        assert int.from_bytes(packed[:4], "little") == len(packed) - 4
-        depth_m = np.frombuffer(zlib.decompress(packed[4:], wbits=-15), np.float32)
-        np.testing.assert_array_equal((depth_m * 1000).astype(np.uint16), values.reshape(-1))  # as the toolkit does
 
 
 @pytest.mark.parametrize("content", [b"nothing of the kind", raw(b"\0" * 1000), raw(b"\0" * 4 * 49152)[:-3]])

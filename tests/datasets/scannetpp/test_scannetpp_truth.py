@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from places import CASES
-from scannet_scan import grid
+from recording_files import grid
 from scannetpp_scene import MAP, NAMES, write_lists, write_scans
 
 from su3d_bench.core.errors import DataError
@@ -89,9 +89,9 @@ def test_the_surface_of_an_object_is_that_of_most_corners(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("name", "text", "line"),
     [
-        ("segments.json", '{"segIndices": [1, 2, -1]}', r"'segIndices'\[2\] is -1; expected a segment id"),
+        ("segments.json", '{"segIndices": [1, 2, -1]}', "segIndices.2: Input should be greater than"),
         ("segments.json", '{"segIndices": [1, 2]}', "has 2 vertices, mesh_aligned_0.05.ply has 3; they belong to two"),
-        ("segments_anno.json", '{"segGroups": [{"segments": [1]}]}', "group 0: 'label' is None; expected a word"),
+        ("segments_anno.json", '{"segGroups": [{"segments": [1]}]}', "segGroups.0.label: Field required"),
         ("mesh_aligned_0.05_mask.txt", "3\n", "'3' is no vertex of mesh_aligned_0.05.ply, which has 3"),
     ],
 )

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from places import CASES
-from scannet_scan import SCAN
-from scannet_scans import write_scan
+from scannet_scan import SCAN, write_scan
 from scored_room import ENCODER, instances, nothing, room, truth_as_prediction
 
 from su3d_bench.core.errors import DataError

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-
-from su3d_bench.formats.images import png_bytes
-from su3d_bench.formats.ply import PlyElement, write_ply
+from recording_files import write_files
 
 SCENE, SHORT = "00824-Dd4bFSTQ8gi", "Dd4bFSTQ8gi"
 SIZE = WIDTH, HEIGHT = 8, 6
@@ -19,37 +17,22 @@ POSES = [np.eye(4), np.array([[0.0, 0, 1, 0.5], [0, 1, 0, 1.5], [-1, 0, 0, 0], [
 OBJECTS = ((3, "chair", "0A0B0C", CHAIR), (7, "wall", "FFEEDD", WALL))
 
 
-def write_points(path: Path, points: np.ndarray) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    columns = {name: np.asarray(points, np.float64)[:, i] for i, name in enumerate("xyz")}
-    write_ply(path, [PlyElement("vertex", len(points), columns)])
-
-
 def write_walk(root: Path) -> Path:
     """The walk, and the annotation of its scene in the release; the walk's folder."""
     folder = root / "hm3dsem_walks/val" / SCENE
-    for kind in ("rgb", "depth", "pose"):
-        (folder / kind).mkdir(parents=True)
+    files: dict[str, Any] = {f"objects/{key}.ply": points for key, _, _, points in OBJECTS}
     for k, pose in enumerate(POSES):
-        rgb = np.full((HEIGHT, WIDTH, 3), (10 * k, 20, 30), np.uint8)
-        (folder / f"rgb/{SHORT}_{k:06d}.png").write_bytes(png_bytes(rgb))
-        depth = np.arange(HEIGHT * WIDTH, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 50
-        (folder / f"depth/{SHORT}_{k:06d}.png").write_bytes(png_bytes(depth))
-        line = "\t".join(str(value) for value in pose.reshape(-1).tolist())
-        (folder / f"pose/{SHORT}_{k:06d}.txt").write_text(line + "\n")
-    for key, _, _, points in OBJECTS:
-        write_points(folder / f"objects/{key}.ply", points)
-    (folder / "scene_info.json").write_text(json.dumps(info()))
-    release = root / "hm3d/val" / SCENE
-    release.mkdir(parents=True)
+        files[f"rgb/{SHORT}_{k:06d}.png"] = np.full((HEIGHT, WIDTH, 3), (10 * k, 20, 30), np.uint8)
+        files[f"depth/{SHORT}_{k:06d}.png"] = np.arange(HEIGHT * WIDTH, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 50
+        files[f"pose/{SHORT}_{k:06d}.txt"] = "\t".join(str(value) for value in pose.reshape(-1).tolist()) + "\n"
+    write_files(folder, files | {"scene_info.json": info()})
     lines = ["HM3D Semantic Annotations", *(f'{key},{colour},"{name}",5' for key, name, colour, _ in OBJECTS)]
-    (release / f"{SHORT}.semantic.txt").write_text("\n".join(lines) + "\n")
+    write_files(root / "hm3d/val" / SCENE, {f"{SHORT}.semantic.txt": "\n".join(lines) + "\n"})
     return folder
 
 
 def info() -> dict[str, list[dict[str, object]]]:
     """What stands in ``scene_info.json``."""
-    ids = [key for key, *_ in OBJECTS]
     room = {"id": 5, "floor_id": 0, "voted_category": "office", "category": None, "min_height": 0.0, "max_height": 2.4}
     objects = [
         {
@@ -60,8 +43,8 @@ def info() -> dict[str, list[dict[str, object]]]:
         for key, name, colour, points in OBJECTS
     ]  # fmt: skip
     return {
-        "levels": [{"id": 0, "lower": 0.0, "upper": 2.4, "regions": [5], "objects": ids}],
-        "regions": [room | {"mean_height": 1.0, "bev_region_points": ROOM.tolist(), "objects": ids}],
+        "levels": [{"id": 0, "lower": 0.0, "upper": 2.4}],
+        "regions": [room | {"mean_height": 1.0, "bev_region_points": ROOM.tolist()}],
         "objects": objects,
     }
 
@@ -69,14 +52,13 @@ def info() -> dict[str, list[dict[str, object]]]:
 def write_graph(folder: Path, n_dimensions: int = 4) -> Path:
     """A scene graph that is right: one floor, one room, both objects; its folder."""
     corners = [[x, y, z] for x in (-1.0, 1.0) for y in (0.0, 2.4) for z in (-3.0, -1.0)]
-    floor = {"floor_id": "0", "name": "floor_0", "rooms": ["0_0"], "vertices": corners, "floor_height": 2.4}
+    floor = {"floor_id": "0", "rooms": ["0_0"], "vertices": corners, "floor_height": 2.4, "floor_zero_level": 0.0}
     room = {"room_id": "0_0", "name": "office", "floor_id": "0", "room_height": 2.4, "room_zero_level": 0.0}
-    tables = {"floors/0": (ROOM, floor | {"floor_zero_level": 0.0}), "rooms/0_0": (ROOM, room | {"embeddings": []})}
+    files: dict[str, Any] = {"floors/0.json": floor, "floors/0.ply": ROOM, "rooms/0_0.ply": ROOM}
+    files["rooms/0_0.json"] = room | {"embeddings": []}
     for k, (_, name, _, points) in enumerate(OBJECTS):
         feature = np.eye(n_dimensions)[k].tolist()
         table = {"object_id": f"0_0_{k}", "room_id": "0_0", "name": name, "embedding": feature}
-        tables[f"objects/0_0_{k}"] = points, table
-    for name, (points, table) in tables.items():
-        write_points(folder / f"{name}.ply", points)
-        (folder / f"{name}.json").write_text(json.dumps(table))
+        files |= {f"objects/0_0_{k}.ply": points, f"objects/0_0_{k}.json": table}
+    write_files(folder, files)
     return folder

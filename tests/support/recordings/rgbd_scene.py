@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
+from recording_files import text_of, turn, write_files
 
 from su3d_bench.core.config import write_toml
 from su3d_bench.datasets.rgbd.dataset import Rgbd
 
 WIDTH, HEIGHT = 12, 8
-
-
 CAMERA = {"width": WIDTH, "height": HEIGHT, "intrinsic_matrix": [6.0, 0, 0, 0, 6.5, 0, 5.5, 3.5, 1]}
-
-
 NUMBERED: dict[str, Any] = {
     "folder": "data",
     "colour": "colour/frame-{index}.png",
@@ -27,45 +22,27 @@ NUMBERED: dict[str, Any] = {
     "intrinsics": [6.0, 6.5, 5.5, 3.5],
     "depth_unit_m": 0.001,
 }
-
-
 Change = Callable[[Path], object]
-
-
-def pose(index: int) -> np.ndarray:
-    matrix = np.eye(4)
-    angle = 0.1 * index
-    matrix[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    matrix[:3, 3] = index, 1 / 3, -index
-    return matrix
 
 
 def depth_values(index: int) -> np.ndarray:
     return np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 600 + index
 
 
-def text_of(matrix: np.ndarray) -> str:
-    return "\n".join(" ".join(repr(float(value)) for value in row) for row in matrix) + "\n"
-
-
 def log_of(indices: range) -> str:
-    return "".join(f"{k} {k} {k + 1}\n{text_of(pose(k))}" for k in indices)
+    return "".join(f"{k} {k} {k + 1}\n{text_of(turn(k))}" for k in indices)
 
 
-def write_scene(root: Path, n_frames: int = 3, description: dict[str, Any] | None = None, **changes: Any) -> Path:
+def write_scene(root: Path, n_frames: int = 3, **changes: Any) -> Path:
     """A scene 'desk' with images, pose files and every kind of trajectory and camera file; None drops a key."""
     folder = root / "rgbd" / "desk"
-    for name in ("colour", "depth"):
-        (folder / "data" / name).mkdir(parents=True, exist_ok=True)
+    files: dict[str, Any] = {"trajectory.log": log_of(range(n_frames)), "camera.json": CAMERA}
     for index in range(n_frames):
-        colour = np.full((HEIGHT, WIDTH, 3), (30, 120, 200), np.uint8)
-        cv2.imwrite(str(folder / f"data/colour/frame-{index}.png"), colour)
-        cv2.imwrite(str(folder / f"data/depth/frame-{index}.png"), depth_values(index))
-        (folder / f"data/frame-{index}.pose.txt").write_text(text_of(pose(index)))
-    (folder / "data/trajectory.log").write_text(log_of(range(n_frames)))
-    (folder / "data/camera.json").write_text(json.dumps(CAMERA) + "\n")
-    (folder / "data/intrinsics.txt").write_text("6 0 5.5\n0 6.5 3.5\n0 0 1\n")
-    describe(folder, {**(description or NUMBERED), "check_convention": False, **changes})
+        files[f"colour/frame-{index}.png"] = np.full((HEIGHT, WIDTH, 3), (200, 120, 30), np.uint8)
+        files[f"depth/frame-{index}.png"] = depth_values(index)
+        files[f"frame-{index}.pose.txt"] = text_of(turn(index))
+    write_files(folder / "data", files | {"intrinsics.txt": "6 0 5.5\n0 6.5 3.5\n0 0 1\n"})
+    describe(folder, {**NUMBERED, "check_convention": False, **changes})
     return folder
 
 
