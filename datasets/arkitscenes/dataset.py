@@ -16,6 +16,7 @@ from su3d_bench.core.errors import FramesMissing, GroundTruthMissing
 from su3d_bench.core.types import Frame, GroundTruth, Surface
 from su3d_bench.datasets.arkitscenes import challenge as challenge_files
 from su3d_bench.datasets.arkitscenes import frames
+from su3d_bench.datasets.arkitscenes.frames import PhoneRecording
 from su3d_bench.datasets.recordings import meshes
 from su3d_bench.datasets.recordings.file_dataset import FileDataset, faults_of, keeps_last, sizes_and_ends
 from su3d_bench.datasets.recordings.recorded_frames import reading
@@ -157,7 +158,7 @@ class ArkitScenes(FileDataset[ArkitScenesOptions]):
         )
 
     @keeps_last
-    def recording(self, scene: str) -> frames.PhoneRecording:
+    def recording(self, scene: str) -> PhoneRecording:
         deeper = self.folder(scene) / f"{scene}_frames"
         folder = deeper if deeper.is_dir() else self.folder(scene)
         options = self.options

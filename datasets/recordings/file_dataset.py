@@ -69,17 +69,20 @@ def folders_in(root: Path, names: Iterable[str]) -> Iterator[tuple[Path, list[Pa
 
 @dataclass(frozen=True)
 class SceneTree:
-    """``places``: the folders with scenes; ``folder_of`` each; ``made``: those that ``datasets make`` rendered."""
+    """``places``: the folders with scenes; ``folders`` of each, the first place first; ``made``: those that
+    ``datasets make`` rendered."""
 
     root: Path
     places: tuple[Path, ...]
-    folder_of: Mapping[str, Path]
-    made: frozenset[str]
+    folders: Mapping[str, tuple[Path, ...]]
+    made: frozenset[str] = frozenset()
 
 
-def find_scenes(root: Path, names: Iterable[str], is_scene: Callable[[Path], bool]) -> SceneTree:
-    """The scenes in folders of these names below ``root``, each in the first; none is no error here."""
-    folder_of: dict[str, Path] = {}
+def find_scenes(
+    root: Path, names: Iterable[str], is_scene: Callable[[Path], bool], first: Sequence[str] = ()
+) -> SceneTree:
+    """The scenes in folders of these names below ``root``, those of ``first`` before all others; none is no error."""
+    folders: dict[str, tuple[Path, ...]] = {}
     places, made = [], set[str]()
     for place, children in folders_in(root, names):
         scenes = [child for child in children if is_scene(child)]
@@ -88,8 +91,9 @@ def find_scenes(root: Path, names: Iterable[str], is_scene: Callable[[Path], boo
             places.append(place)
             made |= {scene.name for scene in scenes if scene.name in rooms}
         for scene in scenes:
-            folder_of.setdefault(scene.name, scene)
-    return SceneTree(root, tuple(places), dict(sorted(folder_of.items())), frozenset(made))
+            folders[scene.name] = (*folders.get(scene.name, ()), scene)
+    order = dict.fromkeys([scene for scene in first if scene in folders] + sorted(folders))
+    return SceneTree(root, tuple(places), {scene: folders[scene] for scene in order}, frozenset(made))
 
 
 def keeps_last(method: Callable[[DatasetT, str], Answer]) -> Callable[[DatasetT, str], Answer]:
@@ -169,12 +173,12 @@ class FileDataset(ABC, Generic[OptionsT]):
     def tree(self) -> SceneTree:
         """Where the scenes are; a ``ScenesMissing`` that says how to get data where there are none."""
         tree = self.find_tree()
-        if not tree.folder_of:
+        if not tree.folders:
             raise ScenesMissing(f"{self.name}: no scene in {self.root}{self.how_to_get}")
         return tree
 
     def scenes(self) -> Sequence[str]:
-        return tuple(self.tree.folder_of)
+        return tuple(self.tree.folders)
 
     def places(self) -> Sequence[Path]:
         """Where scenes are, or else would be looked for first."""
@@ -240,10 +244,10 @@ class FileDataset(ABC, Generic[OptionsT]):
 
     def folder(self, scene: str) -> Path:
         """The folder of a scene; a ``DataError`` where there is none."""
-        if scene not in self.tree.folder_of:
-            hint = suggest(scene, list(self.tree.folder_of), f"{self.tree.places[0]} has")
+        if scene not in self.tree.folders:
+            hint = suggest(scene, list(self.tree.folders), f"{self.tree.places[0]} has")
             raise DataError(f"{self.name}: no scene '{scene}'{hint}")
-        return self.tree.folder_of[scene]
+        return self.tree.folders[scene][0]
 
 
 class RecordedDataset(FileDataset[OptionsT]):

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -66,14 +65,12 @@ class Finding:
         the pose with its direction and axes changed.
         """
         direction, axes = "pose_direction", "camera_axes"
-        of_motion: Mapping[Motion, tuple[str, ...]] = MappingProxyType(
-            {
-                "as read": (),
-                "inverse": (direction,) if camera_axes == "opencv" else (direction, axes),
-                "other axes": (axes,),
-                "inverse and other axes": (direction, axes) if camera_axes == "opencv" else (direction,),
-            }
-        )
+        of_motion: Mapping[Motion, tuple[str, ...]] = {
+            "as read": (),
+            "inverse": (direction,) if camera_axes == "opencv" else (direction, axes),
+            "other axes": (axes,),
+            "inverse and other axes": (direction, axes) if camera_axes == "opencv" else (direction,),
+        }
         return of_motion[self.motion]
 
 
@@ -107,11 +104,12 @@ def judge_scene(dataset: Dataset, scene: str, frames: Sequence[Frame] | None = N
 def _in_words(finding: Finding) -> str:
     if finding.depth_factor != 1:
         return f"with depth times {finding.depth_factor:g}; check the unit of the depth"
-    if finding.motion == "inverse":
-        return "with the inverse poses; check whether they are camera-to-world or world-to-camera"
-    if finding.motion == "other axes":
-        return "with OpenGL's camera axes for OpenCV's, or the reverse; check the axes of the poses"
-    return "with the inverse poses and OpenGL's camera axes for OpenCV's, or the reverse; check both"
+    words: Mapping[Motion, str] = {
+        "inverse": "the inverse poses; check whether they are camera-to-world or world-to-camera",
+        "other axes": "OpenGL's camera axes for OpenCV's, or the reverse; check the axes of the poses",
+        "inverse and other axes": "the inverse poses and OpenGL's camera axes for OpenCV's, or the reverse; check both",
+    }
+    return f"with {words[finding.motion]}"
 
 
 def _doubt(shares: Float64Array) -> str | None:

@@ -269,15 +269,14 @@ class ExportedFrames:
     camera_files: Sequence[str]
     size_reason: str
 
+    def __post_init__(self) -> None:
+        self.numbers: Int64Array = np.array([frame.number for frame in self.frames], np.int64)
+
     def __len__(self) -> int:
         return len(self.frames)
 
     def pose(self, i: int) -> Float64Array:
         return read_matrix(self.folder, self.frames[i].pose, self.where)
-
-    @cached_property
-    def numbers(self) -> Int64Array:
-        return np.array([frame.number for frame in self.frames], np.int64)
 
     def poses(self) -> Float64Array:
         return np.array([self.pose(i) for i in range(len(self))]).reshape(-1, 4, 4)

@@ -186,7 +186,7 @@ class Replica(FileDataset[NoOptions]):
         released = self._released_truths(scene)
         paths += [path for files in released.values() for path in files]
         if released["openmask3d"] or released["ovo-51"]:
-            paths += [mesh.path for mesh in self._labelled_meshes(scene)]
+            paths += self._labelled_meshes(scene).values()
         return tuple(path for path in dict.fromkeys(paths) if path.exists())
 
     def _released_truths(self, scene: str) -> dict[str, tuple[Path, ...]]:
@@ -207,13 +207,11 @@ class Replica(FileDataset[NoOptions]):
             return folders.find_label_file(self.root, scene, folders.INSTANCE_FOLDERS, "instance_labels_")
         return folders.find_label_file(self.root, scene, folders.SEMANTIC_LABEL_FOLDERS, "semantic_labels_")
 
-    def _labelled_meshes(self, scene: str) -> list[truth.LabelledMesh]:
+    def _labelled_meshes(self, scene: str) -> dict[str, Path]:
         """The meshes whose vertices a label file may describe, that of the render first, as the authors used it."""
         original, render = folders.find_original_scene(self.root, scene), self._render_mesh(scene)
-        meshes = [truth.LabelledMesh(render, render.name)]
-        if original is not None:
-            meshes.append(truth.LabelledMesh(original / truth.MESH_NAME, truth.MESH_NAME))
-        return [mesh for mesh in meshes if mesh.path.exists()]
+        meshes = {render.name: render} | ({} if original is None else {truth.MESH_NAME: original / truth.MESH_NAME})
+        return {name: path for name, path in meshes.items() if path.exists()}
 
     def _label_file_truth(self, scene: str, variant: str) -> GroundTruth:
         path, where = self._label_file(scene, variant), self.where(scene)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 import re
 from array import array
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -209,22 +209,14 @@ OVO_CLASSES = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class LabelledMesh:
-    """A mesh whose vertices a label file may describe; ``name`` is what messages call it."""
-
-    path: Path
-    name: str
-
-
-def instance_file_truth(path: Path, meshes: Sequence[LabelledMesh], where: str) -> GroundTruth:
+def instance_file_truth(path: Path, meshes: Mapping[str, Path], where: str) -> GroundTruth:
     """Instances of a ``class id * 1000 + instance`` file on the vertices of the first of ``meshes`` that has as many.
 
     Values below 1000 and those of the undefined class 256 are void. Each other value is an instance, one ending in
     000 too, as ScanNet's evaluation has it; instances are numbered from 1 in the order of their values, because two
     classes may use the same number.
     """
-    values, mesh = _labels_of_mesh(path, meshes, where)
+    values, name = _labels_of_mesh(path, meshes, where)
     distinct, inverse = np.unique(values, return_inverse=True)
     label = distinct // INSTANCES_PER_CLASS
     if label[0] < 0:
@@ -245,22 +237,22 @@ def instance_file_truth(path: Path, meshes: Sequence[LabelledMesh], where: str) 
             f"{INSTANCES_PER_CLASS - 1}"
         )
     return GroundTruth(
-        _vertices(mesh, where),
+        _vertices(meshes[name], f"{where}: {name}"),
         np.where(is_void, 0, label).astype(np.int32)[inverse],
         number.astype(np.int32)[inverse],
         replica_label_set(),
         "openmask3d",
-        f"{path.parent.name}/{path.name}, class id * {INSTANCES_PER_CLASS} + instance of each vertex of {mesh.name}",
+        f"{path.parent.name}/{path.name}, class id * {INSTANCES_PER_CLASS} + instance of each vertex of {name}",
     )
 
 
-def class_file_truth(path: Path, meshes: Sequence[LabelledMesh], where: str) -> GroundTruth:
+def class_file_truth(path: Path, meshes: Mapping[str, Path], where: str) -> GroundTruth:
     """Classes of a file of Replica's ids on the vertices of the first of ``meshes`` that has as many; no instances.
 
     Any number that is none of the 51 and does not stand for 'no class' is refused: it would mean another numbering,
     such as 0 to 50 in the order of OpenNeRF's evaluation, and every label would be wrong.
     """
-    values, mesh = _labels_of_mesh(path, meshes, where)
+    values, name = _labels_of_mesh(path, meshes, where)
     foreign = np.setdiff1d(values, (*OVO_CLASSES, *CLASSLESS))
     if len(foreign):
         raise DataError(
@@ -268,41 +260,43 @@ def class_file_truth(path: Path, meshes: Sequence[LabelledMesh], where: str) -> 
             "evaluation; a file numbered 0 to 50 must be brought back to Replica's ids first"
         )
     return GroundTruth(
-        _vertices(mesh, where),
+        _vertices(meshes[name], f"{where}: {name}"),
         np.where(np.isin(values, OVO_CLASSES), values, 0).astype(np.int32),
         np.zeros(len(values), np.int32),
         replica_label_set(),
         "ovo-51",
-        f"{path.parent.name}/{path.name}, the class of each vertex of {mesh.name}",
+        f"{path.parent.name}/{path.name}, the class of each vertex of {name}",
     )
 
 
-def _labels_of_mesh(path: Path, meshes: Sequence[LabelledMesh], where: str) -> tuple[Int32Array, LabelledMesh]:
-    """The labels, and the mesh that has as many vertices; a ``DataError`` that names all counts where none has."""
-    n_vertices = [_n_vertices(mesh, where) for mesh in meshes]
+def _labels_of_mesh(path: Path, meshes: Mapping[str, Path], where: str) -> tuple[Int32Array, str]:
+    """The labels, and the name of the mesh that has as many vertices; a ``DataError`` with all counts where none has.
+
+    ``meshes``: those that the file may describe by what messages call them.
+    """
+    n_vertices = {name: _n_vertices(mesh, f"{where}: {name}") for name, mesh in meshes.items()}
     if not n_vertices:
         raise DataError(
             f"{where}: {path.name}: labels the vertices of a mesh, but neither the mesh of the render nor that of the "
             "original release is here; copy one of them"
         )
-    values, n_lines = read_whole_numbers(path, max(n_vertices), f"{where}: {path.name}")
-    for mesh, n in zip(meshes, n_vertices, strict=True):
-        if 0 < n == n_lines:
-            return values, mesh
-    counts = " and ".join(f"{mesh.name} {n}" for mesh, n in zip(meshes, n_vertices, strict=True))
-    raise DataError(f"{where}: {path.name}: has {n_lines} labels, {counts} vertices; expected one label a vertex")
+    values, n_lines = read_whole_numbers(path, max(n_vertices.values()), f"{where}: {path.name}")
+    name = next((name for name, n in n_vertices.items() if 0 < n == n_lines), None)
+    if name is None:
+        counts = " and ".join(f"{name} {n}" for name, n in n_vertices.items())
+        raise DataError(f"{where}: {path.name}: has {n_lines} labels, {counts} vertices; expected one label a vertex")
+    return values, name
 
 
-def _n_vertices(mesh: LabelledMesh, where: str) -> int:
+def _n_vertices(mesh: Path, where: str) -> int:
     """As the header says it; ``_vertices`` reads and checks the chosen mesh."""
-    where = f"{where}: {mesh.name}"
-    with reading(where, DataError), opened(mesh.path) as file:
+    with reading(where, DataError), opened(mesh) as file:
         header = read_header(file.read(MAX_HEADER_BYTES), where)
     return next((element.n_rows for element in header.elements if element.name == "vertex"), 0)
 
 
-def _vertices(mesh: LabelledMesh, where: str) -> Float32Array:
-    return vertex_positions(read_ply(mesh.path, f"{where}: {mesh.name}"), f"{where}: {mesh.name}")
+def _vertices(mesh: Path, where: str) -> Float32Array:
+    return vertex_positions(read_ply(mesh, where), where)
 
 
 def read_whole_numbers(path: Path, at_most: int, where: str) -> tuple[Int32Array, int]:

@@ -50,7 +50,7 @@ class RgbdOptions(BaseModel):
 class Rgbd(RecordedDataset[RgbdOptions]):
     """Any folder of colour, depth and pose files that an rgbd.toml describes; unscored, without ground truth.
 
-    ``folder_of`` is the description of each scene: those of the option ``files`` in its order, then those below the
+    ``folders`` are the description of each scene: those of the option ``files`` in its order, then those below the
     data root. A file is called by its own name, or by its folder's where it is an ``rgbd.toml``.
     """
 
@@ -72,10 +72,9 @@ class Rgbd(RecordedDataset[RgbdOptions]):
         path_of: dict[str, Path] = {}
         for path in (*named, *(path for path in below if path.is_file())):
             name = path.resolve().parent.name if path.name == files.FILE_NAME else path.stem
-            if name in path_of and path_of[name] != path:
+            if path_of.setdefault(name, path) != path:
                 raise DataError(f"rgbd: scene '{name}' is described twice, in {path_of[name]} and {path}; rename one")
-            path_of[name] = path
-        return SceneTree(self.root, (*self.options.files, place), path_of, frozenset())
+        return SceneTree(self.root, (*self.options.files, place), {name: (path,) for name, path in path_of.items()})
 
     def is_reading_checked(self, scene: str) -> bool:
         """Whether the description lets depth be held against the poses."""

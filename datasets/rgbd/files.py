@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from su3d_bench.core.config import Setting, Settings, flatten, resolve
+from su3d_bench.core.config import Setting, Settings, flatten, key_lines, resolve
 from su3d_bench.core.errors import ConfigError, DataError, suggest
 from su3d_bench.core.geometry import are_rigid, turn_to_z
 from su3d_bench.core.system.files import parse_toml
@@ -25,7 +25,6 @@ FILE_NAME = "rgbd.toml"
 INDEX = "{index}"
 MAX_DESCRIPTION_BYTES = 1 << 14  # some twenty lines are in use; deeply nested keys take quadratic time
 MAX_MESSAGE_LENGTH = 480
-ASSIGNMENT = re.compile(r"""\s*["']?([\w-]+)["']?\s*=""")
 Number = Annotated[float, Field(allow_inf_nan=False)]
 DepthValue = Annotated[int, Field(ge=0, le=65535)]
 
@@ -99,7 +98,7 @@ def read_description(path: Path, where: str) -> RgbdDescription:
         raise DataError(f"{where} has {len(text)} characters; expected a description of a few lines")
     try:
         table = parse_toml(text)
-        lines = _lines_of(text)
+        lines = {key[0]: line for key, line in reversed(key_lines(text).items())}
         _check_keys(table, lines, where)
         leaves = flatten(table)
         settings = Settings(
@@ -112,15 +111,6 @@ def read_description(path: Path, where: str) -> RgbdDescription:
         # A rule on several keys has no line of its own.
         place, of_whole, rule = str(error).partition(" rgbd = '...':")
         raise DataError(_one_line(f"{where}:{rule}" if of_whole else f"{where}{place}")) from error
-
-
-def _lines_of(text: str) -> dict[str, int]:
-    """The line on which each key stands first."""
-    line_of: dict[str, int] = {}
-    for number, line in enumerate(text.split("\n"), start=1):
-        if match := ASSIGNMENT.match(line):
-            line_of.setdefault(match[1], number)
-    return line_of
 
 
 def _check_keys(table: dict[str, Any], lines: dict[str, int], where: str) -> None:

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.types import Float64Array, Frame, GroundTruth, InstanceMesh, Surface
 from su3d_bench.datasets import openscan
-from su3d_bench.datasets.recordings.file_dataset import FileDataset, faults_of, keeps_last, shortened
+from su3d_bench.datasets.recordings.file_dataset import FileDataset, SceneTree, faults_of, keeps_last, shortened
 from su3d_bench.datasets.recordings.source import Grid, RgbdSource, make_registration
 from su3d_bench.datasets.scannet import folders, recordings, truth
 from su3d_bench.formats.ply import read_ply
@@ -45,7 +45,7 @@ def annotation_problems(files: Mapping[str, Path], scan: str, where: str) -> Ite
         truth.mesh_name(scan): lambda path: read_ply(path, f"{where}: {path.name}"),
         truth.labels_name(scan): lambda path: read_ply(path, f"{where}: {path.name}"),
     }
-    reads = [partial(read, files[name]) for name, read in readers.items() if name in files]
+    reads: list[Callable[[], object]] = [partial(read, files[name]) for name, read in readers.items() if name in files]
     if set(truth.truth_names(scan)) <= set(files):
         reads.append(partial(truth.read_annotated_scan, files, scan, where))
     yield from faults_of(reads)
@@ -81,14 +81,8 @@ class ScanNet(FileDataset[ScannetOptions]):
     further_truths = openscan.FURTHER_TRUTHS
     Options = ScannetOptions
 
-    def find_tree(self) -> folders.ScanFolders:
+    def find_tree(self) -> SceneTree:
         return folders.find_scans(self.root)
-
-    @property
-    def scans(self) -> folders.ScanFolders:
-        """The tree of scenes, with all folders of each."""
-        assert isinstance(self.tree, folders.ScanFolders)
-        return self.tree
 
     def groups(self) -> Mapping[str, Sequence[str]]:
         """The official splits, and the five scenes of the paper and of OVO, by name; whether they are here or not."""
@@ -104,7 +98,7 @@ class ScanNet(FileDataset[ScannetOptions]):
             self._truth_files(scene)
         except GroundTruthMissing as error:
             return f"{frames}, {str(error).partition(': ')[2]}"
-        table = "" if self.scans.find_label_table() else f", no ScanNet200: {truth.TABLE_NAME} is missing"
+        table = "" if folders.find_table(self.tree) else f", no ScanNet200: {truth.TABLE_NAME} is missing"
         return f"{frames}, ground truth{table}"
 
     def n_frames(self, scene: str, stride: int) -> int:
@@ -137,7 +131,7 @@ class ScanNet(FileDataset[ScannetOptions]):
         if table is None:
             raise GroundTruthMissing(
                 f"{self.where(scene)}: no ground truth '{variant}'; {truth.TABLE_NAME} of the release is missing, put "
-                f"it into {self.scans.table_folders()[0]}"
+                f"it into {folders.table_folders(self.tree)[0]}"
             )
         return truth.scannet200_truth(scan, table)
 
@@ -147,7 +141,7 @@ class ScanNet(FileDataset[ScannetOptions]):
         if path is None:
             raise GroundTruthMissing(
                 f"{where}: no ground truth '{variant}'; {openscan.RAW_NAME} is missing, get it by {openscan.PAGE} and "
-                f"put it into {self.scans.table_folders()[0]}"
+                f"put it into {folders.table_folders(self.tree)[0]}"
             )
         attributes = self._attributes.get(scene)
         if attributes is None:
@@ -165,7 +159,7 @@ class ScanNet(FileDataset[ScannetOptions]):
 
     @property
     def _openscan(self) -> Path | None:
-        return self.scans.find_label_table(openscan.RAW_NAME)
+        return folders.find_table(self.tree, openscan.RAW_NAME)
 
     def instance_mesh(self, scene: str) -> InstanceMesh:
         return truth.instance_mesh(self._annotated_scan(scene), self._label_tables)
@@ -173,14 +167,14 @@ class ScanNet(FileDataset[ScannetOptions]):
     def surface(self, scene: str) -> Surface:
         """The decimated mesh, with the published segments where they are here; scans without truth have both."""
         self.folder(scene)
-        mesh = self.scans.find_file(scene, truth.mesh_name(scene))
+        mesh = folders.find_file(self.tree, scene, truth.mesh_name(scene))
         if mesh is None:
             raise DataError(
                 f"{self.where(scene)}: no mesh; {truth.mesh_name(scene)} is missing, copy it into "
-                f"{self.scans.folders[scene][0]}"
+                f"{self.tree.folders[scene][0]}"
             )
         surface = truth.read_surface(
-            mesh, self.scans.find_file(scene, truth.segments_name(scene)), scene, self.where(scene)
+            mesh, folders.find_file(self.tree, scene, truth.segments_name(scene)), scene, self.where(scene)
         )
         motion = self._motion(scene)
         return surface if motion is None else replace(surface, vertices=truth.moved(surface.vertices, motion))
@@ -196,7 +190,7 @@ class ScanNet(FileDataset[ScannetOptions]):
     def folder(self, scene: str) -> Path:
         """The folder of the scan with its recording."""
         super().folder(scene)
-        return recordings.folder_of_recording(self.scans.folders[scene], scene, self.options.source)
+        return recordings.folder_of_recording(self.tree.folders[scene], scene, self.options.source)
 
     @keeps_last
     def _open(self, scene: str) -> tuple[RgbdSource, recordings.Walk]:
@@ -213,11 +207,11 @@ class ScanNet(FileDataset[ScannetOptions]):
         return np.eye(4) if self.options.axis_align else self._alignment(scene)
 
     def _alignment(self, scene: str) -> Float64Array:
-        path = self.scans.find_file(scene, truth.meta_name(scene))
+        path = folders.find_file(self.tree, scene, truth.meta_name(scene))
         if path is None:
             raise DataError(
                 f"{self.where(scene)}: {truth.meta_name(scene)} is missing; what lies along the walls needs it, copy "
-                f"it into {self.scans.folders[scene][0]}"
+                f"it into {self.tree.folders[scene][0]}"
             )
         return truth.read_axis_alignment(path, self.where(scene))
 
@@ -227,26 +221,28 @@ class ScanNet(FileDataset[ScannetOptions]):
         if table is None:
             raise DataError(
                 f"{self.name}: {truth.TABLE_NAME} of the release is missing, by which names of objects have classes; "
-                f"put it into {self.scans.table_folders()[0]}"
+                f"put it into {folders.table_folders(self.tree)[0]}"
             )
         class_id = table.nyu40_of.get(category)
         return None if class_id is None else truth.nyu40_label_set().name_of(class_id)
 
     @cached_property
     def _label_tables(self) -> Sequence[truth.LabelTable]:
-        return [truth.read_label_table(path, self.name) for path in self.scans.label_tables()]
+        return [truth.read_label_table(path, self.name) for path in folders.label_tables(self.tree)]
 
     def small_files(self, scene: str) -> tuple[Path, ...]:
-        paths = [self.scans.find_file(scene, name) for name in (truth.meta_name(scene), *truth.truth_names(scene))]
-        return tuple(path for path in (*paths, *self.scans.label_tables(), self._openscan) if path is not None)
+        paths = [
+            folders.find_file(self.tree, scene, name) for name in (truth.meta_name(scene), *truth.truth_names(scene))
+        ]
+        return tuple(path for path in (*paths, *folders.label_tables(self.tree), self._openscan) if path is not None)
 
     def _truth_files(self, scene: str) -> dict[str, Path]:
         """The path of each file of the truth."""
         self.folder(scene)
-        path_of = {name: self.scans.find_file(scene, name) for name in truth.truth_names(scene)}
+        path_of = {name: folders.find_file(self.tree, scene, name) for name in truth.truth_names(scene)}
         missing = [name for name, path in path_of.items() if path is None]
         if missing:
-            reason = f"; expected in {self.scans.folders[scene][0]}"
+            reason = f"; expected in {self.tree.folders[scene][0]}"
             if scene in folders.split_scenes("test"):
                 reason = "; the benchmark keeps that of its test scans to itself"
             raise GroundTruthMissing(f"{self.where(scene)}: no ground truth, {missing[0]} is missing{reason}")

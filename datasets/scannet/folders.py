@@ -7,13 +7,11 @@ different places: frames are often exported beside the release.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 from su3d_bench.core.system.files import file_text
-from su3d_bench.datasets.recordings.file_dataset import SceneTree, folders_in, read_marker
+from su3d_bench.datasets.recordings.file_dataset import SceneTree, find_scenes
 from su3d_bench.datasets.scannet.truth import FIRST_TABLE_NAME, TABLE_NAME
 
 # The scenes of OpenSU3D's evaluation, in the order of its section IV-A.
@@ -38,57 +36,37 @@ PLACES = tuple(dict.fromkeys("/".join(part for part in (b, s) if part) or "." fo
 # beside the scans, where some keep the label table, and OpenScan's attributes
 TABLE_FOLDERS = ("tasks", "metadata", "v2/tasks", "v1/tasks", "openscan", "OpenScan")
 SCAN_NAME = re.compile(r"scene\d{4}_\d{2}")
-EXPORTS = ("pose", "data/pose", "exported", "_info.txt")  # what tells a folder with exported frames
 
 
-@dataclass(frozen=True)
-class ScanFolders(SceneTree):
-    """Scans in the order of the paper's, then every other; ``folders`` of each, the first place first."""
-
-    folders: Mapping[str, tuple[Path, ...]]
-
-    def find_file(self, scan: str, name: str) -> Path | None:
-        """The file ``name`` of a scan, from the first of its folders that has it."""
-        return next((path for folder in self.folders[scan] if (path := folder / name).is_file()), None)
-
-    def find_label_table(self, name: str = TABLE_NAME) -> Path | None:
-        """The label table: in a folder with scans, above one, or in the usual folders beside them."""
-        return next((path for folder in self.table_folders() if (path := folder / name).is_file()), None)
-
-    def label_tables(self) -> list[Path]:
-        """That of the second release and that of the first, as far as they are here."""
-        found = [self.find_label_table(name) for name in (TABLE_NAME, FIRST_TABLE_NAME)]
-        return [path for path in found if path is not None]
-
-    def table_folders(self) -> list[Path]:
-        """Where the label table is looked for, the nearest to the scans first."""
-        near = [path for place in self.places for path in (place, *place.parents) if path.is_relative_to(self.root)]
-        near += [self.root, *(self.root / base for base in BASES if base)]
-        return list(dict.fromkeys(folder / name for folder in near for name in (".", *TABLE_FOLDERS)))
-
-
-def find_scans(root: Path) -> ScanFolders:
+def find_scans(root: Path) -> SceneTree:
     """Every scan in ``PLACES`` below ``root``; none is no error here."""
-    folders: dict[str, list[Path]] = {}
-    places, made = [], set[str]()
-    for place, children in folders_in(root, PLACES):
-        rooms = read_marker(place)
-        scans = [child for child in children if _is_scan(child, rooms)]
-        if scans:
-            places.append(place)
-            made |= {scan.name for scan in scans if scan.name in rooms}
-        for scan in scans:
-            folders.setdefault(scan.name, []).append(scan)
-    first = [scan for scan in PAPER_SCENES if scan in folders]
-    found = {scan: tuple(folders[scan]) for scan in (*first, *sorted(set(folders) - set(first)))}
-    return ScanFolders(root, tuple(places), {scan: paths[0] for scan, paths in found.items()}, frozenset(made), found)
+    return find_scenes(root, PLACES, _is_scan, PAPER_SCENES)
 
 
-def _is_scan(folder: Path, rooms: Mapping[str, str]) -> bool:
-    if SCAN_NAME.fullmatch(folder.name) or (folder / f"{folder.name}.sens").is_file():
-        return True
-    # Rooms in the layout of another dataset have a marker of the same name.
-    return folder.name in rooms and any((folder / part).exists() for part in EXPORTS)
+def _is_scan(folder: Path) -> bool:
+    return SCAN_NAME.fullmatch(folder.name) is not None or (folder / f"{folder.name}.sens").is_file()
+
+
+def find_file(tree: SceneTree, scan: str, name: str) -> Path | None:
+    """The file ``name`` of a scan, from the first of its folders that has it."""
+    return next((path for folder in tree.folders.get(scan, ()) if (path := folder / name).is_file()), None)
+
+
+def table_folders(tree: SceneTree) -> list[Path]:
+    """Where the label table is looked for, the nearest to the scans first: in a folder with scans, above, beside."""
+    near = [path for place in tree.places for path in (place, *place.parents) if path.is_relative_to(tree.root)]
+    near += [tree.root, *(tree.root / base for base in BASES if base)]
+    return list(dict.fromkeys(folder / name for folder in near for name in (".", *TABLE_FOLDERS)))
+
+
+def find_table(tree: SceneTree, name: str = TABLE_NAME) -> Path | None:
+    return next((path for folder in table_folders(tree) if (path := folder / name).is_file()), None)
+
+
+def label_tables(tree: SceneTree) -> list[Path]:
+    """That of the second release and that of the first, as far as they are here."""
+    found = [find_table(tree, name) for name in (TABLE_NAME, FIRST_TABLE_NAME)]
+    return [path for path in found if path is not None]
 
 
 @cache

@@ -90,9 +90,10 @@ def parse_header(start: bytes, where: str) -> tuple[SensHeader, int, int]:
             "it is cut short or damaged"
         )
     values = REST.unpack_from(start, START.size + n_name)
+    matrices = np.array(values[:64], np.float64).reshape(4, 4, 4)
     header = SensHeader(
         start[START.size : START.size + n_name].decode("utf-8", "replace"),
-        *np.array(values[:64], np.float64).reshape(4, 4, 4),
+        *(matrices[0], matrices[1], matrices[2], matrices[3]),
         _compression(values[64], COLOUR_CODES, "colour", where),
         _compression(values[65], DEPTH_CODES, "depth", where),
         *values[66:],

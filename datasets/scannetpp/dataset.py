@@ -21,6 +21,7 @@ from su3d_bench.datasets.openlex3d import release as openlex3d
 from su3d_bench.datasets.recordings.file_dataset import FileDataset, faults_of, keeps_last, sizes_and_ends
 from su3d_bench.datasets.recordings.recorded_frames import reading
 from su3d_bench.datasets.scannetpp import frames, truth
+from su3d_bench.datasets.scannetpp.frames import IphoneRecording
 from su3d_bench.formats.arrays import read_text
 
 SCENE_NAMES = r"[0-9a-f]{10}"
@@ -145,7 +146,7 @@ class ScanNetPP(FileDataset[ScannetppOptions]):
             yield from faults_of([lambda: self.annotated_scan(scene)])
 
     @keeps_last
-    def recording(self, scene: str) -> frames.IphoneRecording:
+    def recording(self, scene: str) -> IphoneRecording:
         with reading(self.where(scene)):
             return frames.open_recording(self.folder(scene) / IPHONE, self.where(scene), self.options.poses)
 

@@ -198,13 +198,11 @@ def read_tracking(path: Path, where: str, size: Size) -> PosedFrames:
             f"{intrinsics[row, 1, 2]:g}), the images have {size[0]}x{size[1]}; it belongs to images of another size"
         )
     is_finite = np.isfinite(poses).all(axis=(1, 2))
-    is_faulty = is_finite.copy()
-    is_faulty[is_finite] = ~are_rigid(poses[is_finite])
-    if is_faulty.any():
-        raise DataError(
-            f"{where}: frame {order[int(is_faulty.argmax())]}: 'aligned_pose' is not a rigid motion; copy the file "
-            "again"
-        )
+    faulty = [
+        n for n, pose in zip(order, poses, strict=True) if np.isfinite(pose).all() and not are_rigid(pose[None])[0]
+    ]
+    if faulty:
+        raise DataError(f"{where}: frame {faulty[0]}: 'aligned_pose' is not a rigid motion; copy the file again")
     if not is_finite.any():
         raise DataError(f"{where}: none of the {len(order)} frames has a pose; leave the scene out")
     return PosedFrames(np.array(order, np.int64), poses, intrinsics, size, np.zeros(4), (path,))

@@ -18,7 +18,15 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from su3d_bench.core.errors import ConfigError, DataError, StoreError, printable, suggest
-from su3d_bench.datasets.scannet.folders import PAPER_SCENES, SCAN_NAME, SPLITS, find_scans, split_scenes
+from su3d_bench.datasets.scannet.folders import (
+    PAPER_SCENES,
+    SCAN_NAME,
+    SPLITS,
+    find_file,
+    find_scans,
+    find_table,
+    split_scenes,
+)
 from su3d_bench.datasets.scannet.truth import TABLE_NAME
 from su3d_bench.fetching.bringing import Arrived, Brought, Planned, bring_file, held_state, move, write_arrival
 from su3d_bench.fetching.download import Patience, Stated, Wanted, Watch, checked
@@ -71,10 +79,10 @@ def plan_scans(names: Sequence[str], root: Path) -> Scans:
     missing = {}
     for scan in dict.fromkeys(scans):
         wanted = [f"{scan}{suffix}" for suffix in _suffixes(scan)]
-        lacking = [name for name in wanted if scan not in found.folders or found.find_file(scan, name) is None]
+        lacking = [name for name in wanted if find_file(found, scan, name) is None]
         if lacking:
             missing[scan] = tuple(lacking)
-    return Scans(root, missing, len(dict.fromkeys(scans)), found.find_label_table() is None)
+    return Scans(root, missing, len(dict.fromkeys(scans)), find_table(found) is None)
 
 
 def _suffixes(scan: str) -> tuple[str, ...]:
