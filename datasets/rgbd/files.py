@@ -24,7 +24,6 @@ from su3d_bench.formats.arrays import parsed_json, read_text
 FILE_NAME = "rgbd.toml"
 INDEX = "{index}"
 MAX_DESCRIPTION_BYTES = 1 << 14  # some twenty lines are in use; deeply nested keys take quadratic time
-MAX_MESSAGE_LENGTH = 480
 Number = Annotated[float, Field(allow_inf_nan=False)]
 DepthValue = Annotated[int, Field(ge=0, le=65535)]
 
@@ -106,11 +105,11 @@ def read_description(path: Path, where: str) -> RgbdDescription:
         )
         return resolve(settings, ("rgbd",), RgbdDescription)
     except tomllib.TOMLDecodeError as error:
-        raise DataError(_one_line(f"{where}: not valid TOML: {error}")) from error
+        raise DataError(f"{where}: not valid TOML: {error}") from error
     except ConfigError as error:
         # A rule on several keys has no line of its own.
         place, of_whole, rule = str(error).partition(" rgbd = '...':")
-        raise DataError(_one_line(f"{where}:{rule}" if of_whole else f"{where}{place}")) from error
+        raise DataError(f"{where}:{rule}" if of_whole else f"{where}{place}") from error
 
 
 def _check_keys(table: dict[str, Any], lines: dict[str, int], where: str) -> None:
@@ -119,15 +118,10 @@ def _check_keys(table: dict[str, Any], lines: dict[str, int], where: str) -> Non
     for key in table:
         if key not in fields:
             hint = suggest(key[:40], fields)
-            raise DataError(_one_line(f"{where}:{lines.get(key, 1)}: unknown key '{key[:40]}'{hint}"))
+            raise DataError(f"{where}:{lines.get(key, 1)}: unknown key '{key[:40]}'{hint}")
     for key, field in fields.items():
         if field.is_required() and key not in table:
             raise DataError(f"{where}: the key '{key}' is missing; needed: colour, depth, depth_unit_m, and more")
-
-
-def _one_line(message: str) -> str:
-    line = "".join(character if character.isprintable() else " " for character in message)
-    return line if len(line) <= MAX_MESSAGE_LENGTH else f"{line[:MAX_MESSAGE_LENGTH]}..."
 
 
 MAX_NUMBER = 2**31 - 1  # maps keep the numbers of frames in 32 bits; time stamps in names do not fit

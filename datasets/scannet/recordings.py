@@ -76,10 +76,8 @@ def find_source(folder: Path, scene: str, where: str, kind: SourceKind = "auto")
         "cpp": f"{INFO} and frame-000000.color.jpg and so on",
     }
     wanted = [text for name, text in looked_for.items() if kind in ("auto", name)]
-    raise DataError(
-        f"{where}: no recording in {folder}; looked for {'; '.join(wanted)}"
-        + ("" if kind == "sens" else f"; exports also in exported/ and {scene}/")
-    )
+    places = f"exports also in exported/ and {scene}/"
+    raise DataError(f"{where}: no recording in {folder}; looked for {'; '.join(wanted)}; {places}")
 
 
 def _find(folder: Path, scene: str, kind: SourceKind) -> tuple[SourceKind, Path] | None:
@@ -127,12 +125,8 @@ def open_python_export(folder: Path, where: str) -> sensors.ExportedFrames:
     expected = sensors.every_kth(known)
     sensors.check_complete(kinds, expected, where)
     colours, depths, poses = kinds.values()
-    frames = [
-        sensors.FrameFiles(
-            n, f"{layout.colour}/{colours[n]}", f"{layout.depth}/{depths[n]}", f"{layout.pose}/{poses[n]}"
-        )
-        for n in expected
-    ]
+    names = {n: (f"{layout.colour}/{colours[n]}", f"{layout.depth}/{depths[n]}") for n in expected}
+    frames = [sensors.FrameFiles(n, *names[n], f"{layout.pose}/{poses[n]}") for n in expected]
     camera, camera_files = _python_camera(folder, layout, frames[0], where)
     return sensors.ExportedFrames(folder, where, camera, frames, camera_files, "as the first frame")
 

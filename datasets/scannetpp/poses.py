@@ -24,7 +24,7 @@ import numpy as np
 from pydantic import Field
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.geometry import are_rigid
+from su3d_bench.core.geometry import are_rigid, rotations_of
 from su3d_bench.core.system.files import opened
 from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.datasets.recordings.recorded_frames import numbers, pinhole, reading
@@ -159,13 +159,7 @@ def _inverse_pose(values: Sequence[float], where: str) -> Float64Array:
     if not all(math.isfinite(value) and abs(value) < 1e9 for value in values) or abs(length - 1) > 1e-2:
         raise DataError(f"{where}: expected a unit quaternion qw qx qy qz and a shift in metres; copy the file again")
     w, x, y, z = (value / length for value in values[:4])
-    to_camera = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    to_camera = rotations_of(np.array([[x, y, z, w]]))[0]
     pose = np.eye(4)
     pose[:3, :3] = to_camera.T
     pose[:3, 3] = -to_camera.T @ np.array(values[4:7])
