@@ -55,13 +55,6 @@ def test_the_scan_covers_what_is_cast_and_faces_the_same_way() -> None:
     assert set(scan.triangles.reshape(-1)) == set(range(len(scan.vertices)))
 
 
-def test_no_side_of_a_square_of_the_scan_exceeds_the_option() -> None:
-    scan = corridor(surface_edge_m=0.3).surface("2m")
-    a, b, c = corners_of(scan.vertices, scan.triangles[::2]).transpose(1, 0, 2)
-    sides = np.linalg.norm([b - a, c - b], axis=2)
-    assert 0.25 < sides.max() <= 0.3 + 1e-5
-
-
 def walk(scene: str, n_points: Float64Array, **stages_ms: Float64Array) -> UpdateTimes:
     columns = {"n_points": n_points, **stages_ms, "total_ms": np.sum(list(stages_ms.values()), axis=0)}
     return UpdateTimes("r", scene, "m", columns, (), None, None)

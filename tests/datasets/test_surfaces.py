@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from recording_files import grid
+from recording_files import grid, write_mesh
 from replica_scene import QUADS, TWO_OBJECTS, write_original, write_render
 from rgbd_scene import write_scene
 from scannet_scan import SCAN, write_recording
@@ -17,7 +17,6 @@ from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.datasets.rgbd.dataset import Rgbd
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 from su3d_bench.datasets.scannet.dataset import ScanNet, ScannetOptions
-from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
 
 
 @pytest.fixture(scope="module")
@@ -40,20 +39,12 @@ def test_replicas_surface_is_the_renders_mesh_in_fans_without_labels(tmp_path: P
     dataset = Replica(tmp_path)
     with pytest.raises(DataError, match=r"replica/room0: no mesh; room0_mesh\.ply is missing in .*Replica$"):
         dataset.surface("room0")
-    before = dataset.digest("room0")
-    write_quads(tmp_path / "Replica" / "room0_mesh.ply", 9)
+    original = tmp_path / "replica_v1/room_0/habitat/mesh_semantic.ply"
+    (tmp_path / "Replica/room0_mesh.ply").write_bytes(original.read_bytes())
     surface = dataset.surface("room0")
     assert surface.vertices.shape == (9, 3) and surface.segments is None
-    assert surface.triangles.tolist() == [[0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4]]
-    assert dataset.digest("room0") != before
+    assert surface.triangles[:4].tolist() == [[0, 1, 4], [0, 4, 3], [3, 4, 7], [3, 7, 6]]
     assert tmp_path / "Replica" / "room0_mesh.ply" in dataset.files("room0")
-
-
-def write_quads(path: Path, n_vertices: int, corners: tuple[int, ...] = (0, 1, 4, 3, 1, 2, 5, 4)) -> None:
-    points = np.array([(k % 3, k // 3, 0) for k in range(n_vertices)], np.float32)
-    vertex = PlyElement("vertex", n_vertices, {axis: points[:, i].copy() for i, axis in enumerate("xyz")})
-    indices = ListColumn(np.arange(0, len(corners) + 1, 4), np.array(corners, np.int32))
-    write_ply(path, [vertex, PlyElement("face", len(corners) // 4, {"vertex_indices": indices})])
 
 
 def scannet(root: Path, **options: object) -> ScanNet:
@@ -96,9 +87,8 @@ def test_a_described_folder_may_name_a_mesh(tmp_path: Path) -> None:
         Rgbd(tmp_path).surface(folder.name)
     write_scene(tmp_path / "with", mesh="mesh.ply")
     data = tmp_path / "with" / "rgbd" / folder.name / "data"
-    write_quads(data / "mesh.ply", 9)
-    dataset = Rgbd(tmp_path / "with")
-    assert dataset.surface(folder.name).triangles.shape == (4, 3)
-    before = dataset.digest(folder.name)
-    write_quads(data / "mesh.ply", 12)
+    write_mesh(data / "mesh.ply", *grid(3, 2))
+    assert Rgbd(tmp_path / "with").surface(folder.name).triangles.tolist() == grid(3, 2)[1].tolist()
+    before = Rgbd(tmp_path / "with").digest(folder.name)
+    write_mesh(data / "mesh.ply", *grid(3, 3))
     assert Rgbd(tmp_path / "with").digest(folder.name) != before

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from hm3dsem_walk import CHAIR, POSES, ROOM, SCENE, SHORT, WALL, WIDTH, info, write_graph, write_walk
+from hm3dsem_walk import CHAIR, POSES, ROOM, SCENE, WALL, WIDTH, write_graph, write_walk
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import DataError, GroundTruthMissing, PredictionError, ScenesMissing
+from su3d_bench.core.errors import GroundTruthMissing, PredictionError
 from su3d_bench.core.maps import Instances
 from su3d_bench.datasets.hm3dsem.dataset import Hm3dSem
 from su3d_bench.datasets.hm3dsem.truth import label_set
@@ -56,10 +54,6 @@ def test_scenes_groups_and_a_word_on_each(walk: Path, tmp_path: Path) -> None:
     assert {name: len(scenes) for name, scenes in dataset.groups().items()} == {"hovsg": 8, "walks": 10}
     assert len(dataset.files(SCENE)) == 2 * 3 + 1 + 2 + 1 and len(dataset.digest(SCENE)) == 64
     assert dataset.up(SCENE).axis == "y" and list(dataset.problems(SCENE)) == []
-    with pytest.raises(DataError, match=rf"^hm3dsem: no scene 'x'; .*{SCENE}"):
-        dataset.info("x", 1)
-    with pytest.raises(ScenesMissing, match="generate them with HOV-SG's tools"):
-        Hm3dSem(tmp_path / "nowhere").scenes()
 
 
 def test_a_walk_without_truth_has_frames_and_says_so(walk: Path, tmp_path: Path) -> None:
@@ -71,65 +65,6 @@ def test_a_walk_without_truth_has_frames_and_says_so(walk: Path, tmp_path: Path)
     for ask in (lambda: dataset.ground_truth(SCENE, "hovsg-objects"), lambda: dataset.instance_mesh(SCENE)):
         with pytest.raises(GroundTruthMissing):
             ask()
-
-
-def change(walk: Path, edit: Callable[[Any], object]) -> None:
-    content: Any = info()
-    edit(content)
-    (walk / "scene_info.json").write_text(json.dumps(content))
-
-
-@pytest.mark.parametrize(
-    ("edit", "words"),
-    [
-        (lambda c: c.pop("levels"), "levels: Field required"),
-        (lambda c: c["objects"].insert(0, 5), "objects.0: expected an object; found 5"),
-        (lambda c: c["objects"][1].update(obb_dims=[1, -1, 1]), "objects.1.obb_dims.1: Input should be greater"),
-        (
-            lambda c: c["regions"][0].update(bev_region_points=[[0, 1]]),
-            "bev_region_points.0: List should have at least 3",
-        ),
-    ],
-)
-def test_a_damaged_scene_info_is_one_line_that_says_where(
-    walk: Path, tmp_path: Path, edit: Callable[[Any], object], words: str
-) -> None:
-    change(walk, edit)
-    (line,) = Hm3dSem(tmp_path).problems(SCENE)
-    assert line.startswith(f"hm3dsem/{SCENE}: scene_info.json") and words in line and "\n" not in line
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "words"),
-    [
-        (f"pose/{SHORT}_000001.txt", None, r"pose/..._000001.txt is missing"),
-        (f"pose/{SHORT}_000001.txt", " ".join(["2"] * 16), "is no rigid pose"),
-        ("depth/notes.txt", "x", "belongs to no frame"),
-        ("objects/7.ply", "ply", "objects/7.ply"),
-    ],
-)
-def test_a_damaged_file_of_a_walk_is_one_line(
-    walk: Path, tmp_path: Path, name: str, content: str | None, words: str
-) -> None:
-    (walk / name).unlink() if content is None else (walk / name).write_text(content)
-    (line,) = Hm3dSem(tmp_path).problems(SCENE)
-    assert line.startswith(f"hm3dsem/{SCENE}: ") and words in line and "\n" not in line
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("HM3D Semantic Annotations\n3,0A0B0C,chair\n", ":2: is '3,0A0B0C,chair'"),
-        ('HM3D Semantic Annotations\n3,0A0B0C,"chair",5\n3,0A0B0C,"wall",5\n', ":3: object 3 stands there twice"),
-        ('HM3D Semantic Annotations\n3,0A0B0C,"sofa, old",5\n', "object 3 is not that of the scene's .semantic.txt"),
-    ],
-)
-def test_truth_that_is_not_of_the_scenes_annotation_is_one_line(
-    walk: Path, tmp_path: Path, text: str, words: str
-) -> None:
-    (tmp_path / "hm3d/val" / SCENE / f"{SHORT}.semantic.txt").write_text(text)
-    (line,) = Hm3dSem(tmp_path).problems(SCENE)
-    assert words in line and "\n" not in line
 
 
 def test_a_scene_graph_is_read_with_floors_rooms_features_and_the_names_as_captions(tmp_path: Path) -> None:

@@ -176,13 +176,10 @@ def test_depth_on_the_colour_grid_is_that_of_the_wall(wall: tuple[SensorPair, UI
 @pytest.mark.parametrize(
     ("camera", "message"),
     [
-        (pair(extrinsic=np.zeros((4, 4))), "the depth extrinsic is not a rigid motion; expected a 4x4 pose, metres"),
-        (pair(colour_extrinsic=np.diag([1.0, 1, -1, 1])), "the colour extrinsic is not a rigid motion"),
-        (pair(extrinsic=np.full((4, 4), 1e300)), "the depth extrinsic is not a rigid motion"),
+        (pair(extrinsic=np.full((4, 4), 1e300)), "the depth extrinsic is not a rigid motion; expected a 4x4 pose"),
         (pair(colour_focal=1e30), "the colour intrinsics are no camera matrix; expected fx 0 cx / 0 fy cy / 0 0 1"),
     ],
 )
 def test_what_is_no_pair_of_cameras_is_one_line(camera: SensorPair, message: str) -> None:
-    with pytest.raises(DataError) as caught:
+    with pytest.raises(DataError, match=f"^scannet/x: {message}"):
         register(camera)
-    assert str(caught.value).startswith(f"scannet/x: {message}")

@@ -5,13 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 from replica_scene import (
     CHAIR,
-    CLOUDS,
     QUADS,
     REFERENCE,
-    SEQUENCE,
     TABLE,
     TWO_OBJECTS,
     write_clouds,
@@ -20,7 +17,6 @@ from replica_scene import (
 )
 from scored_room import instances
 
-from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.datasets.replica.truth import OVO_CLASSES
 from su3d_bench.formats.ply import PlyElement, write_ply
@@ -82,28 +78,6 @@ def test_the_51_classes_are_those_of_the_conceptgraphs_list_without_other() -> N
 INSTANCES, CLASSES = "Replica/ground_truth/room0.txt", "Replica/semantic_gt/room0.txt"
 
 
-@pytest.mark.parametrize(
-    ("variant", "text", "message"),
-    [
-        ("openmask3d", b"20001\n" * 3, "room0.txt: has 3 labels, room0_mesh.ply 2 and habitat/mesh_semantic.ply 9"),
-        ("openmask3d", b"20001\n102005\n", "room0.txt: 102005 is of class 102, Replica has 1 to 101; an inst"),
-        ("openmask3d", b"20001\n\x1b[31m\n", r"room0.txt: line 2 is '\x1b[31m'; expected one whole number"),
-        ("ovo-51", b"20\n1\n", "room0.txt: holds the class 1, none of the 51 Replica ids"),
-    ],
-)
-def test_each_fault_of_a_label_file_is_one_clear_line(tmp_path: Path, variant: str, text: bytes, message: str) -> None:
-    write_render(tmp_path)
-    write_mesh(tmp_path / "Replica/room0_mesh.ply", 2)
-    write_original(tmp_path, QUADS, [0, 0, 5, 5], TWO_OBJECTS)
-    path = write_labels(tmp_path, INSTANCES if variant == "openmask3d" else CLASSES, [])
-    path.write_bytes(text)
-    with pytest.raises(DataError) as caught:
-        Replica(tmp_path).ground_truth("room0", variant)
-    assert str(caught.value).startswith("replica/room0: ")
-    assert message in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
 def test_the_released_instances_as_a_prediction_score_exactly_one(tmp_path: Path) -> None:
     write_render(tmp_path)
     write_mesh(tmp_path / "Replica/room0_mesh.ply", 360)
@@ -116,7 +90,7 @@ def test_the_released_instances_as_a_prediction_score_exactly_one(tmp_path: Path
     assert [metrics[name] for name in ("AP", "AP50", "AP25")] == [1.0, 1.0, 1.0]
 
 
-def test_files_and_digest_cover_every_released_truth(tmp_path: Path) -> None:
+def test_files_and_status_cover_every_released_truth(tmp_path: Path) -> None:
     write_render(tmp_path)
     write_mesh(tmp_path / "Replica/room0_mesh.ply", 2)
     write_clouds(tmp_path, np.zeros((3, 3)), np.zeros(3, int), np.zeros((1, 3)))
@@ -125,13 +99,5 @@ def test_files_and_digest_cover_every_released_truth(tmp_path: Path) -> None:
     replica = Replica(tmp_path)
     assert replica.status("room0").endswith("; also conceptgraphs, openmask3d, ovo-51")
     assert set(replica.files("room0")) == {path for path in tmp_path.rglob("*") if path.is_file()}
-    digests = {replica.digest("room0")}
-    (tmp_path / REFERENCE).rename(tmp_path / "away")
+    (tmp_path / REFERENCE).unlink()
     assert "; also conceptgraphs without its pc_points.h5, openmask3d" in replica.status("room0")
-    (tmp_path / "away").rename(tmp_path / REFERENCE)
-    for path in (f"{CLOUDS}/pc_embeddings.h5", f"{SEQUENCE}/traj_w_c.txt", REFERENCE, INSTANCES, CLASSES):
-        content = bytearray((tmp_path / path).read_bytes())
-        content[len(content) // 2] ^= 1
-        (tmp_path / path).write_bytes(bytes(content))
-        digests.add(replica.digest("room0"))
-    assert len(digests) == 6

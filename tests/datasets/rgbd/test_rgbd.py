@@ -14,7 +14,7 @@ from recording_files import turn as pose
 from rgbd_scene import HEIGHT, WIDTH, depth_values, log_of, open_scene, write_scene
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.recordings.pose_convention import FLIP
 from su3d_bench.datasets.rgbd.dataset import Rgbd
 
@@ -156,15 +156,3 @@ def test_a_trajectory_counts_missing_images_or_leaves_them_out(tmp_path: Path) -
     (folder / "data/trajectory.log").write_text(log_of(range(5)))
     with pytest.raises(DataError, match=r"trajectory\.log has 5 poses; expected 3, one an image, or 4, one a number"):
         open_scene(tmp_path)
-
-
-def test_there_is_no_ground_truth_and_no_scene_without_description(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"rgbd: no scene in .*--set rgbd\.files=path/to/rgbd\.toml"):
-        Rgbd(tmp_path).scenes()
-    write_scene(tmp_path)
-    with pytest.raises(DataError, match="no scene 'dusk'; did you mean 'desk'"):
-        Rgbd(tmp_path).info("dusk", 1)
-    with pytest.raises(GroundTruthMissing):
-        Rgbd(tmp_path).ground_truth("desk", "mesh-vertices")
-    with pytest.raises(GroundTruthMissing):
-        Rgbd(tmp_path).instance_mesh("desk")

@@ -11,21 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scannet_scan as made
 from recording_files import HEIGHT_M, LEFT, RIGHT, floor_image, pose
-from scannet_scan import (
-    COLOUR_SIZE,
-    DEPTH_SIZE,
-    LOST,
-    SCAN,
-    WHERE,
-    dataset,
-    export,
-    header,
-    positions,
-    write_floor_truth,
-    write_recording,
-    write_scan,
-)
+from scannet_toy import write_python_export
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError, GroundTruthMissing
@@ -40,81 +28,84 @@ from su3d_bench.datasets.scannet.recordings import read_walk
     [".", "scannet/scans", "ScanNet/scans_test", "scans/val"],
 )
 def test_scans_are_found_in_every_layout_that_circulates(tmp_path: Path, place: str) -> None:
-    write_scan(tmp_path, place=place)
+    made.write_scan(tmp_path, place=place)
     found = ScanNet(tmp_path)
-    assert list(found.scenes()) == [SCAN]
+    assert list(found.scenes()) == [made.SCAN]
     assert list(found.places()) == [tmp_path / place]
-    assert len(found.frames(SCAN, 1)) == 5
-    assert "scannet200-vertices" in found.ground_truth(SCAN, "scannet200-vertices").variant
+    assert len(found.frames(made.SCAN, 1)) == 5
+    assert "scannet200-vertices" in found.ground_truth(made.SCAN, "scannet200-vertices").variant
 
 
 def test_recording_and_truth_may_lie_in_two_places(tmp_path: Path) -> None:
-    folder = write_scan(tmp_path)
-    (tmp_path / "scannet" / SCAN).mkdir(parents=True)
-    (folder / f"{SCAN}.sens").rename(tmp_path / "scannet" / SCAN / f"{SCAN}.sens")
+    folder = made.write_scan(tmp_path)
+    (tmp_path / "scannet" / made.SCAN).mkdir(parents=True)
+    (folder / f"{made.SCAN}.sens").rename(tmp_path / "scannet" / made.SCAN / f"{made.SCAN}.sens")
     scannet = ScanNet(tmp_path)
-    assert len(scannet.frames(SCAN, 1)) == 5
-    assert scannet.ground_truth(SCAN, "nyu40-vertices").instance.max() == 2
-    assert scannet.status(SCAN) == "5 frames, ground truth"
+    assert len(scannet.frames(made.SCAN, 1)) == 5
+    assert scannet.ground_truth(made.SCAN, "nyu40-vertices").instance.max() == 2
+    assert scannet.status(made.SCAN) == "5 frames, ground truth"
 
 
 def test_frames_hold_what_the_recording_holds_on_the_depth_grid(tmp_path: Path) -> None:
-    write_scan(tmp_path)
-    frames = ScanNet(tmp_path).frames(SCAN, 2)
+    made.write_scan(tmp_path)
+    frames = ScanNet(tmp_path).frames(made.SCAN, 2)
     assert [frames[i].index for i in range(len(frames))] == [0, 2, 4]
     frame = frames[-1]
     assert frame.timestamp_s == pytest.approx(1 + 4 * 0.033333)
-    np.testing.assert_array_equal(frame.camera_to_world, pose(positions(5)[4]))
-    assert frame.depth_m.shape == DEPTH_SIZE[::-1]
+    np.testing.assert_array_equal(frame.camera_to_world, pose(made.positions(5)[4]))
+    assert frame.depth_m.shape == made.DEPTH_SIZE[::-1]
     assert (frame.depth_m == HEIGHT_M).all()
     assert frame.intrinsics.tolist() == [[32, 0, 15.5], [0, 32, 11.5], [0, 0, 1]]
     # twice as many colour pixels: the edge between the halves lies between two depth pixels
-    np.testing.assert_array_equal(frames[1].rgb, floor_image(DEPTH_SIZE, 2.0))
+    np.testing.assert_array_equal(frames[1].rgb, floor_image(made.DEPTH_SIZE, 2.0))
     assert frames[1].rgb[0, [15, 16]].tolist() == [list(LEFT), list(RIGHT)]
     with pytest.raises(IndexError):
         frames[3]
 
 
 def test_the_colour_grid_keeps_colour_and_thins_depth(tmp_path: Path) -> None:
-    write_scan(tmp_path)
-    frame = dataset(tmp_path, grid="colour").frames(SCAN, 1)[0]
-    np.testing.assert_array_equal(frame.rgb, floor_image(COLOUR_SIZE, 1.0))
-    assert np.count_nonzero(frame.depth_m) == DEPTH_SIZE[0] * DEPTH_SIZE[1]
+    made.write_scan(tmp_path)
+    frame = made.dataset(tmp_path, grid="colour").frames(made.SCAN, 1)[0]
+    np.testing.assert_array_equal(frame.rgb, floor_image(made.COLOUR_SIZE, 1.0))
+    assert np.count_nonzero(frame.depth_m) == made.DEPTH_SIZE[0] * made.DEPTH_SIZE[1]
     assert frame.intrinsics.tolist() == [[64, 0, 31.5], [0, 64, 23.5], [0, 0, 1]]
 
 
 def test_axis_align_turns_poses_and_mesh_alike(tmp_path: Path) -> None:
-    folder = write_scan(tmp_path)
-    plain, turned = dataset(tmp_path), dataset(tmp_path, axis_align=True)
+    folder = made.write_scan(tmp_path)
+    plain, turned = made.dataset(tmp_path), made.dataset(tmp_path, axis_align=True)
     motion = np.array([[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]], float)
-    before, after = plain.frames(SCAN, 1)[3], turned.frames(SCAN, 1)[3]
+    before, after = plain.frames(made.SCAN, 1)[3], turned.frames(made.SCAN, 1)[3]
     np.testing.assert_allclose(after.camera_to_world, motion @ before.camera_to_world)
-    points = [one.ground_truth(SCAN, "nyu40-vertices").points for one in (plain, turned)]
+    points = [one.ground_truth(made.SCAN, "nyu40-vertices").points for one in (plain, turned)]
     np.testing.assert_allclose(points[1], points[0] @ motion[:3, :3].T + motion[:3, 3], atol=1e-5)
-    np.testing.assert_array_equal(turned.instance_mesh(SCAN).vertices, points[1])
-    assert plain.digest(SCAN) != turned.digest(SCAN)
-    (folder / f"{SCAN}.txt").unlink()
-    assert len(dataset(tmp_path).frames(SCAN, 1)) == 5
-    with pytest.raises(DataError, match=rf"^{WHERE}: {SCAN}\.txt is missing; what lies along the walls needs it"):
-        dataset(tmp_path, axis_align=True).frames(SCAN, 1)
+    np.testing.assert_array_equal(turned.instance_mesh(made.SCAN).vertices, points[1])
+    assert plain.digest(made.SCAN) != turned.digest(made.SCAN)
+    (folder / f"{made.SCAN}.txt").unlink()
+    assert len(made.dataset(tmp_path).frames(made.SCAN, 1)) == 5
+    with pytest.raises(
+        DataError, match=rf"^{made.WHERE}: {made.SCAN}\.txt is missing; what lies along the walls needs it"
+    ):
+        made.dataset(tmp_path, axis_align=True).frames(made.SCAN, 1)
 
 
 def test_the_source_option_chooses_among_recording_and_export(tmp_path: Path) -> None:
-    export(write_scan(tmp_path))
+    write_python_export(made.write_scan(tmp_path))
     depths = {
-        kind: dataset(tmp_path, source=kind).frames(SCAN, 4)[1].depth_m[0, 0] for kind in ("auto", "sens", "python")
+        kind: made.dataset(tmp_path, source=kind).frames(made.SCAN, 1)[0].depth_m.max()
+        for kind in ("auto", "sens", "python")
     }
-    assert depths == {"auto": 2.0, "sens": 2.0, "python": 1.5}
-    assert dataset(tmp_path, source="python").status(SCAN) == "5 exported frames, ground truth"
-    assert [frame.index for frame in dataset(tmp_path, source="python").frames(SCAN, 1)] == [0, 2, 3, 4]
-    assert dataset(tmp_path, source="cpp").status(SCAN) == "no recording, ground truth"
-    with pytest.raises(DataError, match=rf"^{WHERE}: no recording in .*; looked for _info\.txt"):
-        dataset(tmp_path, source="cpp").frames(SCAN, 1)
+    assert depths["auto"] == depths["sens"] == 2.0 != depths["python"]
+    assert made.dataset(tmp_path, source="python").status(made.SCAN) == "4 exported frames, ground truth"
+    assert [frame.index for frame in made.dataset(tmp_path, source="python").frames(made.SCAN, 1)] == [0, 1, 3]
+    assert made.dataset(tmp_path, source="cpp").status(made.SCAN) == "no recording, ground truth"
+    with pytest.raises(DataError, match=rf"^{made.WHERE}: no recording in .*; looked for _info\.txt"):
+        made.dataset(tmp_path, source="cpp").frames(made.SCAN, 1)
 
 
 def poses_alone(poses: Sequence[np.ndarray], step: int = 1) -> Any:
     """A recording of poses alone."""
-    return SimpleNamespace(where=WHERE, poses=lambda: np.array(poses), numbers=np.arange(len(poses)) * step)
+    return SimpleNamespace(where=made.WHERE, poses=lambda: np.array(poses), numbers=np.arange(len(poses)) * step)
 
 
 def turned(angle: float) -> Float64Array:
@@ -127,7 +118,7 @@ def test_which_poses_are_lost() -> None:
     quarter = np.array([[0.0, -1, 0, 3], [1, 0, 0, 4], [0, 0, 1, 5], [0, 0, 0, 1]])
     nan, one_inf, zero = turned(0.1), turned(0.2), np.zeros((4, 4))
     nan[2, 3], one_inf[0, 1] = np.nan, np.inf
-    walk = read_walk(poses_alone([turned(0.3), LOST, nan, one_inf, zero, quarter]))
+    walk = read_walk(poses_alone([turned(0.3), made.LOST, nan, one_inf, zero, quarter]))
     assert walk.is_usable.tolist() == [True, False, False, False, False, True]
 
 
@@ -146,36 +137,26 @@ def test_the_official_splits_are_whole_and_apart() -> None:
     assert set(PAPER_SCENES) <= {*lists["train"], *lists["val"]}
 
 
-def test_no_data_is_said_with_the_way_to_get_it(tmp_path: Path) -> None:
-    with pytest.raises(DataError) as caught:
-        ScanNet(tmp_path).scenes()
-    assert str(caught.value).startswith(f"scannet: no scene in {tmp_path} or in its folders scans, scannet")
-    assert "datasets make rooms --layout scannet" in str(caught.value)
-    write_recording(tmp_path / SCAN / f"{SCAN}.sens", 1)
-    with pytest.raises(DataError, match=r"scannet: no scene 'scene0000_01'; did you mean 'scene0000_00'\?"):
-        ScanNet(tmp_path).frames("scene0000_01", 1)
-
-
 def test_a_scan_without_truth_has_frames_and_a_reason(tmp_path: Path) -> None:
-    for scan in (SCAN, "scene0707_00"):
-        write_recording(tmp_path / scan / f"{scan}.sens")
+    for scan in (made.SCAN, "scene0707_00"):
+        made.write_recording(tmp_path / scan / f"{scan}.sens")
     scannet = ScanNet(tmp_path)
     assert (
-        scannet.status(SCAN)
-        == f"5 frames, no ground truth, {SCAN}_vh_clean_2.ply is missing; expected in {tmp_path / SCAN}"
+        scannet.status(made.SCAN)
+        == f"5 frames, no ground truth, {made.SCAN}_vh_clean_2.ply is missing; expected in {tmp_path / made.SCAN}"
     )
     with pytest.raises(
         GroundTruthMissing, match=r"scene0707_00_vh_clean_2\.ply is missing; the benchmark keeps that of"
     ):
         scannet.instance_mesh("scene0707_00")
-    write_floor_truth(tmp_path / SCAN)
-    (tmp_path / SCAN / f"{SCAN}.aggregation.json").unlink()
+    made.write_floor_truth(tmp_path / made.SCAN)
+    (tmp_path / made.SCAN / f"{made.SCAN}.aggregation.json").unlink()
     with pytest.raises(
         GroundTruthMissing, match=r"no ground truth, scene0000_00\.aggregation\.json is missing; expected"
     ):
-        scannet.ground_truth(SCAN, "nyu40-vertices")
+        scannet.ground_truth(made.SCAN, "nyu40-vertices")
     with pytest.raises(GroundTruthMissing, match=r"no ground truth 'nyu20-vertices'; did you mean 'nyu40-vertices'\?"):
-        scannet.ground_truth(SCAN, "nyu20-vertices")
+        scannet.ground_truth(made.SCAN, "nyu20-vertices")
 
 
 @pytest.mark.parametrize("profile", ["oracle", "embedded"])
@@ -183,23 +164,23 @@ def test_a_run_on_a_scan_is_scored_under_the_benchmarks_protocols(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, profile: str
 ) -> None:
     """A chair and a couch of 2 x 2 m, seen from above: with true masks the map holds exactly these two."""
-    folder = write_scan(tmp_path / "data")
-    write_recording(folder / f"{SCAN}.sens", 9, (4,), header((256, 192), (128, 96)))
+    folder = made.write_scan(tmp_path / "data")
+    made.write_recording(folder / f"{made.SCAN}.sens", 9, (4,), made.header((256, 192), (128, 96)))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
     protocols = ["scannet-instance", "scannet-semantic", "scannet200-instance"]
-    words = ["run", "--scenes", WHERE, "--methods", "opensu3d", "--profile", profile, "--set", "opensu3d.stride=2"]
+    words = ["run", "--scenes", made.WHERE, "--methods", "opensu3d", "--profile", profile, "--set", "opensu3d.stride=2"]
     assert main([*words, "--protocols", *protocols, "--out", "out", "--jobs", "1", "--no-pictures", "--quiet"]) == 0
     rows = {row["protocol"]: row for row in json.loads(Path("out/metrics.json").read_text())["results"]}
     assert list(rows) == protocols
     for row in rows.values():
-        assert row["unscored"] == [] and row["result"]["n_predictions"] == {WHERE: 2}
+        assert row["unscored"] == [] and row["result"]["n_predictions"] == {made.WHERE: 2}
         assert all(math.isfinite(row["result"]["metrics"][name]) for name in row["headline"])
     assert rows["scannet-instance"]["ceiling"]["AP"] == rows["scannet200-instance"]["ceiling"]["AP"] == 1
     assert rows["scannet-semantic"]["ceiling"]["mIoU"] == 1
     if profile == "oracle":
         assert rows["scannet-instance"]["result"]["metrics"]["AP25"] == 1
         assert rows["scannet200-instance"]["result"]["metrics"]["AP25"] == 1
-    log = Path(f"out/scenes/scannet.{SCAN}/opensu3d/log.txt").read_text()
-    assert f"{WHERE}: frames without a pose, left out: 1 of 9 (the first: 4)" in log
+    log = Path(f"out/scenes/scannet.{made.SCAN}/opensu3d/log.txt").read_text()
+    assert f"{made.WHERE}: frames without a pose, left out: 1 of 9 (the first: 4)" in log

@@ -2,36 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import logging
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from recording_files import grid, write_files, write_mesh
+from recording_files import grid
 from scannet_scan import SCAN, TABLE_ROWS, table_text, write_truth
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.datasets.scannet.truth import (
-    FIRST_TABLE_NAME,
-    TABLE_NAME,
-    AnnotatedScan,
-    LabelTable,
-    aggregation_name,
-    instance_mesh,
-    labels_name,
-    mesh_name,
-    nyu40_label_set,
-    nyu40_truth,
-    raw_label_set,
-    read_annotated_scan,
-    read_axis_alignment,
-    read_label_table,
-    scannet200_truth,
-    segments_name,
-    truth_names,
-)
+from su3d_bench.datasets.scannet import truth as annotation
 from su3d_bench.metrics.instance.average_precision import encode_ground_truth
 from su3d_bench.metrics.protocols.loading import load_protocol
 
@@ -47,18 +27,20 @@ INSTANCE = [1, 1, 3, 3, 6, 6] * 4
 INSTANCE[0] = 0
 
 
-def read(folder: Path, scan: str = SCAN) -> AnnotatedScan:
-    return read_annotated_scan({name: folder / name for name in truth_names(scan)}, scan, f"scannet/{scan}")
+def read(folder: Path, scan: str = SCAN) -> annotation.AnnotatedScan:
+    return annotation.read_annotated_scan(
+        {name: folder / name for name in annotation.truth_names(scan)}, scan, f"scannet/{scan}"
+    )
 
 
-def table(tmp_path: Path, text: str | None = None) -> LabelTable:
-    (tmp_path / TABLE_NAME).write_text(table_text() if text is None else text, newline="")
-    return read_label_table(tmp_path / TABLE_NAME, WHERE)
+def table(tmp_path: Path, text: str | None = None) -> annotation.LabelTable:
+    (tmp_path / annotation.TABLE_NAME).write_text(table_text() if text is None else text, newline="")
+    return annotation.read_label_table(tmp_path / annotation.TABLE_NAME, WHERE)
 
 
 def test_nyu40_truth_is_the_label_of_the_file_and_the_last_object_that_claims_the_segment(tmp_path: Path) -> None:
     write_truth(tmp_path, SEGMENTS, GROUPS, NYU40)
-    truth = nyu40_truth(read(tmp_path), [])
+    truth = annotation.nyu40_truth(read(tmp_path), [])
     assert truth.semantic.tolist() == NYU40
     assert truth.instance.tolist() == INSTANCE
     assert truth.variant == "nyu40-vertices"
@@ -69,23 +51,26 @@ def test_nyu40_truth_is_the_label_of_the_file_and_the_last_object_that_claims_th
 
 def test_scannet200_truth_is_the_raw_id_of_the_category(tmp_path: Path) -> None:
     write_truth(tmp_path, SEGMENTS, GROUPS, NYU40)
-    truth = scannet200_truth(read(tmp_path), table(tmp_path))
+    truth = annotation.scannet200_truth(read(tmp_path), table(tmp_path))
     assert truth.semantic[:6].tolist() == [0, 2, 90, 90, 38, 38]
     assert truth.instance.tolist() == INSTANCE
     assert [truth.labels.name_of(one) for one in (2, 38, 90)] == ["chair", "stool", "piano"]
 
 
 def test_the_label_sets_name_every_class_of_the_protocols_as_these_do(tmp_path: Path) -> None:
-    sets = {"scannet-instance": nyu40_label_set(), "scannet200-instance": raw_label_set(table(tmp_path))}
+    sets = {
+        "scannet-instance": annotation.nyu40_label_set(),
+        "scannet200-instance": annotation.raw_label_set(table(tmp_path)),
+    }
     for protocol, labels in sets.items():
         classes = load_protocol(protocol).classes
         assert [labels.name_of(entry.id) for entry in classes] == [entry.name for entry in classes]
         assert len(set(labels.names)) == len(labels.names)
-    assert nyu40_label_set().ids == tuple(range(1, 41))
+    assert annotation.nyu40_label_set().ids == tuple(range(1, 41))
 
 
 def test_a_raw_id_outside_the_200_does_not_bear_the_name_of_one_of_them(tmp_path: Path) -> None:
-    labels = raw_label_set(table(tmp_path, table_text([*TABLE_ROWS, ("book", 1300, 23, "books")])))
+    labels = annotation.raw_label_set(table(tmp_path, table_text([*TABLE_ROWS, ("book", 1300, 23, "books")])))
     assert labels.name_of(1300) == "book (1300)"
     assert labels.name_of(22) == "book"
 
@@ -93,8 +78,8 @@ def test_a_raw_id_outside_the_200_does_not_bear_the_name_of_one_of_them(tmp_path
 def test_mixed_line_ends_trailing_blanks_and_repeated_categories_of_the_table(tmp_path: Path) -> None:
     rows = [*TABLE_ROWS, ("object ", 40, 40, "otherprop"), ("object", 1234, 39, "otherfurniture")]
     text = "\ufeff" + table_text(rows).replace("\n", "\r\n", 3).replace("\n", "\r", 2) + "\r\n\t\n"
-    (tmp_path / TABLE_NAME).write_bytes(text.encode())
-    found = read_label_table(tmp_path / TABLE_NAME, WHERE)
+    (tmp_path / annotation.TABLE_NAME).write_bytes(text.encode())
+    found = annotation.read_label_table(tmp_path / annotation.TABLE_NAME, WHERE)
     assert (found.nyu40_of["object"], found.raw_id_of["object"]) == (40, 40)
     assert found.nyu40_of["couch"] == 6
 
@@ -102,17 +87,17 @@ def test_mixed_line_ends_trailing_blanks_and_repeated_categories_of_the_table(tm
 def test_a_category_without_row_is_void_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_truth(tmp_path, SEGMENTS, [*GROUPS[:2], (5, "Stool", [19])], NYU40)
     with caplog.at_level(logging.WARNING):
-        truth = scannet200_truth(read(tmp_path), table(tmp_path))
+        truth = annotation.scannet200_truth(read(tmp_path), table(tmp_path))
     assert truth.semantic[:6].tolist() == [0, 2, 90, 90, 0, 0]
     assert [record.getMessage() for record in caplog.records] == [
-        f"{WHERE}: categories without a row in {TABLE_NAME}: 1 (the first: 'Stool'); vertices made void: 8"
+        f"{WHERE}: categories without a row in {annotation.TABLE_NAME}: 1 (the first: 'Stool'); vertices made void: 8"
     ]
 
 
 def test_ids_may_be_text_and_blanks_may_surround_a_category(tmp_path: Path) -> None:
     groups = [(str(one), f" {category} ", [str(part) for part in parts]) for one, category, parts in GROUPS]
     write_truth(tmp_path, [str(one) for one in SEGMENTS], groups, NYU40)
-    truth = scannet200_truth(read(tmp_path), table(tmp_path))
+    truth = annotation.scannet200_truth(read(tmp_path), table(tmp_path))
     assert truth.instance.tolist() == INSTANCE
     assert truth.semantic[:3].tolist() == [0, 2, 90]
 
@@ -125,7 +110,7 @@ def test_labels_of_the_first_release_are_raw_ids_and_become_nyu40(tmp_path: Path
     """The second scan has no id above 40: only its objects tell the releases apart."""
     raw = [6 if one == 90 else one for one in RAW] if groups is not GROUPS else RAW
     write_truth(tmp_path, SEGMENTS, groups, raw, prefix="")
-    truth = nyu40_truth(read(tmp_path), [table(tmp_path)])
+    truth = annotation.nyu40_truth(read(tmp_path), [table(tmp_path)])
     assert truth.semantic.tolist() == ([6 if one == 39 else one for one in NYU40] if groups is not GROUPS else NYU40)
     assert truth.instance.tolist() == INSTANCE
     assert "categories" in truth.source
@@ -135,18 +120,20 @@ def test_a_stray_label_above_40_does_not_make_a_file_one_of_the_first_release(tm
     """As in scene0270_00 and scene0384_00 of the second release."""
     labels = [149 if k == 8 else one for k, one in enumerate(NYU40)]
     write_truth(tmp_path, SEGMENTS, [*GROUPS[:2], (5, "stool with a name of its own", [19])], labels)
-    truth = nyu40_truth(read(tmp_path), [table(tmp_path)])
+    truth = annotation.nyu40_truth(read(tmp_path), [table(tmp_path)])
     assert truth.semantic.tolist() == [0 if k == 8 else one for k, one in enumerate(NYU40)]
     assert "labels.ply" in truth.source
 
 
-def first_table(tmp_path: Path) -> LabelTable:
+def first_table(tmp_path: Path) -> annotation.LabelTable:
     """The table of the first release: no ids but the numbers of rows, and a class that is not there."""
     categories = [("wall", "1"), ("stool", "40"), ("storage", ""), *[(f"thing {k}", "40") for k in range(4, 47)]]
     categories += [("piano", "39"), ("chair", "5")]
     rows = [f"{name}\t7\t21\t{nyu40}\t4\t{name}" for name, nyu40 in categories]
-    (tmp_path / FIRST_TABLE_NAME).write_text("\n".join(["category\tcount\tnyuId\tnyu40id\teigen13id\tnyuClass", *rows]))
-    return read_label_table(tmp_path / FIRST_TABLE_NAME, WHERE)
+    (tmp_path / annotation.FIRST_TABLE_NAME).write_text(
+        "\n".join(["category\tcount\tnyuId\tnyu40id\teigen13id\tnyuClass", *rows])
+    )
+    return annotation.read_label_table(tmp_path / annotation.FIRST_TABLE_NAME, WHERE)
 
 
 @pytest.mark.parametrize("beside", [False, True])
@@ -156,17 +143,17 @@ def test_labels_of_the_first_release_are_rows_of_its_own_table(tmp_path: Path, b
     first = first_table(tmp_path)
     assert (first.raw_id_of["storage"], first.nyu40_of.get("storage")) == (3, None)
     other = table(tmp_path, table_text([("chair", 2, 6, "sofa")]))  # knows no piano, and the chair as a sofa
-    truth = nyu40_truth(read(tmp_path), [other, first] if beside else [first])
+    truth = annotation.nyu40_truth(read(tmp_path), [other, first] if beside else [first])
     assert truth.semantic.tolist() == NYU40
-    assert truth.source.endswith(f"categories in {FIRST_TABLE_NAME} and the objects of .aggregation.json")
-    (tmp_path / FIRST_TABLE_NAME).write_text(table_text().replace("\tcategory", "\tother"))
+    assert truth.source.endswith(f"categories in {annotation.FIRST_TABLE_NAME} and the objects of .aggregation.json")
+    (tmp_path / annotation.FIRST_TABLE_NAME).write_text(table_text().replace("\tcategory", "\tother"))
     with pytest.raises(DataError, match=r"scannet-labels.combined.tsv: has no column 'category'"):
-        read_label_table(tmp_path / FIRST_TABLE_NAME, WHERE)
+        annotation.read_label_table(tmp_path / annotation.FIRST_TABLE_NAME, WHERE)
 
 
 def test_a_triangle_belongs_to_the_instance_of_most_of_its_vertices(tmp_path: Path) -> None:
     write_truth(tmp_path, SEGMENTS, GROUPS, NYU40)
-    mesh = instance_mesh(read(tmp_path), [])
+    mesh = annotation.instance_mesh(read(tmp_path), [])
     # the first cell: vertices 0 (none), 1 and 6 (chair); the second: 1, 7 (chair) and 2, 8 (piano)
     assert mesh.triangles[:4].tolist() == [[0, 1, 6], [1, 7, 6], [1, 2, 7], [2, 8, 7]]
     assert mesh.instance_of_triangle[:4].tolist() == [1, 1, 1, 3]
@@ -177,88 +164,6 @@ def test_a_triangle_of_three_instances_belongs_to_none(tmp_path: Path) -> None:
     points, triangles = np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32)
     write_truth(tmp_path, [1, 2, 3], [(0, "chair", [1]), (1, "couch", [2]), (2, "x", [3])], [5, 6, 0],
                 mesh=(points, triangles))  # fmt: skip
-    mesh = instance_mesh(read(tmp_path), [])
+    mesh = annotation.instance_mesh(read(tmp_path), [])
     assert mesh.instance_of_triangle.tolist() == [0]
     assert mesh.class_of_instance == {1: 5, 2: 6}
-
-
-def change_json(name: str, **values: object) -> Callable[[Path], object]:
-    def change(folder: Path) -> None:
-        content = json.loads((folder / name).read_text()) | values
-        write_files(folder, {name: content})
-
-    return change
-
-
-def rewrite(name: str, content: str | bytes) -> Callable[[Path], object]:
-    return lambda folder: (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
-
-
-def write_mesh_file(
-    name: str, move_m: float = 0.0, n_vertices: int = 24, label: bool = False
-) -> Callable[[Path], None]:
-    def change(folder: Path) -> None:
-        points, triangles = grid()
-        points[3] += move_m
-        kept = triangles[(triangles < n_vertices).all(axis=1)]
-        write_mesh(folder / name, points[:n_vertices], kept, np.zeros(n_vertices, np.uint16) if label else None)
-
-    return change
-
-
-AGGREGATION, SEGMENT_FILE = aggregation_name(SCAN), segments_name(SCAN)
-MESH, LABELS = mesh_name(SCAN), labels_name(SCAN)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (rewrite(AGGREGATION, "{"), f"{AGGREGATION}: not JSON"),
-        (change_json(AGGREGATION, sceneId="scannet.scene0001_00"), "'sceneId' is 'scannet.scene0001_00', not 'scene00"),
-        (change_json(SEGMENT_FILE, segIndices=[-3] * 24), "segIndices.0: Input should be greater than"),
-        (write_mesh_file(LABELS, move_m=0.1, label=True), f"{LABELS}: vertex 3 is at [1.6"),
-    ],
-)
-def test_each_fault_of_the_truth_is_one_clear_line(
-    tmp_path: Path, change: Callable[[Path], object], message: str
-) -> None:
-    write_truth(tmp_path, SEGMENTS, GROUPS, NYU40)
-    change(tmp_path)
-    with pytest.raises(DataError) as caught:
-        read(tmp_path)
-    line = str(caught.value)
-    assert line.startswith(f"{WHERE}: {SCAN}")
-    assert message in line
-    assert line.isprintable() and len(line) < 400
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("id\tnyu40id\n1\t1\n", "has no column 'raw_category'"),
-        (table_text([("chair", 2, 41, "")]), "line 2: 'nyu40id' is '41'; expected a whole number from 1 to 40"),
-        (table_text() + "3\tlamp\n", "line 8: has no raw_category, id, nyu40id"),
-        (table_text() + "3\tla\x1bmp\t\t\t4\n", "line 8: has no raw_category, id, nyu40id"),
-    ],
-)
-def test_each_fault_of_the_label_table_is_one_clear_line(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(DataError) as caught:
-        table(tmp_path, text)
-    assert str(caught.value).startswith(f"{WHERE}: {TABLE_NAME}")
-    assert message in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("colorHeight\n", "line 1: 'colorHeight' is no 'key = value'"),
-        ("axisAlignment = 1 0 0 0\n", "'axisAlignment' has 4 values; expected 16"),
-        ("axisAlignment = 1 0 0 nan 0 1 0 0 0 0 1 0 0 0 0 1\n", "expected 16 finite numbers"),
-        ("axisAlignment = 2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n", "'axisAlignment' is not a rigid motion"),
-    ],
-)
-def test_each_fault_of_the_facts_of_a_scan_is_one_clear_line(tmp_path: Path, text: str, message: str) -> None:
-    (tmp_path / "x.txt").write_text(text)
-    with pytest.raises(DataError, match=r"^scannet/scene0000_00: x\.txt") as caught:
-        read_axis_alignment(tmp_path / "x.txt", WHERE)
-    assert message in str(caught.value)

@@ -18,15 +18,34 @@ import numpy as np
 import pytest
 from damage import outcomes, truncations
 from places import CASES
-from scannet_scan import colour_content, depth_content
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.datasets.scannet.sens import SensFile, SensFrame, SensHeader, write_sens
+from su3d_bench.core.types import UInt8Array
+from su3d_bench.datasets.scannet.sens import (
+    ColourCompression,
+    DepthCompression,
+    SensFile,
+    SensFrame,
+    SensHeader,
+    write_sens,
+)
+from su3d_bench.formats.images import UInt16Array, jpeg_bytes, png_bytes
 
 TOY, RAW_TOY = CASES / "sens01_toy.sens", CASES / "sens02_toy_raw.sens"
 WHERE = "scannet/scene0000_00"
 START_OF_SIZES = 80  # in a frame record
 N_HEADER = 4 + 8 + len("StructureSensor") + 256 + 8 + 16 + 4 + 8
+
+
+def colour_content(rgb: UInt8Array, compression: ColourCompression) -> bytes:
+    """A colour image (H, W, 3) RGB as a ``.sens`` file stores it."""
+    return {"raw": np.ndarray.tobytes, "jpeg": jpeg_bytes, "png": png_bytes}[compression](rgb)
+
+
+def depth_content(values: UInt16Array, compression: DepthCompression) -> bytes:
+    """A depth image (H, W) as a ``.sens`` file stores it."""
+    raw = values.astype("<u2").tobytes()
+    return zlib.compress(raw) if compression == "zlib" else raw
 
 
 @pytest.fixture(scope="module")

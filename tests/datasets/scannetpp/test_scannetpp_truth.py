@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from places import CASES
 from recording_files import grid
-from scannetpp_scene import MAP, NAMES, write_lists, write_scans
+from scannetpp_scene import NAMES, write_lists, write_scans
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import GroundTruth
@@ -86,40 +86,8 @@ def test_the_surface_of_an_object_is_that_of_most_corners(tmp_path: Path) -> Non
     assert mesh.class_of_instance == {1: 2, 2: 4}
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "line"),
-    [
-        ("segments.json", '{"segIndices": [1, 2, -1]}', "segIndices.2: Input should be greater than"),
-        ("segments.json", '{"segIndices": [1, 2]}', "has 2 vertices, mesh_aligned_0.05.ply has 3; they belong to two"),
-        ("segments_anno.json", '{"segGroups": [{"segments": [1]}]}', "segGroups.0.label: Field required"),
-        ("mesh_aligned_0.05_mask.txt", "3\n", "'3' is no vertex of mesh_aligned_0.05.ply, which has 3"),
-    ],
-)
-def test_what_is_wrong_with_a_scan_is_one_line(tmp_path: Path, name: str, text: str, line: str) -> None:
-    written(tmp_path, [1, 2, 2], [("chair", (1,))], mesh=row_of_points(3))
-    (tmp_path / "scans" / name).write_text(text)
-    with pytest.raises(DataError, match=f"^here: .*{line}"):
-        truth_of(tmp_path / "scans", tmp_path / "metadata/semantic_benchmark")
-
-
 def test_more_objects_than_ids_can_tell_apart_are_refused(tmp_path: Path) -> None:
     groups = [*[("floor", (1,))] * 999, ("chair", (2,))]
     assert written(tmp_path, [1, 2, 2], groups, mesh=row_of_points(3)).instance.tolist() == [0, 1000, 1000]
     with pytest.raises(DataError, match="cannot tell more than 1000 apart"):
         written(tmp_path, [1, 2, 2], [*groups, ("chair", (2,))], mesh=row_of_points(3))
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "line"),
-    [
-        ("top100.txt", "wall\nwall\n", "top100.txt: has 'wall' twice"),
-        ("top100_instance.txt", "piano\n", "top100_instance.txt has 'piano', which top100.txt has not"),
-        ("map_benchmark.csv", f"{MAP}sofa\n", "row 7: has 1 cells of 4"),
-    ],
-)
-def test_what_is_wrong_with_the_lists_is_one_line(tmp_path: Path, name: str, text: str, line: str) -> None:
-    write_lists(tmp_path)
-    folder = tmp_path / "metadata/semantic_benchmark"
-    (folder / name).write_text(text)
-    with pytest.raises(DataError, match=f"^here: .*{line}"):
-        read_benchmark_classes(folder, "here")

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from recording_files import HEIGHT_M, floor_image, grid, pose, text_of, write_files, write_mesh
+from recording_files import HEIGHT_M, floor_image, grid, pose, write_files, write_mesh
 
-from su3d_bench.core.types import Float64Array, UInt8Array
+from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.scannet.dataset import ScanNet, ScannetOptions
-from su3d_bench.datasets.scannet.sens import ColourCompression, DepthCompression, SensFrame, SensHeader, write_sens
+from su3d_bench.datasets.scannet.sens import SensFrame, SensHeader, write_sens
 from su3d_bench.datasets.scannet.truth import TABLE_NAME
-from su3d_bench.formats.images import UInt16Array, jpeg_bytes, png_bytes
+from su3d_bench.formats.images import png_bytes
 
 SCAN = "scene0000_00"
 WHERE = f"scannet/{SCAN}"
@@ -82,17 +82,6 @@ def positions(n_frames: int) -> Float64Array:
     return np.linspace(1.0, 3.0, n_frames)
 
 
-def colour_content(rgb: UInt8Array, compression: ColourCompression) -> bytes:
-    """A colour image (H, W, 3) RGB as a ``.sens`` file stores it."""
-    return {"raw": np.ndarray.tobytes, "jpeg": jpeg_bytes, "png": png_bytes}[compression](rgb)
-
-
-def depth_content(values: UInt16Array, compression: DepthCompression) -> bytes:
-    """A depth image (H, W) as a ``.sens`` file stores it."""
-    raw = values.astype("<u2").tobytes()
-    return zlib.compress(raw) if compression == "zlib" else raw
-
-
 def write_recording(path: Path, n_frames: int = 5, lost: Sequence[int] = (), head: SensHeader | None = None) -> None:
     """A walk along the floor; frames in ``lost`` have no pose."""
     head = head or header()
@@ -102,7 +91,9 @@ def write_recording(path: Path, n_frames: int = 5, lost: Sequence[int] = (), hea
     for i, x_m in enumerate(positions(n_frames)):
         time = 1_000_000 + 33_333 * i
         colour = png_bytes(floor_image((head.colour_width, head.colour_height), x_m))
-        frame = SensFrame(LOST if i in lost else pose(x_m), time, time, colour, depth_content(depth, "zlib"))
+        frame = SensFrame(
+            LOST if i in lost else pose(x_m), time, time, colour, zlib.compress(depth.astype("<u2").tobytes())
+        )
         frames.append(frame.stored)
     write_sens(path, head, frames, b"")
 
@@ -119,14 +110,3 @@ def write_scan(root: Path, scan: str = SCAN, place: str = "scans", n_frames: int
 
 def dataset(root: Path, **options: Any) -> ScanNet:
     return ScanNet(root, ScannetOptions(**options))
-
-
-def export(folder: Path, n_frames: int = 5) -> None:
-    """The same walk as the Python reader exports it, in millimetres of 1.5 m to tell it from the recording."""
-    head = header()
-    cameras = {"color": head.intrinsic_colour, "depth": head.intrinsic_depth}
-    write_files(folder, {f"intrinsic/intrinsic_{name}.txt": text_of(matrix) for name, matrix in cameras.items()})
-    for i, x_m in enumerate(positions(n_frames)):
-        depth, matrix = np.full(DEPTH_SIZE[::-1], 1500, np.uint16), LOST if i == 1 else pose(x_m)
-        images = {f"color/{i}.jpg": floor_image(COLOUR_SIZE, x_m), f"depth/{i}.png": depth}
-        write_files(folder, images | {f"pose/{i}.txt": text_of(matrix)})

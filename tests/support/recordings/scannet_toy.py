@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from places import CASES
 
-from su3d_bench.datasets.recordings.source import RgbdSource
 from su3d_bench.datasets.scannet.sens import SensFile
 from su3d_bench.formats.images import png_bytes
 
@@ -52,18 +51,3 @@ def write_cpp_export(folder: Path) -> Path:
         files[f"frame-{i:06d}.depth.pgm"] = pgm_bytes(toy.depth(i))
         files[f"frame-{i:06d}.pose.txt"] = RECORDED["pose_txt_cpp"][str(i)]
     return _write(folder, files | {"_info.txt": RECORDED["info_cpp"]})
-
-
-def assert_is_the_toy(source: RgbdSource, digits: float) -> None:
-    """The source gives what the toy recording gives; poses and cameras to ``digits``, images exactly."""
-    toy = SensFile(TOY, WHERE)
-    assert (len(source), source.where) == (N_FRAMES, WHERE)
-    np.testing.assert_allclose(source.poses(), toy.poses(), rtol=digits, atol=digits)
-    for i in range(N_FRAMES):
-        np.testing.assert_array_equal(source.colour(i), toy.colour(i))
-        np.testing.assert_array_equal(source.depth(i), toy.depth(i))
-    assert np.isneginf(source.poses()[2]).all()
-    for name in ("colour_size", "depth_size", "depth_shift"):
-        assert getattr(source.camera, name) == getattr(toy.camera, name)
-    for name in ("colour_intrinsics", "depth_intrinsics", "colour_extrinsic", "depth_extrinsic"):
-        np.testing.assert_allclose(getattr(source.camera, name), getattr(toy.camera, name), rtol=digits, atol=digits)
