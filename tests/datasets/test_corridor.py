@@ -1,4 +1,4 @@
-"""The corridor that ``make bench-methods`` walks along, and the table that is made of the walks."""
+"""The corridor that ``make bench-methods`` walks along."""
 
 from __future__ import annotations
 
@@ -7,23 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from benchmark_programs import benchmark_program
 from places import ROOT
 
 from su3d_bench.core.registry import load
 from su3d_bench.core.types import Float64Array, Int32Array
-from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.reports.pictures.plots import medians_by_size
 
 
 def corridor(**options: float) -> Any:
     dataset = load("dataset", f"{ROOT / 'benchmarks/scale/corridor.py'}:Corridor")
     return dataset(Path(), dataset.Options(**options))
-
-
-@pytest.fixture(scope="module")
-def write_performance() -> Any:
-    return benchmark_program("write_performance")
 
 
 def corners_of(vertices: Any, triangles: Int32Array) -> Float64Array:
@@ -53,25 +46,6 @@ def test_the_scan_covers_what_is_cast_and_faces_the_same_way() -> None:
     np.testing.assert_allclose(scan.vertices.min(axis=0), cast.vertices.min(axis=0), atol=1e-6)
     np.testing.assert_allclose(scan.vertices.max(axis=0), cast.vertices.max(axis=0), atol=1e-6)
     assert set(scan.triangles.reshape(-1)) == set(range(len(scan.vertices)))
-
-
-def walk(scene: str, n_points: Float64Array, **stages_ms: Float64Array) -> UpdateTimes:
-    columns = {"n_points": n_points, **stages_ms, "total_ms": np.sum(list(stages_ms.values()), axis=0)}
-    return UpdateTimes("r", scene, "m", columns, (), None, None)
-
-
-def test_the_table_tells_what_the_smallest_and_the_largest_maps_cost(write_performance: Any) -> None:
-    points = np.linspace(1e5, 5e6, 103)
-    one = walk("corridor/9m", points, decode_ms=points, match_ms=points / 1e5, insert_ms=np.full(103, 1e-3))
-    head, row = write_performance.growth_table([[one]])
-    told = dict(zip(head, row, strict=True))
-    steady = points[3:] / 1e5 + 1e-3
-    assert (told["m"], told["updates"]) == ("9", "103")
-    assert (told["points, from"], told["to"]) == (f"{points[3]:,.0f}", "5,000,000")
-    assert told["ms, smallest tenth"] == f"{np.median(steady[:10]):.1f}"
-    assert (told["largest"], told["worst"]) == (f"{np.median(steady[-10:]):.1f}", "50")
-    assert told["exponent"].startswith("1.00 [")
-    assert told["stages that grow"] == "match 1.00"
 
 
 def test_medians_by_size_are_those_of_ranges_of_one_width_on_a_log_axis() -> None:

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 from places import CASES
-from replica_scene import QUADS, TWO_OBJECTS, write_original, write_render, write_scene_graphs
+from recording_files import write_files
+from replica_scene import QUADS, TWO_OBJECTS, write_original, write_render
 from scored_room import ENCODER, nothing, room, truth_as_prediction
 
 from su3d_bench.baselines.oracle import Oracle
@@ -151,6 +152,21 @@ def test_counts_that_no_scene_gives_are_refused() -> None:
     other = RelationCounts(one, one, one, one, one)
     with pytest.raises(DataError, match="was scored with 2 classes"):
         metric_of(RULES).check("a", other)
+
+
+def write_scene_graphs(root: Path, objects: list[tuple[int, str]], relations: list[tuple[int, int, str]]) -> Path:
+    """ReplicaSSG's annotation of room_0, and of another scan, with the classes of its protocol."""
+    rules = load_protocol("replica-relations")
+    rows = [{"label": label, "id": str(number)} for number, label in objects]
+    triples = [[subject, other, rules.predicates.index(name), name] for subject, other, name in relations]
+    files: dict[str, Any] = {
+        f"{key}.json": {"scans": [{"scan": "apartment_0", key: []}, {"scan": "room_0", key: content}]}
+        for key, content in {"objects": rows, "relationships": triples}.items()
+    }
+    meant = {"chair": "chair", "sofa": "chair", "table": "table", "wall": "unknown"}
+    classes = {"Replica2VisualGenome": meant, "VisualGenome_list": [entry.name for entry in rules.classes]}
+    write_files(root / "ReplicaSSG", files | {"replica_to_visual_genome.json": classes})
+    return root / "ReplicaSSG"
 
 
 def written(folder: Path) -> Replica:

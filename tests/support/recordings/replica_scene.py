@@ -13,7 +13,6 @@ from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.replica.folders import replica_label_set
 from su3d_bench.datasets.replica.truth import N_EMBEDDING
 from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
-from su3d_bench.metrics.protocols.loading import load_protocol
 
 WIDTH, HEIGHT, SCALE = 12, 8, 6553.5
 CAMERA = {"w": WIDTH, "h": HEIGHT, "fx": 6.0, "fy": 6.5, "cx": 5.5, "cy": 3.5, "scale": SCALE}
@@ -59,21 +58,6 @@ def write_original(
     face = PlyElement("face", len(faces), {"vertex_indices": corners, "object_id": np.array(object_ids, np.uint16)})
     write_ply(habitat / "mesh_semantic.ply", [vertex, face])
     return habitat
-
-
-def write_scene_graphs(root: Path, objects: list[tuple[int, str]], relations: list[tuple[int, int, str]]) -> Path:
-    """ReplicaSSG's annotation of room_0, and of another scan, with the classes of its protocol."""
-    rules = load_protocol("replica-relations")
-    rows = [{"label": label, "id": str(number)} for number, label in objects]
-    triples = [[subject, other, rules.predicates.index(name), name] for subject, other, name in relations]
-    files: dict[str, Any] = {
-        f"{key}.json": {"scans": [{"scan": "apartment_0", key: []}, {"scan": "room_0", key: content}]}
-        for key, content in {"objects": rows, "relationships": triples}.items()
-    }
-    meant = {"chair": "chair", "sofa": "chair", "table": "table", "wall": "unknown"}
-    classes = {"Replica2VisualGenome": meant, "VisualGenome_list": [entry.name for entry in rules.classes]}
-    write_files(root / "ReplicaSSG", files | {"replica_to_visual_genome.json": classes})
-    return root / "ReplicaSSG"
 
 
 def first_pose() -> Float64Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,6 @@ from typing import Any
 import numpy as np
 from recording_files import HEIGHT_M, floor_image, grid, pose, write_files, write_mesh
 
-from su3d_bench.core.types import UInt8Array
 from su3d_bench.datasets.scannetpp.images import DEPTH_SIZE
 
 SCENE = "036bce3393"
@@ -52,30 +50,6 @@ def depth_values(number: int) -> np.ndarray:
     return values
 
 
-def packed(values: np.ndarray) -> bytes:
-    """A depth image in metres, a hair above each millimetre, as ``depth.bin`` has it."""
-    pack = zlib.compressobj(wbits=-15)
-    content = pack.compress(((values.astype(np.float32) + 0.01) / 1000).astype("<f4").tobytes()) + pack.flush()
-    return len(content).to_bytes(4, "little") + content
-
-
-def grey(number: int) -> UInt8Array:
-    return np.full((HEIGHT, WIDTH, 3), 60 + 6 * number, np.uint8)
-
-
-def write_packed(folder: Path) -> None:
-    """``depth.bin`` and a Matroska video with an image for every frame; the grey of each tells its number."""
-    import cv2
-
-    numbers = range(NUMBERS[-1] + 1)
-    (folder / "depth.bin").write_bytes(b"".join(packed(depth_values(number)) for number in numbers))
-    video = cv2.VideoWriter(str(folder / "rgb.mkv"), cv2.VideoWriter.fourcc(*"MJPG"), 60.0, COLOUR_SIZE)
-    assert video.isOpened()
-    for number in numbers:
-        video.write(grey(number))
-    video.release()
-
-
 def write_lists(root: Path) -> None:
     instances = "\n".join(INSTANCES) + "\n"
     files = {"top100.txt": "\n".join(NAMES), "top100_instance.txt": instances, "map_benchmark.csv": MAP}
@@ -92,17 +66,15 @@ def write_scans(folder: Path, segments: Any, groups: Any, masked: Any = (), mesh
     write_files(folder, files | {"mesh_aligned_0.05_mask.txt": "".join(f"{vertex}\n" for vertex in masked)})
 
 
-def write_scene(root: Path, *, is_packed: bool = False, spacing_m: float = 0.1) -> Path:
-    """A whole scene below ``root``, its images extracted or packed; its folder.
+def write_scene(root: Path, *, spacing_m: float = 0.1) -> Path:
+    """A whole scene below ``root``; its folder.
 
     A floor of 4 x 2 m: left half a chair, right half a couch, a rug across the middle; the last row is masked.
     """
     folder = root / "data" / SCENE
     write_colmap(folder / "iphone/colmap")
     write_files(folder, {"iphone/pose_intrinsic_imu.json": tracking()})
-    if is_packed:
-        write_packed(folder / "iphone")
-    for number, matrix in zip(() if is_packed else NUMBERS, () if is_packed else POSES, strict=True):
+    for number, matrix in zip(NUMBERS, POSES, strict=True):
         image = floor_image(COLOUR_SIZE, float(matrix[0, 3]))
         names = f"iphone/rgb/frame_{number:06d}.jpg", f"iphone/depth/frame_{number:06d}.png"
         write_files(folder, dict(zip(names, (image, depth_values(number)), strict=True)))
