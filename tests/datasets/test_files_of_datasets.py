@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +50,7 @@ def write_tracked(root: Path) -> None:
 
 MAKERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "replica": ("room0", write_replica),
-    "scannet": (SCAN, lambda root: (write_scan(root), write_files(root, {"openscan_val_raw.json": [RECORD]}))),
+    "scannet": (SCAN, lambda root: write_files(write_scan(root).parents[1], {"openscan_val_raw.json": [RECORD]})),
     "scannet python": (SCAN, lambda root: write_python_export(root / SCANS)),
     "scannet cpp": (SCAN, lambda root: write_cpp_export(root / SCANS)),
     "scannetpp": (pp.SCENE, pp.write_scene),
@@ -79,11 +80,12 @@ def change(root: Path, name: str, content: Content) -> None:
 
 def faults(dataset: Any, scene: str) -> list[str]:
     """The line of everything that fails; ground truth that is not there is no fault."""
-    lines = []
-    asks = [lambda: dataset.frames(scene, 1)[1], lambda: list(dataset.frames(scene, 1))]
-    asks += [lambda variant=variant: dataset.ground_truth(scene, variant) for variant in dataset.variants]
-    asks += [lambda: dataset.ground_truth(scene, next(iter(getattr(dataset, "further_truths", {"": ""}).values())))]
-    for ask in (lambda: lines.extend(dataset.problems(scene)), *asks):
+    lines: list[str] = []
+    variants = [*dataset.variants, *dict(getattr(dataset, "further_truths", {})).values()]
+    asks: list[Callable[[], object]] = [lambda: lines.extend(dataset.problems(scene))]
+    asks += [lambda: dataset.frames(scene, 1)[1], lambda: list(dataset.frames(scene, 1))]
+    asks += [partial(dataset.ground_truth, scene, variant) for variant in variants]
+    for ask in asks:
         try:
             ask()
         except GroundTruthMissing:
@@ -103,7 +105,7 @@ def boxed(**changes: Any) -> dict[str, Any]:
     return table
 
 
-def walk_info(place: str, number: int, **changes: Any) -> dict[str, Any]:
+def walk_info(place: str, number: int, **changes: Any) -> Any:
     table: Any = hm.info()
     table[place][number] |= changes
     return table

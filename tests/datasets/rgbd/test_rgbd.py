@@ -126,7 +126,7 @@ def test_rotated_bits_are_turned_back_and_invalid_values_have_no_depth(tmp_path:
 def test_direction_and_axes_are_undone(tmp_path: Path, direction: str, axes: str) -> None:
     folder = write_scene(tmp_path, pose_direction=direction, camera_axes=axes)
     for index in range(3):
-        stored = pose(index) @ FLIP if axes == "opengl" else pose(index)
+        stored: np.ndarray = pose(index) @ FLIP if axes == "opengl" else pose(index)
         stored = np.linalg.inv(stored) if direction == "world_to_camera" else stored
         (folder / f"data/frame-{index}.pose.txt").write_text(text_of(stored))
     for index, frame in enumerate(open_scene(tmp_path)):

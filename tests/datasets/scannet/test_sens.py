@@ -39,7 +39,9 @@ N_HEADER = 4 + 8 + len("StructureSensor") + 256 + 8 + 16 + 4 + 8
 
 def colour_content(rgb: UInt8Array, compression: ColourCompression) -> bytes:
     """A colour image (H, W, 3) RGB as a ``.sens`` file stores it."""
-    return {"raw": np.ndarray.tobytes, "jpeg": jpeg_bytes, "png": png_bytes}[compression](rgb)
+    if compression == "raw":
+        return rgb.tobytes()
+    return jpeg_bytes(rgb) if compression == "jpeg" else png_bytes(rgb)
 
 
 def depth_content(values: UInt16Array, compression: DepthCompression) -> bytes:

@@ -192,12 +192,12 @@ def test_the_annotation_of_replicassg_lies_on_the_centres_of_faces(tmp_path: Pat
 @pytest.mark.parametrize(
     ("name", "old", "new", "message"),
     [
-        ("objects.json", '"scan": "room_0"', '"scan": "room_1"', "has 0 entries of room_0 with a list 'objects'"),
-        ("objects.json", '"id": "5"', '"id": "five"', "expected an id and a label"),
+        ("objects.json", '"scan": "room_0"', '"scan": "room_1"', "has 0 entries of room_0; expected one"),
+        ("objects.json", '"id": "5"', '"id": "five"', "objects: 1.id: Input should be a valid integer"),
         ("objects.json", '"chair"', '"wall"', "a relation names object 1, which is none of the graph"),
-        ("relationships.json", '"near"', "3", "expected subject, object, number, name"),
-        ("relationships.json", '"scans"', '"scan"', "has no list 'scans'"),
-        ("replica_to_visual_genome.json", "VisualGenome_list", "list", "has no list 'VisualGenome_list' of names"),
+        ("relationships.json", '"near"', "3", "relationships: 0.3: Input should be a valid string"),
+        ("relationships.json", '"scans"', '"scan"', "scans: Field required"),
+        ("replica_to_visual_genome.json", "VisualGenome_list", "list", "VisualGenome_list: Field required"),
         ("replica_to_visual_genome.json", "{", "[", "not JSON"),
     ],
 )

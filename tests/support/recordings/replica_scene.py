@@ -47,10 +47,14 @@ def info_table(objects: list[tuple[int, int]]) -> dict[str, Any]:
 
 
 def write_original(
-    root: Path, faces: Sequence[list[int]], object_ids: list[int], objects: list[tuple[int, int]]
+    root: Path,
+    faces: Sequence[list[int]],
+    object_ids: list[int],
+    objects: list[tuple[int, int]],
+    folder: str = "replica_v1/room_0",
 ) -> Path:
     """A mesh on a grid of nine points, three a row, and its table of objects."""
-    habitat = root / "replica_v1/room_0/habitat"
+    habitat = root / folder / "habitat"
     write_files(habitat, {"info_semantic.json": info_table(objects)})
     grid = np.array([(i % 3, i // 3, 0) for i in range(9)], np.float32)
     corners = ListColumn(np.cumsum([0, *map(len, faces)]), np.concatenate(faces).astype(np.int32))
