@@ -37,7 +37,7 @@ from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.metrics.attribution.arrays import LookedAt
 from su3d_bench.metrics.costs import MAP, TOTAL, MethodSummary, StageSummary, UpdateTimes, summarise
 from su3d_bench.metrics.protocols.model import ProtocolRules
-from su3d_bench.metrics.semantic.confusion import SemanticCounts, concatenate
+from su3d_bench.metrics.semantic.confusion import SemanticCounts
 from su3d_bench.numerics.statistics import Growth
 from su3d_bench.reports.tables.run import Found, Unscored, not_scored_lines
 from su3d_bench.runs.executors import SCENE_DONE, Event, Report, run_inline, run_processes
@@ -216,7 +216,9 @@ def _confusions(run: FinishedRun, method: str) -> list[dict[str, Any]]:
             confusions.append(confusion | {"reason": f"the rules of {name} here are not those that scored the run"})
             continue
         names = [entry.name for entry in rules.classes]
-        confusions.append(confusion | {"names": names, "cells": confusion_cells(concatenate(counts).confusion)})
+        confusions.append(
+            confusion | {"names": names, "cells": confusion_cells(SemanticCounts.joined(counts).confusion)}
+        )
     return confusions
 
 
