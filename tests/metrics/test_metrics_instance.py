@@ -70,7 +70,7 @@ def test_a_number_above_all_others_gives_what_the_refused_infinity_would() -> No
     for above in (0.9, 1e300):
         counts = per_scene(truth, indptr, indices, np.full(3, 5), np.array([above, 0.8, 0.1]), [5, 7])
         assert combine([counts]).of_class(0)[1] == pytest.approx((2 / 3 + 1 / 2 + 1 + 1) / 4)
-    with pytest.raises(PredictionError, match="instance 0: its confidence is inf; confidences are finite numbers"):
+    with pytest.raises(PredictionError, match="confidences that are finite numbers"):
         per_scene(truth, indptr, indices, np.full(3, 5), np.array([np.inf, 0.8, 0.1]), [5, 7])
 
 

@@ -148,21 +148,6 @@ def write_scene_graphs(root: Path, objects: list[tuple[int, str]], relations: li
     return root / "ReplicaSSG"
 
 
-def write_scene_graphs(root: Path, objects: list[tuple[int, str]], relations: list[tuple[int, int, str]]) -> Path:
-    """ReplicaSSG's annotation of room_0, and of another scan, with the classes of its protocol."""
-    rules = load_protocol("replica-relations")
-    rows = [{"label": label, "id": str(number)} for number, label in objects]
-    triples = [[subject, other, rules.predicates.index(name), name] for subject, other, name in relations]
-    files: dict[str, Any] = {
-        f"{key}.json": {"scans": [{"scan": "apartment_0", key: []}, {"scan": "room_0", key: content}]}
-        for key, content in {"objects": rows, "relationships": triples}.items()
-    }
-    meant = {"chair": "chair", "sofa": "chair", "table": "table", "wall": "unknown"}
-    classes = {"Replica2VisualGenome": meant, "VisualGenome_list": [entry.name for entry in rules.classes]}
-    write_files(root / "ReplicaSSG", files | {"replica_to_visual_genome.json": classes})
-    return root / "ReplicaSSG"
-
-
 def written(folder: Path) -> Replica:
     write_render(folder)
     write_original(folder, QUADS, [0, 0, 5, 5], TWO_OBJECTS)
