@@ -162,7 +162,9 @@ def _compare_methods(
         remarks = _remarks_of_scenes(every, name, [numbers.scores(side)[name] for side in every], common)
         halves = over_scenes[: len(left.runs)], over_scenes[len(left.runs) :]
         metrics = {
-            metric: difference_of(*(sides.headline_numbers(half, metric) for half in halves), common)
+            metric: difference_of(
+                sides.headline_numbers(halves[0], metric), sides.headline_numbers(halves[1], metric), common
+            )
             for metric in rules.headline
         }
         classes = _compare_classes(rules, halves, common) if per_class else {}
@@ -358,7 +360,7 @@ def plan(
     numbers = sides.SideNumbers()
     plans: dict[str, dict[str, MetricPlan]] = {}
     scenes: dict[str, None] = {}
-    for name in sides.protocols_in_both(*every[:2], protocols):
+    for name in sides.protocols_in_both(every[0], every[1], protocols):
         found = numbers.over_common(name, every)
         n_scenes = len(found[0].result.scenes) if found else 0
         if n_scenes < 2:

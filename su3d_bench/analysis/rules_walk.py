@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -141,7 +141,10 @@ class Walker:
                 )
             return found
 
-        adds = {name: shares(n, lambda bits, name=name: values(bits)[name]) for name in mixtures.values}
+        def share_of(name: str) -> Sequence[Share]:
+            return shares(n, lambda bits: values(bits)[name])
+
+        adds = {name: share_of(name) for name in mixtures.values}
         return Walk(
             run=self.run.name,
             method=printable(self.method, 80),
