@@ -160,7 +160,7 @@ def test_the_tables_compile_without_a_warning(tmp_path: Path) -> None:
         *paper_table("III", instances, shown, with_published=True),
         ablation_table([*rows, *instances], [SweepRow("m", "5", "opensu3d")], Shown(), with_published=True),
         replace(hostile_table(), columns=("=f", "<b>")),
-        wide_and_high(40),
+        wide_and_high(6),
     ]
     tables = [replace(table, name=f"{table.name} {k}") for k, table in enumerate(tables)]
     (tmp_path / "tables.tex").write_text(latex(tables))
