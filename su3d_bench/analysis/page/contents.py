@@ -213,8 +213,8 @@ def _comparisons(runs: Sequence[FinishedRun]) -> list[dict[str, Any]]:
         pairs += itertools.combinations((Side(run, method) for method in run.methods), 2)
     numbers, compared = SideNumbers(), []
     for pair in pairs[:MOST_PAIRS]:
-        first, second = ([runs.index(side.run), side.method] for side in pair)
-        found: dict[str, Any] = {"left": first, "right": second, "protocols": [], "remarks": [], "reason": None}
+        left, right = ([runs.index(side.run), side.method] for side in pair)
+        found: dict[str, Any] = {"left": left, "right": right, "protocols": [], "remarks": [], "reason": None}
         try:
             comparison = compare(*(f"{side.run.folder.path}:{side.method}" for side in pair), numbers=numbers).to_json()
             found |= {name: comparison[name] for name in ("protocols", "remarks")}
