@@ -11,10 +11,10 @@ import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from su3d_bench.core.config import MOVES_NO_NUMBER
 from su3d_bench.core.english import plural
@@ -192,6 +192,13 @@ class MethodResult(_Model):
     metrics: dict[str, Value] = Field(min_length=1)
     scenes: dict[str, dict[str, Value]] = Field(min_length=1)
     classes: dict[str, dict[str, Value]]
+
+    @model_validator(mode="after")
+    def _can_fail(self) -> Self:
+        """A reference without a number would pass every run that has none either."""
+        if all(value.value is None for value in self.metrics.values()):
+            raise ValueError(f"{self.method} under {self.protocol} has no value")
+        return self
 
 
 class Reference(_Model):
