@@ -6,6 +6,7 @@ import argparse
 import math
 import re
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
@@ -214,20 +215,30 @@ def _above(bars: Progress) -> AbstractContextManager[None]:
 
 @contextmanager
 def overall_progress(what: str, *, is_quiet: bool) -> Iterator[tuple[Callable[[int], None], Report]]:
-    """One bar over the steps of all units, with the time left: a function that takes their number, and a ``Report``."""
+    """Progress over the steps of all units: a function that takes their number, and a ``Report``.
+
+    On a terminal it is one bar with the time left, elsewhere one line per unit that is done.
+    """
     n_done: dict[str, int] = {}
+    n_all, started = 0, time.monotonic()
     with drawn_bars(is_quiet=is_quiet, tells_time_left=True) as bars:
-        if bars is None:
-            yield lambda n_steps: None, lambda event: None
-            return
-        task = bars.add_task(what, total=None, remark="")
+        task = None if bars is None else bars.add_task(what, total=None, remark="")
 
         def begin(n_steps: int) -> None:
-            bars.update(task, total=n_steps)
+            nonlocal n_all
+            n_all = n_steps
+            if bars is not None and task is not None:
+                bars.update(task, total=n_steps)
 
         def report(event: Event) -> None:
             n_done[event.unit] = event.done
-            bars.update(task, completed=sum(n_done.values()), description=f"{event.unit}: {event.label}")
+            n = sum(n_done.values())
+            if bars is not None and task is not None:
+                bars.update(task, completed=n, description=f"{event.unit}: {event.label}")
+            elif event.done == event.total and n:
+                seconds_left = (time.monotonic() - started) * (n_all / n - 1)
+                left = f", about {seconds_left:.0f} s left" if n < n_all else ""
+                remark(f"{what}: {event.unit} done, {n} of {n_all} steps{left}", quiet=is_quiet)
 
         yield begin, report
 
