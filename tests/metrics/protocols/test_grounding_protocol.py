@@ -197,7 +197,7 @@ def test_scannet_gives_its_axis_alignment_and_the_classes_of_names(tmp_path: Pat
     [
         ("scene0011_00-chair-two-4-5", "['a']", "'stimulus_id' must be scan-class-n-target-others"),
         ("scene0011_00-chair--4-5", "['a']", "'stimulus_id' must be scan-class-n-target-others"),
-        ("scene0011_00-chair-3-4-5", "['a']", "says 3 objects and names 1 others"),
+        ("scene0011_00-chair-3-4-5", "['a']", "'stimulus_id' must be scan-class-n-target-others"),
         ("scene0011_00-chair-2-4-5", "['a'", "'tokens' must be a list of words"),
         ("scene0011_00-chair-2-4-5", "__import__('os').getcwd()", "'tokens' must be a list of words"),
         ("scene0011_00-chair-2-4-5", "(" * 9000, "'tokens' must be a list of words"),

@@ -121,7 +121,7 @@ def test_what_cannot_answer_a_text_is_refused_in_one_line() -> None:
     points = np.zeros((3, 3), np.float32)
     dense = DenseFeatures(points, np.zeros((3, 3), np.float16))
     for content, message in (
-        (dense, "has no masks, and the challenge's submission needs them"),
+        (dense, "has no masks"),
         (Instances.of(points, [np.array([0])]), "needs features to compare with texts, and the prediction has none"),
     ):
         with pytest.raises(PredictionError, match=message):
