@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -13,7 +12,6 @@ from hypothesis import strategies as st
 
 from su3d_bench.core.maps import Masks
 from su3d_bench.core.types import Int32Array, Int64Array
-from su3d_bench.metrics.attribution import masks as attribution
 from su3d_bench.metrics.attribution.arrays import Pool, single_mask_errors, single_point_errors
 from su3d_bench.metrics.attribution.masks import (
     KINDS,
@@ -77,10 +75,6 @@ def gains(masks: list[Int32Array], classes: list[int], scores: list[float]) -> t
     for kind, ap in found.items():
         assert (ap.ap != base.ap) <= (mended.n[kind] > 0)
     return {kind: ap.ap50 - base.ap50 for kind, ap in found.items()}, dict(mended.n)
-
-
-def test_the_example_runs() -> None:
-    assert doctest.testmod(attribution).failed == 0
 
 
 def test_a_mask_on_void_is_background_where_void_is_not_forgiven() -> None:

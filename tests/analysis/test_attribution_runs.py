@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 import json
 import shutil
 from dataclasses import fields, replace
@@ -15,7 +14,6 @@ from painted import WordEncoder, colour_perception
 from places import SCENES
 from scored_room import ENCODER, NAMES, instances, noisy, room, truth_as_prediction
 
-import su3d_bench.reports.tables.samples
 from su3d_bench.analysis.attribution import attribute
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, PredictionError
@@ -262,8 +260,3 @@ def test_the_command_prints_a_table_and_draws_the_plot(capsys: pytest.CaptureFix
     assert main(["report", "attribution", "dropped", "--protocol", "rooms-instance", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert [one["protocol"] for one in found["protocols"]] == ["rooms-instance"]
-
-
-def test_the_examples_in_the_docstrings_run() -> None:
-    assert doctest.testmod(attribution_semantic).failed == 0
-    assert doctest.testmod(su3d_bench.reports.tables.samples).failed == 0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 import json
 import shutil
 from functools import cache
@@ -14,7 +13,6 @@ from painted import colour_perception
 from places import SCENES
 from scored_room import noisy_scores
 
-import su3d_bench.analysis.sides
 from su3d_bench.analysis.comparison import compare, plan
 from su3d_bench.cli.main import main
 from su3d_bench.metrics.metric import SceneScore
@@ -138,7 +136,3 @@ def test_a_side_of_several_seeds_stands_for_their_mean_and_says_how_far_seeds_al
     assert found.deviations_of_seeds == pytest.approx([np.std(side, ddof=1) for side in whole])
     assert list(found.per_scene.values()) == pytest.approx(list(alone[1] - alone[0]))
     assert found.test == sign_flip_test(alone[1] - alone[0])
-
-
-def test_the_examples_in_the_docstrings_run() -> None:
-    assert doctest.testmod(su3d_bench.analysis.sides).failed == 0

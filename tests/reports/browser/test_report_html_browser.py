@@ -1,24 +1,52 @@
-"""The page of runs in a real browser, opened as a file: its numbers and every control."""
+"""The page of runs in a real browser, opened as a file: its numbers, its maps and every control."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
 
+import chromium
 import pytest
 from chromium import Chromium, find_chromium
-from looks import complaints
-from runs_page import choose, column, open_maps, options, picture, press, text_of
+from looks import WHOLE, complaints
+from runs_page import (
+    SELECT,
+    browser_for_pages,
+    choose,
+    column,
+    headers,
+    open_maps,
+    options,
+    page_of_runs,
+    picture,
+    press,
+    text_of,
+)  # fmt: skip
 
 pytestmark = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
 MIDDLE_SECTIONS = ("Scenes", "Classes", "Confusion", "Errors", "Timing", "Compare")
 GALLERY = "Worst errors"  # its controls have tests of their own
 
 
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return page_of_runs(tmp_path_factory.mktemp("page"))
+
+
+@pytest.fixture(scope="module")
+def opened(page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
+    """The page in a browser, as the tests before left it."""
+    with browser_for_pages(tmp_path_factory.mktemp("profile")) as found:
+        found.open(page)
+        found.until(WHOLE)
+        yield found
+
+
 @pytest.fixture
-def browser(opened_runs: Chromium) -> Iterator[Chromium]:
-    yield opened_runs
-    assert complaints(opened_runs) == []
+def browser(opened: Chromium) -> Iterator[Chromium]:
+    yield opened
+    assert complaints(opened) == []
 
 
 def test_every_section_is_there_and_the_navigation_leads_to_it(browser: Chromium) -> None:
@@ -92,3 +120,41 @@ def test_each_control_of_a_section_changes_what_it_shows(browser: Chromium, part
             else:
                 browser.until(f"{shown} !== {json.dumps(before)}")
     assert n_operated > 0
+
+
+def test_every_colouring_draws_another_picture_and_says_what_it_means(browser: Chromium) -> None:
+    open_maps(browser)
+    kinds = options(browser, "maps", "Colour by")
+    assert kinds == ["colour", "instance", "class", "true class", "error against the truth", "similarity to a text"]
+    seen = {}
+    for kind in kinds:
+        choose(browser, "maps", "Colour by", kind)
+        seen[kind] = picture(browser)
+        assert text_of(browser, "#maps .legend").strip()
+    assert len(set(seen.values())) >= 5  # instances and classes may have the same colours where each is of one class
+    choose(browser, "maps", "Colour by", kinds[4])
+    assert "right class" in text_of(browser, "#maps .legend")
+    choose(browser, "maps", "Colour by", kinds[5])
+    assert options(browser, "maps", "Text") == ["chair", "table"]
+    first = picture(browser)
+    choose(browser, "maps", "Text", "table")
+    assert picture(browser) != first
+    assert column(browser, "maps", 0)[0] == "table"
+    assert headers(browser, "maps") == ["Instance", "Similarity", "Points"]
+    choose(browser, "maps", "Colour by", kinds[0])
+    assert browser.run(f"{SELECT.format(part='maps', label='Text')}.closest('.field').hidden")
+    assert headers(browser, "maps") == ["Instance", "Score", "Points"]
+
+
+def test_without_webgl_the_page_says_so_and_keeps_its_numbers(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(chromium, "FLAGS", (*chromium.FLAGS, "--disable-3d-apis"))
+    with Chromium(tmp_path / "profile") as browser:
+        browser.open(page)
+        browser.run("document.getElementById('maps').scrollIntoView()")
+        browser.until("document.querySelector('#maps .say')?.innerText.includes('no WebGL 2')")
+        browser.until("document.querySelectorAll('#maps .side tbody tr').length > 0")
+        browser.run("document.querySelector('#maps .side tbody tr').click()")
+        assert "Points" in text_of(browser, "#maps .detail")
+        assert browser.run("document.querySelectorAll('#summary table').length") == 2
