@@ -85,10 +85,6 @@ def test_what_is_farther_than_5_cm_covers_nothing() -> None:
     assert values(moved)["all"] == values(moved)["reachable"] == 0.0
 
 
-def test_an_empty_map_answers_nothing() -> None:
-    assert values(nothing(TRUTH))["all"] == 0.0
-
-
 def test_where_there_is_nothing_to_rank_no_instance_comes_first() -> None:
     assert first_instances(RULES, ["chair", "lamp"], nothing(room()), ENCODER).tolist() == [-1, -1]
     assert first_instances(RULES, [], PERFECT, ENCODER).tolist() == []
@@ -122,13 +118,6 @@ def test_texts_to_which_the_name_alone_is_the_answer_stand_apart() -> None:
     found = values(PERFECT, RetrievalTruth(TRUTH, (*ASKED, *(AskedText(kind, "red table", (i,)) for kind, i in kinds))))
     assert (found["by name"], found["n_by name"]) == (2 / 3, 3)
     assert (found["all"], found["n_all"]) == (4 / 6, 6)
-
-
-def test_order_of_instances_and_questions_changes_nothing() -> None:
-    order = np.random.default_rng(0).permutation(len(PERFECT))
-    assert PERFECT.features is not None
-    mixed = instances(TRUTH.points, [PERFECT.mask(k) for k in order], None, PERFECT.features[order])
-    assert values(mixed, RetrievalTruth(TRUTH, ASKED[::-1])) == values(PERFECT)
 
 
 def test_scenes_pool_by_their_questions_and_counts_survive_the_file() -> None:
