@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from painted import WordEncoder, colour_perception
-from places import SCENES
+from painted import WordEncoder
+from painted_runs import painted_run
 from scored_room import ENCODER, NAMES, instances, noisy, room, truth_as_prediction
 
 from su3d_bench.analysis.attribution import attribute
@@ -33,10 +33,7 @@ from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.scoring import score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.runs import finished as finished_run
-from su3d_bench.runs import scene as scene_run
 
-PAINTED = f"{SCENES}/painted.py:Painted"
-COLLECTOR = f"{SCENES}/painted.py:Collector"
 ROOM_RULES = load_protocol("rooms-semantic")
 EXPLAINED = [
     name
@@ -184,12 +181,10 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """``whole``: all found; ``dropped``: one object of each scene is not; ``oracle``: what the truth gives."""
     folder = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
         patch.chdir(folder)
-        for out, more in (("whole", []), ("dropped", ["--set", "collector.drop=1"])):
-            words = ["run", "--scenes", f"{PAINTED}/[ab]", "--methods", COLLECTOR, "--no-pictures", "--jobs", "1"]
-            protocols = ["--protocols", "rooms-semantic", "rooms-instance", "replica-mesh-ex6"]
-            assert main([*words, *protocols, "--quiet", "--out", out, *more]) == 0
+        protocols = ["--quiet", "--protocols", "rooms-semantic", "rooms-instance", "replica-mesh-ex6"]
+        painted_run(Path("whole"), *protocols)
+        painted_run(Path("dropped"), *protocols, "--set", "collector.drop=1")
         shutil.copytree("whole", "oracle")
         text = Path("oracle/run.json").read_text()
         Path("oracle/run.json").write_text(text.replace('"profile": "embedded"', '"profile": "oracle"'))

@@ -235,17 +235,11 @@ NUMBERS_ALONE = "holds numbers without the counts of scenes, from which this is 
 PREDICTIONS = (
     "pred: holds predictions (scannet-text) and no run.json; make a run of them with: su3d-bench evaluate pred"
 )
-
-
 NO_RUNS = {
     "compare numbers.json runs/mine": f"numbers.json: {NUMBERS_ALONE}",
     "compare runs/mine both.json:mine": f"both.json: {NUMBERS_ALONE}",
-    "compare pred runs/mine": PREDICTIONS,
     "compare nowhere runs/mine": "nowhere: there is no such folder",
     "report attribution pred": PREDICTIONS,
-    "check numbers.json --against reference.json": f"numbers.json: {NUMBERS_ALONE}",
-    "sheets make pred --kind annotation --out sheets": PREDICTIONS,
-    "report tables both.json": f"both.json: {NUMBERS_ALONE}",
     "report leaderboard pred": "pred: holds no run below it; su3d-bench run writes one, and evaluate --out",
 }
 
@@ -255,7 +249,6 @@ def test_what_is_no_run_is_refused_with_the_truth_and_what_makes_one(capsys: pyt
     main([*TEXTS, "--json", "numbers.json", "--quiet"])
     numbers = json.loads(Path("numbers.json").read_text())
     Path("both.json").write_text(json.dumps({"schema": 1, "methods": {"mine": numbers}}))
-    main(["check", "--learn", "runs/mine", "--out", "reference.json"])
     for words, line in NO_RUNS.items():
         error = answered(capsys, *words.split(), code=2)
         assert error.startswith(f"su3d-bench: {line}") and error.count("\n") == 1

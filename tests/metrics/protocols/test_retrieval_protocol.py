@@ -29,7 +29,7 @@ from su3d_bench.metrics.questions.score import (
     first_instances,
     is_answer_right,
 )
-from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, plain_json, score_scene, unpack_scores
+from su3d_bench.metrics.scoring import combine, metric_of, plain_json, score_scene
 from su3d_bench.predictions.base import vertex_masks
 from su3d_bench.questions import truths
 from su3d_bench.questions.sight import Sight
@@ -120,14 +120,10 @@ def test_texts_to_which_the_name_alone_is_the_answer_stand_apart() -> None:
     assert (found["all"], found["n_all"]) == (4 / 6, 6)
 
 
-def test_scenes_pool_by_their_questions_and_counts_survive_the_file() -> None:
+def test_scenes_pool_by_their_questions() -> None:
     few = RetrievalTruth(TRUTH, ASKED[:1])
-    scores = {
-        "a": score_scene(RULES, QUESTIONS, PERFECT, ENCODER),
-        "b": score_scene(RULES, few, PERFECT, ENCODER),
-    }
-    stored = {scene: unpack_scores(pack_scores({RULES.name: one}))[RULES.name] for scene, one in scores.items()}
-    result = combine(RULES, stored)
+    asked = {"a": QUESTIONS, "b": few}
+    result = combine(RULES, {scene: score_scene(RULES, one, PERFECT, ENCODER) for scene, one in asked.items()})
     assert result.metrics["all"] == 5 / 7
     assert result.metrics == result.pooled
     assert result.per_scene["b"]["all"] == 1.0
