@@ -107,36 +107,18 @@ def causes(prediction: Prediction) -> dict[str, int]:
     return {name: n for name, n in mended.n.items() if n}
 
 
-def whole() -> tuple[list[np.ndarray], list[str]]:
-    truth = truth_as_prediction(room(), with_labels=True)
-    return [truth.mask(k) for k in range(len(truth))], list(NAMES)
-
-
-def test_an_object_that_the_map_lacks_is_missing_geometry() -> None:
-    masks, names = whole()
-    kept = np.setdiff1d(np.arange(len(room().points)), masks[4])
-    place = np.full(len(room().points), -1)
+def test_the_cause_of_points_that_are_wrong_is_told() -> None:
+    truth, names, points = truth_as_prediction(room(), with_labels=True), list(NAMES), room().points
+    masks = [truth.mask(k) for k in range(len(truth))]
+    fewer, called = [*masks[:4], *masks[5:]], [*names[:4], *names[5:]]
+    assert causes(instances(points, fewer, called)) == {"background": 150}, "in the map and in no mask"
+    kept = np.setdiff1d(np.arange(len(points)), masks[4])
+    place = np.full(len(points), -1)
     place[kept] = np.arange(len(kept))
-    del masks[4], names[4]
-    assert causes(instances(room().points[kept], [place[mask] for mask in masks], names)) == {"geometry": 150}
-
-
-def test_an_object_in_the_map_but_in_no_mask_is_background() -> None:
-    masks, names = whole()
-    del masks[4], names[4]
-    assert causes(instances(room().points, masks, names)) == {"background": 150}
-
-
-def test_points_in_another_object_s_mask_are_lost_to_association() -> None:
-    masks, names = whole()
-    masks[3], masks[4] = np.sort(np.concatenate([masks[3], masks[4][:40]])), masks[4][40:]
-    assert causes(instances(room().points, masks, names)) == {"association": 40}
-
-
-def test_the_right_mask_under_a_wrong_name_is_a_wrong_label() -> None:
-    masks, names = whole()
-    names[4] = "sofa"
-    assert causes(instances(room().points, masks, names)) == {"label": 150}
+    assert causes(instances(points[kept], [place[mask] for mask in fewer], called)) == {"geometry": 150}
+    mixed = [*masks[:3], np.sort(np.concatenate([masks[3], masks[4][:40]])), masks[4][40:], *masks[5:]]
+    assert causes(instances(points, mixed, names)) == {"association": 40}, "in the mask of another object"
+    assert causes(instances(points, masks, [*names[:4], "sofa", *names[5:]])) == {"label": 150}
 
 
 def row_of_points(*rows: tuple[int, int, int, float, bool]) -> LabelledPoints:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evaluated_text import scene
+from evaluated_text import scene, write_truth
 from painted import Painted
 from places import SCENES
 from prediction_files import write_openmask3d, write_scannet_text
@@ -176,9 +176,8 @@ def test_a_folder_of_something_else_is_refused_before_anything_is_scored(capsys:
 @pytest.fixture
 def _texts() -> None:
     """Ground truth as text, in which a chair and a table lie, and predictions of it."""
-    Path("gt").mkdir()
     for name, n in (("scene0001_00", 2), ("scene0001_01", 1), ("scene0002_00", 2)):
-        Path(f"gt/{name}.txt").write_text("".join(f"{value}\n" for value in np.repeat([5001, 7002, 1003], 200)))
+        write_truth(Path("gt"), name)
         masks = [np.arange(150), np.arange(220, 400)][:n]
         write_scannet_text(Path("pred"), scene(masks, [5, 7][:n], [0.9, 0.8][:n], name=name))
 

@@ -124,7 +124,8 @@ def test_the_truth_scores_one_and_an_empty_map_nothing(name: str) -> None:
 def renumbered(truth: Any) -> Any:
     """The same truth with other numbers of objects, and its queries the other way round."""
     if isinstance(truth, PresenceTruth | RetrievalTruth):
-        return replace(truth, asked=truth.asked[::-1])
+        asked: Any = truth.asked[::-1]
+        return replace(truth, asked=asked)
     if isinstance(truth, GroundTruth):
         boxes = truth.boxes and ObjectBoxes(
             {9 - k: box for k, box in truth.boxes.boxes.items()},

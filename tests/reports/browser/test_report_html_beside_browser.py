@@ -74,12 +74,6 @@ def opened(browser: Chromium, text: str = "painted/a by") -> None:
     browser.until(READ.format(text=json.dumps(text)))
 
 
-def settled(browser: Chromium) -> None:
-    """Until an address that was given has been followed."""
-    browser.run("new Promise((done) => setTimeout(done, 100))")
-    browser.until("!document.querySelector('#maps .panes[aria-busy]')")
-
-
 def choose(browser: Chromium, label: str, text: str) -> None:
     runs_page.choose(browser, "maps", label, text)
 
