@@ -19,8 +19,6 @@ MOST_KEPT_BYTES = 4 << 30
 sys.path += sorted({str(file.parent) for file in TESTS.rglob("*.py")} - {*sys.path})
 
 from chat_server import ChatServer, chat_server  # noqa: E402 (it is found by the line above)
-from chromium import Chromium  # noqa: E402
-from gated_runs import gate_reference, gate_reference_file, gated, gated_copy  # noqa: E402, F401
 from painted import colour_perception  # noqa: E402
 from painted_sheets import painted_folder, painted_source  # noqa: E402, F401
 
@@ -87,26 +85,6 @@ def chat(chat_of_module: ChatServer, monkeypatch: pytest.MonkeyPatch) -> ChatSer
     monkeypatch.delenv("OPENAI_BASE_URL", raising=False)
     chat_of_module.forget()
     return chat_of_module
-
-
-@pytest.fixture(scope="session")
-def runs_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The page of runs, made once."""
-    from made_pages import page_of_runs
-
-    return page_of_runs(tmp_path_factory.mktemp("page"))
-
-
-@pytest.fixture(scope="module")
-def opened_runs(runs_page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
-    """The page of runs in a browser, as the tests before left it."""
-    from looks import WHOLE
-    from made_pages import browser_for_pages
-
-    with browser_for_pages(tmp_path_factory.mktemp("profile")) as found:
-        found.open(runs_page)
-        found.until(WHOLE)
-        yield found
 
 
 def pytest_xdist_auto_num_workers() -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 import json
 import shutil
 from dataclasses import fields, replace
@@ -11,11 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from painted import WordEncoder, colour_perception
-from places import SCENES
+from painted import WordEncoder
+from painted_runs import painted_run
 from scored_room import ENCODER, NAMES, instances, noisy, room, truth_as_prediction
 
-import su3d_bench.reports.tables.samples
 from su3d_bench.analysis.attribution import attribute
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, PredictionError
@@ -35,10 +33,7 @@ from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.scoring import score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.runs import finished as finished_run
-from su3d_bench.runs import scene as scene_run
 
-PAINTED = f"{SCENES}/painted.py:Painted"
-COLLECTOR = f"{SCENES}/painted.py:Collector"
 ROOM_RULES = load_protocol("rooms-semantic")
 EXPLAINED = [
     name
@@ -112,36 +107,18 @@ def causes(prediction: Prediction) -> dict[str, int]:
     return {name: n for name, n in mended.n.items() if n}
 
 
-def whole() -> tuple[list[np.ndarray], list[str]]:
-    truth = truth_as_prediction(room(), with_labels=True)
-    return [truth.mask(k) for k in range(len(truth))], list(NAMES)
-
-
-def test_an_object_that_the_map_lacks_is_missing_geometry() -> None:
-    masks, names = whole()
-    kept = np.setdiff1d(np.arange(len(room().points)), masks[4])
-    place = np.full(len(room().points), -1)
+def test_the_cause_of_points_that_are_wrong_is_told() -> None:
+    truth, names, points = truth_as_prediction(room(), with_labels=True), list(NAMES), room().points
+    masks = [truth.mask(k) for k in range(len(truth))]
+    fewer, called = [*masks[:4], *masks[5:]], [*names[:4], *names[5:]]
+    assert causes(instances(points, fewer, called)) == {"background": 150}, "in the map and in no mask"
+    kept = np.setdiff1d(np.arange(len(points)), masks[4])
+    place = np.full(len(points), -1)
     place[kept] = np.arange(len(kept))
-    del masks[4], names[4]
-    assert causes(instances(room().points[kept], [place[mask] for mask in masks], names)) == {"geometry": 150}
-
-
-def test_an_object_in_the_map_but_in_no_mask_is_background() -> None:
-    masks, names = whole()
-    del masks[4], names[4]
-    assert causes(instances(room().points, masks, names)) == {"background": 150}
-
-
-def test_points_in_another_object_s_mask_are_lost_to_association() -> None:
-    masks, names = whole()
-    masks[3], masks[4] = np.sort(np.concatenate([masks[3], masks[4][:40]])), masks[4][40:]
-    assert causes(instances(room().points, masks, names)) == {"association": 40}
-
-
-def test_the_right_mask_under_a_wrong_name_is_a_wrong_label() -> None:
-    masks, names = whole()
-    names[4] = "sofa"
-    assert causes(instances(room().points, masks, names)) == {"label": 150}
+    assert causes(instances(points[kept], [place[mask] for mask in fewer], called)) == {"geometry": 150}
+    mixed = [*masks[:3], np.sort(np.concatenate([masks[3], masks[4][:40]])), masks[4][40:], *masks[5:]]
+    assert causes(instances(points, mixed, names)) == {"association": 40}, "in the mask of another object"
+    assert causes(instances(points, masks, [*names[:4], "sofa", *names[5:]])) == {"label": 150}
 
 
 def row_of_points(*rows: tuple[int, int, int, float, bool]) -> LabelledPoints:
@@ -186,12 +163,10 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """``whole``: all found; ``dropped``: one object of each scene is not; ``oracle``: what the truth gives."""
     folder = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
         patch.chdir(folder)
-        for out, more in (("whole", []), ("dropped", ["--set", "collector.drop=1"])):
-            words = ["run", "--scenes", f"{PAINTED}/[ab]", "--methods", COLLECTOR, "--no-pictures", "--jobs", "1"]
-            protocols = ["--protocols", "rooms-semantic", "rooms-instance", "replica-mesh-ex6"]
-            assert main([*words, *protocols, "--quiet", "--out", out, *more]) == 0
+        protocols = ["--quiet", "--protocols", "rooms-semantic", "rooms-instance", "replica-mesh-ex6"]
+        painted_run(Path("whole"), *protocols)
+        painted_run(Path("dropped"), *protocols, "--set", "collector.drop=1")
         shutil.copytree("whole", "oracle")
         text = Path("oracle/run.json").read_text()
         Path("oracle/run.json").write_text(text.replace('"profile": "embedded"', '"profile": "oracle"'))
@@ -262,8 +237,3 @@ def test_the_command_prints_a_table_and_draws_the_plot(capsys: pytest.CaptureFix
     assert main(["report", "attribution", "dropped", "--protocol", "rooms-instance", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert [one["protocol"] for one in found["protocols"]] == ["rooms-instance"]
-
-
-def test_the_examples_in_the_docstrings_run() -> None:
-    assert doctest.testmod(attribution_semantic).failed == 0
-    assert doctest.testmod(su3d_bench.reports.tables.samples).failed == 0

@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from painted import colour_perception
-from places import SCENES
+from painted_runs import painted_run
 from scored_room import noisy_scores
 
 from su3d_bench.analysis.comparison import Difference, compare, difference_of
@@ -26,39 +25,22 @@ from su3d_bench.metrics.scoring import metric_of, pack_scores
 from su3d_bench.numerics.statistics import SignFlipTest, sign_flip_test
 from su3d_bench.reports.tables.comparison import comparison_tables
 from su3d_bench.reports.tables.formats import markdown
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.run_folder import RunFolder
-
-PAINTED = f"{SCENES}/painted.py:Painted"
-
-
-COLLECTOR = f"{SCENES}/painted.py:Collector"
-
-
-# the sign-flip test
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """``a``: everything found; ``b``: one object dropped; ``few``: as ``b``, two scenes; ``truth``: the oracle."""
+    """``a``: everything found; ``b``: one object dropped; ``few``: as ``b``, two scenes."""
     folder = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
         patch.chdir(folder)
         for out, scenes, more in (
-            ("a", "[abc]", []),
-            ("b", "[abc]", ["--set", "collector.drop=1"]),
-            ("few", "[bd]", ["--set", "collector.drop=1"]),
-            ("partial", "[ab]", ["--limit", "2"]),
-            ("failed", "[abc]", ["--set", "painted.fault=crash"]),
-            ("variants", "[abc]", ["--methods", COLLECTOR, f"{COLLECTOR}@drop=2"]),
-            ("other-data", "[abc]", ["--set", "painted.n_frames=5"]),
+            ("a", "abc", []),
+            ("b", "abc", ["--set", "collector.drop=1"]),
+            ("few", "bd", ["--set", "collector.drop=1"]),
+            ("other-data", "abc", ["--set", "painted.n_frames=5"]),
         ):
-            words = ["run", "--scenes", f"{PAINTED}/{scenes}", "--methods", COLLECTOR, "--no-pictures", "--jobs", "1"]
-            protocols = ["--protocols", "rooms-semantic", "rooms-instance"]
-            assert main([*words, *protocols, "--quiet", "--out", out, *more]) == (3 if out == "failed" else 0)
-        words[words.index(COLLECTOR)] = "oracle"
-        assert main([*words, *protocols, "--quiet", "--out", "truth"]) == 0
+            painted_run(Path(out), "--quiet", *more, scenes=scenes)
         copy_as("a", "other-encoder", "metrics.json", lambda text: text.replace("words-1", "words-2"))
         copy_as(
             "a", "other-rules", "run.json", lambda text: text.replace(load_protocol("rooms-instance").digest, "0" * 64)

@@ -10,20 +10,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from painted import colour_perception
-from places import SCENES
+from painted_runs import COLLECTOR, painted_run
 
 from su3d_bench.analysis.comparison import Comparison, compare
 from su3d_bench.analysis.sides import Side, SideNumbers
-from su3d_bench.cli.main import main
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
 from su3d_bench.numerics.statistics import MAX_EXACT_PAIRS, SignFlipTest, sign_flip_test
-from su3d_bench.runs import scene as scene_run
 
 RULES = load_protocol("rooms-semantic")
-COLLECTOR = f"{SCENES}/painted.py:Collector"
 CLASS = next(index for index, entry in enumerate(RULES.classes) if not RULES.is_ignored(entry.name))
 LEFT = {"painted/a": 100, "painted/b": 500, "painted/c": 900}  # points of a thousand that are called rightly
 GAIN = {"painted/a": 50, "painted/b": 60, "painted/c": 70}
@@ -32,13 +28,8 @@ GAIN = {"painted/a": 50, "painted/b": 60, "painted/c": 70}
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of three scenes and two methods; its own numbers do not matter here."""
-    out = tmp_path_factory.mktemp("pairs") / "run"
-    words = ["run", "--scenes", f"{SCENES}/painted.py:Painted/[abc]", "--methods", COLLECTOR, f"{COLLECTOR}@drop=2"]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
-        options = ["--protocols", RULES.name, "--no-pictures", "--jobs", "1", "--quiet"]
-        assert main([*words, *options, "--out", str(out)]) == 0
-    return out
+    methods = (COLLECTOR, f"{COLLECTOR}@drop=2")
+    return painted_run(tmp_path_factory.mktemp("pairs") / "run", "--quiet", methods=methods, scenes="abc")
 
 
 class MadeNumbers(SideNumbers):
@@ -65,7 +56,8 @@ def scored(n_right: Mapping[str, int]) -> dict[str, SceneScore]:
 
 def compared(folder: Path, left: Mapping[str, SceneScore], right: Mapping[str, SceneScore]) -> Comparison:
     numbers = MadeNumbers(left, right)
-    return compare(f"{folder}:collector", f"{folder}:collector@drop=2", numbers=numbers, per_class=True)
+    sides = (f"{folder}:collector", f"{folder}:collector@drop=2")
+    return compare(*sides, protocols=[RULES.name], numbers=numbers, per_class=True)
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 2, 0)])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 import json
 import shutil
 from functools import cache
@@ -10,21 +9,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from painted import colour_perception
-from places import SCENES
+from painted_runs import COLLECTOR, painted_run
 from scored_room import noisy_scores
 
-import su3d_bench.analysis.sides
 from su3d_bench.analysis.comparison import compare, plan
 from su3d_bench.cli.main import main
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, pack_scores
 from su3d_bench.numerics.statistics import scenes_needed, sign_flip_test, variance_of
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.run_folder import RunFolder
 
-COLLECTOR = f"{SCENES}/painted.py:Collector"
 PROTOCOLS = ("rooms-semantic", "rooms-instance")
 METHODS = ("collector", "collector@drop=1")
 N_SCENES = 3
@@ -40,20 +35,16 @@ def scores_of(name: str) -> list[SceneScore]:
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """``seed-0`` to ``seed-2``: the same two methods, with other counts in every scene, method and run."""
     folder = tmp_path_factory.mktemp("plans")
-    words = ["run", "--scenes", f"{SCENES}/painted.py:Painted/[abc]", "--methods", COLLECTOR, f"{COLLECTOR}@drop=1"]
-    words += ["--protocols", *PROTOCOLS, "--no-pictures", "--jobs", "1", "--quiet"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
         patch.chdir(folder)
-        assert main([*words, "--seed", "0", "--out", "seed-0"]) == 0
+        methods = (COLLECTOR, f"{COLLECTOR}@drop=1")
+        painted_run(Path("seed-0"), "--quiet", "--seed", "0", methods=methods, scenes="abc")
         for seed in (1, 2):
             shutil.copytree("seed-0", f"seed-{seed}")
             for name, text in (("run.json", '"seed": {}'), ("run.toml", "\nseed = {}")):
                 file = Path(f"seed-{seed}", name)
                 assert text.format(0) in file.read_text()
                 file.write_text(file.read_text().replace(text.format(0), text.format(seed), 1))
-        assert main([*words, "--set", "painted.n_frames=5", "--seed", "9", "--out", "other-data"]) == 0
-        assert main([*words, "--limit", "2", "--seed", "8", "--out", "partial"]) == 0
     made = {name: scores_of(name) for name in PROTOCOLS}
     for k in range(6):
         for s, scene in enumerate("abc"):
@@ -138,7 +129,3 @@ def test_a_side_of_several_seeds_stands_for_their_mean_and_says_how_far_seeds_al
     assert found.deviations_of_seeds == pytest.approx([np.std(side, ddof=1) for side in whole])
     assert list(found.per_scene.values()) == pytest.approx(list(alone[1] - alone[0]))
     assert found.test == sign_flip_test(alone[1] - alone[0])
-
-
-def test_the_examples_in_the_docstrings_run() -> None:
-    assert doctest.testmod(su3d_bench.analysis.sides).failed == 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import doctest
 import io
 import json
 from collections import Counter
@@ -17,8 +16,6 @@ from painted import WordEncoder
 from painted_runs import COLLECTOR, painted_run
 from scored_room import ENCODER, noisy
 
-import su3d_bench.metrics.instance.average_precision
-import su3d_bench.reports.tables.samples
 from su3d_bench.analysis.attribution import attribute
 from su3d_bench.analysis.samples import _OfPoints, samples
 from su3d_bench.cli.main import main
@@ -40,11 +37,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         patch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
         folder, methods = tmp_path_factory.mktemp("samples") / "run", (COLLECTOR, "oracle")
         yield painted_run(folder, "--quiet", "--set", "collector.drop=1", methods=methods)
-
-
-def test_the_examples_hold() -> None:
-    assert doctest.testmod(su3d_bench.metrics.instance.average_precision).failed == 0
-    assert doctest.testmod(su3d_bench.reports.tables.samples).failed == 0
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
+from evaluated_text import CHAIR, TABLE, scene, write_truth
 from prediction_files import write_scannet_text
 
 from su3d_bench.cli.main import main
@@ -17,16 +17,9 @@ def _files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two scenes with a chair and a table in ``gt``, predicted in ``pred``: one rightly, one with the table missed."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
-    Path("gt").mkdir()
-    values = "".join(f"{value}\n" for value in np.repeat([5001, 7002, 1003], 200))
     for name, n in (("scene0001_00", 2), ("scene0001_01", 1)):
-        Path(f"gt/{name}.txt").write_text(values)
-        masks = np.repeat(np.eye(3, dtype=bool)[:n], 200, axis=1)
-        files = [f"masks/{name}_{k}.txt" for k in range(n)]
-        labels, scores = np.array([5, 7])[:n], np.array([0.9, 0.8])[:n]
-        write_scannet_text(
-            Path("pred"), {"name": name, "masks": masks, "labels": labels, "scores": scores, "files": files}
-        )
+        write_truth(Path("gt"), name)
+        write_scannet_text(Path("pred"), scene([CHAIR, TABLE][:n], [5, 7][:n], [0.9, 0.8][:n], name=name))
 
 
 WORDS = ["evaluate", "pred/", "--ground-truth", "gt/", "--protocol", "scannet-instance"]

@@ -9,62 +9,37 @@ from typing import Any
 import numpy as np
 import pytest
 from evaluated_text import said, write_texts
-from places import SCENES
+from painted_runs import PAINTED, painted_run
 from test_openlex3d_original import SAMPLED, metres, of_dataset, write_labels, write_objects
 
-from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, PredictionError
 from su3d_bench.datasets.openlex3d.release import VISIBLE_NAME
 from su3d_bench.evaluation.evaluate import evaluate
 from su3d_bench.evaluation.result import Request
 from su3d_bench.formats.ply import PlyElement, write_ply
 
-PAINTED = f"{SCENES}/painted.py:Painted"
-
-
 # ---- datasets
 
 
-def run_oracle(folder: Path, monkeypatch: pytest.MonkeyPatch, scenes: str, capsys: Any) -> Path:
-    from painted import colour_perception
+def test_the_oracle_of_a_dataset_scores_one_and_scenes_that_a_run_lost_count_as_missed(tmp_path: Path) -> None:
+    def found(predictions: Path) -> Any:
+        request = Request((predictions,), dataset=PAINTED, protocols=("rooms-instance", "rooms-semantic"))
+        return evaluate(request).to_json()["protocols"]
 
-    from su3d_bench.runs import scene as scene_run
-
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    words = ["run", "--scenes", f"{PAINTED}/{scenes}", "--methods", "oracle", "--protocols", "rooms-instance"]
-    assert main([*words, "--no-pictures", "--jobs", "1", "--out", str(folder / "run"), "--quiet"]) == 0
-    capsys.readouterr()
-    return folder / "run"
-
-
-BOTH = ("rooms-instance", "rooms-semantic")
-
-
-def test_the_oracle_of_a_dataset_scores_exactly_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = run_oracle(tmp_path, monkeypatch, "[ab]", capsys)
-    found = evaluate(Request((run,), dataset=PAINTED, protocols=BOTH)).to_json()["protocols"]
-    assert found["rooms-instance"]["metrics"] == {"ap": 1.0, "ap50": 1.0, "ap25": 1.0}
-    assert found["rooms-semantic"]["metrics"] == {"macc": 1.0, "miou": 1.0, "fmiou": 1.0}
-    assert found["rooms-instance"]["coverage"] == {"0.025": 1.0, "0.05": 1.0, "0.1": 1.0}
-    assert list(found["rooms-instance"]["per_scene"]) == ["a", "b"]  # those of the run, not all of the dataset
-
-
-def test_scenes_that_a_run_lost_count_as_missed_under_our_own_protocols(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    run = run_oracle(tmp_path, monkeypatch, "[ab]", capsys)
+    run = painted_run(tmp_path / "run", methods=("oracle",))
+    whole = found(run)
+    assert whole["rooms-instance"]["metrics"] == {"ap": 1.0, "ap50": 1.0, "ap25": 1.0}
+    assert whole["rooms-semantic"]["metrics"] == {"macc": 1.0, "miou": 1.0, "fmiou": 1.0}
+    assert whole["rooms-instance"]["coverage"] == {"0.025": 1.0, "0.05": 1.0, "0.1": 1.0}
+    assert list(whole["rooms-instance"]["per_scene"]) == ["a", "b"]  # those of the run, not all of the dataset
     (run / "scenes/painted.b/oracle/prediction.npz").unlink()
-    found = evaluate(Request((run,), dataset=PAINTED, protocols=BOTH)).to_json()["protocols"]
-    assert found["rooms-instance"]["metrics"]["ap"] == 0.5  # half of the recall, precision 1
-    assert found["rooms-instance"]["missed_scenes"] == ["b"]
-    assert found["rooms-semantic"]["metrics"]["macc"] < 1
-    assert said(found["rooms-instance"], "1 of 2 scenes have no prediction and count as missed: b")
-    for name in ("prediction.npz", "."):
-        alone = run / "scenes/painted.a/oracle" / name
-        found = evaluate(Request((alone,), dataset=PAINTED, protocols=BOTH)).to_json()["protocols"]
-        assert found["rooms-instance"]["metrics"]["ap"] == 1.0  # each stands for its scene, a folder of scenes for all
+    lost = found(run)
+    assert lost["rooms-instance"]["metrics"]["ap"] == 0.5  # half of the recall, precision 1
+    assert lost["rooms-instance"]["missed_scenes"] == ["b"]
+    assert lost["rooms-semantic"]["metrics"]["macc"] < 1
+    assert said(lost["rooms-instance"], "1 of 2 scenes have no prediction and count as missed: b")
+    for name in ("prediction.npz", "."):  # each stands for its scene, a folder of scenes for all
+        assert found(run / "scenes/painted.a/oracle" / name)["rooms-instance"]["metrics"]["ap"] == 1.0
 
 
 # ---- OpenLex3D

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from evaluated_text import scene
+from evaluated_text import scene, write_truth
 from painted import Painted
 from places import SCENES
 from prediction_files import write_openmask3d, write_scannet_text
@@ -176,9 +176,8 @@ def test_a_folder_of_something_else_is_refused_before_anything_is_scored(capsys:
 @pytest.fixture
 def _texts() -> None:
     """Ground truth as text, in which a chair and a table lie, and predictions of it."""
-    Path("gt").mkdir()
     for name, n in (("scene0001_00", 2), ("scene0001_01", 1), ("scene0002_00", 2)):
-        Path(f"gt/{name}.txt").write_text("".join(f"{value}\n" for value in np.repeat([5001, 7002, 1003], 200)))
+        write_truth(Path("gt"), name)
         masks = [np.arange(150), np.arange(220, 400)][:n]
         write_scannet_text(Path("pred"), scene(masks, [5, 7][:n], [0.9, 0.8][:n], name=name))
 
@@ -235,17 +234,11 @@ NUMBERS_ALONE = "holds numbers without the counts of scenes, from which this is 
 PREDICTIONS = (
     "pred: holds predictions (scannet-text) and no run.json; make a run of them with: su3d-bench evaluate pred"
 )
-
-
 NO_RUNS = {
     "compare numbers.json runs/mine": f"numbers.json: {NUMBERS_ALONE}",
     "compare runs/mine both.json:mine": f"both.json: {NUMBERS_ALONE}",
-    "compare pred runs/mine": PREDICTIONS,
     "compare nowhere runs/mine": "nowhere: there is no such folder",
     "report attribution pred": PREDICTIONS,
-    "check numbers.json --against reference.json": f"numbers.json: {NUMBERS_ALONE}",
-    "sheets make pred --kind annotation --out sheets": PREDICTIONS,
-    "report tables both.json": f"both.json: {NUMBERS_ALONE}",
     "report leaderboard pred": "pred: holds no run below it; su3d-bench run writes one, and evaluate --out",
 }
 
@@ -255,7 +248,6 @@ def test_what_is_no_run_is_refused_with_the_truth_and_what_makes_one(capsys: pyt
     main([*TEXTS, "--json", "numbers.json", "--quiet"])
     numbers = json.loads(Path("numbers.json").read_text())
     Path("both.json").write_text(json.dumps({"schema": 1, "methods": {"mine": numbers}}))
-    main(["check", "--learn", "runs/mine", "--out", "reference.json"])
     for words, line in NO_RUNS.items():
         error = answered(capsys, *words.split(), code=2)
         assert error.startswith(f"su3d-bench: {line}") and error.count("\n") == 1

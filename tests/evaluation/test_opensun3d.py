@@ -10,15 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from evaluated_text import scene, write_truth
 from places import CASES
-from scored_room import instances
+from prediction_files import write_scannet_text
 
 from su3d_bench.core.errors import ConfigError, PredictionError
-from su3d_bench.core.types import GroundTruth, LabelSet
 from su3d_bench.evaluation.evaluate import evaluate
 from su3d_bench.evaluation.result import Request, ValuesForm
-from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.predictions.formats import recognise
 
 CASE = "opensun3d01_numbers"
@@ -63,26 +61,6 @@ def test_a_submission_on_disk_has_the_answer_of_the_script_of_the_challenge(inde
     assert [metrics[name] for name in NAMES] == [PROBLEMS[index][name] for name in NAMES]
 
 
-def test_the_cases_tell_the_rule_for_void_from_none() -> None:
-    rules = load_protocol(PROTOCOL)
-    labels = LabelSet("scannet", (1,), ("object",))
-    n_other = n_same = 0
-    for index in range(len(PROBLEMS)):
-        scores: dict[str, dict[str, Any]] = {"without": {}, "with": {}}
-        for name, values, masks, confidences, _ in scenes_of(index):
-            number = np.where(values // 1000 < 2, values % 1000, 0).astype(np.int32)
-            points = np.random.default_rng(0).random((len(values), 3)).astype(np.float32)
-            truth = GroundTruth(points, np.minimum(number, 1), number, labels, "scannet200-vertices", "made for a test")
-            prediction = instances(points, [np.flatnonzero(row) for row in masks], None, scores=confidences)
-            for key, used in (("without", rules), ("with", rules.model_copy(update={"void": None}))):
-                scores[key][name] = score_scene(used, truth, prediction, None)
-        found = {key: combine(rules, each).metrics for key, each in scores.items()}
-        n_other += found["with"]["AP25"] != found["without"]["AP25"]
-        n_same += found["without"]["AP25"] == PROBLEMS[index]["ap25"]
-    assert n_other >= 20
-    assert n_same >= 28  # of truth in arrays, where a number 0 is none: as text 1000 is one
-
-
 def test_a_scene_without_a_submission_counts_as_missed(tmp_path: Path) -> None:
     write_problem(tmp_path, 0)
     whole = numbers(tmp_path)
@@ -125,21 +103,9 @@ def test_a_line_that_is_no_mask_is_named(
     assert message in str(raised.value)
 
 
-# ---- what values of the truth are
-
-
-def write_values(folder: Path, values: np.ndarray, members: slice) -> None:
-    for name in ("gt", "pred/masks"):
-        (folder / name).mkdir(parents=True, exist_ok=True)
-    (folder / "gt/scene0001_00.txt").write_text("".join(f"{value}\n" for value in values))
-    mask = np.zeros(len(values), int)
-    mask[members] = 1
-    (folder / "pred/masks/0.txt").write_text("".join(f"{value}\n" for value in mask))
-    (folder / "pred/scene0001_00.txt").write_text("masks/0.txt 3 0.9\n")
-
-
 def test_values_that_may_be_classes_or_instances_are_not_guessed(tmp_path: Path) -> None:
-    write_values(tmp_path, np.repeat([1000, 1001, 1067], 200), slice(200, 400))
+    write_truth(tmp_path / "gt", values=np.repeat([1000, 1001, 1067], 200))
+    write_scannet_text(tmp_path / "pred", scene([np.arange(200, 400)], [3]))
     request = Request((tmp_path / "pred",), ground_truth=tmp_path / "gt", protocols=("class-agnostic-segment3d",))
     with pytest.raises(ConfigError, match=r"1000 to 1067, may be class ids alone, .* say which with --truth-values"):
         evaluate(request)

@@ -59,10 +59,6 @@ def as_table(answer: dict[str, Any]) -> Any:
     return np.array([[np.nan if v is None else v for v in row] for row in answer["ap"]])
 
 
-def is_same(value: float, expected: float | None) -> bool:
-    return np.isnan(value) if expected is None else value == expected
-
-
 def test_a_number_above_all_others_gives_what_the_refused_infinity_would() -> None:
     truth = np.repeat([5001, 5002, 7001], 200)
     masks = [np.arange(200), np.arange(400, 600), np.arange(200, 400)]  # a hit, a false positive, a hit
@@ -80,19 +76,13 @@ def test_the_thresholds_are_the_original_doubles() -> None:
 
 
 @pytest.mark.parametrize("case", INSTANCE_CASES)
-def test_every_ap_of_a_reference_case_is_equal_in_every_bit(case: str) -> None:
+def test_every_ap_of_a_reference_case_and_their_averages_are_equal_in_every_bit(case: str) -> None:
     ours, answer = evaluate(case, "official_py3_pr26")
     assert np.array_equal(ours.table, as_table(answer), equal_nan=True)
-
-
-@pytest.mark.parametrize("case", INSTANCE_CASES)
-def test_the_averages_of_a_reference_case_are_equal_in_every_bit(case: str) -> None:
-    ours, answer = evaluate(case, "official_py3_pr26")
     assert (ours.ap, ours.ap50, ours.ap25) == (answer["all_ap"], answer["all_ap50"], answer["all_ap25"])
     for index, label in enumerate(answer["class_labels"]):
-        of_class = answer["classes"][label]
-        for value, key in zip(ours.of_class(index), ("ap", "ap50", "ap25"), strict=True):
-            assert is_same(value, of_class[key])
+        expected = [answer["classes"][label][key] for key in ("ap", "ap50", "ap25")]
+        assert [None if np.isnan(value) else value for value in ours.of_class(index)] == expected
 
 
 def test_openmask3ds_own_replica_script_gives_the_same_bits() -> None:
@@ -204,13 +194,6 @@ def test_scenes_share_one_curve() -> None:
     false = counts_of(np.repeat([7001, 0], [200, 200]), [FIRST], [5], [0.9])
     assert combine([hit]).ap50 == 1.0
     assert combine([hit, false]).table[0, 0] == pytest.approx((2 / 3) / 2)
-
-
-def test_pooled_ap_differs_from_scene_mean() -> None:
-    arrays, expected = load("inst01_basic")
-    ids = expected["official_py3_pr26"]["class_ids"]
-    counts = [scene_counts(arrays, s, ids) for s in range(4)]
-    assert combine(counts).ap != np.mean([combine([c]).ap for c in counts])
 
 
 def test_a_scene_without_predictions_counts_its_truth_as_missed() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 from collections import Counter
 
 import numpy as np
@@ -11,19 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from su3d_bench.core.maps import Masks
-from su3d_bench.metrics.instance import score as score_instances
-from su3d_bench.metrics.matching import votes as neighbours
 from su3d_bench.metrics.matching.votes import transfer_each_mask, transfer_votes
-from su3d_bench.metrics.open_vocabulary import openlex3d
-from su3d_bench.metrics.open_vocabulary import score as score_open_vocabulary
-
-MODULES = (neighbours, openlex3d, score_instances, score_open_vocabulary)
-
-
-@pytest.mark.parametrize("module", MODULES, ids=lambda module: module.__name__)
-def test_the_examples_in_the_docstrings_run(module: object) -> None:
-    outcome = doctest.testmod(module)  # type: ignore[arg-type]
-    assert outcome.attempted > 0 and outcome.failed == 0
 
 
 def plain_votes(points: np.ndarray, values: np.ndarray, targets: np.ndarray, k: int, cap_m: float) -> list[int]:

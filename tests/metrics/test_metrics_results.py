@@ -26,11 +26,13 @@ from scored_room import (
 
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.maps import Prediction
+from su3d_bench.core.maps import Instances, Prediction
 from su3d_bench.core.types import LabelSet
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine, combined_metrics, pack_scores, score_scene, unpack_scores
+
+LABELLED, UNLABELLED = (truth_as_prediction(room(), with_labels=labels) for labels in (True, False))
 
 # ---- several scenes
 
@@ -85,44 +87,38 @@ def warnings_of(name: str, prediction: Prediction, encoder: Encoder | None = Non
     return "\n".join(combine(rules, {"rooms/a": score_scene(rules, room(), prediction, encoder)}).warnings)
 
 
-def test_a_perfect_prediction_warns_of_nothing() -> None:
+CHAIRS = [np.flatnonzero(room().instance == k) for k in (2, 3)]
+
+
+def chairs(masks: list[np.ndarray], *scores: float) -> Instances:
+    return instances(room().points, masks, ["chair"] * len(masks), scores=scores or None)
+
+
+def test_constant_confidences_are_told_where_they_count() -> None:
+    alike = chairs(CHAIRS, 0.25, 0.25)
+    told = warnings_of("rooms-instance", alike)
+    assert told == "rooms/a: every confidence is 0.25: AP of a class is then recall (1 + precision) / 2"
+    assert warnings_of("rooms-instance", chairs(CHAIRS, 0.25, 0.5)) == ""
+    assert warnings_of("rooms-instance", chairs(CHAIRS[:1])) == ""  # one has no order
+    assert warnings_of("replica-openmask3d", alike) == ""
     for name in (*SEMANTIC, "rooms-instance"):
-        assert warnings_of(name, truth_as_prediction(room(), with_labels=True)) == ""
-
-
-def test_constant_confidences_are_told() -> None:
-    prediction = replace(truth_as_prediction(room(), with_labels=True), scores=np.full(8, 0.5))
-    told = warnings_of("rooms-instance", prediction)
-    assert told == "rooms/a: every confidence is 0.5: AP of a class is then recall (1 + precision) / 2"
-    chairs = [np.flatnonzero(room().instance == k) for k in (2, 3)]
-    two = instances(room().points, chairs, ["chair", "chair"], scores=[0.25, 0.25])
-    assert warnings_of("rooms-instance", two).startswith("rooms/a: every confidence is 0.25: ")
-    assert warnings_of("rooms-instance", replace(two, scores=np.array([0.25, 0.5]))) == ""
-    assert warnings_of("rooms-instance", instances(room().points, chairs[:1], ["chair"])) == ""  # one has no order
-    assert warnings_of("replica-openmask3d", two) == ""  # where none counts
+        assert warnings_of(name, LABELLED) == ""
 
 
 def test_duplicates_are_told() -> None:
-    truth = room()
-    chairs = np.flatnonzero(truth.instance == 2)
-    small = [chairs[:99], chairs[50:], chairs[50:], chairs[:99]]  # of 100 points two, and two that do not count
-    told = warnings_of("rooms-instance", instances(truth.points, small, ["chair"] * 4))
+    of_one = CHAIRS[0]
+    small = [of_one[:99], of_one[50:], of_one[50:], of_one[:99]]  # of 100 points two, and two that do not count
+    told = warnings_of("rooms-instance", chairs(small))
     assert told.startswith("rooms/a: 1 pair of predictions overlaps with IoU above 0.9 (first 1 and 2); ")
-    assert "3 pairs of predictions overlap with" in warnings_of(
-        "rooms-instance", instances(truth.points, [chairs] * 3, ["chair"] * 3)
-    )
+    assert "3 pairs of predictions overlap with" in warnings_of("rooms-instance", chairs([of_one] * 3))
 
 
-def test_another_encoder_than_the_protocols_is_told() -> None:
-    told = warnings_of("replica-mesh-ex6", truth_as_prediction(room(), with_labels=False), ENCODER)
-    assert told == ("rooms/a: labels come from the encoder 'one-hot', the protocol's is 'ViT-H-14/laion2b_s32b_b79k'")
-    assert warnings_of("rooms-semantic", truth_as_prediction(room(), with_labels=False), ENCODER) == ""
-
-
-def test_what_every_scene_warns_of_is_told_once() -> None:
+def test_another_encoder_than_the_protocols_is_told_once_for_all_scenes() -> None:
     rules = load_protocol("replica-mesh-ex6")
-    score = score_scene(rules, room(), truth_as_prediction(room(), with_labels=False), ENCODER)
-    assert len(combine(rules, {"a": score, "b": score, "c": score}).warnings) == 1
+    told = combine(rules, dict.fromkeys("abc", score_scene(rules, room(), UNLABELLED, ENCODER))).warnings
+    assert len(told) == 1
+    assert "labels come from the encoder 'one-hot', the protocol's is 'ViT-H-14/laion2b_s32b_b79k'" in told[0]
+    assert warnings_of("rooms-semantic", UNLABELLED, ENCODER) == ""
 
 
 def test_a_class_of_the_truth_without_scored_points_is_told_and_counts_zero_in_its_scene_alone() -> None:
@@ -164,19 +160,15 @@ def test_coverage_is_the_share_of_scored_points_without_a_predicted_point_that_n
 # ---- bytes
 
 
-def test_equal_scores_pack_to_equal_bytes_at_any_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    scores = {name: score_scene(load_protocol(name), *noisy(0), None) for name in (*SEMANTIC, *INSTANCE)}
-    first = pack_scores(scores)
-    monkeypatch.setattr(time, "time", lambda: 2e9)
-    assert pack_scores(dict(reversed(scores.items()))) == first
-
-
-def test_packed_scores_hold_no_pickle_and_come_back_whole() -> None:
+def test_packed_scores_hold_no_pickle_come_back_whole_and_have_the_same_bytes_at_any_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     scores = {name: score_scene(load_protocol(name), *noisy(0), None) for name in (*SEMANTIC, *INSTANCE)}
     data = pack_scores(scores)
     with np.load(io.BytesIO(data), allow_pickle=False) as archive:
         assert all(archive[key].dtype != object for key in archive.files)
-    assert pack_scores(unpack_scores(data)) == data
+    monkeypatch.setattr(time, "time", lambda: 2e9)
+    assert pack_scores(unpack_scores(data)) == pack_scores(dict(reversed(scores.items()))) == data
 
 
 @pytest.mark.parametrize("cut", [0, 10, 500])
@@ -214,33 +206,23 @@ def test_a_result_has_no_nan_in_its_json() -> None:
 # ---- what cannot be scored
 
 
-def test_a_prediction_needs_labels_or_features_and_an_encoder_that_names_them() -> None:
-    without = replace(truth_as_prediction(room(), with_labels=True), labels=None)
-    for prediction, encoder in ((without, ENCODER), (truth_as_prediction(room(), with_labels=False), None)):
-        with pytest.raises(PredictionError, match="needs features and an encoder, or labels"):
-            score_scene(ROOM, room(), prediction, encoder)
+UNFIT: list[tuple[str, Instances, Encoder | None, str]] = [
+    ("rooms-semantic", replace(LABELLED, labels=None), ENCODER, "needs features and an encoder, or labels"),
+    ("rooms-semantic", UNLABELLED, None, "needs features and an encoder, or labels"),
+    ("rooms-semantic", replace(UNLABELLED, features=np.ones((8, 3), np.float32)), ENCODER,
+     "features have 3 dimensions, the encoder 'one-hot' has 70"),
+    ("rooms-semantic", replace(LABELLED, points=np.full_like(LABELLED.points, np.nan)), None, "not finite"),
+    *((name, replace(LABELLED, scores=np.array([0.5] * 3 + [np.nan] * 5)), None, "instance 3 has the confidence nan")
+      for name in ("rooms-semantic", "rooms-instance", "replica-openmask3d")),
+]  # fmt: skip
 
 
-def test_features_of_another_encoder_are_refused() -> None:
-    prediction = replace(truth_as_prediction(room(), with_labels=False), features=np.ones((8, 3), np.float32))
-    with pytest.raises(PredictionError, match="features have 3 dimensions, the encoder 'one-hot' has 70"):
-        score_scene(ROOM, room(), prediction, ENCODER)
-
-
-@pytest.mark.parametrize("name", ["rooms-semantic", "rooms-instance", "replica-openmask3d"])
-def test_a_confidence_that_is_no_number_is_refused(name: str) -> None:
-    scores = np.full(8, 0.5)
-    scores[3] = np.nan
-    prediction = replace(truth_as_prediction(room(), with_labels=True), scores=scores)
-    with pytest.raises(PredictionError, match="instance 3 has the confidence nan"):
-        score_scene(load_protocol(name), room(), prediction, None)
-
-
-def test_points_that_are_no_numbers_are_refused() -> None:
-    points = room().points.copy()
-    points[7, 1] = np.nan
-    with pytest.raises(PredictionError, match="not finite"):
-        score_scene(ROOM, room(), replace(truth_as_prediction(room(), with_labels=True), points=points), None)
+@pytest.mark.parametrize(("name", "prediction", "encoder", "said"), UNFIT)
+def test_a_prediction_that_cannot_be_named_or_is_no_number_is_refused(
+    name: str, prediction: Instances, encoder: Encoder | None, said: str
+) -> None:
+    with pytest.raises(PredictionError, match=said):
+        score_scene(load_protocol(name), room(), prediction, encoder)
 
 
 def test_a_truth_of_another_kind_is_refused() -> None:

@@ -77,14 +77,6 @@ def test_classes_above_a_level_are_counted_in_float32_by_default_too() -> None:
     assert metrics.n_classes_above[0] == case["metrics"]["acc0.15"] == 3
 
 
-def test_the_printed_golden_figures_come_out() -> None:
-    kept = conceptgraphs_metrics(np.array(GOLDEN["cg"]["conf"]), np.array([0, 1, 3, 4]))
-    assert round(kept.mean_iou, 7) == 0.4989157
-    assert round(kept.frequency_weighted_iou, 7) == 0.6476767
-    pooled = conceptgraphs_metrics(np.array(POOLING["all"]), np.array([0, 1, 2]))
-    assert round(pooled.mean_accuracy, 5) == 0.73889
-
-
 def test_the_f1_of_conceptgraphs_has_its_own_name_beside_the_harmonic_mean() -> None:
     metrics = conceptgraphs_metrics(np.array(GOLDEN["cg_f1_quirk"]["conf"]), np.arange(3))
     np.testing.assert_allclose(metrics.f1, [0.1379, 0.1818, 0.2979], atol=5e-5)
@@ -120,12 +112,6 @@ def test_scannet_cases_are_equal_in_every_bit(case: str) -> None:
         (metrics.mean_accuracy, "derived_mean_acc_over_classes_with_gt"),
     ):
         assert ours == expected[key] or (np.isnan(ours) and expected[key] is None)
-
-
-def test_scannet_counts_a_predicted_only_class_as_zero_and_leaves_out_one_that_never_occurs() -> None:
-    metrics = scannet_metrics(np.array([[3, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]))
-    assert metrics.iou[1] == 0.0
-    assert np.isnan(metrics.iou[2])
 
 
 def test_scannet_values_are_those_worked_out_by_hand() -> None:

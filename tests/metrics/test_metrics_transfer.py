@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,10 +11,7 @@ from threadpoolctl import threadpool_info
 
 from su3d_bench.core.maps import Masks, Partition
 from su3d_bench.core.types import Float64Array
-from su3d_bench.metrics import scoring
-from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.instance import scene_counts
-from su3d_bench.metrics.matching import checks, labelling
+from su3d_bench.metrics.matching import labelling
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.checks import duplicate_pairs
 from su3d_bench.metrics.matching.labelling import most_similar
@@ -26,16 +21,6 @@ from su3d_bench.metrics.matching.nearest import (
     transfer_masks,
     transfer_values,
 )
-from su3d_bench.metrics.semantic import confusion as semantic
-
-
-@pytest.mark.parametrize(
-    "module",
-    [checks, instance_ap, labelling, scene_counts, scoring, semantic, transfer],
-    ids=lambda m: m.__name__,
-)
-def test_the_examples_in_the_docstrings_run(module: object) -> None:
-    assert doctest.testmod(module).failed == 0  # type: ignore[arg-type]
 
 
 def brute_force(candidates: np.ndarray, queries: np.ndarray) -> np.ndarray:

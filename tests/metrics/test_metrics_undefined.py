@@ -128,12 +128,6 @@ def test_a_class_of_a_single_point_has_values_in_the_scenes_that_have_it() -> No
     np.testing.assert_array_equal(found[ROOM.classes[A].name]["IoU"], [1.0, 1.0, NAN])
     np.testing.assert_array_equal(found[ROOM.classes[B].name]["recall"], [0.8, 0.75, 1.0])
     assert set(found) == {ROOM.classes[A].name, ROOM.classes[B].name}
-    single = [confusion({A: {A: 1}}), confusion({B: {B: 3, N: 1}})]
-    weights = np.array([[1, 1], [1, 0], [0, 1]])
-    of_all = metric_of(ROOM).resampled(single, weights)
-    assert_as_drawn(dict(of_all), of_drawn(ROOM, single, weights), ("mAcc", "mIoU", "F-mIoU"))
-    assert of_all["mAcc"].tolist() == of_all["mIoU"].tolist() == [0.875, 1.0, 0.75]
-    assert of_all["F-mIoU"].tolist() == [0.8, 1.0, 0.75]
 
 
 def test_under_scannet_a_class_that_is_neither_true_nor_called_leaves_the_mean_of_drawn_scenes() -> None:
@@ -245,14 +239,6 @@ def test_values_over_drawn_scenes_slice_away_what_the_pooled_rows_do() -> None:
     for drawn in (np.ones((1, 3), np.int64), WEIGHTS):
         found = metric_of(ROOM).resampled(counts, drawn)
         assert_as_drawn(dict(found), of_drawn(ROOM, counts, drawn), ("mAcc", "mIoU", "F-mIoU"))
-    metric = metric_of(ROOM)
-    classes = metric.resampled_classes(counts, WEIGHTS)
-    for row, drawn in enumerate(WEIGHTS):
-        pooled = metric.pooled([counts[s] for s in range(3) for _ in range(drawn[s])]).classes
-        for name, columns in pooled.items():
-            assert {column: float(classes[name][column][row]) for column in classes[name]} == pytest.approx(
-                {column: columns[column] for column in classes[name]}
-            )
 
 
 def test_what_is_called_a_class_that_no_scene_has_stays_wrong() -> None:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import base64
-import doctest
 import hashlib
 import json
 import re
 import shutil
-from collections.abc import Mapping
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -19,20 +17,14 @@ from packed_maps import unpacked
 from painted import Painted, WordEncoder
 from painted_runs import COLLECTOR, painted_page, painted_run
 
-from su3d_bench.analysis.page import contents as page_contents
-from su3d_bench.analysis.page import maps as page_maps
-from su3d_bench.analysis.page import scene as page_scene
 from su3d_bench.analysis.page.scene import same_objects
 from su3d_bench.core.maps import DenseFeatures, Instances, Masks
 from su3d_bench.core.types import GroundTruth, LabelSet
-from su3d_bench.reports.page import maps as html_map
-from su3d_bench.reports.page import page as html_page
 from su3d_bench.reports.page.maps import (
     NO_TRUTH_NEAR,
     NOT_SCORED,
 )
 from su3d_bench.reports.page.page import page_html
-from su3d_bench.reports.pictures import scene as scene_look
 from su3d_bench.store.predictions import read_prediction, write_prediction
 
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(1)>&\"'<!--"
@@ -229,14 +221,3 @@ def test_dense_features_have_a_class_a_point_and_no_instance(run: Path, tmp_path
     assert about["instances"] == []
     assert planes["owner"].tolist() == [0xFFFF] * 4
     assert planes["truth"][order.tolist().index(2)] == NO_TRUTH_NEAR
-
-
-@pytest.mark.parametrize(
-    "module",
-    [html_map, html_page, page_maps, page_contents, page_scene, scene_look],
-    ids=lambda module: module.__name__,
-)
-def test_the_examples_in_docstrings_hold(module: Any) -> None:
-    found: Mapping[str, int] = doctest.testmod(module)._asdict()
-    assert found["attempted"] > 0
-    assert found["failed"] == 0

@@ -33,14 +33,6 @@ def stages_of(summary: Any) -> dict[str, Any]:
     return {one.name: one for one in summary.stages}
 
 
-def test_a_cost_that_is_a_power_of_the_size_has_its_exponent() -> None:
-    sizes = np.linspace(1e4, 1e6, 60)
-    growth = growth_exponent(sizes, 0.01 * sizes**0.7)
-    assert growth is not None
-    np.testing.assert_allclose([growth.exponent, growth.low, growth.high], 0.7, atol=1e-12)
-    assert growth.words == "grows"
-
-
 def test_a_noisy_constant_is_called_constant_and_a_noisy_root_grows() -> None:
     sizes = np.linspace(1e4, 1e6, 200)
     noise = np.exp(np.random.default_rng(0).normal(0, 0.1, 200))

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from made_sheets import PAINTED
 from painted import LABELS, Painted
+from painted_runs import PAINTED
 from simulated_annotators import SET_ID
 
 from su3d_bench.cli.main import main

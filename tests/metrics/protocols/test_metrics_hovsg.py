@@ -24,7 +24,6 @@ from su3d_bench.predictions.base import VertexLabels
 
 GOLDEN = json.loads((CASES / "conceptgraphs_golden.json").read_text())["hovsg"]
 HOVSG, EXACT, OVO = (load_protocol(name) for name in ("replica-hovsg", "replica-hovsg-exact", "replica-ovo51"))
-VOTED = {"replica-hovsg": HOVSG, "replica-hovsg-exact": EXACT, "replica-ovo51": OVO}
 
 
 def fitting(rules: ProtocolRules, truth: GroundTruth) -> GroundTruth:

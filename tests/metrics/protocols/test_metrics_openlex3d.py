@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from open_scene import (
     ENCODER,
     OBJECTS,
@@ -242,31 +240,6 @@ def test_a_partition_and_dense_features_score_as_the_same_instances(rules: Any) 
     expected = values_of(rules, truth, whole)
     assert values_of(rules, truth, partition) == expected
     assert values_of(rules, truth, DenseFeatures(truth.points, features)) == pytest.approx(expected, abs=1e-3)
-
-
-@settings(max_examples=15, deadline=None)
-@given(seed=st.integers(0, 1000), rules=st.sampled_from([TOPN, RANKING]))
-def test_shuffled_instances_and_object_ids_change_nothing(seed: int, rules: Any) -> None:
-    rng = np.random.default_rng(seed)
-    truth, whole = lex_truth(seed), noisy(seed)
-    order = rng.permutation(len(whole))
-    assert whole.features is not None
-    shuffled = instances_with(truth.points, [whole.mask(k) for k in order], whole.features[order])
-    new_id = {one: int(n) for one, n in zip(truth.objects, rng.permutation(500)[: len(truth.objects)], strict=True)}
-    renamed = OpenLexTruth(
-        truth.points,
-        np.array([new_id.get(int(one), -1) for one in truth.object_of_point]),
-        {new_id[one]: moved(labels, new_id) for one, labels in truth.objects.items()},
-        truth.prompts,
-        truth.variant,
-        truth.source,
-    )
-    assert values_of(rules, renamed, shuffled) == pytest.approx(values_of(rules, truth, whole), abs=1e-12)
-
-
-def moved(labels: ObjectLabels, new_id: dict[int, int]) -> ObjectLabels:
-    clutter = tuple(new_id[one] for one in labels.clutter)
-    return ObjectLabels(labels.synonyms, labels.depictions, labels.vis_sim, clutter)
 
 
 def noisy(seed: int) -> Any:

@@ -20,7 +20,6 @@ from su3d_bench.metrics.semantic import panoptic
 from su3d_bench.metrics.semantic.panoptic import PanopticCounts, Rule, Segments, count_segments
 
 RULES = load_protocol("rooms-panoptic")
-KITTI = load_protocol("scannet-panoptic-oneformer3d")
 ORIGINALS: dict[str, Rule] = {"panoptic01_panopticapi": "panopticapi", "panoptic02_semantic_kitti": "semantic-kitti"}
 PROBLEMS = {name: json.loads((CASES / f"{name}.json").read_text())["problems"] for name in ORIGINALS}
 ONE_THING, THING_AND_STUFF = np.array([True]), np.array([True, False])

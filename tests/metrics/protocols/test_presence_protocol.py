@@ -9,8 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from places import CASES
 from scored_room import ENCODER, LABELS, instances, nothing, room, truth_as_prediction
 
@@ -84,22 +82,6 @@ def test_a_map_that_never_says_yes_has_no_precision_and_an_f1_of_zero() -> None:
     assert (values["recall random"], values["F1 random"], values["accuracy random"]) == (0.0, 0.0, 0.5)
     nothing_there = once([counts_of([0, 0], [0, 1])])
     assert np.isnan(nothing_there["F1 random"])
-
-
-@settings(max_examples=40, deadline=None)
-@given(st.integers(1, 5), st.integers(0, 10_000))
-def test_scenes_drawn_several_times_count_so_often(n_scenes: int, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    scenes = []
-    for _ in range(n_scenes):
-        n = int(rng.integers(0, 8))
-        there, yes, similarity = rng.random(n) < 0.5, rng.random(n) < 0.5, np.round(rng.random(n), 1)
-        scenes.append(PresenceCounts(rng.integers(0, 3, n), there, yes, similarity))
-    weights = rng.integers(0, 3, (6, n_scenes))
-    found = measured(scenes, weights)
-    for r, row in enumerate(weights):
-        repeated = [scene for scene, n in zip(scenes, row, strict=True) for _ in range(n)] or [counts_of([], [])]
-        assert {name: float(value[r]) for name, value in found.items()} == pytest.approx(once(repeated), nan_ok=True)
 
 
 def test_a_perfect_map_says_yes_to_what_is_there_and_no_to_what_is_not() -> None:

@@ -29,7 +29,7 @@ from su3d_bench.metrics.questions.score import (
     first_instances,
     is_answer_right,
 )
-from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, plain_json, score_scene, unpack_scores
+from su3d_bench.metrics.scoring import combine, metric_of, plain_json, score_scene
 from su3d_bench.predictions.base import vertex_masks
 from su3d_bench.questions import truths
 from su3d_bench.questions.sight import Sight
@@ -85,10 +85,6 @@ def test_what_is_farther_than_5_cm_covers_nothing() -> None:
     assert values(moved)["all"] == values(moved)["reachable"] == 0.0
 
 
-def test_an_empty_map_answers_nothing() -> None:
-    assert values(nothing(TRUTH))["all"] == 0.0
-
-
 def test_where_there_is_nothing_to_rank_no_instance_comes_first() -> None:
     assert first_instances(RULES, ["chair", "lamp"], nothing(room()), ENCODER).tolist() == [-1, -1]
     assert first_instances(RULES, [], PERFECT, ENCODER).tolist() == []
@@ -124,21 +120,10 @@ def test_texts_to_which_the_name_alone_is_the_answer_stand_apart() -> None:
     assert (found["all"], found["n_all"]) == (4 / 6, 6)
 
 
-def test_order_of_instances_and_questions_changes_nothing() -> None:
-    order = np.random.default_rng(0).permutation(len(PERFECT))
-    assert PERFECT.features is not None
-    mixed = instances(TRUTH.points, [PERFECT.mask(k) for k in order], None, PERFECT.features[order])
-    assert values(mixed, RetrievalTruth(TRUTH, ASKED[::-1])) == values(PERFECT)
-
-
-def test_scenes_pool_by_their_questions_and_counts_survive_the_file() -> None:
+def test_scenes_pool_by_their_questions() -> None:
     few = RetrievalTruth(TRUTH, ASKED[:1])
-    scores = {
-        "a": score_scene(RULES, QUESTIONS, PERFECT, ENCODER),
-        "b": score_scene(RULES, few, PERFECT, ENCODER),
-    }
-    stored = {scene: unpack_scores(pack_scores({RULES.name: one}))[RULES.name] for scene, one in scores.items()}
-    result = combine(RULES, stored)
+    asked = {"a": QUESTIONS, "b": few}
+    result = combine(RULES, {scene: score_scene(RULES, one, PERFECT, ENCODER) for scene, one in asked.items()})
     assert result.metrics["all"] == 5 / 7
     assert result.metrics == result.pooled
     assert result.per_scene["b"]["all"] == 1.0

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from chromium import find_chromium
 from looks import CHECKS, complaints, unfold
-from made_pages import STRUCK, browser_for_pages, finished_runs, page_of_runs
 from made_sheets import made
 from places import SCENES
 from registry_bundles import painted_bundle
+from runs_page import STRUCK, browser_for_pages, finished_runs, page_of_runs
 
 from su3d_bench.cli.main import main
 from su3d_bench.reports.pictures.items import png_bytes
@@ -52,18 +52,8 @@ def page_of_second_looks(folder: Path) -> Path:
 
 def page_of_audit(folder: Path) -> Path:
     """``questions audit``."""
-    words = [
-        "query",
-        "audit",
-        "--scenes",
-        f"{SCENES}/painted.py:Painted/a",
-        "--n",
-        "6",
-        "--out",
-        str(folder),
-        "--quiet",
-    ]
-    assert main(words) == 0
+    words = ["query", "audit", "--scenes", f"{SCENES}/painted.py:Painted/a", "--n", "6", "--quiet"]
+    assert main([*words, "--out", str(folder)]) == 0
     return folder / "index.html"
 
 

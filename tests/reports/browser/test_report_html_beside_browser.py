@@ -10,8 +10,8 @@ import pytest
 import runs_page
 from chromium import Chromium, find_chromium
 from looks import WHOLE, complaints
-from made_pages import browser_for_pages
 from painted_runs import COLLECTOR, painted_page, painted_run
+from runs_page import browser_for_pages, options, picture
 
 from su3d_bench.core.maps import Instances
 from su3d_bench.store.predictions import read_prediction, write_prediction
@@ -74,12 +74,6 @@ def opened(browser: Chromium, text: str = "painted/a by") -> None:
     browser.until(READ.format(text=json.dumps(text)))
 
 
-def settled(browser: Chromium) -> None:
-    """Until an address that was given has been followed."""
-    browser.run("new Promise((done) => setTimeout(done, 100))")
-    browser.until("!document.querySelector('#maps .panes[aria-busy]')")
-
-
 def choose(browser: Chromium, label: str, text: str) -> None:
     runs_page.choose(browser, "maps", label, text)
 
@@ -95,20 +89,20 @@ def press(browser: Chromium, *keys: str, k: int = 0) -> None:
 
 def test_the_truth_or_another_map_stands_beside_and_moves_with_the_first(browser: Chromium) -> None:
     opened(browser)
-    assert runs_page.options(browser, "maps", "Beside") == ["nothing", "truth", "collector@noise_m=0.3"]
+    assert options(browser, "maps", "Beside") == ["nothing", "truth", "collector@noise_m=0.3"]
     assert browser.run("document.querySelectorAll('#maps .pane')[1].hidden")
     for text in ("truth", "collector@noise_m=0.3"):
         choose(browser, "Beside", text)
         browser.until(f"document.querySelectorAll('#maps .title')[1].textContent.includes({json.dumps(text)})")
-        before = [runs_page.picture(browser, 0), runs_page.picture(browser, 1)]
+        before = [picture(browser, 0), picture(browser, 1)]
         assert before[0] != before[1]
         press(browser, "ArrowLeft", "ArrowLeft", k=1)
-        turned = [runs_page.picture(browser, 0), runs_page.picture(browser, 1)]
+        turned = [picture(browser, 0), picture(browser, 1)]
         assert turned[0] != before[0]
         assert turned[1] != before[1]
         press(browser, "ArrowUp", "-", k=0)
-        assert runs_page.picture(browser, 0) != turned[0]
-        assert runs_page.picture(browser, 1) != turned[1]
+        assert picture(browser, 0) != turned[0]
+        assert picture(browser, 1) != turned[1]
     choose(browser, "Beside", "nothing")
     browser.until("document.querySelectorAll('#maps .pane')[1].hidden")
 
@@ -118,15 +112,15 @@ def test_missed_objects_are_ghosts_that_can_be_taken_away(browser: Chromium) -> 
     browser.until(f"{field('Missed objects')}.parentNode.textContent.includes('(1)')")
     assert not browser.run(f"{field('Missed objects')}.disabled")
     assert "rooms-instance" in browser.run(f"{field('Missed objects')}.parentNode.title")
-    ghosts = runs_page.picture(browser)
+    ghosts = picture(browser)
     browser.run(f"{field('Missed objects')}.click()")
-    bare = runs_page.picture(browser)
+    bare = picture(browser)
     assert bare != ghosts
     browser.run(f"{field('Missed objects')}.focus()")
     browser.call("Input.dispatchKeyEvent", {"type": "keyDown", "key": " ", "text": " ", "code": "Space"})
     browser.call("Input.dispatchKeyEvent", {"type": "keyUp", "key": " ", "code": "Space"})
     browser.until(f"{field('Missed objects')}.checked")
-    assert runs_page.picture(browser) == ghosts
+    assert picture(browser) == ghosts
     choose(browser, "Map", "collector@noise_m=0.3")
     browser.until(READ.format(text=json.dumps("noise_m")))
     browser.until(f"!{field('Missed objects')}.parentNode.textContent.includes('not known')")
@@ -137,14 +131,14 @@ def test_growth_shows_the_instances_that_frames_had_shown_by_then(browser: Chrom
     note = "document.querySelector('#maps [role=status].keys').innerText"
     assert browser.run(note).startswith("Update 6 of 6, frame 5: 3 of 3 instances seen; the method held 4.")
     assert "what was merged into others or dropped on the way is not kept" in browser.run(note)
-    whole = runs_page.picture(browser)
+    whole = picture(browser)
     slide(browser, "Grown to", 2)
     assert browser.run(note).startswith("Update 3 of 6, frame 2: 2 of 3 instances seen")
-    early = runs_page.picture(browser)
+    early = picture(browser)
     assert early != whole
     slide(browser, "Grown to", 3)
     assert browser.run(note).startswith("Update 4 of 6, frame 3: 3 of 3 instances seen")
-    assert runs_page.picture(browser) == whole
+    assert picture(browser) == whole
     assert browser.run(f"{field('Grown to')}.getAttribute('aria-valuetext')").startswith("Update 4 of 6")
 
 

@@ -1,24 +1,40 @@
-"""The page of runs in a real browser, opened as a file: its numbers and every control."""
+"""The page of runs in a real browser, opened as a file: its numbers, its maps and every control."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
 
+import chromium
 import pytest
+import runs_page
 from chromium import Chromium, find_chromium
-from looks import complaints
-from runs_page import choose, column, open_maps, options, picture, press, text_of
+from looks import WHOLE, complaints
 
 pytestmark = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
 MIDDLE_SECTIONS = ("Scenes", "Classes", "Confusion", "Errors", "Timing", "Compare")
 GALLERY = "Worst errors"  # its controls have tests of their own
 
 
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return runs_page.page_of_runs(tmp_path_factory.mktemp("page"))
+
+
+@pytest.fixture(scope="module")
+def opened(page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
+    """The page in a browser, as the tests before left it."""
+    with runs_page.browser_for_pages(tmp_path_factory.mktemp("profile")) as found:
+        found.open(page)
+        found.until(WHOLE)
+        yield found
+
+
 @pytest.fixture
-def browser(opened_runs: Chromium) -> Iterator[Chromium]:
-    yield opened_runs
-    assert complaints(opened_runs) == []
+def browser(opened: Chromium) -> Iterator[Chromium]:
+    yield opened
+    assert complaints(opened) == []
 
 
 def test_every_section_is_there_and_the_navigation_leads_to_it(browser: Chromium) -> None:
@@ -31,23 +47,23 @@ def test_every_section_is_there_and_the_navigation_leads_to_it(browser: Chromium
 
 
 def test_no_text_of_a_run_becomes_an_element(browser: Chromium) -> None:
-    assert "<img src=x onerror=window.struck=1>" in text_of(browser, "#summary .notes")
+    assert "<img src=x onerror=window.struck=1>" in runs_page.text_of(browser, "#summary .notes")
     assert browser.run("window.struck === undefined && !document.querySelector('main img[src=x]')")
 
 
 def test_a_header_sorts_and_turns_by_mouse_and_keyboard(browser: Chromium) -> None:
     browser.run("document.querySelectorAll('#summary table')[0].querySelectorAll('th button')[1].click()")
-    down = column(browser, "summary", 1)
+    down = runs_page.column(browser, "summary", 1)
     assert (
         browser.run("document.querySelectorAll('#summary th[aria-sort]')[0].getAttribute('aria-sort')") == "descending"
     )
     values = [float(value.split()[0]) for value in down]
     assert values == sorted(values, reverse=True)
     assert len(set(values)) > 1
-    press(browser, "#summary th[aria-sort] button")
+    runs_page.press(browser, "#summary th[aria-sort] button")
     browser.call("Input.dispatchKeyEvent", {"type": "keyDown", "key": "Enter", "text": "\r"})
     browser.call("Input.dispatchKeyEvent", {"type": "keyUp", "key": "Enter"})
-    assert [float(value.split()[0]) for value in column(browser, "summary", 1)] == sorted(values)
+    assert [float(value.split()[0]) for value in runs_page.column(browser, "summary", 1)] == sorted(values)
 
 
 # Every control of the page, by its section, kind and name; column headers and rows of tables apart.
@@ -68,18 +84,20 @@ OPERATE = """(part, kind, k) => {
 
 @pytest.mark.parametrize("part", ["summary", *(name.lower() for name in MIDDLE_SECTIONS), "provenance", "maps"])
 def test_each_control_of_a_section_changes_what_it_shows(browser: Chromium, part: str) -> None:
-    open_maps(browser)
+    runs_page.open_maps(browser)
     browser.run("document.querySelectorAll('details').forEach((one) => { one.open = false; })")
     shown = f"document.getElementById('{part}').outerHTML + document.querySelector('#{part} select')?.value"
     n_operated = 0
     if part == "confusion":  # the other methods confuse nothing
-        choose(browser, part, "Method", next(one for one in options(browser, part, "Method") if "noise" in one))
+        runs_page.choose(
+            browser, part, "Method", next(one for one in runs_page.options(browser, part, "Method") if "noise" in one)
+        )
     for kind in ("button.sort", "summary", "input", "select", "button:not(.sort, .to-gallery)"):
         for k in range(browser.run(f"document.querySelectorAll('#{part} {kind}').length")):
             is_of_view = part == "maps" and kind == "button:not(.sort, .to-gallery)"
             if is_of_view:  # so that the whole map is another picture than this one
-                press(browser, "#maps canvas", "ArrowLeft")
-            before, seen = browser.run(shown), picture(browser) if is_of_view else b""
+                runs_page.press(browser, "#maps canvas", "ArrowLeft")
+            before, seen = browser.run(shown), runs_page.picture(browser) if is_of_view else b""
             if kind == "select" and browser.run(
                 f"document.querySelectorAll('#{part} select')[{k}].closest('[hidden]')"
             ):
@@ -88,7 +106,45 @@ def test_each_control_of_a_section_changes_what_it_shows(browser: Chromium, part
                 continue
             n_operated += 1
             if seen:
-                assert picture(browser) != seen, (kind, k)
+                assert runs_page.picture(browser) != seen, (kind, k)
             else:
                 browser.until(f"{shown} !== {json.dumps(before)}")
     assert n_operated > 0
+
+
+def test_every_colouring_draws_another_picture_and_says_what_it_means(browser: Chromium) -> None:
+    runs_page.open_maps(browser)
+    kinds = runs_page.options(browser, "maps", "Colour by")
+    assert kinds == ["colour", "instance", "class", "true class", "error against the truth", "similarity to a text"]
+    seen = {}
+    for kind in kinds:
+        runs_page.choose(browser, "maps", "Colour by", kind)
+        seen[kind] = runs_page.picture(browser)
+        assert runs_page.text_of(browser, "#maps .legend").strip()
+    assert len(set(seen.values())) >= 5  # instances and classes may have the same colours where each is of one class
+    runs_page.choose(browser, "maps", "Colour by", kinds[4])
+    assert "right class" in runs_page.text_of(browser, "#maps .legend")
+    runs_page.choose(browser, "maps", "Colour by", kinds[5])
+    assert runs_page.options(browser, "maps", "Text") == ["chair", "table"]
+    first = runs_page.picture(browser)
+    runs_page.choose(browser, "maps", "Text", "table")
+    assert runs_page.picture(browser) != first
+    assert runs_page.column(browser, "maps", 0)[0] == "table"
+    assert runs_page.headers(browser, "maps") == ["Instance", "Similarity", "Points"]
+    runs_page.choose(browser, "maps", "Colour by", kinds[0])
+    assert browser.run(f"{runs_page.SELECT.format(part='maps', label='Text')}.closest('.field').hidden")
+    assert runs_page.headers(browser, "maps") == ["Instance", "Score", "Points"]
+
+
+def test_without_webgl_the_page_says_so_and_keeps_its_numbers(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(chromium, "FLAGS", (*chromium.FLAGS, "--disable-3d-apis"))
+    with Chromium(tmp_path / "profile") as browser:
+        browser.open(page)
+        browser.run("document.getElementById('maps').scrollIntoView()")
+        browser.until("document.querySelector('#maps .say')?.innerText.includes('no WebGL 2')")
+        browser.until("document.querySelectorAll('#maps .side tbody tr').length > 0")
+        browser.run("document.querySelector('#maps .side tbody tr').click()")
+        assert "Points" in runs_page.text_of(browser, "#maps .detail")
+        assert browser.run("document.querySelectorAll('#summary table').length") == 2

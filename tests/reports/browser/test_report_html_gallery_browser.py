@@ -11,17 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 from chromium import Chromium, find_chromium
+from looks import WHOLE
 from painted_runs import COLLECTOR, painted_page, painted_run
 from places import SCENES
+from runs_page import SELECT, choose
 
 from su3d_bench.analysis.page.gallery import PHOTO, PREDICTED, SeenError, error_photo
 from su3d_bench.core.types import Frame
 
 needs_browser = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
-WHOLE = "!document.querySelector('#main[aria-busy]')"
-FIELD = "[...document.querySelectorAll('#gallery select')].find((one) => one.labels[0].textContent === '{label}')"
-
-MAPS_FIELD = FIELD.replace("#gallery", "#maps")
 
 
 @pytest.fixture(scope="module")
@@ -123,36 +121,18 @@ def browser(page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ch
 @pytest.fixture
 def anew(browser: Chromium) -> Iterator[Chromium]:
     """The gallery with nothing filtered, of masks by AP."""
-    choose(browser, "Protocol", "rooms-instance")
+    choose(browser, "gallery", "Protocol", "rooms-instance")
     browser.run("document.querySelector('#gallery .toolbar > button:last-of-type').click()")
-    choose(browser, "Metric", "AP")
+    choose(browser, "gallery", "Metric", "AP")
     yield browser
     assert [line for line in browser.faults() if "GL" not in line] == []
-
-
-def choose(browser: Chromium, label: str, text: str) -> None:
-    browser.run(
-        f"{{ const field = {FIELD.format(label=label)}; field.value = [...field.options].find((one) => one.text === "
-        f"{json.dumps(text)}).value; field.dispatchEvent(new Event('change')); }}"
-    )
-
-
-def shown(browser: Chromium, what: str = "") -> list[str]:
-    found: list[str] = browser.run(
-        f"[...document.querySelectorAll('#gallery .card {what}')].map((one) => one.innerText)"
-    )
-    return found
-
-
-def click(browser: Chromium, selector: str) -> None:
-    browser.run(f"document.querySelector({json.dumps(selector)}).click()")
 
 
 @needs_browser
 @pytest.mark.parametrize("kind", ["missed", "label"])
 def test_a_card_leads_to_what_it_is_about_in_the_map_and_back(anew: Chromium, page: Path, kind: str) -> None:
-    choose(anew, "Protocol", "rooms-semantic" if kind == "label" else "rooms-instance")
-    choose(anew, "Kind", kind)
+    choose(anew, "gallery", "Protocol", "rooms-semantic" if kind == "label" else "rooms-instance")
+    choose(anew, "gallery", "Kind", kind)
     told = next(card for card in cards(page.read_text()) if card["kind"] == kind)
     anew.run("document.querySelector('#gallery .card .to-map').scrollIntoView({ block: 'center' })")
     before = anew.run("scrollY")
@@ -162,11 +142,11 @@ def test_a_card_leads_to_what_it_is_about_in_the_map_and_back(anew: Chromium, pa
     anew.until(f"{heading} !== null && !document.querySelector('#maps .panes[aria-busy]')")
     assert abs(anew.run("document.getElementById('maps').getBoundingClientRect().top")) < 200
     shown = {
-        name: anew.run(f"{MAPS_FIELD.format(label=name)}.selectedOptions[0].text")
+        name: anew.run(f"{SELECT.format(part='maps', label=name)}.selectedOptions[0].text")
         for name in ("Scene", "Map", "Beside")
     }
     assert shown == {"Scene": told["scene"], "Map": told["method"], "Beside": "truth"}
-    colour = anew.run(f"{MAPS_FIELD.format(label='Colour by')}.value")
+    colour = anew.run(f"{SELECT.format(part='maps', label='Colour by')}.value")
     assert colour == ("class" if kind == "label" else "instance")
     told_there = anew.run("document.querySelector('#maps .detail').innerText")
     assert told["true"][0] in told_there

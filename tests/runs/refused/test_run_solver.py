@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 from chat_server import KEY, Answered, Body, ChatServer
-from made_sheets import COLLECTOR, PAINTED
 from painted import colour_perception
+from painted_runs import COLLECTOR, PAINTED
 
 from su3d_bench.cli.main import main
 from su3d_bench.questions.scene_map import MapObject, SceneMap

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from places import SCENES
 
 from su3d_bench.core.errors import printable
 from su3d_bench.reports.pictures.items import png_bytes
@@ -15,13 +14,7 @@ from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.items import ASKS, Key, SheetKind
 from su3d_bench.sheets.sets import MadeSheets, make_sheets
 
-PAINTED = f"{SCENES}/painted.py:Painted"
-COLLECTOR = f"{SCENES}/painted.py:Collector"
 METHODS = ("collector", "collector@noise_m=0.0", "collector@drop=1")
-RUN = [
-    "run", "--scenes", f"{PAINTED}/a", "--methods", COLLECTOR, f"{COLLECTOR}@noise_m=0.0", f"{COLLECTOR}@drop=1",
-    "--protocols", "rooms-instance", "--no-pictures", "--jobs", "1", "--out", "run", "--quiet",
-]  # fmt: skip
 HOSTILE = (
     "<script>document.title='gone'</script><img src=x onerror=alert(1)>",
     '=HYPERLINK("http://example.com","win")',

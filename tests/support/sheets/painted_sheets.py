@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from painted import colour_perception
+from painted_runs import COLLECTOR, painted_run
 
 if TYPE_CHECKING:
     from su3d_bench.sheets.sources import RunSource
@@ -17,17 +17,12 @@ if TYPE_CHECKING:
 @pytest.fixture(scope="session")
 def painted_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a finished run in ``run`` and a file of queries."""
-    from made_sheets import RUN
-
-    from su3d_bench.cli.main import main
-    from su3d_bench.runs import scene as scene_run
-
     path = tmp_path_factory.mktemp("sheets")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
         patch.setenv("SU3D_DATA", str(path / "data"))
         patch.chdir(path)
-        assert main(RUN) == 0
+        methods = (COLLECTOR, f"{COLLECTOR}@noise_m=0.0", f"{COLLECTOR}@drop=1")
+        painted_run(Path("run"), "--protocols", "rooms-instance", "--quiet", methods=methods, scenes="a")
     rows = [("painted/a", "chair", "1", "instance"), ("painted/a", "a green sofa", "2", "property")]
     rows += [("painted/a", "=HYPERLINK(0)", "", "relative"), ("painted/a", "<script>x</script>", "3", "affordance")]
     text = io.StringIO(newline="")

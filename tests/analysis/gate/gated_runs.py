@@ -4,22 +4,16 @@ from __future__ import annotations
 
 import csv
 import json
-import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
-from painted_runs import painted_run
 
-from su3d_bench.analysis.gate import Reference, learn
-from su3d_bench.cli.main import main
 from su3d_bench.core.digests import digest_file
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, pack_scores, unpack_scores
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
-from su3d_bench.runs.finished import read_run
 
 COSTS = {"calibration_ms": 5.0, "start_ms": 10.0, "close_ms": 0.0}
 
@@ -101,24 +95,8 @@ def lowered(table: str, *keys: str, by: float = 0.001) -> Callable[[Path], None]
     return in_metrics(change)
 
 
-def slower(factor: float) -> Callable[[Path], None]:
-    return with_times([40.0 * factor] * 6)
-
-
-def with_times(method_ms: Sequence[float] = (40.0,) * 6, **costs: float) -> Callable[[Path], None]:
-    def change(run: Path) -> None:
-        timed(run, method_ms, **costs)
-
-    return change
-
-
-def setting(old: str, new: str) -> Callable[[Path], None]:
-    def change(run: Path) -> None:
-        text = (run / "run.toml").read_text()
-        assert old in text
-        (run / "run.toml").write_text(text.replace(old, new, 1))
-
-    return change
+def slower(factor: float) -> Callable[[Path], Path]:
+    return lambda run: timed(run, [40.0 * factor] * 6)
 
 
 def without_calibration(run: Path) -> None:
@@ -128,27 +106,3 @@ def without_calibration(run: Path) -> None:
 
 def results_in(run: Any) -> Any:
     return run.results["collector", "rooms-semantic"].result
-
-
-@pytest.fixture(scope="module")
-def gated(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return timed(painted_run(tmp_path_factory.mktemp("gate") / "run"))
-
-
-@pytest.fixture(scope="module")
-def gate_reference(gated: Path) -> Reference:
-    return learn([read_run(gated)])
-
-
-@pytest.fixture(scope="module")
-def gate_reference_file(gated: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The reference as the command writes it."""
-    path = tmp_path_factory.mktemp("gate") / "reference.json"
-    assert main(["check", "--learn", str(gated), "--out", str(path)]) == 0
-    return path
-
-
-@pytest.fixture
-def gated_copy(gated: Path, tmp_path: Path) -> Path:
-    shutil.copytree(gated, tmp_path / "run")
-    return tmp_path / "run"

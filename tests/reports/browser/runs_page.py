@@ -1,11 +1,58 @@
-"""What a person does with the page of runs, for its tests in a browser."""
+"""The page of runs for its tests in a browser: how it is made, and what a person does with it."""
 
 from __future__ import annotations
 
 import base64
 import json
+from pathlib import Path
 
+import chromium
+import pytest
 from chromium import Chromium
+from looks import DESKTOP
+from painted import WordEncoder, colour_perception
+from painted_runs import COLLECTOR, painted_run, run
+
+from su3d_bench.cli.main import main
+from su3d_bench.runs import finished as finished_run
+from su3d_bench.runs import scene as scene_run
+
+# WebGL without a graphics card.
+SOFTWARE_GL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
+STRUCK = "<img src=x onerror=window.struck=1></script><script>window.struck=1</script>"
+
+
+def browser_for_pages(folder: Path) -> Chromium:
+    """A browser that draws maps too; the profile is in ``folder``."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(chromium, "FLAGS", (*chromium.FLAGS, *SOFTWARE_GL))
+        return Chromium(folder, width=DESKTOP[0], height=DESKTOP[1])
+
+
+def finished_runs(folder: Path) -> list[str]:
+    """Two runs: two methods on two scenes with maps midway, and one method of them on one of the scenes."""
+    both = (COLLECTOR, f"{COLLECTOR}@noise_m=0.3")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", colour_perception)
+        patch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
+        painted_run(folder / "one", "--anytime", "0.5", methods=both)
+        assert run(scenes="a", out=str(folder / "two")) == 0
+    record = json.loads((folder / "one" / "metrics.json").read_text())
+    record["results"][0]["caveat"] = STRUCK
+    (folder / "one" / "metrics.json").write_text(json.dumps(record))
+    return [str(folder / "one"), str(folder / "two")]
+
+
+def page_of_runs(folder: Path) -> Path:
+    """``report html``."""
+    page = folder / "page.html"
+    words = ["--out", str(page), "--quiet", "--jobs", "1", "--queries", "chair", "table"]
+    runs = finished_runs(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
+        assert main(["report", "html", *runs, *words]) == 0
+    return page
+
 
 SELECT = "[...document.querySelectorAll('#{part} select')].find((one) => one.labels[0].textContent === '{label}')"
 
