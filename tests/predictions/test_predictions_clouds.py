@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
-from cloud_files import (
-    FORMATS,
-    NAMES,
+from painted import Painted, WordEncoder
+from places import SCENES
+from prediction_files import (
+    CLASSES,
     RNG,
+    WITH_POINTS,
+    Tensor,
     a_map,
     an_object,
-    settings,
+    refused,
+    tensors,
     write_gradslam,
     write_hovsg,
     write_map,
@@ -21,13 +27,9 @@ from cloud_files import (
     write_onlineanyseg,
     write_openlex,
     write_ovo,
-    write_rayfronts,
     write_small,
-    write_tensor,
+    write_torch,
 )
-from painted import Painted, WordEncoder
-from places import SCENES
-from prediction_files import refused
 
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
 from su3d_bench.evaluation.evaluate import evaluate
@@ -51,7 +53,7 @@ def instances(prediction: ScenePrediction) -> Instances:
 # ---- every format
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", WITH_POINTS)
 def test_each_is_known_as_itself_alone_at_every_level(tmp_path: Path, format: str) -> None:
     folder = write_small(tmp_path, format)
     for path in (folder, folder / "room0"):
@@ -62,7 +64,7 @@ def test_each_is_known_as_itself_alone_at_every_level(tmp_path: Path, format: st
         assert all(remark == remark.strip() and "\n" not in remark for remark in prediction.remarks)
 
 
-@pytest.mark.parametrize("format", [name for name in FORMATS if name != "esam"])  # which names nothing
+@pytest.mark.parametrize("format", [name for name in WITH_POINTS if name != "esam"])  # which names nothing
 def test_the_truth_in_each_format_is_scored_as_perfect(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, format: str
 ) -> None:
@@ -83,7 +85,7 @@ def test_the_truth_in_each_format_is_scored_as_perfect(
     elif format == "ovo":
         write_ovo(scene, truth.points, row + 3, {k + 3: features[k] for k in range(4)})
     elif format == "rayfronts":
-        write_rayfronts(scene / "map.pt", {"feats_xyz": truth.points, "feats_feats": features[row]})
+        write_torch(scene / "map.pt", tensors({"feats_xyz": truth.points, "feats_feats": features[row]}))
     elif format == "onlineanyseg":
         write_onlineanyseg(scene, truth.points, [row == k for k in range(4)], list(features))
     else:
@@ -101,6 +103,22 @@ def test_the_truth_in_each_format_is_scored_as_perfect(
 
 
 # ---- ConceptGraphs
+
+
+def settings(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Settings as ConceptGraphs stores them: an object of omegaconf's class, with a path in it."""
+    module = ModuleType("omegaconf.dictconfig")
+
+    class DictConfig:
+        pass
+
+    DictConfig.__module__, DictConfig.__qualname__ = module.__name__, "DictConfig"
+    module.DictConfig = DictConfig  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "omegaconf", ModuleType("omegaconf"))
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    made = DictConfig()
+    vars(made).update(_content={"dataset_root": Path("/data/Replica"), "stride": 5}, _parent=None, ref_type=dict)
+    return made
 
 
 @pytest.mark.parametrize("protocol", range(2, 6))  # ConceptGraphs writes 4; before 2 objects were written otherwise
@@ -125,7 +143,13 @@ def test_a_map_comes_back_object_by_object(tmp_path: Path, monkeypatch: pytest.M
 def test_the_streamlined_variant_is_read(tmp_path: Path) -> None:
     one = an_object(3, [1, 1], class_name="lamp", consolidated_caption="a lamp\non a desk", captions=["x"], id="u-1")
     del one["text_ft"], one["class_id"]
-    value = {"objects": [one], "cfg": {"stride": 10}, "class_names": NAMES, "class_colors": {}, "edges": [(0, 1, "on")]}
+    value = {
+        "objects": [one],
+        "cfg": {"stride": 10},
+        "class_names": CLASSES,
+        "class_colors": {},
+        "edges": [(0, 1, "on")],
+    }
     write_map(tmp_path / "room0/exps/rerun/pcd_rerun.pkl.gz", value)
     for path in (tmp_path, tmp_path / "room0", tmp_path / "room0/exps", tmp_path / "room0/exps/rerun/pcd_rerun.pkl.gz"):
         found = instances(read(path))
@@ -139,7 +163,7 @@ def test_without_features_the_names_of_the_detections_are_the_classes(tmp_path: 
     objects = [an_object(3, [1]), an_object(2, [0])]
     for one in objects:
         del one["clip_ft"]
-    prediction = read(write_map(tmp_path / "pcd_x.pkl.gz", {"objects": objects, "class_names": NAMES}), "pcd_x")
+    prediction = read(write_map(tmp_path / "pcd_x.pkl.gz", {"objects": objects, "class_names": CLASSES}), "pcd_x")
     found = instances(prediction)
     assert found.features is None and found.labels == ("lamp", "couch")
     assert any("the names of their detections decide" in remark for remark in prediction.remarks)
@@ -270,7 +294,7 @@ def test_each_fault_of_a_hovsg_map_is_one_line(tmp_path: Path) -> None:
     assert "pcd_0.ply: point 0 is at [0.0, 0.0, inf]" in refused(tmp_path, "room0", "hovsg")
     write_ply(scene / "objects/pcd_0.ply", [PlyElement("vertex", 1, {"x": np.zeros(1), "y": np.zeros(1)})])
     assert "pcd_0.ply: its vertices have no x, y and z" in refused(tmp_path, "room0", "hovsg")
-    write_tensor(scene / "mask_feats.pt", np.ones(3, np.float32))
+    write_torch(scene / "mask_feats.pt", Tensor(np.ones(3, np.float32)))
     assert "mask_feats.pt: holds an array of shape (3,)" in refused(tmp_path, "room0", "hovsg")
 
 

@@ -24,8 +24,6 @@ from prediction_files import (
     write_openins3d,
     write_openmask3d,
     write_openyolo3d,
-    write_openyolo3d_labelled,
-    write_sam3d,
     write_sam3d_colours,
     write_scannet_text,
     write_scannetpp_json,
@@ -186,7 +184,7 @@ def test_open3dis_tensors_have_masks_in_rows_unless_the_scores_say_otherwise(tmp
 
 
 def test_labelled_masks_of_openyolo3d_are_told_from_its_proposals(tmp_path: Path) -> None:
-    write_openyolo3d_labelled(tmp_path, TOY)
+    write_openyolo3d(tmp_path, TOY, has_labels=True)
     prediction = read(tmp_path, TOY["name"])
     assert prediction.format == "openyolo3d" and masks_of(prediction).numbering == "index"
     assert_masks(masks_of(prediction), TOY["masks"], TOY["labels"], TOY["scores"].astype(np.float32))
@@ -238,7 +236,7 @@ def test_groups_of_sam3d_become_masks_without_classes(tmp_path: Path, suffix: st
     if suffix == ".npy":
         np.save(tmp_path / "s.npy", groups)
     else:
-        write_sam3d(tmp_path, "s", groups)
+        write_torch(tmp_path / "s.pth", groups)
     prediction = read(tmp_path, "s")
     assert_masks(masks_of(prediction), np.stack([groups == 0, groups == 2, groups == 4]))
     assert prediction.format == "sam3d" and masks_of(prediction).keys == ("group 0", "group 2", "group 4")

@@ -13,9 +13,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from cloud_files import write_esam, write_object, write_onlineanyseg, write_ovo, write_rayfronts
 from places import CASES
-from prediction_files import Tensor, refused, tensors, write_torch
+from prediction_files import (
+    Tensor,
+    refused,
+    tensors,
+    write_esam,
+    write_object,
+    write_onlineanyseg,
+    write_ovo,
+    write_torch,
+)
 
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
 from su3d_bench.predictions.formats import READERS, recognise
@@ -92,8 +100,8 @@ def test_colours_of_esam_are_masks_and_grey_is_none(tmp_path: Path) -> None:
 def test_caches_of_an_evaluation_are_read_by_the_folder_of_the_scene(tmp_path: Path) -> None:
     value = {"feats_xyz": POINTS, "feats_feats": np.ones((6, 4), np.float32)}
     for scene in ("office0", "room0"):
-        write_rayfronts(tmp_path / "SemSegReplica" / scene / "map.pt", value)
-        write_rayfronts(tmp_path / "SemSegReplica" / scene / "text_embeds.pt", {"text_embeds": np.ones((2, 4))})
+        write_torch(tmp_path / "SemSegReplica" / scene / "map.pt", tensors(value))
+        write_torch(tmp_path / "SemSegReplica" / scene / "text_embeds.pt", tensors({"text_embeds": np.ones((2, 4))}))
     for path in (tmp_path, tmp_path / "SemSegReplica"):
         assert list(recognise(path).scenes(path)) == ["office0", "room0"]
         assert len(read(path).points) == 6
@@ -147,7 +155,7 @@ def test_each_fault_of_a_map_of_ovo_is_one_line(
     ],
 )
 def test_each_fault_of_a_map_of_rayfronts_is_one_line(tmp_path: Path, value: dict[str, Any], message: str) -> None:
-    write_rayfronts(tmp_path / "room0.pt", value)
+    write_torch(tmp_path / "room0.pt", tensors(value))
     assert message in refused(tmp_path, "room0", "rayfronts")
 
 
