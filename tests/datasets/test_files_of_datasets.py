@@ -18,8 +18,7 @@ import scannetpp_scene as pp
 from recording_files import grid, write_files, write_mesh
 from rgbd_scene import CAMERA, NUMBERED, describe
 from rgbd_scene import write_scene as write_rgbd
-from scannet_scan import SCAN, table_text, write_scan
-from scannet_toy import RECORDED, pgm_bytes, write_cpp_export, write_python_export
+from scannet_scan import RECORDED, SCAN, pgm_bytes, table_text, write_cpp_export, write_python_export, write_scan
 from test_openscan import RECORD
 from test_tum import SCENE as SEQUENCE
 from test_tum import write_sequence
@@ -72,8 +71,6 @@ def change(root: Path, name: str, content: Content) -> None:
         (root / name).unlink()
     elif callable(content):
         content(root)
-    elif isinstance(content, bytes):
-        (root / name).write_bytes(content)
     else:
         write_files(root, {name: content})
 

@@ -5,46 +5,37 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from recording_files import HEIGHT, WIDTH, depth_values, write_files
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.tum.dataset import Tum, TumOptions, associate, pose_at, quaternion_poses, read_trajectory
 
-WIDTH, HEIGHT = 12, 8
 CAMERA = "6.0 6.5 5.5 3.5\n"
 SCENE = "rgbd_dataset_freiburg2_xyz"
 Change = Callable[[Path], object]
 
 
-def depth_values(index: int) -> np.ndarray:
-    return np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 500 + index
-
-
 def write_sequence(root: Path, scene: str = SCENE, n_frames: int = 4) -> Path:
     """Frames 0.1 s apart, depth 0.004 s after colour, a pose at every colour time that moves by 1 m along x."""
-    folder = root / scene
-    (folder / "rgb").mkdir(parents=True)
-    (folder / "depth").mkdir()
     lists: dict[str, list[str]] = {"rgb": ["# color images"], "depth": ["# depth maps"], "groundtruth": ["# t x y z"]}
+    files: dict[str, Any] = {"camera.txt": CAMERA}
     for index in range(n_frames):
         time_s = 100 + index / 10
-        for name, image, late in (
-            ("rgb", np.full((HEIGHT, WIDTH, 3), (30, 120, 200), np.uint8), 0.0),
-            ("depth", depth_values(index), 0.004),
-        ):
+        colour = np.full((HEIGHT, WIDTH, 3), (200, 120, 30), np.uint8)
+        for name, image, late in (("rgb", colour, 0.0), ("depth", depth_values(index), 0.004)):
             file = f"{name}/{time_s + late:.6f}.png"
-            cv2.imwrite(str(folder / file), image)
+            files[file] = image
             lists[name].append(f"{time_s + late:.6f} {file}")
         lists["groundtruth"].append(f"{time_s:.4f} {index} 0.5 -1 0 0 0 1")
-    for name, lines in lists.items():
-        (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
-    (folder / "camera.txt").write_text(CAMERA)
-    return folder
+    write_files(root / scene, files | {f"{name}.txt": "\n".join(lines) + "\n" for name, lines in lists.items()})
+    return root / scene
 
 
 def test_frames_hold_what_the_files_hold(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import replica_scene as rep
+from recording_files import depth_values
 from recording_files import turn as pose
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
@@ -26,7 +27,7 @@ def test_frames_hold_what_the_files_hold(tmp_path: Path) -> None:
     last: Frame = frames[-1]
     assert (last.index, frames[0].index, last.timestamp_s) == (2, 0, 2 / 30)
     np.testing.assert_array_equal(last.camera_to_world, pose(2))
-    np.testing.assert_array_equal(last.depth_m, (rep.depth_values(2) / rep.SCALE).astype(np.float32))
+    np.testing.assert_array_equal(last.depth_m, (depth_values(2) / rep.SCALE).astype(np.float32))
     np.testing.assert_array_equal(last.intrinsics, [[6, 0, 5.5], [0, 6.5, 3.5], [0, 0, 1]])
     assert np.abs(last.rgb.astype(int) - (200, 120, 30)).max() <= 3
     with pytest.raises(IndexError):

@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 import scannet_scan as made
 from recording_files import HEIGHT_M, LEFT, RIGHT, floor_image, pose
-from scannet_scan import SCAN, WHERE, positions, write_scan
-from scannet_toy import write_python_export
+from scannet_scan import SCAN, WHERE, positions, write_python_export, write_scan
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError, GroundTruthMissing
