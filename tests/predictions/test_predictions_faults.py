@@ -8,17 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import prediction_files as made
 import pytest
-from prediction_files import (
-    FEATURES,
-    TOY,
-    Sparse,
-    Tensor,
-    own_instances,
-    refused,
-    write_openmask3d,
-    write_torch,
-)
 
 from su3d_bench.core.files.atomic import write_npz
 from su3d_bench.store.predictions import prediction_arrays
@@ -67,7 +58,7 @@ def test_each_fault_of_a_list_is_one_line_with_its_place(tmp_path: Path, line: s
     os.symlink("loop", folder / "loop")
     other = "pred_mask/a.txt 3 0.5\n" if "short" in line else ""
     (folder / "scene.txt").write_text(f"{other}{line}\n")
-    text = refused(folder, "scene", "scannet-text")
+    text = made.refused(folder, "scene", "scannet-text")
     assert text.startswith(f"{folder}/scene.txt") and message in text and "\x1b" not in text
 
 
@@ -77,13 +68,13 @@ def test_each_fault_of_a_list_is_one_line_with_its_place(tmp_path: Path, line: s
 )
 def test_each_fault_of_labels_is_one_line(tmp_path: Path, content: str, message: str) -> None:
     (tmp_path / "s.txt").write_text(content)
-    assert message in refused(tmp_path, "s", "scannet-semantic-text")
+    assert message in made.refused(tmp_path, "s", "scannet-semantic-text")
 
 
 # ---- wrong shapes and values in archives
 
 
-MASKS = TOY["masks"].T
+MASKS = made.TOY["masks"].T
 
 
 @pytest.mark.parametrize(
@@ -101,23 +92,25 @@ MASKS = TOY["masks"].T
 )
 def test_each_fault_of_an_archive_of_masks_is_one_line(tmp_path: Path, arrays: dict[str, Any], message: str) -> None:
     np.savez(tmp_path / "s.npz", **arrays)
-    text = refused(tmp_path, "s", "maskclustering")
+    text = made.refused(tmp_path, "s", "maskclustering")
     assert text.startswith(f"{tmp_path}/s.npz") and message in text
 
 
 def test_wrong_shapes_in_torch_files_are_refused(tmp_path: Path) -> None:
-    write_torch(tmp_path / "a.pt", (Tensor(MASKS), Tensor(np.ones(4, np.float32))))
-    assert "3 masks, but the scores are an array of shape (4,)" in refused(tmp_path, "a", "openyolo3d")
-    write_torch(tmp_path / "b.pth", {"ins": Tensor(MASKS), "conf": Tensor(np.ones(7))})
-    assert "but there are 7 scores or classes" in refused(tmp_path, "b", "open3dis")
-    write_openmask3d(tmp_path, TOY, FEATURES[:2])
-    assert "3 masks, but the features are an array of shape (2, 768)" in refused(tmp_path, TOY["name"], "openmask3d")
-    write_torch(tmp_path / "c.pth", np.zeros((2, 2), np.int64))
-    assert "expected one group number a point" in refused(tmp_path, "c", "sam3d")
+    made.write_torch(tmp_path / "a.pt", (made.Tensor(MASKS), made.Tensor(np.ones(4, np.float32))))
+    assert "3 masks, but the scores are an array of shape (4,)" in made.refused(tmp_path, "a", "openyolo3d")
+    made.write_torch(tmp_path / "b.pth", {"ins": made.Tensor(MASKS), "conf": made.Tensor(np.ones(7))})
+    assert "but there are 7 scores or classes" in made.refused(tmp_path, "b", "open3dis")
+    made.write_openmask3d(tmp_path, made.TOY, made.FEATURES[:2])
+    assert "3 masks, but the features are an array of shape (2, 768)" in made.refused(
+        tmp_path, made.TOY["name"], "openmask3d"
+    )
+    made.write_torch(tmp_path / "c.pth", np.zeros((2, 2), np.int64))
+    assert "expected one group number a point" in made.refused(tmp_path, "c", "sam3d")
     np.save(tmp_path / "d.npy", np.zeros(4))
-    assert "expected one group number a point" in refused(tmp_path, "d", "sam3d")
-    write_torch(tmp_path / "e.pt", Sparse(np.zeros((2, 0), np.int64), (5, 10**12)))
-    assert "1000000000000 masks of 5 points" in refused(tmp_path, "e", "openins3d")
+    assert "expected one group number a point" in made.refused(tmp_path, "d", "sam3d")
+    made.write_torch(tmp_path / "e.pt", made.Sparse(np.zeros((2, 0), np.int64), (5, 10**12)))
+    assert "1000000000000 masks of 5 points" in made.refused(tmp_path, "e", "openins3d")
 
 
 @pytest.mark.parametrize(
@@ -134,10 +127,12 @@ def test_wrong_shapes_in_torch_files_are_refused(tmp_path: Path) -> None:
 )
 def test_each_fault_of_our_own_file_is_one_line(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     arrays = {
-        name: array for name, array in {**prediction_arrays(own_instances()), **changes}.items() if array is not None
+        name: array
+        for name, array in {**prediction_arrays(made.own_instances()), **changes}.items()
+        if array is not None
     }
     write_npz(tmp_path / "prediction.npz", arrays)
-    text = refused(tmp_path / "prediction.npz", "prediction", "su3d-bench")
+    text = made.refused(tmp_path / "prediction.npz", "prediction", "su3d-bench")
     assert text.startswith(f"{tmp_path}/prediction.npz: ") and message in text
 
 

@@ -54,17 +54,8 @@ def test_vertices_take_the_object_of_most_of_their_faces_and_the_lowest_id_on_ti
     rep.write_original(tmp_path, rep.QUADS, [0, 5, 5, 5], rep.TWO_OBJECTS)
     truth = Replica(tmp_path).ground_truth("room0", "mesh-vertices")
     # vertex 1 and 3 have one face of each object: the chair, id 0; vertex 4 has three faces of the table
-    assert truth.semantic.tolist() == [
-        rep.CHAIR,
-        rep.CHAIR,
-        rep.TABLE,
-        rep.CHAIR,
-        rep.TABLE,
-        rep.TABLE,
-        rep.TABLE,
-        rep.TABLE,
-        rep.TABLE,
-    ]
+    chair, table = rep.CHAIR, rep.TABLE
+    assert truth.semantic.tolist() == [chair, chair, table, chair, table, table, table, table, table]
     assert truth.instance.tolist() == [1, 1, 6, 1, 6, 6, 6, 6, 6]
     assert truth.labels.name_of(rep.CHAIR) == "chair"
     assert truth.points[5].tolist() == [2, 1, 0]
