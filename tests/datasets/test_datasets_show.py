@@ -13,11 +13,7 @@ from painted import Painted
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.replica.dataset import Replica
-from su3d_bench.reports.pictures.scene import (
-    WIDTH,
-    draw_scene_picture,
-    look_at,
-)
+from su3d_bench.reports.pictures.scene import WIDTH, draw_scene_picture, look_at
 
 
 @pytest.fixture(scope="module")

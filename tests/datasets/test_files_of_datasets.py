@@ -93,11 +93,8 @@ def faults(dataset: Any, scene: str) -> list[str]:
 
 def boxed(**changes: Any) -> dict[str, Any]:
     """The table of objects with a box, some of whose parts are other ones."""
-    box: dict[str, Any] = {"center": [1, 1, 0], "sizes": [2, 2, 1], "rotation": [0, 0, 0, 1], "translation": [0, 0, 0]}
-    box |= changes
-    parts = {"abb": ("center", "sizes"), "orientation": ("rotation", "translation")}
     table = rep.info_table(rep.TWO_OBJECTS)
-    table["objects"][0]["oriented_bbox"] = {key: {name: box[name] for name in names} for key, names in parts.items()}
+    table["objects"][0]["oriented_bbox"] = rep.box(**changes)
     return table
 
 
@@ -194,12 +191,7 @@ FAULTS: list[tuple[str, str, Content, str]] = [
     ("scannetpp", f"{pp.LISTS}/top100.txt", "wall\nwall\n", "top100.txt: has 'wall' twice"),
     ("scannetpp", f"{pp.LISTS}/top100_instance.txt", "piano\n", "has 'piano', which top100.txt has not"),
     ("scannetpp", f"{pp.LISTS}/map_benchmark.csv", f"{pp.MAP}sofa\n", "row 7: has 1 cells of 4"),
-    (
-        "scannetpp tracking",
-        TRACKING,
-        pp.tracking(aligned_pose=(2 * np.eye(4)).tolist()),
-        "'aligned_pose' is not",
-    ),
+    ("scannetpp tracking", TRACKING, pp.tracking(aligned_pose=(2 * np.eye(4)).tolist()), "'aligned_pose' is not"),
     ("hm3dsem", f"{WALK}/scene_info.json", {}, "levels: Field required"),
     ("hm3dsem", f"{WALK}/scene_info.json", walk_info("regions", 0, floor_id=3), "a 'floor_id' names no level"),
     ("hm3dsem", f"{WALK}/scene_info.json", walk_info("objects", 1, id=3), "an object stands there twice"),

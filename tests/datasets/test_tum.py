@@ -59,10 +59,7 @@ def test_sequences_are_found_in_the_usual_places(tmp_path: Path, place: str) -> 
     assert Tum(tmp_path).info(SCENE, 3).n_frames == 2
 
 
-@pytest.mark.parametrize(
-    ("scene", "focal"),
-    [("rgbd_dataset_freiburg1_desk", 517.3), ("own", 525.0)],
-)
+@pytest.mark.parametrize(("scene", "focal"), [("rgbd_dataset_freiburg1_desk", 517.3), ("own", 525.0)])
 def test_without_a_camera_file_the_name_tells_the_camera(tmp_path: Path, scene: str, focal: float) -> None:
     folder = write_sequence(tmp_path, scene)
     (folder / "camera.txt").unlink()

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import struct
-import tracemalloc
 import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from damage import assert_same
+from damage import assert_same, traced
 from places import CASES
 
 from su3d_bench.core.errors import PredictionError
@@ -144,13 +143,8 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_each_fault_inside_an_archive_is_one_line(tmp_path: Path, fault: str) -> None:
     path = archive(tmp_path, {"a/data.pkl": FAULTS[fault], "a/data/0": SIX})
-    tracemalloc.start()
-    try:
-        with pytest.raises(PredictionError) as caught:
-            read_torch(path)
-        assert tracemalloc.get_traced_memory()[1] < 2_000_000
-    finally:
-        tracemalloc.stop()
+    with traced(2_000_000), pytest.raises(PredictionError) as caught:
+        read_torch(path)
     assert str(caught.value).startswith(f"{path}: ") and str(caught.value).isprintable()
 
 

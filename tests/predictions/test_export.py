@@ -71,9 +71,7 @@ def test_shared_points_go_to_the_first_object_and_unowned_ones_nowhere(tmp_path:
     assert found.instance.tolist() == [0, 0, 0, 1] and len(found.features) == 3
 
 
-@given(
-    members=st.lists(st.sets(st.integers(0, 11)), min_size=1, max_size=5).filter(any),
-)
+@given(members=st.lists(st.sets(st.integers(0, 11)), min_size=1, max_size=5).filter(any))
 @settings(max_examples=60, deadline=None)
 def test_every_point_of_an_object_is_exported_once_to_one_of_its_objects(members: list[set[int]]) -> None:
     made = a_map([sorted(one) for one in members], n_points=12)

@@ -135,10 +135,7 @@ FAULTS = (
         edited(object_id=True),
         "samples.0.object_id: Input should be a valid integer; found True",
     ),
-    (release.read_categories, edited(object_id=10**30), "object_id: Input should be less than or equal to 2147483647"),
-    (release.read_categories, edited(synonyms=["a", 3]), "synonyms.1: Input should be a valid string; found 3"),
     (release.read_categories, edited(synonyms=["\ud800"]), "synonyms.0: "),
-    (release.read_categories, edited(clutter=["x"]), "clutter.0: Input should be a valid integer"),
     (release.read_categories, "[" * 100_000, "not JSON"),
     (
         release.read_queries,

@@ -17,9 +17,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.recordings.pose_convention import FLIP, judge_scene
 from su3d_bench.datasets.rgbd.dataset import Rgbd
-from su3d_bench.datasets.rgbd.files import (
-    direction_in,
-)
+from su3d_bench.datasets.rgbd.files import direction_in
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 
 

@@ -25,10 +25,7 @@ from su3d_bench.datasets.scannet.recordings import read_walk
 from su3d_bench.datasets.scannet.truth import TABLE_NAME
 
 
-@pytest.mark.parametrize(
-    "place",
-    [".", "scannet/scans", "ScanNet/scans_test", "scans/val"],
-)
+@pytest.mark.parametrize("place", [".", "scannet/scans", "ScanNet/scans_test", "scans/val"])
 def test_scans_are_found_in_every_layout_that_circulates(tmp_path: Path, place: str) -> None:
     write_scan(tmp_path, place=place)
     found = ScanNet(tmp_path)

@@ -6,9 +6,8 @@ import hashlib
 import json
 import os
 import struct
-import tracemalloc
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from damage import outcomes, truncations
+from damage import outcomes, traced, truncations
 from places import CASES
 
 from su3d_bench.core.errors import DataError
@@ -238,13 +237,8 @@ def test_a_depth_image_that_is_unfit_is_named_and_never_unpacked_further(
             with_frame(tmp_path, depth=depth)
         depth = zlib.compress(bytes(100 << 20), 9)
     file = with_frame(tmp_path, depth=depth)
-    tracemalloc.start()
-    try:
-        with pytest.raises(DataError, match=rf"{WHERE}: bad\.sens: frame 1 at byte \d+: depth.*{message}"):
-            file.depth(1)
-        assert tracemalloc.get_traced_memory()[1] < 1 << 20
-    finally:
-        tracemalloc.stop()
+    with traced(1 << 20), pytest.raises(DataError, match=rf"{WHERE}: bad\.sens: frame 1 at byte \d+: depth.*{message}"):
+        file.depth(1)
 
 
 @pytest.mark.parametrize(
@@ -259,17 +253,8 @@ def test_a_depth_image_that_is_unfit_is_named_and_never_unpacked_further(
 def test_a_promise_of_too_much_allocates_nothing(tmp_path: Path, at: int, number: int) -> None:
     toy = bytearray(TOY.read_bytes())
     toy[N_HEADER + at : N_HEADER + at + 8] = struct.pack("<Q", number)
-    assert refused_within_a_megabyte(lambda: opened(tmp_path / "bad.sens", bytes(toy)))
-
-
-def refused_within_a_megabyte(read: Callable[[], object]) -> bool:
-    tracemalloc.start()
-    try:
-        with pytest.raises(DataError, match=rf"^{WHERE}: bad\.sens: "):
-            read()
-        return tracemalloc.get_traced_memory()[1] < 1 << 20
-    finally:
-        tracemalloc.stop()
+    with traced(1 << 20), pytest.raises(DataError, match=rf"^{WHERE}: bad\.sens: "):
+        opened(tmp_path / "bad.sens", bytes(toy))
 
 
 def test_a_missing_file_a_folder_and_a_pipe_are_data_errors(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import resource
 import time
+import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import is_dataclass
@@ -113,6 +114,17 @@ def bounded_addresses(most_bytes: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+@contextmanager
+def traced(max_bytes: int) -> Iterator[None]:
+    """The block must end, by whatever, with less than ``max_bytes`` allocated at any time."""
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < max_bytes
+    finally:
+        tracemalloc.stop()
 
 
 def reset_peak() -> int:

@@ -43,6 +43,14 @@ def info_table(objects: list[tuple[int, int]]) -> dict[str, Any]:
     return {"classes": classes, "objects": [{"id": one, "class_id": class_id} for one, class_id in objects]}
 
 
+def box(
+    centre: Any = (1, 1, 0), sizes: Any = (2, 2, 0.1), rotation: Any = (0, 0, 0, 1), translation: Any = (0, 0, 0)
+) -> dict[str, Any]:
+    """An entry ``oriented_bbox`` of a table of objects."""
+    turned = {"rotation": list(rotation), "translation": list(translation)}
+    return {"abb": {"center": list(centre), "sizes": list(sizes)}, "orientation": turned}
+
+
 def write_original(
     root: Path,
     faces: Sequence[list[int]],
