@@ -92,7 +92,6 @@ def test_the_command_writes_the_picture_and_tells_counts(capsys: pytest.CaptureF
     ],
 )
 def test_each_wrong_request_is_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    Path("file").write_text("")
     assert main(["datasets", "show", *words]) == 2
     said = capsys.readouterr()
     assert said.out == "" and said.err.startswith(f"su3d-bench: {message}") and said.err.count("\n") == 1, said.err

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,6 @@ from su3d_bench.datasets.tum.dataset import Tum, TumOptions, associate, pose_at,
 
 CAMERA = "6.0 6.5 5.5 3.5\n"
 SCENE = "rgbd_dataset_freiburg2_xyz"
-Change = Callable[[Path], object]
 
 
 def write_sequence(root: Path, scene: str = SCENE, n_frames: int = 4) -> Path:
@@ -90,7 +88,8 @@ def test_frames_without_a_pose_in_time_are_counted_and_left_out(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     folder = write_sequence(tmp_path)
-    rewrite("groundtruth.txt", lambda text: text.replace("100.1000", "100.1300"))(folder)
+    path = folder / "groundtruth.txt"
+    path.write_text(path.read_text().replace("100.1000", "100.1300"))
     with caplog.at_level(logging.WARNING):
         assert [frame.index for frame in Tum(tmp_path).frames(SCENE, 1)] == [0, 2, 3]
     assert "1 colour images have no pose within 0.02 s in groundtruth.txt (the first: rgb/100.1" in caplog.text
@@ -146,10 +145,6 @@ def test_quaternions_become_rotations_and_any_length_is_made_one(tmp_path: Path)
     times_s, rows = read_trajectory(tmp_path / "groundtruth.txt", "x")
     assert times_s.tolist() == [1, 2]
     np.testing.assert_allclose(rows[:, 3:], [[0, 0, 0, -1], [0, 0, 0.5**0.5, 0.5**0.5]])
-
-
-def rewrite(name: str, change: Callable[[str], str]) -> Change:
-    return lambda folder: (folder / name).write_text(change((folder / name).read_text()))
 
 
 def test_times_denser_than_any_camera_are_refused_before_pairs_are_made(tmp_path: Path) -> None:

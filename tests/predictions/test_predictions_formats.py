@@ -251,11 +251,9 @@ def test_our_own_run_folders_and_files_are_read(tmp_path: Path) -> None:
         (tmp_path / "run/scenes" / name / "opensu3d").mkdir(parents=True)
         write_prediction(tmp_path / "run/scenes" / name / "opensu3d/prediction.npz", content)
     reader = recognise(tmp_path / "run")
-    assert (reader.name, sorted(reader.scenes(tmp_path / "run"))) == (
-        "su3d-bench",
-        ["replica/room0", "replica/room1", "rooms/a.b"],
-    )
-    for scene, content in zip(("replica/room0", "replica/room1", "rooms/a.b"), contents.values(), strict=True):
+    scenes = ["replica/room0", "replica/room1", "rooms/a.b"]
+    assert (reader.name, sorted(reader.scenes(tmp_path / "run"))) == ("su3d-bench", scenes)
+    for scene, content in zip(scenes, contents.values(), strict=True):
         ours = reader.read(tmp_path / "run", scene).content
         assert type(ours) is type(content)
         np.testing.assert_array_equal(ours.points, content.points)
