@@ -16,7 +16,7 @@ from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
 
 LEFT, RIGHT = (200, 60, 40), (40, 80, 200)
 HEIGHT_M = 2.0
-SIZE = WIDTH, HEIGHT = 12, 8  # of images whose depth tells the pixel
+WIDTH, HEIGHT = 12, 8  # of images whose depth tells the pixel
 
 
 def depth_values(index: int) -> UInt16Array:
