@@ -25,8 +25,17 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests" / "support" / "files"))
 
 from check_wheel import bring_kernels, built_wheel  # noqa: E402
-from file_server import FileServer, Served, file_server, serve_repository  # noqa: E402
-from published import entry, serve_file, serve_model, serve_replica, write_table  # noqa: E402
+from file_server import (  # noqa: E402
+    FileServer,
+    Served,
+    entry,
+    hub_entry,
+    serve_file,
+    serve_model,
+    serve_replica,
+    serve_repository,
+    write_table,
+)
 
 SCENES = ("room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4")
 ROOM = ("--scenes", "bedroom0", "--set", "n_frames=8", "width=64", "height=48", "mesh_spacing_m=0.2")
@@ -110,10 +119,8 @@ def serve_models(server: FileServer, place: Place) -> list[dict[str, Any]]:
     # Where the table says it lies there is nobody: it comes from a mirror.
     rows.append(entry("sam-vit-h", "models", {SAM: sam | {"address": f"http://127.0.0.1:9/{SAM}"}}))
     serve_repository(server, "xinyu1205/recognize-anything-plus-model", {RAM: b"of its own package alone" * 100})
-    row = entry("ram-plus", "models", {}, hosts=["127.0.0.1", "localhost"], endpoint=server.url)
-    del row["files"]
     hub = {"repository": "xinyu1205/recognize-anything-plus-model", "files": [RAM], "optional": [], "read_at": "here"}
-    return [*rows, row | {"hub": hub}]
+    return [*rows, hub_entry(server, "ram-plus", hub)]
 
 
 def serve_rooms(server: FileServer, place: Place) -> list[dict[str, Any]]:
@@ -212,7 +219,7 @@ def verified(place: Place, bundle: Path) -> None:
 
 
 def main() -> int:
-    with tempfile.TemporaryDirectory() as name, file_server() as server:
+    with tempfile.TemporaryDirectory() as name, FileServer() as server:
         place = installed(Path(name).resolve())
         models, rooms = serve_models(server, place), serve_rooms(server, place)
         table = write_table(place.folder / "own.toml", [*models, *rooms])

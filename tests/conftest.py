@@ -18,7 +18,7 @@ MOST_KEPT_BYTES = 4 << 30
 # The table of readers to damage takes its samples from the tests of those readers.
 sys.path += sorted({str(file.parent) for file in TESTS.rglob("*.py")} - {*sys.path})
 
-from chat_server import ChatServer, chat_server  # noqa: E402 (it is found by the line above)
+from chat_server import ChatServer  # noqa: E402 (it is found by the line above)
 from painted import colour_perception  # noqa: E402
 from painted_sheets import painted_folder, painted_source  # noqa: E402, F401
 
@@ -74,7 +74,7 @@ def data_to_spoil(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[
 
 @pytest.fixture(scope="module")
 def chat_of_module() -> Iterator[ChatServer]:
-    with chat_server() as server:
+    with ChatServer() as server:
         yield server
 
 

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import pytest
 from cli_calls import Declined, called
+from damage import bounded_addresses
 from fuzz_targets import TARGETS, copied_run
 from fuzz_words import ODD, drawn_words, verbs
 from fuzzing import ENDLESS, MOST_ADDRESSES_BYTES, Input, Sample, alarm
-from memory import bounded_addresses
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, PredictionError, StoreError

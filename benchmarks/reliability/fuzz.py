@@ -62,9 +62,9 @@ class Tally:
 
 def work() -> None:
     """For each order on stdin, meet a reader with damage and say a line of JSON on each input."""
+    from damage import bounded_addresses
     from fuzz_targets import TARGETS
     from fuzzing import MOST_ADDRESSES_BYTES, Sample
-    from memory import bounded_addresses
 
     said, null = os.fdopen(os.dup(1), "w"), os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 1)

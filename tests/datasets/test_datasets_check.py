@@ -185,16 +185,12 @@ def test_a_camera_that_stands_still_and_images_that_repeat_are_warnings() -> Non
     assert found_in(*repeated) == [("warning", "motion", "")]
 
 
-@pytest.fixture
-def at_root(root: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+def test_the_command_caps_what_it_lists_and_ends_with_1(
+    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setenv("SU3D_DATA", str(root))
-    monkeypatch.chdir(tmp_path)
-    return root
-
-
-def test_the_command_caps_what_it_lists_and_ends_with_1(at_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_box_room(at_root, 14, "room1", with_truth=False)
-    for path in (at_root / "Replica/room1/results").glob("depth*.png"):
+    write_box_room(root, 14, "room1", with_truth=False)
+    for path in (root / "Replica/room1/results").glob("depth*.png"):
         path.write_bytes(b"x")
     assert main(["datasets", "check", "replica/room0", "replica/room1", "--jobs", "2"]) == 1
     text = capsys.readouterr().out
@@ -219,7 +215,6 @@ def test_the_digest_is_the_one_that_a_run_records(
     words = ["--methods", f"{file}:Collector", "--no-pictures", "--jobs", "1", "--out", str(tmp_path / "run")]
     assert main(["run", "--scenes", scene, *options, "--protocols", "rooms-semantic", *words]) == 0
     assert digest in (tmp_path / "run" / "run.json").read_text()
-    assert json.loads((tmp_path / "run/scenes/painted.a/collector/done.json").read_text())
     assert digest in (tmp_path / "run/scenes/painted.a/collector/done.json").read_text()
 
 

@@ -13,11 +13,7 @@ from painted import Painted
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.replica.dataset import Replica
-from su3d_bench.reports.pictures.scene import (
-    WIDTH,
-    draw_scene_picture,
-    look_at,
-)
+from su3d_bench.reports.pictures.scene import WIDTH, draw_scene_picture, look_at
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +92,6 @@ def test_the_command_writes_the_picture_and_tells_counts(capsys: pytest.CaptureF
     ],
 )
 def test_each_wrong_request_is_one_line(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
-    Path("file").write_text("")
     assert main(["datasets", "show", *words]) == 2
     said = capsys.readouterr()
     assert said.out == "" and said.err.startswith(f"su3d-bench: {message}") and said.err.count("\n") == 1, said.err

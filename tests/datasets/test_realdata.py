@@ -76,15 +76,11 @@ def run(scene: str, *words: str) -> Instances:
     return prediction
 
 
-def stored_labels(*words: str) -> list[str]:
-    folder = REAL_RECORDINGS.resolve() / "label_fusion/labels"
-    return ["--profile", "stored", "--set", f"perception.stored.folder={folder}",
-            "perception.stored.images=frame-{index}.segm.png", *words]  # fmt: skip
-
-
 def test_fifteen_labelled_frames_give_exactly_the_two_labelled_objects_never_swapped(root: Path) -> None:
     (root / "names.toml").write_text('48 = "parcel"\n132 = "carton"\n')
-    found = run("rgbd/shelf", *stored_labels(f"perception.stored.names={root / 'names.toml'}"))
+    stored = {"folder": REAL_RECORDINGS.resolve() / "label_fusion/labels", "images": "frame-{index}.segm.png"}
+    words = [f"perception.stored.{key}={value}" for key, value in (stored | {"names": root / "names.toml"}).items()]
+    found = run("rgbd/shelf", "--profile", "stored", "--set", *words)
     assert sorted(found.names) == ["carton", "parcel"]
     # Values ascend, so detection 0 of every image is the region 48 and detection 1 the region 132.
     views = [found.views[found.view_indptr[k] : found.view_indptr[k + 1]].tolist() for k in range(2)]

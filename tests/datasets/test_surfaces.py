@@ -9,14 +9,13 @@ import pytest
 from recording_files import grid, write_mesh
 from replica_scene import QUADS, TWO_OBJECTS, write_original, write_render
 from rgbd_scene import write_scene
-from scannet_scan import SCAN, write_recording
+from scannet_scan import SCAN, dataset, write_recording
 from scannet_scan import write_truth as write_scan_truth
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.datasets.rgbd.dataset import Rgbd
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
-from su3d_bench.datasets.scannet.dataset import ScanNet, ScannetOptions
 
 
 @pytest.fixture(scope="module")
@@ -47,10 +46,6 @@ def test_replicas_surface_is_the_renders_mesh_in_fans_without_labels(tmp_path: P
     assert tmp_path / "Replica" / "room0_mesh.ply" in dataset.files("room0")
 
 
-def scannet(root: Path, **options: object) -> ScanNet:
-    return ScanNet(root, ScannetOptions(**options))  # type: ignore[arg-type]
-
-
 def write_scan(root: Path, segments: list[int]) -> Path:
     folder = root / "scans" / SCAN
     folder.mkdir(parents=True)
@@ -61,24 +56,24 @@ def write_scan(root: Path, segments: list[int]) -> Path:
 
 def test_scannets_surface_has_the_published_segments(tmp_path: Path) -> None:
     write_scan(tmp_path, [7] * 10 + [4_000_000_000] * 14)
-    surface = scannet(tmp_path).surface(SCAN)
+    surface = dataset(tmp_path).surface(SCAN)
     assert np.array_equal(surface.vertices, grid()[0]) and np.array_equal(surface.triangles, grid()[1])
     assert surface.segments is not None and surface.segments.tolist() == [0] * 10 + [1] * 14
 
 
 def test_a_scan_without_annotation_has_a_surface_and_without_segments_too(tmp_path: Path) -> None:
     folder = write_scan(tmp_path, [7] * 24)
-    dataset = scannet(tmp_path)
-    before = dataset.digest(SCAN)
+    scans = dataset(tmp_path)
+    before = scans.digest(SCAN)
     (folder / f"{SCAN}.aggregation.json").unlink()
     (folder / f"{SCAN}_vh_clean_2.labels.ply").unlink()
-    assert dataset.surface(SCAN).segments is not None
+    assert scans.surface(SCAN).segments is not None
     (folder / f"{SCAN}_vh_clean_2.0.010000.segs.json").unlink()
-    assert dataset.surface(SCAN).segments is None
-    assert dataset.digest(SCAN) != before
+    assert scans.surface(SCAN).segments is None
+    assert scans.digest(SCAN) != before
     (folder / f"{SCAN}_vh_clean_2.ply").unlink()
     with pytest.raises(DataError, match=rf"scannet/{SCAN}: no mesh; {SCAN}_vh_clean_2\.ply is missing, copy it into"):
-        dataset.surface(SCAN)
+        scans.surface(SCAN)
 
 
 def test_a_described_folder_may_name_a_mesh(tmp_path: Path) -> None:

@@ -3,48 +3,37 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from recording_files import HEIGHT, WIDTH, depth_values, write_files
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.tum.dataset import Tum, TumOptions, associate, pose_at, quaternion_poses, read_trajectory
 
-WIDTH, HEIGHT = 12, 8
 CAMERA = "6.0 6.5 5.5 3.5\n"
 SCENE = "rgbd_dataset_freiburg2_xyz"
-Change = Callable[[Path], object]
-
-
-def depth_values(index: int) -> np.ndarray:
-    return np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 500 + index
 
 
 def write_sequence(root: Path, scene: str = SCENE, n_frames: int = 4) -> Path:
     """Frames 0.1 s apart, depth 0.004 s after colour, a pose at every colour time that moves by 1 m along x."""
-    folder = root / scene
-    (folder / "rgb").mkdir(parents=True)
-    (folder / "depth").mkdir()
     lists: dict[str, list[str]] = {"rgb": ["# color images"], "depth": ["# depth maps"], "groundtruth": ["# t x y z"]}
+    files: dict[str, Any] = {"camera.txt": CAMERA}
     for index in range(n_frames):
         time_s = 100 + index / 10
-        for name, image, late in (
-            ("rgb", np.full((HEIGHT, WIDTH, 3), (30, 120, 200), np.uint8), 0.0),
-            ("depth", depth_values(index), 0.004),
-        ):
+        colour = np.full((HEIGHT, WIDTH, 3), (200, 120, 30), np.uint8)
+        for name, image, late in (("rgb", colour, 0.0), ("depth", depth_values(index), 0.004)):
             file = f"{name}/{time_s + late:.6f}.png"
-            cv2.imwrite(str(folder / file), image)
+            files[file] = image
             lists[name].append(f"{time_s + late:.6f} {file}")
         lists["groundtruth"].append(f"{time_s:.4f} {index} 0.5 -1 0 0 0 1")
-    for name, lines in lists.items():
-        (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
-    (folder / "camera.txt").write_text(CAMERA)
-    return folder
+    write_files(root / scene, files | {f"{name}.txt": "\n".join(lines) + "\n" for name, lines in lists.items()})
+    return root / scene
 
 
 def test_frames_hold_what_the_files_hold(tmp_path: Path) -> None:
@@ -68,10 +57,7 @@ def test_sequences_are_found_in_the_usual_places(tmp_path: Path, place: str) -> 
     assert Tum(tmp_path).info(SCENE, 3).n_frames == 2
 
 
-@pytest.mark.parametrize(
-    ("scene", "focal"),
-    [("rgbd_dataset_freiburg1_desk", 517.3), ("own", 525.0)],
-)
+@pytest.mark.parametrize(("scene", "focal"), [("rgbd_dataset_freiburg1_desk", 517.3), ("own", 525.0)])
 def test_without_a_camera_file_the_name_tells_the_camera(tmp_path: Path, scene: str, focal: float) -> None:
     folder = write_sequence(tmp_path, scene)
     (folder / "camera.txt").unlink()
@@ -102,7 +88,8 @@ def test_frames_without_a_pose_in_time_are_counted_and_left_out(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     folder = write_sequence(tmp_path)
-    rewrite("groundtruth.txt", lambda text: text.replace("100.1000", "100.1300"))(folder)
+    path = folder / "groundtruth.txt"
+    path.write_text(path.read_text().replace("100.1000", "100.1300"))
     with caplog.at_level(logging.WARNING):
         assert [frame.index for frame in Tum(tmp_path).frames(SCENE, 1)] == [0, 2, 3]
     assert "1 colour images have no pose within 0.02 s in groundtruth.txt (the first: rgb/100.1" in caplog.text
@@ -158,10 +145,6 @@ def test_quaternions_become_rotations_and_any_length_is_made_one(tmp_path: Path)
     times_s, rows = read_trajectory(tmp_path / "groundtruth.txt", "x")
     assert times_s.tolist() == [1, 2]
     np.testing.assert_allclose(rows[:, 3:], [[0, 0, 0, -1], [0, 0, 0.5**0.5, 0.5**0.5]])
-
-
-def rewrite(name: str, change: Callable[[str], str]) -> Change:
-    return lambda folder: (folder / name).write_text(change((folder / name).read_text()))
 
 
 def test_times_denser_than_any_camera_are_refused_before_pairs_are_made(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from file_server import FileServer, Served, file_server
+from file_server import FileServer, Served
 
 from su3d_bench.core.errors import DataError, StoreError
 from su3d_bench.fetching import download
@@ -27,7 +27,7 @@ UNSTATED: dict[str, Any] = {"n_bytes": None, "stated": Stated()}
 def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[FileServer]:
     monkeypatch.setattr(download, "FIRST_PAUSE_S", 0.0)
     monkeypatch.setattr(download, "TIMEOUT_S", 5.0)
-    with file_server() as running:
+    with FileServer() as running:
         yield running
 
 
@@ -96,7 +96,7 @@ def test_a_redirection_goes_to_named_hosts_alone(server: FileServer, tmp_path: P
     server.files[f"/{NAME}"] = Served(b"", redirect=f"{server.other_host}/store")
     with pytest.raises(DataError, match="host 'localhost' is not named for it"):
         fetched(server, tmp_path / NAME)
-    assert server.paths() == [f"/{NAME}"]
+    assert [asked.path for asked in server.asked] == [f"/{NAME}"]
     fetched(server, tmp_path / NAME, hosts=("127.0.0.1", "localhost"))
     assert (tmp_path / NAME).read_bytes() == CONTENT
 

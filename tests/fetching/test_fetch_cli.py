@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 from box_room import write_box_room
-from file_server import FileServer, Served, file_server
-from published import entry, serve_file, serve_model, serve_replica, write_table
+from file_server import FileServer, Served, entry, serve_file, serve_model, serve_replica, write_table
 from scannet_scan import write_scan
 
 from su3d_bench.cli.main import main
@@ -31,7 +30,7 @@ def server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FileServ
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "no-hub"))
     for variable in ("HF_ENDPOINT", "http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY"):
         monkeypatch.delenv(variable, raising=False)
-    with file_server() as running:
+    with FileServer() as running:
         yield running
 
 

@@ -7,14 +7,13 @@ import os
 import pickle
 import struct
 import subprocess
-import tracemalloc
 from collections import OrderedDict, defaultdict
 from pathlib import Path, PosixPath
 from typing import Any
 
 import numpy as np
 import pytest
-from damage import assert_same
+from damage import assert_same, traced
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.formats import pickles
@@ -82,12 +81,8 @@ def test_payloads_below_a_key_to_forget_are_not_kept(tmp_path: Path, protocol: i
     masks = [np.random.default_rng(k).random((500, 1000)) < 0.5 for k in range(5)]
     one = {"pcd": np.ones((1000, 3)), "mask": masks, "colours": np.ones(9000), "after": np.ones(2000)}
     content = pickle.dumps({"objects": [one]}, protocol)
-    tracemalloc.start()
-    try:
+    with traced(1_300_000):
         found = read(tmp_path, content, forget=("mask", "colours"))["objects"][0]
-        assert tracemalloc.get_traced_memory()[1] < 1_300_000
-    finally:
-        tracemalloc.stop()
     assert [type(mask) for mask in (*found["mask"], found["colours"])] == [Forgotten] * 6
     assert found["pcd"].shape == (1000, 3) and found["after"].shape == (2000,)
 
@@ -156,12 +151,8 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_each_fault_of_a_pickle_is_one_line(tmp_path: Path, fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pickles, "FREE_STEPS", 20_000)
-    tracemalloc.start()
-    try:
+    with traced(400 << 20):
         refused(tmp_path, FAULTS[fault])
-        assert tracemalloc.get_traced_memory()[1] < 400 << 20
-    finally:
-        tracemalloc.stop()
 
 
 @pytest.mark.parametrize(
@@ -174,22 +165,14 @@ def test_each_fault_of_a_pickle_is_one_line(tmp_path: Path, fault: str, monkeypa
     ],
 )
 def test_odd_pickles_cost_no_more_than_their_bytes(tmp_path: Path, content: bytes) -> None:
-    tracemalloc.start()
-    try:
+    with traced(300 * len(content) + 10_000_000):
         read(tmp_path, content)
-        assert tracemalloc.get_traced_memory()[1] < 300 * len(content) + 10_000_000
-    finally:
-        tracemalloc.stop()
 
 
 def test_a_gzip_bomb_stops_at_the_bound(tmp_path: Path) -> None:
     zeros = b"\x8e" + struct.pack("<Q", 256 << 20) + bytes(256 << 20) + b"."
     content = gzip.compress(zeros, 1)
-    tracemalloc.start()
-    try:
+    with traced(16 << 20):
         assert "unpacks to more than" in refused(tmp_path, content)
-        assert tracemalloc.get_traced_memory()[1] < 16 << 20
-    finally:
-        tracemalloc.stop()
     with pytest.raises(PredictionError, match="cannot be read"):
         read_pickle_file(tmp_path)

@@ -16,8 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bombs import MIB, Member, deflated, gzip_of, jpeg_of_scans, npy_head, npz_of_zeros, png_of_zeros, zip_of
-from damage import lacked_memory
-from memory import bounded_addresses, peak_bytes, reset_peak
+from damage import bounded_addresses, lacked_memory, peak_bytes, reset_peak
 
 from su3d_bench.core.errors import DataError, PredictionError, StoreError, Su3dError
 from su3d_bench.core.files.atomic import DAMAGE, read_arrays

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from chat_server import Answered, Body, ChatServer, chat_server, error
+from chat_server import Answered, Body, ChatServer, error
 from tiny_models import needs_models, paper_words, write_models
 
 from su3d_bench.cli.main import main
@@ -82,7 +82,7 @@ class Finished:
 def made(tmp_path_factory: pytest.TempPathFactory, rooms_data: Path) -> Iterator[Finished]:
     root = tmp_path_factory.mktemp("captions")
     models = write_models(root / "models")
-    with pytest.MonkeyPatch.context() as patch, chat_server() as server:
+    with pytest.MonkeyPatch.context() as patch, ChatServer() as server:
         patch.setenv("SU3D_DATA", str(rooms_data))
         patch.setenv("SU3D_CACHE", str(root / "cache"))
         patch.delenv("SU3D_TEST_KEY", raising=False)

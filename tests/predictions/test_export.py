@@ -17,16 +17,8 @@ from su3d_bench.core.maps import DenseFeatures, Instances, Partition
 from su3d_bench.metrics.matching.nearest import masks_of, transfer_masks
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
+from su3d_bench.predictions import export
 from su3d_bench.predictions.base import VertexLabels, VertexMasks, vertex_masks
-from su3d_bench.predictions.export import (
-    file_name,
-    masks_as_they_are,
-    masks_on_truth,
-    openlex_parts,
-    whole_folder,
-    write_openlex,
-    write_scannet,
-)
 from su3d_bench.predictions.formats import READERS
 
 RULES = load_protocol("rooms-instance")
@@ -34,22 +26,9 @@ RNG = np.random.default_rng(0)
 
 
 def a_map(members: list[list[int]], n_points: int = 8, dim: int = 4, **more: Any) -> Instances:
-    k = len(members)
-    values: dict[str, Any] = {
-        "points": RNG.normal(size=(n_points, 3)).astype(np.float32),
-        "indptr": np.cumsum([0, *(len(one) for one in members)]),
-        "indices": np.array([point for one in members for point in one], np.int32),
-        "scores": np.linspace(0.1, 0.9, k),
-        "features": RNG.normal(size=(k, dim)).astype(np.float32),
-        "labels": None,
-        "names": ("",) * k,
-        "captions": ("",) * k,
-        "boxes": np.zeros((k, 2, 3), np.float32),
-        "centroids": np.zeros((k, 3), np.float32),
-        "view_indptr": np.zeros(k + 1, np.int64),
-        "views": np.zeros((0, 2), np.int32),
-    }
-    return Instances(**{**values, **more})
+    k, points = len(members), RNG.normal(size=(n_points, 3)).astype(np.float32)
+    made = Instances.of(points, members, np.linspace(0.1, 0.9, k), RNG.normal(size=(k, dim)).astype(np.float32))
+    return replace(made, **more)
 
 
 def read_openlex(folder: Path) -> Partition:
@@ -69,19 +48,19 @@ def read_text(folder: Path, scene: str) -> VertexMasks:
 
 def test_a_map_without_overlaps_comes_back_whole(tmp_path: Path) -> None:
     made = a_map([[0, 2], [1, 3, 4], [5, 6, 7]])
-    assert write_openlex(made, tmp_path / "s") == ()
+    assert export.write_openlex(made, tmp_path / "s") == ()
     found = read_openlex(tmp_path / "s")
     np.testing.assert_array_equal(found.points, made.points)
     assert found.instance.tolist() == [0, 1, 0, 1, 1, 2, 2, 2]
     np.testing.assert_array_equal(found.features, made.features)
-    assert write_openlex(found, tmp_path / "t") == ()
+    assert export.write_openlex(found, tmp_path / "t") == ()
     for file in ("point_cloud.pcd", "index.npy", "embeddings.npy"):
         assert (tmp_path / "s" / file).read_bytes() == (tmp_path / "t" / file).read_bytes()
 
 
 def test_shared_points_go_to_the_first_object_and_unowned_ones_nowhere(tmp_path: Path) -> None:
     made = a_map([[0, 1, 2], [1, 2, 4], [2]])
-    remarks = write_openlex(made, tmp_path / "s")
+    remarks = export.write_openlex(made, tmp_path / "s")
     assert remarks == (
         "2 points are in several objects and went to the first of them",
         "4 of 8 points are in no object and were left out",
@@ -92,13 +71,11 @@ def test_shared_points_go_to_the_first_object_and_unowned_ones_nowhere(tmp_path:
     assert found.instance.tolist() == [0, 0, 0, 1] and len(found.features) == 3
 
 
-@given(
-    members=st.lists(st.sets(st.integers(0, 11)), min_size=1, max_size=5).filter(any),
-)
+@given(members=st.lists(st.sets(st.integers(0, 11)), min_size=1, max_size=5).filter(any))
 @settings(max_examples=60, deadline=None)
 def test_every_point_of_an_object_is_exported_once_to_one_of_its_objects(members: list[set[int]]) -> None:
     made = a_map([sorted(one) for one in members], n_points=12)
-    parts = openlex_parts(made)
+    parts = export.openlex_parts(made)
     kept = sorted(set().union(*members))
     np.testing.assert_array_equal(parts.points, made.points[kept])
     assert [min(k for k, one in enumerate(members) if point in one) for point in kept] == parts.index.tolist()
@@ -106,11 +83,11 @@ def test_every_point_of_an_object_is_exported_once_to_one_of_its_objects(members
 
 def test_partitions_and_dense_maps_leave_out_what_has_no_object(tmp_path: Path) -> None:
     points, features = RNG.normal(size=(4, 3)).astype(np.float32), RNG.normal(size=(2, 3)).astype(np.float32)
-    remarks = write_openlex(Partition(points, np.array([1, -1, 0, 1], np.int32), features), tmp_path / "p")
+    remarks = export.write_openlex(Partition(points, np.array([1, -1, 0, 1], np.int32), features), tmp_path / "p")
     assert remarks == ("1 of 4 points are in no object and were left out",)
     assert read_openlex(tmp_path / "p").instance.tolist() == [1, 0, 1]
     rows = np.array([[1, 2], [0, 0], [3, 4], [0, -1]], np.float16)
-    remarks = write_openlex(DenseFeatures(points, rows), tmp_path / "d")
+    remarks = export.write_openlex(DenseFeatures(points, rows), tmp_path / "d")
     assert remarks[1] == "1 of 4 points have no feature and were left out"
     found = read_openlex(tmp_path / "d")
     np.testing.assert_array_equal(found.points, points[[0, 2, 3]])
@@ -133,7 +110,7 @@ def test_partitions_and_dense_maps_leave_out_what_has_no_object(tmp_path: Path) 
 )
 def test_what_openlex3d_cannot_hold_is_refused(content: Any, message: str) -> None:
     with pytest.raises(PredictionError, match=message):
-        openlex_parts(content)
+        export.openlex_parts(content)
 
 
 # ---- ScanNet
@@ -141,27 +118,17 @@ def test_what_openlex3d_cannot_hold_is_refused(content: Any, message: str) -> No
 
 def test_masks_labels_and_scores_come_back_to_the_last_bit(tmp_path: Path) -> None:
     scores = np.array([0.1 + 0.2, 1 / 3, 1e-17, 0.30000000000000004 + 1e-16])
-    members = [[0, 3], [1], [0, 1, 2, 3], [2, 4]]
-    indptr = np.cumsum([0, *map(len, members)])
-    indices = np.concatenate([np.array(one, np.int32) for one in members])
-    made = vertex_masks(
-        "x",
-        [np.array(one, np.int32) for one in members],
-        5,
-        scores=scores,
-        class_numbers=np.arange(1, 5, dtype=np.int32),
-    )
-    assert write_scannet(masks_as_they_are(made), "scene0011_00", tmp_path) == ()
+    members = [np.array(one, np.int32) for one in ([0, 3], [1], [0, 1, 2, 3], [2, 4])]
+    made = vertex_masks("x", members, 5, scores=scores, class_numbers=np.arange(1, 5, dtype=np.int32))
+    assert export.write_scannet(export.masks_as_they_are(made), "scene0011_00", tmp_path) == ()
     found = read_text(tmp_path, "scene0011_00")
     assert found.n_points == 5
-    np.testing.assert_array_equal(found.indptr, indptr)
-    np.testing.assert_array_equal(found.indices, indices)
+    assert [one.tolist() for one in found.sets()] == [one.tolist() for one in members]
     assert found.scores.tolist() == scores.tolist()
     assert found.class_numbers is not None and found.class_numbers.tolist() == [1, 2, 3, 4]
     assert (tmp_path / "pred_mask/scene0011_00_000.txt").read_text() == "1\n0\n0\n1\n0\n"
-    assert (
-        (tmp_path / "scene0011_00.txt").read_text().startswith("pred_mask/scene0011_00_000.txt 1 0.30000000000000004\n")
-    )
+    first = (tmp_path / "scene0011_00.txt").read_text().splitlines()[0]
+    assert first == "pred_mask/scene0011_00_000.txt 1 0.30000000000000004"
 
 
 def labelled_room() -> Instances:
@@ -177,7 +144,7 @@ def labelled_room() -> Instances:
 
 def test_a_map_on_other_points_is_moved_to_the_vertices_and_scores_the_same(tmp_path: Path) -> None:
     truth, made = room(), labelled_room()
-    write_scannet(masks_on_truth(made, RULES, truth, None), "living0", tmp_path)
+    export.write_scannet(export.masks_on_truth(made, RULES, truth, None), "living0", tmp_path)
     found = read_text(tmp_path, "living0")
     moved = transfer_masks(
         made.points, masks_of(made), truth.points, RULES.transfer.cap_m, RULES.transfer.evaluation_voxel_m
@@ -195,10 +162,10 @@ def test_features_are_named_by_the_encoder_among_the_classes_of_the_protocol() -
     made = labelled_room()
     assert made.labels is not None
     featured = replace(made, labels=None, features=ENCODER.encode_texts(made.labels))
-    labelled = masks_on_truth(featured, RULES, room(), ENCODER)
+    labelled = export.masks_on_truth(featured, RULES, room(), ENCODER)
     assert labelled.class_ids.tolist() == [ID[label] for label in made.labels]
     assert labelled.remarks == ()
-    other = masks_on_truth(featured, load_protocol("replica-openmask3d"), room(), ENCODER)
+    other = export.masks_on_truth(featured, load_protocol("replica-openmask3d"), room(), ENCODER)
     assert other.remarks == ("labels come from the encoder 'one-hot', the protocol's is 'ViT-L-14-336/openai'",)
 
 
@@ -208,21 +175,21 @@ def test_a_partition_is_exported_with_scores_of_one_and_a_remark(tmp_path: Path)
     owner = np.full(len(truth.points), -1, np.int32)
     owner[made.indices] = np.repeat(np.arange(len(made), dtype=np.int32), np.diff(made.indptr))
     partition = Partition(truth.points, owner, ENCODER.encode_texts(made.labels))
-    labelled = masks_on_truth(partition, RULES, truth, ENCODER)
+    labelled = export.masks_on_truth(partition, RULES, truth, ENCODER)
     assert labelled.remarks[0] == "a partition has no scores: 1 for every mask"
-    write_scannet(labelled, "living0", tmp_path)
+    export.write_scannet(labelled, "living0", tmp_path)
     found = read_text(tmp_path, "living0")
     assert found.scores.tolist() == [1.0] * len(made)
     np.testing.assert_array_equal(found.indices, made.indices)
     with pytest.raises(PredictionError, match="for each point, -1 for none"):
-        masks_on_truth(replace(partition, instance=owner + 100), RULES, truth, ENCODER)
+        export.masks_on_truth(replace(partition, instance=owner + 100), RULES, truth, ENCODER)
 
 
 def test_positions_in_the_list_of_classes_become_class_ids() -> None:
     n = len(room().points)
     members = [np.array([0, 1], np.int32)] * 3
     made = vertex_masks("x", members, n, class_numbers=np.array([0, 2, 10_000], np.int32), numbering="index")
-    labelled = masks_on_truth(made, RULES, room(), None)
+    labelled = export.masks_on_truth(made, RULES, room(), None)
     assert labelled.class_ids.tolist() == [RULES.scored[0].id, RULES.scored[2].id, 0]
 
 
@@ -230,30 +197,30 @@ def test_what_scannets_list_cannot_hold_is_refused() -> None:
     dense = DenseFeatures(np.zeros((1, 3), np.float32), np.ones((1, 2), np.float16))
     for content in (dense, VertexLabels(np.zeros(3, np.int32))):
         with pytest.raises(PredictionError, match="has no masks"):
-            masks_on_truth(content, RULES, room(), None)
+            export.masks_on_truth(content, RULES, room(), None)
     with pytest.raises(PredictionError, match=r"is of 9 points, the scene of \d+; both must be of one mesh"):
-        masks_on_truth(vertex_masks("x", [np.array([1], np.int32)], 9), RULES, room(), None)
+        export.masks_on_truth(vertex_masks("x", [np.array([1], np.int32)], 9), RULES, room(), None)
     with pytest.raises(PredictionError, match="NaN or infinite"):
-        masks_on_truth(replace(labelled_room(), scores=np.full(8, np.nan)), RULES, room(), None)
+        export.masks_on_truth(replace(labelled_room(), scores=np.full(8, np.nan)), RULES, room(), None)
 
 
 @pytest.mark.parametrize("scene", ["", "..", "a/b", "a\nb", "-x", "/etc"])
 def test_a_scene_whose_name_leads_elsewhere_is_refused(scene: str, tmp_path: Path) -> None:
     with pytest.raises(PredictionError, match="cannot be the name of a file"):
-        file_name(scene)
+        export.file_name(scene)
 
 
 def test_a_folder_is_filled_whole_or_not_at_all(tmp_path: Path) -> None:
-    with whole_folder(tmp_path / "deep/out") as folder:
+    with export.whole_folder(tmp_path / "deep/out") as folder:
         (folder / "x").write_text("1")
         assert not (tmp_path / "deep/out").exists()
     assert (tmp_path / "deep/out/x").read_text() == "1"
-    with pytest.raises(PredictionError), whole_folder(tmp_path / "other") as folder:
-        write_openlex(a_map([[]]), folder / "s")
+    with pytest.raises(PredictionError), export.whole_folder(tmp_path / "other") as folder:
+        export.write_openlex(a_map([[]]), folder / "s")
     assert sorted(file.name for file in tmp_path.iterdir()) == ["deep"]
-    with pytest.raises(StoreError, match="choose another folder with --out"), whole_folder(tmp_path / "deep"):
+    with pytest.raises(StoreError, match="choose another folder with --out"), export.whole_folder(tmp_path / "deep"):
         pass
     (tmp_path / "empty").mkdir()
-    with whole_folder(tmp_path / "empty") as folder:
+    with export.whole_folder(tmp_path / "empty") as folder:
         (folder / "y").write_text("2")
     assert (tmp_path / "empty/y").read_text() == "2"

@@ -13,16 +13,7 @@ from open_scene import ENCODER, OBJECTS, PROMPTS, instances_with
 from test_openlex3d_original import write_visible
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.datasets.openlex3d.release import (
-    LabelledPoints,
-    OpenLexFiles,
-    categories_truth,
-    face_corners_of,
-    queries_truth,
-    read_categories,
-    read_prompts,
-    read_queries,
-)
+from su3d_bench.datasets.openlex3d import release
 from su3d_bench.datasets.replica.truth import AnnotatedMesh
 from su3d_bench.formats.ply import ListColumn
 from su3d_bench.metrics.open_vocabulary.score import TextQuery
@@ -53,13 +44,13 @@ CATEGORIES = {
 QUERIES = {"level0": {"chair": [7], "pot": [31, "12"]}, "level1": {"chair": [7]}}
 
 
-def written(tmp_path: Path) -> OpenLexFiles:
+def written(tmp_path: Path) -> release.OpenLexFiles:
     scene = tmp_path / "replica/room0"
     scene.mkdir(parents=True)
     (tmp_path / "replica/prompt_list.txt").write_text("\n".join(f" {prompt} " for prompt in PROMPTS) + "\n")
     (scene / "gt_categories.json").write_text(json.dumps(CATEGORIES))
     (scene / "gt_categories_query_to_object_mapping_all.json").write_text(json.dumps(QUERIES))
-    return OpenLexFiles(tmp_path, "replica", "room0")
+    return release.OpenLexFiles(tmp_path, "replica", "room0")
 
 
 # ---- what is read
@@ -75,11 +66,11 @@ def test_the_three_files_of_a_scene_are_read(tmp_path: Path) -> None:
 # ---- from files to a score
 
 
-def corners() -> LabelledPoints:
+def corners() -> release.LabelledPoints:
     """Each object as points of a box."""
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.random((50, 3)) * 0.3 + [i, 0, 0] for i in range(len(OBJECTS))]).astype(np.float32)
-    return LabelledPoints(points, np.repeat(list(OBJECTS), 50), "made for a test")
+    return release.LabelledPoints(points, np.repeat(list(OBJECTS), 50), "made for a test")
 
 
 def test_the_files_with_the_points_of_a_mesh_can_be_scored(tmp_path: Path) -> None:
@@ -89,10 +80,10 @@ def test_the_files_with_the_points_of_a_mesh_can_be_scored(tmp_path: Path) -> No
     words = [labels.synonyms[0] for labels in OBJECTS.values()]
     prediction = instances_with(mesh.points, masks, ENCODER.encode_texts(words))
     rules = load_protocol("openlex3d-topn")
-    score = score_scene(rules, categories_truth(files, mesh), prediction, ENCODER)
+    score = score_scene(rules, release.categories_truth(files, mesh), prediction, ENCODER)
     assert combine(rules, {"a": score}).metrics["synonyms"] == 1.0
     rules = load_protocol("openlex3d-queries")
-    truth = queries_truth(files, mesh, "all")
+    truth = release.queries_truth(files, mesh, "all")
     assert len(truth.queries) == 3
     assert combine(rules, {"a": score_scene(rules, truth, prediction, ENCODER)}).metrics["AP25"] > 0.5
 
@@ -101,7 +92,7 @@ def test_a_visible_point_far_from_every_corner_has_no_object(tmp_path: Path) -> 
     mesh = corners()
     files = written(tmp_path)
     write_visible(tmp_path / "replica/room0", np.array([mesh.points[0] + [0.02, 0, 0], mesh.points[0] + [0, 9, 0]]))
-    truth = categories_truth(files, mesh)
+    truth = release.categories_truth(files, mesh)
     assert truth.object_of_point.tolist() == [7, -1]
 
 
@@ -110,7 +101,7 @@ def test_the_corners_of_a_replica_mesh_keep_the_numbers_of_all_objects() -> None
     faces = ListColumn(np.array([0, 3, 6]), np.array([0, 1, 2, 1, 2, 3]))
     without_class = np.zeros(2, np.int32)
     mesh = AnnotatedMesh(vertices, faces, np.array([7, 0]), without_class, without_class, {})
-    found = face_corners_of(mesh)
+    found = release.face_corners_of(mesh)
     assert found.object_of_point.tolist() == [7, 7, 7, 0, 0, 0]
     assert found.points[3].tolist() == vertices[1].tolist()
 
@@ -136,18 +127,23 @@ def edited(**changes: Any) -> str:
 
 
 FAULTS = (
-    (read_prompts, " \n \n", "has no prompt; expected one a line"),
-    (read_categories, "[]", "expected an object; found []"),
-    (read_categories, '{"dataset": {}}', "dataset.samples: Field required"),
-    (read_categories, edited(object_id=True), "samples.0.object_id: Input should be a valid integer; found True"),
-    (read_categories, edited(object_id=10**30), "object_id: Input should be less than or equal to 2147483647"),
-    (read_categories, edited(synonyms=["a", 3]), "synonyms.1: Input should be a valid string; found 3"),
-    (read_categories, edited(synonyms=["\ud800"]), "synonyms.0: "),
-    (read_categories, edited(clutter=["x"]), "clutter.0: Input should be a valid integer"),
-    (read_categories, "[" * 100_000, "not JSON"),
-    (read_queries, '{"level0": {"a\\u001b[31m": 7}}', "level0.a\\x1b[31m: Input should be a valid list; found 7"),
-    (read_queries, '{"level0": {"a": [7, 7]}}', "query 'a': an object stands there twice"),
-    (read_queries, '{"level0": {"a": [NaN]}}', "level0.a.0: Input should be a finite number; found nan"),
+    (release.read_prompts, " \n \n", "has no prompt; expected one a line"),
+    (release.read_categories, "[]", "expected an object; found []"),
+    (release.read_categories, '{"dataset": {}}', "dataset.samples: Field required"),
+    (
+        release.read_categories,
+        edited(object_id=True),
+        "samples.0.object_id: Input should be a valid integer; found True",
+    ),
+    (release.read_categories, edited(synonyms=["\ud800"]), "synonyms.0: "),
+    (release.read_categories, "[" * 100_000, "not JSON"),
+    (
+        release.read_queries,
+        '{"level0": {"a\\u001b[31m": 7}}',
+        "level0.a\\x1b[31m: Input should be a valid list; found 7",
+    ),
+    (release.read_queries, '{"level0": {"a": [7, 7]}}', "query 'a': an object stands there twice"),
+    (release.read_queries, '{"level0": {"a": [NaN]}}', "level0.a.0: Input should be a finite number; found nan"),
 )
 
 
@@ -165,4 +161,4 @@ def test_a_file_that_cannot_be_used_is_told_in_one_line(
 def test_a_name_that_leaves_its_folder_is_refused(tmp_path: Path, name: str) -> None:
     for dataset, scene in ((name, "room0"), ("replica", name)):
         with pytest.raises(DataError, match="is no name of a dataset or scene"):
-            OpenLexFiles(tmp_path, dataset, scene)
+            release.OpenLexFiles(tmp_path, dataset, scene)

@@ -2,32 +2,16 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
+import prediction_files as made
 import pytest
-from cloud_files import (
-    FORMATS,
-    NAMES,
-    RNG,
-    a_map,
-    an_object,
-    settings,
-    write_gradslam,
-    write_hovsg,
-    write_map,
-    write_object,
-    write_onlineanyseg,
-    write_openlex,
-    write_ovo,
-    write_rayfronts,
-    write_small,
-    write_tensor,
-)
 from painted import Painted, WordEncoder
 from places import SCENES
-from prediction_files import refused
 
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
 from su3d_bench.evaluation.evaluate import evaluate
@@ -51,9 +35,9 @@ def instances(prediction: ScenePrediction) -> Instances:
 # ---- every format
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", made.WITH_POINTS)
 def test_each_is_known_as_itself_alone_at_every_level(tmp_path: Path, format: str) -> None:
-    folder = write_small(tmp_path, format)
+    folder = made.write_small(tmp_path, format)
     for path in (folder, folder / "room0"):
         assert [name for name in READERS if READERS[name].recognise(path) is not None] == [format]
         assert list(READERS[format].scenes(path)) == ["room0"]
@@ -62,7 +46,7 @@ def test_each_is_known_as_itself_alone_at_every_level(tmp_path: Path, format: st
         assert all(remark == remark.strip() and "\n" not in remark for remark in prediction.remarks)
 
 
-@pytest.mark.parametrize("format", [name for name in FORMATS if name != "esam"])  # which names nothing
+@pytest.mark.parametrize("format", [name for name in made.WITH_POINTS if name != "esam"])  # which names nothing
 def test_the_truth_in_each_format_is_scored_as_perfect(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, format: str
 ) -> None:
@@ -74,20 +58,20 @@ def test_the_truth_in_each_format_is_scored_as_perfect(
     features = encoder.encode_texts([truth.labels.name_of(int(truth.semantic[row == k][0])) for k in range(4)])
     scene = tmp_path / "maps/a"
     if format == "conceptgraphs":
-        objects = [an_object(1, [0], pcd_np=truth.points[row == k], clip_ft=features[k]) for k in range(4)]
-        write_map(scene / "pcd_saves/full_pcd_x.pkl.gz", {"objects": objects, "bg_objects": None})
+        objects = [made.an_object(1, [0], pcd_np=truth.points[row == k], clip_ft=features[k]) for k in range(4)]
+        made.write_map(scene / "pcd_saves/full_pcd_x.pkl.gz", {"objects": objects, "bg_objects": None})
     elif format == "gradslam":
-        write_gradslam(scene / "saved-map/pointclouds", truth.points, features[row])
+        made.write_gradslam(scene / "saved-map/pointclouds", truth.points, features[row])
     elif format == "hovsg":
-        write_hovsg(scene, {k: truth.points[row == k] for k in range(4)}, features)
+        made.write_hovsg(scene, {k: truth.points[row == k] for k in range(4)}, features)
     elif format == "ovo":
-        write_ovo(scene, truth.points, row + 3, {k + 3: features[k] for k in range(4)})
+        made.write_ovo(scene, truth.points, row + 3, {k + 3: features[k] for k in range(4)})
     elif format == "rayfronts":
-        write_rayfronts(scene / "map.pt", {"feats_xyz": truth.points, "feats_feats": features[row]})
+        made.write_torch(scene / "map.pt", made.tensors({"feats_xyz": truth.points, "feats_feats": features[row]}))
     elif format == "onlineanyseg":
-        write_onlineanyseg(scene, truth.points, [row == k for k in range(4)], list(features))
+        made.write_onlineanyseg(scene, truth.points, [row == k for k in range(4)], list(features))
     else:
-        write_openlex(scene, truth.points, row, features)
+        made.write_openlex(scene, truth.points, row, features)
     np.savez(tmp_path / "texts.npz", names=np.array(names), features=encoder.encode_texts(names))
     request = Request(
         (tmp_path / "maps",),
@@ -103,10 +87,26 @@ def test_the_truth_in_each_format_is_scored_as_perfect(
 # ---- ConceptGraphs
 
 
+def settings(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Settings as ConceptGraphs stores them: an object of omegaconf's class, with a path in it."""
+    module = ModuleType("omegaconf.dictconfig")
+
+    class DictConfig:
+        pass
+
+    DictConfig.__module__, DictConfig.__qualname__ = module.__name__, "DictConfig"
+    module.DictConfig = DictConfig  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "omegaconf", ModuleType("omegaconf"))
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    made = DictConfig()
+    vars(made).update(_content={"dataset_root": Path("/data/Replica"), "stride": 5}, _parent=None, ref_type=dict)
+    return made
+
+
 @pytest.mark.parametrize("protocol", range(2, 6))  # ConceptGraphs writes 4; before 2 objects were written otherwise
 def test_a_map_comes_back_object_by_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, protocol: int) -> None:
-    value = a_map(cfg=settings(monkeypatch))
-    write_map(tmp_path / "room0/pcd_saves/full_pcd_none_x.pkl.gz", value, protocol)
+    value = made.a_map(cfg=settings(monkeypatch))
+    made.write_map(tmp_path / "room0/pcd_saves/full_pcd_none_x.pkl.gz", value, protocol)
     prediction = read(tmp_path)
     found = instances(prediction)
     background = value["bg_objects"][0]
@@ -123,23 +123,33 @@ def test_a_map_comes_back_object_by_object(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_the_streamlined_variant_is_read(tmp_path: Path) -> None:
-    one = an_object(3, [1, 1], class_name="lamp", consolidated_caption="a lamp\non a desk", captions=["x"], id="u-1")
+    one = made.an_object(
+        3, [1, 1], class_name="lamp", consolidated_caption="a lamp\non a desk", captions=["x"], id="u-1"
+    )
     del one["text_ft"], one["class_id"]
-    value = {"objects": [one], "cfg": {"stride": 10}, "class_names": NAMES, "class_colors": {}, "edges": [(0, 1, "on")]}
-    write_map(tmp_path / "room0/exps/rerun/pcd_rerun.pkl.gz", value)
+    value = {
+        "objects": [one],
+        "cfg": {"stride": 10},
+        "class_names": made.CLASSES,
+        "class_colors": {},
+        "edges": [(0, 1, "on")],
+    }
+    made.write_map(tmp_path / "room0/exps/rerun/pcd_rerun.pkl.gz", value)
     for path in (tmp_path, tmp_path / "room0", tmp_path / "room0/exps", tmp_path / "room0/exps/rerun/pcd_rerun.pkl.gz"):
         found = instances(read(path))
         assert (found.names, found.captions) == (("lamp",), ("a lamp on a desk",))
-    write_map(tmp_path / "room0/exps/again/pcd_again.pkl.gz", value)
-    message = refused(tmp_path, "room0", "conceptgraphs")
+    made.write_map(tmp_path / "room0/exps/again/pcd_again.pkl.gz", value)
+    message = made.refused(tmp_path, "room0", "conceptgraphs")
     assert "both of scene 'room0'" in message and "exps/again" in message and "exps/rerun" in message
 
 
 def test_without_features_the_names_of_the_detections_are_the_classes(tmp_path: Path) -> None:
-    objects = [an_object(3, [1]), an_object(2, [0])]
+    objects = [made.an_object(3, [1]), made.an_object(2, [0])]
     for one in objects:
         del one["clip_ft"]
-    prediction = read(write_map(tmp_path / "pcd_x.pkl.gz", {"objects": objects, "class_names": NAMES}), "pcd_x")
+    prediction = read(
+        made.write_map(tmp_path / "pcd_x.pkl.gz", {"objects": objects, "class_names": made.CLASSES}), "pcd_x"
+    )
     found = instances(prediction)
     assert found.features is None and found.labels == ("lamp", "couch")
     assert any("the names of their detections decide" in remark for remark in prediction.remarks)
@@ -147,14 +157,14 @@ def test_without_features_the_names_of_the_detections_are_the_classes(tmp_path: 
 
 def test_of_a_pair_of_maps_the_one_after_the_last_merging_is_read(tmp_path: Path) -> None:
     folder = tmp_path / "room0/pcd_saves"
-    write_map(folder / "full_pcd_a.pkl.gz", a_map())
-    write_map(folder / "full_pcd_a_post.pkl.gz", a_map(objects=[an_object(2, [0])]))
+    made.write_map(folder / "full_pcd_a.pkl.gz", made.a_map())
+    made.write_map(folder / "full_pcd_a_post.pkl.gz", made.a_map(objects=[made.an_object(2, [0])]))
     prediction = read(tmp_path)
     assert len(instances(prediction)) == 2 and prediction.path.name == "full_pcd_a_post.pkl.gz"
     assert any("'full_pcd_a_post.pkl.gz' is read" in remark for remark in prediction.remarks)
     assert len(instances(read(folder / "full_pcd_a.pkl.gz"))) == 4
-    write_map(folder / "full_pcd_a_post2.pkl.gz", a_map())
-    message = refused(tmp_path, "room0", "conceptgraphs")
+    made.write_map(folder / "full_pcd_a_post2.pkl.gz", made.a_map())
+    message = made.refused(tmp_path, "room0", "conceptgraphs")
     assert "holds 3 maps (full_pcd_a.pkl.gz, full_pcd_a_post.pkl.gz, full_pcd_a_post2.pkl.gz)" in message
 
 
@@ -166,17 +176,20 @@ def test_of_a_pair_of_maps_the_one_after_the_last_merging_is_read(tmp_path: Path
         ({"objects": [{"pcd_np": np.zeros((3, 2))}]}, "object 0: the points are an array of shape (3, 2) float64"),
         ({"objects": [{"pcd_np": np.array([[0, 0, 0], [0, np.nan, 0]])}]}, "object 0: point 1 is at [0.0, nan, 0.0]"),
         ({"objects": [{"pcd_np": np.full((1, 3), 1e300)}]}, "point 0 is at [1e+300, 1e+300, 1e+300]"),
-        ({"objects": [an_object(1, [0]), an_object(1, [0], clip_ft=None)]}, "object 1: 'clip_ft' is a NoneType"),
         (
-            {"objects": [an_object(1, [0]), an_object(1, [0], clip_ft=np.ones(3))]},
+            {"objects": [made.an_object(1, [0]), made.an_object(1, [0], clip_ft=None)]},
+            "object 1: 'clip_ft' is a NoneType",
+        ),
+        (
+            {"objects": [made.an_object(1, [0]), made.an_object(1, [0], clip_ft=np.ones(3))]},
             "object 1: 'clip_ft' is an array of shape (3,) float64; expected a list of 16 numbers",
         ),
         ({"objects": [], "bg_objects": 5}, "'bg_objects' is 5; expected a list"),
     ],
 )
 def test_each_fault_of_a_map_is_one_line(tmp_path: Path, value: object, message: str) -> None:
-    path = write_map(tmp_path / "pcd_x.pkl.gz", value)
-    text = refused(path, "pcd_x", "conceptgraphs")
+    path = made.write_map(tmp_path / "pcd_x.pkl.gz", value)
+    text = made.refused(path, "pcd_x", "conceptgraphs")
     assert text.startswith(f"{path}: ") and message in text
 
 
@@ -185,9 +198,9 @@ def test_each_fault_of_a_map_is_one_line(tmp_path: Path, value: object, message:
 
 @pytest.mark.parametrize("kind", [np.float16, np.float32])
 def test_a_dense_map_comes_back(tmp_path: Path, kind: Any) -> None:
-    points, features = RNG.normal(size=(50, 3)).astype(np.float32), RNG.normal(size=(50, 8)).astype(kind)
+    points, features = made.RNG.normal(size=(50, 3)).astype(np.float32), made.RNG.normal(size=(50, 8)).astype(kind)
     features[[3, 7]] = 0
-    write_gradslam(tmp_path / "room0/saved-map/pointclouds", points, features)
+    made.write_gradslam(tmp_path / "room0/saved-map/pointclouds", points, features)
     prediction = read(tmp_path)
     assert isinstance(prediction.content, DenseFeatures)
     np.testing.assert_array_equal(prediction.content.points, points)
@@ -197,20 +210,20 @@ def test_a_dense_map_comes_back(tmp_path: Path, kind: Any) -> None:
 
 
 def test_the_first_pose_beside_the_points_brings_them_to_the_world(tmp_path: Path) -> None:
-    write_gradslam(tmp_path / "room0", np.array([[1, 2, 3]], np.float32), np.ones((1, 4), np.float16))
+    made.write_gradslam(tmp_path / "room0", np.array([[1, 2, 3]], np.float32), np.ones((1, 4), np.float16))
     pose = np.array([[0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 30], [0, 0, 0, 1]], float)
     (tmp_path / "room0/traj.txt").write_text(" ".join(map(repr, pose.reshape(-1).tolist())) + "\nnext pose\n")
     prediction = read(tmp_path)
     assert prediction.content.points.tolist() == [[8, 21, 33]]  # type: ignore[union-attr]
     assert prediction.remarks == ("points were brought to the world with the first pose of traj.txt",)
     (tmp_path / "room0/first_pose.txt").write_text("1 2 3\n")
-    assert "first_pose.txt line 1 has 3 values; expected 16" in refused(tmp_path, "room0", "gradslam")
+    assert "first_pose.txt line 1 has 3 values; expected 16" in made.refused(tmp_path, "room0", "gradslam")
 
 
 def test_rows_that_float16_cannot_hold_have_no_feature(tmp_path: Path) -> None:
     features = np.ones((4, 2), np.float32)
     features[0, 0], features[1, 1], features[2, 0] = np.nan, np.inf, 1e6
-    write_gradslam(tmp_path / "room0", np.zeros((4, 3), np.float32), features)
+    made.write_gradslam(tmp_path / "room0", np.zeros((4, 3), np.float32), features)
     prediction = read(tmp_path)
     assert prediction.content.features.tolist() == [[0, 0], [0, 0], [0, 0], [1, 1]]  # type: ignore[union-attr]
     assert any("3 of 4 points have no feature" in remark for remark in prediction.remarks)
@@ -227,17 +240,17 @@ def test_rows_that_float16_cannot_hold_have_no_feature(tmp_path: Path) -> None:
     ],
 )
 def test_each_fault_of_a_dense_map_is_one_line(tmp_path: Path, points: Any, features: Any, message: str) -> None:
-    write_gradslam(tmp_path / "room0", points, features)
-    assert message in refused(tmp_path, "room0", "gradslam")
+    made.write_gradslam(tmp_path / "room0", points, features)
+    assert message in made.refused(tmp_path, "room0", "gradslam")
 
 
 # ---- HOV-SG
 
 
 def test_objects_come_back_with_the_row_of_their_number(tmp_path: Path) -> None:
-    clouds = {k: RNG.normal(size=(k % 3 + 1, 3)) for k in range(12)}
-    features = RNG.normal(size=(12, 8))  # as HOV-SG saves them: doubles
-    write_hovsg(tmp_path / "room0", clouds, features)
+    clouds = {k: made.RNG.normal(size=(k % 3 + 1, 3)) for k in range(12)}
+    features = made.RNG.normal(size=(12, 8))  # as HOV-SG saves them: doubles
+    made.write_hovsg(tmp_path / "room0", clouds, features)
     found = instances(read(tmp_path))
     assert found.ids.tolist() == list(range(12))  # 10 and 11 are not sorted as texts
     np.testing.assert_array_equal(found.features, features.astype(np.float32))
@@ -246,8 +259,8 @@ def test_objects_come_back_with_the_row_of_their_number(tmp_path: Path) -> None:
 
 
 def test_missing_numbers_leave_their_rows_out_and_lose_no_object(tmp_path: Path) -> None:
-    features = RNG.normal(size=(6, 4)).astype(np.float16)
-    write_hovsg(tmp_path / "room0", {k: np.full((1, 3), k) for k in (0, 2, 5)}, features)
+    features = made.RNG.normal(size=(6, 4)).astype(np.float16)
+    made.write_hovsg(tmp_path / "room0", {k: np.full((1, 3), k) for k in (0, 2, 5)}, features)
     write_pcd_points(tmp_path / "room0/objects/pcd_3.pcd", np.full((2, 3), 3, np.float32))
     (tmp_path / "room0/objects/pcd_04.ply").write_text("not counted")
     prediction = read(tmp_path)
@@ -260,18 +273,18 @@ def test_missing_numbers_leave_their_rows_out_and_lose_no_object(tmp_path: Path)
 
 def test_each_fault_of_a_hovsg_map_is_one_line(tmp_path: Path) -> None:
     scene = tmp_path / "room0"
-    write_hovsg(scene, {0: np.zeros((2, 3)), 4: np.zeros((1, 3))}, np.ones((3, 4), np.float32))
-    assert "pcd_4.ply: object 4 has no feature, mask_feats.pt has 3 rows" in refused(tmp_path, "room0", "hovsg")
+    made.write_hovsg(scene, {0: np.zeros((2, 3)), 4: np.zeros((1, 3))}, np.ones((3, 4), np.float32))
+    assert "pcd_4.ply: object 4 has no feature, mask_feats.pt has 3 rows" in made.refused(tmp_path, "room0", "hovsg")
     (scene / "objects/pcd_4.ply").unlink()
     write_pcd_points(scene / "objects/pcd_0.pcd", np.zeros((1, 3), np.float32))
-    assert "object 0 is there as .ply and .pcd" in refused(tmp_path, "room0", "hovsg")
+    assert "object 0 is there as .ply and .pcd" in made.refused(tmp_path, "room0", "hovsg")
     (scene / "objects/pcd_0.pcd").unlink()
-    write_object(scene / "objects/pcd_0.ply", [[0, 0, np.inf]])
-    assert "pcd_0.ply: point 0 is at [0.0, 0.0, inf]" in refused(tmp_path, "room0", "hovsg")
+    made.write_object(scene / "objects/pcd_0.ply", [[0, 0, np.inf]])
+    assert "pcd_0.ply: point 0 is at [0.0, 0.0, inf]" in made.refused(tmp_path, "room0", "hovsg")
     write_ply(scene / "objects/pcd_0.ply", [PlyElement("vertex", 1, {"x": np.zeros(1), "y": np.zeros(1)})])
-    assert "pcd_0.ply: its vertices have no x, y and z" in refused(tmp_path, "room0", "hovsg")
-    write_tensor(scene / "mask_feats.pt", np.ones(3, np.float32))
-    assert "mask_feats.pt: holds an array of shape (3,)" in refused(tmp_path, "room0", "hovsg")
+    assert "pcd_0.ply: its vertices have no x, y and z" in made.refused(tmp_path, "room0", "hovsg")
+    made.write_torch(scene / "mask_feats.pt", made.Tensor(np.ones(3, np.float32)))
+    assert "mask_feats.pt: holds an array of shape (3,)" in made.refused(tmp_path, "room0", "hovsg")
 
 
 # ---- OpenLex3D
@@ -279,8 +292,12 @@ def test_each_fault_of_a_hovsg_map_is_one_line(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("cloud", ["point_cloud.pcd", "point_cloud.ply", "input.ply"])
 def test_the_three_files_come_back_as_a_partition(tmp_path: Path, cloud: str) -> None:
-    points, index, features = RNG.normal(size=(9, 3)).astype(np.float32), np.arange(9) % 3, RNG.normal(size=(4, 8))
-    write_openlex(tmp_path / "replica/room0", points, index, features, cloud)
+    points, index, features = (
+        made.RNG.normal(size=(9, 3)).astype(np.float32),
+        np.arange(9) % 3,
+        made.RNG.normal(size=(4, 8)),
+    )
+    made.write_openlex(tmp_path / "replica/room0", points, index, features, cloud)
     prediction = read(tmp_path, "replica/room0")
     assert isinstance(prediction.content, Partition) and prediction.remarks == ()
     np.testing.assert_array_equal(prediction.content.points, points)
@@ -289,8 +306,8 @@ def test_the_three_files_come_back_as_a_partition(tmp_path: Path, cloud: str) ->
 
 
 def test_of_several_clouds_the_one_that_the_original_reads_counts(tmp_path: Path) -> None:
-    write_openlex(tmp_path / "room0", np.zeros((2, 3)), np.zeros(2, int), np.zeros((1, 4)), "input.ply")
-    write_openlex(tmp_path / "room0", np.ones((2, 3)), np.zeros(2, int), np.zeros((1, 4)))
+    made.write_openlex(tmp_path / "room0", np.zeros((2, 3)), np.zeros(2, int), np.zeros((1, 4)), "input.ply")
+    made.write_openlex(tmp_path / "room0", np.ones((2, 3)), np.zeros(2, int), np.zeros((1, 4)))
     prediction = read(tmp_path)
     assert prediction.content.points.all()  # type: ignore[union-attr]
     assert prediction.remarks[0] == "point_cloud.pcd is read, as the original does, and not input.ply"
@@ -309,5 +326,5 @@ def test_of_several_clouds_the_one_that_the_original_reads_counts(tmp_path: Path
     ],
 )
 def test_each_fault_of_the_three_files_is_one_line(tmp_path: Path, index: Any, features: Any, message: str) -> None:
-    write_openlex(tmp_path / "room0", np.zeros((2, 3)), index, features)
-    assert message in refused(tmp_path, "room0", "openlex3d")
+    made.write_openlex(tmp_path / "room0", np.zeros((2, 3)), index, features)
+    assert message in made.refused(tmp_path, "room0", "openlex3d")

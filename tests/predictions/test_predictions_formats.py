@@ -7,31 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import prediction_files as made
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from places import CASES, ROOT
-from prediction_files import (
-    FEATURES,
-    OURS,
-    TOY,
-    Tensor,
-    own_instances,
-    runs,
-    scenes_of,
-    write_maskclustering,
-    write_open3dis,
-    write_openins3d,
-    write_openmask3d,
-    write_openyolo3d,
-    write_openyolo3d_labelled,
-    write_sam3d,
-    write_sam3d_colours,
-    write_scannet_text,
-    write_scannetpp_json,
-    write_torch,
-    written_in,
-)
 
 from su3d_bench.core.errors import ConfigError, PredictionError
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition, Prediction
@@ -71,9 +51,9 @@ def assert_masks(content: VertexMasks, masks: Any, labels: Any = None, scores: A
 
 @pytest.mark.parametrize("case", MASK_CASES)
 def test_reference_cases_come_back_from_scannets_text_files(tmp_path: Path, case: str) -> None:
-    scenes = scenes_of(case)
+    scenes = made.scenes_of(case)
     for scene in scenes:
-        write_scannet_text(tmp_path, scene)
+        made.write_scannet_text(tmp_path, scene)
     reader = recognise(tmp_path)
     assert reader.name == "scannet-text"
     assert sorted(reader.scenes(tmp_path)) == sorted(scene["name"] for scene in scenes)
@@ -90,22 +70,22 @@ def test_reference_cases_come_back_from_scannets_text_files(tmp_path: Path, case
 
 @pytest.mark.parametrize("case", MASK_CASES)
 def test_reference_cases_come_back_from_archives_of_masks(tmp_path: Path, case: str) -> None:
-    for scene in scenes_of(case):
+    for scene in made.scenes_of(case):
         masks, labels, scores = scene["masks"], scene["labels"], scene["scores"]
-        write_maskclustering(tmp_path / "maskclustering", scene)
+        made.write_maskclustering(tmp_path / "maskclustering", scene)
         assert_masks(masks_of(read(tmp_path / "maskclustering", scene["name"])), masks, labels, scores)
-        write_open3dis(tmp_path / "open3dis", scene)
+        made.write_open3dis(tmp_path / "open3dis", scene)
         content = masks_of(read(tmp_path / "open3dis", scene["name"]))
         assert_masks(content, masks, labels, scores)
         assert content.numbering == "index"
         features = np.random.default_rng(1).normal(size=(len(masks), 8))
-        write_openmask3d(tmp_path / "openmask3d", scene, features)
+        made.write_openmask3d(tmp_path / "openmask3d", scene, features)
         content = masks_of(read(tmp_path / "openmask3d", scene["name"]))
         assert_masks(content, masks)
         np.testing.assert_array_equal(content.features, features.astype(np.float32))
-        write_openyolo3d(tmp_path / "openyolo3d", scene)
+        made.write_openyolo3d(tmp_path / "openyolo3d", scene)
         assert_masks(masks_of(read(tmp_path / "openyolo3d", scene["name"])), masks, scores=scores.astype(np.float32))
-        write_openins3d(tmp_path / "openins3d", scene)
+        made.write_openins3d(tmp_path / "openins3d", scene)
         assert_masks(masks_of(read(tmp_path / "openins3d", scene["name"])), masks)
 
 
@@ -129,36 +109,36 @@ def test_a_folder_as_mask3d_and_segment3d_export_it_is_read(tmp_path: Path) -> N
     folder = tmp_path / "instance_evaluation_exp_0" / "decoder_-1"
     folder.mkdir(parents=True)
     (folder / "pred_mask").mkdir()
-    for k, mask in enumerate(TOY["masks"]):
+    for k, mask in enumerate(made.TOY["masks"]):
         np.savetxt(folder / f"pred_mask/scene0011_00_{k}.txt", mask, fmt="%d")
     lines = [f"pred_mask/scene0011_00_{k}.txt 0.0 1.0\n" for k in range(3)]
     (folder / "scene0011_00.txt").write_text("".join(lines))
     for path in (folder.parent, folder, folder / "scene0011_00.txt"):
-        assert_masks(masks_of(read(path, "scene0011_00")), TOY["masks"], [0, 0, 0])
+        assert_masks(masks_of(read(path, "scene0011_00")), made.TOY["masks"], [0, 0, 0])
 
 
 def test_masks_of_scannetpp_are_read_from_run_lengths(tmp_path: Path) -> None:
-    write_scannetpp_json(tmp_path, TOY)
-    assert_masks(masks_of(read(tmp_path, TOY["name"])), TOY["masks"], TOY["labels"], TOY["scores"])
+    made.write_scannetpp_json(tmp_path, made.TOY)
+    assert_masks(masks_of(read(tmp_path, made.TOY["name"])), made.TOY["masks"], made.TOY["labels"], made.TOY["scores"])
 
 
 def test_the_official_answer_in_the_folder_is_no_scene(tmp_path: Path) -> None:
-    write_scannet_text(tmp_path, TOY)
+    made.write_scannet_text(tmp_path, made.TOY)
     (tmp_path / "semantic_instance_evaluation.txt").write_text("class,class id,ap,ap50,ap25\n")
     assert list(recognise(tmp_path).scenes(tmp_path)) == ["scene0011_00"]
 
 
 def test_a_mask_file_named_twice_by_two_ways_is_one_mask(tmp_path: Path) -> None:
-    write_scannet_text(tmp_path, TOY)
+    made.write_scannet_text(tmp_path, made.TOY)
     list_file = tmp_path / "scene0011_00.txt"
     list_file.write_text(list_file.read_text() + "pred_mask/../pred_mask/./scene0011_00_0.txt 3 0.125\n")
     prediction = read(tmp_path, "scene0011_00")
-    assert_masks(masks_of(prediction), TOY["masks"], [3, 7, 39], [0.125, 0.25, 0.75])
+    assert_masks(masks_of(prediction), made.TOY["masks"], [3, 7, 39], [0.125, 0.25, 0.75])
     assert prediction.remarks[0].startswith("1 lines name a mask file again: class and confidence of its last line")
 
 
 def test_maskclustering_and_mask3d_name_the_scores_differently(tmp_path: Path) -> None:
-    masks, scores, labels = TOY["masks"].T, TOY["scores"], TOY["labels"]
+    masks, scores, labels = made.TOY["masks"].T, made.TOY["scores"], made.TOY["labels"]
     for folder, arrays, remarks in (
         ("a", {"pred_score": scores, "pred_classes": labels}, 0),
         ("b", {"pred_scores": scores, "pred_classes": labels.astype(np.float32)}, 0),
@@ -169,53 +149,50 @@ def test_maskclustering_and_mask3d_name_the_scores_differently(tmp_path: Path) -
         np.savez_compressed(tmp_path / folder / "s.npz", pred_masks=masks, **arrays)
         prediction = read(tmp_path / folder, "s")
         expected = (None, None) if folder == "d" else (arrays["pred_classes"], next(iter(arrays.values())))
-        assert_masks(masks_of(prediction), TOY["masks"], *expected)
+        assert_masks(masks_of(prediction), made.TOY["masks"], *expected)
         assert len(prediction.remarks) == remarks
 
 
 def test_open3dis_tensors_have_masks_in_rows_unless_the_scores_say_otherwise(tmp_path: Path) -> None:
-    write_open3dis(tmp_path, TOY, as_tensor=True)
-    assert_masks(masks_of(read(tmp_path, TOY["name"])), TOY["masks"], TOY["labels"], TOY["scores"])
-    turned = {"ins": Tensor(TOY["masks"].T), "conf": Tensor(TOY["scores"])}
-    write_torch(tmp_path / "turned.pth", turned)
+    made.write_open3dis(tmp_path, made.TOY, as_tensor=True)
+    assert_masks(masks_of(read(tmp_path, made.TOY["name"])), made.TOY["masks"], made.TOY["labels"], made.TOY["scores"])
+    turned = {"ins": made.Tensor(made.TOY["masks"].T), "conf": made.Tensor(made.TOY["scores"])}
+    made.write_torch(tmp_path / "turned.pth", turned)
     prediction = read(tmp_path, "turned")
-    assert_masks(masks_of(prediction), TOY["masks"], None, TOY["scores"])
+    assert_masks(masks_of(prediction), made.TOY["masks"], None, made.TOY["scores"])
     assert any("class-agnostic" in remark for remark in prediction.remarks)
-    write_torch(tmp_path / "alone.pth", {"ins": Tensor(TOY["masks"]), "conf": None})
-    assert_masks(masks_of(read(tmp_path, "alone")), TOY["masks"])
+    made.write_torch(tmp_path / "alone.pth", {"ins": made.Tensor(made.TOY["masks"]), "conf": None})
+    assert_masks(masks_of(read(tmp_path, "alone")), made.TOY["masks"])
 
 
 def test_labelled_masks_of_openyolo3d_are_told_from_its_proposals(tmp_path: Path) -> None:
-    write_openyolo3d_labelled(tmp_path, TOY)
-    prediction = read(tmp_path, TOY["name"])
+    made.write_openyolo3d(tmp_path, made.TOY, has_labels=True)
+    prediction = read(tmp_path, made.TOY["name"])
     assert prediction.format == "openyolo3d" and masks_of(prediction).numbering == "index"
-    assert_masks(masks_of(prediction), TOY["masks"], TOY["labels"], TOY["scores"].astype(np.float32))
+    assert_masks(masks_of(prediction), made.TOY["masks"], made.TOY["labels"], made.TOY["scores"].astype(np.float32))
     assert prediction.remarks == ("Open-YOLO 3D's own evaluator puts 1 for every score",)
 
 
 def test_scores_of_all_classes_that_open3dis_leaves_are_those_of_the_masks_own(tmp_path: Path) -> None:
     table = np.random.default_rng(2).random((3, 50))
-    write_open3dis(tmp_path, TOY | {"scores": table.ravel()})
-    own = table[np.arange(3), TOY["labels"]]
-    assert_masks(masks_of(read(tmp_path, TOY["name"])), TOY["masks"], TOY["labels"], own)
+    made.write_open3dis(tmp_path, made.TOY | {"scores": table.ravel()})
+    own = table[np.arange(3), made.TOY["labels"]]
+    assert_masks(masks_of(read(tmp_path, made.TOY["name"])), made.TOY["masks"], made.TOY["labels"], own)
 
 
-@pytest.mark.parametrize("form", ["text", "list", "array"])
-def test_run_lengths_are_read_in_every_form(form: str) -> None:
-    for mask in (*TOY["masks"], np.zeros(40, bool), np.ones(40, bool)):
-        counts = runs(mask)
-        given_as = {"text": " ".join(map(str, counts)), "list": counts.tolist(), "array": counts.astype(np.int32)}[form]
-        np.testing.assert_array_equal(run_members(40, given_as, "x"), np.flatnonzero(mask))
+def test_run_lengths_may_be_a_list_of_numbers() -> None:
+    (mask, *_) = made.TOY["masks"]
+    np.testing.assert_array_equal(run_members(40, made.runs(mask).tolist(), "x"), np.flatnonzero(mask))
 
 
 def test_openmask3d_masks_without_a_feature_keep_a_row_of_zeros(tmp_path: Path) -> None:
-    features = FEATURES.copy()
+    features = made.FEATURES.copy()
     features[0], features[1, 5] = 0, np.nan
-    write_openmask3d(tmp_path, TOY, features)
-    prediction = read(tmp_path, TOY["name"])
+    made.write_openmask3d(tmp_path, made.TOY, features)
+    prediction = read(tmp_path, made.TOY["name"])
     stored = masks_of(prediction).features
     assert stored is not None and not stored[:2].any()
-    np.testing.assert_array_equal(stored[2], FEATURES[2].astype(np.float32))
+    np.testing.assert_array_equal(stored[2], made.FEATURES[2].astype(np.float32))
     assert prediction.remarks == (
         "the file has no scores: 1 for every mask",
         "2 masks have no feature (a row of zeros or NaN)",
@@ -223,13 +200,13 @@ def test_openmask3d_masks_without_a_feature_keep_a_row_of_zeros(tmp_path: Path) 
 
 
 def test_openmask3d_short_names_tensors_and_missing_features_are_read(tmp_path: Path) -> None:
-    write_torch(tmp_path / "room0.pt", Tensor(TOY["masks"].T))
+    made.write_torch(tmp_path / "room0.pt", made.Tensor(made.TOY["masks"].T))
     prediction = read(tmp_path, "room0")
-    assert_masks(masks_of(prediction), TOY["masks"])
+    assert_masks(masks_of(prediction), made.TOY["masks"])
     assert masks_of(prediction).features is None and "no features" in prediction.remarks[1]
-    np.save(tmp_path / "room0.npy", FEATURES)
+    np.save(tmp_path / "room0.npy", made.FEATURES)
     prediction = read(tmp_path, "room0")
-    np.testing.assert_array_equal(masks_of(prediction).features, FEATURES.astype(np.float32))
+    np.testing.assert_array_equal(masks_of(prediction).features, made.FEATURES.astype(np.float32))
 
 
 @pytest.mark.parametrize("suffix", [".pth", ".npy"])
@@ -238,7 +215,7 @@ def test_groups_of_sam3d_become_masks_without_classes(tmp_path: Path, suffix: st
     if suffix == ".npy":
         np.save(tmp_path / "s.npy", groups)
     else:
-        write_sam3d(tmp_path, "s", groups)
+        made.write_torch(tmp_path / "s.pth", groups)
     prediction = read(tmp_path, "s")
     assert_masks(masks_of(prediction), np.stack([groups == 0, groups == 2, groups == 4]))
     assert prediction.format == "sam3d" and masks_of(prediction).keys == ("group 0", "group 2", "group 4")
@@ -249,13 +226,13 @@ def test_groups_of_sam3d_become_masks_without_classes(tmp_path: Path, suffix: st
 
 def test_colours_of_sam3d_are_groups_and_black_is_none(tmp_path: Path) -> None:
     groups = np.repeat([1, -1, 0, 1, 2], [30, 25, 40, 15, 50])
-    write_sam3d_colours(tmp_path / "s.ply", groups)
+    made.write_sam3d_colours(tmp_path / "s.ply", groups)
     prediction = read(tmp_path, "s")
     sizes = sorted(masks_of(prediction).sizes.tolist())
     assert (prediction.format, sizes, masks_of(prediction).n_points) == ("sam3d-colours", [40, 45, 50], len(groups))
     members = {tuple(masks_of(prediction).mask(k).tolist()) for k in range(3)}
     assert members == {tuple(np.flatnonzero(groups == group).tolist()) for group in range(3)}
-    write_sam3d_colours(tmp_path / "photograph.ply", np.arange(200))
+    made.write_sam3d_colours(tmp_path / "photograph.ply", np.arange(200))
     assert READERS["sam3d-colours"].recognise(tmp_path / "photograph.ply") is None
     (tmp_path / "plain.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n")
     with pytest.raises(PredictionError, match=r"plain.ply: its points have no colours red, green, blue of one byte"):
@@ -265,16 +242,18 @@ def test_colours_of_sam3d_are_groups_and_black_is_none(tmp_path: Path) -> None:
 def test_our_own_run_folders_and_files_are_read(tmp_path: Path) -> None:
     dense = DenseFeatures(np.zeros((4, 3), np.float32), np.ones((4, 8), np.float16))
     parts = Partition(np.zeros((4, 3), np.float32), np.zeros(4, np.int32), np.ones((1, 8), np.float32))
-    contents: dict[str, Prediction] = {"replica.room0": own_instances(), "replica.room1": dense, "rooms.a.b": parts}
+    contents: dict[str, Prediction] = {
+        "replica.room0": made.own_instances(),
+        "replica.room1": dense,
+        "rooms.a.b": parts,
+    }
     for name, content in contents.items():
         (tmp_path / "run/scenes" / name / "opensu3d").mkdir(parents=True)
         write_prediction(tmp_path / "run/scenes" / name / "opensu3d/prediction.npz", content)
     reader = recognise(tmp_path / "run")
-    assert (reader.name, sorted(reader.scenes(tmp_path / "run"))) == (
-        "su3d-bench",
-        ["replica/room0", "replica/room1", "rooms/a.b"],
-    )
-    for scene, content in zip(("replica/room0", "replica/room1", "rooms/a.b"), contents.values(), strict=True):
+    scenes = ["replica/room0", "replica/room1", "rooms/a.b"]
+    assert (reader.name, sorted(reader.scenes(tmp_path / "run"))) == ("su3d-bench", scenes)
+    for scene, content in zip(scenes, contents.values(), strict=True):
         ours = reader.read(tmp_path / "run", scene).content
         assert type(ours) is type(content)
         np.testing.assert_array_equal(ours.points, content.points)
@@ -283,7 +262,7 @@ def test_our_own_run_folders_and_files_are_read(tmp_path: Path) -> None:
         ours = read(path, "replica/room0").content
         assert isinstance(ours, Instances) and ours.indices.tolist() == [0, 1, 2, 3, 5]
     (one.parent / "other").mkdir()
-    write_prediction(one.parent / "other/prediction.npz", own_instances())
+    write_prediction(one.parent / "other/prediction.npz", made.own_instances())
     for path, advice in ((tmp_path / "run", "/scenes/*/opensu3d"), (one.parent, "/opensu3d")):
         with pytest.raises(PredictionError) as caught:
             recognise(path).scenes(path)
@@ -294,9 +273,9 @@ def test_our_own_run_folders_and_files_are_read(tmp_path: Path) -> None:
 # ---- which format a path is in
 
 
-@pytest.mark.parametrize("format", OURS)
+@pytest.mark.parametrize("format", made.OURS)
 def test_each_format_is_recognised_as_itself_alone(tmp_path: Path, format: str) -> None:
-    folder = written_in(tmp_path, format)
+    folder = made.written_in(tmp_path, format)
     assert recognise(folder).name == format
     assert [name for name in READERS if READERS[name].recognise(folder) is not None] == [format]
     (file,) = recognise(folder).scenes(folder).values()
@@ -311,8 +290,8 @@ def test_a_path_in_no_format_or_in_two_is_an_error_that_says_so(tmp_path: Path) 
     for path in (tmp_path, tmp_path / "photo.jpg"):
         with pytest.raises(PredictionError, match="in none of the known formats"):
             recognise(path)
-    write_scannet_text(tmp_path, TOY)
-    write_maskclustering(tmp_path, TOY)
+    made.write_scannet_text(tmp_path, made.TOY)
+    made.write_maskclustering(tmp_path, made.TOY)
     with pytest.raises(PredictionError, match=r"could be in 2 formats \(scannet-text: .*; maskclustering: .*--format"):
         recognise(tmp_path)
     with pytest.raises(ConfigError, match=r"unknown format 'maskclusterin'; did you mean 'maskclustering'"):

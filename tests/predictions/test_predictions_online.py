@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import prediction_files as made
 import pytest
-from cloud_files import write_esam, write_object, write_onlineanyseg, write_ovo, write_rayfronts
 from places import CASES
-from prediction_files import Tensor, refused, tensors, write_torch
 
 from su3d_bench.core.maps import DenseFeatures, Instances, Partition
 from su3d_bench.predictions.formats import READERS, recognise
@@ -67,7 +66,7 @@ def test_both_maps_of_rayfronts_that_can_be_saved_are_features_of_places(tmp_pat
 def test_masks_of_onlineanyseg_lie_on_its_own_points_with_a_feature_each(tmp_path: Path) -> None:
     folder, known = copied(tmp_path, masks="ckpt_final.npz"), expected()
     points = np.random.default_rng(0).normal(size=(30, 3))
-    write_object(folder / "final.ply", points)
+    made.write_object(folder / "final.ply", points)
     content = read(folder)
     assert isinstance(content, Instances) and content.labels is None
     np.testing.assert_array_equal(content.points, points.astype(np.float32))
@@ -92,26 +91,28 @@ def test_colours_of_esam_are_masks_and_grey_is_none(tmp_path: Path) -> None:
 def test_caches_of_an_evaluation_are_read_by_the_folder_of_the_scene(tmp_path: Path) -> None:
     value = {"feats_xyz": POINTS, "feats_feats": np.ones((6, 4), np.float32)}
     for scene in ("office0", "room0"):
-        write_rayfronts(tmp_path / "SemSegReplica" / scene / "map.pt", value)
-        write_rayfronts(tmp_path / "SemSegReplica" / scene / "text_embeds.pt", {"text_embeds": np.ones((2, 4))})
+        made.write_torch(tmp_path / "SemSegReplica" / scene / "map.pt", made.tensors(value))
+        made.write_torch(
+            tmp_path / "SemSegReplica" / scene / "text_embeds.pt", made.tensors({"text_embeds": np.ones((2, 4))})
+        )
     for path in (tmp_path, tmp_path / "SemSegReplica"):
         assert list(recognise(path).scenes(path)) == ["office0", "room0"]
         assert len(read(path).points) == 6
 
 
 def test_a_map_of_ovo_as_an_archive_or_with_gaussians_is_read_too(tmp_path: Path) -> None:
-    write_ovo(tmp_path / "room0", POINTS, [2, 2, 7, -1, 7, 7], {7: ROW, 2: 2 * ROW}, is_stream=False)
+    made.write_ovo(tmp_path / "room0", POINTS, [2, 2, 7, -1, 7, 7], {7: ROW, 2: 2 * ROW}, is_stream=False)
     content = read(tmp_path)
     np.testing.assert_array_equal(content.instance, [1, 1, 0, -1, 0, 0])
     cloud = {"xyz": POINTS, "obj_ids": np.full((6, 1), -1, np.int32)}
     value = {"gaussian_params": cloud, "ovo_map_params": {"ins_3d_ids": np.zeros(0, np.int64)}}
-    write_torch(tmp_path / "room0/ovo_map.ckpt", tensors(value), is_stream=True)
+    made.write_torch(tmp_path / "room0/ovo_map.ckpt", made.tensors(value), is_stream=True)
     content = read(tmp_path)
     assert (content.instance == -1).all() and len(content.features) == 0
 
 
 def test_objects_of_ovo_without_points_or_features_are_told(tmp_path: Path) -> None:
-    write_ovo(tmp_path / "room0", POINTS, [0] * 6, {0: ROW, 3: None})
+    made.write_ovo(tmp_path / "room0", POINTS, [0] * 6, {0: ROW, 3: None})
     prediction = recognise(tmp_path).read(tmp_path, "room0")
     assert prediction.remarks == (
         "1 objects have no feature (a row of zeros or NaN)",
@@ -131,8 +132,8 @@ def test_objects_of_ovo_without_points_or_features_are_told(tmp_path: Path) -> N
 def test_each_fault_of_a_map_of_ovo_is_one_line(
     tmp_path: Path, ids: list[int], features: dict[int, Any], message: str
 ) -> None:
-    write_ovo(tmp_path / "room0", POINTS, ids, features)
-    assert message in refused(tmp_path, "room0", "ovo")
+    made.write_ovo(tmp_path / "room0", POINTS, ids, features)
+    assert message in made.refused(tmp_path, "room0", "ovo")
 
 
 @pytest.mark.parametrize(
@@ -147,24 +148,24 @@ def test_each_fault_of_a_map_of_ovo_is_one_line(
     ],
 )
 def test_each_fault_of_a_map_of_rayfronts_is_one_line(tmp_path: Path, value: dict[str, Any], message: str) -> None:
-    write_rayfronts(tmp_path / "room0.pt", value)
-    assert message in refused(tmp_path, "room0", "rayfronts")
+    made.write_torch(tmp_path / "room0.pt", made.tensors(value))
+    assert message in made.refused(tmp_path, "room0", "rayfronts")
 
 
 def test_objects_and_clouds_that_share_one_table_are_refused(tmp_path: Path) -> None:
     """A reference costs a few bytes of the file, what it stands for memory each time."""
-    n, wide = 5_000, Tensor(np.ones(100_000, np.float16))
-    cloud = tensors({"xyz": POINTS, "obj_ids": np.zeros((6, 1), np.int32)})
+    n, wide = 5_000, made.Tensor(np.ones(100_000, np.float16))
+    cloud = made.tensors({"xyz": POINTS, "obj_ids": np.zeros((6, 1), np.int32)})
     objects = {"ins_3d_ids": np.arange(n)} | {f"ins3d_{k}_clip_feature": wide for k in range(n)}
-    write_torch(tmp_path / "room0/ovo_map.ckpt", {"map_params": cloud, "ovo_map_params": objects}, is_stream=True)
-    assert "unpacks to more than" in refused(tmp_path, "room0", "ovo")
-    clouds = [Tensor(np.ones((100_000, 3), np.float32))] * n
-    write_torch(tmp_path / "room0.pt", {"global_xyz_pc": clouds, "global_feat_pc": clouds})
-    assert "unpacks to more than" in refused(tmp_path / "room0.pt", "room0", "rayfronts")
+    made.write_torch(tmp_path / "room0/ovo_map.ckpt", {"map_params": cloud, "ovo_map_params": objects}, is_stream=True)
+    assert "unpacks to more than" in made.refused(tmp_path, "room0", "ovo")
+    clouds = [made.Tensor(np.ones((100_000, 3), np.float32))] * n
+    made.write_torch(tmp_path / "room0.pt", {"global_xyz_pc": clouds, "global_feat_pc": clouds})
+    assert "unpacks to more than" in made.refused(tmp_path / "room0.pt", "room0", "rayfronts")
 
 
 def test_each_fault_of_results_of_esam_and_onlineanyseg_is_one_line(tmp_path: Path) -> None:
-    write_esam(tmp_path / "room0", POINTS, [0, 1, 0, 1, -1, 0])
+    made.write_esam(tmp_path / "room0", POINTS, [0, 1, 0, 1, -1, 0])
     colours = np.load(tmp_path / "room0/points_color.npy")
     for wrong, message in (
         (colours[:5], "expected a colour for each of points.npy, (6, 3)"),
@@ -172,20 +173,20 @@ def test_each_fault_of_results_of_esam_and_onlineanyseg_is_one_line(tmp_path: Pa
         (colours / 255, "float64; expected a colour"),
     ):
         np.save(tmp_path / "room0/points_color.npy", wrong)
-        assert message in refused(tmp_path, "room0", "esam")
+        assert message in made.refused(tmp_path, "room0", "esam")
     n = 300
     np.save(tmp_path / "room0/points.npy", np.zeros((n, 3)))
     np.save(
         tmp_path / "room0/points_color.npy",
         np.stack([np.arange(n) % 256, np.arange(n) // 256, np.zeros(n)], 1).astype(int),
     )
-    assert "has 300 colours, ESAM's palette 256" in refused(tmp_path, "room0", "esam")
+    assert "has 300 colours, ESAM's palette 256" in made.refused(tmp_path, "room0", "esam")
     folder = tmp_path / "online"
-    write_onlineanyseg(folder / "room0", POINTS, [np.arange(5) < 2])
-    assert "the masks are of 5 points, final.ply has 6" in refused(folder, "room0", "onlineanyseg")
-    write_onlineanyseg(folder / "room0", POINTS, [np.arange(6) < 2], [ROW, ROW])
-    assert "1 masks, but the features are" in refused(folder, "room0", "onlineanyseg")
-    write_onlineanyseg(folder / "room0", POINTS, [np.arange(6) < 2])
+    made.write_onlineanyseg(folder / "room0", POINTS, [np.arange(5) < 2])
+    assert "the masks are of 5 points, final.ply has 6" in made.refused(folder, "room0", "onlineanyseg")
+    made.write_onlineanyseg(folder / "room0", POINTS, [np.arange(6) < 2], [ROW, ROW])
+    assert "1 masks, but the features are" in made.refused(folder, "room0", "onlineanyseg")
+    made.write_onlineanyseg(folder / "room0", POINTS, [np.arange(6) < 2])
     assert "class-agnostic" in recognise(folder).read(folder, "room0").remarks[0]
     assert READERS["maskclustering"].recognise(folder / "room0") is None
 

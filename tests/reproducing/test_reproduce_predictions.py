@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cloud_files import write_hovsg
+from prediction_files import write_hovsg
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.config import Settings

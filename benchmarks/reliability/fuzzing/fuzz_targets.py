@@ -31,13 +31,12 @@ def _prediction(name: str, *, has_points: bool) -> Make:
     """A scene in the format of that name, with points of its own or over the vertices of a mesh."""
 
     def make(folder: Path) -> Read:
-        from cloud_files import write_small
-        from prediction_files import scene_name, written_in
+        from prediction_files import write_small, written_in
 
         from su3d_bench.predictions.formats import READERS, recognise
 
         written = write_small(folder, name) if has_points else written_in(folder, name)
-        scene = "room0" if has_points else scene_name(name)
+        (scene,) = READERS[name].scenes(written)
         reads = partial(recognise, written, None), partial(READERS[name].read, written, scene)
         return lambda: every_one_of(iter(reads))
 
@@ -142,7 +141,7 @@ def _saved(name: str) -> bytes:
 
 
 def _a_map() -> bytes:
-    from cloud_files import a_map, an_object
+    from prediction_files import a_map, an_object
 
     return pickle.dumps(a_map(objects=[an_object(2, [0, 1], mask=[np.zeros((9, 9), np.bool_)])]), 4)
 

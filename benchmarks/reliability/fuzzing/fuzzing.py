@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-from memory import peak_bytes, reset_peak
+from damage import peak_bytes, reset_peak
 from mutations import mutated
 
 from su3d_bench.core.errors import GroundTruthMissing, Su3dError

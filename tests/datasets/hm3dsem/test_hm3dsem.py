@@ -95,7 +95,6 @@ def test_objects_come_in_the_order_of_their_files_names_as_the_original_loads_th
         ("floors/0.json", "[]", "should be an object"),
         ("rooms/0_0.json", '{"room_height": [1], "room_zero_level": 0}', "room_height: "),
         ("objects/0_0_0.json", None, "has no .json beside it"),
-        ("objects/0_0_0.json", '{"embedding": "x"}', "embedding: "),
     ],
 )
 def test_a_damaged_scene_graph_is_one_line(tmp_path: Path, name: str, content: str | None, words: str) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from box_room import CLASSES, SIZE, write_box_room
+from replica_scene import box
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError, GroundTruthMissing
@@ -21,13 +22,12 @@ THICK_M = 0.1
 THINGS = {7: "chair", 8: "lamp"}  # which the frames do not show
 
 
-def box(side: int) -> dict[str, object]:
+def side_box(side: int) -> dict[str, object]:
     """The flat box of one of the room's six sides, the middle of its thickness on the wall."""
     axis, is_high = divmod(side - 1, 2)
     centre, sizes = SIZE / 2, SIZE.copy()
     centre[axis], sizes[axis] = is_high * SIZE[axis], THICK_M
-    half = {"rotation": [0.0, 0.0, 0.0, 1.0], "translation": [0.0, 0.0, 0.0]}
-    return {"abb": {"center": centre.tolist(), "sizes": sizes.tolist()}, "orientation": half}
+    return box(centre, sizes)
 
 
 @pytest.fixture
@@ -37,11 +37,10 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     info = tmp_path / INFO
     table = json.loads(info.read_text())
     for row in table["objects"]:
-        row["oriented_bbox"] = box(row["id"])
+        row["oriented_bbox"] = side_box(row["id"])
     ids = {row["name"]: row["id"] for row in table["classes"]}
     for number, name in THINGS.items():
-        straight = {"rotation": [0.0, 0.0, 0.0, 1.0], "translation": [float(number) - 6.5, 0.5, 0.0]}
-        small = {"abb": {"center": [0.0, 0.0, 0.25], "sizes": [0.5, 0.5, 0.5]}, "orientation": straight}
+        small = box((0, 0, 0.25), (0.5, 0.5, 0.5), translation=(number - 6.5, 0.5, 0))
         table["objects"].append({"id": number, "class_id": ids[name], "oriented_bbox": small})
     info.write_text(json.dumps(table))
     info.with_name("mesh_semantic.ply").unlink()

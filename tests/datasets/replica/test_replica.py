@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import replica_scene as rep
+from recording_files import depth_values
 from recording_files import turn as pose
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
@@ -26,7 +27,7 @@ def test_frames_hold_what_the_files_hold(tmp_path: Path) -> None:
     last: Frame = frames[-1]
     assert (last.index, frames[0].index, last.timestamp_s) == (2, 0, 2 / 30)
     np.testing.assert_array_equal(last.camera_to_world, pose(2))
-    np.testing.assert_array_equal(last.depth_m, (rep.depth_values(2) / rep.SCALE).astype(np.float32))
+    np.testing.assert_array_equal(last.depth_m, (depth_values(2) / rep.SCALE).astype(np.float32))
     np.testing.assert_array_equal(last.intrinsics, [[6, 0, 5.5], [0, 6.5, 3.5], [0, 0, 1]])
     assert np.abs(last.rgb.astype(int) - (200, 120, 30)).max() <= 3
     with pytest.raises(IndexError):
@@ -53,17 +54,8 @@ def test_vertices_take_the_object_of_most_of_their_faces_and_the_lowest_id_on_ti
     rep.write_original(tmp_path, rep.QUADS, [0, 5, 5, 5], rep.TWO_OBJECTS)
     truth = Replica(tmp_path).ground_truth("room0", "mesh-vertices")
     # vertex 1 and 3 have one face of each object: the chair, id 0; vertex 4 has three faces of the table
-    assert truth.semantic.tolist() == [
-        rep.CHAIR,
-        rep.CHAIR,
-        rep.TABLE,
-        rep.CHAIR,
-        rep.TABLE,
-        rep.TABLE,
-        rep.TABLE,
-        rep.TABLE,
-        rep.TABLE,
-    ]
+    chair, table = rep.CHAIR, rep.TABLE
+    assert truth.semantic.tolist() == [chair, chair, table, chair, table, table, table, table, table]
     assert truth.instance.tolist() == [1, 1, 6, 1, 6, 6, 6, 6, 6]
     assert truth.labels.name_of(rep.CHAIR) == "chair"
     assert truth.points[5].tolist() == [2, 1, 0]

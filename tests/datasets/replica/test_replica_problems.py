@@ -7,21 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from replica_scene import QUADS, TWO_OBJECTS, info_table, write_original, write_render
+from replica_scene import QUADS, TWO_OBJECTS, box, info_table, write_original, write_render
 
 from su3d_bench.datasets.replica.dataset import Replica
-
-
-def box(
-    centre: Any = (1, 1, 0),
-    sizes: Any = (2, 2, 0.1),
-    rotation: Any = (0, 0, 0, 1),
-    translation: Any = (0, 0, 0),
-) -> dict[str, Any]:
-    return {
-        "abb": {"center": list(centre), "sizes": list(sizes)},
-        "orientation": {"rotation": list(rotation), "translation": list(translation)},
-    }
 
 
 def write_boxes(root: Path, boxes: dict[int, Any], *, mesh: bool = True) -> Path:

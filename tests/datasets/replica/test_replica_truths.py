@@ -5,16 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from replica_scene import (
-    CHAIR,
-    QUADS,
-    REFERENCE,
-    TABLE,
-    TWO_OBJECTS,
-    write_clouds,
-    write_original,
-    write_render,
-)
+import replica_scene as rep
 from scored_room import instances
 
 from su3d_bench.datasets.replica.dataset import Replica
@@ -38,21 +29,21 @@ def write_labels(root: Path, name: str, values: list[int]) -> Path:
 
 
 def test_instances_of_the_file_stand_on_the_vertices_of_the_renders_mesh(tmp_path: Path) -> None:
-    write_render(tmp_path)
+    rep.write_render(tmp_path)
     write_mesh(tmp_path / "Replica/room0_mesh.ply", 7, at=100)
-    write_original(tmp_path, QUADS, [0, 0, 5, 5], TWO_OBJECTS)
+    rep.write_original(tmp_path, rep.QUADS, [0, 0, 5, 5], rep.TWO_OBJECTS)
     write_labels(tmp_path, "Replica/ground_truth/room0.txt", [20066, 80066, 30, 256003, 20000, 0, 20066])
     truth = Replica(tmp_path).ground_truth("room0", "openmask3d")
-    assert truth.semantic.tolist() == [CHAIR, TABLE, 0, 0, CHAIR, 0, CHAIR]
+    assert truth.semantic.tolist() == [rep.CHAIR, rep.TABLE, 0, 0, rep.CHAIR, 0, rep.CHAIR]
     assert truth.instance.tolist() == [2, 3, 0, 0, 1, 0, 2]  # in the order of the values
     assert truth.points[:, 0].tolist() == [100, 101, 102, 103, 104, 105, 106]
     assert truth.source == "ground_truth/room0.txt, class id * 1000 + instance of each vertex of room0_mesh.ply"
 
 
 def test_labels_of_the_original_mesh_are_recognised_by_their_number(tmp_path: Path) -> None:
-    write_render(tmp_path)
+    rep.write_render(tmp_path)
     write_mesh(tmp_path / "Replica/room0_mesh.ply", 7)
-    write_original(tmp_path, QUADS, [0, 0, 5, 5], TWO_OBJECTS)
+    rep.write_original(tmp_path, rep.QUADS, [0, 0, 5, 5], rep.TWO_OBJECTS)
     write_labels(tmp_path, "Replica/ground_truth/room_0.txt", [20001] * 9)
     truth = Replica(tmp_path).ground_truth("room0", "openmask3d")
     assert truth.points[5].tolist() == [2, 1, 0]
@@ -60,7 +51,7 @@ def test_labels_of_the_original_mesh_are_recognised_by_their_number(tmp_path: Pa
 
 
 def test_classes_of_the_file_are_replicas_own_ids_and_undefined_ones_are_void(tmp_path: Path) -> None:
-    write_render(tmp_path)
+    rep.write_render(tmp_path)
     write_mesh(tmp_path / "Replica/room0_mesh.ply", 6)
     write_labels(tmp_path, "Replica/semantic_gt/room0.txt", [20, -1, 93, -2, 256, 3])
     truth = Replica(tmp_path).ground_truth("room0", "ovo-51")
@@ -79,7 +70,7 @@ INSTANCES, CLASSES = "Replica/ground_truth/room0.txt", "Replica/semantic_gt/room
 
 
 def test_the_released_instances_as_a_prediction_score_exactly_one(tmp_path: Path) -> None:
-    write_render(tmp_path)
+    rep.write_render(tmp_path)
     write_mesh(tmp_path / "Replica/room0_mesh.ply", 360)
     write_labels(tmp_path, INSTANCES, [20001] * 120 + [80001] * 120 + [30] * 120)
     truth = Replica(tmp_path).ground_truth("room0", "openmask3d")
@@ -91,13 +82,13 @@ def test_the_released_instances_as_a_prediction_score_exactly_one(tmp_path: Path
 
 
 def test_files_and_status_cover_every_released_truth(tmp_path: Path) -> None:
-    write_render(tmp_path)
+    rep.write_render(tmp_path)
     write_mesh(tmp_path / "Replica/room0_mesh.ply", 2)
-    write_clouds(tmp_path, np.zeros((3, 3)), np.zeros(3, int), np.zeros((1, 3)))
+    rep.write_clouds(tmp_path, np.zeros((3, 3)), np.zeros(3, int), np.zeros((1, 3)))
     write_labels(tmp_path, INSTANCES, [20001] * 2)
     write_labels(tmp_path, CLASSES, [20] * 2)
     replica = Replica(tmp_path)
     assert replica.status("room0").endswith("; also conceptgraphs, openmask3d, ovo-51")
     assert set(replica.files("room0")) == {path for path in tmp_path.rglob("*") if path.is_file()}
-    (tmp_path / REFERENCE).unlink()
+    (tmp_path / rep.REFERENCE).unlink()
     assert "; also conceptgraphs without its pc_points.h5, openmask3d" in replica.status("room0")

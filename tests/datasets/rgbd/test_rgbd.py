@@ -9,17 +9,15 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from recording_files import text_of
+from recording_files import HEIGHT, WIDTH, depth_values, text_of
 from recording_files import turn as pose
-from rgbd_scene import HEIGHT, NUMBERED, WIDTH, depth_values, describe, log_of, open_scene, write_scene
+from rgbd_scene import NUMBERED, describe, log_of, open_scene, write_scene
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.recordings.pose_convention import FLIP, judge_scene
 from su3d_bench.datasets.rgbd.dataset import Rgbd
-from su3d_bench.datasets.rgbd.files import (
-    direction_in,
-)
+from su3d_bench.datasets.rgbd.files import direction_in
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 
 

@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 import scannet_scan as made
 from recording_files import HEIGHT_M, LEFT, RIGHT, floor_image, pose
-from scannet_scan import SCAN, WHERE, positions, write_scan
-from scannet_toy import write_python_export
+from scannet_scan import SCAN, WHERE, positions, write_python_export, write_scan
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError, GroundTruthMissing
@@ -26,10 +25,7 @@ from su3d_bench.datasets.scannet.recordings import read_walk
 from su3d_bench.datasets.scannet.truth import TABLE_NAME
 
 
-@pytest.mark.parametrize(
-    "place",
-    [".", "scannet/scans", "ScanNet/scans_test", "scans/val"],
-)
+@pytest.mark.parametrize("place", [".", "scannet/scans", "ScanNet/scans_test", "scans/val"])
 def test_scans_are_found_in_every_layout_that_circulates(tmp_path: Path, place: str) -> None:
     write_scan(tmp_path, place=place)
     found = ScanNet(tmp_path)

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from scannet_toy import N_FRAMES, RECORDED, SCENE, TOY, WHERE, write_cpp_export, write_python_export
+from scannet_scan import N_FRAMES, RECORDED, SCAN, TOY, WHERE, write_cpp_export, write_python_export
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.recordings.source import ExportedFrames, RgbdSource
@@ -62,7 +62,7 @@ def test_the_cameras_of_the_cpp_export_are_those_in_its_text(tmp_path: Path) -> 
 def test_openmask3d_layouts_are_the_recording(tmp_path: Path) -> None:
     whole = write_python_export(tmp_path / "all", images="data_compressed/", rest="data/")
     assert_is_the_toy(open_python_export(whole, WHERE), 1e-6)
-    assert_is_the_toy(find_source(whole, SCENE, WHERE), 1e-6)
+    assert_is_the_toy(find_source(whole, SCAN, WHERE), 1e-6)
 
 
 def equal_sizes(folder: Path, size: tuple[int, int], matrix: np.ndarray) -> ExportedFrames:

@@ -12,12 +12,7 @@ import pytest
 from places import CASES
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.datasets.scannetpp.images import (
-    DepthFile,
-    NotLz4,
-    millimetres,
-    unpacked_block,
-)
+from su3d_bench.datasets.scannetpp.images import DepthFile, NotLz4, millimetres, unpacked_block
 
 CASE = json.loads((CASES / "scannetpp_lz4.json").read_text())
 SHAPE = (192, 256)

@@ -14,21 +14,17 @@ from scannetpp_scene import NAMES, write_lists, write_scans
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import GroundTruth
-from su3d_bench.datasets.scannetpp.truth import (
-    TRUTH_NAMES,
-    instance_mesh,
-    read_annotated_scan,
-    read_benchmark_classes,
-    vertex_truth,
-)
+from su3d_bench.datasets.scannetpp import truth as truth_files
 
 CASE = json.loads((CASES / "scannetpp_truth.json").read_text())
 NO_LABEL = -100
 
 
 def truth_of(folder: Path, lists: Path) -> GroundTruth:
-    files = {name: folder / name for name in TRUTH_NAMES}
-    return vertex_truth(read_annotated_scan(files, read_benchmark_classes(lists, "here"), "here"))
+    files = {name: folder / name for name in truth_files.TRUTH_NAMES}
+    return truth_files.vertex_truth(
+        truth_files.read_annotated_scan(files, truth_files.read_benchmark_classes(lists, "here"), "here")
+    )
 
 
 def written(root: Path, segments: Any, groups: Any, masked: Any = (), mesh: Any = None) -> GroundTruth:
@@ -80,8 +76,10 @@ def test_the_surface_of_an_object_is_that_of_most_corners(tmp_path: Path) -> Non
     points, triangles = grid(3, 2)
     write_lists(tmp_path)
     write_scans(tmp_path, [1, 1, 2, 1, 1, 2], [("floor", (1,)), ("couch", (2,))], mesh=(points, triangles))
-    classes = read_benchmark_classes(tmp_path / "metadata/semantic_benchmark", "here")
-    mesh = instance_mesh(read_annotated_scan({name: tmp_path / name for name in TRUTH_NAMES}, classes, "here"))
+    classes = truth_files.read_benchmark_classes(tmp_path / "metadata/semantic_benchmark", "here")
+    mesh = truth_files.instance_mesh(
+        truth_files.read_annotated_scan({name: tmp_path / name for name in truth_files.TRUTH_NAMES}, classes, "here")
+    )
     assert mesh.instance_of_triangle.tolist() == [1, 1, 1, 2]
     assert mesh.class_of_instance == {1: 2, 2: 4}
 

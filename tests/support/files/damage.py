@@ -1,14 +1,21 @@
-"""Damaged copies of a file, and a check that a reader meets each with a typed error, soon and in little memory."""
+"""Damaged copies of a file, and a check that a reader meets each with a typed error, soon and in little memory.
+
+How much memory this process has taken, and at most may take, is measured and set here.
+"""
 
 from __future__ import annotations
 
 import os
+import resource
 import time
+import tracemalloc
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import is_dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from memory import bounded_addresses, peak_bytes, reset_peak
 
 from su3d_bench.core.errors import DataError, Su3dError
 
@@ -76,8 +83,7 @@ def outcomes(
 
 def assert_fit(error: Su3dError, must_name: str) -> None:
     message = str(error)
-    assert must_name in message, message
-    assert "\n" not in message and len(message) < 600, message
+    assert must_name in message and "\n" not in message and len(message) < 600, message
     assert not lacked_memory(error), message
 
 
@@ -86,17 +92,54 @@ def lacked_memory(error: BaseException | None) -> bool:
     return error is not None and (isinstance(error, MemoryError) or lacked_memory(error.__context__))
 
 
+def facts(value: Any) -> Any:
+    """A value with the types of all that is in it."""
+    if is_dataclass(value) or isinstance(value, dict):
+        return [(key, facts(one)) for key, one in (value if isinstance(value, dict) else vars(value)).items()]
+    if isinstance(value, np.ndarray):
+        return value.dtype, value.shape, value.tolist()
+    return type(value), [facts(one) for one in value] if isinstance(value, list | tuple) else value
+
+
 def assert_same(ours: Any, theirs: Any) -> None:
-    if isinstance(theirs, np.ndarray):
-        assert isinstance(ours, np.ndarray) and ours.dtype == theirs.dtype
-        np.testing.assert_array_equal(ours, theirs)
-    elif isinstance(theirs, dict):
-        assert list(ours) == list(theirs)
-        for key, value in theirs.items():
-            assert_same(ours[key], value)
-    elif isinstance(theirs, list | tuple):
-        assert type(ours) is type(theirs) and len(ours) == len(theirs)
-        for one, other in zip(ours, theirs, strict=True):
-            assert_same(one, other)
-    else:
-        assert type(ours) is type(theirs) and ours == theirs
+    assert facts(ours) == facts(theirs)
+
+
+@contextmanager
+def bounded_addresses(most_bytes: int) -> Iterator[None]:
+    """No more than ``most_bytes`` of address space beyond what is taken now; what asks for more gets a MemoryError."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (_status("VmSize") + most_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+@contextmanager
+def traced(max_bytes: int) -> Iterator[None]:
+    """The block must end, by whatever, with less than ``max_bytes`` allocated at any time."""
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < max_bytes
+    finally:
+        tracemalloc.stop()
+
+
+def reset_peak() -> int:
+    """The resident memory now, from which the peak is counted afresh."""
+    Path("/proc/self/clear_refs").write_text("5")  # proc(5): resets the peak of the resident set
+    return _status("VmRSS")
+
+
+def peak_bytes() -> int:
+    """The largest resident memory since the peak was reset."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+
+
+def _status(key: str) -> int:
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(f"{key}:"):
+            return int(line.split()[1]) * 1024
+    raise KeyError(key)

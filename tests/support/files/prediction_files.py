@@ -1,7 +1,8 @@
-"""Predictions written as the programs themselves write them, for tests of readers."""
+"""Predictions written as the programs themselves write them, over the vertices of a mesh or with their own points."""
 
 from __future__ import annotations
 
+import gzip
 import io
 import json
 import pickle
@@ -15,10 +16,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hm3dsem_walk import write_graph
 from places import CASES
+from recording_files import write_files
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.maps import Instances
+from su3d_bench.formats.pcd import write_pcd_points
 from su3d_bench.formats.ply import PlyElement, write_ply
 from su3d_bench.predictions.formats import READERS
 from su3d_bench.store.predictions import write_prediction
@@ -29,32 +33,31 @@ def scenes_of(case: str) -> list[dict[str, Any]]:
     with np.load(CASES / f"{case}.npz") as archive:
         arrays = {key: archive[key] for key in archive.files}
     found = []
-    for s, name in enumerate(arrays["scene_names"]):
+    for s, name in enumerate(map(str, arrays["scene_names"])):
         n_points = len(arrays[f"gt_{s}"])
         masks = np.unpackbits(arrays[f"masks_packed_{s}"], axis=1)[:, :n_points].astype(bool)
         files = [str(file) for file in arrays.get(f"mask_files_{s}", [])]
-        found.append(
-            {
-                "name": str(name),
-                "masks": masks,
-                "labels": arrays[f"labels_{s}"],
-                "scores": arrays[f"scores_{s}"],
-                "files": files or [f"pred_mask/{name}_{k:03d}.txt" for k in range(len(masks))],
-            }
-        )
+        files = files or [f"pred_mask/{name}_{k:03d}.txt" for k in range(len(masks))]
+        scores = {"labels": arrays[f"labels_{s}"], "scores": arrays[f"scores_{s}"]}
+        found.append({"name": name, "masks": masks, "files": files, **scores})
     return found
+
+
+def write_list(folder: Path, scene: dict[str, Any], files: list[str], masks: list[str], labels: Any) -> None:
+    """Mask files, and a list with the name, the class (a text) and the confidence of each."""
+    lines = []
+    for file, content, label, score in zip(files, masks, labels, scene["scores"], strict=True):
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).write_text(content)
+        lines.append(f"{file} {label}{float(score)!r}\n")
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{scene['name']}.txt").write_text("".join(lines))
 
 
 def write_scannet_text(folder: Path, scene: dict[str, Any], *, file_end: str = "\n") -> None:
     """The submission format: a list of mask files, class and confidence, and one digit a line in each mask file."""
-    lines = []
-    rows = zip(scene["files"], scene["masks"], scene["labels"], scene["scores"], strict=True)
-    for file, mask, label, score in rows:
-        (folder / file).parent.mkdir(parents=True, exist_ok=True)
-        (folder / file).write_text("\n".join("1" if member else "0" for member in mask) + file_end)
-        lines.append(f"{file} {label} {float(score)!r}\n")
-    folder.mkdir(parents=True, exist_ok=True)
-    (folder / f"{scene['name']}.txt").write_text("".join(lines))
+    masks = ["\n".join("1" if member else "0" for member in mask) + file_end for mask in scene["masks"]]
+    write_list(folder, scene, scene["files"], masks, [f"{label} " for label in scene["labels"]])
 
 
 def runs(mask: Any) -> Any:
@@ -66,23 +69,16 @@ def runs(mask: Any) -> Any:
 
 def write_scannetpp_json(folder: Path, scene: dict[str, Any]) -> None:
     """ScanNet++'s submission: the same list, and JSON run lengths."""
-    lines = []
-    (folder / "masks").mkdir(parents=True, exist_ok=True)
-    for k, (mask, label, score) in enumerate(zip(scene["masks"], scene["labels"], scene["scores"], strict=True)):
-        content = {"length": len(mask), "counts": " ".join(str(run) for run in runs(mask))}
-        (folder / f"masks/{scene['name']}_{k}.json").write_text(json.dumps(content))
-        lines.append(f"masks/{scene['name']}_{k}.json {label} {float(score)!r}\n")
-    (folder / f"{scene['name']}.txt").write_text("".join(lines))
+    lengths = [" ".join(map(str, runs(mask))) for mask in scene["masks"]]
+    masks = [json.dumps({"length": scene["masks"].shape[1], "counts": counts}) for counts in lengths]
+    files = [f"masks/{scene['name']}_{k}.json" for k in range(len(masks))]
+    write_list(folder, scene, files, masks, [f"{label} " for label in scene["labels"]])
 
 
 def write_maskclustering(folder: Path, scene: dict[str, Any]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    np.savez(
-        folder / f"{scene['name']}.npz",
-        pred_masks=scene["masks"].T,
-        pred_score=scene["scores"],
-        pred_classes=scene["labels"],
-    )
+    scores = {"pred_score": scene["scores"], "pred_classes": scene["labels"]}
+    np.savez(folder / f"{scene['name']}.npz", pred_masks=scene["masks"].T, **scores)
 
 
 class TorchName:
@@ -183,14 +179,10 @@ def write_openmask3d(folder: Path, scene: dict[str, Any], features: Any) -> None
     np.save(folder / f"{scene['name']}_openmask3d_features.npy", features)
 
 
-def write_openyolo3d(folder: Path, scene: dict[str, Any]) -> None:
-    columns = Tensor(scene["masks"].T), Tensor(scene["scores"].astype(np.float32))
-    write_torch(folder / f"{scene['name']}.pt", columns)
-
-
-def write_openyolo3d_labelled(folder: Path, scene: dict[str, Any]) -> None:
-    """What predict of Open-YOLO 3D gives of a scene: masks, positions of their classes and scores."""
-    columns = scene["masks"].T, scene["labels"].astype(np.int64), scene["scores"].astype(np.float32)
+def write_openyolo3d(folder: Path, scene: dict[str, Any], *, has_labels: bool = False) -> None:
+    """Masks and scores; with what predict of Open-YOLO 3D gives, the positions of their classes between them."""
+    labels = [scene["labels"].astype(np.int64)] if has_labels else []
+    columns = scene["masks"].T, *labels, scene["scores"].astype(np.float32)
     write_torch(folder / f"{scene['name']}.pt", tuple(map(Tensor, columns)))
 
 
@@ -209,13 +201,9 @@ def write_open3dis(folder: Path, scene: dict[str, Any], *, as_tensor: bool = Fal
 
 def write_opensun3d(folder: Path, scene: dict[str, Any]) -> None:
     """A submission to the OpenSUN3D challenge: mask file and confidence."""
-    lines = []
-    (folder / "predicted_masks").mkdir(parents=True, exist_ok=True)
-    for k, (mask, score) in enumerate(zip(scene["masks"], scene["scores"], strict=True)):
-        file = f"predicted_masks/{scene['name']}_{k}.txt"
-        np.savetxt(folder / file, mask, fmt="%d")
-        lines.append(f"{file} {float(score)!r}\n")
-    (folder / f"{scene['name']}.txt").write_text("".join(lines))
+    masks = ["".join(f"{int(member)}\n" for member in mask) for mask in scene["masks"]]
+    files = [f"predicted_masks/{scene['name']}_{k}.txt" for k in range(len(masks))]
+    write_list(folder, scene, files, masks, [""] * len(masks))
 
 
 def write_sam3d_colours(file: Path, groups: Any) -> None:
@@ -225,10 +213,6 @@ def write_sam3d_colours(file: Path, groups: Any) -> None:
     colours, points = palette[groups], rng.random((len(groups), 3))
     columns = dict(zip("xyz", points.T, strict=True)) | dict(zip(("red", "green", "blue"), colours.T, strict=True))
     write_ply(file, [PlyElement("vertex", len(groups), columns)])
-
-
-def write_sam3d(folder: Path, name: str, groups: Any) -> None:
-    write_torch(folder / f"{name}.pth", groups)
 
 
 RNG = np.random.default_rng(0)
@@ -266,7 +250,7 @@ def written_in(tmp_path: Path, format: str) -> Path:
         "open3dis": lambda: write_open3dis(folder, TOY),
         "openyolo3d": lambda: write_openyolo3d(folder, TOY),
         "openins3d": lambda: write_openins3d(folder, TOY),
-        "sam3d": lambda: write_sam3d(folder, name, np.array([0, 0, -1, 1])),
+        "sam3d": lambda: write_torch(folder / f"{name}.pth", np.array([0, 0, -1, 1])),
         "sam3d-colours": lambda: write_sam3d_colours(folder / f"{name}.ply", np.repeat([0, -1, 1], [30, 40, 50])),
         "opensun3d-challenge": lambda: write_opensun3d(folder, TOY),
     }
@@ -287,5 +271,144 @@ def refused(path: Path, scene: str, format: str) -> str:
     return message
 
 
-def scene_name(format: str) -> str:
-    return "replica/scene0011_00" if format == "su3d-bench" else "scene0011_00"
+# ---- predictions with their own points
+
+CLASSES = ["couch", "lamp", "wall"]
+
+
+def an_object(n_points: int, class_ids: list[int], **more: Any) -> dict[str, Any]:
+    """An object of ConceptGraphs with keys of every kind that its map has."""
+    n = len(class_ids)
+    feature = RNG.normal(size=16)
+    return {
+        "image_idx": list(range(n)),
+        "color_path": [f"/home/author/Replica/room0/results/frame{k:06d}.jpg" for k in range(n)],
+        "class_name": [CLASSES[one % 3] for one in class_ids],
+        "class_id": list(class_ids),
+        "mask": [RNG.random((60, 80)) < 0.5 for _ in range(n)],
+        "xyxy": [RNG.random(4) for _ in range(n)],
+        "conf": [np.float32(0.5)] * n,
+        "pixel_area": [np.int64(7)] * n,
+        "contain_number": [None] * n,
+        "is_background": False,
+        "clip_ft": (feature / np.linalg.norm(feature)).astype(np.float32),
+        "text_ft": np.ones(16, np.float32),
+        "pcd_np": RNG.normal(size=(n_points, 3)),
+        "pcd_color_np": RNG.random((n_points, 3)),
+        **more,
+    }
+
+
+def a_map(**more: Any) -> dict[str, Any]:
+    objects = [an_object(5, [0, 1, 0]), an_object(0, [1]), an_object(3, [1, 0])]
+    background = [an_object(4, [2], is_background=True)]
+    colours = {str(k): [0.1, 0.2, 0.3] for k in range(3)}
+    return {"objects": objects, "bg_objects": background, "class_names": CLASSES, "class_colors": colours, **more}
+
+
+def write_map(path: Path, value: object, protocol: int = 4) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with gzip.open(path, "wb", compresslevel=1) as stream:
+        pickle.dump(value, stream, protocol)
+    return path
+
+
+def write_gradslam(folder: Path, points: Any, embeddings: Any) -> None:
+    tables = {"points": points, "embeddings": embeddings, "colors": points, "confidences": points}
+    write_files(folder, {f"pc_{name}.h5": values for name, values in tables.items()})
+
+
+def write_object(path: Path, points: Any) -> None:
+    """A cloud as Open3D writes it: doubles, and colours behind them."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    columns = {axis: np.asarray(points)[:, k].astype(np.float64) for k, axis in enumerate("xyz")}
+    colours = {name: np.full(len(points), 7, np.uint8) for name in ("red", "green", "blue")}
+    write_ply(path, [PlyElement("vertex", len(points), {**columns, **colours})])
+
+
+def write_hovsg(folder: Path, clouds: dict[int, Any], features: Any) -> None:
+    for number, cloud in clouds.items():
+        write_object(folder / f"objects/pcd_{number}.ply", cloud)
+    (folder / "objects").mkdir(parents=True, exist_ok=True)
+    write_torch(folder / "mask_feats.pt", Tensor(features))
+
+
+def write_openlex(folder: Path, points: Any, index: Any, features: Any, cloud: str = "point_cloud.pcd") -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    if cloud.endswith(".pcd"):
+        write_pcd_points(folder / cloud, np.asarray(points, np.float32))
+    else:
+        write_object(folder / cloud, points)
+    np.save(folder / "index.npy", index)
+    np.save(folder / "embeddings.npy", features)
+
+
+def write_ovo(folder: Path, points: Any, ids: Any, features: dict[int, Any], *, is_stream: bool = True) -> None:
+    """A checkpoint of OVO: the points of its SLAM with the object of each in a column, a feature an object."""
+    cloud = {
+        "xyz": np.asarray(points, np.float32),
+        "obj_ids": np.asarray(ids, np.int32)[:, np.newaxis],
+        "ids": np.arange(len(points), dtype=np.int32)[:, np.newaxis],
+        "max_id": len(points),
+    }
+    objects = {f"ins3d_{number}_clip_feature": feature for number, feature in features.items()}
+    numbers = {"ins_3d_ids": np.array(list(features), np.int64), "ins3d_0_clip_feature_kf": None}
+    value = {"map_params": tensors(cloud), "ovo_map_params": numbers | tensors(objects)}
+    write_torch(folder / "ovo_map.ckpt", value, is_stream=is_stream)
+
+
+def write_esam(folder: Path, points: Any, groups: Any) -> None:
+    """What ESAM's stream demo leaves: the points (frames, points, 3) and one of its 256 colours each, 200 for none."""
+    folder.mkdir(parents=True, exist_ok=True)
+    palette = (np.random.default_rng(0).random((256, 3)) * 255).astype(int)
+    palette[-1] = 200
+    np.save(folder / "points.npy", np.asarray(points, np.float32))
+    np.save(folder / "points_color.npy", palette[np.asarray(groups)].reshape(np.shape(points)))
+
+
+def write_onlineanyseg(folder: Path, points: Any, masks: Any, features: Any = None) -> None:
+    """Masks over the rebuilt points, class 0 and score 1 for each, its features in columns; and these points."""
+    write_object(folder / "final.ply", points)
+    arrays: dict[str, Any] = {"pred_masks": np.stack(masks, 1), "pred_score": np.ones(len(masks))}
+    arrays |= {"pred_classes": np.zeros(len(masks), np.int32)}
+    arrays |= {} if features is None else {"pred_sem_features": np.stack(features, 1)}
+    np.savez(folder / "ckpt_final.npz", **arrays)
+
+
+def write_small(folder: Path, format: str) -> Path:
+    """The scene room0 in ``format``, small; the folder that holds the scene's folder."""
+    scene = folder / "room0"
+    points, rows = RNG.normal(size=(6, 3)).astype(np.float32), np.ones((6, 8), np.float32)
+    ovo = {5: rows[0], 0: rows[:1]}
+    writers: dict[str, Callable[[], object]] = {
+        "conceptgraphs": lambda: write_map(scene / "pcd_saves/full_pcd_none_x.pkl.gz", a_map()),
+        "gradslam": lambda: write_gradslam(scene / "saved-map/pointclouds", points, rows.astype(np.float16)),
+        "hovsg": lambda: write_hovsg(scene, {0: points[:4], 1: points[4:]}, rows[:2]),
+        "hovsg-graph": lambda: write_graph(scene / "graph"),
+        "openlex3d": lambda: write_openlex(scene, points, np.array([0, 0, 1, 1, 0, 1]), rows[:2]),
+        "ovo": lambda: write_ovo(scene, points, [5, -1, 5, 0, 0, 5], ovo),
+        "rayfronts": lambda: write_torch(scene / "map.pt", tensors({"feats_xyz": points, "feats_feats": rows})),
+        "esam": lambda: write_esam(scene, points.reshape(3, 2, 3), [0, 0, 1, -1, 1, 0]),
+        "onlineanyseg": lambda: write_onlineanyseg(scene, points, [np.arange(6) < 3, np.arange(6) > 2], list(rows[:2])),
+        "fross": lambda: write_fross(scene / "predictions_gaussian_test.pkl", [points[:4], points[4:]]),
+    }
+    writers[format]()
+    return folder
+
+
+def write_fross(path: Path, clouds: list[Any]) -> None:
+    """A scene graph of the scene room0, a chain of edges through its objects."""
+    k = len(clouds)
+    graph = {
+        "pcd": [np.asarray(cloud, np.float64) for cloud in clouds],
+        "cls": np.eye(150, dtype=np.int64)[np.arange(k) + 27],
+        "edge_index": np.array([np.arange(k - 1), np.arange(1, k)]),
+        "edge_cls": np.eye(50)[np.full(k - 1, 28)],
+        "mean": np.zeros((k, 3)),
+        "cov": np.zeros((k, 3, 3)),
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(pickle.dumps({"room0": graph}))
+
+
+WITH_POINTS = ("conceptgraphs", "gradslam", "hovsg", "openlex3d", "ovo", "rayfronts", "esam", "onlineanyseg", "fross")

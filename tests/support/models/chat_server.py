@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Callable
-from contextlib import closing, suppress
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from typing import Any
+
+from file_server import LocalServer, send
 
 from su3d_bench.perception.language.chat import LanguageConfig
 
@@ -51,34 +52,15 @@ def completion(body: Body, answered: Answered) -> bytes:
     return json.dumps(value).encode()
 
 
-class ChatServer:
+class ChatServer(LocalServer):
     """``script`` is worked off first, one answer a request; after it ``answer`` says what to do with a body."""
 
     def __init__(self) -> None:
         self.forget()
         self.stop = threading.Event()
         self._lock = threading.Lock()
-        server = self
-
-        class Handler(BaseHTTPRequestHandler):
-            protocol_version = "HTTP/1.1"
-
-            def handle(self) -> None:
-                """Clients that give up close the connection at any moment, also while its next request is awaited."""
-                with suppress(ConnectionError):
-                    super().handle()
-
-            def do_POST(self) -> None:
-                body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-                server.respond(self, body)
-
-            def log_message(self, *words: Any) -> None:
-                pass
-
-        self._http = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self._http.daemon_threads = True
-        self.url = f"http://127.0.0.1:{self._http.server_address[1]}/v1"
-        threading.Thread(target=self._http.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+        super().__init__()
+        self.url = f"http://127.0.0.1:{self.port}/v1"
 
     def forget(self) -> None:
         """As nothing had been asked: no script, "ok" to every body, nothing counted."""
@@ -91,7 +73,8 @@ class ChatServer:
     def n_asked(self) -> int:
         return len(self.bodies)
 
-    def respond(self, handler: BaseHTTPRequestHandler, body: Body) -> None:
+    def respond(self, handler: BaseHTTPRequestHandler) -> None:
+        body = json.loads(handler.rfile.read(int(handler.headers["Content-Length"])))
         with self._lock:
             self.bodies.append(body)
             self.headers.append({name.lower(): value for name, value in handler.headers.items()})
@@ -99,21 +82,11 @@ class ChatServer:
         self.stop.wait(answered.wait_s)
         content = answered.raw if answered.raw is not None else completion(body, answered)
         stated = {"Content-Type": answered.kind, "Content-Length": str(len(content)), **answered.headers}
-        with suppress(OSError):
-            handler.send_response(answered.status)
-            for name, value in stated.items():
-                handler.send_header(name, value)
-            handler.end_headers()
-            handler.wfile.write(content)
+        send(handler, answered.status, stated, content)
 
-    def close(self) -> None:
+    def __exit__(self, *error: object) -> None:
         self.stop.set()
-        self._http.shutdown()
-        self._http.server_close()
-
-
-def chat_server() -> closing[ChatServer]:
-    return closing(ChatServer())
+        super().__exit__(*error)
 
 
 def quick_config(server: ChatServer | None = None, **changes: Any) -> LanguageConfig:

@@ -9,7 +9,7 @@ import numpy as np
 from recording_files import write_files
 
 SCENE, SHORT = "00824-Dd4bFSTQ8gi", "Dd4bFSTQ8gi"
-SIZE = WIDTH, HEIGHT = 8, 6
+WIDTH, HEIGHT = 8, 6
 CHAIR = np.array([[x, y, -2.0 + x] for x in (0.0, 0.1, 0.2) for y in (0.3, 0.4)])
 WALL = np.array([[x, y, -3.0] for x in (-1.0, 0.0, 1.0) for y in (0.0, 2.4)]) + [[0, 0, 0.01 * k] for k in range(6)]
 ROOM = np.array([[x, 0.0, z] for x in (-1.0, 0.0, 1.0) for z in (-3.0, -2.0, -1.0)])

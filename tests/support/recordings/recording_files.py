@@ -11,11 +11,17 @@ import h5py
 import numpy as np
 
 from su3d_bench.core.types import Float64Array, UInt8Array
-from su3d_bench.formats.images import jpeg_bytes, png_bytes
+from su3d_bench.formats.images import UInt16Array, jpeg_bytes, png_bytes
 from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
 
 LEFT, RIGHT = (200, 60, 40), (40, 80, 200)
 HEIGHT_M = 2.0
+WIDTH, HEIGHT = 12, 8  # of images whose depth tells the pixel
+
+
+def depth_values(index: int) -> UInt16Array:
+    """A depth image of frame ``index``, another value in each pixel."""
+    return np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * np.uint16(600) + np.uint16(index)
 
 
 def text_of(matrix: np.ndarray) -> str:
@@ -24,11 +30,13 @@ def text_of(matrix: np.ndarray) -> str:
 
 
 def write_files(root: Path, files: Mapping[str, Any]) -> None:
-    """Texts, JSON, images, clouds and tables by the ends of their names below ``root``."""
+    """Bytes, texts, and by the ends of their names JSON, images, clouds and tables below ``root``."""
     for name, content in files.items():
         path = root / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        match path.suffix:
+        match path.suffix if not isinstance(content, bytes) else "bytes":
+            case "bytes":
+                path.write_bytes(content)
             case ".png" | ".jpg":
                 path.write_bytes(png_bytes(content) if path.suffix == ".png" else jpeg_bytes(content))
             case ".json":

@@ -7,14 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from recording_files import text_of, turn, write_files
+from recording_files import HEIGHT, WIDTH, depth_values, text_of, turn, write_files
+from scipy.spatial.transform import Rotation
 
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.replica.folders import replica_label_set
 from su3d_bench.datasets.replica.truth import N_EMBEDDING
 from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
 
-WIDTH, HEIGHT, SCALE = 12, 8, 6553.5
+SCALE = 6553.5
 CAMERA = {"w": WIDTH, "h": HEIGHT, "fx": 6.0, "fy": 6.5, "cx": 5.5, "cy": 3.5, "scale": SCALE}
 CHAIR, TABLE, WALL = 20, 80, 93
 SEQUENCE = "Replica-semantic/room_0/Sequence_1"
@@ -25,10 +26,6 @@ REFERENCE = "Replica/room0/rgb_cloud/pointclouds/pc_points.h5"
 #                                0 1 2
 QUADS = [[0, 1, 4, 3], [3, 4, 7, 6], [1, 2, 5, 4], [4, 5, 8, 7]]
 TWO_OBJECTS = [(0, CHAIR), (5, TABLE)]
-
-
-def depth_values(index: int) -> np.ndarray:
-    return np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 600 + index
 
 
 def write_render(root: Path, scene: str = "room0", n_frames: int = 3) -> None:
@@ -44,6 +41,14 @@ def info_table(objects: list[tuple[int, int]]) -> dict[str, Any]:
     labels = replica_label_set()
     classes = [{"id": i, "name": name} for i, name in zip(labels.ids, labels.names, strict=True)]
     return {"classes": classes, "objects": [{"id": one, "class_id": class_id} for one, class_id in objects]}
+
+
+def box(
+    centre: Any = (1, 1, 0), sizes: Any = (2, 2, 0.1), rotation: Any = (0, 0, 0, 1), translation: Any = (0, 0, 0)
+) -> dict[str, Any]:
+    """An entry ``oriented_bbox`` of a table of objects."""
+    turned = {"rotation": list(rotation), "translation": list(translation)}
+    return {"abb": {"center": list(centre), "sizes": list(sizes)}, "orientation": turned}
 
 
 def write_original(
@@ -66,11 +71,9 @@ def write_original(
 
 def first_pose() -> Float64Array:
     """A turn about x, then z, and a shift."""
-    a, b = 0.7, -1.9
-    about_x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
-    about_z = np.array([[np.cos(b), -np.sin(b), 0], [np.sin(b), np.cos(b), 0], [0, 0, 1]])
     matrix = np.eye(4)
-    matrix[:3] = np.column_stack([about_z @ about_x, (0.3, -1.25, 1.5)])
+    matrix[:3, :3] = Rotation.from_euler("xz", (0.7, -1.9)).as_matrix()
+    matrix[:3, 3] = 0.3, -1.25, 1.5
     return matrix
 
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from recording_files import text_of, turn, write_files
+from recording_files import HEIGHT, WIDTH, depth_values, text_of, turn, write_files
 
 from su3d_bench.core.config import write_toml
 from su3d_bench.datasets.rgbd.dataset import Rgbd
 
-WIDTH, HEIGHT = 12, 8
 CAMERA = {"width": WIDTH, "height": HEIGHT, "intrinsic_matrix": [6.0, 0, 0, 0, 6.5, 0, 5.5, 3.5, 1]}
 NUMBERED: dict[str, Any] = {
     "folder": "data",
@@ -22,11 +20,6 @@ NUMBERED: dict[str, Any] = {
     "intrinsics": [6.0, 6.5, 5.5, 3.5],
     "depth_unit_m": 0.001,
 }
-Change = Callable[[Path], object]
-
-
-def depth_values(index: int) -> np.ndarray:
-    return np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 600 + index
 
 
 def log_of(indices: range) -> str:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from places import CASES
 from recording_files import HEIGHT_M, floor_image, grid, pose, write_files, write_mesh
 
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.scannet.dataset import ScanNet, ScannetOptions
-from su3d_bench.datasets.scannet.sens import SensFrame, SensHeader, write_sens
+from su3d_bench.datasets.scannet.sens import SensFile, SensFrame, SensHeader, write_sens
 from su3d_bench.datasets.scannet.truth import TABLE_NAME
 from su3d_bench.formats.images import png_bytes
 
@@ -86,15 +88,13 @@ def write_recording(path: Path, n_frames: int = 5, lost: Sequence[int] = (), hea
     """A walk along the floor; frames in ``lost`` have no pose."""
     head = head or header()
     path.parent.mkdir(parents=True, exist_ok=True)
-    depth = np.full((head.depth_height, head.depth_width), round(HEIGHT_M * 1000), np.uint16)
+    depth = np.full((head.depth_height, head.depth_width), round(HEIGHT_M * 1000), "<u2")
     frames = []
     for i, x_m in enumerate(positions(n_frames)):
         time = 1_000_000 + 33_333 * i
         colour = png_bytes(floor_image((head.colour_width, head.colour_height), x_m))
-        frame = SensFrame(
-            LOST if i in lost else pose(x_m), time, time, colour, zlib.compress(depth.astype("<u2").tobytes())
-        )
-        frames.append(frame.stored)
+        matrix = LOST if i in lost else pose(x_m)
+        frames.append(SensFrame(matrix, time, time, colour, zlib.compress(depth.tobytes())).stored)
     write_sens(path, head, frames, b"")
 
 
@@ -110,3 +110,40 @@ def write_scan(root: Path, scan: str = SCAN, place: str = "scans", n_frames: int
 
 def dataset(root: Path, **options: Any) -> ScanNet:
     return ScanNet(root, ScannetOptions(**options))
+
+
+# ---- the toy recording of the cases, as both readers of ScanNet export it
+
+TOY = CASES / "sens01_toy.sens"
+RECORDED = json.loads((CASES / "sens01_toy.json").read_text())
+N_FRAMES = 4
+
+
+def pgm_bytes(values: np.ndarray) -> bytes:
+    """A PGM as the C++ reader writes it, big-endian."""
+    return b"P5\n%d %d\n65535\n" % (values.shape[1], values.shape[0]) + values.astype(">u2").tobytes()
+
+
+def write_python_export(
+    folder: Path, *, images: str = "", rest: str = "", cameras: str = "intrinsic", frame_skip: int = 1
+) -> Path:
+    """The toy recording as ScanNet's Python reader exports it, colour as in the recording; returns ``folder``."""
+    toy, files = SensFile(TOY, WHERE), dict[str, Any]()
+    for i in range(N_FRAMES):
+        files[f"{images}color/{i * frame_skip}.jpg"] = toy.colour_bytes(i)
+        files[f"{images}depth/{i * frame_skip}.png"] = png_bytes(toy.depth(i))
+        files[f"{rest}pose/{i * frame_skip}.txt"] = RECORDED["pose_txt_py2"][str(i)]
+    files |= {f"{rest}{cameras}/{name}": text for name, text in RECORDED["intrinsic_py2"].items()}
+    write_files(folder, files)
+    return folder
+
+
+def write_cpp_export(folder: Path) -> Path:
+    """The toy recording as ScanNet's C++ reader exports it; returns ``folder``."""
+    toy, files = SensFile(TOY, WHERE), dict[str, Any]()
+    for i in range(N_FRAMES):
+        files[f"frame-{i:06d}.color.jpg"] = toy.colour_bytes(i)
+        files[f"frame-{i:06d}.depth.pgm"] = pgm_bytes(toy.depth(i))
+        files[f"frame-{i:06d}.pose.txt"] = RECORDED["pose_txt_cpp"][str(i)]
+    write_files(folder, files | {"_info.txt": RECORDED["info_cpp"]})
+    return folder

@@ -59,9 +59,8 @@ def write_lists(root: Path) -> None:
 def write_scans(folder: Path, segments: Any, groups: Any, masked: Any = (), mesh: Any = None) -> None:
     """The four files of a scan's truth; ``groups`` are (word, segments)."""
     write_mesh(folder / "mesh_aligned_0.05.ply", *(mesh or grid()))
-    entries = [
-        {"id": k, "objectId": k + 1, "label": word, "segments": list(parts)} for k, (word, parts) in enumerate(groups)
-    ]
+    rows = enumerate(groups)
+    entries = [{"id": k, "objectId": k + 1, "label": word, "segments": list(parts)} for k, (word, parts) in rows]
     files = {"segments.json": {"segIndices": list(segments)}, "segments_anno.json": {"segGroups": entries}}
     write_files(folder, files | {"mesh_aligned_0.05_mask.txt": "".join(f"{vertex}\n" for vertex in masked)})
 
@@ -75,9 +74,8 @@ def write_scene(root: Path, *, spacing_m: float = 0.1) -> Path:
     write_colmap(folder / "iphone/colmap")
     write_files(folder, {"iphone/pose_intrinsic_imu.json": tracking()})
     for number, matrix in zip(NUMBERS, POSES, strict=True):
-        image = floor_image(COLOUR_SIZE, float(matrix[0, 3]))
-        names = f"iphone/rgb/frame_{number:06d}.jpg", f"iphone/depth/frame_{number:06d}.png"
-        write_files(folder, dict(zip(names, (image, depth_values(number)), strict=True)))
+        rgb = {f"iphone/rgb/frame_{number:06d}.jpg": floor_image(COLOUR_SIZE, float(matrix[0, 3]))}
+        write_files(folder, rgb | {f"iphone/depth/frame_{number:06d}.png": depth_values(number)})
     columns, rows = round(4 / spacing_m) + 1, round(2 / spacing_m) + 1
     mesh = grid(columns, rows, spacing_m)
     segments = np.where(mesh[0][:, 0] < 2, 17, 40) + (np.abs(mesh[0][:, 0] - 2) < 0.3)
