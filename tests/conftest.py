@@ -83,7 +83,6 @@ def chat_of_module() -> Iterator[ChatServer]:
 @pytest.fixture
 def chat(chat_of_module: ChatServer, monkeypatch: pytest.MonkeyPatch) -> ChatServer:
     """A language model's server as it was before any question; the test says what it answers."""
-    pytest.importorskip("openai", reason="the models extra is not installed")
     monkeypatch.delenv("OPENAI_BASE_URL", raising=False)
     chat_of_module.forget()
     return chat_of_module

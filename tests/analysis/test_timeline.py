@@ -171,7 +171,6 @@ def test_what_is_logged_reaches_the_viewers_library_at_its_place_and_moment() ->
 def test_the_file_is_read_back_and_nothing_else_is_written_or_asked(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip("rerun", reason="the rerun extra is not installed")
     home = tmp_path / "home"
     home.mkdir()
     monkeypatch.setenv("HOME", str(home))

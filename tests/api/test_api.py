@@ -258,9 +258,9 @@ def test_the_notebook_is_kept_without_answers() -> None:
 
 @pytest.mark.proof
 def test_every_cell_of_the_notebook_runs(rooms_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    nbclient = pytest.importorskip("nbclient", reason="nbclient and ipykernel come with the test extra")
-    pytest.importorskip("ipykernel", reason="nbclient and ipykernel come with the test extra")
-    nbformat = pytest.importorskip("nbformat", reason="nbformat comes with nbclient")
+    import nbclient
+    import nbformat
+
     monkeypatch.setenv("SU3D_DATA", str(rooms_data))
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))

@@ -6,22 +6,16 @@ import json
 import string
 from collections.abc import Sequence
 from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from su3d_bench.core.system.devices import require, require_transformers
 from su3d_bench.core.types import Frame, UInt8Array
 from su3d_bench.perception.models.encoders.images import CLIP_MEAN, CLIP_STD
 from su3d_bench.perception.models.masks.grounded_sam import RAM_MODEL, RAM_PX, RAM_TAG_LIST
 
-needs_models = pytest.mark.skipif(
-    find_spec("torch") is None or find_spec("transformers") is None,
-    reason="torch and transformers are not installed: pip install 'su3d-bench[models]'",
-)
 DINO_PX = (48, 80)
 SAM_PX = 64
 
