@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conceptgraphs_scene import QUIET, SCENE, Plate, at_cosine, axis, contents, look, mapped
 from painted import colour_perception
 from places import SCENES
+from plates import QUIET, SCENE, Plate, at_cosine, axis, contents, look, mapped
 
 from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs
 from su3d_bench.baselines.conceptgraphs.objects import MappingConfig
