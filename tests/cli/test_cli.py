@@ -19,7 +19,6 @@ from su3d_bench.cli.output import answer_either, file_name_of, file_name_of_scen
 from su3d_bench.core.errors import EXIT_INTERNAL, ConfigError
 from su3d_bench.reports.pictures import maps
 from su3d_bench.runs import finished as finished_run
-from su3d_bench.runs import scene as scene_run
 
 PAINTED = f"{SCENES}/painted.py:Painted"
 COLLECTOR = f"{SCENES}/painted.py:Collector"
@@ -33,11 +32,7 @@ HEAVY = (
 AT_START = (*HEAVY, "numpy", "pydantic", "rich", "multiprocessing", "zipfile", "traceback", "difflib", "hashlib")
 
 
-@pytest.fixture(autouse=True)
-def _elsewhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
+pytestmark = pytest.mark.usefixtures("painted_place")
 
 
 @pytest.mark.parametrize(

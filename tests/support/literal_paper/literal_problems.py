@@ -1,17 +1,14 @@
-"""Random problems for the paper's text and the pipeline, their settings, and what the maps differ in."""
+"""Random problems for the paper's text and the pipeline, and their settings."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from literal_paper import NONE, Array, PaperProgram, Thing
-from scipy.spatial import cKDTree
+from literal_paper import Array
 from scipy.spatial.transform import Rotation
 
-from su3d_bench.core.maps import Instances
 from su3d_bench.core.types import Detections, Frame
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 
@@ -141,57 +138,3 @@ def random_features(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
     features = rng.normal(size=shape)
     features /= np.linalg.norm(features, axis=-1, keepdims=True)
     return np.asarray(features * (rng.random(shape[:-1]) > 0.05)[..., None], np.float32)
-
-
-SAME_POINT_M = 1e-5  # maps are given in float32
-
-
-def differences(found: Instances, program: PaperProgram) -> list[str]:
-    """A line for each difference between a method's map and the paper's; empty where they are one.
-
-    Two maps are one where they hold the same points, and the same sets of them with the same views, name, caption,
-    feature, box, centroid and score. Which numbers the ids are is free, but each is one instance's.
-    """
-    things, of_none = program.things(), np.flatnonzero(program.scene.ids == NONE)
-    kept = np.concatenate([of_none, *(thing.rows for thing in things)]).astype(int)
-    row_of = matched(found.points, program.scene.points[kept])
-    if row_of is None:
-        return [f"map: {len(found.points)} points, the paper has {len(kept)}, or others"]
-    if len(found) != len(things):
-        return [f"instances: {len(found)}, the paper has {len(things)}"]
-    place = np.full(len(program.scene.ids), NONE)
-    place[kept] = row_of
-    k_of = {found.mask(k).tobytes(): k for k in range(len(found))}
-    masks = [np.sort(place[thing.rows]).astype(found.indices.dtype).tobytes() for thing in things]
-    if {*k_of} != {*masks}:
-        return ["instances: others than the paper's"]
-    pairs = [(k_of[mask], thing) for mask, thing in zip(masks, things, strict=True)]
-    lines = [f"instance {k}: {line}" for k, thing in pairs for line in unlike(found, k, thing)]
-    if len({*found.ids.tolist()}) != len(found):
-        lines.append(f"ids: {found.ids.tolist()} name an instance each")
-    return lines
-
-
-def matched(points: Array, others: Array) -> Array | None:
-    """The row of ``points`` that each of ``others`` is, or None where they are not the same points."""
-    if len(points) != len(others):
-        return None
-    if not len(points):
-        return np.zeros(0, int)
-    distance, rows = cKDTree(points).query(others)
-    is_one = (distance < SAME_POINT_M).all() and len(np.unique(rows)) == len(rows)
-    return np.asarray(rows) if is_one else None
-
-
-def unlike(found: Instances, k: int, thing: Thing) -> Iterator[str]:
-    """What instance ``k`` has otherwise than ``thing``, its points aside."""
-    views = [tuple(view) for view in found.views[found.view_indptr[k] : found.view_indptr[k + 1]].tolist()]
-    assert found.features is not None
-    if views != thing.views:
-        yield f"views {views}, the paper has {thing.views}"
-    if (found.names[k], found.captions[k]) != (thing.name, thing.caption):
-        yield f"'{found.names[k]}', '{found.captions[k]}', the paper has '{thing.name}', '{thing.caption}'"
-    values = {"feature": thing.feature, "box": thing.box, "centroid": thing.centroid, "score": 1.0}
-    for what, ours in zip(values, (found.features, found.boxes, found.centroids, found.scores), strict=True):
-        if not np.allclose(ours[k], values[what], rtol=1e-5, atol=1e-5):
-            yield f"{what} {ours[k]}, the paper has {values[what]}"
