@@ -21,10 +21,8 @@ sys.path += sorted({str(file.parent) for file in TESTS.rglob("*.py")} - {*sys.pa
 from chat_server import ChatServer, chat_server  # noqa: E402 (it is found by the line above)
 from chromium import Chromium  # noqa: E402
 from gated_runs import gate_reference, gate_reference_file, gated, gated_copy  # noqa: E402, F401
-from painted import colour_perception  # noqa: E402
+from painted_runs import see_painted  # noqa: E402
 from painted_sheets import painted_folder, painted_source  # noqa: E402, F401
-
-from su3d_bench.runs import scene  # noqa: E402
 
 # Tables are folded for who says how wide he sees them, as pytest-xdist does to its workers.
 os.environ.pop("COLUMNS", None)
@@ -54,7 +52,7 @@ def rooms_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def painted_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder to work in, where this process sees painted scenes."""
-    monkeypatch.setattr(scene, "build_perception", colour_perception)
+    see_painted(monkeypatch)
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
     return tmp_path

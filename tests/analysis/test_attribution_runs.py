@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from painted import WordEncoder, colour_perception
+from painted_runs import see_painted
 from places import SCENES
 from scored_room import ENCODER, NAMES, instances, noisy, room, truth_as_prediction
 
@@ -34,8 +34,6 @@ from su3d_bench.metrics.attribution.masks import (
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.scoring import score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
-from su3d_bench.runs import finished as finished_run
-from su3d_bench.runs import scene as scene_run
 
 PAINTED = f"{SCENES}/painted.py:Painted"
 COLLECTOR = f"{SCENES}/painted.py:Collector"
@@ -186,7 +184,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """``whole``: all found; ``dropped``: one object of each scene is not; ``oracle``: what the truth gives."""
     folder = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
+        see_painted(patch)
         patch.chdir(folder)
         for out, more in (("whole", []), ("dropped", ["--set", "collector.drop=1"])):
             words = ["run", "--scenes", f"{PAINTED}/[ab]", "--methods", COLLECTOR, "--no-pictures", "--jobs", "1"]
@@ -201,7 +199,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def _in_folder(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(runs)
-    monkeypatch.setattr(finished_run, "encoder_of", lambda run, device: WordEncoder())
+    see_painted(monkeypatch)
 
 
 def attributed(run: str, **more: Any) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from painted import colour_perception
+from painted_runs import see_painted
 from places import SCENES
 from scored_room import noisy_scores
 
@@ -26,7 +26,6 @@ from su3d_bench.metrics.scoring import metric_of, pack_scores
 from su3d_bench.numerics.statistics import SignFlipTest, sign_flip_test
 from su3d_bench.reports.tables.comparison import comparison_tables
 from su3d_bench.reports.tables.formats import markdown
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.run_folder import RunFolder
 
 PAINTED = f"{SCENES}/painted.py:Painted"
@@ -43,7 +42,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """``a``: everything found; ``b``: one object dropped; ``few``: as ``b``, two scenes; ``truth``: the oracle."""
     folder = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
+        see_painted(patch)
         patch.chdir(folder)
         for out, scenes, more in (
             ("a", "[abc]", []),

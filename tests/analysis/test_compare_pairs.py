@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from painted import colour_perception
+from painted_runs import see_painted
 from places import SCENES
 
 from su3d_bench.analysis.comparison import Comparison, compare
@@ -20,7 +20,6 @@ from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
 from su3d_bench.numerics.statistics import MAX_EXACT_PAIRS, SignFlipTest, sign_flip_test
-from su3d_bench.runs import scene as scene_run
 
 RULES = load_protocol("rooms-semantic")
 COLLECTOR = f"{SCENES}/painted.py:Collector"
@@ -35,7 +34,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("pairs") / "run"
     words = ["run", "--scenes", f"{SCENES}/painted.py:Painted/[abc]", "--methods", COLLECTOR, f"{COLLECTOR}@drop=2"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
+        see_painted(patch)
         options = ["--protocols", RULES.name, "--no-pictures", "--jobs", "1", "--quiet"]
         assert main([*words, *options, "--out", str(out)]) == 0
     return out

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from painted import colour_perception
+from painted_runs import see_painted
 from places import SCENES
 from scored_room import noisy_scores
 
@@ -21,7 +21,6 @@ from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, pack_scores
 from su3d_bench.numerics.statistics import scenes_needed, sign_flip_test, variance_of
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.run_folder import RunFolder
 
 COLLECTOR = f"{SCENES}/painted.py:Collector"
@@ -43,7 +42,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     words = ["run", "--scenes", f"{SCENES}/painted.py:Painted/[abc]", "--methods", COLLECTOR, f"{COLLECTOR}@drop=1"]
     words += ["--protocols", *PROTOCOLS, "--no-pictures", "--jobs", "1", "--quiet"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
+        see_painted(patch)
         patch.chdir(folder)
         assert main([*words, "--seed", "0", "--out", "seed-0"]) == 0
         for seed in (1, 2):

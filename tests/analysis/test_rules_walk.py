@@ -8,13 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from painted import WordEncoder
-from painted_runs import COLLECTOR, painted_run
+from painted_runs import COLLECTOR, painted_run, see_painted
 
 from su3d_bench.analysis.rules_walk import Walker
 from su3d_bench.cli.main import main
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.runs import finished
 from su3d_bench.runs.finished import read_run
 
 SEMANTIC = ("rooms-semantic", "replica-mesh-ex6", "replica-openmask3d-semantic")
@@ -30,7 +28,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def _words(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(finished, "encoder_of", lambda run, device: WordEncoder())
+    see_painted(monkeypatch)
 
 
 PAIRS = [(a, b) for names in (SEMANTIC, INSTANCE) for a in names for b in names if a < b]

@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from painted import WordEncoder
-from painted_runs import COLLECTOR, painted_run
+from painted_runs import COLLECTOR, painted_run, see_painted
 from scored_room import ENCODER, noisy
 
 import su3d_bench.metrics.instance.average_precision
@@ -37,7 +36,7 @@ from su3d_bench.runs import finished as finished_run
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Two methods over two painted scenes; one loses an object of each."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
+        see_painted(patch)
         folder, methods = tmp_path_factory.mktemp("samples") / "run", (COLLECTOR, "oracle")
         yield painted_run(folder, "--quiet", "--set", "collector.drop=1", methods=methods)
 

@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from painted import ColourPerception, Painted, colour_perception
+from painted import ColourPerception, Painted
+from painted_runs import see_painted
 from places import SCENES
 
 from su3d_bench.baselines.command.folders import FrameFolder, class_names
@@ -25,7 +26,6 @@ from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Frame, SceneInfo, Surface
 from su3d_bench.datasets.rgbd.dataset import Rgbd
 from su3d_bench.predictions.base import vertex_masks
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.frame_loop import no_detections
 
 SCENE = SceneInfo("rooms", "a b", 6, 1, "rendered-rooms", seed=7)
@@ -300,7 +300,7 @@ def test_another_version_of_the_program_is_another_run(tmp_path: Path) -> None:
 def test_a_run_scores_a_program_keeps_its_words_and_refuses_another_version_of_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    see_painted(monkeypatch)
     monkeypatch.setattr(ColourPerception, "regions", lambda self: None, raising=False)
     monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
     text = """

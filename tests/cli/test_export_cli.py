@@ -16,7 +16,6 @@ from su3d_bench.core.maps import Instances, Partition
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.predictions.base import VertexMasks
 from su3d_bench.predictions.formats import READERS, recognise
-from su3d_bench.runs import finished as finished_run
 
 PAINTED, COLLECTOR = f"{SCENES}/painted.py:Painted", f"{SCENES}/painted.py:Collector"
 RULES = load_protocol("rooms-instance")
@@ -29,9 +28,8 @@ def read_text(folder: Path, scene: str) -> VertexMasks:
 
 
 @pytest.fixture
-def run_folder(painted_place: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+def run_folder(painted_place: Path) -> str:
     """A finished run of two scenes by two methods."""
-    monkeypatch.setattr(finished_run, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
     words = ["run", "--scenes", f"{PAINTED}/a", f"{PAINTED}/b", "--methods", COLLECTOR, "oracle", "--jobs", "1"]
     assert main([*words, "--protocols", "rooms-instance", "--no-pictures", "--quiet", "--out", "r"]) == 0
     return "r"

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from evaluated_text import said, write_texts
+from painted_runs import see_painted
 from places import SCENES
 from test_openlex3d_original import SAMPLED, metres, of_dataset, write_labels, write_objects
 
@@ -26,11 +27,8 @@ PAINTED = f"{SCENES}/painted.py:Painted"
 
 
 def run_oracle(folder: Path, monkeypatch: pytest.MonkeyPatch, scenes: str, capsys: Any) -> Path:
-    from painted import colour_perception
 
-    from su3d_bench.runs import scene as scene_run
-
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    see_painted(monkeypatch)
     words = ["run", "--scenes", f"{PAINTED}/{scenes}", "--methods", "oracle", "--protocols", "rooms-instance"]
     assert main([*words, "--no-pictures", "--jobs", "1", "--out", str(folder / "run"), "--quiet"]) == 0
     capsys.readouterr()

@@ -8,7 +8,8 @@ import time
 from pathlib import Path
 
 import pytest
-from painted import Collector, colour_perception
+from painted import Collector
+from painted_runs import see_painted
 from places import SCENES
 
 from su3d_bench.analysis.gate import (
@@ -24,7 +25,6 @@ from su3d_bench.core.interfaces import StageTimer
 from su3d_bench.core.maps import Prediction
 from su3d_bench.core.system.timing import MethodClock
 from su3d_bench.core.types import Detections, Frame, SceneInfo
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run, read_update_times
 
 WORDS = ["run", "--scenes", f"{SCENES}/painted.py:Painted/a", "--methods", f"{__file__}:Delayed"]
@@ -80,7 +80,7 @@ class Delayed(Collector):
 
 def made_in(folder: Path, *words: str, delay: str = "") -> Path:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
+        see_painted(patch)
         patch.setenv("PAINTED_DELAY", delay)
         assert main([*WORDS, *words, "--out", str(folder)]) == 0
     return folder

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from literal_paper import Array
@@ -16,8 +15,7 @@ NAMES = ("chair", "sofa", "table", "oven", "armchair", "vase")
 DIMENSIONS = 6
 
 
-@dataclass(frozen=True)
-class Problem:
+class Problem(NamedTuple):
     settings: OpenSU3DConfig
     images: tuple[tuple[Frame, Detections], ...]
 

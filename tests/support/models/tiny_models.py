@@ -22,12 +22,10 @@ SAM_PX = 64
 
 def write_models(root: Path) -> Path:
     """Folders of tiny SAM and GroundingDINO in the hub's form under the names that they are looked for."""
-    tiny_sam().save_pretrained(root / "sam-vit-h")
-    (root / "sam-vit-h" / "preprocessor_config.json").write_text("{}")
-    detector = root / "grounding-dino"
-    tiny_dino().save_pretrained(detector)
-    (detector / "preprocessor_config.json").write_text("{}")
-    tiny_tokenizer(detector).save_pretrained(detector)
+    for name, model in (("sam-vit-h", tiny_sam()), ("grounding-dino", tiny_dino())):
+        model.save_pretrained(root / name)
+        (root / name / "preprocessor_config.json").write_text("{}")
+    tiny_tokenizer(root / "grounding-dino").save_pretrained(root / "grounding-dino")
     return root
 
 
@@ -69,13 +67,9 @@ def frame_of(rgb: UInt8Array, index: int = 0) -> Frame:
 
 def noise_images(n: int, seed: int = 0) -> list[UInt8Array]:
     """RGB images of different sizes, one of them a single pixel high, in colours that differ."""
-    random = np.random.default_rng(seed)
-    sizes = [(1, 9), (50, 20), (33, 90), (64, 64), (120, 45)]
-    return [
-        random.integers(0, 256, (*sizes[k % len(sizes)], 3), dtype=np.uint8) // 2
-        + random.integers(0, 128, 3, dtype=np.uint8)
-        for k in range(n)
-    ]
+    rng = np.random.default_rng(seed)
+    sizes = [((1, 9), (50, 20), (33, 90), (64, 64), (120, 45))[k % 5] for k in range(n)]
+    return [rng.integers(0, 256, (*size, 3), np.uint8) // 2 + rng.integers(0, 128, 3, np.uint8) for size in sizes]
 
 
 # ---- SAM

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from painted import colour_perception
+from painted_runs import see_painted
 
 if TYPE_CHECKING:
     from su3d_bench.sheets.sources import RunSource
@@ -20,11 +20,10 @@ def painted_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from made_sheets import RUN
 
     from su3d_bench.cli.main import main
-    from su3d_bench.runs import scene as scene_run
 
     path = tmp_path_factory.mktemp("sheets")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
+        see_painted(patch)
         patch.setenv("SU3D_DATA", str(path / "data"))
         patch.chdir(path)
         assert main(RUN) == 0
