@@ -261,7 +261,7 @@ def test_every_cell_of_the_notebook_runs(rooms_data: Path, tmp_path: Path, monke
     monkeypatch.setenv("SU3D_DATA", str(rooms_data))
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
-    book = nbformat.read(NOTEBOOK, as_version=4)
+    book = nbformat.read(NOTEBOOK, as_version=4)  # type: ignore[no-untyped-call]
     client = nbclient.NotebookClient(book, timeout=None, resources={"metadata": {"path": str(tmp_path)}})
     client.execute()
     shown = {

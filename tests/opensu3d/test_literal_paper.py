@@ -74,9 +74,10 @@ def unlike(found: Instances, k: int, thing: Thing) -> Iterator[str]:
     if (found.names[k], found.captions[k]) != (thing.name, thing.caption):
         yield f"'{found.names[k]}', '{found.captions[k]}', the paper has '{thing.name}', '{thing.caption}'"
     values = {"feature": thing.feature, "box": thing.box, "centroid": thing.centroid, "score": 1.0}
-    for what, ours in zip(values, (found.features, found.boxes, found.centroids, found.scores), strict=True):
-        if not np.allclose(ours[k], values[what], rtol=1e-5, atol=1e-5):
-            yield f"{what} {ours[k]}, the paper has {values[what]}"
+    for what, of_paper in values.items():
+        ours = getattr(found, "boxes" if what == "box" else f"{what}s")[k]
+        if not np.allclose(ours, of_paper, rtol=1e-5, atol=1e-5):
+            yield f"{what} {ours}, the paper has {of_paper}"
 
 
 def both(problem: Problem) -> tuple[OpenSU3D, PaperProgram]:
