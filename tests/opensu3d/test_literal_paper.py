@@ -73,7 +73,12 @@ def unlike(found: Instances, k: int, thing: Thing) -> Iterator[str]:
         yield f"views {views}, the paper has {thing.views}"
     if (found.names[k], found.captions[k]) != (thing.name, thing.caption):
         yield f"'{found.names[k]}', '{found.captions[k]}', the paper has '{thing.name}', '{thing.caption}'"
-    values = {"feature": thing.feature, "box": thing.box, "centroid": thing.centroid, "score": 1.0}
+    values: dict[str, Array | float] = {
+        "feature": thing.feature,
+        "box": thing.box,
+        "centroid": thing.centroid,
+        "score": 1.0,
+    }
     for what, of_paper in values.items():
         ours = getattr(found, "boxes" if what == "box" else f"{what}s")[k]
         if not np.allclose(ours, of_paper, rtol=1e-5, atol=1e-5):
