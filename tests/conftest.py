@@ -19,10 +19,8 @@ MOST_KEPT_BYTES = 4 << 30
 sys.path += sorted({str(file.parent) for file in TESTS.rglob("*.py")} - {*sys.path})
 
 from chat_server import ChatServer  # noqa: E402 (it is found by the line above)
-from painted import colour_perception  # noqa: E402
+from painted_runs import see_painted  # noqa: E402
 from painted_sheets import painted_folder, painted_source  # noqa: E402, F401
-
-from su3d_bench.runs import scene  # noqa: E402
 
 # Tables are folded for who says how wide he sees them, as pytest-xdist does to its workers.
 os.environ.pop("COLUMNS", None)
@@ -52,7 +50,7 @@ def rooms_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def painted_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder to work in, where this process sees painted scenes."""
-    monkeypatch.setattr(scene, "build_perception", colour_perception)
+    see_painted(monkeypatch)
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -81,7 +79,6 @@ def chat_of_module() -> Iterator[ChatServer]:
 @pytest.fixture
 def chat(chat_of_module: ChatServer, monkeypatch: pytest.MonkeyPatch) -> ChatServer:
     """A language model's server as it was before any question; the test says what it answers."""
-    pytest.importorskip("openai", reason="the models extra is not installed")
     monkeypatch.delenv("OPENAI_BASE_URL", raising=False)
     chat_of_module.forget()
     return chat_of_module

@@ -29,7 +29,6 @@ from export_onnx import export_encoder
 from measured import write_measured
 from numpy.typing import NDArray
 from tiny_models import DINO_PX, SAM_PX, blocks, noise_images, tiny_dino, tiny_sam, tiny_tokenizer, write_tiny_clip
-from torch_devices import TORCH_ON_CPU
 
 from su3d_bench.cli.main import main as command_line
 from su3d_bench.core.errors import ConfigError, ModelMissing
@@ -44,6 +43,7 @@ from su3d_bench.perception.models.masks.grounding_dino import GroundingDino
 from su3d_bench.perception.models.masks.sam import Sam, TorchSam
 
 REPEATS = 5
+TORCH_ON_CPU = "cpu:0"  # not "cpu", for which the package does without torch
 CLIP = "clip-vit-h-14"
 TEXTS = ("a chair in a scene", "the lamp", "tv screen", "a red cup on the table")
 Arrays = Iterable[NDArray[Any]]

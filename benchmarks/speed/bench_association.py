@@ -86,7 +86,8 @@ def test_cropped_ckdtree(benchmark: BenchmarkFixture, n_scene: int) -> None:
 
 def match_by_open3d(scene: Float64Array, frame: Float64Array) -> int:
     """Builds the tree over the whole scene, as an update that finds a new map must; gives the number of matches."""
-    open3d = pytest.importorskip("open3d")
+    import open3d
+
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(scene))
     tree = open3d.geometry.KDTreeFlann(cloud)
     return sum(tree.search_hybrid_vector_3d(point, EPS, 1)[0] for point in frame)

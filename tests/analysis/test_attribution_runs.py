@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from painted import WordEncoder
-from painted_runs import painted_run
+from painted_runs import painted_run, see_painted
 from scored_room import ENCODER, NAMES, instances, noisy, room, truth_as_prediction
 
 from su3d_bench.analysis.attribution import attribute
@@ -32,7 +31,6 @@ from su3d_bench.metrics.attribution.masks import (
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names
 from su3d_bench.metrics.scoring import score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
-from su3d_bench.runs import finished as finished_run
 
 ROOM_RULES = load_protocol("rooms-semantic")
 EXPLAINED = [
@@ -176,7 +174,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def _in_folder(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(runs)
-    monkeypatch.setattr(finished_run, "encoder_of", lambda run, device: WordEncoder())
+    see_painted(monkeypatch)
 
 
 def attributed(run: str, **more: Any) -> dict[str, Any]:

@@ -9,14 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from painted import WordEncoder
-from painted_runs import COLLECTOR, painted_run
+from painted_runs import COLLECTOR, painted_run, see_painted
 
 from su3d_bench.analysis.leaderboard import leaderboard
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.metrics.protocols.loading import load_protocol, protocol_names, read_rules
-from su3d_bench.runs import finished
 from su3d_bench.runs.finished import read_run
 
 
@@ -49,7 +47,7 @@ VERBS = {
 def test_a_verb_knows_the_rules_by_their_name(
     verb: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(finished, "encoder_of", lambda run, device: WordEncoder())
+    see_painted(monkeypatch)
     places = {"first": made / "first", "second": made / "second", "out": tmp_path}
     assert main([word.format(**places) for word in VERBS[verb]]) == 0, capsys.readouterr().err
     written = "".join(file.read_text() for file in tmp_path.iterdir() if file.is_file())

@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from painted import WordEncoder
-from painted_runs import COLLECTOR, painted_run
+from painted_runs import COLLECTOR, painted_run, see_painted
 
 from su3d_bench.analysis.rules_walk import Walker
 from su3d_bench.cli.main import main
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.runs import finished
 from su3d_bench.runs.finished import read_run
 
 
@@ -25,7 +23,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def _words(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(finished, "encoder_of", lambda run, device: WordEncoder())
+    see_painted(monkeypatch)
 
 
 def test_from_the_number_of_the_run_each_rule_gets_what_it_moves_and_the_way_back_is_its_reverse(

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from painted import WordEncoder
-from painted_runs import COLLECTOR, painted_run
+from painted_runs import COLLECTOR, painted_run, see_painted
 from scored_room import ENCODER, noisy
 
 from su3d_bench.analysis.attribution import attribute
@@ -34,7 +33,7 @@ from su3d_bench.runs import finished as finished_run
 def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Two methods over two painted scenes; one loses an object of each."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
+        see_painted(patch)
         folder, methods = tmp_path_factory.mktemp("samples") / "run", (COLLECTOR, "oracle")
         yield painted_run(folder, "--quiet", "--set", "collector.drop=1", methods=methods)
 
@@ -154,7 +153,8 @@ def test_the_verb_writes_one_row_each(run: Path, tmp_path: Path, capsys: pytest.
 
 
 def test_parquet_holds_the_same_with_what_each_column_means(run: Path, tmp_path: Path) -> None:
-    parquet = pytest.importorskip("pyarrow.parquet", reason="the parquet extra is not installed")
+    from pyarrow import parquet
+
     file = tmp_path / "samples.parquet"
     assert main(["report", "samples", str(run), "--out", str(file), "--quiet"]) == 0
     table = parquet.read_table(file)

@@ -14,15 +14,13 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
-from painted import WordEncoder
-from painted_runs import painted_run
+from painted_runs import painted_run, see_painted
 
 from su3d_bench.analysis import timeline as places
 from su3d_bench.analysis.page.maps import Spaces
 from su3d_bench.analysis.timeline import MOST_POINTS, SEEN_M, Recording, SceneTimeline, in_view
 from su3d_bench.cli.main import main
 from su3d_bench.core.types import Frame
-from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs.finished import read_run
 from su3d_bench.store.records import read_updates
 
@@ -36,7 +34,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def _words_are_known(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
+    see_painted(monkeypatch)
 
 
 @dataclass(frozen=True)
@@ -171,7 +169,6 @@ def test_what_is_logged_reaches_the_viewers_library_at_its_place_and_moment() ->
 def test_the_file_is_read_back_and_nothing_else_is_written_or_asked(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip("rerun", reason="the rerun extra is not installed")
     home = tmp_path / "home"
     home.mkdir()
     monkeypatch.setenv("HOME", str(home))

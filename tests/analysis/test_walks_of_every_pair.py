@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from replica_scene import first_pose, write_clouds
-from scanned_stage import write_scene
+from written_scenes import write_scene
 
 from su3d_bench.analysis.attribution import Inputs
 from su3d_bench.analysis.rules_walk import KINDS, Walker

@@ -13,14 +13,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from painted import WordEncoder, colour_perception
+from painted_runs import see_painted
 from places import ROOT, SCENES
 
 import su3d_bench as su3d
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import RunIncomplete
-from su3d_bench.runs import finished as finished_run
-from su3d_bench.runs import scene as scene_run
 
 SMALL = {"rooms.n_frames": 80, "rooms.width": 160, "rooms.height": 120}
 PAINTED, COLLECTOR = f"{SCENES}/painted.py:Painted", f"{SCENES}/painted.py:Collector"
@@ -99,8 +97,7 @@ def painted(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     words = ["run", "--scenes", f"{PAINTED}/*", "--methods", COLLECTOR, "oracle", "--protocols", *BOTH]
     words += ["--set", "collector.drop=1"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
-        patch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
+        see_painted(patch)
         assert main([*words, "--jobs", "1", "--no-pictures", "--quiet", "--out", str(folder)]) == 0
         yield folder
 
@@ -200,7 +197,7 @@ def test_a_script_without_a_guard_starts_workers_and_runs_once(tmp_path: Path) -
 def test_scenes_that_fail_are_an_error_and_the_others_are_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    see_painted(monkeypatch)
     events = list[str]()
     with pytest.raises(RunIncomplete, match=r"1 of 2 scenes failed, the first with: .*frame 2 is missing.*load_run"):
         su3d.run(
@@ -258,13 +255,13 @@ def test_the_notebook_is_kept_without_answers() -> None:
 
 @pytest.mark.proof
 def test_every_cell_of_the_notebook_runs(rooms_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    nbclient = pytest.importorskip("nbclient", reason="nbclient and ipykernel come with the test extra")
-    pytest.importorskip("ipykernel", reason="nbclient and ipykernel come with the test extra")
-    nbformat = pytest.importorskip("nbformat", reason="nbformat comes with nbclient")
+    import nbclient
+    import nbformat
+
     monkeypatch.setenv("SU3D_DATA", str(rooms_data))
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("IPYTHONDIR", str(tmp_path / "ipython"))
-    book = nbformat.read(NOTEBOOK, as_version=4)
+    book = nbformat.read(NOTEBOOK, as_version=4)  # type: ignore[no-untyped-call]
     client = nbclient.NotebookClient(book, timeout=None, resources={"metadata": {"path": str(tmp_path)}})
     client.execute()
     shown = {

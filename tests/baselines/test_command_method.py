@@ -5,26 +5,90 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from made_programs import MASKS, SCENE, SURFACE, fed, frames, method, program, refused
-from painted import ColourPerception, colour_perception
+from painted import ColourPerception, Painted
+from painted_runs import see_painted
 from places import SCENES
 
 from su3d_bench.baselines.command.folders import FrameFolder, class_names
 from su3d_bench.baselines.command.method import Command, CommandConfig, check_placeholders
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.errors import DataError, PredictionError
+from su3d_bench.core.interfaces import SceneTools
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.system.timing import Timer
+from su3d_bench.core.types import Frame, SceneInfo, Surface
 from su3d_bench.datasets.rgbd.dataset import Rgbd
 from su3d_bench.predictions.base import vertex_masks
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.frame_loop import no_detections
+
+SCENE = SceneInfo("rooms", "a b", 6, 1, "rendered-rooms", seed=7)
+SURFACE = Surface(
+    np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 2], [3, 0, 0]], np.float32),
+    np.array([[0, 1, 2], [0, 1, 3]], np.int32),
+)
+# Two masks over five vertices as ScanNet's text has them, with the class ids of chair and wall in the rooms.
+MASKS = """
+import os, sys
+out = sys.argv[1]
+os.mkdir(out + "/masks")
+open(out + "/scene.txt", "w").write("masks/0.txt 20 0.9\\nmasks/1.txt 93 0.5\\n")
+open(out + "/masks/0.txt", "w").write("1\\n1\\n0\\n0\\n0\\n")
+open(out + "/masks/1.txt", "w").write("0\\n0\\n0\\n1\\n1\\n")
+"""
+
+
+def frames(n: int = 3) -> list[Frame]:
+    dataset = Painted(Path(), Painted.Options(n_frames=n))
+    return list(dataset.frames("a", 1))
+
+
+def program(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "program.py"
+    path.write_text(text)
+    return path
+
+
+def method(tmp_path: Path, text: str, *words: str, surface: Surface | None = SURFACE, **config: Any) -> Command:
+    """The method around the Python program ``text``, fed with three frames."""
+    command = (sys.executable, str(program(tmp_path, text)), *(words or ("{output}",)))
+    return fed(Command(CommandConfig(command=command, **config)), surface)
+
+
+def fed(
+    one: Command,
+    surface: Surface | None = SURFACE,
+    shots: Sequence[Frame] | None = None,
+    scene: SceneInfo = SCENE,
+) -> Command:
+    def give() -> Surface:
+        if surface is None:
+            raise DataError("rooms/a b: the dataset has no mesh")
+        return surface
+
+    shots = frames() if shots is None else shots
+    one.receive_tools(SceneTools(shots, None, give))  # type: ignore[arg-type]
+    one.start(scene)
+    for frame in shots:
+        one.update(frame, no_detections(frame, one.needs), Timer())
+    return one
+
+
+def refused(one: Command) -> str:
+    with pytest.raises(PredictionError) as caught:
+        one.finish()
+    text = str(caught.value)
+    assert "\n" not in text
+    assert "\x1b" not in text
+    assert len(text) < 700
+    one.close()
+    return text
 
 
 def test_the_exported_folder_reads_back_as_the_frames_that_went_in(tmp_path: Path) -> None:
@@ -236,7 +300,7 @@ def test_another_version_of_the_program_is_another_run(tmp_path: Path) -> None:
 def test_a_run_scores_a_program_keeps_its_words_and_refuses_another_version_of_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    see_painted(monkeypatch)
     monkeypatch.setattr(ColourPerception, "regions", lambda self: None, raising=False)
     monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
     text = """

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from made_programs import MASKS, fed, refused
+from test_command_method import MASKS, fed, refused
 from waiting import wait_until
 
 from su3d_bench.baselines.command.method import Command, CommandConfig

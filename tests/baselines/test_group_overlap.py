@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
-from grouped_clouds import cloud, ids, nearest_by_brute_force, patch, row
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from places import CASES
@@ -26,8 +27,43 @@ from su3d_bench.baselines.sam3d.overlap import (
     without_small_groups,
 )
 from su3d_bench.core.system.timing import Timer
+from su3d_bench.core.types import Float64Array, Int64Array
 
 RULES = MergeRules()
+
+
+def ids(*values: int) -> Int64Array:
+    return np.array(values, np.int64)
+
+
+def cloud(points: object, group: object, view_group: Sequence[int] = (), views: Sequence[int] = ()) -> GroupedCloud:
+    return GroupedCloud(
+        np.array(points, np.float64).reshape(-1, 3), np.array(group, np.int64), ids(*view_group), ids(*views)
+    )
+
+
+def row(*centres: float) -> Float64Array:
+    """Points along x at these centimetres."""
+    return np.array([[x / 100, 0, 0] for x in centres]).reshape(-1, 3)
+
+
+def patch(n_x: int, n_y: int, x: int = 0, y: int = 0) -> Float64Array:
+    """Centres of the 5 cm voxels from (x, y) on, in the plane z = 0.02 m."""
+    grid = np.stack(np.meshgrid(np.arange(x, x + n_x), np.arange(y, y + n_y), indexing="ij"), -1).reshape(-1, 2)
+    return np.column_stack([(grid + 0.5) * 0.05, np.full(len(grid), 0.02)])
+
+
+def nearest_by_brute_force(queries: Float64Array, points: Float64Array, radius_m: float) -> list[tuple[int, int]]:
+    """Pairs by comparing every two points in float32; the first of equals, the radius itself is too far."""
+    pairs = []
+    held = points.astype(np.float32)
+    for i, query in enumerate(queries.astype(np.float32)):
+        offset = query - held
+        squared = offset[:, 0] * offset[:, 0] + offset[:, 1] * offset[:, 1] + offset[:, 2] * offset[:, 2]
+        best = int(np.argmin(squared))
+        if np.sqrt(squared[best]) < np.float32(radius_m):
+            pairs.append((i, best))
+    return pairs
 
 
 def frames_of(case: np.lib.npyio.NpzFile) -> list[GroupedCloud]:

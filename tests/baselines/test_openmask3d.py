@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from prediction_files import write_openyolo3d
-from proposals_by_hand import made_proposals
+from test_proposals import made_proposals
 
 from su3d_bench.baselines.openmask3d.method import (
     MaskViews,

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from prediction_files import write_openmask3d, write_openyolo3d, write_scannet_text
-from proposals_by_hand import made_proposals
 from test_mesh_segments import sheet
 
 from su3d_bench.baselines.openmask3d.method import OpenMask3D, OpenMask3DConfig
@@ -38,6 +38,16 @@ SCENE: dict[str, Any] = {
     "labels": np.array([0, 0, 0]),
     "files": [f"pred_mask/room0_{k}.txt" for k in range(3)],
 }
+
+
+def made_proposals(points: np.ndarray, *masks: Sequence[int], scores: Sequence[float] | None = None) -> Proposals:
+    return Proposals(
+        points=points.astype(np.float32),
+        indptr=np.cumsum([0, *(len(mask) for mask in masks)]).astype(np.int64),
+        indices=np.array([k for mask in masks for k in mask], np.int32),
+        scores=np.ones(len(masks)) if scores is None else np.array(scores, np.float64),
+        source="made",
+    )
 
 
 def choice(most: int, min_points: int, max_share: float, same_iou: float) -> ProposalConfig:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from grouped_clouds import Plate, look
+from plates import Plate, axis, contents, look
 
 from su3d_bench.baselines.sam3d.method import SAM3D, SAM3DConfig
 from su3d_bench.core.errors import DataError
@@ -18,8 +18,14 @@ from su3d_bench.core.types import Detections, Frame, SceneInfo, Surface
 
 SCENE = SceneInfo("made", "plates", 4, 1, "rendered-rooms")
 TREE, INCREMENTAL = SAM3DConfig(), SAM3DConfig(schedule="incremental")
-LEFT, RIGHT = Plate((-0.6, 0.0)), Plate((0.0, 0.6))
 Views = Sequence[tuple[Frame, Detections]]
+
+
+def plate(low: float, high: float, k: int = 0, name: str = "left") -> Plate:
+    return Plate((low, high), (-0.5, 0.5), 2.0, axis(k), name, score=0.5, bend_m=0.0)
+
+
+LEFT, RIGHT = plate(-0.6, 0.0), plate(0.0, 0.6, name="right")
 
 
 def tools_with(surface: Callable[[], Surface]) -> SceneTools:
@@ -42,11 +48,6 @@ def run(views: Views, config: SAM3DConfig = TREE, surface: Surface | None = None
     return method
 
 
-def contents(found: Instances) -> tuple[object, ...]:
-    parts = (found.points, found.indptr, found.indices, found.scores, found.features, found.views, found.view_indptr)
-    return (*(np.asarray(part).tobytes() for part in parts), found.names, found.captions)
-
-
 def views_of(found: Instances, k: int) -> list[tuple[int, int]]:
     return [tuple(row) for row in found.views[found.view_indptr[k] : found.view_indptr[k + 1]].tolist()]
 
@@ -57,14 +58,14 @@ def test_one_plate_in_many_frames_is_one_group_with_all_its_views(config: SAM3DC
     assert len(found) == 1
     assert views_of(found, 0) == [(index, 0) for index in range(5)]
     assert found.scores.tolist() == [1.0]
-    assert found.view_names == ("plate 0",) * 5 and np.asarray(found.view_scores).tolist() == [0.5] * 5
+    assert found.view_names == ("left",) * 5 and np.asarray(found.view_scores).tolist() == [0.5] * 5
     assert found.boxes[0] == pytest.approx(np.array([[-0.6, -0.5, 2], [0, 0.5, 2]]), abs=0.05)
 
 
 @pytest.mark.parametrize("config", [TREE, INCREMENTAL])
 def test_one_mask_over_both_joins_plates_whose_features_are_opposed(config: SAM3DConfig) -> None:
-    apart = [look([LEFT, replace(RIGHT, axis=1)], 0)]
-    both = look([Plate((-0.6, 0.6), axis=2)], 1)
+    apart = [look([LEFT, replace(RIGHT, feature=axis(1))], 0)]
+    both = look([plate(-0.6, 0.6, 2)], 1)
     found = run([*apart, both], config).finish()
     assert len(found) == 1
     assert views_of(found, 0) == [(0, 1), (0, 0), (1, 0)]  # the last mask of an image is its first group
@@ -73,8 +74,8 @@ def test_one_mask_over_both_joins_plates_whose_features_are_opposed(config: SAM3
 def test_the_order_of_merging_decides() -> None:
     # A strip over the seam of two plates joins both where it comes alone. Merged with the right plate first it is
     # mostly that plate, and what it shares with the left one is too little.
-    left, right, strip = Plate((-1, 0)), Plate((0, 1)), Plate((-0.2, 0.2))
-    views = [look([plate], index) for index, plate in enumerate((left, right, strip, right))]
+    left, right, strip = plate(-1, 0), plate(0, 1), plate(-0.2, 0.2)
+    views = [look([one], index) for index, one in enumerate((left, right, strip, right))]
     assert len(run(views, SAM3DConfig(ratio=0.4)).finish()) == 2
     assert len(run(views, SAM3DConfig(ratio=0.4, schedule="incremental")).finish()) == 1
 
@@ -91,15 +92,15 @@ def test_finish_midway_changes_nothing(config: SAM3DConfig) -> None:
 
 def test_a_feature_is_the_mean_of_the_views_or_that_of_the_largest() -> None:
     views = [
-        look([replace(LEFT, axis=0)], 0),
-        look([replace(LEFT, axis=1)], 1),
-        look([Plate((-0.7, 0.1), axis=1)], 2),
+        look([LEFT], 0),
+        look([replace(LEFT, feature=axis(1))], 1),
+        look([plate(-0.7, 0.1, 1)], 2),
     ]
     mean = run(views).finish()
     assert np.asarray(mean.features) == pytest.approx(np.array([[1, 2, 0, 0]]) / 5**0.5)
     largest = run(views, SAM3DConfig(features="largest-view")).finish()
     assert np.asarray(largest.features).tolist() == [[0, 1, 0, 0]]
-    assert largest.names == mean.names == ("plate 0",)
+    assert largest.names == mean.names == ("left",)
     assert "largest-view" in SAM3D(SAM3DConfig(features="largest-view")).caveat
 
 
@@ -127,12 +128,12 @@ def test_the_map_is_on_the_meshs_vertices_and_none_is_taken_beyond_the_limit() -
 
 def test_the_ensemble_gives_segments_whole_to_the_group_that_claims_them() -> None:
     mesh = grid_mesh((-0.6, 0.6))
-    views = [look([replace(LEFT, axis=1), replace(RIGHT, axis=2)], 0)]
+    views = [look([replace(LEFT, feature=axis(1)), replace(RIGHT, feature=axis(2))], 0)]
     apart = run(views, surface=mesh).finish()
     found = run(views, SAM3DConfig(ensemble=True), mesh).finish()
     # The seam of the groups at x = 0 moves to that of the segments at 0.1.
     seams = [max(mesh.vertices[each.mask(k)][:, 0].min() for k in range(2)) for each in (apart, found)]
     assert seams == [pytest.approx(0, abs=0.03), pytest.approx(0.1, abs=0.001)]
-    assert set(found.names) == {"plate 0", "plate 1"}
-    right = found.names.index("plate 1")
+    assert set(found.names) == {"left", "right"}
+    right = found.names.index("right")
     assert np.asarray(found.features)[right].tolist() == [0, 0, 1, 0] and views_of(found, right) == [(0, 1)]

@@ -168,7 +168,6 @@ def test_wrong_input_is_one_line(job: JobFolder, capsys: pytest.CaptureFixture[s
 def test_a_missing_key_is_one_line(
     job: JobFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip("openai", reason="the models extra is not installed")
     monkeypatch.delenv("OPENAI_API_KEY")
     assert main(["query", "ask", SCENE, "x", "--solver", "llm"]) == 2
     assert "su3d-bench: $OPENAI_API_KEY is not set" in capsys.readouterr().err

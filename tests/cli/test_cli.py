@@ -11,15 +11,12 @@ from typing import Any
 
 import pytest
 from fuzz_words import verbs
-from painted import colour_perception
 from places import SCENES
 
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.cli.output import answer_either, file_name_of, file_name_of_scene
 from su3d_bench.core.errors import EXIT_INTERNAL, ConfigError
 from su3d_bench.reports.pictures import maps
-from su3d_bench.runs import finished as finished_run
-from su3d_bench.runs import scene as scene_run
 
 PAINTED = f"{SCENES}/painted.py:Painted"
 COLLECTOR = f"{SCENES}/painted.py:Collector"
@@ -33,11 +30,7 @@ HEAVY = (
 AT_START = (*HEAVY, "numpy", "pydantic", "rich", "multiprocessing", "zipfile", "traceback", "difflib", "hashlib")
 
 
-@pytest.fixture(autouse=True)
-def _elsewhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
+pytestmark = pytest.mark.usefixtures("painted_place")
 
 
 @pytest.mark.parametrize(
@@ -208,7 +201,6 @@ def test_pictures_of_different_texts_and_scenes_have_different_names() -> None:
 def test_a_query_ranks_the_map_and_draws_it(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(finished_run, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
     assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a"]) == 0
     capsys.readouterr()
     words = ["query", "text", "painted/a", "a red sofa", "--method", "collector"]
@@ -237,10 +229,7 @@ def test_a_query_ranks_the_map_and_draws_it(
     assert Path("here/heat.png").is_file()
 
 
-def test_a_map_without_features_cannot_be_queried(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(finished_run, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
+def test_a_map_without_features_cannot_be_queried(capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a", "--quiet"]) == 0
     capsys.readouterr()
     assert main(["query", "text", "painted/a", "sofa", "--method", "oracle"]) == 2

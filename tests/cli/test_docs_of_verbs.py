@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from fuzz_words import verbs
 from places import ROOT
 from verbs_page import MORE, PAGE, page
@@ -118,7 +119,6 @@ PINNED = re.compile(r"actions/(setup-python@v5|cache@v4|upload-artifact@v4)")
 
 @pytest.fixture(scope="module")
 def action() -> Any:
-    yaml = pytest.importorskip("yaml", reason="PyYAML comes with transformers and ray")
     return yaml.safe_load(ACTION.read_text())
 
 

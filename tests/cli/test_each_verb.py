@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Iterator
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -40,11 +39,7 @@ CASES: dict[str, tuple[str, int, str]] = {
     "report timing": ("out --out timing", 0, "timing/timing.md"),
     "report html": ("out --no-maps --out page.html", 0, "page.html"),
     "report samples": ("out --out samples.csv", 0, "predicted instances"),
-    "report rerun": (
-        ("out --out out.rrd", 0, "out.rrd")
-        if find_spec("rerun") is not None
-        else ("out --out out.rrd", 2, "pip install 'su3d-bench[rerun]'")
-    ),
+    "report rerun": ("out --out out.rrd", 0, "out.rrd"),
     "report leaderboard": ("out --out board.md", 0, "board.md"),
     "report bundle": ("out --out registry/bundles/mine.zip", 0, "registry/bundles/mine.zip"),
     "report verify": ("tables.tex", 0, ""),

@@ -16,8 +16,6 @@ from su3d_bench.core.maps import Instances, Partition
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.predictions.base import VertexMasks
 from su3d_bench.predictions.formats import READERS, recognise
-from su3d_bench.runs import finished as finished_run
-from su3d_bench.runs import scene as scene_run
 
 PAINTED, COLLECTOR = f"{SCENES}/painted.py:Painted", f"{SCENES}/painted.py:Collector"
 RULES = load_protocol("rooms-instance")
@@ -30,12 +28,8 @@ def read_text(folder: Path, scene: str) -> VertexMasks:
 
 
 @pytest.fixture
-def run_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> str:
+def run_folder(painted_place: Path) -> str:
     """A finished run of two scenes by two methods."""
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    monkeypatch.setattr(finished_run, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
     words = ["run", "--scenes", f"{PAINTED}/a", f"{PAINTED}/b", "--methods", COLLECTOR, "oracle", "--jobs", "1"]
     assert main([*words, "--protocols", "rooms-instance", "--no-pictures", "--quiet", "--out", "r"]) == 0
     return "r"

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from painted import colour_perception
+from painted_runs import see_painted
 from places import SCENES
 
 from su3d_bench.cli.main import main
@@ -61,7 +61,7 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a finished run of two scenes, pictures drawn, in ``runs/demo``."""
     folder = tmp_path_factory.mktemp("kept")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
+        see_painted(patch)
         patch.chdir(folder)
         patch.setenv("SU3D_CACHE", str(folder / "cache"))
         assert main(f"{SAME} --jobs 1 --quiet".split()) == 0
@@ -71,7 +71,7 @@ def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def _painted(kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    see_painted(monkeypatch)
     monkeypatch.chdir(kept)
     monkeypatch.setenv("SU3D_CACHE", str(kept / "cache"))
     monkeypatch.setenv("SU3D_MODELS", str(kept / "no-models"))

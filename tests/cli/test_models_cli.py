@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import socket
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -22,10 +21,6 @@ from su3d_bench.perception.models.loading import load_encoder
 from su3d_bench.runs.finished import encoder_of
 from su3d_bench.store.run_folder import RunFolder
 
-needs_models = pytest.mark.skipif(
-    any(find_spec(name) is None for name in ("torch", "transformers", "onnx")),
-    reason="torch, transformers or onnx is not installed: pip install 'su3d-bench[models]'",
-)
 HEAVY = ("torch", "transformers", "onnxruntime", "open3d", "sklearn", "pandas", "matplotlib", "numba")
 
 
@@ -66,7 +61,6 @@ def test_the_list_names_every_model_with_size_licence_and_that_it_is_missing(
     assert f"{len(MODELS)} missing; su3d-bench models check clip-vit-h-14 says what to fetch" in err
 
 
-@needs_models
 def test_check_tells_the_digests_of_a_whole_model(found: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["models", "check"]) == 0
     out = capsys.readouterr().out
@@ -78,7 +72,6 @@ def test_check_tells_the_digests_of_a_whole_model(found: Path, capsys: pytest.Ca
     assert all(f"{digest}  {name}" in out for name, digest in row["sha256"].items())
 
 
-@needs_models
 def test_check_names_what_is_wrong_and_answers_1(found: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (found / "config.json").write_text('{"model_type": "bert"}')
     assert main(["models", "check", "clip-vit-b-32"]) == 1
@@ -104,7 +97,6 @@ def test_what_cannot_be_done_is_one_line(words: list[str], said: str, capsys: py
     assert len(err.splitlines()) == 1
 
 
-@needs_models
 def test_warm_tells_time_and_memory_and_the_digest_of_run_records(
     found: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -126,7 +118,6 @@ def _finished_run(folder: Path, made_by: str | None, made_with: str) -> RunFolde
     return RunFolder(folder)
 
 
-@needs_models
 def test_a_query_reads_the_encoder_that_the_run_was_made_with(found: Path, home: Path) -> None:
     made = load_encoder(ModelsConfig(encoder="clip-vit-b-32", precision="bfloat16"))
     encoder = encoder_of(_finished_run(home / "run", made.name, made.digest))
@@ -135,7 +126,6 @@ def test_a_query_reads_the_encoder_that_the_run_was_made_with(found: Path, home:
     assert encoder.encode_texts(["chair"]).shape == (1, CLIP_DIM)
 
 
-@needs_models
 def test_a_query_over_features_of_other_weights_is_an_error(found: Path, home: Path) -> None:
     with pytest.raises(PredictionError, match=r"made by encoder ViT-B-32/openai \(000000000000\), here is ViT-B-32/op"):
         encoder_of(_finished_run(home / "run", "ViT-B-32/openai", "0" * 64))
@@ -145,7 +135,6 @@ def test_a_query_over_features_of_other_weights_is_an_error(found: Path, home: P
         encoder_of(_finished_run(home / "run", "ViT-L-14/openai", "0" * 64))
 
 
-@needs_models
 def test_an_evaluation_names_features_with_the_protocols_encoder_where_it_is_here(tiny_clip: Path, home: Path) -> None:
     rules = load_protocol("replica-conceptgraphs-ex6")
     assert "which is not here" in str(encoder_for(rules, CLIP_DIM, None, is_own=False))

@@ -10,11 +10,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from painted import colour_perception
+from painted_runs import see_painted
 from places import SCENES
 
 from su3d_bench.cli.main import main
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.run_folder import RunFolder
 
 PAINTED = f"{SCENES}/painted.py:Painted"
@@ -26,7 +25,7 @@ WORDS = ["--methods", COLLECTOR, "--protocols", "rooms-semantic", "--no-pictures
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
+        see_painted(patch)
         patch.chdir(folder)
         assert main(["run", f"{PAINTED}/a", *WORDS, "--out", "runs/one"]) == 0
         assert main(["run", f"{PAINTED}/[ab]", *WORDS, "--limit", "2", "--seed", "3", "--out", "runs/two"]) == 0
@@ -74,7 +73,7 @@ def test_a_run_shows_what_was_asked_for_and_the_command_that_it_shows_takes_it_u
     shown = json.loads(capsys.readouterr().out)
     assert shown["asked"]["limit"] == "2"
     before = Path("runs/two/run.json").read_bytes()
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    see_painted(monkeypatch)
     assert main([*shown["command"].split()[1:], "--jobs", "1"]) == 0
     assert Path("runs/two/run.json").read_bytes() == before
 

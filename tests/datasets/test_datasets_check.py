@@ -14,6 +14,7 @@ import painted
 import pytest
 from box_room import write_box_room, write_poses
 from painted import Painted
+from painted_runs import see_painted
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError, printable, printable_json
@@ -204,9 +205,8 @@ def test_the_command_caps_what_it_lists_and_ends_with_1(
 def test_the_digest_is_the_one_that_a_run_records(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from su3d_bench.runs import scene as scene_run
 
-    monkeypatch.setattr(scene_run, "build_perception", painted.colour_perception)
+    see_painted(monkeypatch)
     monkeypatch.setenv("SU3D_DATA", str(tmp_path))
     file = Path(painted.__file__)
     scene, options = f"{file}:Painted/a", ["--set", "painted.n_frames=3"]

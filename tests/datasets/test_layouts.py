@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scanned_stage import write_scene
+from written_scenes import write_scene
 
 from su3d_bench.cli.main import main
 from su3d_bench.core import registry

@@ -8,7 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from places import REAL_RECORDINGS, needs_recordings
 from scipy.spatial import cKDTree
 
 from su3d_bench.cli.main import main
@@ -20,7 +19,8 @@ from su3d_bench.datasets.rgbd.dataset import Rgbd
 from su3d_bench.datasets.tum.dataset import Tum
 from su3d_bench.store.predictions import read_prediction
 
-pytestmark = needs_recordings
+pytestmark = pytest.mark.recordings
+REAL_RECORDINGS = Path(os.environ.get("SU3D_RECORDINGS") or "no-recordings")
 FRAME_FILES = {
     "colour": "frame-{index}.color.png",
     "depth": "frame-{index}.depth.png",
@@ -50,6 +50,12 @@ SCENES = {
         "depth_unit_m": 1e-3,
     },
 }
+
+
+@pytest.fixture(autouse=True)
+def _recordings() -> None:
+    if not REAL_RECORDINGS.is_dir():
+        pytest.fail("SU3D_RECORDINGS names no folder of real recordings (see CONTRIBUTING.md)", pytrace=False)
 
 
 @pytest.fixture

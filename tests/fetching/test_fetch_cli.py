@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from box_room import write_box_room
 from file_server import FileServer, Served, entry, serve_file, serve_model, serve_replica, write_table
+from huggingface_hub import constants
 from scannet_scan import write_scan
 
 from su3d_bench.cli.main import main
@@ -141,7 +142,6 @@ def test_a_mirror_gives_the_files_that_the_table_states(
 def test_a_model_of_the_hub_comes_whole_by_its_stated_checksums(
     server: FileServer, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    constants = pytest.importorskip("huggingface_hub.constants", reason="the models extra is not installed")
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
     made = tmp_path / "made"
     made.mkdir()
@@ -166,7 +166,6 @@ def test_a_model_of_the_hub_comes_whole_by_its_stated_checksums(
 def test_what_the_hub_cannot_give_is_one_line(
     server: FileServer, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    constants = pytest.importorskip("huggingface_hub.constants", reason="the models extra is not installed")
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
     (tmp_path / "made").mkdir()
     (tmp_path / "made/config.json").write_text("{}")

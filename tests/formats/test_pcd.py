@@ -79,7 +79,8 @@ def test_every_form_gives_the_points_back(tmp_path: Path, form: str) -> None:
 
 @pytest.mark.parametrize("form", ["ascii", "binary", "binary_compressed"])
 def test_what_open3d_writes_is_read(tmp_path: Path, form: str) -> None:
-    open3d = pytest.importorskip("open3d", reason="needs Open3D, whose files these are")
+    import open3d
+
     rng = np.random.default_rng(0)
     points = rng.normal(size=(5000, 3)).astype(np.float32).round(1)  # rounded, so that LZF finds repetitions
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
@@ -91,11 +92,12 @@ def test_what_open3d_writes_is_read(tmp_path: Path, form: str) -> None:
 
 
 def test_what_is_written_is_read_by_us_and_by_open3d(tmp_path: Path) -> None:
+    import open3d
+
     path = tmp_path / "a.pcd"
     points = np.random.default_rng(1).normal(size=(100, 3)).astype(np.float32)
     write_pcd_points(path, points)
     np.testing.assert_array_equal(read_pcd_points(path), points.astype(np.float64))
-    open3d = pytest.importorskip("open3d", reason="needs Open3D to read the file")
     np.testing.assert_array_equal(np.asarray(open3d.io.read_point_cloud(str(path)).points), points.astype(np.float64))
 
 

@@ -6,11 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from torch_devices import TORCH_ON_CPU, needs_torch, on_each_device
 
 from su3d_bench.cli.main import main
 from su3d_bench.metrics.matching.labelling import cosines, most_similar
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
+
+TORCH_ON_CPU = "cpu:0"  # torch's name of the CPU that is not "cpu", for which the package does without torch
+on_each_device = pytest.mark.parametrize("device", [TORCH_ON_CPU, pytest.param("cuda:0", marks=pytest.mark.gpu)])
 
 
 @on_each_device
@@ -40,7 +42,6 @@ def test_cosines_of_a_device_are_those_of_the_cpu(device: str) -> None:
 
 @on_each_device
 def test_the_embedded_encoder_gives_the_features_of_the_cpu_on_a_device(device: str) -> None:
-    pytest.importorskip("onnx", reason="needs onnx: pip install 'su3d-bench[models]'")
     rng = np.random.default_rng(2)
     images = [rng.integers(0, 256, (*size, 3), np.uint8) for size in ((12, 40), (64, 64), (200, 90))] * 13
     texts = ["chair", "a plant on the shelf", "the", ""]
@@ -50,14 +51,12 @@ def test_the_embedded_encoder_gives_the_features_of_the_cpu_on_a_device(device: 
     np.testing.assert_allclose(there.encode_texts(texts), here.encode_texts(texts), rtol=0, atol=tolerance)
 
 
-@needs_torch
 def test_a_run_on_a_gpu_that_is_not_here_ends_before_any_work_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import torch
 
-    if torch.cuda.is_available():
-        pytest.skip("this machine has a GPU")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert main(["run", "--device", "cuda", "--scenes", "rooms/living0", "--out", str(tmp_path / "run")]) == 2
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "device 'cuda': torch sees no GPU here; use --device cpu" in error

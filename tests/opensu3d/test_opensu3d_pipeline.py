@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from plates import contents
 
-from su3d_bench.core.maps import Instances
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, Frame, SceneInfo
 from su3d_bench.opensu3d.config import OpenSU3DConfig
@@ -33,11 +33,10 @@ def look(
     plates: Mapping[int, Plate],
     index: int,
     camera_x: float = 0.0,
-    hidden: tuple[int, ...] = (),
     names: Mapping[int, str] | None = None,
     scores: Mapping[int, float] | None = None,
 ) -> tuple[Frame, Detections]:
-    """A frame of plates before a wall at 3 m; detections in ascending key, without the hidden ones."""
+    """A frame of plates before a wall at 3 m; detections in ascending key."""
     u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     depth, owner = np.full((HEIGHT, WIDTH), 3.0), np.zeros((HEIGHT, WIDTH), np.int64)
     for key, plate in plates.items():
@@ -45,7 +44,7 @@ def look(
         y = (v - INTRINSICS[1, 2]) / FOCAL * plate.z
         on = (plate.x[0] <= x) & (x < plate.x[1]) & (plate.y[0] <= y) & (y < plate.y[1]) & (plate.z < depth)
         depth[on], owner[on] = plate.z, key
-    seen = [key for key in sorted(plates) if (owner == key).any() and key not in hidden]
+    seen = [key for key in sorted(plates) if (owner == key).any()]
     features = np.zeros((len(seen), 3, 8), np.float32)
     for row, key in enumerate(seen):
         features[row, :, key % 8] = 1
@@ -72,11 +71,6 @@ def run(views: list[tuple[Frame, Detections]], config: OpenSU3DConfig = CONFIG) 
     for frame, detections in views:
         method.update(frame, detections, Timer())
     return method
-
-
-def contents(found: Instances) -> tuple[object, ...]:
-    parts = (found.points, found.indptr, found.indices, found.scores, found.boxes, found.views, found.ids)
-    return (*(part.tobytes() for part in parts), np.asarray(found.features).tobytes(), found.names, found.captions)
 
 
 TWINS = {1: Plate((-0.6, -0.1), (-0.3, 0.3)), 2: Plate((0.1, 0.6), (-0.3, 0.3))}

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import fields, replace
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 import pytest
-from literal_problems import Problem, config_of, random_problem
+from literal_problems import Problem, random_problem
 from numpy.typing import NDArray
+from plates import contents
 
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.system.timing import Timer
@@ -26,13 +26,13 @@ Marks = frozenset[tuple[int, ...]]
 def sequence(seed: int) -> Problem:
     """A random problem in which objects fall into parts that are objects of their own."""
     problem = random_problem(seed)
-    split = replace(problem.settings, density="scene", eps=EPS, dbscan_eps=0.1, dbscan_min_points=3, split_fraction=0.2)
-    return Problem(split, problem.images)
+    parts = {"density": "scene", "eps": EPS, "dbscan_eps": 0.1, "dbscan_min_points": 3, "split_fraction": 0.2}
+    return Problem(problem.settings.model_copy(update=parts), problem.images)
 
 
 def maps(problem: Problem, asked_after: Iterable[int]) -> list[Instances]:
     """The maps of one method, asked for after those images, the last for the final map."""
-    method = OpenSU3D(config_of(problem.settings))
+    method = OpenSU3D(problem.settings)
     method.start(SCENE)
     answers = []
     for nth, (frame, detections) in enumerate(problem.images):
@@ -56,12 +56,6 @@ def marks_of(found: Instances) -> dict[int, tuple[Marks, Marks]]:
 
 def marks_in(rows: NDArray[Any]) -> Marks:
     return frozenset(map(tuple, rows.tolist()))
-
-
-def contents(found: Instances) -> tuple[object, ...]:
-    """Every byte of a map."""
-    values = (getattr(found, one.name) for one in fields(found))
-    return tuple(value.tobytes() if isinstance(value, np.ndarray) else value for value in values)
 
 
 def strangers(answers: Sequence[Instances]) -> list[int]:

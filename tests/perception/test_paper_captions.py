@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from chat_server import Answered, Body, ChatServer, error
-from tiny_models import needs_models, paper_words, write_models
+from tiny_models import paper_words, write_models
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.files.atomic import read_json
@@ -18,7 +18,6 @@ from su3d_bench.core.maps import Instances
 from su3d_bench.perception.language.captioner import DESCRIBE
 from su3d_bench.store.predictions import read_prediction
 
-pytestmark = needs_models
 TIMEOUT_S = 1.5  # after it a hung connection is given up; long enough for good answers on a busy machine
 N_TRIES = 2
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from painted import WordEncoder
-from painted_runs import painted_run
+from painted_runs import painted_run, see_painted
 from places import SCENES
 
 from su3d_bench.analysis.attribution import Explained, attribution_of, explained_of
@@ -39,7 +39,7 @@ def run(made_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path
     """A copy of the run, in the folder from which the command is given."""
     shutil.copytree(made_run, tmp_path / "run")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
+    see_painted(monkeypatch)
     return Path("run")
 
 
@@ -115,7 +115,7 @@ def test_what_could_not_be_had_is_asked_for_again(run: Path, monkeypatch: pytest
 
     monkeypatch.setattr(finished_run, "encoder_of", no_encoder)
     assert b"the encoder is not here" in page()
-    monkeypatch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
+    see_painted(monkeypatch)
     assert page() == first
 
 

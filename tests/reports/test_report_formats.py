@@ -11,6 +11,7 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
+import markdown_it
 import pytest
 from measured_rows import measured, measured_instances
 
@@ -96,7 +97,6 @@ MARKUP = (
 
 @pytest.mark.parametrize("text", [*MARKUP, *HOSTILE])
 def test_markdown_shows_a_text_letter_for_letter(text: str) -> None:
-    markdown_it = pytest.importorskip("markdown_it")
     page = _Page()
     parts: list[Table | Prose] = [
         Prose((text,)),

@@ -9,7 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from painted import ColourPerception, colour_perception
+from painted import ColourPerception
+from painted_runs import see_painted
 from places import SCENES
 
 from su3d_bench.analysis.tables import check_paper, measured_results
@@ -17,7 +18,6 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.reports.tables.latex import latex
 from su3d_bench.reports.tables.paper import Shown, selection_tables
-from su3d_bench.runs import scene as scene_run
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run over four painted scenes with a method and two variants of it."""
     out = tmp_path_factory.mktemp("sweep") / "runs" / "a run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
+        see_painted(patch)
         patch.setattr(ColourPerception, "regions", lambda self: None, raising=False)
         patch.setenv("SU3D_DATA", str(out.parent / "data"))
         words = ["ablate", "--method", f"{SCENES}/painted.py:Collector", "--vary", "noise_m=0.0,0.3", "drop=1"]

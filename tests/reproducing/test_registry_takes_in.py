@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import yaml
 from registry_bundles import ROOM, Files, flip_labels, read_bundle, rewrite_bundle, room_bundle
 
 from su3d_bench.cli.main import main
 
-yaml = pytest.importorskip("yaml", reason="PyYAML comes with transformers and ray")
 RUN = "runs/room"
 JOB = f"{RUN}/scenes/{ROOM.replace('/', '.')}/opensu3d"
 

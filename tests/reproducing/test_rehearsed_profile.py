@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from tiny_models import needs_models, write_fetched
+from tiny_models import write_fetched
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import Su3dError
@@ -23,7 +23,6 @@ def out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "out"
 
 
-@needs_models
 def test_the_profile_paper_runs_end_to_end_on_tiny_networks(
     out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

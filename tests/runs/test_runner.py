@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from painted import ColourPerception, colour_perception
-from painted_runs import COLLECTOR, PAINTED, job, metrics, run, words
+from painted import ColourPerception
+from painted_runs import COLLECTOR, PAINTED, job, metrics, run, see_painted, words
 from places import SCENES
 
 from su3d_bench.cli.main import main
@@ -23,7 +23,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of all four scenes, which no test changes."""
     out = tmp_path_factory.mktemp("finished") / "out"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
+        see_painted(patch)
         assert run(out=str(out)) == 0
     return out
 

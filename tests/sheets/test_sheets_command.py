@@ -10,11 +10,10 @@ from typing import Any
 import pytest
 from chat_server import KEY, Answered, ChatServer
 from made_sheets import METHODS
-from painted import colour_perception
+from painted_runs import see_painted
 
 from su3d_bench.cli.main import main
 from su3d_bench.metrics.protocols.loading import load_protocol
-from su3d_bench.runs import finished as finished_run
 from su3d_bench.sheets.items import read_key, read_sheet
 from su3d_bench.sheets.sources import RunSource
 
@@ -31,7 +30,7 @@ def folder(painted_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setenv("SU3D_DATA", str(painted_folder / "data"))
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
     monkeypatch.setattr(RunSource, "rules", lambda self, scene, kind: load_protocol(f"rooms-{kind}"))
-    monkeypatch.setattr(finished_run, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
+    see_painted(monkeypatch)
     return tmp_path
 
 

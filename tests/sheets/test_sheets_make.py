@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_sheets import HOSTILE, METHODS, made
-from painted import WordEncoder, colour_perception
+from painted import WordEncoder
+from painted_runs import see_painted
 from PIL import Image
 
 from su3d_bench.cli.main import main
@@ -19,7 +20,6 @@ from su3d_bench.metrics.questions.score import RefinedNames
 from su3d_bench.questions.model import new_question
 from su3d_bench.questions.scene_map import MapObject, SceneMap
 from su3d_bench.questions.solver import built_in
-from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs.finished import read_run
 from su3d_bench.sheets import sources as run_source
 from su3d_bench.sheets.drafts import annotation_drafts, reasoning_drafts, retrieval_drafts, without_ids
@@ -144,7 +144,7 @@ def test_sheets_are_made_from_the_command_line(
 ) -> None:
     monkeypatch.chdir(painted_folder)
     monkeypatch.setenv("SU3D_DATA", str(painted_folder / "data"))
-    monkeypatch.setattr(finished_run, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
+    see_painted(monkeypatch)
     words = ["sheets", "make", "run", "--kind", "retrieval", "--out", "out"]
     assert main([*words, "--questions", "queries.csv", "--annotators", "2", "--json"]) == 0
     (told,) = json.loads(capsys.readouterr().out)["sets"]

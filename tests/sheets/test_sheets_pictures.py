@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from made_sheets import drafts_of
-from painted import colour_perception
+from painted_runs import see_painted
 from PIL import Image
 
 from su3d_bench.cli.main import main
@@ -22,7 +22,6 @@ from su3d_bench.reports.pictures.items import (
     mask_in_frame,
     seen_in,
 )
-from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs.executors import run_processes
 from su3d_bench.sheets.drawing import Artist, SceneDrafts, _lost, draw_all, draw_scene
 from su3d_bench.sheets.sources import RunSource
@@ -78,7 +77,7 @@ def test_a_figure_has_its_words_as_text(
 ) -> None:
     monkeypatch.chdir(painted_folder)
     monkeypatch.setenv("SU3D_DATA", str(painted_folder / "data"))
-    monkeypatch.setattr(finished_run, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
+    see_painted(monkeypatch)
     words = ["sheets", "pictures", "run", "--methods", "collector", "--photo", "--colours", "cividis"]
     wanted = [*words, "--queries", "<b>sofa</b> $x_1$", "--out", f"heat.{suffix}"]
     assert main(wanted) == 0

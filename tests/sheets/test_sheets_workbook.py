@@ -6,13 +6,13 @@ import subprocess
 import zipfile
 from pathlib import Path
 
+import openpyxl
 import pytest
 from made_sheets import HOSTILE, made
 
 from su3d_bench.sheets.answers import read_answers
 from su3d_bench.sheets.sets import COLUMNS, HEADER_ROW, HIDDEN, MadeSheets, workbook_bytes
 
-openpyxl = pytest.importorskip("openpyxl", reason="needs the sheets extra")
 OFFICE = shutil.which("soffice") or shutil.which("libreoffice")
 
 

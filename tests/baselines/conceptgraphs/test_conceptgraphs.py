@@ -9,15 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conceptgraphs_scene import QUIET, SCENE, Plate, at_cosine, axis, contents, look, mapped
-from painted import colour_perception
+from painted_runs import see_painted
 from places import SCENES
+from plates import QUIET, SCENE, Plate, at_cosine, axis, contents, look, mapped
 
 from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs
 from su3d_bench.baselines.conceptgraphs.objects import MappingConfig
 from su3d_bench.cli.main import main
 from su3d_bench.core.system.timing import Timer
-from su3d_bench.runs import scene as scene_run
 
 LEFT, RIGHT = Plate((-0.5, 0.0)), Plate((0.0, 0.5))
 BARE = QUIET.model_copy(update={"obj_min_detections": 0})
@@ -78,7 +77,7 @@ def test_finish_midway_changes_nothing() -> None:
 
 
 def test_a_run_maps_painted_scenes_and_times_the_stages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    see_painted(monkeypatch)
     painted = f"{SCENES}/painted.py:Painted/a"
     settings = ["conceptgraphs.stride=1", "conceptgraphs.max_bbox_area_ratio=1.0", "conceptgraphs.denoise_interval=2"]
     protocols = ["--protocols", "rooms-semantic", "rooms-instance"]

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conceptgraphs_scene import QUIET, an_object, at_cosine, axis, block
+from plates import QUIET, at_cosine, axis, block
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 from su3d_bench.baselines.conceptgraphs.map import (
@@ -18,6 +18,8 @@ from su3d_bench.baselines.conceptgraphs.map import (
 )
 from su3d_bench.baselines.conceptgraphs.objects import (
     MapObject,
+    Sighting,
+    bounding_box,
     denoised,
     grown,
     merge_overlapping,
@@ -29,6 +31,20 @@ from su3d_bench.baselines.conceptgraphs.objects import (
 from su3d_bench.core.types import OrientedBox
 
 PAPER = QUIET.model_copy(update={"association": "paper"})
+
+
+def an_object(
+    points: np.ndarray,
+    number: int = 1,
+    *,
+    n: int = 1,
+    feature: tuple[float, ...] = axis(0),
+    text: tuple[float, ...] = axis(0),
+) -> MapObject:
+    """An object of ``n`` detections."""
+    seen = tuple(Sighting(k, 0, "item", "", 1.0) for k in range(n))
+    cloud = np.asarray(points, np.float64)
+    return MapObject(number, cloud, bounding_box(cloud, oriented=True), np.array(feature), np.array(text), seen)
 
 
 def box(centre: tuple[float, float, float], sizes: tuple[float, float, float] = (1, 1, 1), turn: float = 0.0):  # type: ignore[no-untyped-def]

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conceptgraphs_scene import Plate, at_cosine, axis, mapped
+from plates import Plate, at_cosine, axis, mapped
 
 from su3d_bench.baselines.conceptgraphs.method import ConceptGraphsDetector, DetectorConfig
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conceptgraphs_scene import DIMENSION, HEIGHT, QUIET, WIDTH, Plate, block, look
+from plates import DIMENSION, HEIGHT, QUIET, WIDTH, Plate, block, look
 
 from su3d_bench.baselines.conceptgraphs.objects import (
     LiftedRegion,

@@ -253,7 +253,8 @@ def noisy(seed: int) -> Any:
 
 
 def test_a_cloud_is_reduced_as_open3d_reduces_it() -> None:
-    open3d = pytest.importorskip("open3d")
+    import open3d
+
     points = (np.random.default_rng(0).random((2000, 3)) - 0.37).astype(np.float32)
     theirs = open3d.t.geometry.PointCloud(points).voxel_down_sample(0.05).point.positions.numpy()
     assert len(theirs) < 1900

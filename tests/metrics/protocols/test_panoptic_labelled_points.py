@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from made_segments import our_qualities
-from painted import colour_perception
+from painted_runs import see_painted
 from places import CASES, ROOT
 from scored_room import ID, room, truth_as_prediction
 
@@ -20,7 +20,6 @@ from su3d_bench.evaluation.scoring import score_on_truth
 from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine
 from su3d_bench.metrics.semantic.panoptic import PanopticCounts, count_segments, told_truth
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run
 
 RULES = load_protocol("rooms-panoptic")
@@ -90,7 +89,7 @@ def test_stuff_without_instances_is_whole_in_the_score_of_the_truth_beside_an_ev
 def test_a_run_of_the_truth_has_its_stuff_where_stuff_counts_and_nowhere_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    see_painted(monkeypatch)
     monkeypatch.chdir(tmp_path)
     Path("open_walls.py").write_text(OPEN_WALLS)
     painted = ROOT / "tests/support/scenes/painted.py"

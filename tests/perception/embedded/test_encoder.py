@@ -83,7 +83,8 @@ def test_model_card_describes_the_shipped_files(encoder: EmbeddedEncoder) -> Non
 
 
 def test_weights_need_nothing_but_standard_operators() -> None:
-    onnx = pytest.importorskip("onnx", reason="onnx of the models extra is not installed")
+    import onnx
+
     for name in (IMAGE_FILE, TEXT_FILE):
         model = onnx.load(FOLDER / name)
         onnx.checker.check_model(model)
@@ -132,8 +133,6 @@ def test_the_words_for_materials_are_those_of_the_rooms() -> None:
 
 @pytest.mark.slow
 def test_training_runs_from_rooms_to_model_card(tmp_path: Path) -> None:
-    for package in ("torch", "onnx"):
-        pytest.importorskip(package, reason="the models extra is not installed")
     import train_encoder
 
     options = "--rooms 1 --held-out-rooms 1 --frames-per-room 1 --minutes 2 --max-steps 2 --jobs 1"

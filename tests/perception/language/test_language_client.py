@@ -17,8 +17,6 @@ from su3d_bench.perception.language.chat import ChatRequest, Image, LanguageConf
 from su3d_bench.perception.language.client import HOSTED, ChatClient
 from su3d_bench.perception.language.parsing import CaptionForm
 
-pytest.importorskip("openai", reason="the models extra is not installed")
-
 
 @pytest.fixture
 def server(chat: ChatServer, monkeypatch: pytest.MonkeyPatch) -> ChatServer:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_models import needs_models, noise_images, write_tiny_clip, write_tiny_siglip
+from tiny_models import noise_images, write_tiny_clip, write_tiny_siglip
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
@@ -41,7 +41,6 @@ def config(folder: Path, encoder: str = "clip-vit-h-14", **settings: Any) -> Mod
 # ---- features
 
 
-@needs_models
 @pytest.mark.parametrize("name", ["clip-vit-h-14", "siglip-base-224"])
 def test_features_are_those_of_transformers_own_model_and_processor(folder: Path, name: str) -> None:
     import torch
@@ -66,7 +65,6 @@ def _unit(rows: Float32Array) -> Float32Array:
     return np.asarray(rows / np.linalg.norm(rows.astype(np.float64), axis=1, keepdims=True), np.float32)
 
 
-@needs_models
 @pytest.mark.parametrize("name", ["clip-vit-h-14", "siglip-base-224"])
 def test_a_feature_does_not_depend_on_the_rest_of_its_batch(folder: Path, name: str) -> None:
     encoder = load_encoder(config(folder, name))
@@ -81,7 +79,6 @@ def test_a_feature_does_not_depend_on_the_rest_of_its_batch(folder: Path, name: 
     assert encoder.encode_texts([]).shape == (0, encoder.dim)
 
 
-@needs_models
 def test_the_digest_moves_with_all_that_moves_a_feature(folder: Path, tmp_path: Path) -> None:
     digest = load_encoder(config(folder)).digest
     assert load_encoder(config(folder, batch=4)).digest == digest
@@ -141,7 +138,6 @@ class _Payload:
         return exec, ("raise SystemExit('the payload ran')",)
 
 
-@needs_models
 @pytest.mark.parametrize("name", ["pytorch_model.bin", "weights.pt", "weights.pth"])
 def test_a_weights_file_that_holds_code_is_refused(tmp_path: Path, name: str) -> None:
     import torch
@@ -155,7 +151,6 @@ def test_a_weights_file_that_holds_code_is_refused(tmp_path: Path, name: str) ->
             read_weights(tmp_path / name)
 
 
-@needs_models
 @pytest.mark.parametrize(
     ("change", "said"),
     [

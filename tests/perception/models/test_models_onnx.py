@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import shutil
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import export_onnx
 import numpy as np
 import pytest
 from tiny_models import SAM_PX, blocks, noise_images, tiny_sam, write_tiny_clip
@@ -19,11 +19,6 @@ from su3d_bench.perception.models.files import locate
 from su3d_bench.perception.models.loading import load_encoder
 from su3d_bench.perception.models.masks.sam import Prompts, Sam, TorchSam, load_onnx_sam
 from su3d_bench.perception.models.onnx import Provider, open_session
-
-if any(find_spec(name) is None for name in ("torch", "transformers", "onnx")):
-    pytest.skip("needs the models extra: pip install 'su3d-bench[models]'", allow_module_level=True)
-
-import export_onnx
 
 CLIP = "clip-vit-h-14"
 TEXTS = ("chair", "a red cup on the table", "tv-screen")

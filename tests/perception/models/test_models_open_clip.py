@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import types
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +17,6 @@ from su3d_bench.core.interfaces import Encoder
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.encoders.images import ImageTransform
 from su3d_bench.perception.models.loading import load_encoder
-
-pytestmark = pytest.mark.skipif(
-    any(find_spec(name) is None for name in ("torch", "safetensors")),
-    reason="torch and safetensors are not installed: pip install 'su3d-bench[models]'",
-)
 
 SIZE, DIM, WORDS = 8, 6, 300
 

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_models import N_TOKENS, blocks, needs_models, tiny_sam, write_clip_tokenizer
+import regex
+from tiny_models import N_TOKENS, blocks, tiny_sam, write_clip_tokenizer
 
 from su3d_bench.core.types import BoolArray
 from su3d_bench.perception.cache import mask_boxes
@@ -65,7 +66,6 @@ def test_suppression_keeps_what_torchvision_keeps_at_the_threshold_too(case: dic
 
 @pytest.mark.parametrize(("text", "cleaned", "words"), CASES["texts"], ids=[ascii(case[0]) for case in CASES["texts"]])
 def test_texts_are_cleaned_and_parted_as_open_clip_does(text: str, cleaned: str, words: list[str]) -> None:
-    regex = pytest.importorskip("regex")
     assert plain_text(text) == cleaned
     # What transformers' tokenizer splits at, which knows the marks of a text's ends.
     known = r"<\|startoftext\|>|<\|endoftext\|>|'s|'t|'re|'ve|'m|'ll|'d|[\p{L}]+|[\p{N}]|[^\s\p{L}\p{N}]+"
@@ -77,7 +77,6 @@ def test_texts_in_a_broken_encoding_stay_broken() -> None:
         assert plain_text(text) == text.lower() != mended
 
 
-@needs_models
 def test_the_mark_of_a_texts_end_does_not_end_a_text(tmp_path: Path) -> None:
     from su3d_bench.perception.models.encoders.texts import read_tokeniser
 
@@ -103,7 +102,8 @@ def test_sams_pixels_are_the_originals_to_the_bit() -> None:
 
 @pytest.mark.parametrize("case", CASES["sam_points"], ids=lambda case: f"{case['height']}x{case['width']}")
 def test_points_of_a_grid_reach_sams_prompts_with_the_originals_bits(case: dict[str, Any]) -> None:
-    torch = pytest.importorskip("torch")
+    import torch
+
     told: list[Any] = []
 
     class Told:
@@ -130,7 +130,6 @@ def test_points_of_a_grid_reach_sams_prompts_with_the_originals_bits(case: dict[
     assert (2 * ((rounded + np.float32(0.5)) / np.float32(side)) - 1 != places).any()
 
 
-@needs_models
 @pytest.mark.parametrize(("original", "name"), CASES["sam_names"])
 def test_the_original_checkpoints_names_become_those_of_transformers(original: str, name: str) -> None:
     assert name in tiny_sam().state_dict()
@@ -166,7 +165,6 @@ class Drawn:
 
 
 def test_automatic_masks_have_the_originals_boxes_and_a_mask_of_one_pixels_width_has_none() -> None:
-    pytest.importorskip("torch")
     found = AutomaticMasks(Sam(Drawn()), AutomaticMaskConfig()).regions(np.zeros((64, 64, 3), np.uint8))
     sides = found.boxes[:, 2:] - found.boxes[:, :2]
     rows = np.concatenate([found.boxes[:, :2], sides, found.masks.sum(axis=(1, 2))[:, None]], axis=1)

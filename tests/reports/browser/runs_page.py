@@ -10,12 +10,9 @@ import chromium
 import pytest
 from chromium import Chromium
 from looks import DESKTOP
-from painted import WordEncoder, colour_perception
-from painted_runs import COLLECTOR, painted_run, run
+from painted_runs import COLLECTOR, painted_run, run, see_painted
 
 from su3d_bench.cli.main import main
-from su3d_bench.runs import finished as finished_run
-from su3d_bench.runs import scene as scene_run
 
 # WebGL without a graphics card.
 SOFTWARE_GL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
@@ -33,8 +30,7 @@ def finished_runs(folder: Path) -> list[str]:
     """Two runs: two methods on two scenes with maps midway, and one method of them on one of the scenes."""
     both = (COLLECTOR, f"{COLLECTOR}@noise_m=0.3")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
-        patch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
+        see_painted(patch)
         painted_run(folder / "one", "--anytime", "0.5", methods=both)
         assert run(scenes="a", out=str(folder / "two")) == 0
     record = json.loads((folder / "one" / "metrics.json").read_text())
@@ -49,7 +45,7 @@ def page_of_runs(folder: Path) -> Path:
     words = ["--out", str(page), "--quiet", "--jobs", "1", "--queries", "chair", "table"]
     runs = finished_runs(folder)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
+        see_painted(patch)
         assert main(["report", "html", *runs, *words]) == 0
     return page
 

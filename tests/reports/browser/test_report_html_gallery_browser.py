@@ -12,20 +12,45 @@ import numpy as np
 import pytest
 from chromium import Chromium, find_chromium
 from looks import WHOLE
+from painted import Collector
 from painted_runs import COLLECTOR, painted_page, painted_run
-from places import SCENES
 from runs_page import SELECT, choose
 
 from su3d_bench.analysis.page.gallery import PHOTO, PREDICTED, SeenError, error_photo
-from su3d_bench.core.types import Frame
+from su3d_bench.core.maps import Prediction
+from su3d_bench.core.types import Frame, SceneInfo
 
 needs_browser = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
+
+
+class Mistaken(Collector):
+    """A collector with one error of a kind: in scene a two halves of the chair and a sofa that looks like a table, in
+    scene b no table."""
+
+    name = "mistaken"
+
+    def start(self, scene: SceneInfo) -> None:
+        super().start(scene)
+        self._scene = scene.scene
+
+    def finish(self) -> Prediction:
+        if self._scene != "a":
+            self._points.pop("table", None)
+            return super().finish()
+        if {"chair", "sofa", "table"} <= set(self._points):
+            chair = np.concatenate(self._points["chair"])
+            is_left = chair[:, 0] < np.median(chair[:, 0])
+            self._points |= {"chair": [chair[is_left]], "chair half": [chair[~is_left]]}
+            self._views["chair half"] = self._views["chair"]
+            self._features["chair half"] = self._features["chair"]
+            self._features["sofa"] = self._features["table"]
+        return super().finish()
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two methods on two scenes, of which the second makes mistakes."""
-    methods = (COLLECTOR, f"{SCENES}/painted.py:Mistaken")
+    methods = (COLLECTOR, f"{__file__}:Mistaken")
     return painted_run(tmp_path_factory.mktemp("gallery") / "run", methods=methods)
 
 

@@ -11,13 +11,11 @@ from typing import Any
 
 import psutil
 import pytest
+import ray
 from places import SCENES
 from waiting import wait_until
 
 from su3d_bench.cli.main import main
-
-ray = pytest.importorskip("ray", reason="the ray extra is not installed")
-pytest.importorskip("submitit", reason="the slurm extra is not installed")
 
 PAINTED = f"{SCENES}/painted_cli.py:Painted"
 COLLECTOR = f"{SCENES}/painted_cli.py:Collector"

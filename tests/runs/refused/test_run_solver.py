@@ -9,13 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 from chat_server import KEY, Answered, Body, ChatServer
-from painted import colour_perception
 from painted_runs import COLLECTOR, PAINTED
 
 from su3d_bench.cli.main import main
 from su3d_bench.questions.scene_map import MapObject, SceneMap
 from su3d_bench.questions.solver import Solver
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.run_folder import RunFolder
 
 RUN = ["run", "--scenes", f"{PAINTED}/a", "--methods", COLLECTOR, "--no-pictures", "--jobs", "1", "--quiet"]
@@ -23,14 +21,9 @@ ASKED = ["--protocols", "rooms-reasoning"]
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
-    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+def folder(painted_place: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
-    monkeypatch.delenv("OPENAI_BASE_URL", raising=False)
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    return tmp_path
+    return painted_place
 
 
 @pytest.fixture

@@ -1,47 +1,23 @@
-"""OpenSU3D as the text of its paper says it, sentence by sentence: slow, and sharing no line with the pipeline.
+"""OpenSU3D as the text of its paper says it, sentence by sentence: slow, sharing its settings alone with the pipeline.
 
 Numpy, a KD-tree and scikit-learn's DBSCAN. A function an equation or a sentence, which its docstring names; what the
-paper leaves open is a field of ``PaperSettings``. The whole scene is one array, and every image looks at all of it.
+paper leaves open is a field of ``OpenSU3DConfig``. The whole scene is one array, and every image looks at all of it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from su3d_bench.opensu3d.config import OpenSU3DConfig
 
 Array = NDArray[Any]
 View = tuple[int, int]  # the index of an image, and the row of a detection in what was found there
 
 NONE = -1
-
-
-@dataclass(frozen=True)
-class PaperSettings:
-    """The values of section IV-A, and the readings of what the paper leaves open."""
-
-    crop_ratios: tuple[float, ...] = (0.8, 1.0, 1.2)
-    multi_scale: Literal["direct", "weighted"] = "direct"
-    multi_view: Literal["direct", "global"] = "direct"
-    top_m: int = 5
-    border_px: float = 20.0
-    border_reference_width: int = 1200  # the paper's px are those of images of this width; 0: of any
-    border_shape: Literal["disc", "square"] = "disc"
-    background_pixels: Literal["keep", "drop"] = "keep"
-    depth_min: float = 0.0
-    depth_max: float = 10.0
-    eps: float = 0.02
-    frame_voxel: float | None = None  # that of eps; 0: every pixel
-    overlap_threshold: float = 0.3
-    overlap_rule: Literal["smaller-segment", "frame-segment", "as-printed"] = "smaller-segment"
-    density: Literal["scene", "frame", "all"] = "scene"
-    in_one_voxel: Literal["all", "first", "last"] = "all"  # which of the instances' points that an image has in a voxel
-    dbscan_eps: float = 0.1
-    dbscan_min_points: int = 20
-    split_fraction: float = 0.8
 
 
 class Cloud(NamedTuple):
@@ -62,8 +38,7 @@ class Cloud(NamedTuple):
         return [int(one) for one in np.unique(self.ids) if one != NONE]
 
 
-@dataclass(frozen=True)
-class Sighting:
+class Sighting(NamedTuple):
     """What is stored of a detection: its points, and the metadata n, c, s_pred, f_MS and f_G."""
 
     points: Array
@@ -74,11 +49,10 @@ class Sighting:
     of_image: Array
 
 
-@dataclass(frozen=True)
-class Thing:
+class Thing(NamedTuple):
     """An element (P, n, c, f_MV, bb_3D, centroid) of the map M, with the views that Q holds for it.
 
-    ``rows`` are those of P_scene; ``parent`` is its ID there, and ``part`` which of the parent's clusters it is.
+    ``rows`` are those of P_scene.
     """
 
     rows: Array
@@ -88,8 +62,6 @@ class Thing:
     box: Array
     centroid: Array
     views: list[View]
-    parent: int
-    part: int
 
 
 def mask_image(masks: Array, border_px: int, shape: str) -> Array:
@@ -118,7 +90,7 @@ def around(mask: Array, border_px: int, shape: str) -> Array:
     return near
 
 
-def back_projected(depth: Array, intrinsics: Array, pose: Array, image: Array, settings: PaperSettings) -> Cloud:
+def back_projected(depth: Array, intrinsics: Array, pose: Array, image: Array, settings: OpenSU3DConfig) -> Cloud:
     """P_frame, Eq. 1: { T (D(u, v) K^-1 (u, v, 1)), M'(u, v) }."""
     has_depth = np.isfinite(depth) & (depth > 0) & (depth >= settings.depth_min) & (depth <= settings.depth_max)
     if settings.background_pixels == "drop":
@@ -162,7 +134,7 @@ def index_pairs(frame: Cloud, crop: Cloud, eps: float) -> tuple[Array, Array]:
     return pairs, nearest[pairs]
 
 
-def replaced_ids(frame: Cloud, crop: Cloud, settings: PaperSettings) -> dict[int, int]:
+def replaced_ids(frame: Cloud, crop: Cloud, settings: OpenSU3DConfig) -> dict[int, int]:
     """ID_f to ID_s where Eq. 2 says so: "if OverlapRatio >= rho, we perform an ID replacement"."""
     i_frame, i_scene = index_pairs(frame, crop, settings.eps)
     same: dict[int, int] = {}
@@ -183,7 +155,7 @@ def replaced_ids(frame: Cloud, crop: Cloud, settings: PaperSettings) -> dict[int
     return same
 
 
-def concatenated(scene: Cloud, near: Array, frame: Cloud, settings: PaperSettings) -> Cloud:
+def concatenated(scene: Cloud, near: Array, frame: Cloud, settings: OpenSU3DConfig) -> Cloud:
     """P_scene after "P'_frame, which is then concatenated to P_scene"; ``near`` (N,) are the points of P'_scene.
 
     "Additionally, set of points from P'_scene can also be deleted to retain constant sparsity": those whose voxel a new
@@ -196,20 +168,17 @@ def concatenated(scene: Cloud, near: Array, frame: Cloud, settings: PaperSetting
     holds_instance, is_instance = scene.ids[near] != NONE, frame.ids != NONE
     comes = is_instance | ~np.isin(new, np.append(held[holds_instance], new[is_instance]))
     if settings.density == "frame":
-        return scene.followed_by(frame.where(comes & ~np.isin(new, held) & one_a_voxel(new, is_instance, "first")))
-    comes &= one_a_voxel(new, is_instance, settings.in_one_voxel)
+        return scene.followed_by(frame.where(comes & ~np.isin(new, held) & one_a_voxel(new, is_instance, 1)))
+    comes &= one_a_voxel(new, is_instance, -1)
     goes = np.isin(held, new[is_instance]) | (~holds_instance & np.isin(held, new))
     stays = np.ones(len(near), bool)
     stays[np.flatnonzero(near)[goes]] = False
     return scene.where(stays).followed_by(frame.where(comes))
 
 
-def one_a_voxel(voxel: Array, is_instance: Array, which: str) -> Array:
-    """Whether a point is the one that stands for its voxel: of an instance where there is such a point."""
-    if which == "all":
-        return np.ones(len(voxel), bool)
-    turn = np.arange(len(voxel)) if which == "first" else -np.arange(len(voxel))
-    in_turn = np.lexsort([turn, ~is_instance])
+def one_a_voxel(voxel: Array, is_instance: Array, step: int) -> Array:
+    """Whether a point is the first of its voxel, or the last (step -1): of those of instances where there is one."""
+    in_turn = np.lexsort([step * np.arange(len(voxel)), ~is_instance])
     _, first = np.unique(voxel[in_turn], return_index=True)
     return np.isin(np.arange(len(voxel)), in_turn[first])
 
@@ -219,24 +188,24 @@ def cosine(a: Array, b: Array) -> float:
     return float(a @ b) / max(float(np.linalg.norm(a)) * float(np.linalg.norm(b)), 1e-8)
 
 
-def multi_scale_feature(crops: Sequence[Array], settings: PaperSettings) -> Array:
+def multi_scale_feature(crops: Sequence[Array], settings: OpenSU3DConfig) -> Array:
     """f_MS of the k crops: the direct mean, or the weighted one in which f_1, the best-fit crop, is that of ratio 1."""
     k = len(crops)
-    if settings.multi_scale == "direct":
+    if settings.fusion.multi_scale == "direct":
         return np.asarray(sum(crops) / k)
-    f_1 = crops[settings.crop_ratios.index(1.0)]
+    f_1 = crops[settings.fusion.crop_ratios.index(1.0)]
     return np.asarray(sum(cosine(f_1, f_i) * f_i for f_i in crops) / k)
 
 
-def multi_view_feature(top: Sequence[Sighting], settings: PaperSettings) -> Array:
+def multi_view_feature(top: Sequence[Sighting], settings: OpenSU3DConfig) -> Array:
     """f_MV of the top m views: the direct mean, or with the images' own features, both terms inside the sum."""
     m = len(top)
-    if settings.multi_view == "direct":
+    if settings.fusion.multi_view == "direct":
         return np.asarray(sum(one.multi_scale for one in top) / m)
     return np.asarray(sum(one.multi_scale + cosine(one.multi_scale, one.of_image) * one.of_image for one in top) / m)
 
 
-def clusters_of(points: Array, settings: PaperSettings) -> list[Array]:
+def clusters_of(points: Array, settings: OpenSU3DConfig) -> list[Array]:
     """The rows of each cluster "with points >= 80% of the largest cluster", the largest first; the rest is noise."""
     from sklearn.cluster import DBSCAN
 
@@ -249,7 +218,7 @@ def clusters_of(points: Array, settings: PaperSettings) -> list[Array]:
 class PaperProgram:
     """P_scene, Q and the stored metadata, which grow image by image."""
 
-    def __init__(self, settings: PaperSettings) -> None:
+    def __init__(self, settings: OpenSU3DConfig) -> None:
         self.settings = settings
         self.scene = Cloud(np.zeros((0, 3)), np.zeros(0, int))
         self.tracks: dict[int, list[View]] = {}  # Q
@@ -258,11 +227,9 @@ class PaperProgram:
     def add_image(self, frame: Any, detections: Any) -> None:
         """Takes in an image I' with what was found in it: section "2D to 3D Fusion & Tracking"."""
         settings = self.settings
-        width = frame.depth_m.shape[1]
-        px = round(
-            settings.border_px * (width / settings.border_reference_width if settings.border_reference_width else 1)
-        )
-        image = mask_image(detections.masks, px, settings.border_shape)
+        width = frame.depth_m.shape[1]  # the paper's px are those of images of the reference width
+        px = settings.border_px * (width / settings.border_reference_width if settings.border_reference_width else 1)
+        image = mask_image(detections.masks, round(px), settings.border_shape)
         cloud = back_projected(frame.depth_m, frame.intrinsics, frame.camera_to_world, image, settings)
         cloud = reduced(cloud, settings.eps if settings.frame_voxel is None else settings.frame_voxel)
         if not len(cloud.points):
@@ -282,7 +249,7 @@ class PaperProgram:
         """What is stored of detection ``k``."""
         crops = [
             np.asarray(detections.crop_features[k, detections.crop_ratios.index(ratio)], float)
-            for ratio in self.settings.crop_ratios
+            for ratio in self.settings.fusion.crop_ratios
         ]
         name = detections.names[k]
         return Sighting(
@@ -300,12 +267,11 @@ class PaperProgram:
         for parent in self.scene.named:
             own = np.flatnonzero(self.scene.ids == parent)
             clusters = clusters_of(self.scene.points[own], self.settings)
-            for part, members in enumerate(clusters):
-                rows = own[members]
+            for rows in (own[members] for members in clusters):
                 views = self.tracks[parent]
                 if len(clusters) > 1:
                     views = [view for view in views if self.hits(view, self.scene.points[rows])]
-                found.append(self.thing(rows, views, parent, part))
+                found.append(self.thing(rows, views))
         return found
 
     def hits(self, view: View, points: Array) -> bool:
@@ -313,7 +279,7 @@ class PaperProgram:
         of_mask, of_points = (np.floor(cloud / self.settings.eps) for cloud in (self.seen[view].points, points))
         return not {*map(tuple, of_mask)}.isdisjoint(map(tuple, of_points))
 
-    def thing(self, rows: Array, views: list[View], parent: int, part: int) -> Thing:
+    def thing(self, rows: Array, views: list[View]) -> Thing:
         """Label and caption "corresponding to the highest S'_pred", f_MV of the top m, box and centroid of P_i."""
         points = self.scene.points[rows]
         by_score = sorted(views, key=lambda view: -self.seen[view].score)  # of equal ones the earlier
@@ -326,6 +292,4 @@ class PaperProgram:
             np.stack([points.min(axis=0), points.max(axis=0)]),
             points.mean(axis=0),
             views,
-            parent,
-            part,
         )

@@ -6,34 +6,26 @@ import json
 import string
 from collections.abc import Sequence
 from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from su3d_bench.core.system.devices import require, require_transformers
 from su3d_bench.core.types import Frame, UInt8Array
 from su3d_bench.perception.models.encoders.images import CLIP_MEAN, CLIP_STD
 from su3d_bench.perception.models.masks.grounded_sam import RAM_MODEL, RAM_PX, RAM_TAG_LIST
 
-needs_models = pytest.mark.skipif(
-    find_spec("torch") is None or find_spec("transformers") is None,
-    reason="torch and transformers are not installed: pip install 'su3d-bench[models]'",
-)
 DINO_PX = (48, 80)
 SAM_PX = 64
 
 
 def write_models(root: Path) -> Path:
     """Folders of tiny SAM and GroundingDINO in the hub's form under the names that they are looked for."""
-    tiny_sam().save_pretrained(root / "sam-vit-h")
-    (root / "sam-vit-h" / "preprocessor_config.json").write_text("{}")
-    detector = root / "grounding-dino"
-    tiny_dino().save_pretrained(detector)
-    (detector / "preprocessor_config.json").write_text("{}")
-    tiny_tokenizer(detector).save_pretrained(detector)
+    for name, model in (("sam-vit-h", tiny_sam()), ("grounding-dino", tiny_dino())):
+        model.save_pretrained(root / name)
+        (root / name / "preprocessor_config.json").write_text("{}")
+    tiny_tokenizer(root / "grounding-dino").save_pretrained(root / "grounding-dino")
     return root
 
 
@@ -75,13 +67,9 @@ def frame_of(rgb: UInt8Array, index: int = 0) -> Frame:
 
 def noise_images(n: int, seed: int = 0) -> list[UInt8Array]:
     """RGB images of different sizes, one of them a single pixel high, in colours that differ."""
-    random = np.random.default_rng(seed)
-    sizes = [(1, 9), (50, 20), (33, 90), (64, 64), (120, 45)]
-    return [
-        random.integers(0, 256, (*sizes[k % len(sizes)], 3), dtype=np.uint8) // 2
-        + random.integers(0, 128, 3, dtype=np.uint8)
-        for k in range(n)
-    ]
+    rng = np.random.default_rng(seed)
+    sizes = [((1, 9), (50, 20), (33, 90), (64, 64), (120, 45))[k % 5] for k in range(n)]
+    return [rng.integers(0, 256, (*size, 3), np.uint8) // 2 + rng.integers(0, 128, 3, np.uint8) for size in sizes]
 
 
 # ---- SAM

@@ -10,7 +10,6 @@ import subprocess
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from waiting import wait_until
@@ -70,9 +69,7 @@ class Chromium:
     def __enter__(self) -> Chromium:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         try:
             self._call("Browser.close", {}, None)
             self._process.wait(timeout=20)
@@ -170,8 +167,7 @@ class Chromium:
             self.call("Input.dispatchKeyEvent", {"type": "keyUp", **values})
 
     def downloads_to(self, folder: Path) -> None:
-        values = {"behavior": "allow", "downloadPath": str(folder)}
-        self._call("Browser.setDownloadBehavior", values, None)
+        self._call("Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(folder)}, None)
 
     def faults(self) -> list[str]:
         """What the page complained of: errors, what was refused, every address that it asked for."""

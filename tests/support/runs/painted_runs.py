@@ -21,6 +21,12 @@ COLLECTOR = f"{SCENES}/painted.py:Collector"
 PROTOCOLS = ["--protocols", "rooms-semantic", "rooms-instance"]
 
 
+def see_painted(patch: pytest.MonkeyPatch) -> None:
+    """This process sees painted scenes, and encodes texts as their perception does."""
+    patch.setattr(scene_run, "build_perception", colour_perception)
+    patch.setattr(finished_run, "encoder_of", lambda run, device="cpu": WordEncoder())
+
+
 def words(*more: str, scenes: str = "*", out: str = "out") -> list[str]:
     base = ["run", "--scenes", f"{PAINTED}/{scenes}", "--methods", COLLECTOR, *PROTOCOLS, "--no-pictures"]
     return [*base, "--jobs", "1", "--out", out, *more]
@@ -47,7 +53,7 @@ def painted_run(folder: Path, *more: str, methods: Sequence[str] = (COLLECTOR,),
     """A finished run of some scenes, made in this process."""
     named = ["run", *(f"{PAINTED}/{scene}" for scene in scenes), "--methods", *methods, *PROTOCOLS, "--no-pictures"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scene_run, "build_perception", colour_perception)
+        see_painted(patch)
         assert main([*named, "--jobs", "1", "--out", str(folder), *more]) == 0
     return folder
 
@@ -55,6 +61,6 @@ def painted_run(folder: Path, *more: str, methods: Sequence[str] = (COLLECTOR,),
 def painted_page(run: Path, page: Path, *more: str) -> str:
     """The page of a run, made with the encoder of painted scenes."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
+        see_painted(patch)
         assert main(["report", "html", str(run), "--out", str(page), "--quiet", "--jobs", "1", *more]) == 0
     return page.read_text(encoding="utf-8")

@@ -37,7 +37,6 @@ from su3d_bench.core.types import (
 HEIGHT, WIDTH = 24, 32
 INTRINSICS = np.array([[30.0, 0, 15.5], [0, 30.0, 11.5], [0, 0, 1]])
 LABELS = LabelSet("replica", (20, 76, 80, 93), ("chair", "sofa", "table", "wall"))
-DELAY_S = 0.15
 COLOURS = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [120, 120, 120]], np.uint8)
 
 
@@ -93,10 +92,6 @@ class Painted:
             raise DataError(f"painted/{scene}: frame 2 is missing; copy it again")
         if fault == "nan-pose":
             pose[0, 0] = np.nan
-        if fault == "depth-size":
-            depth_m = depth_m[:-1]
-        if fault == "empty-depth":
-            depth_m = np.zeros_like(depth_m)
         if fault == "crash":
             raise ZeroDivisionError("a mistake in a plug-in")
         if fault == "memory":
@@ -217,76 +212,6 @@ class Collector:
             views=[self._views[name] for name in names],
             ids=np.arange(1, len(names) + 1, dtype=np.int32),
         )
-
-
-class Mistaken(Collector):
-    """A collector with one error of a kind: in scene a two halves of the chair and a sofa that looks like a table, in
-    scene b no table."""
-
-    name = "mistaken"
-
-    def start(self, scene: SceneInfo) -> None:
-        super().start(scene)
-        self._scene = scene.scene
-
-    def finish(self) -> Prediction:
-        if self._scene != "a":
-            self._points.pop("table", None)
-            return super().finish()
-        if {"chair", "sofa", "table"} <= set(self._points):
-            chair = np.concatenate(self._points["chair"])
-            is_left = chair[:, 0] < np.median(chair[:, 0])
-            self._points |= {"chair": [chair[is_left]], "chair half": [chair[~is_left]]}
-            self._views["chair half"] = self._views["chair"]
-            self._features["chair half"] = self._features["chair"]
-            self._features["sofa"] = self._features["table"]
-        return super().finish()
-
-
-class Delayed(Collector):
-    """A collector that takes ``DELAY_S`` longer where the environment says; its name and numbers stay the same.
-
-    What it says of its own costs is not true.
-    """
-
-    name = "delayed"
-
-    def __init__(self, config: Collector.Config) -> None:
-        super().__init__(config)
-        self._n_updates = 0
-        self._delayed("made")
-
-    def _delayed(self, where: str) -> None:
-        if os.environ.get("PAINTED_DELAY") == where:
-            time.sleep(DELAY_S)
-
-    def start(self, scene: SceneInfo) -> None:
-        super().start(scene)
-        self._delayed("start")
-
-    def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
-        super().update(frame, detections, timer)
-        self._n_updates += 1
-        self._delayed("outside")
-        if self._n_updates <= 3:
-            self._delayed("first")
-        with timer.stage("segment"):
-            self._delayed("named")
-
-    def finish(self) -> Prediction:
-        self._delayed("finish")
-        return super().finish()
-
-    @property
-    def finish_costs(self) -> dict[str, float | int]:
-        return {"finish_ms": 0.0, "n_things": 7}
-
-    @property
-    def losses(self) -> dict[str, int]:
-        return {"frame": 0, "method_ms": 0, "n_lost": 3}
-
-    def close(self) -> None:
-        self._delayed("close")
 
 
 class Twins(Painted):

@@ -1,13 +1,13 @@
-"""Plates before a camera, each with a feature and a name, and objects of made-up clouds, for ConceptGraphs' tests."""
+"""Plates before a camera, each with a feature and a name, for the tests of methods that map them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
-from su3d_bench.baselines.conceptgraphs.objects import MapObject, MappingConfig, Sighting, bounding_box
+from su3d_bench.baselines.conceptgraphs.objects import MappingConfig
 from su3d_bench.core.maps import Instances
 from su3d_bench.core.system.timing import Timer
 from su3d_bench.core.types import Detections, Frame, SceneInfo
@@ -31,7 +31,7 @@ def at_cosine(cosine: float) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class Plate:
-    """A rectangle facing the camera, bent a little towards it: its lower and upper x and y and its depth, metres."""
+    """A rectangle facing the camera, bent so far towards it: its lower and upper x and y and its depth, metres."""
 
     x: tuple[float, float]
     y: tuple[float, float] = (-0.3, 0.3)
@@ -40,18 +40,22 @@ class Plate:
     name: str = "item"
     text: tuple[float, ...] = axis(0)
     score: float = 1.0
+    bend_m: float = 0.05
 
 
-def look(plates: Sequence[Plate], index: int = 0) -> tuple[Frame, Detections]:
-    """A frame of ``plates`` in front of nothing, and one detection each."""
+def look(plates: Sequence[Plate], index: int = 0, camera_x: float = 0.0) -> tuple[Frame, Detections]:
+    """A frame of ``plates`` in front of nothing, and one detection each, which may overlap."""
     u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     depth, masks = np.zeros((HEIGHT, WIDTH)), np.zeros((len(plates), HEIGHT, WIDTH), np.bool_)
     for row, plate in enumerate(plates):
         x, y = ((c - INTRINSICS[i, 2]) / FOCAL * plate.z for i, c in enumerate((u, v)))
+        x = x + camera_x
         masks[row] = (plate.x[0] <= x) & (x < plate.x[1]) & (plate.y[0] <= y) & (y < plate.y[1])
-        depth[masks[row]] = plate.z + 0.05 * np.cos(3 * x + 2 * y)[masks[row]]
+        depth[masks[row]] = plate.z + plate.bend_m * np.cos(3 * x + 2 * y)[masks[row]]
     rgb = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    frame = Frame(index, index / 30, rgb, depth.astype(np.float32), np.eye(4), INTRINSICS)
+    pose = np.eye(4)
+    pose[0, 3] = camera_x
+    frame = Frame(index, index / 30, rgb, depth.astype(np.float32), pose, INTRINSICS)
     features = np.array([plate.feature for plate in plates], np.float32).reshape(len(plates), 1, DIMENSION)
     return frame, Detections(
         index,
@@ -75,20 +79,6 @@ def mapped(method, views: Sequence[Sequence[Plate]]):  # type: ignore[no-untyped
     return method
 
 
-def an_object(
-    points: np.ndarray,
-    number: int = 1,
-    *,
-    n: int = 1,
-    feature: tuple[float, ...] = axis(0),
-    text: tuple[float, ...] = axis(0),
-) -> MapObject:
-    """An object of ``n`` detections."""
-    seen = tuple(Sighting(k, 0, "item", "", 1.0) for k in range(n))
-    cloud = np.asarray(points, np.float64)
-    return MapObject(number, cloud, bounding_box(cloud, oriented=True), np.array(feature), np.array(text), seen)
-
-
 def block(low: Sequence[float], size: Sequence[float] = (0.3, 0.3, 0.3), step: float = 0.05) -> np.ndarray:
     """A filled block of points ``step`` apart from its corner ``low``."""
     grid = np.meshgrid(*(np.arange(0, side - 1e-9, step) for side in size), indexing="ij")
@@ -96,10 +86,9 @@ def block(low: Sequence[float], size: Sequence[float] = (0.3, 0.3, 0.3), step: f
 
 
 def contents(found: Instances) -> tuple[object, ...]:
-    """Everything of ``found`` in bytes."""
-    parts = (found.points, found.indptr, found.indices, found.scores, found.boxes, found.views, found.ids)
-    features = np.asarray(found.features).tobytes()
-    return (*(part.tobytes() for part in parts), features, found.names, found.captions, found.labels)
+    """Every byte of a map."""
+    values = (getattr(found, one.name) for one in fields(found))
+    return tuple(value.tobytes() if isinstance(value, np.ndarray) else value for value in values)
 
 
 # Frames without noise, so that values can be worked out by hand; the rest as published.

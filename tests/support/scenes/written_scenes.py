@@ -1,0 +1,23 @@
+"""One scene written as the files of a dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from su3d_bench.datasets.writing import Layout, finish_scene, plan_scenes, write_frames
+
+
+def write_scene(
+    layout: Layout,
+    dataset: Any,  # rooms, or a stage in their place
+    scene: str,
+    out: Path,
+    report: Callable[[int], None] = lambda n_done: None,
+) -> None:
+    """Write one scene whole; nothing is done where it is there already."""
+    for target in plan_scenes(layout, dataset, [scene], out):
+        write_frames(layout, dataset, target, range(len(dataset.frames(scene, 1))), report)
+        layout.write_truth(dataset, target)
+        finish_scene(layout, dataset, target)
