@@ -29,7 +29,7 @@ USUAL = (
     *("prediction su3d-bench", "file ascii.ply", "file binary_compressed.pcd", "file a.png", "file a.npz"),
     *("file map.pkl.gz", "file q.toml", "dataset replica", "run", "answers ann.xlsx", "archive a.tar.gz"),
 )
-N_VECTORS = int(os.environ.get("SU3D_FUZZ_EXAMPLES", "4"))  # of words behind each verb
+N_VECTORS = int(os.environ.get("SU3D_FUZZ_EXAMPLES", "2"))  # of words behind each verb
 # A verb whose work could begin with nothing more than its name ends with words that keep it from that.
 HELD_BACK = {"run": ["--scenes", "replica/none", "--dry-run"], "ablate": ["--scenes", "replica/none", "--dry-run"]}
 HELD_BACK |= {"questions": ["--scenes", "replica/none"], "make": ["--scenes", "none/none", "--out", "folder/out"]}

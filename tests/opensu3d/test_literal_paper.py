@@ -176,7 +176,8 @@ def run_side_by_side(out: Path, profile: str, *words: str) -> None:
     assert len(list(out.glob("scenes/*/side-by-side@*/prediction.npz"))) == len(methods)
 
 
-@pytest.mark.parametrize("profile", ["oracle", pytest.param("embedded", marks=pytest.mark.proof)])
+@pytest.mark.proof
+@pytest.mark.parametrize("profile", ["oracle", "embedded"])
 def test_a_room_is_what_the_papers_text_makes_of_it(
     profile: str, tmp_path: Path, rooms_data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -119,6 +119,7 @@ def test_what_could_not_be_had_is_asked_for_again(run: Path, monkeypatch: pytest
     assert page() == first
 
 
+@pytest.mark.proof
 def test_processes_side_by_side_give_the_same_bytes(run: Path) -> None:
     first = page()
     shutil.rmtree(run / FOLDER)

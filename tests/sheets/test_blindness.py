@@ -146,6 +146,7 @@ def test_an_instance_looks_the_same_however_dense_and_complete_its_map_is(source
     assert len(drawn) == 1
 
 
+@pytest.mark.proof
 def test_sheets_of_questions_come_out_the_same_without_any_map(run: Path, tmp_path: Path) -> None:
     bare = tmp_path / "bare" / run.name
     shutil.copytree(run, bare, ignore=shutil.ignore_patterns("prediction*", ".cache"))

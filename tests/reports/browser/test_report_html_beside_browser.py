@@ -165,7 +165,8 @@ def test_the_address_follows_what_is_changed_and_brings_it_back(browser: Chromiu
     browser.run("history.replaceState(null, '', location.pathname)")
     browser.open(page)
     browser.run(f"history.replaceState(null, '', {json.dumps(link)})")
-    browser.reload("document.querySelector('#maps .detail h3') !== null")
+    browser.reload("true")
+    browser.until("document.querySelector('#maps .detail h3') !== null")
     browser.until("!document.querySelectorAll('#maps .pane')[1].hidden")
     browser.until(READ.format(text=json.dumps("painted/a by")))
     assert browser.run(shown) == chosen
