@@ -2,8 +2,8 @@
 
 Words, rows and columns must be equal; values may differ by ``TOLERANCE`` points, because ONNX Runtime, Embree and BLAS
 round differently on other processors and a region that falls on the other side of a threshold moves a metric a little.
-The ends of an interval over four scenes are the value and 3.18 standard errors: where each scene moves by ``TOLERANCE``,
-they move by up to ``TOLERANCE * (1 + 3.18 / 2)``.
+The ends of an interval over four scenes are the value and 3.18 standard errors: where each scene moves by
+``TOLERANCE``, they move by up to ``TOLERANCE * (1 + 3.18 / 2)``.
 """
 
 from __future__ import annotations
